@@ -1,0 +1,33 @@
+"""From the caustic pattern of a lensless camera to a picture.
+
+>>> from mwdn import Calibration, Reconstructor, read_frame, write_picture
+>>> calibration = Calibration.from_file("psf.png")
+>>> reconstruct = Reconstructor("admm", calibration)
+>>> write_picture("scene.png", reconstruct(calibration.correct(read_frame("capture.png"))))
+"""
+
+from mwdn.calibration import Calibration
+from mwdn.data import read_frame, read_picture, write_linear, write_picture
+from mwdn.errors import MwdnError
+from mwdn.fourier import convolve, correlate, wiener
+from mwdn.networks import build
+from mwdn.optics import Camera, Sensor
+from mwdn.reconstruct import Reconstructor
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Calibration",
+    "Camera",
+    "MwdnError",
+    "Reconstructor",
+    "Sensor",
+    "build",
+    "convolve",
+    "correlate",
+    "read_frame",
+    "read_picture",
+    "wiener",
+    "write_linear",
+    "write_picture",
+]

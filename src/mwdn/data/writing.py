@@ -1,0 +1,83 @@
+"""Files that are either wholly new or wholly old. What the disk refuses is raised as its `OSError`."""
+
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from mwdn.types import FloatFrame, Frame
+
+
+@contextmanager
+def atomic(path: Path) -> Iterator[Path]:
+    """Write a file so that nobody ever sees half of it.
+
+    The file is written under a hidden name in the same folder, and renamed once all of it is on the disk. If
+    anything fails before that, an existing ``path`` keeps its bytes and the hidden file is removed.
+
+    Args:
+        path: where the file shall be; folders that are missing on the way are created, and a symbolic link is
+            followed rather than replaced.
+
+    Yields:
+        The name to write to: same folder and suffix as ``path``, unlike that of any other process.
+
+    Raises:
+        OSError: the folder cannot be written to, the disk is full, or ``path`` is a folder.
+    """
+    path = path.resolve()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # The stem is left out: a long one plus a token could pass the 255 bytes that a file system allows.
+    temporary = path.with_name(f".mwdn-{os.getpid()}-{secrets.token_hex(4)}{path.suffix}")
+    try:
+        yield temporary
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def save_png(path: Path, pixels: Frame) -> None:
+    """Write a frame as PNG, atomically.
+
+    Args:
+        path: where the file shall be.
+        pixels: (H, W, 1) or (H, W, 3), RGB, uint8 or uint16.
+
+    Raises:
+        OSError: as for `atomic`, or the frame has over a million rows or columns, which PNG writers refuse.
+    """
+    import cv2
+
+    try:
+        encoded, data = cv2.imencode(".png", np.ascontiguousarray(pixels[..., ::-1]))
+    except cv2.error as error:
+        raise OSError(f"OpenCV: {error.err}") from error
+    if not encoded:
+        raise OSError(f"OpenCV cannot encode {pixels.shape[0]:,} x {pixels.shape[1]:,} pixels as PNG")
+    with atomic(path) as temporary:
+        temporary.write_bytes(data.tobytes())
+
+
+def save_linear(path: Path, frame: FloatFrame) -> None:
+    """Write a frame's float32 numbers as NPY or, by any other suffix, as TIFF, atomically.
+
+    Args:
+        path: where the file shall be.
+        frame: (H, W, 1) or (H, W, 3), RGB.
+
+    Raises:
+        OSError: as for `atomic`.
+    """
+    with atomic(path) as temporary:
+        if path.suffix.lower() == ".npy":
+            with temporary.open("wb") as file:
+                np.save(file, frame, allow_pickle=False)
+        else:
+            import tifffile
+
+            tifffile.imwrite(temporary, frame, photometric="rgb" if frame.shape[-1] == 3 else "minisblack")

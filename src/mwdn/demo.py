@@ -1,0 +1,94 @@
+"""A synthetic camera, captures through it, and every method that needs no training."""
+
+import html
+from importlib.resources import files
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from rich.table import Table
+from torch.nn import functional as F
+
+from mwdn.calibration import Calibration
+from mwdn.data.images import read_picture, write_picture
+from mwdn.data.sheets import contact_sheet, for_people
+from mwdn.data.writing import atomic
+from mwdn.optics import Camera
+from mwdn.optics.patterns import contour_psf
+from mwdn.reconstruct import Reconstructor
+from mwdn.types import Image, Scene
+
+SIZE = 320, 320
+"""The paper's sensor, binned."""
+
+METHODS = ("wiener", "fista", "admm")
+
+
+def scenes() -> dict[str, Scene]:
+    """The pictures that come with the package, each in the middle of a dark scene, by their names."""
+    found = {}
+    for name in ("astronaut", "coffee", "cat"):
+        picture = read_picture(str(files("mwdn") / "pictures" / f"{name}.jpg"))
+        margin = (SIZE[0] - picture.shape[-2]) // 2
+        found[name] = F.pad(picture, (margin,) * 4)
+    return found
+
+
+def psnr(reconstruction: Image, scene: Image) -> float:
+    """Peak signal-to-noise ratio in dB of the reconstruction clipped to [0, 1], for a peak of 1."""
+    return float(-10 * torch.log10((reconstruction.clamp(0, 1) - scene).square().mean()))
+
+
+def run(out: Path, seed: int, console: Console) -> None:
+    """Simulate, reconstruct, print a table; write the pictures and a page into ``out``.
+
+    Args:
+        out: a folder; its files of the same names are replaced.
+        seed: of the camera and its noise.
+        console: where to print.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    camera = Camera(contour_psf(SIZE, generator=generator))
+    calibration = Calibration(camera.psf)
+    reconstructors = {name: Reconstructor(name, calibration, device="cpu") for name in METHODS}
+    table = Table("picture", *METHODS, title="PSNR in dB")
+    rows = []
+    for name, scene in scenes().items():
+        measurement = camera.simulate(scene, generator=generator)
+        results = [reconstruct(measurement) for reconstruct in reconstructors.values()]
+        table.add_row(name, *(f"{psnr(result, scene):.2f}" for result in results))
+        rows.append([scene, measurement, *results])
+    write_picture(out / "psf.png", for_people(camera.psf))
+    write_picture(out / "comparison.png", contact_sheet(rows, ["scene", "measurement", *METHODS]))
+    with atomic(out / "index.html") as temporary:
+        temporary.write_text(_page(table), encoding="utf-8")
+    console.print(table)
+    console.print(f"Look at {out / 'index.html'}", highlight=False)
+
+
+_PAGE = """<!doctype html>
+<html lang="en"><meta charset="utf-8"><title>mwdn demo</title>
+<style>
+body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 78rem; margin: 2rem auto; padding: 0 1rem; color: #222; }}
+img {{ max-width: 100%; }} td, th {{ padding: .2rem 1rem; text-align: right; }} th:first-child {{ text-align: left; }}
+</style>
+<h1>From a caustic pattern to a picture</h1>
+<p>A camera without a lens: a thin mask in front of the sensor turns each point of the scene into the pattern
+below, its point spread function. What the sensor records is the scene convolved with it.</p>
+<img src="psf.png" alt="point spread function" width="320">
+<p>None of the reconstructions below needed any training.</p>
+<img src="comparison.png" alt="scene, measurement and reconstructions">
+<h2>PSNR in dB</h2>
+<table><tr>{head}</tr>{body}</table>
+</html>
+"""
+
+
+def _page(table: Table) -> str:
+    columns = [[str(cell) for cell in column.cells] for column in table.columns]
+    head = "".join(f"<th>{html.escape(str(column.header))}</th>" for column in table.columns)
+    body = "".join(
+        f"<tr><th>{html.escape(name)}</th>" + "".join(f"<td>{value}</td>" for value in values) + "</tr>"
+        for name, *values in zip(*columns, strict=True)
+    )
+    return _PAGE.format(head=head, body=body)

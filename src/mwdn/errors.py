@@ -1,0 +1,57 @@
+"""Everything that this package raises on purpose.
+
+::
+
+    MwdnError
+    ├── ShapeError (ValueError)        two arrays that do not fit together
+    ├── ParameterError (ValueError)    a number or an option outside its range
+    │   └── UnknownNameError           a name that no method, network or recipe key has
+    ├── ImageError (ValueError)        a picture or frame that cannot be read or written
+    ├── PsfError (ValueError)          a PSF that no reconstruction can trust
+    └── CheckpointError (ValueError)   weights that are damaged or belong to something else
+
+A message states what must hold, what was got, and the way out.
+"""
+
+import difflib
+from collections.abc import Iterable
+
+
+class MwdnError(Exception):
+    """Base of the tree: catch this to catch them all."""
+
+
+class ShapeError(MwdnError, ValueError):
+    """Two arrays that must fit together do not."""
+
+
+class ParameterError(MwdnError, ValueError):
+    """A number or an option is outside its range."""
+
+
+class UnknownNameError(ParameterError):
+    """A name that nothing here has; the message offers the nearest one.
+
+    Args:
+        kind: what was looked up, for example ``"network"``.
+        name: what was asked for.
+        known: every name that would have been found.
+    """
+
+    def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
+        known = sorted(known)
+        nearest = difflib.get_close_matches(name, known, n=1)
+        hint = f" Did you mean '{nearest[0]}'?" if nearest else ""
+        super().__init__(f"No {kind} named '{name}'.{hint} Known: {', '.join(known)}.")
+
+
+class ImageError(MwdnError, ValueError):
+    """A picture or a frame cannot be read or written; the message names the file."""
+
+
+class PsfError(MwdnError, ValueError):
+    """A PSF is saturated, empty, not finite, or of the wrong size."""
+
+
+class CheckpointError(MwdnError, ValueError):
+    """Weights are damaged, or belong to another network or camera."""

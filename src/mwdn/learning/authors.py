@@ -1,0 +1,73 @@
+"""Checkpoints of the MWDN authors' public code (github.com/IOE8AILab/MWDNs), read into this package's networks."""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from mwdn.errors import CheckpointError
+from mwdn.networks import build
+
+OPTIONS: dict[str, Any] = {"pooling": "average", "boundary": "circular"}
+"""What their code does otherwise than their paper, for both networks."""
+
+# Their module names, beside ours. Each scale is a double convolution, in theirs wrapped once more.
+_ENCODER = {"inc": "0", "down1.avgpool_conv.1": "1", "down2.avgpool_conv.1": "2", "down3.avgpool_conv.1": "3"}
+_MODULES = {f"{theirs}.double_conv": f"encoder.scales.{ours}" for theirs, ours in _ENCODER.items()}
+_MODULES |= {"down4.avgpool_conv.1.double_conv": "encoder.scales.4", "outc.conv": "decoder.head"}
+_MODULES |= {f"up{i + 1}.conv.double_conv": f"decoder.scales.{i}" for i in range(4)}
+_MODULES |= {
+    f"{theirs}.double_conv": f"psf_encoder.scales.{i}"
+    for i, theirs in enumerate(("inc0", "down11.avgpool_conv.1", "down22.avgpool_conv.1", "down33.avgpool_conv.1"))
+}
+
+
+def is_authors(state: dict[str, Tensor]) -> bool:
+    """Whether these weights have the authors' names."""
+    return "delta" in state and "inc.double_conv.0.weight" in state
+
+
+def load_authors(state: dict[str, Tensor]) -> nn.Module:
+    """MWDN or MWDN-CPSF, in the form of the authors' code, with these weights.
+
+    Their networks take the PSF as stored, in [0, 1] with its background: calibrate with ``background=0``.
+
+    Args:
+        state: tensors by the authors' names.
+
+    Raises:
+        CheckpointError: a tensor is missing, superfluous or of another shape, or a w or lambda is not positive.
+    """
+    name = "mwdn-cpsf" if "inc0.double_conv.0.weight" in state else "mwdn"
+    extra = {"authors_scalars": True} if name == "mwdn-cpsf" else {"psf_pooling": "average"}
+    first, last = state["inc.double_conv.0.weight"], state["outc.conv.weight"]
+    options = OPTIONS | extra | {"channels": first.shape[1], "outputs": last.shape[0], "width": first.shape[0]}
+    network = build(name, **options)
+    try:
+        network.load_state_dict(_renamed(state, name), strict=True)
+    except RuntimeError as error:
+        raise CheckpointError(f"These weights have the names of the authors' {name}, but: {error}") from error
+    return network
+
+
+def _renamed(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:
+    ours = {}
+    for key, value in state.items():
+        if key in ("w", "delta"):
+            continue
+        module = next((module for module in _MODULES if key.startswith(module + ".")), None)
+        ours[key.replace(module, _MODULES[module], 1) if module else key] = value
+    for i, regularisation in enumerate(_logarithm("delta", state["delta"])[:4]):
+        ours[f"filters.{i}.log_regularisation"] = regularisation
+    if name == "mwdn-cpsf":
+        return ours | {"weight": state["w"], "unused_regularisation": state["delta"][4]}
+    return ours | {f"filters.{i}.log_weight": weight for i, weight in enumerate(_logarithm("w", state["w"]))}
+
+
+def _logarithm(name: str, values: Tensor) -> Tensor:
+    if not (values > 0).all():
+        raise CheckpointError(
+            f"`{name}` ({values.tolist()}) must be positive: a Wiener filter with a negative constant has poles. "
+            "Train longer, or take another checkpoint."
+        )
+    return torch.log(values)

@@ -1,0 +1,100 @@
+"""Networks in files: safetensors with what it takes to build them again. Nothing is pickled."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from mwdn.data.writing import atomic
+from mwdn.errors import CheckpointError
+from mwdn.learning.authors import is_authors, load_authors
+from mwdn.networks import build
+
+SUFFIXES = frozenset({".safetensors", ".pt", ".pth", ".tar", ".ckpt"})
+"""Suffixes of files that hold weights."""
+
+
+def save_network(
+    path: str | Path,
+    network: nn.Module,
+    name: str,
+    options: dict[str, Any],
+    **metadata: Any,  # noqa: ANN401
+) -> None:
+    """Write a network's weights, atomically.
+
+    Args:
+        path: ends in ``.safetensors``.
+        network: as built by ``build(name, **options)``.
+        name: of the network.
+        options: it was built with; plain values that JSON can hold.
+        **metadata: more to remember, for example the recipe, the PSF's hash, metrics.
+    """
+    from mwdn import __version__
+
+    header = {"name": name, "options": options, "version": __version__, **metadata}
+    tensors = {key: value.detach().cpu().contiguous() for key, value in network.state_dict().items()}
+    with atomic(Path(path)) as temporary:
+        save_file(tensors, temporary, metadata={"mwdn": json.dumps(header)})
+
+
+def read_metadata(path: str | Path) -> dict[str, Any]:
+    """What `save_network` stored beside the weights: name, options, version and more.
+
+    Raises:
+        CheckpointError: not a checkpoint of this package.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            text = (file.metadata() or {}).get("mwdn")
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(f"`{path}` cannot be read as safetensors: {error}.") from error
+    if text is None:
+        raise CheckpointError(f"`{path}` was not written by mwdn: it does not say which network it belongs to.")
+    header: dict[str, Any] = json.loads(text)
+    return header
+
+
+def load_network(path: str | Path) -> nn.Module:
+    """Build the network that a file describes, with its weights, on the CPU, in evaluation mode.
+
+    Args:
+        path: a checkpoint of this package (``.safetensors``), or one of the MWDN authors (``.tar`` and the like,
+            read without unpickling code).
+
+    Raises:
+        CheckpointError: damaged, of unknown layout, or its weights do not fit its network.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CheckpointError(f"No checkpoint at `{path}`. Check the name; the current folder is `{Path.cwd()}`.")
+    if path.suffix != ".safetensors":
+        return load_authors(_read_foreign(path)).eval()
+    header = read_metadata(path)
+    network = build(header["name"], **header["options"])
+    with safe_open(path, framework="pt") as file:
+        state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    try:
+        network.load_state_dict(state)
+    except RuntimeError as error:
+        raise CheckpointError(f"`{path}` does not fit the network '{header['name']}' it names: {error}") from error
+    return network.eval()
+
+
+def _read_foreign(path: Path) -> dict[str, Tensor]:
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises many kinds for damaged files
+        raise CheckpointError(f"`{path}` cannot be read as plain weights: {error}") from error
+    state = content.get("net_state_dict", content) if isinstance(content, dict) else {}
+    state = {key.removeprefix("module."): value for key, value in state.items() if isinstance(value, Tensor)}
+    if not is_authors(state):
+        raise CheckpointError(
+            f"`{path}` is neither a checkpoint of mwdn (.safetensors) nor one of the MWDN authors "
+            f"(`net_state_dict` with `delta` and `inc.double_conv.*`). It holds: {', '.join(list(state)[:5])} ..."
+        )
+    return state

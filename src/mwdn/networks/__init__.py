@@ -1,0 +1,39 @@
+"""Learned reconstruction, one file a method. Each is called as ``network(measurement, psf)``."""
+
+from typing import Any
+
+from torch import nn
+
+from mwdn.errors import UnknownNameError
+from mwdn.networks.mwdn import Mwdn
+from mwdn.networks.mwdn_cpsf import MwdnCpsf
+from mwdn.networks.unet import UNet
+from mwdn.networks.wiener import WienerNetwork
+from mwdn.networks.wiener_unet import WienerUNet
+
+NETWORKS: dict[str, type[nn.Module]] = {
+    "wiener": WienerNetwork,
+    "unet": UNet,
+    "wiener-unet": WienerUNet,
+    "mwdn": Mwdn,
+    "mwdn-cpsf": MwdnCpsf,
+}
+"""Every network by the name that recipes and the command line use."""
+
+
+def build(name: str, **options: Any) -> nn.Module:  # noqa: ANN401
+    """Make a fresh network.
+
+    Args:
+        name: one of `NETWORKS`.
+        **options: keyword arguments of that network, for example ``width=32``.
+
+    Raises:
+        UnknownNameError: there is no such network.
+    """
+    if name not in NETWORKS:
+        raise UnknownNameError("network", name, NETWORKS)
+    return NETWORKS[name](**options)
+
+
+__all__ = ["NETWORKS", "Mwdn", "MwdnCpsf", "UNet", "WienerNetwork", "WienerUNet", "build"]

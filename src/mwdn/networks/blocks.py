@@ -1,0 +1,136 @@
+"""The parts that the paper's networks share: convolution block, encoder, decoder, learned Wiener filter."""
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from mwdn.errors import ParameterError, ShapeError
+from mwdn.fourier import Boundary, wiener
+from mwdn.types import Image, Measurement, Psf
+
+Pooling = Literal["max", "average"]
+
+
+def halve(kind: Pooling) -> nn.Module:
+    """Halve height and width, rounding down."""
+    kinds = {"max": nn.MaxPool2d, "average": nn.AvgPool2d}
+    if kind not in kinds:
+        raise ParameterError(f"`pooling` must be max or average, not {kind!r}.")
+    return kinds[kind](2)
+
+
+def double_convolution(inputs: int, outputs: int, inner: int | None = None) -> nn.Sequential:
+    """(3x3 convolution, BatchNorm, ReLU) twice."""
+    inner = inner or outputs
+    return nn.Sequential(
+        nn.Conv2d(inputs, inner, 3, padding=1),
+        nn.BatchNorm2d(inner),
+        nn.ReLU(inplace=True),
+        nn.Conv2d(inner, outputs, 3, padding=1),
+        nn.BatchNorm2d(outputs),
+        nn.ReLU(inplace=True),
+    )
+
+
+class Encoder(nn.Module):
+    """Left half of a U-Net: features at scales 1, 1/2, 1/4, ..., each a double convolution of the one before.
+
+    Args:
+        channels: of the picture.
+        widths: feature channels at each scale, (64, 128, 256, 512, 512) in the paper.
+        pooling: between the scales; the paper's figure shows max-pooling, the authors' code averages.
+    """
+
+    def __init__(self, channels: int, widths: tuple[int, ...], *, pooling: Pooling = "max") -> None:
+        super().__init__()
+        self.pool = halve(pooling)
+        self.scales = nn.ModuleList(
+            double_convolution(inputs, outputs) for inputs, outputs in zip((channels, *widths), widths, strict=False)
+        )
+
+    def forward(self, picture: Image) -> list[Tensor]:
+        """Features, finest first."""
+        features = [self.scales[0](picture)]
+        for scale in self.scales[1:]:
+            features.append(scale(self.pool(features[-1])))
+        return features
+
+
+class Decoder(nn.Module):
+    """Right half of a U-Net: up-sample, join the skip connection, double convolution; then a 1x1 head.
+
+    Args:
+        channels: of the reconstruction.
+        widths: those of the encoder.
+    """
+
+    def __init__(self, channels: int, widths: tuple[int, ...]) -> None:
+        super().__init__()
+        first, *skips = widths[::-1]
+        # 512 + 512 -> 256, 256 + 256 -> 128, 128 + 128 -> 64, 64 + 64 -> 64: what comes up has the skip's width.
+        following = (*skips[1:], skips[-1])
+        joined = [a + b for a, b in zip((first, *following), skips, strict=False)]
+        self.scales = nn.ModuleList(
+            double_convolution(inputs, outputs, inputs // 2) for inputs, outputs in zip(joined, following, strict=True)
+        )
+        self.head = nn.Conv2d(following[-1], channels, 1)
+
+    def forward(self, features: list[Tensor]) -> Image:
+        """Picture of the finest feature's size, from features, finest first."""
+        *skips, x = features
+        for scale, skip in zip(self.scales, reversed(skips), strict=True):
+            x = F.interpolate(x, size=skip.shape[-2:], mode="bilinear", align_corners=True)
+            x = scale(torch.cat([skip, x], dim=1))
+        return self.head(x)
+
+
+def paper_widths(width: int) -> tuple[int, ...]:
+    """Feature channels of the U-Net at scales 1 to 1/16, for ``width`` at scale 1 (64 in the paper)."""
+    return (width, 2 * width, 4 * width, 8 * width, 8 * width)
+
+
+class Wiener(nn.Module):
+    """A Wiener filter, eq. (2), whose weight w and regularisation lambda are learned.
+
+    Both are stored as logarithms, so that no gradient step can make them negative.
+
+    Args:
+        weight: start value of w; ``None`` leaves w out (MWDN-CPSF, whose PSF is learned).
+        regularisation: start value of lambda.
+        boundary: see `mwdn.fourier.Boundary`.
+    """
+
+    def __init__(
+        self, *, weight: float | None = 1e-3, regularisation: float = 1e-2, boundary: Boundary = "taper"
+    ) -> None:
+        super().__init__()
+        for name, value in (("weight", weight), ("regularisation", regularisation)):
+            if value is not None and not value > 0:
+                raise ParameterError(f"`{name}` ({value}) must be positive: its logarithm is what is learned.")
+        self.log_regularisation = nn.Parameter(torch.tensor(math.log(regularisation)))
+        if weight is not None:
+            self.log_weight = nn.Parameter(torch.tensor(math.log(weight)))
+        self.boundary = boundary
+
+    def forward(self, features: Tensor, psf: Psf) -> Tensor:
+        """Deconvolve each channel with the PSF, or with its own where the PSF has as many channels."""
+        if hasattr(self, "log_weight"):
+            psf = self.log_weight.exp() * psf
+        return wiener(features, psf, self.log_regularisation.exp(), boundary=self.boundary)
+
+
+def peak_one(psf: Psf, measurement: Measurement) -> Psf:
+    """Scale each PSF so that its largest value is 1, the range that the paper's PSFs have.
+
+    Raises:
+        ShapeError: the PSF does not have the height and width of the measurement.
+    """
+    if psf.shape[-2:] != measurement.shape[-2:]:
+        raise ShapeError(
+            f"`psf` {tuple(psf.shape)} and `measurement` {tuple(measurement.shape)} must have the same height "
+            "and width. Bin or crop the PSF: `--bin`, `--crop`."
+        )
+    return psf / psf.amax(dim=(1, 2, 3), keepdim=True)

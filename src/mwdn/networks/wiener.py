@@ -1,0 +1,25 @@
+"""A single learned Wiener filter (section 3.2.3 of the paper)."""
+
+from torch import nn
+
+from mwdn.fourier import Boundary
+from mwdn.networks.blocks import Wiener, peak_one
+from mwdn.types import Measurement, Psf, Scene
+
+
+class WienerNetwork(nn.Module):
+    """Pure physics: eq. (2) with a learned weight w and regularisation lambda. 2 learnable numbers.
+
+    Args:
+        weight: start value of w, for a PSF whose peak is 1.
+        regularisation: start value of lambda.
+        boundary: see `mwdn.fourier.Boundary`.
+    """
+
+    def __init__(self, *, weight: float = 1e-3, regularisation: float = 1e-2, boundary: Boundary = "taper") -> None:
+        super().__init__()
+        self.filter = Wiener(weight=weight, regularisation=regularisation, boundary=boundary)
+
+    def forward(self, measurement: Measurement, psf: Psf) -> Scene:
+        """Scene (B, C, H, W), each colour deconvolved with its own PSF."""
+        return self.filter(measurement, peak_one(psf, measurement))

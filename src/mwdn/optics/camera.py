@@ -1,0 +1,52 @@
+"""The forward model of a lensless camera: ``crop(psf * scene)``, then a sensor."""
+
+from dataclasses import dataclass, field
+
+import torch
+
+from mwdn.fourier import Size, convolve, correlate
+from mwdn.optics.sensor import Sensor
+from mwdn.types import Image, Measurement, Psf, Scene
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A thin mask before a sensor, shift-invariant over its field of view.
+
+    Args:
+        psf: (1 or B, 1 or C, h, w), centred; unit sum per channel keeps the energy of the scene.
+        size: height and width of the sensor in pixels; the PSF's unless given.
+        sensor: what turns light into numbers; noise-free and unbounded only in `forward`.
+
+    References:
+        Eq. (1) of the MWDN paper.
+    """
+
+    psf: Psf
+    size: Size | None = None
+    sensor: Sensor = field(default_factory=Sensor)
+
+    @property
+    def sensor_size(self) -> Size:
+        """Height and width of a measurement."""
+        return self.size or (self.psf.shape[-2], self.psf.shape[-1])
+
+    def forward(self, scene: Scene) -> Measurement:
+        """Light on the sensor: the scene convolved with the PSF, cropped to the sensor."""
+        return convolve(scene, self.psf, size=self.sensor_size)
+
+    def adjoint(self, measurement: Measurement, *, scene_size: Size | None = None) -> Scene:
+        """Exact adjoint of `forward` for scenes of ``scene_size`` (the sensor's unless given)."""
+        return correlate(measurement, self.psf, size=scene_size)
+
+    def simulate(self, scene: Scene, *, generator: torch.Generator | None = None) -> Image:
+        """A capture: `forward`, then noise, black level, saturation and quantisation of the sensor.
+
+        Args:
+            scene: (B, C, H, W), linear light; 1 is what just saturates a pixel that receives all of it.
+            generator: source of the noise, on the scene's device.
+
+        Returns:
+            (B, C, *sensor_size) in [0, 1], black level subtracted.
+        """
+        return self.sensor.expose(self.forward(scene), generator=generator)

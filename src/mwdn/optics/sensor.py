@@ -1,0 +1,64 @@
+"""From light to numbers: shot noise, read noise, black level, saturation, quantisation."""
+
+from dataclasses import dataclass
+
+import torch
+
+from mwdn.errors import ParameterError
+from mwdn.types import Image
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A linear image sensor.
+
+    Args:
+        full_well: electrons at saturation. Photon noise is relatively weaker the larger it is: the best
+            signal-to-noise ratio of a pixel is its square root.
+        read_noise: standard deviation in electrons, the same for each pixel and frame.
+        bit_depth: bits of the analogue-to-digital converter.
+        black_level: what a dark pixel reads, as a fraction of the full scale; it keeps the noise of dark pixels
+            from being cut at zero.
+
+    Raises:
+        ParameterError: a number that no sensor can have.
+
+    References:
+        J. R. Janesick, Photon Transfer (SPIE, 2007): the variance of a measurement in units of the full scale is
+        ``signal / full_well + (read_noise / full_well)^2 + quantisation_step^2 / 12``.
+    """
+
+    full_well: float = 15_000.0
+    read_noise: float = 3.0
+    bit_depth: int = 12
+    black_level: float = 0.01
+
+    def __post_init__(self) -> None:
+        if not self.full_well > 0:
+            raise ParameterError(f"`full_well` ({self.full_well}) must be positive: electrons at saturation.")
+        if not self.read_noise >= 0:
+            raise ParameterError(f"`read_noise` ({self.read_noise}) must not be negative: it is in electrons.")
+        if not 1 <= self.bit_depth <= 16:
+            raise ParameterError(f"`bit_depth` ({self.bit_depth}) must be 1 to 16.")
+        if not 0 <= self.black_level < 1:
+            raise ParameterError(f"`black_level` ({self.black_level}) must be in [0, 1), a part of the full scale.")
+
+    def expose(self, light: Image, *, generator: torch.Generator | None = None) -> Image:
+        """One capture of the light on the sensor.
+
+        Args:
+            light: (B, C, H, W); 1 fills the well.
+            generator: source of the noise, on the same device.
+
+        Returns:
+            Same shape; the black level is subtracted and the rest scaled so that saturation is 1, so the noise of
+            dark pixels reaches below 0.
+        """
+        electrons = torch.poisson(light.clamp(min=0) * self.full_well, generator=generator)
+        electrons += self.read_noise * torch.randn(
+            light.shape, generator=generator, device=light.device, dtype=light.dtype
+        )
+        span = 1 - self.black_level
+        steps = 2**self.bit_depth - 1
+        counts = ((electrons / self.full_well * span + self.black_level) * steps).round().clamp(0, steps)
+        return (counts / steps - self.black_level) / span

@@ -1,0 +1,145 @@
+"""A method bound to one calibrated camera: measurement in, picture out."""
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Literal
+
+import torch
+from torch import nn
+
+from mwdn import solvers
+from mwdn.calibration import Calibration
+from mwdn.data.images import READABLE, read_frame, write_linear, write_picture
+from mwdn.data.sheets import for_people
+from mwdn.errors import ParameterError, ShapeError, UnknownNameError
+from mwdn.learning.checkpoint import SUFFIXES, load_network
+from mwdn.types import Measurement, Psf, Scene
+
+Method = Callable[[Measurement, Psf], Scene]
+"""Anything that is called as ``method(measurement, psf)``: a solver or a network."""
+
+
+def find_method(name: str | Path) -> Method:
+    """A solver by its name, or a network by the path of its checkpoint.
+
+    Raises:
+        UnknownNameError: neither a solver nor a file.
+        CheckpointError: the file holds no usable weights.
+    """
+    path = Path(name)
+    if path.suffix in SUFFIXES or path.is_file():
+        return load_network(path)
+    if str(name) not in solvers.SOLVERS:
+        raise UnknownNameError("method", str(name), [*solvers.SOLVERS, "PATH/OF/CHECKPOINT.safetensors"])
+    return solvers.build(str(name))
+
+
+class Reconstructor:
+    """Reconstructs the measurements of one camera.
+
+    Args:
+        method: a solver, a network, the name of a solver, or the path of a checkpoint.
+        calibration: of the camera that took the measurements.
+        device: where to compute; a GPU if there is one, unless given.
+
+    Raises:
+        UnknownNameError: no such method.
+        CheckpointError: the checkpoint cannot be used.
+    """
+
+    def __init__(
+        self,
+        method: Method | str | Path,
+        calibration: Calibration,
+        *,
+        device: str | torch.device | None = None,
+    ) -> None:
+        self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        self.calibration = calibration
+        self.method = find_method(method) if isinstance(method, str | Path) else method
+        if isinstance(self.method, nn.Module):
+            self.method = self.method.to(self.device).eval()
+        self.psf = calibration.psf.to(self.device)
+
+    @torch.inference_mode()
+    def __call__(self, measurement: Measurement) -> Scene:
+        """Reconstruct a batch.
+
+        Args:
+            measurement: (B, C, H, W), as `Calibration.correct` gives it.
+
+        Returns:
+            (B, C, H, W) on the CPU, linear light. Solvers give non-negative values; networks may leave [0, 1].
+
+        Raises:
+            ShapeError: the measurement does not have the size of the PSF.
+        """
+        if measurement.shape[-2:] != self.psf.shape[-2:]:
+            raise ShapeError(
+                f"`measurement` {tuple(measurement.shape)} and `psf` {tuple(self.psf.shape)} must have the same "
+                "height and width. Pass raw frames through `Calibration.correct` first."
+            )
+        return self.method(measurement.to(self.device), self.psf).cpu()
+
+
+Format = Literal["png", "png16", "tiff", "npy"]
+"""``png`` and ``png16`` are sRGB for people; ``tiff`` and ``npy`` hold the linear float32 values."""
+
+_SUFFIX = {"png": ".png", "png16": ".png", "tiff": ".tif", "npy": ".npy"}
+SUMMARY = "summary.png"
+
+
+def find_captures(paths: Iterable[str | Path]) -> list[Path]:
+    """Files as named, and every readable file of each folder, in the order of their names.
+
+    Raises:
+        ParameterError: nothing was named, or a folder holds no picture.
+    """
+    found: list[Path] = []
+    for path in map(Path, paths):
+        inside = sorted(f for f in path.iterdir() if f.suffix.lower() in READABLE) if path.is_dir() else [path]
+        if not inside:
+            raise ParameterError(f"The folder `{path}` holds no capture. Readable: {', '.join(sorted(READABLE))}.")
+        found += inside
+    if not found:
+        raise ParameterError("Name at least one capture, or a folder of captures.")
+    return found
+
+
+def plan_outputs(captures: list[Path], out: Path, form: Format, *, protected: Iterable[Path | None] = ()) -> list[Path]:
+    """Where each capture's reconstruction goes: its name, in ``out``.
+
+    Raises:
+        ParameterError: two captures would go to one file, or one would overwrite an input.
+    """
+    outputs = [out / (capture.stem + _SUFFIX[form]) for capture in captures]
+    inputs = {path.resolve() for path in (*captures, *protected) if path is not None}
+    seen: dict[Path, Path] = {out / SUMMARY: Path("the summary picture")}
+    for capture, output in zip(captures, outputs, strict=True):
+        if output in seen:
+            raise ParameterError(
+                f"`{capture}` and `{seen[output]}` would both be written to `{output}`. Reconstruct them into "
+                "two folders: `--out`."
+            )
+        if output.resolve() in inputs or (out / SUMMARY).resolve() in inputs:
+            raise ParameterError(f"`{output}` would overwrite an input. Choose another folder: `--out`.")
+        seen[output] = capture
+    return outputs
+
+
+def reconstruct_file(
+    reconstruct: Reconstructor, capture: Path, output: Path, form: Format
+) -> tuple[Measurement, Scene]:
+    """Read a capture, reconstruct it, write the picture; returns both for a summary.
+
+    Raises:
+        MwdnError: the capture cannot be read or does not fit the camera, or the picture cannot be written.
+    """
+    calibration = reconstruct.calibration
+    measurement = calibration.correct(read_frame(capture, bgr=calibration.bgr))
+    scene = reconstruct(measurement)
+    if form in ("tiff", "npy"):
+        write_linear(output, scene)
+    else:
+        write_picture(output, for_people(scene), bits=16 if form == "png16" else 8)
+    return measurement, scene

@@ -1,0 +1,29 @@
+"""Classical reconstruction, no training needed. Each is called as ``solver(measurement, psf)``."""
+
+from typing import Any
+
+from mwdn.errors import UnknownNameError
+from mwdn.solvers.admm import TEXTBOOK, Admm, Penalties, Progress
+from mwdn.solvers.fista import Fista
+from mwdn.solvers.wiener import Wiener, noise_level
+
+SOLVERS: dict[str, type[Admm | Fista | Wiener]] = {"admm": Admm, "fista": Fista, "wiener": Wiener}
+"""Every solver by the name that the command line uses."""
+
+
+def build(name: str, **options: Any) -> Admm | Fista | Wiener:  # noqa: ANN401
+    """Make a solver.
+
+    Args:
+        name: one of `SOLVERS`.
+        **options: keyword arguments of that solver, for example ``iterations=50``.
+
+    Raises:
+        UnknownNameError: there is no such solver.
+    """
+    if name not in SOLVERS:
+        raise UnknownNameError("solver", name, SOLVERS)
+    return SOLVERS[name](**options)
+
+
+__all__ = ["SOLVERS", "TEXTBOOK", "Admm", "Fista", "Penalties", "Progress", "Wiener", "build", "noise_level"]

@@ -1,0 +1,91 @@
+"""Wiener deconvolution that finds its own regularisation from the noise of the measurement."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mwdn.errors import ParameterError
+from mwdn.fourier import Boundary, deconvolution_grid, extend, inverse_spectrum, spectrum, transfer_function
+from mwdn.types import Measurement, Psf, Scene
+
+
+def noise_level(measurement: Measurement) -> Tensor:
+    """Standard deviation of the noise of each channel, (B, C, 1, 1), if it is white.
+
+    A caustic pattern is smooth from pixel to pixel, so the mixed second difference of 2 x 2 pixels holds nothing
+    but noise, with twice its standard deviation; the median of its size keeps the few sharp edges out.
+
+    References:
+        D. L. Donoho and I. M. Johnstone, Biometrika 81, 425 (1994), for the median of the finest detail.
+    """
+    b = measurement.float()
+    detail = b[..., 1:, 1:] - b[..., :-1, 1:] - b[..., 1:, :-1] + b[..., :-1, :-1]
+    median = detail.abs().flatten(2).median(dim=-1).values if detail.numel() else b.new_zeros(b.shape[:2])
+    return (median / (2 * 0.6745))[..., None, None]
+
+
+@dataclass(frozen=True)
+class Wiener:
+    """Wiener deconvolution, eq. (2) of the paper, with lambda given or found.
+
+    Called with a measurement (B, C, H, W) and a PSF, it returns the scene (B, C, H, W), not negative.
+
+    Args:
+        regularisation: lambda for a PSF of unit sum. ``None`` chooses it for each channel of each sample by the
+            discrepancy principle: as large as it can be while the scene, blurred again, still explains the
+            measurement to within ``tolerance``.
+        tolerance: part of the measurement's contrast that may stay unexplained besides its noise: what a crop,
+            a PSF that was measured, and a field that is not quite shift-invariant cost.
+        boundary: see `mwdn.fourier.Boundary`.
+
+    Raises:
+        ParameterError: a constant is not positive.
+
+    References:
+        V. A. Morozov, Soviet Mathematics Doklady 7, 414 (1966), for the discrepancy principle.
+    """
+
+    regularisation: float | None = None
+    tolerance: float = 0.03
+    boundary: Boundary = "taper"
+
+    def __post_init__(self) -> None:
+        for name, value in (("regularisation", self.regularisation), ("tolerance", self.tolerance)):
+            if value is not None and not value > 0:
+                raise ParameterError(f"`{name}` ({value}) must be positive.")
+
+    @torch.no_grad()
+    def __call__(self, measurement: Measurement, psf: Psf) -> Scene:
+        size = measurement.shape[-2], measurement.shape[-1]
+        grid = deconvolution_grid(size, self.boundary)
+        total = psf.sum((-2, -1), keepdim=True)
+        H = transfer_function(psf / total, grid)
+        B = spectrum(extend(measurement, grid, self.boundary), grid)
+        regularisation = self.regularisation or self._discrepancy(measurement, B, H)
+        V = H.conj() * B / (H.abs().square() + regularisation)
+        return (inverse_spectrum(V, grid, size) / total).clamp(min=0)
+
+    def _discrepancy(self, measurement: Measurement, B: Tensor, H: Tensor) -> Tensor:
+        """Lambda (B, C, 1, 1) whose residual has the power of the noise and the tolerated misfit.
+
+        In the Fourier domain the residual is ``B lambda / (|H|^2 + lambda)``; it grows with lambda, so forty
+        halvings of the interval find it.
+        """
+        contrast = measurement.std((-2, -1), keepdim=True)
+        allowed = noise_level(measurement).square() + (self.tolerance * contrast).square()
+        power, filtered = B.abs().square(), H.abs().square()
+        power[..., 0, 0] = 0  # the mean says nothing about detail
+        # Half a spectrum: all but the outer columns stand for two. Parseval: sum |B|^2 = pixels x variance.
+        power[..., 1:-1] *= 2
+        target = allowed * power.sum((-2, -1), keepdim=True) / contrast.square().clamp(min=1e-20)
+        low, high = torch.full_like(target, -16.0), torch.full_like(target, 1.0)
+        for _ in range(40):
+            middle = (low + high) / 2
+            regularisation = 10**middle
+            residual = (power * (regularisation / (filtered + regularisation)).square()).sum((-2, -1), keepdim=True)
+            low, high = (
+                torch.where(residual < target, middle, low),
+                torch.where(residual < target, high, middle),
+            )
+        return 10**high

@@ -1,0 +1,442 @@
+"""ADMM and FISTA against textbook equations in numpy, scipy's solvers, scikit-image, and each other."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import nnls
+from skimage.restoration import denoise_tv_chambolle
+
+import oracles
+from mwdn import fourier
+from mwdn.errors import ParameterError, ShapeError
+from mwdn.solvers import admm, proximal
+from mwdn.solvers.admm import TEXTBOOK, Admm, Penalties
+from mwdn.solvers.fista import Fista
+
+# (sensor, PSF)
+SIZES = [
+    ((6, 7), (5, 5)),
+    ((9, 12), (9, 12)),
+    ((16, 16), (5, 4)),
+    ((5, 4), (8, 11)),
+    ((1, 1), (1, 1)),
+    ((13, 1), (2, 3)),
+]
+VARIATIONS = ["anisotropic", "isotropic", "colour"]
+USUAL, BRISK = TEXTBOOK, Penalties(data=0.1, gradient=0.05, sign=0.1)
+
+
+def pair(sensor, psf, generator, *, channels=3, psf_channels=3, batch=1):
+    """A noise-like measurement and a PSF with a few strong points, whose spectrum has no deep zero."""
+    b = torch.rand(batch, channels, *sensor, generator=generator)
+    return b, torch.rand(1, psf_channels, *psf, generator=generator) ** 4
+
+
+def capture(generator, *, noise=0.0, size=(24, 30)):
+    """A letter-like scene and its measurement through a random caustic."""
+    scene = torch.full((1, 3, *size), 0.05)
+    scene[..., 6:18, 8:11] = torch.tensor([0.9, 0.6, 0.3])[:, None, None]
+    scene[..., 6:9, 8:20] = torch.tensor([0.2, 0.8, 0.5])[:, None, None]
+    h = torch.rand(1, 3, *size, generator=generator) ** 12
+    h = h / h.sum((-2, -1), keepdim=True)
+    b = fourier.convolve(scene, h)
+    return scene, b + noise * torch.randn(b.shape, generator=generator), h
+
+
+# --- Gradient and proximal maps -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 5), (2, 2), (7, 4), (13, 13)])
+def test_divergence_is_the_adjoint_of_the_gradient(size, generator):
+    v, y, x = torch.randn(3, 2, 3, *size, generator=generator, dtype=torch.float64)
+    down, along = proximal.gradient(v)
+    left = (down * y).sum() + (along * x).sum()
+    right = (v * proximal.divergence((y, x))).sum()
+    torch.testing.assert_close(left, right, rtol=1e-12, atol=1e-12)
+
+
+def test_gradient_goes_down_the_rows_and_along_the_columns():
+    v = torch.arange(12.0).reshape(1, 1, 3, 4)
+    down, along = proximal.gradient(v)
+    assert (down[..., :-1, :] == 4).all()
+    assert (down[..., -1, :] == -8).all()
+    assert (along[..., :-1] == 1).all()
+    assert (along[..., -1] == -3).all()
+
+
+def test_laplacian_of_the_problem_is_divergence_of_gradient(generator):
+    problem = admm.pose(*pair((6, 9), (5, 4), generator))
+    v = torch.randn(1, 3, *problem.grid, generator=generator)
+    product = fourier.spectrum(v, problem.grid) * problem.laplacian
+    found = fourier.inverse_spectrum(product, problem.grid, problem.grid)
+    torch.testing.assert_close(found, proximal.divergence(proximal.gradient(v)), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("threshold", [0.0, 0.3, 1.5])
+def test_shrink_solves_its_minimisation(threshold):
+    """argmin 1/2 (u - g)^2 + t |u| over a grid of 1e-3."""
+    g = np.linspace(-2, 2, 41)
+    u = np.linspace(-2.5, 2.5, 5001)
+    best = u[(0.5 * (u - g[:, None]) ** 2 + threshold * abs(u)).argmin(1)]
+    given = torch.from_numpy(g).reshape(1, 1, 1, -1)
+    for part in proximal.shrink((given, -given), threshold, "anisotropic"):
+        found = part.flatten().numpy()
+        assert abs(abs(found) - abs(best)).max() <= 1e-3
+        assert abs(found * np.sign(part.numpy().flatten())).min() >= 0
+    assert (proximal.shrink((given, given), threshold, "anisotropic")[0].flatten().numpy() * g >= 0).all()
+
+
+@pytest.mark.parametrize("threshold", [0.3, 1.2])
+def test_shrink_isotropic_solves_its_minimisation(threshold, generator):
+    """argmin 1/2 |u - g|^2 + t |u| for vectors, over a plane grid of 1e-2."""
+    axis = np.linspace(-2, 2, 401)
+    first, second = np.meshgrid(axis, axis, indexing="ij")
+    gs = 3 * torch.rand(20, 2, generator=generator, dtype=torch.float64) - 1.5
+    for g in gs:
+        cost = 0.5 * ((first - g[0].item()) ** 2 + (second - g[1].item()) ** 2)
+        best = np.unravel_index((cost + threshold * np.hypot(first, second)).argmin(), cost.shape)
+        found = proximal.shrink((g[0].reshape(1, 1, 1, 1), g[1].reshape(1, 1, 1, 1)), threshold, "isotropic")
+        assert abs(found[0].item() - axis[best[0]]) <= 0.011
+        assert abs(found[1].item() - axis[best[1]]) <= 0.011
+
+
+@pytest.mark.parametrize("variation", VARIATIONS)
+@pytest.mark.parametrize("threshold", [2.0, 0.1, 1e-6, 1e-12])
+def test_gradients_at_zero_are_finite(variation, threshold):
+    """The first iteration of every unrolled network starts there; a root of zero would turn training NaN."""
+    u = (torch.zeros(1, 1, 3, 3, requires_grad=True), torch.zeros(1, 1, 3, 3, requires_grad=True))
+    t = torch.tensor(threshold, requires_grad=True)
+    found = proximal.shrink(u, t, variation)
+    (found[0].sum() + 2 * found[1].sum()).backward()
+    assert found[0].abs().max() == 0
+    for variable in (*u, t):
+        assert variable.grad.isfinite().all()
+
+
+# --- ADMM ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("variation", VARIATIONS)
+@pytest.mark.parametrize("mu", [USUAL, BRISK, Penalties(1e-2, 1e-1, 1e-3)])
+@pytest.mark.parametrize(("sensor", "psf"), SIZES)
+def test_five_iterations_are_the_textbooks(sensor, psf, mu, variation, generator):
+    """The copies live on the sensor here and on the whole grid in the textbook; the scenes agree."""
+    for tau, psf_channels in ((1e-3, 3), (0.0, 1)):
+        b, h = pair(sensor, psf, generator, psf_channels=psf_channels)
+        solver = Admm(regularisation=tau, penalties=mu, iterations=5, variation=variation)
+        grid = admm.pose(b, h).grid
+        v = oracles.admm(
+            b[0].double().numpy(),
+            h[0].double().numpy(),
+            grid,
+            mu=mu,
+            tau=tau,
+            iterations=5,
+            variation=variation,
+        )
+        scale = (b.double().norm() / h.double().norm()).item()
+        expected = scale * np.maximum(v[:, : sensor[0], : sensor[1]], 0)
+        found = solver(b, h)[0].double().numpy()
+        assert abs(found - expected).max() <= 1e-4 * abs(expected).max()
+
+
+@pytest.mark.parametrize("variation", VARIATIONS)
+def test_objective_falls(variation, generator):
+    _, b, h = capture(generator, noise=1e-3)
+    values = []
+    solver = Admm(iterations=60, penalties=BRISK, variation=variation, regularisation=1e-4)
+    solver(b, h, callback=lambda progress: values.append(progress.objective.item()))
+    assert len(values) == 60
+    # The zero scene has 1/2: the measurement is at unit norm.
+    assert values[0] < 0.5
+    assert values[-1] < 0.01
+    assert values[-1] < 0.1 * values[0]
+    assert all(math.isfinite(value) for value in values)
+
+
+@pytest.mark.parametrize("variation", VARIATIONS)
+def test_objective_is_what_it_says(variation, generator):
+    b, h = pair((6, 7), (5, 5), generator, batch=2)
+    problem = admm.pose(b, h)
+    v = torch.rand(2, 3, *problem.grid, generator=generator)
+    V = fourier.spectrum(v, problem.grid)
+    Hv = fourier.inverse_spectrum(problem.transfer * V, problem.grid, problem.sensor)
+    state = admm.start(problem)._replace(v=v, V=V, Hv=Hv)
+    found = admm.objective(state, problem, 0.3, variation)
+    for i in range(2):
+        expected, sizes, squares = 0.0, 0.0, []
+        for c in range(3):
+            scene, psf = v[i, c].double().numpy(), h[0, c].double().numpy()
+            grid = problem.grid
+            seen = np.fft.ifft2(np.fft.fft2(scene) * oracles.transfer(psf, grid)).real[:6, :7]
+            down, along = np.roll(scene, -1, 0) - scene, np.roll(scene, -1, 1) - scene
+            expected += 0.5 * ((seen - b[i, c].double().numpy()) ** 2).sum()
+            squares.append(down**2 + along**2)
+            sizes += (abs(down) + abs(along)).sum()
+        lengths = {"isotropic": np.sqrt(squares).sum(), "colour": np.sqrt(sum(squares)).sum()}
+        expected += 0.3 * lengths.get(variation, sizes)
+        assert math.isclose(found[i].item(), expected, rel_tol=1e-5)
+
+
+NNLS_SIZES = [((6, 7), (5, 5)), ((5, 6), (4, 7)), ((4, 5), (8, 6)), ((7, 7), (1, 1))]
+
+
+def nnls_problem(sensor, psf, generator):
+    """Light cannot fit the noise below zero: the least misfit is not zero, and Hv is unique."""
+    h = torch.rand(1, 1, *psf, generator=generator) ** 3 + 0.01
+    b = torch.randn(1, 1, *sensor, generator=generator) + 0.3
+    A = oracles.matrix(h[0, 0].double().numpy(), sensor)
+    x, misfit = nnls(A, b[0, 0].double().numpy().ravel(), maxiter=10_000)
+    return b, h, 0.5 * misfit**2, (A @ x).reshape(sensor)
+
+
+@pytest.mark.parametrize(("sensor", "psf"), NNLS_SIZES)
+def test_fista_reaches_the_least_squares_of_scipy(sensor, psf, generator):
+    b, h, least, _ = nnls_problem(sensor, psf, generator)
+    values = []
+    Fista(iterations=1000)(b, h, callback=lambda iteration, value: values.append((iteration, value.item())))
+    assert [iteration for iteration, _ in values] == list(range(1, 1001))
+    assert math.isclose(values[-1][1], least, rel_tol=1e-3)
+    assert min(value for _, value in values) > (1 - 1e-5) * least
+
+
+@pytest.mark.parametrize(("sensor", "psf"), NNLS_SIZES)
+def test_admm_without_prior_reaches_the_least_squares_of_scipy(sensor, psf, generator):
+    b, h, least, seen = nnls_problem(sensor, psf, generator)
+    problem = admm.pose(b / b.norm(), h / h.norm())
+    state, mu = admm.start(problem), Penalties(data=0.1, gradient=1e-3, sign=0.1)
+    for _ in range(1000):
+        state = admm.merge(state, admm.split(state, problem, mu, 0.0, "anisotropic"), problem, mu)
+    found = admm.objective(state, problem, 0.0, "anisotropic").item() * b.square().sum().item()
+    assert math.isclose(found, least, rel_tol=2e-3)
+    Hv = state.Hv[0, 0].double().numpy() * b.norm().item()
+    assert abs(Hv - seen).max() <= 0.03 * b.abs().max().item()
+    assert state.v.min() > -1e-3
+
+
+def test_both_solvers_find_the_same_scene_where_it_is_unique(generator):
+    """Of a well-conditioned PSF and a scene that lies within the sensor."""
+    scene = torch.zeros(1, 3, 16, 18)
+    scene[..., 5:11, 5:13] = torch.rand(1, 3, 6, 8, generator=generator)
+    h = 0.3 * torch.rand(1, 3, 5, 5, generator=generator) / 25
+    h[..., 2, 2] = 1
+    b = fourier.convolve(scene, h)
+    by_fista = Fista(iterations=300)(b, h)
+    by_admm = Admm(regularisation=0.0, penalties=Penalties(0.5, 1e-3, 0.1), iterations=300)(b, h)
+    torch.testing.assert_close(by_fista, scene, rtol=0, atol=2e-3)
+    torch.testing.assert_close(by_admm, scene, rtol=0, atol=2e-3)
+
+
+@pytest.mark.parametrize("weight", [0.1, 0.2])
+def test_tv_with_a_delta_psf_is_scikit_images_denoising(weight, generator):
+    """Both minimise 1/2 |v - b|^2 + weight TV(v), ours with b / |b|, hence weight = tau |b|.
+
+    Compared away from the border, where ours also sees the opposite one. Chambolle's scheme has come within a
+    few thousandths of the minimum; the noise that both take away reaches 0.3.
+    """
+    clean = torch.full((1, 1, 30, 34), 0.2)
+    clean[..., 8:22, 6:16] = 0.9
+    clean[..., 12:25, 19:28] = 0.5
+    b = clean + 0.08 * torch.randn(clean.shape, generator=generator)
+    delta = torch.zeros(1, 1, 3, 3)
+    delta[..., 1, 1] = 1
+    tau = weight / b.norm().item()
+    solver = Admm(regularisation=tau, penalties=Penalties(0.1, 0.1, 0.1), iterations=200, variation="isotropic")
+    found = solver(b, delta)[0, 0].numpy()
+    expected = denoise_tv_chambolle(b[0, 0].double().numpy(), weight=weight, eps=1e-9, max_num_iter=2000)
+    inside = abs(found - expected)[4:-4, 4:-4]
+    assert inside.max() < 0.015
+    assert inside.mean() < 0.003
+    assert abs(b[0, 0].numpy() - expected).max() > 0.15
+
+
+@pytest.mark.parametrize("psf", [(1, 1), (3, 3), (4, 6)])
+@pytest.mark.parametrize(
+    "solver",
+    [Fista(iterations=3), Admm(regularisation=0.0, penalties=Penalties(1.0, 1e-3, 1.0), iterations=200)],
+    ids=["fista", "admm"],
+)
+def test_delta_psf_without_prior_clips_the_sign_and_no_more(solver, psf, generator):
+    b = torch.randn(2, 3, 7, 8, generator=generator)
+    delta = torch.zeros(1, 1, *psf)
+    delta[..., psf[0] // 2, psf[1] // 2] = 4
+    torch.testing.assert_close(solver(b, delta), b.clamp(min=0) / 4, rtol=0, atol=1e-3)
+
+
+def test_reconstruction_finds_the_scene_upright_and_in_place(generator):
+    scene, b, h = capture(generator, noise=1e-4)
+    for solver in (Admm(penalties=BRISK, regularisation=1e-5), Fista(iterations=300)):
+        found = solver(b, h)
+        error = (found - scene).norm() / scene.norm()
+        assert error < 0.3
+        for axes in ((-1,), (-2,), (-2, -1)):
+            assert (found.flip(axes) - scene).norm() > 2 * (found - scene).norm()
+
+
+def test_more_regularisation_is_flatter(generator):
+    _, b, h = capture(generator, noise=3e-3)
+    variations = []
+    for tau in (1e-6, 1e-4, 1e-2):
+        down, along = proximal.gradient(Admm(tau, BRISK, 60)(b, h))
+        variations.append((down[..., :-1, :].abs().sum() + along[..., :-1].abs().sum()).item())
+    assert variations == sorted(variations, reverse=True)
+    assert variations[-1] < 0.5 * variations[0]
+
+
+# --- Stopping and balancing ---------------------------------------------------------------------------
+
+
+def test_tolerance_stops_early_and_near_the_end(generator):
+    _, b, h = capture(generator, noise=1e-3)
+    told = []
+    settings = {"regularisation": 1e-3, "penalties": BRISK, "iterations": 1500}
+    early = Admm(**settings, tolerance=3e-3)(b, h, callback=told.append)
+    assert 10 <= len(told) < 1500
+    assert [progress.iteration for progress in told] == list(range(1, len(told) + 1))
+    assert told[-1].primal.max() < 3e-3
+    assert told[-1].dual.max() < 3e-3
+    assert told[0].primal.max() > 3e-3
+    late = Admm(**{**settings, "iterations": 2 * len(told)})(b, h)
+    assert (early - late).norm() < 0.1 * late.norm()
+
+
+def test_callback_does_not_change_the_result(generator):
+    _, b, h = capture(generator)
+    for settings in ({}, {"balance_every": 5}, {"tolerance": 1e-2, "penalties": BRISK}):
+        solver = Admm(iterations=20, **settings)
+        assert torch.equal(solver(b, h), solver(b, h, callback=lambda progress: None))
+
+
+def test_callback_is_told_one_number_a_sample(generator):
+    b, h = pair((6, 7), (5, 5), generator, batch=2)
+    told = []
+    Admm(iterations=3, penalties=BRISK)(b, h, callback=told.append)
+    for progress in told:
+        assert progress.objective.shape == progress.primal.shape == progress.dual.shape == (2,)
+
+
+@pytest.mark.parametrize("bad", [Penalties(1e3, 1e3, 1e3), Penalties(1e-7, 1.0, 1e2)])
+def test_balancing_gets_further_than_badly_chosen_penalties(bad, generator):
+    _, b, h = capture(generator, noise=1e-3)
+    last = {}
+    for every in (0, 5):
+        told = []
+        Admm(1e-4, bad, iterations=80, balance_every=every)(b, h, callback=told.append)
+        last[every] = told[-1]
+    assert last[5].objective.item() <= last[0].objective.item()
+    assert last[5].objective.item() < 0.05
+    assert last[0].penalties == bad
+    assert any(float(new) != old for new, old in zip(last[5].penalties, bad, strict=True))
+
+
+def test_balance_raises_a_lagging_primal_and_lowers_a_lagging_dual():
+    one, ten = torch.tensor([1.0, 1.0]), torch.tensor([10.0, 1.0])
+    found = admm.Residuals(primal=(ten, one, one), dual=(one, ten, one))
+    data, gradient, sign = admm.balance(Penalties(1.0, 1.0, 1.0), found)
+    assert data.flatten().tolist() == [2, 1]
+    assert gradient.flatten().tolist() == [0.5, 1]
+    assert sign.flatten().tolist() == [1, 1]
+
+
+# --- What any solver owes its user --------------------------------------------------------------------
+
+SOLVERS = {
+    "admm": Admm(iterations=15),
+    "brisk": Admm(regularisation=1e-3, penalties=BRISK, iterations=15),
+    "isotropic": Admm(regularisation=1e-3, penalties=BRISK, iterations=15, variation="isotropic"),
+    "balanced": Admm(iterations=15, balance_every=5),
+    "fista": Fista(iterations=15),
+}
+
+
+@pytest.fixture(params=SOLVERS)
+def solver(request):
+    return SOLVERS[request.param]
+
+
+@pytest.mark.parametrize(("channels", "psf_channels"), [(1, 1), (3, 1), (3, 3)])
+@pytest.mark.parametrize(
+    ("sensor", "psf"), [((9, 13), (9, 13)), ((11, 6), (4, 9)), ((1, 1), (1, 1)), ((17, 1), (2, 2))]
+)
+def test_shape_sign_and_finiteness(solver, sensor, psf, channels, psf_channels, generator):
+    b, h = pair(sensor, psf, generator, channels=channels, psf_channels=psf_channels, batch=2)
+    found = solver(b - 0.3, h)
+    assert found.shape == b.shape
+    assert found.dtype == torch.float32
+    assert found.isfinite().all()
+    assert found.min() >= 0
+
+
+@pytest.mark.parametrize("factor", [1e-3, 7.0, 4095.0])
+def test_scene_scales_with_the_measurement_and_against_the_psf(solver, factor, generator):
+    _, b, h = capture(generator)
+    found = solver(b, h)
+    torch.testing.assert_close(solver(factor * b, h) / factor, found, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(solver(b, factor * h) * factor, found, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("psf_batch", [1, 3])
+def test_batch_is_one_by_one(solver, psf_batch, generator):
+    b = torch.rand(3, 2, 9, 12, generator=generator) * torch.tensor([1.0, 0.01, 5.0])[:, None, None, None]
+    h = torch.rand(psf_batch, 2, 9, 12, generator=generator) ** 4
+    together = solver(b, h)
+    for i in range(3):
+        alone = solver(b[i : i + 1], h[i % psf_batch][None])
+        torch.testing.assert_close(together[i : i + 1], alone, rtol=1e-3, atol=1e-4 * alone.max().item())
+
+
+def test_grey_psf_is_the_same_psf_for_each_colour_of_fista(generator):
+    b, h = pair((9, 12), (9, 12), generator, psf_channels=1)
+    torch.testing.assert_close(Fista(20)(b, h), Fista(20)(b, h.repeat(1, 3, 1, 1)), rtol=1e-4, atol=1e-4)
+
+
+def test_darkness_gives_darkness(solver):
+    found = solver(torch.zeros(1, 3, 9, 12), torch.rand(1, 1, 9, 12))
+    assert (found == 0).all()
+
+
+def test_dark_sample_does_not_spoil_its_neighbour(solver, generator):
+    b, h = pair((9, 12), (9, 12), generator, batch=2)
+    b[0] = 0
+    found = solver(b, h)
+    assert (found[0] == 0).all()
+    torch.testing.assert_close(found[1:], solver(b[1:], h), rtol=1e-3, atol=1e-4)
+
+
+def test_inputs_are_left_as_they_were(solver, generator):
+    b, h = pair((9, 12), (9, 12), generator)
+    before = b.clone(), h.clone()
+    solver(b, h)
+    assert torch.equal(b, before[0])
+    assert torch.equal(h, before[1])
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("psf", [(2, 3, 5, 5), (1, 2, 5, 5), (4, 1, 5, 5)])
+@pytest.mark.parametrize("batch", [1, 3])
+def test_psf_that_does_not_fit_is_refused(solver, psf, batch):
+    with pytest.raises(ShapeError, match="`psf`"):
+        solver(torch.ones(batch, 3, 8, 8), torch.ones(psf))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"regularisation": -1e-4},
+        {"regularisation": math.nan},
+        {"iterations": 0},
+        {"penalties": Penalties(data=0.0)},
+        {"penalties": Penalties(gradient=-1.0)},
+        {"penalties": Penalties(sign=math.nan)},
+    ],
+)
+def test_impossible_constants_are_refused(options):
+    with pytest.raises(ParameterError, match=f"`{next(iter(options))}`"):
+        Admm(**options)
+
+
+def test_fista_needs_an_iteration():
+    with pytest.raises(ParameterError, match=r"`iterations` \(0\) must be at least 1"):
+        Fista(iterations=0)
