@@ -54,7 +54,7 @@ class Calibration:
     distance_mm: float | None = None
 
     @classmethod
-    def from_file(
+    def from_file(  # noqa: PLR0913
         cls,
         path: str | Path,
         *,
@@ -65,7 +65,7 @@ class Calibration:
         binning: int = 1,
         upside_down: bool = False,
         bgr: bool = False,
-    ) -> "Calibration":  # noqa: PLR0913
+    ) -> "Calibration":
         """Read the picture of a point source.
 
         Args:
@@ -165,11 +165,11 @@ class Calibration:
         channels = measurement.shape[1]
         if channels == 1 and self.psf.shape[1] == 3:
             raise ShapeError("The capture is grey, but `psf` has colours. Calibrate with the camera's grey mode.")
-        return _turn(measurement) if self.upside_down else measurement
+        return measurement.flip(-2) if self.upside_down else measurement
 
 
 def _turn(image: Tensor) -> Tensor:
-    """Put the last row first and keep the centre ``H // 2`` where it is: an even height needs one row's roll."""
+    """Put a PSF's last row first and keep its centre ``H // 2`` where it is: an even height needs one row's roll."""
     turned = image.flip(-2)
     return turned.roll(1, -2) if image.shape[-2] % 2 == 0 else turned
 

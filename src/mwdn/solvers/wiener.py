@@ -57,6 +57,7 @@ class Wiener:
 
     @torch.no_grad()
     def __call__(self, measurement: Measurement, psf: Psf) -> Scene:
+        """Reconstruct a batch."""
         size = measurement.shape[-2], measurement.shape[-1]
         grid = deconvolution_grid(size, self.boundary)
         total = psf.sum((-2, -1), keepdim=True)
