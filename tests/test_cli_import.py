@@ -1,3 +1,5 @@
+import sys
+
 import numpy as np
 import pytest
 
@@ -72,3 +74,9 @@ def test_the_layout_is_given_by_options(tmp_path):
 def test_unknown_kind(tmp_path, capsys):
     assert run("diffusecam", tmp_path) == 2
     assert "Did you mean 'diffusercam'?" in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_extra_to_install_survives_the_terminals_markup(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    assert run("parquet", "owner/name", "-o", tmp_path / "pairs.h5") == 2
+    assert "pip install 'mwdn[hub]'" in " ".join(capsys.readouterr().err.split())

@@ -105,7 +105,7 @@ def reconstruct(
             pair = reconstruct_file(reconstructor, file, output, format)
         except MwdnError as error:
             failed += 1
-            errors.print(f"[red]{file}:[/] {error}", highlight=False)
+            errors.print(f"[red]{escape(str(file))}:[/] {escape(str(error))}", highlight=False)
             continue
         rows = [*rows, list(pair)] if len(rows) < 12 else rows
     if rows:
@@ -174,6 +174,6 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     except MwdnError as error:
         if debug:
             errors.print_exception()
-        errors.print(f"[bold red]Error:[/] {error}", highlight=False)
+        errors.print(f"[bold red]Error:[/] {escape(str(error))}", highlight=False)
         sys.exit(2)
     sys.exit(result if isinstance(result, int) else 0)

@@ -45,6 +45,7 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self._file: Any = None
+        self._rows: dict[str, Any] = {}  # looking a data set up by its name takes as long as reading a pair
         self._owner = 0
         file = _open(self.path)
         with file:
@@ -119,7 +120,7 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
         """Close the file of this process; the next reading opens it again."""
         if self._file is not None:
             self._file.close()
-            self._file = None
+            self._file, self._rows = None, {}
 
     def __enter__(self) -> "PairFile":
         return self
@@ -128,7 +129,7 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
         self.close()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_file": None}
+        return {**self.__dict__, "_file": None, "_rows": {}}
 
     def _opened(self) -> Any:  # noqa: ANN401
         if self._owner != os.getpid():
@@ -136,11 +137,13 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
             self.close()
         if self._file is None:
             self._file, self._owner = _open(self.path), os.getpid()
+            self._rows = {name: self._file[name] for name in NAMES}
         return self._file
 
     def _read(self, name: str, number: int) -> Tensor:
         try:
-            stored = self._opened()[name][number]
+            self._opened()
+            stored = self._rows[name][number]
         except (OSError, KeyError, ValueError) as error:
             raise ImageError(f"`{name}` {number} of `{self.path}` cannot be read: {error}. {_AGAIN}") from error
         pixels = stored.transpose(2, 0, 1).astype(np.float32, order="C")

@@ -194,9 +194,8 @@ def _download(name: Path) -> Path:
     try:
         from huggingface_hub import snapshot_download
     except ModuleNotFoundError as error:
-        raise _missing(
-            "huggingface_hub", "hub", f"`{name}` is no file or folder here. To look for it on the hub, "
-        ) from (error)
+        before = f"`{name}` is not here. To look for it on the hub, "
+        raise _missing("huggingface_hub", "hub", before) from error
     try:
         return Path(snapshot_download(name.as_posix(), repo_type="dataset", allow_patterns="*.parquet"))
     except Exception as error:  # its errors are those of its network library, which changes
