@@ -2,18 +2,21 @@
 
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import NoReturn
+from typing import Annotated, NoReturn
 
 import cyclopts
 from cyclopts import App, Parameter
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import track
 from torch import Tensor
 
 from mwdn import __version__
 from mwdn.calibration import Calibration
 from mwdn.data.images import write_picture
+from mwdn.data.importers import Layout, import_pairs
 from mwdn.data.sheets import contact_sheet
 from mwdn.errors import MwdnError
 from mwdn.reconstruct import (
@@ -105,13 +108,41 @@ def reconstruct(
             pair = reconstruct_file(reconstructor, file, output, format)
         except MwdnError as error:
             failed += 1
-            errors.print(f"[red]{file}:[/] {error}", highlight=False)
+            errors.print(f"[red]{escape(str(file))}:[/] {escape(str(error))}", highlight=False)
             continue
         rows = [*rows, list(pair)] if len(rows) < 12 else rows
     if rows:
         write_picture(out / SUMMARY, contact_sheet(rows, ["measurement", f"reconstruction ({Path(method).name})"]))
     console.print(f"{len(files) - failed} of {len(files)} captures reconstructed into {out}", highlight=False)
     return 1 if failed else 0
+
+
+@app.command(name="import")
+def import_(
+    kind: str,
+    path: Path,
+    *,
+    out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("pairs.h5"),
+    skip_damaged: bool = False,
+    layout: Annotated[Layout, Parameter(name="*")] = Layout(),  # noqa: B008
+) -> None:
+    """Turn a public data set, or two folders of pictures, into one file of pairs.
+
+    Args:
+        kind: mwdn (the authors' HDF5), diffusercam, phlatcam, folders (captures/ and scenes/), or parquet.
+        path: of the data set; for parquet a shard, a folder of shards, or owner/name on the Hugging Face hub.
+        out: the file of pairs; one that exists is replaced when all has gone well.
+        skip_damaged: leave out what is damaged or has no partner, and name it.
+        layout: what is unusual about this copy of the data set.
+    """
+    done = import_pairs(
+        kind, path, out, layout=layout, skip_damaged=skip_damaged, track=partial(track, description="Importing")
+    )
+    for reason in done.skipped.values():
+        errors.print(f"[yellow]skipped:[/] {escape(reason)}", highlight=False)
+    names = f": {', '.join(done.skipped)}" if done.skipped else ""
+    summary = f"{done.count:,} pairs written to {out}, {len(done.skipped):,} skipped{names}"
+    console.print(summary, markup=False, highlight=False, soft_wrap=True)
 
 
 @app.command
@@ -146,6 +177,6 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     except MwdnError as error:
         if debug:
             errors.print_exception()
-        errors.print(f"[bold red]Error:[/] {error}", highlight=False)
+        errors.print(f"[bold red]Error:[/] {escape(str(error))}", highlight=False)
         sys.exit(2)
     sys.exit(result if isinstance(result, int) else 0)

@@ -8,7 +8,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-_PACKAGES = ("mwdn", "torch", "numpy", "opencv-python-headless", "tifffile", "safetensors", "cyclopts", "rich")
+_PACKAGES = ("mwdn", "torch", "numpy", "opencv-python-headless", "tifffile", "h5py", "safetensors", "cyclopts", "rich")
 
 
 def _version(package: str) -> str:

@@ -52,6 +52,28 @@ def read_frame(path: str | Path, *, bgr: bool = False, upside_down: bool = False
     return np.ascontiguousarray(frame[:: -1 if upside_down else 1, :, :: -1 if bgr else 1])
 
 
+def decode_frame(data: bytes, name: str) -> Frame:
+    """Read a frame from the bytes of a file, its numbers exactly as stored.
+
+    Args:
+        data: whole content of a PNG, JPEG or BMP.
+        name: of where the bytes come from, for the message.
+
+    Returns:
+        (H, W, 1) or (H, W, 3), as for `read_frame`.
+
+    Raises:
+        ImageError: damaged, cut off, or of another format.
+    """
+    kind = next((kind for sign, kind in _SIGNATURES.items() if data.startswith(sign)), "unknown")
+    try:
+        if kind not in ("PNG", "JPEG", "BMP"):
+            raise ImageError(f"must be PNG, JPEG or BMP, but starts with {data[:8]!r}. Export it as PNG.")
+        return np.ascontiguousarray(_decode(kind, data, photograph=False))
+    except ImageError as problem:
+        raise ImageError(f"{name} {problem}") from problem
+
+
 def read_picture(path: str | Path) -> Image:
     """Read a photograph as linear light: turned upright as its EXIF says, decoded from sRGB.
 

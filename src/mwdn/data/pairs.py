@@ -1,0 +1,187 @@
+"""Files of (measurement, scene) pairs: HDF5, one raw chunk a sample, read in any order by any number of workers."""
+
+import operator
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, SupportsIndex
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from mwdn.data.pair_writer import NAMES, VERSION, VERSION_KEY, Attribute, PairWriter, PixelType, Shape
+from mwdn.errors import ImageError
+from mwdn.types import Psf
+
+_AGAIN = "Make it again, with `mwdn import`."
+
+
+@dataclass(frozen=True)
+class _Header:
+    """All of a file but its pixels, read once and handed to the workers."""
+
+    length: int
+    measurement_shape: Shape
+    scene_shape: Shape
+    attributes: dict[str, Attribute]
+
+
+class PairFile(Dataset[tuple[Tensor, Tensor]]):
+    """A file of pairs, as a data set that `torch.utils.data.DataLoader` understands.
+
+    Each process opens the file for itself when it first reads, so that workers may be forked or spawned.
+
+    Args:
+        path: HDF5 with the data sets ``measurement`` and ``scene``, both (N, H, W, C) of uint8, uint16 or float32,
+            and if it is known ``psf``, (C, H, W) of float32.
+
+    Raises:
+        ImageError: no such file; damaged, cut off, or something else than pairs.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._file: Any = None
+        self._rows: dict[str, Any] = {}  # looking a data set up by its name takes as long as reading a pair
+        self._owner = 0
+        file = _open(self.path)
+        with file:
+            self._header = _read_header(self.path, file)
+
+    @classmethod
+    def create(
+        cls,
+        path: str | Path,
+        *,
+        measurement_shape: Shape,
+        scene_shape: Shape,
+        dtype: PixelType = "float32",
+        attributes: Mapping[str, Attribute] | None = None,
+        psf: Tensor | None = None,
+    ) -> PairWriter:
+        """Begin a new file; use it in a ``with`` statement, at whose end the file gets its name.
+
+        Args:
+            path: of the file. One that exists is replaced only when all has gone well.
+            measurement_shape: (H, W, C) of each measurement.
+            scene_shape: (H, W, C) of each scene, which may be larger than the sensor.
+            dtype: of both. float32 keeps what noise pushed below 0; integers clip it.
+            attributes: of the camera.
+            psf: (C, H, W) or (1, C, H, W), stored as float32.
+
+        Raises:
+            ParameterError: a shape, the type or an attribute is none of these.
+            ShapeError: the PSF has other axes.
+        """
+        return PairWriter(Path(path), (measurement_shape, scene_shape), dtype, dict(attributes or {}), psf)
+
+    def __len__(self) -> int:
+        return self._header.length
+
+    def __getitem__(self, index: SupportsIndex) -> tuple[Tensor, Tensor]:
+        """Measurement and scene, each (C, H, W), linear light, float32, nominally in [0, 1]."""
+        number = operator.index(index)
+        if not -len(self) <= number < len(self):
+            raise IndexError(f"`{self.path}` has {len(self):,} pairs; there is no pair {number}.")
+        number %= len(self)
+        measurement, scene = (self._read(name, number) for name in NAMES)
+        return measurement, scene
+
+    @property
+    def attributes(self) -> dict[str, Attribute]:
+        """What the file says about its camera."""
+        return dict(self._header.attributes)
+
+    @property
+    def measurement_shape(self) -> Shape:
+        """Height, width and channels of a measurement."""
+        return self._header.measurement_shape
+
+    @property
+    def scene_shape(self) -> Shape:
+        """Height, width and channels of a scene."""
+        return self._header.scene_shape
+
+    @property
+    def psf(self) -> Psf | None:
+        """(1, C, H, W), as it was given, or ``None`` if the file has none."""
+        file = self._opened()
+        if "psf" not in file:
+            return None
+        try:
+            return torch.from_numpy(np.asarray(file["psf"][()], np.float32))[None]
+        except (OSError, ValueError) as error:
+            raise ImageError(f"`psf` of `{self.path}` cannot be read: {error}. {_AGAIN}") from error
+
+    def close(self) -> None:
+        """Close the file of this process; the next reading opens it again."""
+        if self._file is not None:
+            self._file.close()
+            self._file, self._rows = None, {}
+
+    def __enter__(self) -> "PairFile":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_file": None, "_rows": {}}
+
+    def _opened(self) -> Any:  # noqa: ANN401
+        if self._owner != os.getpid():
+            # After a fork the handle is the parent's; closing this process's copy of it does not close theirs.
+            self.close()
+        if self._file is None:
+            self._file, self._owner = _open(self.path), os.getpid()
+            self._rows = {name: self._file[name] for name in NAMES}
+        return self._file
+
+    def _read(self, name: str, number: int) -> Tensor:
+        try:
+            self._opened()
+            stored = self._rows[name][number]
+        except (OSError, KeyError, ValueError) as error:
+            raise ImageError(f"`{name}` {number} of `{self.path}` cannot be read: {error}. {_AGAIN}") from error
+        pixels = stored.transpose(2, 0, 1).astype(np.float32, order="C")
+        if stored.dtype.kind == "u":
+            pixels /= np.float32(np.iinfo(stored.dtype).max)
+        return torch.from_numpy(pixels)
+
+
+def _open(path: Path) -> Any:  # noqa: ANN401
+    import h5py
+
+    if not path.is_file():
+        raise ImageError(f"`{path}` is no file. Check the name, or make one with `mwdn import`.")
+    try:
+        # No lock: written files never change, and shared folders of clusters often know no locks.
+        return h5py.File(path, "r", locking=False)
+    except OSError as error:
+        raise ImageError(f"`{path}` is no whole HDF5 file: {error}. {_AGAIN}") from error
+
+
+def _read_header(path: Path, file: Any) -> _Header:  # noqa: ANN401
+    import h5py
+
+    if {"gt", "blur"} <= set(file):
+        raise ImageError(f"`{path}` is the authors' file: `mwdn import mwdn {path} -o pairs.h5`.")
+    shapes = []
+    for name in NAMES:
+        data = file.get(name)
+        if not isinstance(data, h5py.Dataset):
+            raise ImageError(f"`{path}` must have the data set `{name}`, but has {sorted(file)}. {_AGAIN}")
+        if data.ndim != 4 or data.dtype.str not in ("|u1", "<u2", ">u2", "<f4", ">f4"):
+            raise ImageError(
+                f"`{name}` of `{path}` ({data.shape}, {data.dtype}) must be (N, H, W, C) of uint8, uint16 or float32."
+            )
+        shapes.append(data.shape)
+    if shapes[0][0] != shapes[1][0]:
+        raise ImageError(f"`{path}` has {shapes[0][0]:,} measurements and {shapes[1][0]:,} scenes. {_AGAIN}")
+    attributes = {key: value.item() if hasattr(value, "item") else value for key, value in file.attrs.items()}
+    if (version := attributes.pop(VERSION_KEY, VERSION)) != VERSION:
+        raise ImageError(f"`{path}` has version {version} of this format; {VERSION} can be read. Update mwdn.")
+    return _Header(shapes[0][0], shapes[0][1:], shapes[1][1:], attributes)

@@ -1,0 +1,237 @@
+"""Where the pairs of a public data set are, and how one of them is read: one function a layout."""
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mwdn.data.images import READABLE, decode_frame, read_frame
+from mwdn.errors import ImageError
+from mwdn.types import Frame
+
+AGAIN = "Copy it from its source again."
+
+# The ten ImageNet classes of which FlatNet's authors tested; of each class the data set has ten pictures, so these
+# are its 100 test pairs. From `val_target.txt` of their code (S. S. Khan et al., TPAMI 44, 1934, 2022).
+PHLATCAM_TEST = frozenset(
+    {
+        "n01818515",
+        "n01820546",
+        "n02165456",
+        "n02870880",
+        "n02871525",
+        "n02980441",
+        "n03785016",
+        "n06874185",
+        "n07747607",
+        "n09193705",
+    }
+)
+
+
+@dataclass(frozen=True)
+class Source:
+    """One pair that has not been read yet.
+
+    Args:
+        name: by which a person finds it again: a file's stem, or a row.
+        load: reads the capture and the scene as they are stored, (H, W, C), and raises `ImageError`.
+    """
+
+    name: str
+    load: Callable[[], tuple[Frame, Frame]]
+
+
+@dataclass(frozen=True)
+class Found:
+    """The pairs of a data set, in its order, and what has no partner or cannot be opened, with the reason."""
+
+    sources: list[Source]
+    refused: dict[str, str] = field(default_factory=dict)
+
+
+def find_in_folders(path: Path, captures: str, scenes: str) -> Found:
+    """Pair the pictures of two folders, and of the folders in them, by their stems; numbers count as numbers.
+
+    Args:
+        path: of the data set.
+        captures: folder of the measurements in ``path``.
+        scenes: folder of the ground truth in ``path``.
+
+    Raises:
+        ImageError: a folder is missing, or two files differ by nothing but their suffix.
+    """
+    files = {folder: _by_stem(path / folder) for folder in (captures, scenes)}
+    stems = sorted(set(files[captures]) | set(files[scenes]), key=_natural)
+    refused, sources = {}, []
+    for stem in stems:
+        missing = [folder for folder in (captures, scenes) if stem not in files[folder]]
+        if missing:
+            other = next(found[stem] for found in files.values() if stem in found)
+            refused[stem] = f"`{other}` has no partner in `{path / missing[0]}`. Add it, or remove this one."
+        else:
+            sources.append(Source(stem, partial(_read_both, files[captures][stem], files[scenes][stem])))
+    return Found(sources, refused)
+
+
+def find_phlatcam(path: Path, captures: str, scenes: str) -> Found:
+    """Pair two folders as `find_in_folders` does, and put the ten classes of the test set last."""
+    found = find_in_folders(path, captures, scenes)
+    last = sorted(found.sources, key=lambda source: source.name.split("/")[0] in PHLATCAM_TEST)
+    return Found(last, found.refused)
+
+
+def find_in_hdf5(path: Path, captures: str, scenes: str) -> Found:
+    """Rows of the authors' HDF5: two data sets (N, C, H, W) of uint8.
+
+    Raises:
+        ImageError: no HDF5, cut off, or without these data sets.
+    """
+    import h5py
+
+    if not path.is_file():
+        raise ImageError(f"`{path}` is no file. Check the name.")
+    try:
+        file = h5py.File(path, "r", locking=False)
+    except OSError as error:
+        raise ImageError(f"`{path}` is no whole HDF5 file: {error}. {AGAIN}") from error
+    for name in (captures, scenes):
+        data = file.get(name)
+        if not isinstance(data, h5py.Dataset) or data.ndim != 4 or data.shape[1] not in (1, 3) or data.dtype != "u1":
+            raise ImageError(
+                f"`{path}` must have `{name}`, (N, 3, H, W) of uint8, but has {sorted(file)}. "
+                "Name the data sets: `--captures blur --scenes gt`."
+            )
+    counts = [len(file[name]) for name in (captures, scenes)]
+    paired = min(counts)
+    refused = {
+        f"row {row}": f"Row {row} of `{path}` is in one of `{captures}` ({counts[0]:,}) and `{scenes}` ({counts[1]:,})"
+        " only. Copy it from its source again."
+        for row in range(paired, max(counts))
+    }
+    return Found(
+        [Source(f"row {row}", partial(_read_row, path, file, (captures, scenes), row)) for row in range(paired)],
+        refused,
+    )
+
+
+def find_in_parquet(path: Path, captures: str, scenes: str) -> Found:
+    """Rows of the Hugging Face hub's parquet shards, whose columns hold encoded pictures.
+
+    Args:
+        path: a shard, a folder of shards, or a name on the hub such as ``owner/name``.
+        captures: column of the measurements.
+        scenes: column of the ground truth.
+
+    Raises:
+        ImageError: nothing there, or ``pyarrow`` (for the hub ``huggingface_hub``) is not installed.
+    """
+    folder = path if path.exists() else _download(path)
+    shards = sorted(folder.rglob("*.parquet"), key=lambda shard: _natural(str(shard))) if folder.is_dir() else [folder]
+    if not shards:
+        raise ImageError(f"`{path}` has no file that ends in .parquet. Name a shard, or the folder that has them.")
+    sources: list[Source] = []
+    refused = {}
+    for shard in shards:
+        try:
+            rows = _Shard(shard, (captures, scenes))
+        except ImageError as problem:
+            refused[shard.name] = str(problem)
+            continue
+        sources += [Source(f"{shard.name} row {row}", partial(rows.load, row)) for row in range(rows.count)]
+    return Found(sources, refused)
+
+
+class _Shard:
+    """A parquet file, which can be read in groups of rows only: the latest group is kept."""
+
+    def __init__(self, path: Path, columns: Sequence[str]) -> None:
+        try:
+            from pyarrow import parquet
+        except ModuleNotFoundError as error:
+            raise _missing("pyarrow", "parquet") from error
+        self.path, self.columns = path, list(columns)
+        try:
+            self._file: Any = parquet.ParquetFile(path)
+        except (OSError, ValueError) as error:  # pyarrow's own errors are of these
+            raise ImageError(f"`{path}` is no whole parquet file: {error}. {AGAIN}") from error
+        names = self._file.schema_arrow.names
+        if not set(self.columns) <= set(names):
+            way_out = "Name two of them: `--captures lensless --scenes lensed`."
+            raise ImageError(f"`{path}` must have the columns {self.columns}, but has {names}. {way_out}")
+        metadata = self._file.metadata
+        self.count = metadata.num_rows
+        self._ends = np.cumsum([metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)])
+        self._latest: tuple[int, Any] = (-1, None)
+
+    def load(self, row: int) -> tuple[Frame, Frame]:
+        group = int(np.searchsorted(self._ends, row, side="right"))
+        try:
+            if self._latest[0] != group:
+                self._latest = (group, self._file.read_row_group(group, columns=self.columns))
+            first = self._ends[group] - self._latest[1].num_rows
+            cells = [self._latest[1][column][int(row - first)].as_py() for column in self.columns]
+        except (OSError, ValueError) as error:
+            raise ImageError(f"Row {row} of `{self.path}` cannot be read: {error}. {AGAIN}") from error
+        capture, scene = (self._decode(cell, column, row) for cell, column in zip(cells, self.columns, strict=True))
+        return capture, scene
+
+    def _decode(self, cell: object, column: str, row: int) -> Frame:
+        data = cell.get("bytes") if isinstance(cell, dict) else cell
+        name = f"`{column}` of row {row} of `{self.path}`"
+        if not isinstance(data, bytes):
+            raise ImageError(f"{name} holds no bytes of a picture, but {type(data).__name__}. {AGAIN}")
+        return decode_frame(data, name)
+
+
+def _download(name: Path) -> Path:
+    if not re.fullmatch(r"[\w.-]+/[\w.-]+", name.as_posix()) or name.suffix == ".parquet":
+        raise ImageError(f"`{name}` does not exist. Name a shard, a folder of shards, or `owner/name` on the hub.")
+    try:
+        from huggingface_hub import snapshot_download
+    except ModuleNotFoundError as error:
+        before = f"`{name}` is not here. To look for it on the hub, "
+        raise _missing("huggingface_hub", "hub", before) from error
+    try:
+        return Path(snapshot_download(name.as_posix(), repo_type="dataset", allow_patterns="*.parquet"))
+    except Exception as error:  # its errors are those of its network library, which changes
+        raise ImageError(f"`{name}` cannot be had from the hub: {error}. Download it and name its folder.") from error
+
+
+def _missing(package: str, extra: str, before: str = "") -> ImageError:
+    return ImageError(f"{before}`{package}` must be installed: `pip install 'mwdn[{extra}]'`.")
+
+
+def _by_stem(folder: Path) -> dict[str, Path]:
+    if not folder.is_dir():
+        raise ImageError(f"`{folder}` is no folder. Name the folders inside the data set: `--captures A --scenes B`.")
+    found: dict[str, Path] = {}
+    for file in sorted(folder.rglob("*")):
+        if file.suffix.lower() not in READABLE or file.name.startswith(".") or not file.is_file():
+            continue
+        stem = file.relative_to(folder).with_suffix("").as_posix()
+        if stem in found:
+            raise ImageError(f"`{found[stem]}` and `{file}` differ in their suffix only. Remove one of them.")
+        found[stem] = file
+    return found
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Sorting key by which im2 comes before im10."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
+
+
+def _read_both(capture: Path, scene: Path) -> tuple[Frame, Frame]:
+    return read_frame(capture), read_frame(scene)
+
+
+def _read_row(path: Path, file: Any, names: tuple[str, str], row: int) -> tuple[Frame, Frame]:  # noqa: ANN401
+    try:
+        capture, scene = (np.moveaxis(file[name][row], 0, -1) for name in names)
+    except OSError as error:
+        raise ImageError(f"Row {row} of `{path}` cannot be read: {error}. {AGAIN}") from error
+    return capture, scene

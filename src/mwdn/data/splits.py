@@ -1,0 +1,74 @@
+"""Which pairs are for training and which are not."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mwdn.errors import ParameterError, UnknownNameError
+
+Split = dict[str, range | list[int]]
+"""Positions of pairs by ``"train"``, ``"test"`` and, where the protocol has it, ``"validation"``."""
+
+KINDS = ("paper", "diffusercam", "phlatcam", "random")
+
+
+def split(count: int, kind: str = "paper", *, fractions: Sequence[float] = (0.8, 0.1, 0.1), seed: int = 0) -> Split:
+    """Positions of the pairs of each part, by a published protocol or at random.
+
+    The published protocols count positions, so they hold for a data set of which no pair was skipped.
+
+    Args:
+        count: pairs of the file.
+        kind: ``"paper"``, 8:1:1 by position, test first, then validation, then training;
+            ``"diffusercam"``, test the first 1,000 (im1 to im1000), the rest training;
+            ``"phlatcam"``, 9,900 for training, then 100 for test, the order of ``mwdn import phlatcam``;
+            ``"random"``, by ``fractions`` and ``seed``.
+        fractions: of training, validation and test, of sum 1; of ``"random"`` only.
+        seed: of ``"random"`` only; the same one gives the same parts everywhere.
+
+    Returns:
+        Disjoint positions that together are all of ``range(count)``, in ascending order.
+
+    Raises:
+        UnknownNameError: no such kind.
+        ParameterError: too few pairs for the kind, not 10,000 for ``"phlatcam"``, or fractions of another sum.
+    """
+    match kind:
+        case "paper":
+            tenth = count // 10
+            _require(count, 10, kind)
+            return {
+                "train": range(2 * tenth, count),
+                "validation": range(tenth, 2 * tenth),
+                "test": range(tenth),
+            }
+        case "diffusercam":
+            _require(count, 1001, kind)
+            return {"train": range(1000, count), "test": range(1000)}
+        case "phlatcam":
+            if count != 10_000:
+                raise ParameterError(
+                    f"`count` ({count:,}) must be 10,000 for the split 'phlatcam': 9,900 for training, 100 for test. "
+                    "Import the whole data set, or use 'random'."
+                )
+            return {"train": range(9900), "test": range(9900, 10_000)}
+        case "random":
+            return _random(count, fractions, seed)
+    raise UnknownNameError("split", kind, KINDS)
+
+
+def _require(count: int, least: int, kind: str) -> None:
+    if count < least:
+        raise ParameterError(f"`count` ({count:,}) must be at least {least:,} for the split '{kind}'. Use 'random'.")
+
+
+def _random(count: int, fractions: Sequence[float], seed: int) -> Split:
+    if len(fractions) != 3 or min(fractions) < 0 or abs(sum(fractions) - 1) > 1e-6:
+        raise ParameterError(f"`fractions` {tuple(fractions)} must be three, not negative, of sum 1: (0.8, 0.1, 0.1).")
+    parts = dict(zip(("train", "validation", "test"), fractions, strict=True))
+    ends = np.rint(np.cumsum(list(fractions)) * count).astype(int)
+    order = np.random.default_rng(seed).permutation(count)
+    result: Split = {name: sorted(part.tolist()) for name, part in zip(parts, np.split(order, ends[:-1]), strict=True)}
+    if empty := [name for name, fraction in parts.items() if fraction > 0 and not result[name]]:
+        raise ParameterError(f"`count` ({count:,}) leaves no pair for {', '.join(empty)}. Give it a larger fraction.")
+    return result
