@@ -8,6 +8,7 @@ from typing import NoReturn
 import cyclopts
 from cyclopts import App, Parameter
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import track
 
 from mwdn import __version__
@@ -76,7 +77,7 @@ def reconstruct(
     camera: CameraOptions,
     method: str = "admm",
     out: Path = Path("results/reconstruct"),
-    format: Format = "png",  # noqa: A002
+    format: Format = "png",
     device: str | None = None,
 ) -> int:
     """Reconstruct captures: files, or folders of them.
@@ -102,12 +103,13 @@ def reconstruct(
             pair = reconstruct_file(reconstructor, file, output, format)
         except MwdnError as error:
             failed += 1
-            errors.print(f"[red]{file}:[/] {error}", highlight=False)
+            _complain(f"[red]{escape(str(file))}:[/]", error)
             continue
         rows = [*rows, list(pair)] if len(rows) < 12 else rows
     if rows:
         write_picture(out / SUMMARY, contact_sheet(rows, ["measurement", f"reconstruction ({Path(method).name})"]))
-    console.print(f"{len(files) - failed} of {len(files)} captures reconstructed into {out}", highlight=False)
+    done = f"{len(files) - failed} of {len(files)} captures reconstructed into {out}"
+    console.print(done, highlight=False, markup=False, soft_wrap=True)
     return 1 if failed else 0
 
 
@@ -132,6 +134,11 @@ def doctor() -> None:
     report(console)
 
 
+def _complain(start: str, error: MwdnError) -> None:
+    """Print a message whole: its brackets are no markup, and its paths are not broken at the terminal's width."""
+    errors.print(f"{start} {escape(str(error))}", highlight=False, soft_wrap=True)
+
+
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the command line and exit: 0 if all went well, 1 if some captures failed, 2 on a wrong call."""
     arguments = sys.argv[1:] if arguments is None else arguments
@@ -143,6 +150,6 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     except MwdnError as error:
         if debug:
             errors.print_exception()
-        errors.print(f"[bold red]Error:[/] {error}", highlight=False)
+        _complain("[bold red]Error:[/]", error)
         sys.exit(2)
     sys.exit(result if isinstance(result, int) else 0)
