@@ -28,7 +28,7 @@ TIERS = [
     ("reconstruct",),
     ("capture",),
     ("preview",),
-    ("demo", "cli", "__main__"),
+    ("demo", "doctor", "cli", "__main__"),
     ("",),  # mwdn/__init__.py: the public names
 ]
 RANK = {name: rank for rank, names in enumerate(TIERS) for name in names}
@@ -60,6 +60,8 @@ def imports(path: Path) -> list[tuple[int, str]]:
             for alias in node.names:
                 # `from mwdn import fourier` is a module, `from mwdn.fourier import wiener` a name of one.
                 full = f"{base}.{alias.name}"
+                if full == "mwdn.__version__":  # a string, not a module
+                    continue
                 found.append((node.lineno, full if full in KNOWN else base))
     return found
 

@@ -108,12 +108,13 @@ def reconstruct(
             pair = reconstruct_file(reconstructor, file, output, format)
         except MwdnError as error:
             failed += 1
-            errors.print(f"[red]{escape(str(file))}:[/] {escape(str(error))}", highlight=False)
+            _complain(f"[red]{escape(str(file))}:[/]", error)
             continue
         rows = [*rows, list(pair)] if len(rows) < 12 else rows
     if rows:
         write_picture(out / SUMMARY, contact_sheet(rows, ["measurement", f"reconstruction ({Path(method).name})"]))
-    console.print(f"{len(files) - failed} of {len(files)} captures reconstructed into {out}", highlight=False)
+    done = f"{len(files) - failed} of {len(files)} captures reconstructed into {out}"
+    console.print(done, highlight=False, markup=False, soft_wrap=True)
     return 1 if failed else 0
 
 
@@ -166,6 +167,11 @@ def doctor() -> None:
     report(console)
 
 
+def _complain(start: str, error: MwdnError) -> None:
+    """Print a message whole: its brackets are no markup, and its paths are not broken at the terminal's width."""
+    errors.print(f"{start} {escape(str(error))}", highlight=False, soft_wrap=True)
+
+
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the command line and exit: 0 if all went well, 1 if some captures failed, 2 on a wrong call."""
     arguments = sys.argv[1:] if arguments is None else arguments
@@ -177,6 +183,6 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     except MwdnError as error:
         if debug:
             errors.print_exception()
-        errors.print(f"[bold red]Error:[/] {escape(str(error))}", highlight=False)
+        _complain("[bold red]Error:[/]", error)
         sys.exit(2)
     sys.exit(result if isinstance(result, int) else 0)

@@ -63,7 +63,7 @@ def run(out: Path, seed: int, console: Console) -> None:
     with atomic(out / "index.html") as temporary:
         temporary.write_text(_page(table), encoding="utf-8")
     console.print(table)
-    console.print(f"Look at {out / 'index.html'}", highlight=False)
+    console.print(f"Look at {out / 'index.html'}", highlight=False, markup=False, soft_wrap=True)
 
 
 _PAGE = """<!doctype html>

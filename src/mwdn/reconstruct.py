@@ -31,14 +31,26 @@ def find_method(name: str | Path, regularisation: float | None = None) -> Method
         CheckpointError: the file holds no usable weights.
         ParameterError: the method has no regularisation to set.
     """
-    path = Path(name)
     if regularisation is not None and str(name) not in ("admm", "wiener"):
         raise ParameterError(f"`regularisation` belongs to admm and wiener, not to '{name}'.")
+    if str(name) in solvers.SOLVERS:
+        return solvers.build(str(name), **({} if regularisation is None else {"regularisation": regularisation}))
+    path = Path(name)
     if path.suffix in SUFFIXES or path.is_file():
         return load_network(path)
-    if str(name) not in solvers.SOLVERS:
-        raise UnknownNameError("method", str(name), [*solvers.SOLVERS, "PATH/OF/CHECKPOINT.safetensors"])
-    return solvers.build(str(name), **({} if regularisation is None else {"regularisation": regularisation}))
+    raise UnknownNameError("method", str(name), [*solvers.SOLVERS, "PATH/OF/CHECKPOINT.safetensors"])
+
+
+def _usable(device: str | torch.device) -> torch.device:
+    """Return the device once it has held a tensor."""
+    try:
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError) as error:  # torch without CUDA asserts
+        raise ParameterError(
+            f"`device` ({device}) must be one that torch can use here: {str(error).splitlines()[0]} "
+            "Leave it out, or see `mwdn doctor`."
+        ) from error
+    return torch.device(device)
 
 
 class Reconstructor:
@@ -52,6 +64,7 @@ class Reconstructor:
     Raises:
         UnknownNameError: no such method.
         CheckpointError: the checkpoint cannot be used.
+        ParameterError: no such device.
     """
 
     def __init__(
@@ -61,7 +74,7 @@ class Reconstructor:
         *,
         device: str | torch.device | None = None,
     ) -> None:
-        self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        self.device = _usable(device or ("cuda" if torch.cuda.is_available() else "cpu"))
         self.calibration = calibration
         self.method = find_method(method) if isinstance(method, str | Path) else method
         if isinstance(self.method, nn.Module):
@@ -97,40 +110,45 @@ SUMMARY = "summary.png"
 
 
 def find_captures(paths: Iterable[str | Path]) -> list[Path]:
-    """Files as named, and every readable file of each folder, in the order of their names.
+    """Files as named, and every readable file of each folder, in the order of their names; each once.
 
     Raises:
         ParameterError: nothing was named, or a folder holds no picture.
     """
     found: list[Path] = []
     for path in map(Path, paths):
-        inside = sorted(f for f in path.iterdir() if f.suffix.lower() in READABLE) if path.is_dir() else [path]
+        inside = [path]
+        if path.is_dir():
+            inside = sorted(f for f in path.iterdir() if f.suffix.lower() in READABLE and f.is_file())
         if not inside:
             raise ParameterError(f"The folder `{path}` holds no capture. Readable: {', '.join(sorted(READABLE))}.")
         found += inside
     if not found:
         raise ParameterError("Name at least one capture, or a folder of captures.")
-    return found
+    return list(dict.fromkeys(found))
 
 
 def plan_outputs(captures: list[Path], out: Path, form: Format, *, protected: Iterable[Path | None] = ()) -> list[Path]:
     """Where each capture's reconstruction goes: its name, in ``out``.
 
     Raises:
-        ParameterError: two captures would go to one file, or one would overwrite an input.
+        ParameterError: two captures would go to one file, one would overwrite an input, or ``out`` is a file.
     """
+    if out.exists() and not out.is_dir():
+        raise ParameterError(f"`{out}` must be a folder, but is a file. Choose another one: `--out`.")
     outputs = [out / (capture.stem + _SUFFIX[form]) for capture in captures]
     inputs = {path.resolve() for path in (*captures, *protected) if path is not None}
-    seen: dict[Path, Path] = {out / SUMMARY: Path("the summary picture")}
+    for output in (*outputs, out / SUMMARY):
+        if output.resolve() in inputs:
+            raise ParameterError(f"`{output}` would overwrite an input. Choose another folder: `--out`.")
+    seen = {out / SUMMARY: "the summary picture"}
     for capture, output in zip(captures, outputs, strict=True):
         if output in seen:
             raise ParameterError(
-                f"`{capture}` and `{seen[output]}` would both be written to `{output}`. Reconstruct them into "
+                f"`{capture}` and {seen[output]} would both be written to `{output}`. Reconstruct them into "
                 "two folders: `--out`."
             )
-        if output.resolve() in inputs or (out / SUMMARY).resolve() in inputs:
-            raise ParameterError(f"`{output}` would overwrite an input. Choose another folder: `--out`.")
-        seen[output] = capture
+        seen[output] = f"`{capture}`"
     return outputs
 
 

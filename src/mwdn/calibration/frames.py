@@ -18,12 +18,17 @@ def full_scale(frame: Frame, bit_depth: int | None) -> float:
     """Largest number that the sensor can give: ``2^bit_depth - 1``, the file's type, or 1 for floats.
 
     Raises:
-        ParameterError: a number of the frame is larger.
+        ParameterError: a number of the frame is larger, or the file's type holds fewer bits.
     """
     if bit_depth is None:
         return 1.0 if frame.dtype.kind == "f" else float(np.iinfo(frame.dtype).max)
     if not 1 <= bit_depth <= 16:
         raise ParameterError(f"`bit_depth` ({bit_depth}) must be 1 to 16.")
+    if frame.dtype.kind != "f" and bit_depth > 8 * frame.dtype.itemsize:
+        raise ParameterError(
+            f"`bit_depth` ({bit_depth}) must be at most {8 * frame.dtype.itemsize}, the bits of the file's numbers. "
+            "Save frames with 16 bits, or leave it out."
+        )
     largest = 2**bit_depth - 1
     if frame.max() > largest:
         needed = int(frame.max()).bit_length()

@@ -113,10 +113,15 @@ class Calibration:
         )
 
     def __post_init__(self) -> None:
-        if self.psf.shape[0] != 1 or self.psf.shape[1] not in (1, 3):
+        if self.psf.ndim != 4 or self.psf.shape[0] != 1 or self.psf.shape[1] not in (1, 3):
             raise PsfError(f"`psf` {tuple(self.psf.shape)} must be (1, 1 or 3, H, W): grey or RGB.")
         if not self.psf.isfinite().all():
-            raise PsfError("`psf` holds NaN or infinity.")
+            raise PsfError("`psf` holds NaN or infinity. Capture it again.")
+        if self.psf.min() < 0 or not (self.psf.sum((-2, -1)) > 0).all():
+            raise PsfError(
+                f"`psf` (smallest value {self.psf.min():.3g}) must not be negative, and must hold light in each "
+                "channel. Subtract its background and clip it: `psf.clamp(min=0)`."
+            )
 
     @cached_property
     def psf_hash(self) -> str:
@@ -160,16 +165,17 @@ class Calibration:
             (h, w), (H, W) = measurement.shape[-2:], self.size
             raise ShapeError(
                 f"`psf` ({H} x {W}) and the capture ({h} x {w}) must have the same height and width. "
-                + _way_out((h, w), (H, W))
+                + _way_out((h, w), (H, W), self.binning)
             )
         channels = measurement.shape[1]
         if channels == 1 and self.psf.shape[1] == 3:
             raise ShapeError("The capture is grey, but `psf` has colours. Calibrate with the camera's grey mode.")
+        # No `_turn`: a capture has no centre to keep, and a rolled row would be one of the opposite border.
         return measurement.flip(-2) if self.upside_down else measurement
 
 
 def _turn(image: Tensor) -> Tensor:
-    """Put a PSF's last row first and keep its centre ``H // 2`` where it is: an even height needs one row's roll."""
+    """Put a PSF's last row first and keep its centre ``H // 2``: an even height needs one row's roll."""
     turned = image.flip(-2)
     return turned.roll(1, -2) if image.shape[-2] % 2 == 0 else turned
 
@@ -179,7 +185,9 @@ def _refuse_saturated(frame: Frame, bit_depth: int | None) -> None:
         return
     top = int(full_scale(frame, bit_depth))
     # Sensors that store 12 bits as the upper ones of 16 saturate at 65,520: the largest number found counts.
-    top = int(frame.max()) if frame.max() > 0.98 * top else top
+    # So it does where 10, 12 or 14 bits lie in the lower ones and nobody said so.
+    unsaid = bit_depth is None and top > 255 and frame.max() in (1023, 4095, 16383)
+    top = int(frame.max()) if unsaid or frame.max() > 0.98 * top else top
     full = frame.max(axis=-1) >= top
     if full.sum() > SATURATED_PART * full.size:
         raise PsfError(
@@ -196,11 +204,11 @@ def _level(psf: Tensor, background: Background) -> Tensor:
     return torch.full((1, psf.shape[1], 1, 1), float(background))
 
 
-def _way_out(capture: Size, psf: Size) -> str:
+def _way_out(capture: Size, psf: Size, binning: int) -> str:
     for (a, b), name in (((psf, capture), "PSF"), ((capture, psf), "capture")):
         factor = a[0] // b[0]
         if factor > 1 and a == (b[0] * factor, b[1] * factor):
             return f"The {name} is {factor} times as large: bin it by {factor}."
     if psf[0] <= capture[0] and psf[1] <= capture[1]:
-        return f"Crop the capture around its centre: `--crop {psf[0]} {psf[1]}`."
+        return f"Crop the capture around its centre: `--crop {psf[0] * binning} {psf[1] * binning}`."
     return "Use the PSF that belongs to this camera."

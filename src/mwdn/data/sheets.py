@@ -39,7 +39,7 @@ def contact_sheet(rows: list[list[Tensor]], titles: list[str], *, height: int = 
     return torch.cat([_heading(titles, widths, head, widest), *lines], dim=-2)
 
 
-def _cell(picture: Image, height: int, gap: int) -> Tensor:
+def _cell(picture: Tensor, height: int, gap: int) -> Tensor:
     picture = for_people(picture).expand(-1, 3, -1, -1)
     width = max(1, round(picture.shape[-1] * height / picture.shape[-2]))
     smaller = height < picture.shape[-2]

@@ -24,7 +24,7 @@ _MODULES |= {
 
 def is_authors(state: dict[str, Tensor]) -> bool:
     """Whether these weights have the authors' names."""
-    return "delta" in state and "inc.double_conv.0.weight" in state
+    return {"w", "delta", "inc.double_conv.0.weight", "outc.conv.weight"} <= state.keys()
 
 
 def load_authors(state: dict[str, Tensor]) -> nn.Module:
@@ -41,6 +41,13 @@ def load_authors(state: dict[str, Tensor]) -> nn.Module:
     name = "mwdn-cpsf" if "inc0.double_conv.0.weight" in state else "mwdn"
     extra = {"authors_scalars": True} if name == "mwdn-cpsf" else {"psf_pooling": "average"}
     first, last = state["inc.double_conv.0.weight"], state["outc.conv.weight"]
+    scalars = {"w": 1, "delta": 5} if name == "mwdn-cpsf" else {"w": 4, "delta": 4}
+    wrong = [key for key, length in scalars.items() if state[key].shape != (length,)]
+    if wrong or first.ndim != 4:
+        raise CheckpointError(
+            f"`{'`, `'.join(wrong) or 'inc.double_conv.0.weight'}` must have the shape of the authors' {name} "
+            f"({scalars} numbers). Take a checkpoint of their code."
+        )
     options = OPTIONS | extra | {"channels": first.shape[1], "outputs": last.shape[0], "width": first.shape[0]}
     network = build(name, **options)
     try:
@@ -57,7 +64,7 @@ def _renamed(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:
             continue
         module = next((module for module in _MODULES if key.startswith(module + ".")), None)
         ours[key.replace(module, _MODULES[module], 1) if module else key] = value
-    for i, regularisation in enumerate(_logarithm("delta", state["delta"])[:4]):
+    for i, regularisation in enumerate(_logarithm("delta", state["delta"][:4])):
         ours[f"filters.{i}.log_regularisation"] = regularisation
     if name == "mwdn-cpsf":
         return ours | {"weight": state["w"], "unused_regularisation": state["delta"][4]}
@@ -67,7 +74,7 @@ def _renamed(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:
 def _logarithm(name: str, values: Tensor) -> Tensor:
     if not (values > 0).all():
         raise CheckpointError(
-            f"`{name}` ({values.tolist()}) must be positive: a Wiener filter with a negative constant has poles. "
-            "Train longer, or take another checkpoint."
+            f"`{name}` ({values.tolist()}) must be positive: its logarithm is what this package learns, and a filter "
+            "with a negative lambda has poles. Train longer, or take another checkpoint."
         )
     return torch.log(values)

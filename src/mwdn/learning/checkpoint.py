@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import torch
@@ -10,7 +11,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from mwdn.data.writing import atomic
-from mwdn.errors import CheckpointError
+from mwdn.errors import CheckpointError, ParameterError
 from mwdn.learning.authors import is_authors, load_authors
 from mwdn.networks import build
 
@@ -33,9 +34,14 @@ def save_network(
         name: of the network.
         options: it was built with; plain values that JSON can hold.
         **metadata: more to remember, for example the recipe, the PSF's hash, metrics.
+
+    Raises:
+        CheckpointError: another suffix.
     """
     from mwdn import __version__
 
+    if Path(path).suffix != ".safetensors":
+        raise CheckpointError(f"`{path}` must end in .safetensors, not '{Path(path).suffix}'. Rename it.")
     header = {"name": name, "options": options, "version": __version__, **metadata}
     tensors = {key: value.detach().cpu().contiguous() for key, value in network.state_dict().items()}
     with atomic(Path(path)) as temporary:
@@ -55,7 +61,16 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
         raise CheckpointError(f"`{path}` cannot be read as safetensors: {error}.") from error
     if text is None:
         raise CheckpointError(f"`{path}` was not written by mwdn: it does not say which network it belongs to.")
-    header: dict[str, Any] = json.loads(text)
+    try:
+        header = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise CheckpointError(
+            f"The metadata of `{path}` is damaged: {error}. Copy it from its source again."
+        ) from error
+    if not (
+        isinstance(header, dict) and isinstance(header.get("name"), str) and isinstance(header.get("options"), dict)
+    ):
+        raise CheckpointError(f"The metadata of `{path}` must hold a name and options. Save it with `save_network`.")
     return header
 
 
@@ -75,7 +90,13 @@ def load_network(path: str | Path) -> nn.Module:
     if path.suffix != ".safetensors":
         return load_authors(_read_foreign(path)).eval()
     header = read_metadata(path)
-    network = build(header["name"], **header["options"])
+    try:
+        network = build(header["name"], **header["options"])
+    except (TypeError, ParameterError) as error:
+        version = header.get("version", "unknown")
+        raise CheckpointError(
+            f"`{path}`, of mwdn {version}, names a network that cannot be built: {error} Update mwdn."
+        ) from error
     with safe_open(path, framework="pt") as file:
         state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     try:
@@ -89,9 +110,14 @@ def _read_foreign(path: Path) -> dict[str, Tensor]:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many kinds for damaged files
-        raise CheckpointError(f"`{path}` cannot be read as plain weights: {error}") from error
+        # Of torch's own words none: they go on for ten lines, and advise to unpickle the file all the same.
+        why = "it holds objects, whose code is not run" if isinstance(error, UnpicklingError) else "it is damaged"
+        raise CheckpointError(
+            f"`{path}` cannot be read as plain weights: {why}. Copy it again, or save its `state_dict()` alone."
+        ) from error
     state = content.get("net_state_dict", content) if isinstance(content, dict) else {}
-    state = {key.removeprefix("module."): value for key, value in state.items() if isinstance(value, Tensor)}
+    state = state if isinstance(state, dict) else {}
+    state = {str(key).removeprefix("module."): value for key, value in state.items() if isinstance(value, Tensor)}
     if not is_authors(state):
         raise CheckpointError(
             f"`{path}` is neither a checkpoint of mwdn (.safetensors) nor one of the MWDN authors "

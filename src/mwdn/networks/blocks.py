@@ -46,13 +46,23 @@ class Encoder(nn.Module):
 
     def __init__(self, channels: int, widths: tuple[int, ...], *, pooling: Pooling = "max") -> None:
         super().__init__()
+        self.channels = channels
         self.pool = halve(pooling)
         self.scales = nn.ModuleList(
             double_convolution(inputs, outputs) for inputs, outputs in zip((channels, *widths), widths, strict=False)
         )
 
     def forward(self, picture: Image) -> list[Tensor]:
-        """Features, finest first."""
+        """Features, finest first.
+
+        Raises:
+            ShapeError: the picture has another number of channels.
+        """
+        if picture.shape[1] != self.channels:
+            raise ShapeError(
+                f"A picture or PSF {tuple(picture.shape)} must have {self.channels} channels for this network. "
+                f"Train one with `channels={picture.shape[1]}`, or calibrate with frames of {self.channels}."
+            )
         features = [self.scales[0](picture)]
         for scale in self.scales[1:]:
             features.append(scale(self.pool(features[-1])))

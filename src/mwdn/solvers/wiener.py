@@ -6,7 +6,15 @@ import torch
 from torch import Tensor
 
 from mwdn.errors import ParameterError
-from mwdn.fourier import Boundary, deconvolution_grid, extend, inverse_spectrum, spectrum, transfer_function
+from mwdn.fourier import (
+    Boundary,
+    check_fit,
+    deconvolution_grid,
+    extend,
+    inverse_spectrum,
+    spectrum,
+    transfer_function,
+)
 from mwdn.types import Measurement, Psf, Scene
 
 
@@ -58,27 +66,29 @@ class Wiener:
     @torch.no_grad()
     def __call__(self, measurement: Measurement, psf: Psf) -> Scene:
         """Reconstruct a batch."""
+        check_fit(measurement, psf, "measurement")
         size = measurement.shape[-2], measurement.shape[-1]
         grid = deconvolution_grid(size, self.boundary)
         total = psf.sum((-2, -1), keepdim=True)
         H = transfer_function(psf / total, grid)
         B = spectrum(extend(measurement, grid, self.boundary), grid)
-        regularisation = self.regularisation or self._discrepancy(measurement, B, H)
+        regularisation = self.regularisation or self._discrepancy(measurement, B, H, grid[1])
         V = H.conj() * B / (H.abs().square() + regularisation)
         return (inverse_spectrum(V, grid, size) / total).clamp(min=0)
 
-    def _discrepancy(self, measurement: Measurement, B: Tensor, H: Tensor) -> Tensor:
+    def _discrepancy(self, measurement: Measurement, B: Tensor, H: Tensor, width: int) -> Tensor:
         """Lambda (B, C, 1, 1) whose residual has the power of the noise and the tolerated misfit.
 
         In the Fourier domain the residual is ``B lambda / (|H|^2 + lambda)``; it grows with lambda, so forty
         halvings of the interval find it.
         """
-        contrast = measurement.std((-2, -1), keepdim=True)
+        contrast = measurement.std((-2, -1), correction=0, keepdim=True)
         allowed = noise_level(measurement).square() + (self.tolerance * contrast).square()
         power, filtered = B.abs().square(), H.abs().square()
         power[..., 0, 0] = 0  # the mean says nothing about detail
-        # Half a spectrum: all but the outer columns stand for two. Parseval: sum |B|^2 = pixels x variance.
-        power[..., 1:-1] *= 2
+        # Half a spectrum: a column stands for two, but for the first and, of an even width, the last.
+        # Parseval: sum |B|^2 = pixels x variance.
+        power[..., 1 : (width + 1) // 2] *= 2
         target = allowed * power.sum((-2, -1), keepdim=True) / contrast.square().clamp(min=1e-20)
         low, high = torch.full_like(target, -16.0), torch.full_like(target, 1.0)
         for _ in range(40):

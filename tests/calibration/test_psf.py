@@ -1,0 +1,306 @@
+"""A PSF from a file, and raw frames to measurements."""
+
+import re
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+import torch
+
+from mwdn.calibration import Calibration
+from mwdn.calibration.psf import _turn
+from mwdn.errors import ImageError, ParameterError, PsfError, ShapeError
+from mwdn.fourier import convolve
+from mwdn.optics.patterns import contour_psf
+
+SIZE = 48, 40
+
+
+@pytest.fixture
+def caustic(generator):
+    """(H, W) in [0, 0.9], dark at the border."""
+    psf = contour_psf(SIZE, cell=12, generator=generator)[0, 0]
+    return (0.9 * psf / psf.max()).numpy()
+
+
+def store(path, frame):
+    """Write (H, W, C) numbers in RGB order, by the file's suffix."""
+    frame = frame[..., 0] if frame.shape[-1] == 1 else frame
+    if path.suffix == ".npy":
+        np.save(path, frame)
+    elif path.suffix == ".tif":
+        tifffile.imwrite(path, frame)
+    else:
+        assert cv2.imwrite(str(path), frame if frame.ndim == 2 else frame[..., ::-1])
+    return path
+
+
+def coloured(caustic):
+    return np.stack([caustic, 0.5 * caustic, 0.7 * caustic[::-1, ::-1]], -1)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("dtype", ["u1", "u2"])
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".npy"])
+def test_psf_of_any_file(tmp_path, caustic, suffix, dtype, channels):
+    light = coloured(caustic) if channels == 3 else caustic[..., None]
+    frame = (light * np.iinfo(dtype).max).round().astype(dtype)
+    calibration = Calibration.from_file(store(tmp_path / f"psf{suffix}", frame), background=0.0)
+    assert calibration.psf.shape == (1, channels, *SIZE)
+    assert calibration.size == SIZE
+    expected = frame.astype(float) / frame.sum((0, 1), dtype=float)
+    np.testing.assert_allclose(calibration.psf[0].movedim(0, -1), expected, rtol=1e-5)
+    torch.testing.assert_close(calibration.psf.sum((-2, -1)), torch.ones(1, channels))
+    assert calibration.background == (0,) * channels
+
+
+def test_psf_of_floats(tmp_path, caustic):
+    np.save(tmp_path / "psf.npy", 3 * caustic)
+    psf = Calibration.from_file(tmp_path / "psf.npy", background=0.0).psf[0, 0]
+    np.testing.assert_allclose(psf, caustic / caustic.sum(), rtol=1e-5, atol=1e-9)
+
+
+def test_bgr_and_upside_down_are_undone(tmp_path, caustic):
+    frame = (coloured(caustic) * 65535).astype(np.uint16)
+    straight = Calibration.from_file(store(tmp_path / "a.npy", frame))
+    twisted = Calibration.from_file(store(tmp_path / "b.npy", frame[::-1, :, ::-1]), bgr=True, upside_down=True)
+    # Rows of an even height turn about row H / 2, so they are one row lower than those of the first file.
+    torch.testing.assert_close(twisted.psf, straight.psf.roll(1, -2))
+    back = twisted.correct(frame[::-1])
+    torch.testing.assert_close(back, straight.correct(frame))
+
+
+@pytest.mark.parametrize("size", [(9, 9), (10, 10), (11, 8), (8, 11)])
+@pytest.mark.parametrize("crop", [None, (7, 7), (6, 8)])
+@pytest.mark.parametrize("binning", [1, 2, 3])
+@pytest.mark.parametrize("upside_down", [False, True])
+def test_centre_of_the_file_is_the_centre_of_the_psf(tmp_path, size, crop, binning, upside_down):
+    frame = np.zeros((*size, 1), np.uint16)
+    frame[size[0] // 2, size[1] // 2] = 60000
+    options = {"crop": crop, "binning": binning, "upside_down": upside_down, "background": 0.0}
+    calibration = Calibration.from_file(store(tmp_path / "psf.npy", frame), **options)
+    height, width = (n // binning for n in crop or size)
+    expected = torch.zeros(1, 1, height, width)
+    expected[..., height // 2, width // 2] = 1
+    torch.testing.assert_close(calibration.psf, expected)
+    assert calibration.correct(frame).shape[-2:] == calibration.size
+
+
+@pytest.mark.parametrize("size", [(16, 12), (15, 12)])
+def test_turned_scene_through_a_turned_psf_is_the_turned_measurement(size, generator):
+    scene = torch.rand(1, 3, *size, generator=generator)
+    psf = torch.rand(1, 1, *size, generator=generator)
+    psf[..., 0, :] = 0  # the row that an even height rolls from one border to the other
+    torch.testing.assert_close(convolve(scene.flip(-2), _turn(psf)), convolve(scene, psf).flip(-2))
+
+
+def test_captures_of_an_upside_down_camera_are_turned_whole(tmp_path, generator):
+    """Row for row, without a row of the opposite border: a ground truth turned by its reader stays aligned."""
+    frame = np.random.default_rng(0).integers(1, 200, (6, 4, 1)).astype(np.uint8)
+    calibration = Calibration(torch.ones(1, 1, 6, 4), upside_down=True)
+    np.testing.assert_allclose(calibration.correct(frame)[0, 0], frame[::-1, :, 0] / 255, rtol=1e-6)
+
+
+# --- Levels -------------------------------------------------------------------------------------------
+
+
+def noisy(caustic, level, sigma=0.002):
+    noise = sigma * np.random.default_rng(1).standard_normal(caustic.shape)
+    return ((0.8 * caustic + level + noise).clip(0, 1) * 65535).astype(np.uint16)[..., None]
+
+
+def test_given_background_is_subtracted(tmp_path, caustic):
+    path = store(tmp_path / "psf.tif", noisy(caustic, 0.1, sigma=0))
+    calibration = Calibration.from_file(path, background=0.1)
+    assert calibration.background == (0.1,)
+    np.testing.assert_allclose(calibration.psf[0, 0], caustic / caustic.sum(), atol=1e-5)
+
+
+@pytest.mark.parametrize("level", [0.02, 0.1])
+def test_even_light_is_found(tmp_path, caustic, level):
+    calibration = Calibration.from_file(store(tmp_path / "psf.tif", noisy(caustic, level)))
+    assert calibration.background[0] == pytest.approx(level, abs=0.005)
+    clean = caustic / caustic.sum()
+    left = np.abs(calibration.psf[0, 0].numpy() - clean).sum()
+    kept = np.abs(Calibration.from_file(tmp_path / "psf.tif", background=0.0).psf[0, 0].numpy() - clean).sum()
+    assert left < 0.1  # what the noise of 1,920 pixels adds once it is clipped at zero
+    assert left < kept / 3
+
+
+def test_dark_frame_is_subtracted_from_psf_and_captures(tmp_path, caustic):
+    pattern = np.random.default_rng(2).integers(500, 4000, (*SIZE, 1)).astype(np.uint16)
+    light = (caustic * 50000).astype(np.uint16)[..., None]
+    dark = store(tmp_path / "dark.tif", pattern)
+    calibration = Calibration.from_file(store(tmp_path / "psf.tif", light + pattern), dark=dark, background=0.0)
+    np.testing.assert_allclose(calibration.psf[0, 0], light[..., 0] / light.sum(), atol=1e-7)
+    np.testing.assert_allclose(calibration.correct(light // 2 + pattern)[0, 0], light[..., 0] // 2 / 65535, atol=1e-6)
+
+
+def test_dark_frame_is_cropped_and_binned_with_the_frame(tmp_path, caustic):
+    pattern = np.random.default_rng(2).integers(500, 4000, (*SIZE, 1)).astype(np.uint16)
+    light = (caustic * 50000).astype(np.uint16)[..., None]
+    options = {"background": 0.0, "crop": (32, 24), "binning": 2}
+    clean = Calibration.from_file(store(tmp_path / "clean.npy", light), **options)
+    dark = store(tmp_path / "dark.npy", pattern)
+    found = Calibration.from_file(store(tmp_path / "psf.npy", light + pattern), dark=dark, **options)
+    assert found.size == (16, 12)
+    torch.testing.assert_close(found.psf, clean.psf, rtol=1e-4, atol=1e-7)
+
+
+def test_twelve_bits_in_a_file_of_sixteen(tmp_path, caustic):
+    frame = (caustic * 4095).astype(np.uint16)[..., None]
+    calibration = Calibration.from_file(store(tmp_path / "psf.png", frame), bit_depth=12)
+    capture = np.full((*SIZE, 1), 1365, np.uint16)
+    torch.testing.assert_close(calibration.correct(capture), torch.full((1, 1, *SIZE), 1 / 3))
+    with pytest.raises(ParameterError, match="at least 13 bits"):
+        calibration.correct(4 * capture)
+
+
+def test_correct_by_hand():
+    """(200 - 50) / 250 and so on, then the mean of the middle 2 x 2 of a 4 x 4 frame, last row first."""
+    frame = np.zeros((4, 4, 1), np.float32)
+    frame[1:3, 1:3, 0] = [[0.8, 0.4], [0.2, 0.6]]
+    dark = torch.full((1, 1, 4, 4), 0.1)
+    whole = Calibration(torch.ones(1, 1, 1, 1), dark=dark, crop=(2, 2), binning=2)
+    assert whole.correct(frame).item() == pytest.approx((0.7 + 0.3 + 0.1 + 0.5) / 4)
+    rows = Calibration(torch.ones(1, 1, 2, 2), dark=dark, crop=(2, 2), upside_down=True)
+    torch.testing.assert_close(rows.correct(frame), torch.tensor([[[[0.1, 0.5], [0.7, 0.3]]]]))
+
+
+def test_colour_capture_of_a_grey_psf_keeps_its_colours():
+    calibration = Calibration(torch.ones(1, 1, 4, 4))
+    assert calibration.correct(np.zeros((4, 4, 3), np.uint8)).shape == (1, 3, 4, 4)
+
+
+# --- Hash ---------------------------------------------------------------------------------------------
+
+
+def test_hash_is_that_of_the_content(tmp_path, caustic):
+    frame = (caustic * 65535).astype(np.uint16)[..., None]
+    one = Calibration.from_file(store(tmp_path / "a.png", frame)).psf_hash
+    assert re.fullmatch(r"[0-9a-f]{16}", one)
+    assert one == Calibration.from_file(store(tmp_path / "b.tif", frame)).psf_hash
+    frame[20, 20] += 1
+    assert one != Calibration.from_file(store(tmp_path / "a.png", frame)).psf_hash
+
+
+def test_hash_is_the_same_in_every_process_and_knows_the_shape():
+    psf = torch.arange(1, 13).reshape(1, 1, 3, 4).float()
+    assert Calibration(psf).psf_hash == "6832dbfc57f8def7"
+    assert Calibration(psf.reshape(1, 1, 4, 3)).psf_hash != "6832dbfc57f8def7"
+    assert Calibration(psf.movedim(-1, -2).contiguous().movedim(-1, -2)).psf_hash == "6832dbfc57f8def7"
+
+
+# --- Refusals -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("dtype", "top", "bit_depth", "bits"),
+    [
+        ("u1", 255, None, 8),
+        ("u2", 65535, None, 16),
+        ("u2", 4095, 12, 12),
+        ("u2", 65520, None, 16),
+        ("u2", 4095, None, 12),
+        ("u2", 1023, None, 10),
+    ],
+    ids=["8", "16", "12 of 16", "12 in the upper bits", "12 in the lower bits, unsaid", "10 likewise"],
+)
+def test_saturated_psf(tmp_path, caustic, dtype, top, bit_depth, bits):
+    frame = (1.5 * caustic * top).clip(0, top).astype(dtype)[..., None]
+    full = (frame == top).sum()
+    assert full > 2
+    message = f"PSF is saturated: {full:,} of 1,920 pixels are at the {bits}-bit maximum {top}. Lower the exposure"
+    with pytest.raises(PsfError, match=re.escape(message)):
+        Calibration.from_file(store(tmp_path / "psf.png", frame), bit_depth=bit_depth)
+
+
+def test_one_saturated_channel_is_enough(tmp_path, caustic):
+    light = coloured(caustic) * np.array([1, 2.5, 1])
+    with pytest.raises(PsfError, match="PSF is saturated"):
+        Calibration.from_file(store(tmp_path / "psf.png", (light.clip(0, 1) * 255).astype(np.uint8)))
+
+
+def test_a_hot_pixel_is_no_saturation(tmp_path, caustic):
+    frame = (caustic * 200).astype(np.uint8)[..., None]
+    frame[3, 3] = 255
+    assert Calibration.from_file(store(tmp_path / "psf.png", frame)).size == SIZE
+
+
+@pytest.mark.parametrize("background", ["estimate", 0.0, 0.5])
+def test_empty_psf(tmp_path, background):
+    frame = np.full((8, 8, 3), 100, np.uint8)
+    frame[..., 1] = 0
+    with pytest.raises(PsfError, match=r"PSF `.*psf.png` is empty: .* no light is left in a channel\. Expose longer"):
+        Calibration.from_file(store(tmp_path / "psf.png", frame), background=background)
+
+
+def test_nan_in_the_file(tmp_path, caustic):
+    caustic[3, 4] = np.nan
+    with pytest.raises(ImageError, match="holds NaN or infinity"):
+        Calibration.from_file(store(tmp_path / "psf.npy", caustic[..., None]))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_nan_in_the_tensor(value):
+    with pytest.raises(PsfError, match="`psf` holds NaN or infinity"):
+        Calibration(torch.full((1, 1, 4, 4), value))
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("shape", [(1, 2, 4, 4), (1, 4, 4, 4), (2, 1, 4, 4), (3, 4, 4), (1, 3), (4,)])
+def test_wrong_axes(shape):
+    with pytest.raises(PsfError, match=re.escape(f"`psf` {shape} must be (1, 1 or 3, H, W): grey or RGB.")):
+        Calibration(torch.ones(shape))
+
+
+def test_negative_or_dark_psf():
+    with pytest.raises(PsfError, match=r"`psf` \(smallest value -1\) must not be negative"):
+        Calibration(-torch.ones(1, 1, 4, 4))
+    dark = torch.ones(1, 3, 4, 4)
+    dark[:, 1] = 0
+    with pytest.raises(PsfError, match="must hold light in each channel"):
+        Calibration(dark)
+
+
+def test_two_channels_in_the_file(tmp_path):
+    np.save(tmp_path / "psf.npy", np.ones((8, 8, 2), np.uint8))
+    with pytest.raises(ImageError, match=r"has the axes \(8 x 8 x 2\)"):
+        Calibration.from_file(tmp_path / "psf.npy")
+
+
+@pytest.mark.parametrize("background", [-0.1, 1.0, float("nan")])
+def test_background_out_of_range(tmp_path, caustic, background):
+    path = store(tmp_path / "psf.png", (caustic * 255).astype(np.uint8)[..., None])
+    with pytest.raises(ParameterError, match=r"`background` \(.*\) must be in \[0, 1\)"):
+        Calibration.from_file(path, background=background)
+
+
+def test_dark_frame_of_another_size(tmp_path, caustic):
+    path = store(tmp_path / "psf.png", (caustic * 255).astype(np.uint8)[..., None])
+    dark = store(tmp_path / "dark.png", np.zeros((24, 20, 1), np.uint8))
+    with pytest.raises(ShapeError, match=r"`dark` \(1, 24, 20\) must have the size of the frame \(1, 48, 40\)"):
+        Calibration.from_file(path, dark=dark)
+
+
+@pytest.mark.parametrize(
+    ("psf", "binning", "capture", "way_out"),
+    [
+        ((8, 6), 1, (16, 12), "The capture is 2 times as large: bin it by 2."),
+        ((16, 12), 1, (4, 3), "The PSF is 4 times as large: bin it by 4."),
+        ((8, 6), 1, (9, 12), "Crop the capture around its centre: `--crop 8 6`."),
+        ((8, 6), 2, (18, 14), "Crop the capture around its centre: `--crop 16 12`."),  # in raw pixels
+        ((8, 6), 1, (7, 12), "Use the PSF that belongs to this camera."),
+    ],
+)
+def test_capture_of_another_size(psf, binning, capture, way_out):
+    height, width = (n // binning for n in capture)
+    message = f"`psf` ({psf[0]} x {psf[1]}) and the capture ({height} x {width}) must have the same height and width. "
+    with pytest.raises(ShapeError, match=re.escape(message + way_out)):
+        Calibration(torch.ones(1, 1, *psf), binning=binning).correct(np.zeros((*capture, 1), np.uint8))
+
+
+def test_grey_capture_of_a_colour_psf():
+    with pytest.raises(ShapeError, match="The capture is grey, but `psf` has colours"):
+        Calibration(torch.ones(1, 3, 4, 4)).correct(np.zeros((4, 4, 1), np.uint8))
