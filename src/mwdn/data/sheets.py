@@ -20,7 +20,7 @@ def for_people(image: Image) -> Image:
     return (image / brightest.clamp(min=1e-12)[:, None, None, None]).clamp(0, 1)
 
 
-def contact_sheet(rows: list[list[Image]], titles: list[str], *, height: int = 240) -> Image:
+def contact_sheet(rows: list[list[Tensor]], titles: list[str], *, height: int = 240) -> Tensor:
     """Arrange pictures in rows, each scaled by `for_people` and resized to one height.
 
     Args:
@@ -39,7 +39,7 @@ def contact_sheet(rows: list[list[Image]], titles: list[str], *, height: int = 2
     return torch.cat([_heading(titles, widths, head, widest), *lines], dim=-2)
 
 
-def _cell(picture: Image, height: int, gap: int) -> Image:
+def _cell(picture: Image, height: int, gap: int) -> Tensor:
     picture = for_people(picture).expand(-1, 3, -1, -1)
     width = max(1, round(picture.shape[-1] * height / picture.shape[-2]))
     smaller = height < picture.shape[-2]
