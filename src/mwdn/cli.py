@@ -10,7 +10,7 @@ import cyclopts
 from cyclopts import App, Parameter
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import track
+from rich.progress import Progress, track
 from torch import Tensor
 
 from mwdn import __version__
@@ -19,6 +19,7 @@ from mwdn.data.images import write_picture
 from mwdn.data.importers import Layout, import_pairs
 from mwdn.data.sheets import contact_sheet
 from mwdn.errors import MwdnError
+from mwdn.evaluation import Variant
 from mwdn.reconstruct import (
     SUMMARY,
     Format,
@@ -144,6 +145,51 @@ def import_(
     names = f": {', '.join(done.skipped)}" if done.skipped else ""
     summary = f"{done.count:,} pairs written to {out}, {len(done.skipped):,} skipped{names}"
     console.print(summary, markup=False, highlight=False, soft_wrap=True)
+
+
+@app.command
+def evaluate(
+    *methods: str,
+    data: Path,
+    camera: CameraOptions,
+    protocol: str = "full",
+    variant: Variant | None = None,
+    first: int | None = None,
+    out: Path = Path("results/evaluate"),
+    device: str | None = None,
+) -> None:
+    """Compare methods on pairs of measurements and scenes: quality, time, memory.
+
+    Args:
+        methods: admm, wiener, fista, or paths of checkpoints.
+        data: HDF5 file of pairs.
+        camera: calibration of the camera that took them.
+        protocol: full, centre-128 (the paper's), or rows and columns such as 60:270,60:440 (DiffuserCam's).
+        variant: raw, clipped to [0, 1], or best-gain (one gain and offset a picture); raw for centre-128 and
+            clipped for the others unless given.
+        first: use the first so many pairs alone.
+        out: folder for report.json and comparison.png.
+        device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
+    """
+    from mwdn import evaluation
+    from mwdn.data.pairs import PairFile
+
+    part, calibration = evaluation.Protocol.parse(protocol), camera.load()
+    reconstructors = {method: Reconstructor(method, calibration, device=device) for method in methods}
+    file = PairFile(data)
+    pairs = evaluation.First(file, len(file) if first is None else first)
+    with Progress(console=errors, transient=True) as bars:
+        bar = bars.add_task("Evaluating", total=len(reconstructors) * len(pairs))
+        report = evaluation.evaluate(
+            reconstructors,
+            pairs,
+            part,
+            variant=variant,
+            progress=lambda name, _: bars.update(bar, advance=1, description=name),
+        )
+    report.write(out)
+    console.print(report.table())
+    console.print(f"Look at {out}", highlight=False)
 
 
 @app.command

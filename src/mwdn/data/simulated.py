@@ -149,7 +149,9 @@ class SimulatedPairs:
         height, width = self.psf.shape[-2:]
         index = torch.cat([torch.randint(len(self.photographs), (1,), generator=g) for g in generators])
         pictures = self.photographs.light(index.to(self.psf.device))
-        pictures = torch.where((uniform(generators, 0, 1)[..., None, None] < 0.5).to(pictures.device), pictures.flip(-1), pictures)
+        pictures = torch.where(
+            (uniform(generators, 0, 1)[..., None, None] < 0.5).to(pictures.device), pictures.flip(-1), pictures
+        )
         p = self.placement
         extent = uniform(generators, *p.extent)[:, 0] * min(height, width)
         stretch = torch.exp(uniform(generators, -1, 1)[:, 0] * math.log(p.aspect) / 2)

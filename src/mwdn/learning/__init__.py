@@ -1,5 +1,7 @@
-"""Checkpoints of networks."""
+"""Losses, and checkpoints of networks."""
 
+from mwdn.learning.alexnet import load_alexnet, load_heads
 from mwdn.learning.checkpoint import load_network, save_network
+from mwdn.learning.losses import Loss
 
-__all__ = ["load_network", "save_network"]
+__all__ = ["Loss", "load_alexnet", "load_heads", "load_network", "save_network"]

@@ -1,0 +1,172 @@
+"""What a comparison found: numbers, a table, a sheet of pictures."""
+
+import json
+import math
+import statistics
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.table import Table
+from torch import Tensor
+
+from mwdn.data.images import write_picture
+from mwdn.data.sheets import contact_sheet
+from mwdn.data.writing import atomic
+from mwdn.errors import ImageError, UnknownNameError
+from mwdn.evaluation.metrics import LARGER_IS_BETTER, METRICS, bootstrap
+
+JSON = "report.json"
+SHEET = "comparison.png"
+
+_TITLES = {"psnr": "PSNR / dB", "ssim": "SSIM", "lpips": "LPIPS", "feature_mse": "feature MSE", "mse": "MSE"}
+_FORMATS = {"psnr": ".2f", "ssim": ".3f", "lpips": ".3f", "feature_mse": ".4g", "mse": ".3g"}
+
+
+@dataclass(frozen=True)
+class Scores:
+    """One method on all pictures.
+
+    Args:
+        values: of each metric, one number a picture; NaN where it is missing.
+        seconds: for each picture, warmed up, from the measurement in the host's memory to the reconstruction.
+        peak_bytes: memory for one picture, ``None`` where it is unknown. On a GPU the highest total of torch,
+            weights included. On a CPU only what goes beyond the highest memory of the process before this method.
+        device: kind of device that the method used.
+        learnable: count of learnable numbers.
+    """
+
+    values: dict[str, tuple[float, ...]]
+    seconds: tuple[float, ...]
+    peak_bytes: int | None
+    device: str
+    learnable: int
+
+    def summary(self, metric: str, confidence: float = 0.95) -> tuple[float, float, float]:
+        """Mean over the pictures and its confidence interval, by `bootstrap`; NaN where the metric is missing.
+
+        Raises:
+            UnknownNameError: no such metric.
+            ParameterError: the confidence is outside (0, 1).
+        """
+        if metric not in self.values:
+            raise UnknownNameError("metric", metric, self.values)
+        return bootstrap(self.values[metric], confidence)
+
+    @property
+    def median_seconds(self) -> float:
+        """For one picture."""
+        return statistics.median(self.seconds)
+
+
+@dataclass(frozen=True)
+class Report:
+    """All methods under one protocol.
+
+    Args:
+        protocol: name of the part that was compared.
+        variant: what was done to reconstructions first.
+        methods: scores by the method's name.
+        missing: metrics that could not be measured, and why.
+        rows: of the sheet: scene, measurement and one reconstruction a method, each (1, C, H, W), for the first
+            pictures.
+    """
+
+    protocol: str
+    variant: str
+    methods: dict[str, Scores]
+    missing: dict[str, str]
+    rows: list[list[Tensor]] = field(repr=False)
+
+    @property
+    def pictures(self) -> int:
+        """How many were compared."""
+        return len(next(iter(self.methods.values())).seconds)
+
+    def table(self) -> Table:
+        """Means with their 95 % confidence intervals, the best in bold; time, memory, learnable numbers."""
+        title = f"{self.pictures} pictures, protocol {self.protocol}, {self.variant}: mean [95 % confidence]"
+        caption = "\n".join(f"{_TITLES[name]} is missing: {reason}" for name, reason in self.missing.items())
+        table = Table("method", title=title, caption=caption or None)
+        measured = [metric for metric in METRICS if metric not in self.missing]
+        for heading in (*(_TITLES[metric] for metric in measured), "ms / picture", "memory", "learnable"):
+            table.add_column(heading, justify="right")
+        best = {metric: self._best(metric) for metric in measured}
+        for name, scores in self.methods.items():
+            cells = [_cell(metric, scores.summary(metric), name in best[metric]) for metric in measured]
+            table.add_row(name, *cells, *_costs(scores))
+        return table
+
+    def json(self) -> str:
+        """Everything but the pictures, as JSON.
+
+        ``null`` stands for a number that is missing, and for the infinite PSNR of a picture without any error.
+        """
+        content = {
+            "version": version("mwdn"),
+            "torch": torch.__version__,
+            "protocol": self.protocol,
+            "variant": self.variant,
+            "pictures": self.pictures,
+            "missing": self.missing,
+            "methods": {name: _plain(scores) for name, scores in self.methods.items()},
+        }
+        return json.dumps(_finite(content), indent=2, allow_nan=False)
+
+    def sheet(self) -> Tensor:
+        """Arrange the first pictures, (1, 3, H, W) in linear light: scene, measurement, then each method."""
+        return contact_sheet(self.rows, ["scene", "measurement", *(Path(name).name for name in self.methods)])
+
+    def write(self, out: Path) -> None:
+        """Write ``report.json`` and ``comparison.png`` into a folder, atomically.
+
+        Raises:
+            ImageError: the folder cannot be written to.
+        """
+        try:
+            with atomic(out / JSON) as temporary:
+                temporary.write_text(self.json() + "\n", encoding="utf-8")
+        except OSError as error:
+            raise ImageError(f"`{out / JSON}` cannot be written: {error.strerror}. Choose another folder.") from error
+        if self.rows:
+            write_picture(out / SHEET, self.sheet())
+
+    def _best(self, metric: str) -> set[str]:
+        means = {name: statistics.fmean(scores.values[metric]) for name, scores in self.methods.items()}
+        wanted = (max if metric in LARGER_IS_BETTER else min)(means.values())
+        return {name for name, mean in means.items() if mean == wanted}
+
+
+def _cell(metric: str, summary: tuple[float, float, float], best: bool) -> str:
+    mean, low, high = (format(value, _FORMATS[metric]) for value in summary)
+    # The backslash keeps rich from reading the interval as a style.
+    return f"{f'[bold]{mean}[/bold]' if best else mean} \\[{low}, {high}]"
+
+
+def _costs(scores: Scores) -> tuple[str, str, str]:
+    memory = "?" if scores.peak_bytes is None else f"{scores.peak_bytes / 2**20:,.0f} MiB {scores.device}"
+    return f"{1000 * scores.median_seconds:.1f}", memory, f"{scores.learnable:,}"
+
+
+def _plain(scores: Scores) -> dict[str, Any]:
+    summaries = {metric: scores.summary(metric) for metric in scores.values}
+    return {
+        "learnable": scores.learnable,
+        "device": scores.device,
+        "peak_bytes": scores.peak_bytes,
+        "median_seconds": scores.median_seconds,
+        "mean_low_high": summaries,
+        "values": scores.values,
+        "seconds": scores.seconds,
+    }
+
+
+def _finite(content: Any) -> Any:  # noqa: ANN401
+    """Replace NaN and infinity, which JSON has not, by ``None``."""
+    if isinstance(content, dict):
+        return {key: _finite(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_finite(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content

@@ -1,0 +1,248 @@
+"""Distances between pictures, one number a sample, and their weighted sum.
+
+All of them are computed in float32, also inside autocast, on the device of the pictures, and are differentiable:
+their gradients are finite, also between identical pictures.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from functools import wraps
+from pathlib import Path
+from typing import TypeVar, cast
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from mwdn.errors import ParameterError, ShapeError, UnknownNameError
+from mwdn.learning.alexnet import AlexNet, Heads, load_alexnet, load_heads
+from mwdn.types import Image
+
+_Distance = TypeVar("_Distance", bound=Callable[..., Tensor])
+
+
+def _comparing(distance: _Distance) -> _Distance:
+    """Refuse pictures of different shapes, and compute in float32 outside autocast."""
+
+    @wraps(distance)
+    def wrapped(image: Tensor, reference: Tensor, *networks: nn.Module, **named: nn.Module) -> Tensor:
+        if image.ndim != 4 or image.shape != reference.shape:
+            raise ShapeError(
+                f"`image` {tuple(image.shape)} and `reference` {tuple(reference.shape)} must have the same shape "
+                "(B, C, H, W). Crop or resize the larger one."
+            )
+        with torch.autocast(image.device.type, enabled=False):
+            return distance(image.float(), reference.float(), *networks, **named)
+
+    return cast(_Distance, wrapped)
+
+
+@_comparing
+def mse(image: Image, reference: Image) -> Tensor:
+    """Mean squared error of each sample.
+
+    Args:
+        image: (B, C, H, W), any range.
+        reference: of the same shape.
+
+    Returns:
+        (B,), 0 for identical pictures.
+
+    Raises:
+        ShapeError: the shapes differ.
+    """
+    return (image - reference).square().mean((1, 2, 3))
+
+
+@_comparing
+def l1(image: Image, reference: Image) -> Tensor:
+    """Mean absolute error of each sample.
+
+    Args:
+        image: (B, C, H, W), any range.
+        reference: of the same shape.
+
+    Returns:
+        (B,), 0 for identical pictures.
+
+    Raises:
+        ShapeError: the shapes differ.
+    """
+    return (image - reference).abs().mean((1, 2, 3))
+
+
+WINDOW = 11
+"""Pixels along each side of the window of `ssim`."""
+
+
+@_comparing
+def ssim(image: Image, reference: Image) -> Tensor:
+    """Structural similarity of each sample, in a Gaussian window of 11 x 11 pixels, sigma 1.5, for a range of 1.
+
+    Averaged over colours and over all windows that lie wholly inside the picture. It equals scikit-image's
+    ``structural_similarity(gaussian_weights=True, use_sample_covariance=False, data_range=1)``. torchmetrics also
+    counts windows that reach into a reflected border, which changes the second decimal place of small pictures.
+
+    Args:
+        image: (B, C, H, W), nominally in [0, 1].
+        reference: of the same shape.
+
+    Returns:
+        (B,), at most 1, for identical pictures; larger is more similar. As a loss, `Loss` takes 1 - SSIM.
+
+    Raises:
+        ShapeError: the shapes differ, or a side is shorter than 11 pixels.
+
+    References:
+        Z. Wang et al., "Image quality assessment", IEEE Trans. Image Process. 13, 600 (2004), eq. (13).
+    """
+    if min(image.shape[-2:]) < WINDOW:
+        raise ShapeError(f"`image` {tuple(image.shape)} must have at least {WINDOW} x {WINDOW} pixels for SSIM.")
+    x, y = image.flatten(0, 1)[:, None], reference.flatten(0, 1)[:, None]
+    mean_x, mean_y, square_x, square_y, product = _blurred(torch.cat([x, y, x * x, y * y, x * y])).chunk(5)
+    variances = square_x - mean_x.square() + square_y - mean_y.square()
+    covariance = product - mean_x * mean_y
+    c1, c2 = 0.01**2, 0.03**2  # (K1 L)^2 and (K2 L)^2 for the range L = 1
+    luminance = (2 * mean_x * mean_y + c1) / (mean_x.square() + mean_y.square() + c1)
+    structure = (2 * covariance + c2) / (variances + c2)
+    return (luminance * structure).view(len(image), -1).mean(1)
+
+
+def _blurred(planes: Tensor) -> Tensor:
+    """Means of (N, 1, H, W) in each Gaussian window that fits, (N, 1, H - 10, W - 10)."""
+    distance = torch.arange(WINDOW, device=planes.device, dtype=planes.dtype) - WINDOW // 2
+    weights = torch.exp(-0.5 * (distance / 1.5).square())
+    weights = weights / weights.sum()
+    return F.conv2d(F.conv2d(planes, weights.view(1, 1, -1, 1)), weights.view(1, 1, 1, -1))
+
+
+@_comparing
+def feature_mse(image: Image, reference: Image, alexnet: AlexNet) -> Tensor:
+    """Mean squared error of AlexNet's features relu2 plus that of relu4, of each sample.
+
+    This is what the MWDN paper and its public code call LPIPS, in training and in tables; `lpips` is another
+    number. Pictures enter as they are, without the normalisation of ImageNet. (The authors' files are BGR, and so
+    are the pictures behind their published numbers.)
+
+    Args:
+        image: (B, 1 or 3, H, W), nominally in [0, 1], at least 31 x 31 pixels; grey is repeated.
+        reference: of the same shape.
+        alexnet: from `mwdn.learning.alexnet.load_alexnet`, on the device of the pictures.
+
+    Returns:
+        (B,), 0 for identical pictures.
+
+    Raises:
+        ShapeError: the shapes differ or do not suit AlexNet.
+
+    References:
+        Eq. (3) of the MWDN paper.
+    """
+    pairs = zip(alexnet(image, 4), alexnet(reference, 4), strict=True)
+    relu = [(found - wanted).square().mean((1, 2, 3)) for found, wanted in pairs]
+    return relu[1] + relu[3]
+
+
+@_comparing
+def lpips(image: Image, reference: Image, alexnet: AlexNet, heads: Heads) -> Tensor:
+    """LPIPS 0.1 of each sample: calibrated distance of AlexNet's features.
+
+    Args:
+        image: (B, 1 or 3, H, W) in [0, 1], at least 31 x 31 pixels; grey is repeated. LPIPS was calibrated on the
+            numbers of sRGB files, not on linear light.
+        reference: of the same shape.
+        alexnet: from `mwdn.learning.alexnet.load_alexnet`, on the device of the pictures.
+        heads: from `mwdn.learning.alexnet.load_heads`, on the same device.
+
+    Returns:
+        (B,), 0 for identical pictures, about 0.1 for slight and 0.7 for strong distortions.
+
+    Raises:
+        ShapeError: the shapes differ or do not suit AlexNet.
+
+    References:
+        R. Zhang et al., "The unreasonable effectiveness of deep features as a perceptual metric", CVPR (2018),
+        eq. (1).
+    """
+    # LPIPS wants [-1, 1]; this shift and scale are ImageNet's mean and deviation, carried over to that range.
+    shift = image.new_tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1)
+    scale = image.new_tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1)
+    found, wanted = (alexnet((2 * picture - 1 - shift) / scale) for picture in (image, reference))
+    return heads([(_unit(a) - _unit(b)).square() for a, b in zip(found, wanted, strict=True)])
+
+
+def _unit(features: Tensor) -> Tensor:
+    # `vector_norm` has the gradient 0 where all channels are 0, where a square root would give NaN.
+    return features / (torch.linalg.vector_norm(features, dim=1, keepdim=True) + 1e-10)
+
+
+NAMES = ("feature_mse", "l1", "lpips", "mse", "ssim")
+"""What a `Loss` can be made of."""
+
+
+class Loss(nn.Module):
+    """A weighted sum of distances, averaged over the batch.
+
+    AlexNet and the heads of LPIPS are loaded only if a part needs them; move them with ``.to(device)``.
+
+    Args:
+        weights: of each part by its name in `NAMES`; ``{"mse": 1.0, "feature_mse": 0.05}`` ends the training of
+            the MWDN paper. Similarity enters as 1 - SSIM. A part of weight 0 is reported, not trained on.
+        alexnet: file of AlexNet's weights; see `mwdn.learning.alexnet.load_alexnet`.
+        heads: file of LPIPS's heads; see `mwdn.learning.alexnet.load_heads`.
+
+    Raises:
+        UnknownNameError: no such part.
+        ParameterError: no part, or a weight that is negative or not finite.
+        CheckpointError: a network is needed and cannot be had.
+    """
+
+    def __init__(
+        self, weights: Mapping[str, float], *, alexnet: str | Path | None = None, heads: str | Path | None = None
+    ) -> None:
+        super().__init__()
+        self.weights = _checked(weights)
+        """May be changed while training: a weight, not a name."""
+        self.alexnet = load_alexnet(alexnet) if {"feature_mse", "lpips"} & set(weights) else None
+        self.heads = load_heads(heads, alexnet=alexnet) if "lpips" in weights else None
+
+    def forward(self, reconstruction: Image, scene: Image) -> tuple[Tensor, dict[str, Tensor]]:
+        """Compare a batch.
+
+        Args:
+            reconstruction: (B, C, H, W), nominally in [0, 1].
+            scene: of the same shape.
+
+        Returns:
+            The weighted sum, a scalar to be minimised, and each part before its weight, a scalar without gradient.
+
+        Raises:
+            ShapeError: the shapes differ or do not suit a part.
+        """
+        total, parts = reconstruction.new_zeros((), dtype=torch.float32), {}
+        for name, weight in self.weights.items():
+            with torch.set_grad_enabled(weight > 0 and torch.is_grad_enabled()):
+                part = self._part(name, reconstruction, scene).mean()
+            total = total + weight * part if weight > 0 else total
+            parts[name] = part.detach()
+        return total, parts
+
+    def _part(self, name: str, image: Tensor, reference: Tensor) -> Tensor:
+        if name == "ssim":
+            return 1 - ssim(image, reference)
+        if name == "feature_mse" and self.alexnet is not None:
+            return feature_mse(image, reference, self.alexnet)
+        if name == "lpips" and self.alexnet is not None and self.heads is not None:
+            return lpips(image, reference, self.alexnet, self.heads)
+        return {"mse": mse, "l1": l1}[name](image, reference)
+
+
+def _checked(weights: Mapping[str, float]) -> dict[str, float]:
+    if not weights:
+        raise ParameterError(f'`weights` must name at least one of {", ".join(NAMES)}, for example {{"mse": 1.0}}.')
+    for name, weight in weights.items():
+        if name not in NAMES:
+            raise UnknownNameError("loss", name, NAMES)
+        if not (math.isfinite(weight) and weight >= 0):
+            raise ParameterError(f"The weight of `{name}` ({weight}) must be finite and not negative.")
+    return dict(weights)

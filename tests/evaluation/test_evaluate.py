@@ -1,0 +1,205 @@
+"""The comparison from end to end, on a small simulated camera."""
+
+import io
+import json
+import sys
+import types
+
+import pytest
+import torch
+from rich.console import Console
+from torch import nn
+
+from mwdn import cli
+from mwdn.calibration import Calibration
+from mwdn.data.images import read_frame, write_linear
+from mwdn.errors import CheckpointError, ParameterError, ShapeError, UnknownNameError
+from mwdn.evaluation import First, Perceptual, Protocol, evaluate, learnable_numbers, measure
+from mwdn.learning import alexnet
+from mwdn.networks import build
+from mwdn.optics import Camera
+from mwdn.optics.patterns import contour_psf
+from mwdn.reconstruct import Reconstructor
+from mwdn.solvers import Admm
+
+SIZE = 40, 48
+
+
+@pytest.fixture
+def camera(generator):
+    return Camera(contour_psf(SIZE, cell=10, generator=generator))
+
+
+@pytest.fixture
+def pairs(camera, generator):
+    """Three (measurement, scene) as a `PairFile` gives them."""
+    seeds = torch.rand(3, 3, 5, 6, generator=generator)
+    scenes = nn.functional.interpolate(seeds, SIZE, mode="bicubic").clamp(0, 1)
+    return list(zip(camera.simulate(scenes, generator=generator), scenes, strict=True))
+
+
+@pytest.fixture
+def perceptual(data):
+    return Perceptual.load(data / "lpips" / "alexnet_features_torchvision.pth")
+
+
+def printed(table):
+    file = io.StringIO()
+    Console(file=file, width=200).print(table)
+    return file.getvalue()
+
+
+def test_solvers_from_end_to_end(camera, pairs, perceptual, tmp_path):
+    calibration = Calibration(camera.psf)
+    methods = {
+        "wiener": Reconstructor("wiener", calibration, device="cpu"),
+        "admm": Reconstructor(Admm(iterations=20), calibration, device="cpu"),
+    }
+    done = []
+    report = evaluate(
+        methods, pairs, Protocol(), perceptual=perceptual, shown=2, progress=lambda name, i: done.append((name, i))
+    )
+    assert done == [(name, i) for name in methods for i in range(3)]
+    assert (report.protocol, report.variant, report.pictures, report.missing) == ("full", "clipped", 3, {})
+    for name, scores in report.methods.items():
+        for i, (measurement, scene) in enumerate(pairs):
+            wanted = measure(methods[name](measurement[None]), scene[None], Protocol(), perceptual=perceptual)
+            found = {metric: values[i] for metric, values in scores.values.items()}
+            assert found == pytest.approx({metric: value.item() for metric, value in wanted.items()})
+        mean, low, high = scores.summary("psnr")
+        assert 8 < low <= mean <= high
+        assert len(scores.seconds) == 3
+        assert scores.median_seconds > 0
+        assert scores.learnable == 0
+        assert scores.device == "cpu"
+        assert scores.peak_bytes is None or scores.peak_bytes >= 0
+    text = printed(report.table())
+    assert "3 pictures, protocol full, clipped" in text
+    for word in ("wiener", "admm", "PSNR / dB", "LPIPS", f"{report.methods['admm'].summary('psnr')[0]:.2f} ["):
+        assert word in text
+    report.write(tmp_path / "out")
+    content = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert content["methods"]["admm"]["values"]["psnr"] == list(report.methods["admm"].values["psnr"])
+    assert content["methods"]["wiener"]["mean_low_high"]["ssim"] == list(report.methods["wiener"].summary("ssim"))
+    sheet = read_frame(tmp_path / "out" / "comparison.png")
+    # Two rows of four pictures, 240 high, each with a gap of 6, under a heading of 26.
+    assert sheet.shape == (26 + 2 * 246, 4 * (240 * 48 // 40 + 6), 3)
+
+
+def test_missing_metrics_are_named_and_not_averaged(pairs):
+    reason = "No weights of AlexNet here."
+    report = evaluate({"same": lambda b: b}, pairs, Protocol.parse("centre-32"), perceptual=Perceptual.none(reason))
+    assert report.variant == "raw"
+    text = printed(report.table())
+    assert f"LPIPS is missing: {reason}" in text
+    assert f"feature MSE is missing: {reason}" in text
+    content = json.loads(report.json())
+    assert content["missing"] == {"lpips": reason, "feature_mse": reason}
+    assert content["methods"]["same"]["values"]["lpips"] == [None] * 3
+    assert content["methods"]["same"]["mean_low_high"]["lpips"] == [None] * 3
+    with pytest.raises(UnknownNameError, match="Did you mean 'psnr'"):
+        report.methods["same"].summary("psn")
+
+
+def test_weights_that_cannot_be_had_are_reported_unasked(pairs, monkeypatch):
+    def unreachable(path=None):
+        raise CheckpointError("no network")
+
+    monkeypatch.setattr("mwdn.evaluation.metrics.load_alexnet", unreachable)
+    report = evaluate({"same": lambda b: b}, pairs[:1], Protocol())
+    assert report.missing == {"lpips": "no network", "feature_mse": "no network"}
+
+
+def test_the_best_method_is_bold(pairs):
+    scenes = {measurement.sum().item(): scene for measurement, scene in pairs}
+    methods = {"perfect": lambda b: scenes[b.sum().item()][None].clone(), "dark": torch.zeros_like}
+    report = evaluate(methods, pairs, Protocol(), perceptual=Perceptual.none())
+    psnr, ssim, mse = (list(report.table().columns[i].cells) for i in (1, 2, 3))
+    assert psnr[0].startswith("[bold]inf")
+    assert ssim[0].startswith("[bold]1.000")
+    assert mse[0].startswith("[bold]0")
+    assert not any("bold" in column[1] for column in (psnr, ssim, mse))
+    assert json.loads(report.json())["methods"]["perfect"]["values"]["psnr"] == [None] * 3
+
+
+def test_methods_are_called_one_picture_at_a_time_after_a_warm_up(pairs):
+    seen = []
+
+    def method(measurement):
+        seen.append(measurement)
+        return measurement
+
+    evaluate({"method": method}, pairs, Protocol(), perceptual=Perceptual.none())
+    timed = seen[-3:]
+    assert len(seen) > 3
+    assert [b.shape[0] for b in timed] == [1, 1, 1]
+    assert all(torch.equal(b[0], measurement) for b, (measurement, _) in zip(timed, pairs, strict=True))
+
+
+def test_learnable_numbers_are_those_of_the_network_inside(camera):
+    network = build("wiener")
+    assert learnable_numbers(Reconstructor(network, Calibration(camera.psf), device="cpu")) == 2
+    assert learnable_numbers(nn.Conv2d(3, 3, 1)) == 12
+    assert learnable_numbers(torch.zeros_like) == 0
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_wrong_calls_are_refused(pairs):
+    same = {"same": lambda b: b}
+    for methods, some in (({}, pairs), (same, [])):
+        with pytest.raises(ParameterError, match="must not be empty"):
+            evaluate(methods, some, Protocol(), perceptual=Perceptual.none())
+    with pytest.raises(ShapeError, match="must have the same shape"):
+        evaluate({"small": lambda b: b[:, :1]}, pairs, Protocol(), perceptual=Perceptual.none())
+
+
+def test_first_reads_only_what_is_asked_for(pairs):
+    read = []
+
+    class Watched(list):
+        def __getitem__(self, index):
+            read.append(index)
+            return super().__getitem__(index)
+
+    first = First(Watched(pairs), 2)
+    assert len(first) == 2
+    read.clear()
+    assert torch.equal(first[1][0], pairs[1][0])
+    assert read == [1]
+    with pytest.raises(IndexError):
+        first[2]
+    assert len(First(pairs, 10)) == 3
+    with pytest.raises(ParameterError, match="--first"):
+        First(pairs, 0)
+
+
+def run(*arguments):
+    with pytest.raises(SystemExit) as left:
+        cli.main([str(argument) for argument in arguments])
+    return left.value.code
+
+
+def test_command(camera, pairs, tmp_path, monkeypatch, capsys):
+    module = types.ModuleType("mwdn.data.pairs")
+    module.PairFile = lambda path: pairs if path == tmp_path / "pairs.h5" else None
+    monkeypatch.setitem(sys.modules, "mwdn.data.pairs", module)
+    monkeypatch.setattr(alexnet, "cache_folder", lambda: tmp_path / "cache")
+    monkeypatch.delenv("MWDN_ALEXNET", raising=False)
+
+    def unroutable(*_, **__):
+        raise OSError("Network is unreachable")
+
+    monkeypatch.setattr(alexnet, "urlopen", unroutable)
+    write_linear(tmp_path / "psf.npy", camera.psf)
+    common = ["--data", tmp_path / "pairs.h5", "--psf", tmp_path / "psf.npy", "--background", 0, "--device", "cpu"]
+    options = ["--first", 2, "--protocol", "2:38,4:40", "--variant", "best-gain", "--out", tmp_path / "out"]
+    assert run("evaluate", "wiener", "fista", *common, *options) == 0
+    out = capsys.readouterr().out
+    assert "LPIPS is missing" in " ".join(out.split())
+    content = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert list(content["methods"]) == ["wiener", "fista"]
+    assert "Network is unreachable" in content["missing"]["lpips"]
+    assert (content["pictures"], content["protocol"], content["variant"]) == (2, "2:38,4:40", "best-gain")
+    assert run("evaluate", *common) == 2
+    assert run("evaluate", "wiener", *common, "--protocol", "centre") == 2
+    assert run("evaluate", "winer", *common) == 2
