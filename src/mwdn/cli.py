@@ -20,6 +20,8 @@ from mwdn.data.importers import Layout, import_pairs
 from mwdn.data.sheets import contact_sheet
 from mwdn.errors import MwdnError
 from mwdn.evaluation import Variant
+from mwdn.learning.recipe import read_recipe
+from mwdn.learning.train import Report
 from mwdn.reconstruct import (
     SUMMARY,
     Format,
@@ -190,6 +192,46 @@ def evaluate(
     report.write(out)
     console.print(report.table())
     console.print(f"Look at {out}", highlight=False)
+
+
+@app.command
+def train(  # noqa: PLR0913
+    recipe: Path,
+    *,
+    camera: CameraOptions,
+    photos: Path,
+    out: Path = Path("runs/train"),
+    steps: int | None = None,
+    batch: int | None = None,
+    seed: int | None = None,
+    device: str | None = None,
+) -> None:
+    """Train a network for one camera on captures simulated through its PSF. Run again, it goes on where it stopped.
+
+    Args:
+        recipe: TOML file, see recipes/.
+        camera: calibration of the camera.
+        photos: folder of photographs, the more the better.
+        out: folder of the run: best.safetensors is what `mwdn reconstruct --method` takes.
+        steps: instead of the recipe's.
+        batch: instead of the recipe's.
+        seed: instead of the recipe's.
+        device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
+    """
+    from mwdn.learning.session import prepare
+
+    trainer = prepare(read_recipe(recipe, steps=steps, batch=batch, seed=seed), camera.load(), photos, out, device)
+    with Progress(*Progress.get_default_columns(), "{task.fields[now]}", console=errors) as bars:
+        bar = bars.add_task("Training", total=trainer.schedule.steps, completed=trainer.step, now="")
+
+        def show(report: Report) -> None:
+            now = f"{report.pictures_per_s:.1f} pictures/s, loss {report.loss:.4f}"
+            bars.update(bar, completed=report.step, now=now)
+            if report.psnr is not None:
+                bars.print(f"step {report.step}: validation {report.psnr:.2f} dB, best {trainer.best:.2f} dB")
+
+        trainer.run(show)
+    console.print(f"Weights in {out / 'best.safetensors'}", highlight=False, markup=False, soft_wrap=True)
 
 
 @app.command

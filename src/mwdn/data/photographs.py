@@ -1,5 +1,6 @@
 """A folder of photographs, held in memory as a training set wants it."""
 
+import copy
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from mwdn.data.images import READABLE, read_frame, srgb_decode
 from mwdn.errors import ImageError, ParameterError
+from mwdn.types import Frame
 
 
 class Photographs:
@@ -43,13 +45,26 @@ class Photographs:
         """Linear light (B, 3, side, side) of the photographs at ``index`` (B,)."""
         return self._light[self._pixels[index].long()].movedim(-1, 1)
 
+    def split(self, every: int) -> tuple["Photographs", "Photographs"]:
+        """All but one in ``every`` photographs, and those; of fewer than ``every``, all are in both."""
+        held = torch.arange(len(self), device=self._pixels.device) % every == every - 1
+        if not held.any():
+            return self, self
+        parts = []
+        for chosen in (~held, held):
+            part = copy.copy(self)
+            part._pixels = self._pixels[chosen]
+            part.names = [name for name, taken in zip(self.names, chosen.tolist(), strict=True) if taken]
+            parts.append(part)
+        return parts[0], parts[1]
+
     def to(self, device: torch.device | str) -> "Photographs":
         """Keep the pictures on a device, where they are sampled."""
         self._pixels, self._light = self._pixels.to(device), self._light.to(device)
         return self
 
 
-def _square(path: Path, side: int) -> np.ndarray:  # type: ignore[type-arg]
+def _square(path: Path, side: int) -> Frame:
     import cv2
 
     frame = read_frame(path)

@@ -160,7 +160,6 @@ class SimulatedPairs:
         room = torch.stack([1 - scale_y, 1 - scale_x], -1).clamp(min=0.1)
         shift = uniform(generators, -1, 1, 2) * p.offset * room
         theta = affine(turn, scale_y, scale_x, shift, width / height).to(pictures)
-        # Pixels of the photograph a scene pixel covers: average so many first, so that nothing aliases.
         return _resample(pictures, theta, (height, width))
 
     def _shading(self, generators: list[torch.Generator], size: Size) -> Tensor:

@@ -9,6 +9,7 @@ from mwdn.networks.mwdn import Mwdn
 from mwdn.networks.mwdn_cpsf import MwdnCpsf
 from mwdn.networks.unet import UNet
 from mwdn.networks.wiener import WienerNetwork
+from mwdn.networks.wiener_bank import WienerBank
 from mwdn.networks.wiener_unet import WienerUNet
 
 NETWORKS: dict[str, type[nn.Module]] = {
@@ -17,6 +18,7 @@ NETWORKS: dict[str, type[nn.Module]] = {
     "wiener-unet": WienerUNet,
     "mwdn": Mwdn,
     "mwdn-cpsf": MwdnCpsf,
+    "wiener-bank": WienerBank,
 }
 """Every network by the name that recipes and the command line use."""
 
@@ -36,4 +38,4 @@ def build(name: str, **options: Any) -> nn.Module:  # noqa: ANN401
     return NETWORKS[name](**options)
 
 
-__all__ = ["NETWORKS", "Mwdn", "MwdnCpsf", "UNet", "WienerNetwork", "WienerUNet", "build"]
+__all__ = ["NETWORKS", "Mwdn", "MwdnCpsf", "UNet", "WienerBank", "WienerNetwork", "WienerUNet", "build"]

@@ -1,0 +1,109 @@
+"""Recipes: one experiment a TOML file, read into frozen dataclasses."""
+
+import dataclasses
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+from mwdn.data.simulated import Mismatch, Placement
+from mwdn.errors import ParameterError, UnknownNameError
+from mwdn.optics.sensor import Sensor
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How long and how fast to learn.
+
+    Args:
+        steps: optimiser steps.
+        batch: samples a step, over all processes together.
+        learning_rate: at its highest, after the warm-up; it then falls to 1 % as half a cosine.
+        warmup: steps of linear rise.
+        weight_decay: of AdamW, on convolution weights alone.
+        ema: the checkpoint holds a running mean of the weights, with this decay a step; 0 for the last weights.
+        bfloat16: compute convolutions in bfloat16 where the hardware has it.
+        validate_every: steps between validations, checkpoints and contact sheets.
+        validation: samples in a validation.
+        seed: of initial weights and data.
+    """
+
+    steps: int = 2000
+    batch: int = 4
+    learning_rate: float = 1e-3
+    warmup: int = 50
+    weight_decay: float = 1e-4
+    ema: float = 0.99
+    bfloat16: bool = True
+    validate_every: int = 250
+    validation: int = 16
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch", "learning_rate", "validate_every", "validation"):
+            if not getattr(self, name) > 0:
+                raise ParameterError(f"`{name}` ({getattr(self, name)}) must be positive.")
+        if not 0 <= self.ema < 1:
+            raise ParameterError(f"`ema` ({self.ema}) must be in [0, 1).")
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """One experiment.
+
+    Args:
+        network: its name, and options under their own names.
+        schedule: see `Schedule`.
+        loss: weights of its parts, see `mwdn.learning.losses.Loss`.
+        placement: see `mwdn.data.simulated.Placement`.
+        mismatch: see `mwdn.data.simulated.Mismatch`.
+        sensor: see `mwdn.optics.sensor.Sensor`.
+    """
+
+    network: dict[str, Any]
+    schedule: Schedule = Schedule()
+    loss: dict[str, float] = field(default_factory=lambda: {"mse": 1.0})
+    placement: Placement = Placement()
+    mismatch: Mismatch = Mismatch()
+    sensor: Sensor = Sensor()
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values that JSON can hold."""
+        return dataclasses.asdict(self)
+
+
+def read_recipe(path: str | Path, **schedule: Any) -> Recipe:  # noqa: ANN401
+    """Read a recipe.
+
+    Args:
+        path: TOML with the tables of `Recipe`.
+        **schedule: values that replace those of the recipe's schedule; ``None`` leaves one as it is.
+
+    Raises:
+        ParameterError: the file cannot be read, names no network, or a value is outside its range.
+        UnknownNameError: a table or a key that recipes do not have.
+    """
+    try:
+        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ParameterError(f"`{path}` cannot be read as a recipe: {error}") from error
+    fields = {f.name: f for f in dataclasses.fields(Recipe)}
+    for table in content:
+        if table not in fields:
+            raise UnknownNameError("table of a recipe", table, fields)
+    if "name" not in content.get("network", {}):
+        raise ParameterError(f'`{path}` must name a network: [network] name = "mwdn".')
+    changes = {name: value for name, value in schedule.items() if value is not None}
+    content["schedule"] = content.get("schedule", {}) | changes
+    kinds = {"schedule": Schedule, "placement": Placement, "mismatch": Mismatch, "sensor": Sensor}
+    return Recipe(**{name: _fill(kinds[name], table) if name in kinds else table for name, table in content.items()})
+
+
+def _fill(kind: type[T], table: dict[str, Any]) -> T:
+    known = [f.name for f in dataclasses.fields(kind)]  # type: ignore[arg-type]
+    for key in table:
+        if key not in known:
+            raise UnknownNameError(f"key of [{kind.__name__.lower()}]", key, known)
+    return kind(**{key: tuple(value) if isinstance(value, list) else value for key, value in table.items()})

@@ -1,0 +1,231 @@
+"""The training loop: simulated pairs in, checkpoint out."""
+
+import json
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from mwdn.calibration import Calibration
+from mwdn.data.images import write_picture
+from mwdn.data.sheets import contact_sheet
+from mwdn.data.simulated import SimulatedPairs
+from mwdn.data.writing import atomic
+from mwdn.errors import CheckpointError, MwdnError
+from mwdn.learning.checkpoint import save_network
+from mwdn.learning.losses import Loss
+from mwdn.learning.recipe import Recipe, Schedule
+from mwdn.networks import build
+
+VALIDATION_START = 10**12
+"""Samples are numbered; those of the validation start here, where no training ever arrives."""
+
+
+class DivergenceError(MwdnError):
+    """The loss is not finite any more."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a callback is told after a step."""
+
+    step: int
+    loss: float
+    parts: dict[str, float]
+    pictures_per_s: float
+    psnr: float | None = None
+
+
+def learning_rate(step: int, schedule: Schedule) -> float:
+    """Linear warm-up, then half a cosine down to 1 % of the highest rate."""
+    if step < schedule.warmup:
+        return schedule.learning_rate * (step + 1) / schedule.warmup
+    progress = (step - schedule.warmup) / max(1, schedule.steps - schedule.warmup)
+    return schedule.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * progress)))
+
+
+class Trainer:
+    """One run in one folder. Made again on the same folder it goes on where the last one was stopped.
+
+    Args:
+        recipe: the experiment.
+        calibration: of the camera to learn.
+        pairs: the source of its simulated captures.
+        out: folder of the run: ``best.safetensors``, ``last.safetensors``, ``state.safetensors``, ``log.jsonl``.
+        validation: source of other pairs, for the validation; ``pairs`` unless given.
+        device: where to compute.
+        alexnet: file of AlexNet's weights, where the loss needs them.
+
+    Raises:
+        CheckpointError: the folder holds the state of another recipe or PSF.
+        OSError: the folder cannot be written to; found before training starts.
+    """
+
+    def __init__(
+        self,
+        recipe: Recipe,
+        calibration: Calibration,
+        pairs: SimulatedPairs,
+        out: Path,
+        *,
+        validation: SimulatedPairs | None = None,
+        device: torch.device | str = "cpu",
+        alexnet: Path | None = None,
+    ) -> None:
+        self.recipe, self.schedule, self.out = recipe, recipe.schedule, out
+        self.device, self.pairs, self.calibration = torch.device(device), pairs, calibration
+        self.validation = validation or pairs
+        self.psf = calibration.psf.to(self.device)
+        torch.manual_seed(self.schedule.seed)
+        options = {key: value for key, value in recipe.network.items() if key != "name"}
+        self.options = {key: tuple(v) if isinstance(v, list) else v for key, v in options.items()}
+        self.network = build(recipe.network["name"], **self.options).to(self.device)
+        self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.average = build(recipe.network["name"], **self.options).to(self.device).eval()
+        self.average.load_state_dict(self.network.state_dict())
+        self.loss = Loss(recipe.loss, alexnet=alexnet).to(self.device)
+        self.optimiser = torch.optim.AdamW(self._groups(), lr=self.schedule.learning_rate)
+        self.step, self.best = 0, -math.inf
+        # What a checkpoint must agree with to be gone on from.
+        self.identity = {"recipe": recipe.as_dict(), "psf_hash": calibration.psf_hash}
+        self._resume()
+        with atomic(out / "recipe.json") as temporary:  # an unwritable folder is found here, not after an hour
+            temporary.write_text(json.dumps(self.identity, indent=2))
+
+    def _groups(self) -> list[dict[str, Any]]:
+        """Weight decay pulls convolution weights to zero; biases, BatchNorm, w and lambda stay free."""
+        decayed = [p for p in self.network.parameters() if p.ndim > 1]
+        others = [p for p in self.network.parameters() if p.ndim <= 1]
+        return [
+            {"params": decayed, "weight_decay": self.schedule.weight_decay},
+            {"params": others, "weight_decay": 0.0},
+        ]
+
+    def run(self, callback: Callable[[Report], None] = lambda report: None) -> float:
+        """Train to the end of the schedule; returns the best validation PSNR in dB."""
+        last = time.perf_counter()
+        while self.step < self.schedule.steps:
+            loss, parts = self.advance()
+            now = time.perf_counter()
+            speed, last = self.schedule.batch / (now - last), now
+            psnr = None
+            if self.step % self.schedule.validate_every == 0 or self.step == self.schedule.steps:
+                psnr = self.validate()
+                self.save(psnr)
+                last = time.perf_counter()
+            report = Report(self.step, loss, parts, speed, psnr)
+            self._log(report)
+            callback(report)
+        return self.best
+
+    def advance(self) -> tuple[float, dict[str, float]]:
+        """One optimiser step; returns the loss and its parts.
+
+        Raises:
+            DivergenceError: the loss is not finite; the last saved state stays as it was.
+        """
+        first = self.step * self.schedule.batch
+        numbers = range(first, first + self.schedule.batch)
+        measurement, scene = self.pairs.batch(numbers)
+        for group in self.optimiser.param_groups:
+            group["lr"] = learning_rate(self.step, self.schedule)
+        self.network.train()
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.schedule.bfloat16):
+            found = self.network(measurement.contiguous(memory_format=torch.channels_last), self.psf)
+        loss, parts = self.loss(found.float(), scene)
+        if not loss.isfinite():
+            raise DivergenceError(
+                f"The loss of step {self.step} (samples {numbers.start} to {numbers.stop - 1}) is not finite. "
+                f"Lower the learning rate and go on from `{self.out / 'state.safetensors'}`."
+            )
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        self.optimiser.step()
+        self.step += 1
+        self._average()
+        return loss.item(), {name: value.item() for name, value in parts.items()}
+
+    @torch.no_grad()
+    def _average(self) -> None:
+        # A young average would remember the initial weights: its decay grows from 0 to the schedule's.
+        decay = min(self.schedule.ema, self.step / (self.step + 10))
+        for mean, value in zip(self.average.state_dict().values(), self.network.state_dict().values(), strict=True):
+            if value.is_floating_point():
+                mean.lerp_(value, 1 - decay)
+            else:
+                mean.copy_(value)
+
+    @torch.no_grad()
+    def validate(self) -> float:
+        """Mean PSNR in dB of the averaged weights on the validation samples; writes a contact sheet."""
+        scores, rows = [], []
+        numbers = range(VALIDATION_START, VALIDATION_START + self.schedule.validation)
+        for start in range(0, len(numbers), self.schedule.batch):
+            measurement, scene = self.validation.batch(numbers[start : start + self.schedule.batch])
+            found = self.average(measurement, self.psf)
+            scores.append(-10 * torch.log10((found.clamp(0, 1) - scene).square().mean((1, 2, 3))))
+            rows += [[m[None], f[None], s[None]] for m, f, s in zip(measurement, found, scene, strict=True)]
+        cpu = [[picture.cpu() for picture in row] for row in rows[:6]]
+        sheet = contact_sheet(cpu, ["measurement", f"step {self.step}", "scene"])
+        write_picture(self.out / "validation.png", sheet)
+        return float(torch.cat(scores).mean())
+
+    def save(self, psnr: float) -> None:
+        """Write last and, if it is, best weights, and the whole state, each atomically."""
+        self.best = max(self.best, psnr)
+        metadata = {**self.identity, "step": self.step, "psnr": psnr}
+        for name in ("last", *(["best"] if psnr == self.best else [])):
+            network = self.recipe.network["name"]
+            save_network(self.out / f"{name}.safetensors", self.average, network, self.options, **metadata)
+        header = {"identity": json.dumps(self.identity), "step": str(self.step), "best": repr(self.best)}
+        with atomic(self.out / "state.safetensors") as temporary:
+            save_file(dict(self._state()), temporary, metadata=header)
+
+    def _state(self) -> Iterator[tuple[str, Tensor]]:
+        for prefix, module in (("network", self.network), ("average", self.average)):
+            for name, value in module.state_dict().items():
+                yield f"{prefix}.{name}", value.contiguous()
+        for name, parameter in self.network.named_parameters():
+            for key, value in self.optimiser.state[parameter].items():
+                yield f"optimiser.{name}.{key}", value.contiguous()
+
+    def _resume(self) -> None:
+        path = self.out / "state.safetensors"
+        if not path.exists():
+            return
+        from safetensors import safe_open
+
+        with safe_open(path, framework="pt") as file:
+            header = file.metadata()
+        if json.loads(header["identity"]) != json.loads(json.dumps(self.identity)):
+            raise CheckpointError(
+                f"`{self.out}` holds a run of another recipe or PSF. Choose another folder, `--out`, or remove it."
+            )
+        state = load_file(path, device=str(self.device))
+        for prefix, module in (("network", self.network), ("average", self.average)):
+            _restore(module, prefix, state)
+        for name, parameter in self.network.named_parameters():
+            keys = ("step", "exp_avg", "exp_avg_sq")
+            found = {key: state[f"optimiser.{name}.{key}"] for key in keys}
+            # Adam keeps its moments in the layout of the weights.
+            form = torch.channels_last if parameter.ndim == 4 else torch.contiguous_format
+            moments = {key: value.contiguous(memory_format=form) for key, value in found.items() if key != "step"}
+            self.optimiser.state[parameter] = {"step": found["step"].cpu(), **moments}
+        self.step, self.best = int(header["step"]), float(header["best"])
+
+    def _log(self, report: Report) -> None:
+        line = {"step": report.step, "loss": report.loss, **report.parts, "psnr": report.psnr}
+        with (self.out / "log.jsonl").open("a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
+
+
+def _restore(module: nn.Module, prefix: str, state: dict[str, Tensor]) -> None:
+    start = prefix + "."
+    module.load_state_dict({key.removeprefix(start): v for key, v in state.items() if key.startswith(start)})
