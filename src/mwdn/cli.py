@@ -10,6 +10,7 @@ from cyclopts import App, Parameter
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import track
+from torch import Tensor
 
 from mwdn import __version__
 from mwdn.calibration import Calibration
@@ -21,10 +22,10 @@ from mwdn.reconstruct import (
     Format,
     Reconstructor,
     find_captures,
+    find_method,
     plan_outputs,
     reconstruct_file,
 )
-from mwdn.types import Image
 
 app = App(
     name="mwdn",
@@ -76,6 +77,7 @@ def reconstruct(
     *captures: Path,
     camera: CameraOptions,
     method: str = "admm",
+    regularisation: float | None = None,
     out: Path = Path("results/reconstruct"),
     format: Format = "png",
     device: str | None = None,
@@ -86,6 +88,7 @@ def reconstruct(
         captures: raw frames of the camera.
         camera: its calibration.
         method: admm, wiener, fista, or the path of a checkpoint.
+        regularisation: tau of admm or lambda of wiener; less keeps more detail and more noise.
         out: folder for the pictures; summary.png shows the first twelve beside their measurements.
         format: png and png16 are sRGB for people, tiff and npy hold the linear float32 values.
         device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
@@ -93,11 +96,11 @@ def reconstruct(
     calibration = camera.load()
     files = find_captures(captures)
     outputs = plan_outputs(files, out, format, protected=(camera.psf, camera.dark))
-    reconstructor = Reconstructor(method, calibration, device=device)
+    reconstructor = Reconstructor(find_method(method, regularisation), calibration, device=device)
     levels = ", ".join(f"{level:.4f}" for level in calibration.background)
     console.print(f"PSF {calibration.psf_hash}, background {levels} of the full scale subtracted")
     failed = 0
-    rows: list[list[Image]] = []
+    rows: list[list[Tensor]] = []
     for file, output in track(list(zip(files, outputs, strict=True)), "Reconstructing", disable=len(files) == 1):
         try:
             pair = reconstruct_file(reconstructor, file, output, format)

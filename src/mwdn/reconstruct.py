@@ -19,15 +19,22 @@ Method = Callable[[Measurement, Psf], Scene]
 """Anything that is called as ``method(measurement, psf)``: a solver or a network."""
 
 
-def find_method(name: str | Path) -> Method:
-    """A solver by its name, or a network by the path of its checkpoint.
+def find_method(name: str | Path, regularisation: float | None = None) -> Method:
+    """Find a solver by its name, or a network by the path of its checkpoint.
+
+    Args:
+        name: the name or the path.
+        regularisation: of a solver that has one, in place of its default.
 
     Raises:
         UnknownNameError: neither a solver nor a file.
         CheckpointError: the file holds no usable weights.
+        ParameterError: the method has no regularisation to set.
     """
+    if regularisation is not None and str(name) not in ("admm", "wiener"):
+        raise ParameterError(f"`regularisation` belongs to admm and wiener, not to '{name}'.")
     if str(name) in solvers.SOLVERS:
-        return solvers.build(str(name))
+        return solvers.build(str(name), **({} if regularisation is None else {"regularisation": regularisation}))
     path = Path(name)
     if path.suffix in SUFFIXES or path.is_file():
         return load_network(path)

@@ -163,7 +163,7 @@ def test_objective_is_what_it_says(variation, generator):
     v = torch.rand(2, 3, *problem.grid, generator=generator)
     V = fourier.spectrum(v, problem.grid)
     Hv = fourier.inverse_spectrum(problem.transfer * V, problem.grid, problem.sensor)
-    state = admm.start(problem)._replace(v=v, V=V, Hv=Hv)
+    state = admm.start(problem)._replace(v=v, V=V, slope=proximal.gradient(v), Hv=Hv)
     found = admm.objective(state, problem, 0.3, variation)
     for i in range(2):
         expected, sizes, squares = 0.0, 0.0, []

@@ -36,6 +36,7 @@ class Problem(NamedTuple):
 
     measurement: Measurement
     transfer: Spectrum
+    power: Tensor
     laplacian: Tensor
     grid: Size
 
@@ -46,10 +47,14 @@ class Problem(NamedTuple):
 
 
 class State(NamedTuple):
-    """The scene v, what the sensor would see of it, and the multipliers xi, eta, rho."""
+    """The scene v, its gradient, what the sensor sees of it, and the multipliers xi, eta, rho.
+
+    The multipliers are kept divided by their penalties, which saves a multiplication at each of their uses.
+    """
 
     v: Tensor
     V: Spectrum
+    slope: Gradient
     Hv: Measurement
     xi: Measurement
     eta: Gradient
@@ -76,8 +81,8 @@ def pose(measurement: Measurement, psf: Psf) -> Problem:
     rows = torch.arange(height, device=psf.device)[:, None] * (math.pi / height)
     columns = torch.arange(width // 2 + 1, device=psf.device) * (math.pi / width)
     laplacian = 4 * rows.sin().square() + 4 * columns.sin().square()
-    grid = (height, width)
-    return Problem(measurement.float(), transfer_function(psf, grid), laplacian, grid)
+    H = transfer_function(psf, (height, width))
+    return Problem(measurement.float(), H, H.abs().square(), laplacian, (height, width))
 
 
 def start(problem: Problem) -> State:
@@ -86,7 +91,7 @@ def start(problem: Problem) -> State:
     v = b.new_zeros((*b.shape[:2], *problem.grid))
     V = torch.zeros((*b.shape[:2], problem.grid[0], problem.grid[1] // 2 + 1), dtype=torch.complex64, device=b.device)
     zero = torch.zeros_like(b)
-    return State(v, V, zero, zero, (v, v), v)
+    return State(v, V, (v, v), zero, zero, (v, v), v)
 
 
 def split(state: State, problem: Problem, mu: Penalties, tau: float | Tensor, variation: Variation) -> Splitting:
@@ -95,11 +100,10 @@ def split(state: State, problem: Problem, mu: Penalties, tau: float | Tensor, va
     Outside the sensor nothing is measured and the textbook's x obeys ``mu1 x - xi = mu1 H v``, so x and xi are
     kept on the sensor alone.
     """
-    gy, gx = gradient(state.v)
-    scaled = gy + state.eta[0] / mu.gradient, gx + state.eta[1] / mu.gradient
-    u = shrink(scaled, tau / mu.gradient, variation)
-    x = (state.xi + mu.data * state.Hv + problem.measurement) / (1 + mu.data)
-    w = (state.rho / mu.sign + state.v).clamp(min=0)
+    (gy, gx), (ey, ex) = state.slope, state.eta
+    u = shrink((gy + ey, gx + ex), tau / mu.gradient, variation)
+    x = (mu.data * (state.xi + state.Hv) + problem.measurement) / (1 + mu.data)
+    w = (state.rho + state.v).clamp(min=0)
     return Splitting(u, x, w)
 
 
@@ -107,28 +111,38 @@ def merge(state: State, copies: Splitting, problem: Problem, mu: Penalties) -> S
     """Update the scene, which all copies must agree on, in the Fourier domain; then the multipliers."""
     (uy, ux), x, w = copies
     (ey, ex), H = state.eta, problem.transfer
-    prior = (mu.sign * w - state.rho) + divergence((mu.gradient * uy - ey, mu.gradient * ux - ex))
-    beyond = mu.data * (x - state.Hv) - state.xi  # what the sensor adds to mu1 H v
-    power = mu.data * H.abs().square()
+    prior = mu.sign * (w - state.rho) + mu.gradient * divergence((uy - ey, ux - ex))
+    beyond = mu.data * (x - state.Hv - state.xi)  # what the sensor adds to mu1 H v
+    power = mu.data * problem.power
     V = spectrum(prior, problem.grid) + power * state.V + H.conj() * spectrum(beyond, problem.grid)
-    V = V / (power + mu.gradient * problem.laplacian + mu.sign)
+    V = V / (power + (mu.gradient * problem.laplacian + mu.sign))
     v = inverse_spectrum(V, problem.grid, problem.grid)
     Hv = inverse_spectrum(H * V, problem.grid, problem.sensor)
     gy, gx = gradient(v)
     return State(
         v,
         V,
+        (gy, gx),
         Hv,
-        xi=state.xi + mu.data * (Hv - x),
-        eta=(ey + mu.gradient * (gy - uy), ex + mu.gradient * (gx - ux)),
-        rho=state.rho + mu.sign * (v - w),
+        xi=state.xi + (Hv - x),
+        eta=(ey + (gy - uy), ex + (gx - ux)),
+        rho=state.rho + (v - w),
+    )
+
+
+def rescale(state: State, old: Penalties, new: Penalties) -> State:
+    """Keep the multipliers what they are when the penalties change."""
+    ey, ex = state.eta
+    ratio = old.gradient / new.gradient
+    return state._replace(
+        xi=state.xi * (old.data / new.data), eta=(ey * ratio, ex * ratio), rho=state.rho * (old.sign / new.sign)
     )
 
 
 def objective(state: State, problem: Problem, tau: float, variation: Variation) -> Tensor:
     """Value of the minimised function at the scene v, one number a sample."""
     misfit = (state.Hv - problem.measurement).square().sum((1, 2, 3))
-    return 0.5 * misfit + tau * total_variation(gradient(state.v), variation)
+    return 0.5 * misfit + tau * total_variation(state.slope, variation)
 
 
 class Residuals(NamedTuple):
@@ -146,22 +160,21 @@ def _norm(*parts: Tensor) -> Tensor:
     return torch.stack([p.square().sum((1, 2, 3)) for p in parts]).sum(0).sqrt()
 
 
-def residuals(old: State, new: State, copies: Splitting, mu: Penalties) -> Residuals:
+def residuals(old: State, new: State, copies: Splitting) -> Residuals:
     """Relative primal and dual residuals of the iteration from ``old`` to ``new``.
 
     The dual residual is written with the scene in place of its copies, which saves keeping two generations of them.
     """
     tiny = torch.finfo(torch.float32).tiny
-    now, before = gradient(new.v), gradient(old.v)
     primal, dual = [], []
-    for copy, value, last, multiplier, m in (
-        ((copies.x,), (new.Hv,), (old.Hv,), (new.xi,), mu.data),
-        (copies.u, now, before, new.eta, mu.gradient),
-        ((copies.w,), (new.v,), (old.v,), (new.rho,), mu.sign),
+    for copy, value, last, multiplier in (
+        ((copies.x,), (new.Hv,), (old.Hv,), (new.xi,)),
+        (copies.u, new.slope, old.slope, new.eta),
+        ((copies.w,), (new.v,), (old.v,), (new.rho,)),
     ):
         gap = _norm(*(a - b for a, b in zip(copy, value, strict=True)))
         primal.append(gap / torch.maximum(_norm(*copy), _norm(*value)).clamp(min=tiny))
-        moved = _norm(*(m * (a - b) for a, b in zip(value, last, strict=True)))
+        moved = _norm(*(a - b for a, b in zip(value, last, strict=True)))
         dual.append(moved / _norm(*multiplier).clamp(min=tiny))
     return Residuals((primal[0], primal[1], primal[2]), (dual[0], dual[1], dual[2]))
 
@@ -239,6 +252,7 @@ class Admm:
     def __call__(
         self, measurement: Measurement, psf: Psf, *, callback: Callable[[Progress], None] | None = None
     ) -> Scene:
+        """Reconstruct a batch; ``callback`` is told of each iteration."""
         b_norm, h_norm = _norm(measurement)[:, None, None, None], _norm(psf)[:, None, None, None]
         b_norm = b_norm.clamp(min=torch.finfo(torch.float32).tiny)
         problem = pose(measurement / b_norm, psf / h_norm)
@@ -250,7 +264,7 @@ class Admm:
             checking = self.tolerance and iteration % 10 == 0
             if not (balancing or checking or callback):
                 continue
-            found = residuals(old, state, copies, mu)
+            found = residuals(old, state, copies)
             if callback:
                 value = objective(state, problem, tau, self.variation)
                 primal, dual = (torch.stack(each).amax(0) for each in found)
@@ -258,6 +272,7 @@ class Admm:
             if checking and all((r < self.tolerance).all() for r in (*found.primal, *found.dual)):
                 break
             if balancing:
-                mu = balance(mu, found)
+                balanced = balance(mu, found)
+                state, mu = rescale(state, mu, balanced), balanced
         height, width = problem.sensor
         return state.v[..., :height, :width].clamp(min=0) * (b_norm / h_norm)

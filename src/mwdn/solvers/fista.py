@@ -37,6 +37,7 @@ class Fista:
     def __call__(
         self, measurement: Measurement, psf: Psf, *, callback: Callable[[int, Tensor], None] | None = None
     ) -> Scene:
+        """Reconstruct a batch; ``callback`` is told each iteration's number and objectives (B,)."""
         problem = pose(measurement, psf)
         b, H = problem.measurement, problem.transfer
         # The gradient's Lipschitz constant is at most max |H|^2, a step of 1/L can never overshoot.

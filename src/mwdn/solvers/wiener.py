@@ -65,6 +65,7 @@ class Wiener:
 
     @torch.no_grad()
     def __call__(self, measurement: Measurement, psf: Psf) -> Scene:
+        """Reconstruct a batch."""
         check_fit(measurement, psf, "measurement")
         size = measurement.shape[-2], measurement.shape[-1]
         grid = deconvolution_grid(size, self.boundary)

@@ -1,0 +1,31 @@
+# Each target sets up what it needs: a fresh clone and Python 3.11 or later are enough.
+PYTHON ?= python3
+BIN := .venv/bin
+export MPLBACKEND = Agg
+
+.PHONY: demo test check acceptance benchmark clean
+
+.venv/.ready: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+demo: .venv/.ready  ## a synthetic camera, its captures, every untrained method
+	$(BIN)/mwdn demo
+
+test: .venv/.ready  ## everything but the slow checks on real captures
+	$(BIN)/python -m pytest
+
+check: .venv/.ready  ## lint, format, types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+acceptance: .venv/.ready  ## real captures (MWDN_DATA, or ../shared/data); pictures go to results/acceptance
+	$(BIN)/python -m pytest -m acceptance -s
+
+benchmark: .venv/.ready  ## speed against plain baselines in the same run
+	$(BIN)/python benchmarks/admm.py
+
+clean:
+	rm -rf .venv results .pytest_cache .mypy_cache .ruff_cache

@@ -1,0 +1,102 @@
+"""ADMM, 100 iterations, 270x480x3, two threads: this package against a plain textbook loop in numpy and scipy.
+
+    python benchmarks/admm.py [--repeats 3]
+
+Both run in turn in one process, on the same problem with the same constants, and must agree. The textbook keeps
+every copy and multiplier on the padded grid and transforms six times an iteration, as the equations are written.
+"""
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import scipy.fft
+import torch
+
+from mwdn.optics.patterns import contour_psf
+from mwdn.solvers import TEXTBOOK, Admm
+
+SIZE, ITERATIONS = (270, 480), 100
+
+
+def textbook(b, h, tau=1e-4):
+    """The equations of DiffuserCam's ADMM as written, float32."""
+    mu1, mu2, mu3 = (np.float32(mu) for mu in TEXTBOOK)
+    tau = np.float32(tau)
+    height, width = b.shape[-2:]
+    grid = 2 * height, 2 * width
+    top, left = grid[0] // 2 - height // 2, grid[1] // 2 - width // 2
+    inside = (slice(None), slice(top, top + height), slice(left, left + width))
+    fft = lambda z: scipy.fft.rfft2(z, workers=2)  # noqa: E731
+    ifft = lambda z: scipy.fft.irfft2(z, s=grid, workers=2)  # noqa: E731
+    padded, data, sensor = (np.zeros((3, *grid), np.float32) for _ in range(3))
+    padded[inside], data[inside], sensor[inside] = h, b, 1
+    H = fft(np.fft.ifftshift(padded, axes=(-2, -1)))
+    delta = np.zeros((2, *grid), np.float32)
+    delta[:, 0, 0] = -1
+    delta[0, -1, 0] = delta[1, 0, -1] = 1
+    psi2 = (abs(fft(delta)) ** 2).sum(0)
+    denominator = mu1 * abs(H) ** 2 + mu2 * psi2 + mu3
+    v, xi, rho = (np.zeros((3, *grid), np.float32) for _ in range(3))
+    eta = np.zeros((2, 3, *grid), np.float32)
+    psi = lambda z: np.stack([np.roll(z, -1, -2) - z, np.roll(z, -1, -1) - z])  # noqa: E731
+    psi_t = lambda z: np.roll(z[0], 1, -2) - z[0] + np.roll(z[1], 1, -1) - z[1]  # noqa: E731
+    for _ in range(ITERATIONS):
+        g = psi(v) + eta / mu2
+        u = np.sign(g) * np.maximum(abs(g) - tau / mu2, 0)
+        x = (xi + mu1 * ifft(H * fft(v)) + data) / (sensor + mu1)
+        w = np.maximum(rho / mu3 + v, 0)
+        right = mu3 * w - rho + psi_t(mu2 * u - eta) + ifft(H.conj() * fft(mu1 * x - xi))
+        v = ifft(fft(right) / denominator)
+        xi = xi + mu1 * (ifft(H * fft(v)) - x)
+        eta = eta + mu2 * (psi(v) - u)
+        rho = rho + mu3 * (v - w)
+    return np.maximum(v[inside], 0)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/admm.json"))
+    arguments = parser.parse_args()
+    torch.set_num_threads(2)
+    generator = torch.Generator().manual_seed(0)
+    h = contour_psf(SIZE, generator=generator).repeat(1, 3, 1, 1)
+    b = torch.rand(1, 3, *SIZE, generator=generator)
+    h, b = h / h.norm(), b / b.norm()
+    solver = Admm(1e-4, TEXTBOOK, ITERATIONS, "anisotropic")
+    contenders = {
+        "textbook (numpy, scipy)": lambda: textbook(b[0].numpy(), h[0].numpy()),
+        "mwdn, same constants": lambda: solver(b, h)[0].numpy(),
+        "mwdn, defaults": lambda: Admm(iterations=ITERATIONS)(b, h)[0].numpy(),
+    }
+    seconds, results = {name: [] for name in contenders}, {}
+    for _ in range(arguments.repeats):
+        for name, run in contenders.items():
+            start = time.perf_counter()
+            results[name] = run()
+            seconds[name].append(time.perf_counter() - start)
+    plain, ours = list(results.values())[:2]
+    difference = float(abs(plain - ours).max() / abs(plain).max())
+    medians = {name: float(np.median(times)) for name, times in seconds.items()}
+    base = medians["textbook (numpy, scipy)"]
+    for name, median in medians.items():
+        print(f"{name:26s} {median:6.2f} s   {base / median:4.1f} x")
+    print(f"largest difference of the first two: {difference:.1e} of the peak")
+    record = {
+        "size": SIZE,
+        "iterations": ITERATIONS,
+        "threads": torch.get_num_threads(),
+        "torch": torch.__version__,
+        "median_s": medians,
+        "ratio": {name: base / median for name, median in medians.items()},
+        "difference": difference,
+    }
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    arguments.out.write_text(json.dumps(record, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,80 @@
+"""Real captures through the command line. Pictures go to results/acceptance; look at them."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mwdn import Calibration, convolve, read_frame
+from mwdn.cli import main
+
+pytestmark = pytest.mark.acceptance
+OUT = Path("results/acceptance")
+
+
+def reconstruct(*arguments: str | Path) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["reconstruct", *map(str, arguments), "--format", "npy"])
+    assert ended.value.code == 0
+
+
+def explained(scene: np.ndarray, psf: torch.Tensor, measurement: torch.Tensor) -> float:
+    """Correlation of the reconstruction, blurred again, with the measurement."""
+    again = convolve(torch.from_numpy(scene).movedim(-1, 0)[None], psf)
+    return float(np.corrcoef(again.flatten().numpy(), measurement.flatten().numpy())[0, 1])
+
+
+@pytest.mark.parametrize(("pattern", "psf", "count"), [("object_*", "psf_320.png", 4), ("scene*", "psf_480.tif", 6)])
+def test_objects_of_the_papers_camera(data: Path, pattern: str, psf: str, count: int) -> None:
+    camera = data / "mwdn-camera"
+    captures = sorted((camera / "real-objects").glob(pattern))
+    assert len(captures) == count
+    out = OUT / Path(psf).stem
+    reconstruct(*captures, "--psf", camera / psf, "--out", out)
+    calibration = Calibration.from_file(camera / psf)
+    for capture in captures:
+        scene = np.load(out / f"{capture.stem}.npy")
+        assert explained(scene, calibration.psf, calibration.correct(read_frame(capture))) > 0.98
+        # An object in a dark room: its middle is bright, the border of the field is not.
+        border = np.r_[scene[:20].ravel(), scene[-20:].ravel()].mean()
+        middle = scene.shape[0] // 2
+        assert scene[middle - 40 : middle + 40, middle - 40 : middle + 40].mean() > 3 * border
+
+
+def test_hand_at_full_size(data: Path) -> None:
+    folder = data / "diffusercam-tutorial"
+    reconstruct(folder / "rawdata_hand_sample.tif", "--psf", folder / "psf_sample.tif", "--out", OUT / "hand")
+    scene = np.load(OUT / "hand" / "rawdata_hand_sample.npy")
+    assert scene.shape == (1200, 1600, 1)
+    calibration = Calibration.from_file(folder / "psf_sample.tif")
+    measurement = calibration.correct(read_frame(folder / "rawdata_hand_sample.tif"))
+    assert explained(scene, calibration.psf, measurement) > 0.99
+
+
+def best_psnr(found: np.ndarray, truth: np.ndarray) -> float:
+    """PSNR in dB after one gain and one offset by least squares, rows 60:270, columns 60:440."""
+    x, y = (picture[60:270, 60:440].ravel().astype(np.float64) for picture in (found, truth))
+    design = np.stack([x, np.ones_like(x)], axis=1)
+    misfit = design @ np.linalg.lstsq(design, y, rcond=None)[0] - y
+    return float(-10 * np.log10((misfit**2).mean()))
+
+
+def test_diffusercam_pairs(data: Path) -> None:
+    """A textbook ADMM of 100 iterations reaches 16.16 dB on the mean of the eight pairs."""
+    folder, out = data / "diffusercam", OUT / "diffusercam"
+    options = ("--psf", folder / "psf_recovered_270x480.npy", "--upside-down", "--bgr", "--background", "0")
+    reconstruct(folder / "diffuser_images", *options, "--out", out)
+    scores = {}
+    for truth in sorted((folder / "ground_truth_lensed").glob("*.npy")):
+        picture = read_frame(truth, bgr=True, upside_down=True)
+        scores[truth.stem] = best_psnr(np.load(out / truth.name), picture)
+    scores["mean"] = float(np.mean(list(scores.values())))
+    (out / "psnr.json").write_text(json.dumps(scores, indent=2))
+    print({name: round(score, 2) for name, score in scores.items()})
+    assert len(scores) == 9
+    assert scores["mean"] >= 16.5
+    # The right way up and with its own colours: any other orientation scores worse.
+    found, picture = np.load(out / "im326.npy"), read_frame(folder / "ground_truth_lensed/im326.npy", bgr=True)
+    assert best_psnr(found, picture[::-1]) > max(best_psnr(found, picture), best_psnr(found[..., ::-1], picture[::-1]))
