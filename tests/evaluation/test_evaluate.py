@@ -87,18 +87,19 @@ def test_solvers_from_end_to_end(camera, pairs, perceptual, tmp_path):
 
 
 def test_missing_metrics_are_named_and_not_averaged(pairs):
-    reason = "No weights of AlexNet here."
-    report = evaluate({"same": lambda b: b}, pairs, Protocol.parse("centre-32"), perceptual=Perceptual.none(reason))
+    reason = "No weights of AlexNet at [here]."
+    report = evaluate({"a[b].pt": lambda b: b}, pairs, Protocol.parse("centre-32"), perceptual=Perceptual.none(reason))
     assert report.variant == "raw"
     text = printed(report.table())
+    assert "a[b].pt" in text
     assert f"LPIPS is missing: {reason}" in text
     assert f"feature MSE is missing: {reason}" in text
     content = json.loads(report.json())
     assert content["missing"] == {"lpips": reason, "feature_mse": reason}
-    assert content["methods"]["same"]["values"]["lpips"] == [None] * 3
-    assert content["methods"]["same"]["mean_low_high"]["lpips"] == [None] * 3
+    assert content["methods"]["a[b].pt"]["values"]["lpips"] == [None] * 3
+    assert content["methods"]["a[b].pt"]["mean_low_high"]["lpips"] == [None] * 3
     with pytest.raises(UnknownNameError, match="Did you mean 'psnr'"):
-        report.methods["same"].summary("psn")
+        report.methods["a[b].pt"].summary("psn")
 
 
 def test_weights_that_cannot_be_had_are_reported_unasked(pairs, monkeypatch):

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from rich.markup import escape
 from rich.table import Table
 from torch import Tensor
 
@@ -88,7 +89,7 @@ class Report:
     def table(self) -> Table:
         """Means with their 95 % confidence intervals, the best in bold; time, memory, learnable numbers."""
         title = f"{self.pictures} pictures, protocol {self.protocol}, {self.variant}: mean [95 % confidence]"
-        caption = "\n".join(f"{_TITLES[name]} is missing: {reason}" for name, reason in self.missing.items())
+        caption = "\n".join(f"{_TITLES[name]} is missing: {escape(reason)}" for name, reason in self.missing.items())
         table = Table("method", title=title, caption=caption or None)
         measured = [metric for metric in METRICS if metric not in self.missing]
         for heading in (*(_TITLES[metric] for metric in measured), "ms / picture", "memory", "learnable"):
@@ -96,7 +97,7 @@ class Report:
         best = {metric: self._best(metric) for metric in measured}
         for name, scores in self.methods.items():
             cells = [_cell(metric, scores.summary(metric), name in best[metric]) for metric in measured]
-            table.add_row(name, *cells, *_costs(scores))
+            table.add_row(escape(name), *cells, *_costs(scores))
         return table
 
     def json(self) -> str:

@@ -1,7 +1,8 @@
 """Distances between pictures, one number a sample, and their weighted sum.
 
 All of them are computed in float32, also inside autocast, on the device of the pictures, and are differentiable:
-their gradients are finite, also between identical pictures.
+their gradients are finite, also between identical pictures. (AlexNet's convolutions on a GPU follow torch's setting
+for TF32, which costs the third digit.)
 """
 
 import math
@@ -12,7 +13,6 @@ from typing import TypeVar, cast
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from mwdn.errors import ParameterError, ShapeError, UnknownNameError
 from mwdn.learning.alexnet import AlexNet, Heads, load_alexnet, load_heads
@@ -98,22 +98,28 @@ def ssim(image: Image, reference: Image) -> Tensor:
     """
     if min(image.shape[-2:]) < WINDOW:
         raise ShapeError(f"`image` {tuple(image.shape)} must have at least {WINDOW} x {WINDOW} pixels for SSIM.")
-    x, y = image.flatten(0, 1)[:, None], reference.flatten(0, 1)[:, None]
-    mean_x, mean_y, square_x, square_y, product = _blurred(torch.cat([x, y, x * x, y * y, x * y])).chunk(5)
+    x, y = image, reference
+    mean_x, mean_y, square_x, square_y, product = _blurred(torch.stack([x, y, x * x, y * y, x * y]))
     variances = square_x - mean_x.square() + square_y - mean_y.square()
     covariance = product - mean_x * mean_y
     c1, c2 = 0.01**2, 0.03**2  # (K1 L)^2 and (K2 L)^2 for the range L = 1
     luminance = (2 * mean_x * mean_y + c1) / (mean_x.square() + mean_y.square() + c1)
     structure = (2 * covariance + c2) / (variances + c2)
-    return (luminance * structure).view(len(image), -1).mean(1)
+    return (luminance * structure).mean((1, 2, 3))
 
 
 def _blurred(planes: Tensor) -> Tensor:
-    """Means of (N, 1, H, W) in each Gaussian window that fits, (N, 1, H - 10, W - 10)."""
-    distance = torch.arange(WINDOW, device=planes.device, dtype=planes.dtype) - WINDOW // 2
-    weights = torch.exp(-0.5 * (distance / 1.5).square())
-    weights = weights / weights.sum()
-    return F.conv2d(F.conv2d(planes, weights.view(1, 1, -1, 1)), weights.view(1, 1, 1, -1))
+    """Average (..., H, W) in each Gaussian window that fits: (..., H - 10, W - 10)."""
+    weights = [math.exp(-0.5 * ((i - WINDOW // 2) / 1.5) ** 2) for i in range(WINDOW)]
+    # Shifted sums, four times as fast as `conv2d` on a CPU. On a GPU, where convolutions round to TF32, variances
+    # as differences of squares would lose all their digits.
+    for axis in (-2, -1):
+        fitting = planes.shape[axis] - WINDOW + 1
+        blurred = planes.narrow(axis, 0, fitting) * (weights[0] / sum(weights))
+        for i in range(1, WINDOW):
+            blurred.add_(planes.narrow(axis, i, fitting), alpha=weights[i] / sum(weights))
+        planes = blurred
+    return planes
 
 
 @_comparing
