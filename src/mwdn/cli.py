@@ -191,7 +191,7 @@ def evaluate(
         )
     report.write(out)
     console.print(report.table())
-    console.print(f"Look at {out}", highlight=False)
+    console.print(f"Look at {out}", highlight=False, markup=False, soft_wrap=True)
 
 
 @app.command
