@@ -39,7 +39,7 @@ def contact_sheet(rows: list[list[Tensor]], titles: list[str], *, height: int = 
     return torch.cat([_heading(titles, widths, head, widest), *lines], dim=-2)
 
 
-def thumbnail(picture: Image, height: int = 240) -> Image:
+def thumbnail(picture: Image, height: int = 240) -> Tensor:
     """Shrink a picture to a sheet's height, if it is taller: what a sheet of large pictures needs of each."""
     if picture.shape[-2] <= height:
         return picture
