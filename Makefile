@@ -1,7 +1,8 @@
 # Each target sets up what it needs: a fresh clone and Python 3.11 or later are enough.
 PYTHON ?= python3
 BIN := .venv/bin
-export MPLBACKEND = Agg
+# Threads that wait by spinning starve each other where other work shares the machine.
+export OMP_WAIT_POLICY = passive
 
 .PHONY: demo test check acceptance benchmark clean
 
