@@ -99,7 +99,7 @@ def reconstruct(
         device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
     """
     calibration = camera.load()
-    files = find_captures(captures)
+    files = find_captures(captures, apart=(camera.psf, camera.dark))
     outputs = plan_outputs(files, out, format, protected=(camera.psf, camera.dark))
     reconstructor = Reconstructor(find_method(method, regularisation), calibration, device=device)
     levels = ", ".join(f"{level:.4f}" for level in calibration.background)
