@@ -17,7 +17,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 TIERS = [
     ("errors", "types"),
     ("fourier",),
-    ("data.writing", "data.images"),
+    ("data.formats", "data.writing", "data.images"),
     ("optics",),
     ("calibration",),
     ("solvers",),

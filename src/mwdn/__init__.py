@@ -1,13 +1,15 @@
 """From the caustic pattern of a lensless camera to a picture.
 
->>> from mwdn import Calibration, Reconstructor, read_frame, write_picture
+>>> from mwdn import Calibration, Reconstructor, for_people, read_frame, write_picture
 >>> calibration = Calibration.from_file("psf.png")
 >>> reconstruct = Reconstructor("admm", calibration)
->>> write_picture("scene.png", reconstruct(calibration.correct(read_frame("capture.png"))))
+>>> scene = reconstruct(calibration.correct(read_frame("capture.png")))
+>>> write_picture("scene.png", for_people(scene))
 """
 
 from mwdn.calibration import Calibration
 from mwdn.data import read_frame, read_picture, write_linear, write_picture
+from mwdn.data.sheets import for_people
 from mwdn.errors import MwdnError
 from mwdn.fourier import convolve, correlate, wiener
 from mwdn.networks import build
@@ -25,6 +27,7 @@ __all__ = [
     "build",
     "convolve",
     "correlate",
+    "for_people",
     "read_frame",
     "read_picture",
     "wiener",

@@ -17,7 +17,7 @@ from mwdn import __version__
 from mwdn.calibration import Calibration
 from mwdn.data.images import write_picture
 from mwdn.data.importers import Layout, import_pairs
-from mwdn.data.sheets import contact_sheet
+from mwdn.data.sheets import contact_sheet, thumbnail
 from mwdn.errors import MwdnError
 from mwdn.evaluation import Variant
 from mwdn.learning.recipe import read_recipe
@@ -99,7 +99,7 @@ def reconstruct(
         device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
     """
     calibration = camera.load()
-    files = find_captures(captures)
+    files = find_captures(captures, apart=(camera.psf, camera.dark))
     outputs = plan_outputs(files, out, format, protected=(camera.psf, camera.dark))
     reconstructor = Reconstructor(find_method(method, regularisation), calibration, device=device)
     levels = ", ".join(f"{level:.4f}" for level in calibration.background)
@@ -113,7 +113,8 @@ def reconstruct(
             failed += 1
             _complain(f"[red]{escape(str(file))}:[/]", error)
             continue
-        rows = [*rows, list(pair)] if len(rows) < 12 else rows
+        if len(rows) < 12:
+            rows.append([thumbnail(picture) for picture in pair])
     if rows:
         write_picture(out / SUMMARY, contact_sheet(rows, ["measurement", f"reconstruction ({Path(method).name})"]))
     done = f"{len(files) - failed} of {len(files)} captures reconstructed into {out}"
@@ -191,7 +192,7 @@ def evaluate(
         )
     report.write(out)
     console.print(report.table())
-    console.print(f"Look at {out}", highlight=False)
+    console.print(f"Look at {out}", highlight=False, markup=False, soft_wrap=True)
 
 
 @app.command

@@ -26,7 +26,8 @@ def findings() -> dict[str, str]:
         f"{platform.machine()}, {os.cpu_count()} cores, instructions {torch.backends.cpu.get_cpu_capability()}"
     )
     found["threads"] = f"{torch.get_num_threads()} (set OMP_NUM_THREADS to change)"
-    fast = torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    # Builds without oneDNN, such as those for Macs, do not have the question.
+    fast = torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported()  # type: ignore[no-untyped-call]
     found["bfloat16 on the CPU"] = "yes, in hardware" if fast else "emulated: float32 is faster"
     if not torch.cuda.is_available():
         found["GPU"] = "none that torch can use"

@@ -109,17 +109,23 @@ _SUFFIX = {"png": ".png", "png16": ".png", "tiff": ".tif", "npy": ".npy"}
 SUMMARY = "summary.png"
 
 
-def find_captures(paths: Iterable[str | Path]) -> list[Path]:
+def find_captures(paths: Iterable[str | Path], *, apart: Iterable[Path | None] = ()) -> list[Path]:
     """Files as named, and every readable file of each folder, in the order of their names; each once.
+
+    Args:
+        paths: files and folders.
+        apart: files that are no captures where a folder holds them: the PSF, the dark frame. Hidden ones are none.
 
     Raises:
         ParameterError: nothing was named, or a folder holds no picture.
     """
     found: list[Path] = []
+    others = {path.resolve() for path in apart if path is not None}
     for path in map(Path, paths):
         inside = [path]
         if path.is_dir():
             inside = sorted(f for f in path.iterdir() if f.suffix.lower() in READABLE and f.is_file())
+            inside = [f for f in inside if not f.name.startswith(".") and f.resolve() not in others]
         if not inside:
             raise ParameterError(f"The folder `{path}` holds no capture. Readable: {', '.join(sorted(READABLE))}.")
         found += inside

@@ -16,7 +16,8 @@ from PIL import ImageOps
 from skimage import io as skimage_io
 
 from mwdn.data import atomic, read_frame, read_picture, srgb_decode, srgb_encode, write_linear, write_picture
-from mwdn.data.images import MAX_PIXELS, READABLE
+from mwdn.data.formats import MAX_PIXELS
+from mwdn.data.images import READABLE
 from mwdn.errors import ImageError, ParameterError
 
 HEIGHT, WIDTH = 37, 51

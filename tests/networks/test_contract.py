@@ -117,6 +117,14 @@ def test_psf_matters_but_not_its_scale(name, generator):
     assert torch.equal(moved, found) == (name == "unet")
 
 
+def test_grey_psf_is_that_of_each_colour(name, generator):
+    """A monochrome calibration shot serves a colour camera, with weights trained on coloured ones too."""
+    b, h, _ = pair(generator)
+    network = lively(small(name), generator)
+    grey = h[:, :1]
+    torch.testing.assert_close(network(b, grey), network(b, grey.expand_as(h)), rtol=1e-4, atol=1e-5)
+
+
 def test_grey(name, generator):
     b, h, _ = pair(generator, channels=1)
     assert small(name, channels=1)(b, h).shape == b.shape
@@ -226,7 +234,7 @@ def test_wiener_constants_stay_positive_whatever_the_step(name):
 def test_unknown_network_gets_the_nearest_name():
     with pytest.raises(UnknownNameError, match=r"No network named 'mwdm'\. Did you mean 'mwdn'\? Known: .*wiener-unet"):
         build("mwdm")
-    with pytest.raises(MwdnError, match="Known: mwdn, mwdn-cpsf, unet, wiener, wiener-unet"):
+    with pytest.raises(MwdnError, match="Known: mwdn, mwdn-cpsf, unet, wiener, wiener-bank, wiener-unet"):
         build("?")
 
 

@@ -14,9 +14,8 @@ def for_people(image: Image) -> Image:
 
     A reconstruction's absolute brightness depends on the exposure and on the PSF's; people want to see a picture.
     """
-    brightest = torch.stack(
-        [picture.float().flatten().sort().values[int(-0.003 * picture.numel()) - 1] for picture in image]
-    )
+    pixels = image.float().flatten(1)
+    brightest = pixels.kthvalue(pixels.shape[1] - int(0.003 * pixels.shape[1])).values
     return (image / brightest.clamp(min=1e-12)[:, None, None, None]).clamp(0, 1)
 
 
@@ -32,19 +31,30 @@ def contact_sheet(rows: list[list[Tensor]], titles: list[str], *, height: int = 
         (1, 3, H, W) in linear light.
     """
     gap, head = 6, 26
-    lines = [torch.cat([_cell(picture, height, gap) for picture in row], dim=-1) for row in rows]
+    cells = [[_cell(picture, height, gap) for picture in row] for row in rows]
+    lines = [torch.cat(row, dim=-1) for row in cells]
     widest = max(line.shape[-1] for line in lines)
     lines = [F.pad(line, (0, widest - line.shape[-1], 0, 0), value=1.0) for line in lines]
-    widths = [_cell(picture, height, gap).shape[-1] for picture in rows[0]]
+    widths = [cell.shape[-1] for cell in cells[0]]
     return torch.cat([_heading(titles, widths, head, widest), *lines], dim=-2)
 
 
+def thumbnail(picture: Image, height: int = 240) -> Tensor:
+    """Shrink a picture to a sheet's height, if it is taller: what a sheet of large pictures needs of each."""
+    if picture.shape[-2] <= height:
+        return picture
+    return F.interpolate(picture, (height, _width(picture, height)), mode="area")
+
+
 def _cell(picture: Tensor, height: int, gap: int) -> Tensor:
-    picture = for_people(picture).expand(-1, 3, -1, -1)
-    width = max(1, round(picture.shape[-1] * height / picture.shape[-2]))
-    smaller = height < picture.shape[-2]
-    picture = F.interpolate(picture, (height, width), mode="area" if smaller else "bicubic").clamp(0, 1)
-    return F.pad(picture, (0, gap, 0, gap), value=1.0)
+    picture = thumbnail(for_people(picture), height)
+    if picture.shape[-2] < height:
+        picture = F.interpolate(picture, (height, _width(picture, height)), mode="bicubic").clamp(0, 1)
+    return F.pad(picture.expand(-1, 3, -1, -1), (0, gap, 0, gap), value=1.0)
+
+
+def _width(picture: Tensor, height: int) -> int:
+    return max(1, round(picture.shape[-1] * height / picture.shape[-2]))
 
 
 def _heading(titles: list[str], widths: list[int], height: int, total: int) -> Tensor:

@@ -63,7 +63,7 @@ class Mismatch:
     vignetting: float = 0.1
 
 
-EXACT = Mismatch(0, 0, 0, 0, 0, 0, 0)
+EXACT = Mismatch(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """A camera that is what its calibration says."""
 
 

@@ -132,6 +132,12 @@ class Wiener(nn.Module):
         return wiener(features, psf, self.log_regularisation.exp(), boundary=self.boundary)
 
 
+def one_each_colour(psf: Psf, measurement: Measurement) -> Tensor:
+    """`peak_one`, and a grey PSF repeated for each colour: all colours then cast the same pattern."""
+    psf = peak_one(psf, measurement)
+    return psf.expand(-1, measurement.shape[1], -1, -1) if psf.shape[1] == 1 else psf
+
+
 def peak_one(psf: Psf, measurement: Measurement) -> Psf:
     """Scale each PSF so that its largest value is 1, the range that the paper's PSFs have.
 

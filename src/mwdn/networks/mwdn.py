@@ -3,7 +3,7 @@
 from torch import Tensor, nn
 
 from mwdn.fourier import Boundary
-from mwdn.networks.blocks import Decoder, Encoder, Pooling, Wiener, halve, paper_widths, peak_one
+from mwdn.networks.blocks import Decoder, Encoder, Pooling, Wiener, halve, one_each_colour, paper_widths
 from mwdn.types import Measurement, Psf, Scene
 
 
@@ -55,7 +55,7 @@ class Mwdn(nn.Module):
 
     def forward(self, measurement: Measurement, psf: Psf) -> Scene:
         """Scene (B, outputs, H, W) from a measurement and a PSF of the same height and width."""
-        psfs = self.pyramid(peak_one(psf, measurement))
+        psfs = self.pyramid(one_each_colour(psf, measurement))
         *skips, bottleneck = self.encoder(measurement)
         deconvolved = [wiener(skip, h) for wiener, skip, h in zip(self.filters, skips, psfs, strict=True)]
         return self.decoder([*deconvolved, bottleneck])

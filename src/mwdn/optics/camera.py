@@ -47,6 +47,6 @@ class Camera:
             generator: source of the noise, on the scene's device.
 
         Returns:
-            (B, C, *sensor_size) in [0, 1], black level subtracted.
+            (B, C, *sensor_size), black level subtracted, saturation at 1; the noise of dark pixels reaches below 0.
         """
         return self.sensor.expose(self.forward(scene), generator=generator)

@@ -220,11 +220,12 @@ class Admm:
         penalties: mu of the data, gradient and sign constraint. They change the way, not the destination.
         iterations: at most this many.
         variation: which total variation, see `mwdn.solvers.proximal.Variation`.
-        tolerance: stop once every relative residual of every sample is below this; 0 never stops early.
+        tolerance: stop once every relative residual of every sample is below this, looked at every tenth iteration;
+            0 never stops early.
         balance_every: adapt the penalties each this many iterations (residual balancing); 0 keeps them.
 
     Raises:
-        ParameterError: a constant is not positive.
+        ParameterError: a penalty is not positive, another constant is negative, or no iteration is asked for.
         ShapeError: batch or channels of PSF and measurement do not fit.
 
     References:
@@ -245,7 +246,7 @@ class Admm:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) must not be negative.")
         if self.iterations < 1:
             raise ParameterError(f"`iterations` ({self.iterations}) must be at least 1.")
-        if not all(mu > 0 for mu in self.penalties):
+        if not all((torch.as_tensor(mu) > 0).all() for mu in self.penalties):
             raise ParameterError(f"`penalties` {tuple(self.penalties)} must be positive.")
 
     @torch.no_grad()
