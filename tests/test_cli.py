@@ -127,7 +127,15 @@ def test_psf_of_another_size(run, camera):
     code, _, err = reconstruct(run, "captures/a.png", psf="large.png")
     assert code == 1
     assert "`psf` (64 x 80) and the capture (32 x 40) must have the same height and width" in err
-    assert "The PSF is 2 times as large: bin it by 2." in err
+    assert "The PSF is 2 times as large: bin it by 2, `--psf-bin 2`." in err
+    line = ("reconstruct", "captures/a.png", "--method", "wiener")
+    assert run(*line, "--psf", "large.png", "--psf-bin", "2")[0] == 0
+    assert run(*line, "--psf", "psf.png", "--psf-bin", "2")[0] == 1
+    (camera / "halves").mkdir()
+    store("halves/a.png", torch.rand(1, 3, 2 * SIZE[0], 2 * SIZE[1]))
+    code, _, err = run("reconstruct", "halves", "--method", "wiener", "--psf", "psf.png")
+    assert "`--bin 2 --psf-bin 1`" in err
+    assert run("reconstruct", "halves", "--psf", "psf.png", "--bin", "2", "--psf-bin", "1")[0] == 0
 
 
 @pytest.mark.parametrize(

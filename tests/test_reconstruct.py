@@ -162,6 +162,17 @@ def test_measurement_of_another_size(psf):
         Reconstructor("wiener", Calibration(psf))(torch.rand(1, 3, 16, 40))
 
 
+@pytest.mark.parametrize(
+    "error", [torch.OutOfMemoryError("CUDA out of memory"), RuntimeError("DefaultCPUAllocator: can't allocate memory")]
+)
+def test_too_large_for_the_memory(psf, measurement, error):
+    def greedy(measurement, psf):
+        raise error
+
+    with pytest.raises(ParameterError, match=r"needs more memory than cpu has free\. Bin or crop it: `--bin 2`"):
+        Reconstructor(greedy, Calibration(psf), device="cpu")(measurement)
+
+
 @pytest.mark.parametrize("name", ["unet", "mwdn", "mwdn-cpsf"])
 def test_network_of_other_colours(name, psf):
     with pytest.raises(ShapeError, match=r"must have 3 channels for this network"):

@@ -58,6 +58,8 @@ class CameraOptions:
     """Height and width of the middle part of each frame to use."""
     bin: int = 1
     """Average blocks of so many pixels along each axis."""
+    psf_bin: int | None = None
+    """The same for the PSF, where it was taken at another resolution than the captures."""
     upside_down: bool = False
     """The files' first row is the picture's last (DiffuserCam's .npy)."""
     bgr: bool = False
@@ -72,6 +74,7 @@ class CameraOptions:
             bit_depth=self.bit_depth,
             crop=self.crop,
             binning=self.bin,
+            psf_binning=self.psf_bin,
             upside_down=self.upside_down,
             bgr=self.bgr,
         )

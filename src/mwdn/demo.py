@@ -13,10 +13,11 @@ from mwdn.calibration import Calibration
 from mwdn.data.images import read_picture, write_picture
 from mwdn.data.sheets import contact_sheet, for_people
 from mwdn.data.writing import atomic
+from mwdn.evaluation import psnr
 from mwdn.optics import Camera
 from mwdn.optics.patterns import contour_psf
 from mwdn.reconstruct import Reconstructor
-from mwdn.types import Image, Scene
+from mwdn.types import Scene
 
 SIZE = 320, 320
 """The paper's sensor, binned."""
@@ -32,11 +33,6 @@ def scenes() -> dict[str, Scene]:
         margin = (SIZE[0] - picture.shape[-2]) // 2
         found[name] = F.pad(picture, (margin,) * 4)
     return found
-
-
-def psnr(reconstruction: Image, scene: Image) -> float:
-    """Peak signal-to-noise ratio in dB of the reconstruction clipped to [0, 1], for a peak of 1."""
-    return float(-10 * torch.log10((reconstruction.clamp(0, 1) - scene).square().mean()))
 
 
 def run(out: Path, seed: int, console: Console) -> None:
@@ -56,7 +52,7 @@ def run(out: Path, seed: int, console: Console) -> None:
     for name, scene in scenes().items():
         measurement = camera.simulate(scene, generator=generator)
         results = [reconstruct(measurement) for reconstruct in reconstructors.values()]
-        table.add_row(name, *(f"{psnr(result, scene):.2f}" for result in results))
+        table.add_row(name, *(f"{psnr(result.clamp(0, 1), scene).item():.2f}" for result in results))
         rows.append([scene, measurement, *results])
     write_picture(out / "psf.png", for_people(camera.psf))
     write_picture(out / "comparison.png", contact_sheet(rows, ["scene", "measurement", *METHODS]))

@@ -93,13 +93,24 @@ class Reconstructor:
 
         Raises:
             ShapeError: the measurement does not have the size of the PSF.
+            ParameterError: the device has not enough memory for pictures of this size.
         """
         if measurement.shape[-2:] != self.psf.shape[-2:]:
             raise ShapeError(
                 f"`measurement` {tuple(measurement.shape)} and `psf` {tuple(self.psf.shape)} must have the same "
                 "height and width. Pass raw frames through `Calibration.correct` first."
             )
-        return self.method(measurement.to(self.device), self.psf).cpu()
+        try:
+            return self.method(measurement.to(self.device), self.psf).cpu()
+        except (MemoryError, RuntimeError) as error:
+            # On a CPU torch has no type of its own for this.
+            short = isinstance(error, MemoryError | torch.OutOfMemoryError) or "can't allocate memory" in str(error)
+            if not short:
+                raise
+            raise ParameterError(
+                f"`measurement` {tuple(measurement.shape)} needs more memory than {self.device} has free. Bin or crop "
+                "it: `--bin 2`, `--crop 1000 1000`; or try `--device cpu`, `--method wiener`."
+            ) from error
 
 
 Format = Literal["png", "png16", "tiff", "npy"]

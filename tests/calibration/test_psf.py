@@ -287,8 +287,8 @@ def test_dark_frame_of_another_size(tmp_path, caustic):
 @pytest.mark.parametrize(
     ("psf", "binning", "capture", "way_out"),
     [
-        ((8, 6), 1, (16, 12), "The capture is 2 times as large: bin it by 2."),
-        ((16, 12), 1, (4, 3), "The PSF is 4 times as large: bin it by 4."),
+        ((8, 6), 1, (16, 12), "The capture is 2 times as large: bin it by 2, `--bin 2 --psf-bin 1`."),
+        ((16, 12), 1, (4, 3), "The PSF is 4 times as large: bin it by 4, `--psf-bin 4`."),
         ((8, 6), 1, (9, 12), "Crop the capture around its centre: `--crop 8 6`."),
         ((8, 6), 2, (18, 14), "Crop the capture around its centre: `--crop 16 12`."),  # in raw pixels
         ((8, 6), 1, (7, 12), "Use the PSF that belongs to this camera."),
@@ -304,3 +304,18 @@ def test_capture_of_another_size(psf, binning, capture, way_out):
 def test_grey_capture_of_a_colour_psf():
     with pytest.raises(ShapeError, match="The capture is grey, but `psf` has colours"):
         Calibration(torch.ones(1, 3, 4, 4)).correct(np.zeros((4, 4, 1), np.uint8))
+
+
+def test_psf_of_another_resolution_than_the_captures(tmp_path, generator):
+    """The captures were binned by 4 in the camera, the PSF was not: crop and dark frame belong to the captures."""
+    raw = 0.2 * torch.rand(48, 64, 1, generator=generator).numpy()
+    small = raw.reshape(12, 4, 16, 4, 1).mean((1, 3))
+    np.save(tmp_path / "raw.npy", raw)
+    np.save(tmp_path / "small.npy", small)
+    np.save(tmp_path / "dark.npy", np.zeros_like(small))
+    options = {"background": 0.0, "crop": (8, 10)}
+    found = Calibration.from_file(tmp_path / "raw.npy", psf_binning=4, dark=tmp_path / "dark.npy", **options)
+    torch.testing.assert_close(found.psf, Calibration.from_file(tmp_path / "small.npy", **options).psf)
+    assert found.correct(small).shape == (1, 1, 8, 10)
+    with pytest.raises(ParameterError, match=r"`binning` \(0\) must be at least 1"):
+        Calibration.from_file(tmp_path / "raw.npy", binning=0, psf_binning=4)

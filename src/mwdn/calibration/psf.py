@@ -63,6 +63,7 @@ class Calibration:
         bit_depth: int | None = None,
         crop: Size | None = None,
         binning: int = 1,
+        psf_binning: int | None = None,
         upside_down: bool = False,
         bgr: bool = False,
     ) -> "Calibration":
@@ -76,6 +77,8 @@ class Calibration:
             bit_depth: of the sensor, where its numbers do not fill the file's type.
             crop: height and width of the middle part to use, in raw pixels.
             binning: average blocks of so many raw pixels along each axis, after the crop.
+            psf_binning: that of the PSF, where it was taken at another resolution than the captures, whose crop then
+                covers the same part of it, and whose dark frame is left out of it.
             upside_down: the file's first row is the picture's last.
             bgr: the file's channels are blue, green, red.
 
@@ -91,8 +94,13 @@ class Calibration:
         if dark is not None:
             dark_frame = read_frame(dark, bgr=bgr)
             dark_image = as_image(dark_frame, full_scale(dark_frame, bit_depth))
-        shape = cls(torch.ones(1, 1, 1, 1), bit_depth, dark_image, crop, binning, bgr=bgr)
-        psf = shape.prepare(frame)
+        if binning < 1:
+            raise ParameterError(f"`binning` ({binning}) must be at least 1.")
+        own, part, its_dark = binning, crop, dark_image
+        if psf_binning is not None and psf_binning != binning:
+            own, its_dark = psf_binning, None
+            part = crop and (crop[0] * own // binning, crop[1] * own // binning)
+        psf = cls(torch.ones(1, 1, 1, 1), bit_depth, its_dark, part, own).prepare(frame)
         level = _level(psf, background)
         psf = (psf - level).clamp(min=0)
         total = psf.sum((-2, -1), keepdim=True)
@@ -205,10 +213,14 @@ def _level(psf: Tensor, background: Background) -> Tensor:
 
 
 def _way_out(capture: Size, psf: Size, binning: int) -> str:
-    for (a, b), name in (((psf, capture), "PSF"), ((capture, psf), "capture")):
+    for (a, b), name, options in (
+        ((psf, capture), "PSF", "--psf-bin {more}"),
+        ((capture, psf), "capture", "--bin {more} --psf-bin {binning}"),
+    ):
         factor = a[0] // b[0]
         if factor > 1 and a == (b[0] * factor, b[1] * factor):
-            return f"The {name} is {factor} times as large: bin it by {factor}."
+            options = options.format(more=binning * factor, binning=binning)
+            return f"The {name} is {factor} times as large: bin it by {factor}, `{options}`."
     if psf[0] <= capture[0] and psf[1] <= capture[1]:
         return f"Crop the capture around its centre: `--crop {psf[0] * binning} {psf[1] * binning}`."
     return "Use the PSF that belongs to this camera."
