@@ -80,7 +80,7 @@ def uniform(generators: list[torch.Generator], low: float, high: float, count: i
 
 
 def affine(turn: Tensor, scale_y: Tensor, scale_x: Tensor, shift: Tensor, aspect: float) -> Tensor:
-    """(B, 2, 3) matrices for ``affine_grid`` that turn, then scale, then shift a picture's content.
+    """(B, 2, 3) matrices for ``affine_grid`` that scale, then turn (clockwise), then shift a picture's content.
 
     Args:
         turn: (B,), radian.
