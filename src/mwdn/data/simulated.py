@@ -5,7 +5,7 @@ many processes share it, and in whatever batches.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import torch
@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.data.photographs import Photographs
+from mwdn.errors import ParameterError
 from mwdn.fourier import Size
 from mwdn.optics.camera import Camera
 from mwdn.optics.sensor import Sensor
@@ -39,6 +40,17 @@ class Placement:
     offset: float = 0.6
     ambient: Range = (0.0, 0.05)
 
+    def __post_init__(self) -> None:
+        for name, (low, high) in (("extent", self.extent), ("ambient", self.ambient)):
+            if not 0 <= low <= high:
+                raise ParameterError(f"`{name}` ({low}, {high}) must be a range: not negative, the smaller one first.")
+        if not self.extent[0] > 0:
+            raise ParameterError(f"`extent` {self.extent} must be positive: a part of the sensor's shorter side.")
+        if not self.aspect >= 1:
+            raise ParameterError(f"`aspect` ({self.aspect}) must be at least 1, a square.")
+        if not 0 <= self.offset <= 1:
+            raise ParameterError(f"`offset` ({self.offset}) must be in [0, 1]; 1 reaches the border.")
+
 
 @dataclass(frozen=True)
 class Mismatch:
@@ -61,6 +73,14 @@ class Mismatch:
     background: float = 0.1
     colour_shift_px: float = 0.3
     vignetting: float = 0.1
+
+    def __post_init__(self) -> None:
+        for part in fields(self):
+            if not getattr(self, part.name) >= 0:
+                raise ParameterError(f"`{part.name}` ({getattr(self, part.name)}) must not be negative: it is a size.")
+        for name in ("scale", "background", "vignetting"):
+            if not getattr(self, name) < 1:
+                raise ParameterError(f"`{name}` ({getattr(self, name)}) must be below 1.")
 
 
 EXACT = Mismatch(0, 0, 0, 0, 0, 0, 0)
