@@ -11,6 +11,7 @@ import torch
 
 from mwdn.data.simulated import Mismatch, Placement
 from mwdn.errors import MwdnError, ParameterError, UnknownNameError
+from mwdn.learning.losses import checked_weights
 from mwdn.networks import build
 from mwdn.optics.sensor import Sensor
 
@@ -61,7 +62,7 @@ class Recipe:
     """One experiment.
 
     Args:
-        network: its name, and options under their own names.
+        network: its name, and options under their own names; empty only where nothing is trained.
         schedule: see `Schedule`.
         loss: weights of its parts, see `mwdn.learning.losses.Loss`.
         placement: see `mwdn.data.simulated.Placement`.
@@ -69,7 +70,7 @@ class Recipe:
         sensor: see `mwdn.optics.sensor.Sensor`.
     """
 
-    network: dict[str, Any]
+    network: dict[str, Any] = field(default_factory=dict)
     schedule: Schedule = Schedule()
     loss: dict[str, float] = field(default_factory=lambda: {"mse": 1.0})
     placement: Placement = Placement()
@@ -106,6 +107,8 @@ def read_recipe(path: str | Path, **schedule: Any) -> Recipe:  # noqa: ANN401
         raise ParameterError(f'`{path}` must name a network: [network] name = "mwdn".')
     content["network"] = {key: _listless(value) for key, value in content["network"].items()}
     _try(content["network"])
+    if "loss" in content:
+        content["loss"] = checked_weights(content["loss"])
     changes = {name: value for name, value in schedule.items() if value is not None}
     content["schedule"] = content.get("schedule", {}) | changes
     kinds = {"schedule": Schedule, "placement": Placement, "mismatch": Mismatch, "sensor": Sensor}
