@@ -83,7 +83,7 @@ class Mismatch:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) must be below 1.")
 
 
-EXACT = Mismatch(0, 0, 0, 0, 0, 0, 0)
+EXACT = Mismatch(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """A camera that is what its calibration says."""
 
 

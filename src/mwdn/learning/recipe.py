@@ -124,7 +124,7 @@ def _fill(kind: type[T], table: dict[str, Any]) -> T:
         if not _alike(_listless(value), known[key]):
             example = json.dumps(known[key])
             raise ParameterError(f"`{key}` of [{name}] ({value!r}) must be of the same kind as its default, {example}.")
-    return kind(**{key: _listless(value) for key, value in table.items()})
+    return kind(**{key: _as_float(_listless(value), known[key]) for key, value in table.items()})
 
 
 def _listless(value: Any) -> Any:  # noqa: ANN401
@@ -135,6 +135,13 @@ def _alike(value: object, example: object) -> bool:
     if isinstance(value, tuple) and isinstance(example, tuple):
         return len(value) == len(example) and all(map(_alike, value, example))
     return type(value) is type(example) or (type(value) is int and type(example) is float)
+
+
+def _as_float(value: Any, example: object) -> Any:  # noqa: ANN401
+    """TOML's 12 where 12.0 is meant."""
+    if isinstance(value, tuple) and isinstance(example, tuple):
+        return tuple(map(_as_float, value, example))
+    return float(value) if isinstance(example, float) else value
 
 
 def _try(network: dict[str, Any]) -> None:
