@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Mapping
 from functools import wraps
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -243,7 +243,7 @@ class Loss(nn.Module):
         return {"mse": mse, "l1": l1}[name](image, reference)
 
 
-def checked_weights(weights: Mapping[str, float]) -> dict[str, float]:
+def checked_weights(weights: Mapping[str, Any]) -> dict[str, float]:
     """Copy of the weights of a `Loss`, for which its errors are raised."""
     if not weights:
         raise ParameterError(f'`weights` must name at least one of {", ".join(NAMES)}, for example {{"mse": 1.0}}.')
@@ -252,4 +252,4 @@ def checked_weights(weights: Mapping[str, float]) -> dict[str, float]:
             raise UnknownNameError("loss", name, NAMES)
         if not (isinstance(weight, int | float) and math.isfinite(weight) and weight >= 0):
             raise ParameterError(f"The weight of `{name}` ({weight!r}) must be finite and not negative.")
-    return dict(weights)
+    return {name: float(weight) for name, weight in weights.items()}
