@@ -170,20 +170,20 @@ class SimulatedPairs:
         index = torch.cat([torch.randint(len(self.photographs), (1,), generator=g) for g in generators])
         pictures = self.photographs.light(index.to(self.psf.device))
         pictures = torch.where(
-            (uniform(generators, 0, 1)[..., None, None] < 0.5).to(pictures.device), pictures.flip(-1), pictures
+            (uniform(generators, 0.0, 1.0)[..., None, None] < 0.5).to(pictures.device), pictures.flip(-1), pictures
         )
         p = self.placement
         extent = uniform(generators, *p.extent)[:, 0] * min(height, width)
-        stretch = torch.exp(uniform(generators, -1, 1)[:, 0] * math.log(p.aspect) / 2)
+        stretch = torch.exp(uniform(generators, -1.0, 1.0)[:, 0] * math.log(p.aspect) / 2)
         scale_y, scale_x = extent / stretch / height, extent * stretch / width
-        turn = torch.deg2rad(uniform(generators, -1, 1)[:, 0] * p.turn_degrees)
+        turn = torch.deg2rad(uniform(generators, -1.0, 1.0)[:, 0] * p.turn_degrees)
         room = torch.stack([1 - scale_y, 1 - scale_x], -1).clamp(min=0.1)
-        shift = uniform(generators, -1, 1, 2) * p.offset * room
+        shift = uniform(generators, -1.0, 1.0, 2) * p.offset * room
         theta = affine(turn, scale_y, scale_x, shift, width / height).to(pictures)
         return _resample(pictures, theta, (height, width))
 
     def _shading(self, generators: list[torch.Generator], size: Size) -> Tensor:
-        loss = uniform(generators, 0, self.mismatch.vignetting)[..., None, None]
+        loss = uniform(generators, 0.0, self.mismatch.vignetting)[..., None, None]
         y, x = torch.linspace(-1, 1, size[0])[:, None], torch.linspace(-1, 1, size[1])
         return 1 - loss * (y.square() + x.square()) / 2
 
@@ -217,8 +217,8 @@ def perturb(psf: Psf, mismatch: Mismatch, generators: list[torch.Generator]) -> 
     spread = uniform(generators, -mismatch.colour_shift_px, mismatch.colour_shift_px, 2)
     shift = base[:, None] + colours[:, None] * spread[:, None]
     # The PSF's centre is pixel n // 2, half a pixel from the middle of an even frame: turn about it.
-    turn = torch.deg2rad(uniform(generators, -1, 1)[:, 0] * mismatch.turn_degrees).repeat_interleave(channels)
-    scale = (1 + uniform(generators, -1, 1)[:, 0] * mismatch.scale).repeat_interleave(channels)
+    turn = torch.deg2rad(uniform(generators, -1.0, 1.0)[:, 0] * mismatch.turn_degrees).repeat_interleave(channels)
+    scale = (1 + uniform(generators, -1.0, 1.0)[:, 0] * mismatch.scale).repeat_interleave(channels)
     half = torch.tensor([height, width]) / 2
     centre = (torch.tensor([height // 2 + 0.5, width // 2 + 0.5]) - half) / half
     theta = affine(turn, scale, scale, shift.flatten(0, 1) / half, width / height)
@@ -227,10 +227,10 @@ def perturb(psf: Psf, mismatch: Mismatch, generators: list[torch.Generator]) -> 
     planes = psf.reshape(batch * channels, 1, height, width)
     grid = F.affine_grid(theta.to(psf), list(planes.shape), align_corners=False)
     moved = F.grid_sample(planes, grid, mode="bilinear", align_corners=False)
-    sigma = uniform(generators, 0, mismatch.blur_px)[:, 0].repeat_interleave(channels)
+    sigma = uniform(generators, 0.0, mismatch.blur_px)[:, 0].repeat_interleave(channels)
     blurred = _blur(moved, sigma.to(psf)).reshape(psf.shape)
     blurred = blurred / blurred.sum((-2, -1), keepdim=True).clamp(min=1e-12)
-    haze = uniform(generators, 0, mismatch.background)[..., None, None].to(psf)
+    haze = uniform(generators, 0.0, mismatch.background)[..., None, None].to(psf)
     return (1 - haze) * blurred + haze / (height * width)
 
 
