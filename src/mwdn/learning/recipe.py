@@ -105,7 +105,6 @@ def read_recipe(path: str | Path, **schedule: Any) -> Recipe:  # noqa: ANN401
             raise ParameterError(f"`{table}` of `{path}` ({content[table]!r}) must be a table: [{table}].")
     if not isinstance(content.get("network", {}).get("name"), str):
         raise ParameterError(f'`{path}` must name a network: [network] name = "mwdn".')
-    content["network"] = {key: _listless(value) for key, value in content["network"].items()}
     _try(content["network"])
     if "loss" in content:
         content["loss"] = checked_weights(content["loss"])

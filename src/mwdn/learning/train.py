@@ -84,8 +84,7 @@ class Trainer:
         self.validation = validation or pairs
         self.psf = calibration.psf.to(self.device)
         torch.manual_seed(self.schedule.seed)
-        options = {key: value for key, value in recipe.network.items() if key != "name"}
-        self.options = {key: tuple(v) if isinstance(v, list) else v for key, v in options.items()}
+        self.options = {key: value for key, value in recipe.network.items() if key != "name"}
         self.network = build(recipe.network["name"], **self.options).to(self.device)
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = build(recipe.network["name"], **self.options).to(self.device).eval()

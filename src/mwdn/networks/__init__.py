@@ -40,7 +40,8 @@ def build(name: str, **options: Any) -> nn.Module:  # noqa: ANN401
     for option in options:
         if option not in known:
             raise UnknownNameError(f"option of the network '{name}'", option, known)
-    return NETWORKS[name](**options)
+    # JSON and TOML, where options come from, have lists alone.
+    return NETWORKS[name](**{key: tuple(v) if isinstance(v, list) else v for key, v in options.items()})
 
 
 __all__ = ["NETWORKS", "Mwdn", "MwdnCpsf", "UNet", "WienerBank", "WienerNetwork", "WienerUNet", "build"]
