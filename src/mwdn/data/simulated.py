@@ -151,7 +151,7 @@ class SimulatedPairs:
             measurement (B, 3, H, W), its noise relative to the exposure, in units of the scene; and the scene
             (B, 3, H, W), linear light in [0, 1].
         """
-        # A different odd multiplier for each seed keeps the samples of two seeds apart.
+        # Two neighbouring seeds share no sample before the millionth; torch looks at the lower 32 bits alone.
         generators = [torch.Generator().manual_seed((self.seed * 1_000_003 + n) & (2**63 - 1)) for n in numbers]
         scene = self.scenes(generators)
         psf = perturb(self.psf.expand(len(scene), -1, -1, -1), self.mismatch, generators)
