@@ -226,7 +226,7 @@ def test_wiener_constants_stay_positive_whatever_the_step(name):
 def test_unknown_network_gets_the_nearest_name():
     with pytest.raises(UnknownNameError, match=r"No network named 'mwdm'\. Did you mean 'mwdn'\? Known: .*wiener-unet"):
         build("mwdm")
-    with pytest.raises(MwdnError, match="Known: mwdn, mwdn-cpsf, unet, wiener, wiener-unet"):
+    with pytest.raises(MwdnError, match="Known: mwdn, mwdn-cpsf, unet, wiener, wiener-bank, wiener-unet"):
         build("?")
 
 
