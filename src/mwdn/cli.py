@@ -20,14 +20,13 @@ from mwdn.data.importers import Layout, import_pairs
 from mwdn.data.sheets import contact_sheet, thumbnail
 from mwdn.errors import MwdnError
 from mwdn.evaluation import Variant
-from mwdn.learning.recipe import read_recipe
+from mwdn.learning.recipe import Recipe, Schedule, read_recipe
 from mwdn.learning.train import Report
 from mwdn.reconstruct import (
     SUMMARY,
     Format,
     Reconstructor,
     find_captures,
-    find_method,
     plan_outputs,
     reconstruct_file,
 )
@@ -104,7 +103,8 @@ def reconstruct(
     calibration = camera.load()
     files = find_captures(captures, apart=(camera.psf, camera.dark))
     outputs = plan_outputs(files, out, format, protected=(camera.psf, camera.dark))
-    reconstructor = Reconstructor(find_method(method, regularisation), calibration, device=device)
+    reconstructor = Reconstructor(method, calibration, regularisation=regularisation, device=device)
+    _warn(reconstructor)
     levels = ", ".join(f"{level:.4f}" for level in calibration.background)
     console.print(f"PSF {calibration.psf_hash}, background {levels} of the full scale subtracted")
     failed = 0
@@ -182,6 +182,7 @@ def evaluate(
 
     part, calibration = evaluation.Protocol.parse(protocol), camera.load()
     reconstructors = {method: Reconstructor(method, calibration, device=device) for method in methods}
+    _warn(*reconstructors.values())
     file = PairFile(data)
     pairs = evaluation.First(file, len(file) if first is None else first)
     with Progress(console=errors, transient=True) as bars:
@@ -239,6 +240,36 @@ def train(  # noqa: PLR0913
 
 
 @app.command
+def simulate(
+    photos: Path,
+    *,
+    camera: CameraOptions,
+    out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("pairs.h5"),
+    count: int = 100,
+    recipe: Path | None = None,
+    seed: int | None = None,
+    exact: bool = False,
+) -> None:
+    """Write a file of pairs: photographs as scenes, and what the camera would capture of them.
+
+    Args:
+        photos: folder of photographs.
+        camera: calibration of the camera.
+        out: the file of pairs; one that exists is replaced when all has gone well.
+        count: of pairs.
+        recipe: TOML file whose placement, mismatch, sensor and seed are used, see recipes/; defaults unless given.
+        seed: instead of the recipe's.
+        exact: simulate a camera that is exactly what its calibration says.
+    """
+    from mwdn.learning import session
+
+    chosen = read_recipe(recipe, seed=seed) if recipe else Recipe(schedule=Schedule(seed=seed or 0))
+    progress = partial(track, description="Simulating", console=errors, transient=True)
+    session.simulate(chosen, camera.load(), photos, out, count, exact=exact, track=progress)
+    console.print(f"{count:,} pairs written to {out}", markup=False, highlight=False, soft_wrap=True)
+
+
+@app.command
 def demo(*, out: Path = Path("results/demo"), seed: int = 0) -> None:
     """Make a small synthetic camera, capture pictures with it and reconstruct them with every untrained method.
 
@@ -257,6 +288,12 @@ def doctor() -> None:
     from mwdn.doctor import report
 
     report(console)
+
+
+def _warn(*reconstructors: Reconstructor) -> None:
+    """Print why not to trust what they will give."""
+    for warning in filter(None, (reconstructor.warning for reconstructor in reconstructors)):
+        errors.print(f"[yellow]Warning:[/] {escape(warning)}", highlight=False, soft_wrap=True)
 
 
 def _complain(start: str, error: MwdnError) -> None:

@@ -12,7 +12,7 @@ from mwdn.calibration import Calibration
 from mwdn.data.images import READABLE, read_frame, write_linear, write_picture
 from mwdn.data.sheets import for_people
 from mwdn.errors import ParameterError, ShapeError, UnknownNameError
-from mwdn.learning.checkpoint import SUFFIXES, load_network
+from mwdn.learning.checkpoint import SUFFIXES, load_network, read_metadata
 from mwdn.types import Measurement, Psf, Scene
 
 Method = Callable[[Measurement, Psf], Scene]
@@ -53,18 +53,36 @@ def _usable(device: str | torch.device) -> torch.device:
     return torch.device(device)
 
 
+def _other_camera(method: str | Path, calibration: Calibration) -> str | None:
+    """Say so, if a network was trained for another PSF than the calibration's."""
+    if Path(method).suffix != ".safetensors":
+        return None
+    trained = read_metadata(method).get("psf_hash")
+    if trained in (None, calibration.psf_hash):
+        return None
+    return (
+        f"`{method}` was trained for the camera of PSF {trained}, but the PSF given is {calibration.psf_hash}. "
+        "Expect blur, ghosts and invented detail, unless both are of one camera; another crop, binning or background "
+        "of one PSF file counts as another PSF. Use the PSF it was trained for, or train for this one: `mwdn train`."
+    )
+
+
 class Reconstructor:
     """Reconstructs the measurements of one camera.
 
     Args:
         method: a solver, a network, the name of a solver, or the path of a checkpoint.
         calibration: of the camera that took the measurements.
+        regularisation: of a solver given by its name, in place of its default.
         device: where to compute; a GPU if there is one, unless given.
+
+    Attributes:
+        warning: why not to trust the result, or ``None``.
 
     Raises:
         UnknownNameError: no such method.
         CheckpointError: the checkpoint cannot be used.
-        ParameterError: no such device.
+        ParameterError: no such device, or the method has no regularisation to set.
     """
 
     def __init__(
@@ -72,11 +90,13 @@ class Reconstructor:
         method: Method | str | Path,
         calibration: Calibration,
         *,
+        regularisation: float | None = None,
         device: str | torch.device | None = None,
     ) -> None:
         self.device = _usable(device or ("cuda" if torch.cuda.is_available() else "cpu"))
         self.calibration = calibration
-        self.method = find_method(method) if isinstance(method, str | Path) else method
+        self.method = find_method(method, regularisation) if isinstance(method, str | Path) else method
+        self.warning = _other_camera(method, calibration) if isinstance(method, str | Path) else None
         if isinstance(self.method, nn.Module):
             self.method = self.method.to(self.device).eval()
         self.psf = calibration.psf.to(self.device)

@@ -16,13 +16,14 @@ READABLE = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".npy"})
 """Suffixes, in lower case, by which a folder is searched for pictures and frames."""
 
 
-def read_frame(path: str | Path, *, bgr: bool = False, upside_down: bool = False) -> Frame:
-    """Read a frame, its numbers exactly as stored: no gamma, no scaling, no rotation by EXIF.
+def read_frame(path: str | Path, *, bgr: bool = False, upside_down: bool = False, upright: bool = False) -> Frame:
+    """Read a frame, its numbers exactly as stored: no gamma, no scaling.
 
     Args:
         path: PNG, JPEG, BMP, TIFF (its first picture) or NPY.
         bgr: the file's channels are blue, green, red, against its format's custom.
         upside_down: the file's first row is the picture's last. DiffuserCam's ``.npy`` files need both.
+        upright: turn a photograph as its EXIF says; a sensor's frame stays as it lies.
 
     Returns:
         (H, W, 1) or (H, W, 3), RGB, row 0 at the top, uint8 or uint16 as stored, any float as float32.
@@ -32,7 +33,7 @@ def read_frame(path: str | Path, *, bgr: bool = False, upside_down: bool = False
         ImageError: no such file; damaged, cut off, or of an unknown format; other numbers or axes than these;
             more than `mwdn.data.formats.MAX_PIXELS` pixels; NaN or infinity.
     """
-    frame = read(Path(path), photograph=False)
+    frame = read(Path(path), photograph=upright)
     return np.ascontiguousarray(frame[:: -1 if upside_down else 1, :, :: -1 if bgr else 1])
 
 

@@ -30,7 +30,7 @@ class Photographs:
     """
 
     def __init__(self, folder: str | Path, *, side: int = 208, limit: int | None = None) -> None:
-        paths = sorted(p for p in Path(folder).rglob("*") if p.suffix.lower() in READABLE)[:limit]
+        paths = sorted(p for p in Path(folder).rglob("*") if p.suffix.lower() in READABLE and p.is_file())[:limit]
         if not paths:
             raise ParameterError(f"The folder `{folder}` holds no photograph. Readable: {', '.join(sorted(READABLE))}.")
         self.names = [path.name for path in paths]
@@ -67,7 +67,7 @@ class Photographs:
 def _square(path: Path, side: int) -> Frame:
     import cv2
 
-    frame = read_frame(path)
+    frame = read_frame(path, upright=True)
     if frame.dtype != np.uint8:
         raise ImageError(f"`{path}` holds {frame.dtype}; photographs for training have 8 bits. Save it as JPEG.")
     height, width = frame.shape[:2]

@@ -5,7 +5,7 @@ many processes share it, and in whatever batches.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import torch
@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.data.photographs import Photographs
+from mwdn.errors import ParameterError
 from mwdn.fourier import Size
 from mwdn.optics.camera import Camera
 from mwdn.optics.sensor import Sensor
@@ -39,6 +40,17 @@ class Placement:
     offset: float = 0.6
     ambient: Range = (0.0, 0.05)
 
+    def __post_init__(self) -> None:
+        for name, (low, high) in (("extent", self.extent), ("ambient", self.ambient)):
+            if not 0 <= low <= high:
+                raise ParameterError(f"`{name}` ({low}, {high}) must be a range: not negative, the smaller one first.")
+        if not self.extent[0] > 0:
+            raise ParameterError(f"`extent` {self.extent} must be positive: a part of the sensor's shorter side.")
+        if not self.aspect >= 1:
+            raise ParameterError(f"`aspect` ({self.aspect}) must be at least 1, a square.")
+        if not 0 <= self.offset <= 1:
+            raise ParameterError(f"`offset` ({self.offset}) must be in [0, 1]; 1 reaches the border.")
+
 
 @dataclass(frozen=True)
 class Mismatch:
@@ -62,6 +74,14 @@ class Mismatch:
     colour_shift_px: float = 0.3
     vignetting: float = 0.1
 
+    def __post_init__(self) -> None:
+        for part in fields(self):
+            if not getattr(self, part.name) >= 0:
+                raise ParameterError(f"`{part.name}` ({getattr(self, part.name)}) must not be negative: it is a size.")
+        for name in ("scale", "background", "vignetting"):
+            if not getattr(self, name) < 1:
+                raise ParameterError(f"`{name}` ({getattr(self, name)}) must be below 1.")
+
 
 EXACT = Mismatch(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """A camera that is what its calibration says."""
@@ -80,7 +100,7 @@ def uniform(generators: list[torch.Generator], low: float, high: float, count: i
 
 
 def affine(turn: Tensor, scale_y: Tensor, scale_x: Tensor, shift: Tensor, aspect: float) -> Tensor:
-    """(B, 2, 3) matrices for ``affine_grid`` that turn, then scale, then shift a picture's content.
+    """(B, 2, 3) matrices for ``affine_grid`` that scale, then turn (clockwise), then shift a picture's content.
 
     Args:
         turn: (B,), radian.
@@ -131,7 +151,7 @@ class SimulatedPairs:
             measurement (B, 3, H, W), its noise relative to the exposure, in units of the scene; and the scene
             (B, 3, H, W), linear light in [0, 1].
         """
-        # A different odd multiplier for each seed keeps the samples of two seeds apart.
+        # Two neighbouring seeds share no sample before the millionth; torch looks at the lower 32 bits alone.
         generators = [torch.Generator().manual_seed((self.seed * 1_000_003 + n) & (2**63 - 1)) for n in numbers]
         scene = self.scenes(generators)
         psf = perturb(self.psf.expand(len(scene), -1, -1, -1), self.mismatch, generators)
@@ -150,20 +170,20 @@ class SimulatedPairs:
         index = torch.cat([torch.randint(len(self.photographs), (1,), generator=g) for g in generators])
         pictures = self.photographs.light(index.to(self.psf.device))
         pictures = torch.where(
-            (uniform(generators, 0, 1)[..., None, None] < 0.5).to(pictures.device), pictures.flip(-1), pictures
+            (uniform(generators, 0.0, 1.0)[..., None, None] < 0.5).to(pictures.device), pictures.flip(-1), pictures
         )
         p = self.placement
         extent = uniform(generators, *p.extent)[:, 0] * min(height, width)
-        stretch = torch.exp(uniform(generators, -1, 1)[:, 0] * math.log(p.aspect) / 2)
+        stretch = torch.exp(uniform(generators, -1.0, 1.0)[:, 0] * math.log(p.aspect) / 2)
         scale_y, scale_x = extent / stretch / height, extent * stretch / width
-        turn = torch.deg2rad(uniform(generators, -1, 1)[:, 0] * p.turn_degrees)
+        turn = torch.deg2rad(uniform(generators, -1.0, 1.0)[:, 0] * p.turn_degrees)
         room = torch.stack([1 - scale_y, 1 - scale_x], -1).clamp(min=0.1)
-        shift = uniform(generators, -1, 1, 2) * p.offset * room
+        shift = uniform(generators, -1.0, 1.0, 2) * p.offset * room
         theta = affine(turn, scale_y, scale_x, shift, width / height).to(pictures)
         return _resample(pictures, theta, (height, width))
 
     def _shading(self, generators: list[torch.Generator], size: Size) -> Tensor:
-        loss = uniform(generators, 0, self.mismatch.vignetting)[..., None, None]
+        loss = uniform(generators, 0.0, self.mismatch.vignetting)[..., None, None]
         y, x = torch.linspace(-1, 1, size[0])[:, None], torch.linspace(-1, 1, size[1])
         return 1 - loss * (y.square() + x.square()) / 2
 
@@ -197,8 +217,8 @@ def perturb(psf: Psf, mismatch: Mismatch, generators: list[torch.Generator]) -> 
     spread = uniform(generators, -mismatch.colour_shift_px, mismatch.colour_shift_px, 2)
     shift = base[:, None] + colours[:, None] * spread[:, None]
     # The PSF's centre is pixel n // 2, half a pixel from the middle of an even frame: turn about it.
-    turn = torch.deg2rad(uniform(generators, -1, 1)[:, 0] * mismatch.turn_degrees).repeat_interleave(channels)
-    scale = (1 + uniform(generators, -1, 1)[:, 0] * mismatch.scale).repeat_interleave(channels)
+    turn = torch.deg2rad(uniform(generators, -1.0, 1.0)[:, 0] * mismatch.turn_degrees).repeat_interleave(channels)
+    scale = (1 + uniform(generators, -1.0, 1.0)[:, 0] * mismatch.scale).repeat_interleave(channels)
     half = torch.tensor([height, width]) / 2
     centre = (torch.tensor([height // 2 + 0.5, width // 2 + 0.5]) - half) / half
     theta = affine(turn, scale, scale, shift.flatten(0, 1) / half, width / height)
@@ -207,10 +227,10 @@ def perturb(psf: Psf, mismatch: Mismatch, generators: list[torch.Generator]) -> 
     planes = psf.reshape(batch * channels, 1, height, width)
     grid = F.affine_grid(theta.to(psf), list(planes.shape), align_corners=False)
     moved = F.grid_sample(planes, grid, mode="bilinear", align_corners=False)
-    sigma = uniform(generators, 0, mismatch.blur_px)[:, 0].repeat_interleave(channels)
+    sigma = uniform(generators, 0.0, mismatch.blur_px)[:, 0].repeat_interleave(channels)
     blurred = _blur(moved, sigma.to(psf)).reshape(psf.shape)
     blurred = blurred / blurred.sum((-2, -1), keepdim=True).clamp(min=1e-12)
-    haze = uniform(generators, 0, mismatch.background)[..., None, None].to(psf)
+    haze = uniform(generators, 0.0, mismatch.background)[..., None, None].to(psf)
     return (1 - haze) * blurred + haze / (height * width)
 
 

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Mapping
 from functools import wraps
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -207,7 +207,7 @@ class Loss(nn.Module):
         self, weights: Mapping[str, float], *, alexnet: str | Path | None = None, heads: str | Path | None = None
     ) -> None:
         super().__init__()
-        self.weights = _checked(weights)
+        self.weights = checked_weights(weights)
         """May be changed while training: a weight, not a name."""
         self.alexnet = load_alexnet(alexnet) if {"feature_mse", "lpips"} & set(weights) else None
         self.heads = load_heads(heads, alexnet=alexnet) if "lpips" in weights else None
@@ -243,12 +243,13 @@ class Loss(nn.Module):
         return {"mse": mse, "l1": l1}[name](image, reference)
 
 
-def _checked(weights: Mapping[str, float]) -> dict[str, float]:
+def checked_weights(weights: Mapping[str, Any]) -> dict[str, float]:
+    """Copy of the weights of a `Loss`, for which its errors are raised."""
     if not weights:
         raise ParameterError(f'`weights` must name at least one of {", ".join(NAMES)}, for example {{"mse": 1.0}}.')
     for name, weight in weights.items():
         if name not in NAMES:
             raise UnknownNameError("loss", name, NAMES)
-        if not (math.isfinite(weight) and weight >= 0):
-            raise ParameterError(f"The weight of `{name}` ({weight}) must be finite and not negative.")
-    return dict(weights)
+        if not (isinstance(weight, int | float) and math.isfinite(weight) and weight >= 0):
+            raise ParameterError(f"The weight of `{name}` ({weight!r}) must be finite and not negative.")
+    return {name: float(weight) for name, weight in weights.items()}

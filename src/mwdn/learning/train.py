@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
@@ -17,7 +18,7 @@ from mwdn.data.images import write_picture
 from mwdn.data.sheets import contact_sheet
 from mwdn.data.simulated import SimulatedPairs
 from mwdn.data.writing import atomic
-from mwdn.errors import CheckpointError, MwdnError
+from mwdn.errors import CheckpointError, MwdnError, ParameterError
 from mwdn.learning.checkpoint import save_network
 from mwdn.learning.losses import Loss
 from mwdn.learning.recipe import Recipe, Schedule
@@ -63,8 +64,8 @@ class Trainer:
         alexnet: file of AlexNet's weights, where the loss needs them.
 
     Raises:
-        CheckpointError: the folder holds the state of another recipe or PSF.
-        OSError: the folder cannot be written to; found before training starts.
+        CheckpointError: the folder holds the state of another recipe or PSF, or a damaged one.
+        ParameterError: the folder cannot be written to; found before training starts.
     """
 
     def __init__(
@@ -83,8 +84,7 @@ class Trainer:
         self.validation = validation or pairs
         self.psf = calibration.psf.to(self.device)
         torch.manual_seed(self.schedule.seed)
-        options = {key: value for key, value in recipe.network.items() if key != "name"}
-        self.options = {key: tuple(v) if isinstance(v, list) else v for key, v in options.items()}
+        self.options = {key: value for key, value in recipe.network.items() if key != "name"}
         self.network = build(recipe.network["name"], **self.options).to(self.device)
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = build(recipe.network["name"], **self.options).to(self.device).eval()
@@ -95,8 +95,7 @@ class Trainer:
         # What a checkpoint must agree with to be gone on from.
         self.identity = {"recipe": recipe.as_dict(), "psf_hash": calibration.psf_hash}
         self._resume()
-        with atomic(out / "recipe.json") as temporary:  # an unwritable folder is found here, not after an hour
-            temporary.write_text(json.dumps(self.identity, indent=2))
+        self._claim()
 
     def _groups(self) -> list[dict[str, Any]]:
         """Weight decay pulls convolution weights to zero; biases, BatchNorm, w and lambda stay free."""
@@ -117,10 +116,11 @@ class Trainer:
             psnr = None
             if self.step % self.schedule.validate_every == 0 or self.step == self.schedule.steps:
                 psnr = self.validate()
+            report = Report(self.step, loss, parts, speed, psnr)
+            self._log(report)  # before the state: a run killed between the two repeats the step, and its line
+            if psnr is not None:
                 self.save(psnr)
                 last = time.perf_counter()
-            report = Report(self.step, loss, parts, speed, psnr)
-            self._log(report)
             callback(report)
         return self.best
 
@@ -200,11 +200,12 @@ class Trainer:
         path = self.out / "state.safetensors"
         if not path.exists():
             return
-        from safetensors import safe_open
-
-        with safe_open(path, framework="pt") as file:
-            header = file.metadata()
-        if json.loads(header["identity"]) != json.loads(json.dumps(self.identity)):
+        try:
+            with safe_open(path, framework="pt") as file:
+                header = file.metadata() or {}
+        except SafetensorError as error:
+            raise CheckpointError(f"`{path}` is damaged: {error}. Remove it to begin again.") from error
+        if json.loads(header.get("identity", "null")) != json.loads(json.dumps(self.identity)):
             raise CheckpointError(
                 f"`{self.out}` holds a run of another recipe or PSF. Choose another folder, `--out`, or remove it."
             )
@@ -219,6 +220,22 @@ class Trainer:
             moments = {key: value.contiguous(memory_format=form) for key, value in found.items() if key != "step"}
             self.optimiser.state[parameter] = {"step": found["step"].cpu(), **moments}
         self.step, self.best = int(header["step"]), float(header["best"])
+
+    def _claim(self) -> None:
+        """Write to the folder once, so that one that refuses is found now and not after an hour."""
+        log = self.out / "log.jsonl"
+        try:
+            with atomic(self.out / "recipe.json") as temporary:
+                temporary.write_text(json.dumps(self.identity, indent=2), encoding="utf-8")
+            # One line a step; those after the saved step will be written again.
+            lines = log.read_text(encoding="utf-8").splitlines(keepends=True) if log.exists() else []
+            with atomic(log) as temporary:
+                temporary.write_text("".join(lines[: self.step]), encoding="utf-8")
+        except OSError as error:
+            raise ParameterError(
+                f"`{self.out}` must be a folder that can be written to: {error.strerror or error}. "
+                "Choose another one: `--out`."
+            ) from error
 
     def _log(self, report: Report) -> None:
         line = {"step": report.step, "loss": report.loss, **report.parts, "psnr": report.psnr}

@@ -1,5 +1,6 @@
 """Learned reconstruction, one file a method. Each is called as ``network(measurement, psf)``."""
 
+from inspect import signature
 from typing import Any
 
 from torch import nn
@@ -31,11 +32,16 @@ def build(name: str, **options: Any) -> nn.Module:  # noqa: ANN401
         **options: keyword arguments of that network, for example ``width=32``.
 
     Raises:
-        UnknownNameError: there is no such network.
+        UnknownNameError: there is no such network, or it has no such option.
     """
     if name not in NETWORKS:
         raise UnknownNameError("network", name, NETWORKS)
-    return NETWORKS[name](**options)
+    known = signature(NETWORKS[name]).parameters
+    for option in options:
+        if option not in known:
+            raise UnknownNameError(f"option of the network '{name}'", option, known)
+    # JSON and TOML, where options come from, have lists alone.
+    return NETWORKS[name](**{key: tuple(v) if isinstance(v, list) else v for key, v in options.items()})
 
 
 __all__ = ["NETWORKS", "Mwdn", "MwdnCpsf", "UNet", "WienerBank", "WienerNetwork", "WienerUNet", "build"]

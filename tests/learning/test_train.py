@@ -1,0 +1,295 @@
+"""The training loop: it learns, and a run that is stopped anywhere ends as one that was not."""
+
+import itertools
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from mwdn.calibration import Calibration
+from mwdn.data.photographs import Photographs
+from mwdn.data.simulated import SimulatedPairs
+from mwdn.errors import CheckpointError, ParameterError
+from mwdn.learning.checkpoint import load_network, read_metadata
+from mwdn.learning.recipe import Recipe, Schedule
+from mwdn.learning.session import prepare
+from mwdn.learning.train import DivergenceError, Trainer, learning_rate
+from mwdn.optics.patterns import contour_psf
+
+RECIPE = Recipe(
+    {"name": "wiener-bank", "width": 4, "regularisations": (1e-2, 1e-4)},
+    Schedule(steps=6, batch=2, learning_rate=2e-3, warmup=2, ema=0.9, validate_every=3, validation=3),
+)
+
+
+def few(**schedule):
+    return replace(RECIPE, schedule=replace(RECIPE.schedule, **schedule))
+
+
+@pytest.fixture
+def photos(tmp_path):
+    """A few smooth pictures in a folder."""
+    (tmp_path / "photos").mkdir()
+    drawn = np.random.default_rng(2)
+    for number in range(3):
+        smooth = cv2.resize(drawn.integers(0, 256, (4, 4, 3), np.uint8), (24, 24), interpolation=cv2.INTER_CUBIC)
+        cv2.imwrite(str(tmp_path / "photos" / f"{number}.png"), smooth)
+    return tmp_path / "photos"
+
+
+@pytest.fixture
+def calibration(generator):
+    return Calibration(contour_psf((32, 32), cell=10, generator=generator).expand(1, 3, -1, -1).contiguous())
+
+
+@pytest.fixture
+def trainer(photos, calibration, tmp_path):
+    """``trainer(recipe, folder)``"""
+
+    def make(recipe=RECIPE, folder="run"):
+        return prepare(recipe, calibration, photos, tmp_path / folder, "cpu")
+
+    return make
+
+
+def same(one, other):
+    one, other = load_file(one), load_file(other)
+    assert one.keys() == other.keys()
+    return all(torch.equal(value, other[key]) for key, value in one.items())
+
+
+def log(folder):
+    return [json.loads(line) for line in (folder / "log.jsonl").read_text(encoding="utf-8").splitlines()]
+
+
+# --- Learning -----------------------------------------------------------------------------------------
+
+
+class FourPairs(SimulatedPairs):
+    """Always the first four."""
+
+    def batch(self, numbers):
+        return super().batch(range(4)[: len(numbers)])
+
+
+def test_overfits_four_pairs(photos, calibration, tmp_path):
+    recipe = few(steps=40, batch=4, warmup=5, learning_rate=5e-3, validate_every=40, validation=4, bfloat16=False)
+    pairs = FourPairs(Photographs(photos, side=24), calibration.psf)
+    losses = []
+    best = Trainer(recipe, calibration, pairs, tmp_path / "run").run(lambda report: losses.append(report.loss))
+    assert sum(losses[-5:]) < 0.3 * sum(losses[:5])
+    scenes = pairs.batch(range(4)).scene
+    assert best > -10 * torch.log10(scenes.square().mean())  # better than black
+
+
+def test_learning_rate_rises_then_falls_as_half_a_cosine():
+    schedule = Schedule(steps=110, warmup=10, learning_rate=2.0)
+    rates = [learning_rate(step, schedule) for step in range(111)]
+    assert rates[:10] == pytest.approx([0.2 * (step + 1) for step in range(10)])
+    assert rates[10] == pytest.approx(2.0)
+    assert rates[35] == pytest.approx(2.0 * (0.01 + 0.99 * (1 + 0.5**0.5) / 2))  # an eighth of a period
+    assert rates[60] == pytest.approx(2.0 * (0.01 + 0.99 / 2))
+    assert rates[110] == pytest.approx(0.02)
+    assert all(a > b for a, b in itertools.pairwise(rates[10:]))
+    assert learning_rate(0, Schedule(warmup=0, learning_rate=2.0)) == 2.0
+
+
+def test_each_step_has_its_learning_rate(trainer):
+    run = trainer()
+    for step in range(4):
+        run.advance()
+        assert {group["lr"] for group in run.optimiser.param_groups} == {learning_rate(step, run.schedule)}
+
+
+def test_running_mean_of_the_weights(trainer):
+    """Decay min(ema, n / (n + 10)) after step n, from the initial weights on; counters are copied."""
+    run = trainer(few(ema=0.15))
+    mean = {key: value.clone() for key, value in run.network.state_dict().items()}
+    for step in range(1, 4):
+        run.advance()
+        decay = min(0.15, step / (step + 10))
+        for key, value in run.network.state_dict().items():
+            mean[key] = decay * mean[key] + (1 - decay) * value if value.is_floating_point() else value.clone()
+    for key, value in run.average.state_dict().items():
+        torch.testing.assert_close(value, mean[key], rtol=1e-5, atol=1e-7)
+
+
+def test_without_ema_the_last_weights_count(trainer):
+    run = trainer(few(ema=0.0))
+    run.advance()
+    for mean, value in zip(run.average.state_dict().values(), run.network.state_dict().values(), strict=True):
+        assert torch.equal(mean, value)
+
+
+# --- What is written ----------------------------------------------------------------------------------
+
+
+def test_files_of_a_run(trainer, calibration, tmp_path):
+    reports = []
+    best = trainer().run(reports.append)
+    out = tmp_path / "run"
+    assert sorted(path.name for path in out.iterdir()) == [
+        *("best.safetensors", "last.safetensors", "log.jsonl", "recipe.json", "state.safetensors", "validation.png")
+    ]
+    lines = log(out)
+    assert [line["step"] for line in lines] == [1, 2, 3, 4, 5, 6]
+    assert [line["step"] for line in lines if line["psnr"] is not None] == [3, 6]
+    assert best == max(line["psnr"] for line in lines if line["psnr"] is not None)
+    assert [report.loss for report in reports] == [line["loss"] for line in lines]
+    header = read_metadata(out / "best.safetensors")
+    assert (header["name"], header["psf_hash"], header["psnr"]) == ("wiener-bank", calibration.psf_hash, best)
+    assert header["recipe"]["schedule"]["steps"] == 6
+    assert read_metadata(out / "last.safetensors")["step"] == 6
+    assert load_network(out / "best.safetensors")(torch.rand(1, 3, 32, 32), calibration.psf).shape == (1, 3, 32, 32)
+
+
+@pytest.mark.parametrize("recipe", [RECIPE, few(bfloat16=False)], ids=["bfloat16", "float32"])
+def test_resumed_run_ends_bit_identical(trainer, recipe, tmp_path):
+    trainer(recipe, "whole").run()
+    first = trainer(recipe, "halves")
+    for _ in range(3):
+        first.advance()
+    first.save(first.validate())
+    second = trainer(recipe, "halves")
+    assert (second.step, second.best) == (3, first.best)
+    second.run()
+    for name in ("last", "best", "state"):
+        assert same(tmp_path / "whole" / f"{name}.safetensors", tmp_path / "halves" / f"{name}.safetensors")
+
+
+def test_log_has_one_line_a_step_after_a_resume(trainer, tmp_path):
+    """Stopped after step 5, in the middle of a line, resumed from step 3."""
+    first = trainer()
+
+    def stop(report):
+        if report.step == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        first.run(stop)
+    path = tmp_path / "run" / "log.jsonl"
+    before = log(tmp_path / "run")
+    path.write_text(path.read_text() + '{"step": 6, "lo')
+    trainer().run()
+    after = log(tmp_path / "run")
+    assert [line["step"] for line in after] == [1, 2, 3, 4, 5, 6]
+    assert after[:5] == before
+    assert trainer().run() == max(line["psnr"] for line in after if line["psnr"] is not None)  # nothing left to do
+    assert log(tmp_path / "run") == after
+
+
+def test_log_of_a_run_that_never_saved_begins_again(trainer, tmp_path):
+    run = trainer()
+    with pytest.raises(KeyboardInterrupt):
+        run.run(lambda report: (_ for _ in ()).throw(KeyboardInterrupt))
+    trainer()
+    assert log(tmp_path / "run") == []
+
+
+def test_killed_between_log_and_state_repeats_the_step(trainer, tmp_path, monkeypatch):
+    run = trainer()
+    with monkeypatch.context() as patched:
+        patched.setattr(Trainer, "save", lambda self, psnr: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            run.run()
+    trainer().run()
+    assert [line["step"] for line in log(tmp_path / "run")] == [1, 2, 3, 4, 5, 6]
+
+
+TOML = """
+network = { name = "wiener-bank", width = 4, regularisations = [1e-2, 1e-4] }
+schedule = { steps = 60, batch = 1, warmup = 2, ema = 0.9, validate_every = 7, validation = 2 }
+"""
+
+
+def test_killed_runs_end_as_one_that_was_not(photos, calibration, tmp_path):
+    """SIGKILL twice, after some number of further steps, wherever the process then is; then left alone."""
+    (tmp_path / "r.toml").write_text(TOML, encoding="utf-8")
+    np.save(tmp_path / "psf.npy", calibration.psf[0].movedim(0, -1).numpy() / calibration.psf.max().item())
+    line = [sys.executable, "-m", "mwdn", "train", "r.toml", "--psf", "psf.npy", "--photos", str(photos)]
+    options = {"cwd": tmp_path, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "env": os.environ}
+
+    def start(folder):
+        return subprocess.Popen([*line, "--device", "cpu", "--out", folder], **options)
+
+    def lines():
+        path = tmp_path / "killed" / "log.jsonl"
+        return path.read_bytes().count(b"\n") if path.exists() else 0
+
+    whole = start("whole")
+    for _ in range(2):
+        process, goal = start("killed"), lines() + random.randint(3, 20)
+        while process.poll() is None and lines() < goal:
+            with pytest.raises(subprocess.TimeoutExpired):
+                process.wait(0.02)
+        process.send_signal(signal.SIGKILL)
+        process.communicate(timeout=60)
+        assert process.returncode == -signal.SIGKILL
+    last = start("killed")
+    for process in (whole, last):
+        _, err = process.communicate(timeout=300)
+        assert process.returncode == 0, err
+    for name in ("best", "last", "state"):
+        assert same(tmp_path / "whole" / f"{name}.safetensors", tmp_path / "killed" / f"{name}.safetensors")
+    assert [line["step"] for line in log(tmp_path / "killed")] == list(range(1, 61))
+    assert log(tmp_path / "killed") == log(tmp_path / "whole")
+
+
+# --- What is refused ----------------------------------------------------------------------------------
+
+
+def test_another_recipe_or_psf_in_the_same_folder(trainer, photos, calibration, tmp_path):
+    trainer().run()
+    before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
+    other = Calibration(calibration.psf.flip(-1))
+    for again in (
+        lambda: trainer(few(learning_rate=1e-4)),
+        lambda: prepare(RECIPE, other, photos, tmp_path / "run", "cpu"),
+    ):
+        with pytest.raises(CheckpointError, match=r"holds a run of another recipe or PSF\. Choose another folder"):
+            again()
+    assert before == {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
+
+
+def test_damaged_or_foreign_state(trainer, tmp_path):
+    trainer().run()
+    state = tmp_path / "run" / "state.safetensors"
+    whole = state.read_bytes()
+    state.write_bytes(whole[:1000])
+    with pytest.raises(CheckpointError, match=r"state\.safetensors` is damaged: .* Remove it to begin again"):
+        trainer()
+    state.write_bytes((tmp_path / "run" / "last.safetensors").read_bytes())
+    with pytest.raises(CheckpointError, match="another recipe or PSF"):
+        trainer()
+
+
+def test_folder_that_cannot_be_written_is_found_before_training(trainer, tmp_path):
+    (tmp_path / "run").write_text("a file")
+    with pytest.raises(ParameterError, match=r"`.*run` must be a folder that can be written to: .*`--out`"):
+        trainer()
+    with pytest.raises(ParameterError, match="must be a folder that can be written to"):
+        trainer(folder="run/deeper")
+    assert (tmp_path / "run").read_text() == "a file"
+
+
+def test_divergence_leaves_the_state(trainer, tmp_path):
+    run = trainer(few(steps=9))
+    for _ in range(3):
+        run.advance()
+    run.save(run.validate())
+    before = (tmp_path / "run" / "state.safetensors").read_bytes()
+    with torch.no_grad():
+        next(run.network.parameters()).fill_(float("nan"))
+    with pytest.raises(DivergenceError, match=r"The loss of step 3 \(samples 6 to 7\) is not finite\. Lower the"):
+        run.run()
+    assert (tmp_path / "run" / "state.safetensors").read_bytes() == before
+    assert trainer(few(steps=9)).step == 3

@@ -1,0 +1,149 @@
+"""`mwdn train` and `mwdn simulate` as a user types them, and what becomes of their files."""
+
+import re
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from mwdn import read_frame
+from mwdn.calibration import Calibration
+from mwdn.cli import main
+from mwdn.data.pairs import PairFile
+from mwdn.fourier import convolve
+from mwdn.learning.checkpoint import save_network
+from mwdn.networks import build
+from mwdn.optics.patterns import contour_psf
+from mwdn.reconstruct import Reconstructor
+
+RECIPE = """
+network = { name = "wiener-bank", width = 4 }
+schedule = { steps = 9, batch = 2, validate_every = 2, validation = 2, bfloat16 = false }
+placement = { extent = [0.4, 0.4] }
+"""
+
+
+@pytest.fixture
+def camera(tmp_path, monkeypatch, generator):
+    """Current folder with psf.npy, other.npy, photos, a capture and r.toml."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("psf", "other"):
+        psf = contour_psf((32, 40), cell=10, generator=generator).expand(1, 3, -1, -1)
+        np.save(f"{name}.npy", (0.9 * psf / psf.max())[0].movedim(0, -1).numpy())
+    np.save("capture.npy", np.full((32, 40, 3), 0.3, np.float32))
+    (tmp_path / "photos").mkdir()
+    for number in range(3):
+        small = np.random.default_rng(number).integers(0, 256, (4, 4, 3), np.uint8)
+        cv2.imwrite(f"photos/{number}.png", cv2.resize(small, (24, 24), interpolation=cv2.INTER_CUBIC))
+    (tmp_path / "r.toml").write_text(RECIPE, encoding="utf-8")
+    return tmp_path
+
+
+@pytest.fixture
+def run(capsys):
+    """``run("train r.toml ...")`` gives exit code, standard output, standard error."""
+
+    def call(line):
+        with pytest.raises(SystemExit) as caught:
+            main(line.split())
+        return (caught.value.code or 0, *capsys.readouterr())
+
+    return call
+
+
+def flat(text):
+    return re.sub(r"[\s│]+", " ", text)
+
+
+TRAIN = "train r.toml --psf psf.npy --photos photos --steps 4 --device cpu --out runs/x"
+RECONSTRUCT = "reconstruct capture.npy --method runs/x/best.safetensors --device cpu --psf"
+
+
+def test_train_then_reconstruct(run, camera):
+    code, out, err = run(TRAIN)
+    assert code == 0, err
+    assert "Weights in runs/x/best.safetensors" in out
+    assert re.search(r"step 4: validation \d+\.\d\d dB, best \d+\.\d\d dB", flat(err))
+    code, out, err = run(f"{RECONSTRUCT} psf.npy")
+    assert (code, err) == (0, "")
+    assert read_frame("results/reconstruct/capture.png").shape == (32, 40, 3)
+    assert run(TRAIN)[0] == 0  # nothing left to do
+
+
+def test_checkpoint_of_another_camera_is_used_with_a_warning(run, camera):
+    assert run(TRAIN)[0] == 0
+    trained, given = (Calibration.from_file(f"{name}.npy").psf_hash for name in ("psf", "other"))
+    code, _, err = run(f"{RECONSTRUCT} other.npy")
+    assert code == 0
+    assert err.count("Warning:") == len(err.splitlines()) == 1
+    said = f"`runs/x/best.safetensors` was trained for the camera of PSF {trained}, but the PSF given is {given}."
+    assert said in err
+    assert "Expect blur, ghosts and invented detail" in err
+    assert read_frame("results/reconstruct/capture.png").shape == (32, 40, 3)
+
+
+def test_warning_of_a_reconstructor(camera):
+    calibration = Calibration.from_file("psf.npy")
+    network = build("wiener-bank", width=2)
+    for name, told in (("any", {}), ("own", {"psf_hash": calibration.psf_hash}), ("other", {"psf_hash": "0" * 16})):
+        save_network(f"{name}.safetensors", network, "wiener-bank", {"width": 2}, **told)
+        warning = Reconstructor(f"{name}.safetensors", calibration, device="cpu").warning
+        assert (warning is not None) == (name == "other")
+    assert Reconstructor("wiener", calibration).warning is None
+    assert Reconstructor(network, calibration).warning is None
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        (TRAIN.replace("runs/x", "r.toml"), "`r.toml` must be a folder that can be written to"),
+        (TRAIN.replace("--photos photos", "--photos runs"), "The folder `runs` holds no photograph"),
+        (TRAIN.replace("train r.toml", "train r.tml"), "`r.tml` cannot be read as a recipe"),
+        (TRAIN.replace("--steps 4", "--steps 0"), "`steps` (0) must be positive"),
+        ("simulate photos --psf psf.npy --count 0", "`count` (0) must be at least 1"),
+        ("simulate photos --psf psf.npy -o photos", "`photos` is a folder"),
+        ("simulate nothing --psf psf.npy", "The folder `nothing` holds no photograph"),
+    ],
+)
+def test_wrong_call_is_one_message_and_exit_2(run, camera, line, said):
+    code, _, err = run(line)
+    assert code == 2
+    assert said in flat(err)
+    assert "Traceback" not in err
+    assert not list(camera.glob("*.h5"))
+
+
+def test_simulate_then_evaluate(run, camera):
+    code, out, err = run("simulate photos --psf psf.npy -o pairs.h5 --count 5 --recipe r.toml --seed 3")
+    assert code == 0, err
+    assert "5 pairs written to pairs.h5" in out
+    calibration = Calibration.from_file("psf.npy")
+    with PairFile("pairs.h5") as file:
+        assert len(file) == 5
+        assert file.attributes == {"psf_hash": calibration.psf_hash, "seed": 3}
+        assert torch.equal(file.psf, calibration.psf)
+        measurement, scene = file[4]
+        assert measurement.shape == scene.shape == (3, 32, 40)
+        assert measurement.dtype == torch.float32
+        assert 0 < scene.count_nonzero() < 1.6 * 3 * (0.4 * 32 + 4) ** 2  # the recipe's extent
+    code, out, err = run("evaluate wiener --data pairs.h5 --psf psf.npy --device cpu")
+    assert code == 0, err
+    assert "wiener" in out
+
+
+def test_simulate_is_reproducible_and_exact(run, camera):
+    for name, options in (("a", "--seed 1"), ("b", "--seed 1"), ("c", ""), ("exact", "--seed 1 --exact")):
+        assert run(f"simulate photos --psf psf.npy -o {name}.h5 --count 3 {options}")[0] == 0
+    a, b, c, exact = (PairFile(f"{name}.h5") for name in ("a", "b", "c", "exact"))
+    for one, other, another in zip(a, b, c, strict=True):
+        assert all(map(torch.equal, one, other))
+        assert not torch.equal(one[1], another[1])
+    # Apart from ambient light, which is even, only noise distinguishes it from the calibrated camera.
+    errors = []
+    for file in (exact, a):
+        measurement, scene = (torch.stack(part) for part in zip(*(file[i] for i in range(3)), strict=True))
+        difference = measurement - convolve(scene, file.psf)
+        difference = difference - difference.mean((1, 2, 3), keepdim=True)
+        errors.append(float(difference.std() / measurement.std()))
+    assert errors[0] < 0.05 < errors[1]
