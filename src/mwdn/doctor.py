@@ -8,6 +8,8 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from mwdn.learning.precision import has_bfloat16
+
 _PACKAGES = ("mwdn", "torch", "numpy", "opencv-python-headless", "tifffile", "h5py", "safetensors", "cyclopts", "rich")
 
 
@@ -26,14 +28,14 @@ def findings() -> dict[str, str]:
         f"{platform.machine()}, {os.cpu_count()} cores, instructions {torch.backends.cpu.get_cpu_capability()}"
     )
     found["threads"] = f"{torch.get_num_threads()} (set OMP_NUM_THREADS to change)"
-    # Builds without oneDNN, such as those for Macs, do not have the question.
-    fast = torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported()  # type: ignore[no-untyped-call]
-    found["bfloat16 on the CPU"] = "yes, in hardware" if fast else "emulated: float32 is faster"
+    found["bfloat16 on the CPU"] = (
+        "yes, in hardware" if has_bfloat16(torch.device("cpu")) else "emulated: float32 is faster"
+    )
     if not torch.cuda.is_available():
         found["GPU"] = "none that torch can use"
     for index in range(torch.cuda.device_count()):
         card = torch.cuda.get_device_properties(index)
-        bfloat = "with" if torch.cuda.is_bf16_supported() else "without"
+        bfloat = "with" if has_bfloat16(torch.device("cuda", index)) else "without"
         found[f"cuda:{index}"] = f"{card.name}, {card.total_memory / 2**30:.0f} GiB, {bfloat} bfloat16"
     return found
 

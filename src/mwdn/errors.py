@@ -8,7 +8,8 @@
     │   └── UnknownNameError           a name that no method, network or recipe key has
     ├── ImageError (ValueError)        a picture or frame that cannot be read or written
     ├── PsfError (ValueError)          a PSF that no reconstruction can trust
-    └── CheckpointError (ValueError)   weights that are damaged or belong to something else
+    ├── CheckpointError (ValueError)   weights that are damaged or belong to something else
+    └── DivergenceError                a loss that is not finite any more
 
 A message states what must hold, what was got, and the way out.
 """
@@ -55,3 +56,7 @@ class PsfError(MwdnError, ValueError):
 
 class CheckpointError(MwdnError, ValueError):
     """Weights are damaged, or belong to another network or camera."""
+
+
+class DivergenceError(MwdnError):
+    """The loss of a training run is not finite any more."""

@@ -18,18 +18,15 @@ from mwdn.data.images import write_picture
 from mwdn.data.sheets import contact_sheet
 from mwdn.data.simulated import SimulatedPairs
 from mwdn.data.writing import atomic
-from mwdn.errors import CheckpointError, MwdnError, ParameterError
+from mwdn.errors import CheckpointError, DivergenceError, ParameterError
 from mwdn.learning.checkpoint import save_network
 from mwdn.learning.losses import Loss
+from mwdn.learning.precision import has_bfloat16
 from mwdn.learning.recipe import Recipe, Schedule
 from mwdn.networks import build
 
 VALIDATION_START = 10**12
 """Samples are numbered; those of the validation start here, where no training ever arrives."""
-
-
-class DivergenceError(MwdnError):
-    """The loss is not finite any more."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +88,7 @@ class Trainer:
         self.average.load_state_dict(self.network.state_dict())
         self.loss = Loss(recipe.loss, alexnet=alexnet).to(self.device)
         self.optimiser = torch.optim.AdamW(self._groups(), lr=self.schedule.learning_rate)
+        self.bfloat16 = self.schedule.bfloat16 and has_bfloat16(self.device)
         self.step, self.best = 0, -math.inf
         # What a checkpoint must agree with to be gone on from.
         self.identity = {"recipe": recipe.as_dict(), "psf_hash": calibration.psf_hash}
@@ -136,7 +134,7 @@ class Trainer:
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate(self.step, self.schedule)
         self.network.train()
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.schedule.bfloat16):
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
             found = self.network(measurement.contiguous(memory_format=torch.channels_last), self.psf)
         loss, parts = self.loss(found.float(), scene)
         if not loss.isfinite():
