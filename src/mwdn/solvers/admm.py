@@ -36,6 +36,7 @@ class Problem(NamedTuple):
 
     measurement: Measurement
     transfer: Spectrum
+    adjoint: Spectrum
     power: Tensor
     laplacian: Tensor
     grid: Size
@@ -82,7 +83,8 @@ def pose(measurement: Measurement, psf: Psf) -> Problem:
     columns = torch.arange(width // 2 + 1, device=psf.device) * (math.pi / width)
     laplacian = 4 * rows.sin().square() + 4 * columns.sin().square()
     H = transfer_function(psf, (height, width))
-    return Problem(measurement.float(), H, H.abs().square(), laplacian, (height, width))
+    adjoint = H.conj().resolve_conj()  # a lazy conjugate would be copied at each use
+    return Problem(measurement.float(), H, adjoint, H.abs().square(), laplacian, (height, width))
 
 
 def start(problem: Problem) -> State:
@@ -111,23 +113,17 @@ def merge(state: State, copies: Splitting, problem: Problem, mu: Penalties) -> S
     """Update the scene, which all copies must agree on, in the Fourier domain; then the multipliers."""
     (uy, ux), x, w = copies
     (ey, ex), H = state.eta, problem.transfer
-    prior = mu.sign * (w - state.rho) + mu.gradient * divergence((uy - ey, ux - ex))
-    beyond = mu.data * (x - state.Hv - state.xi)  # what the sensor adds to mu1 H v
+    # Copy minus multiplier is what the scene is pulled to; the new multiplier is how far it then stays away.
+    pull_y, pull_x, pull_sensor, pull_w = uy - ey, ux - ex, x - state.xi, w - state.rho
+    prior = (mu.sign * pull_w).add_(mu.gradient * divergence((pull_y, pull_x)))
+    beyond = mu.data * (pull_sensor - state.Hv)  # what the sensor adds to mu1 H v
     power = mu.data * problem.power
-    V = spectrum(prior, problem.grid) + power * state.V + H.conj() * spectrum(beyond, problem.grid)
+    V = spectrum(prior, problem.grid).add_(power * state.V).add_(problem.adjoint * spectrum(beyond, problem.grid))
     V = V / (power + (mu.gradient * problem.laplacian + mu.sign))
     v = inverse_spectrum(V, problem.grid, problem.grid)
     Hv = inverse_spectrum(H * V, problem.grid, problem.sensor)
     gy, gx = gradient(v)
-    return State(
-        v,
-        V,
-        (gy, gx),
-        Hv,
-        xi=state.xi + (Hv - x),
-        eta=(ey + (gy - uy), ex + (gx - ux)),
-        rho=state.rho + (v - w),
-    )
+    return State(v, V, (gy, gx), Hv, xi=Hv - pull_sensor, eta=(gy - pull_y, gx - pull_x), rho=v - pull_w)
 
 
 def rescale(state: State, old: Penalties, new: Penalties) -> State:

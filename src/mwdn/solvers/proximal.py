@@ -20,12 +20,12 @@ Variation = Literal["anisotropic", "isotropic", "colour"]
 
 def gradient(v: Tensor) -> Gradient:
     """Periodic forward differences, ``(v[i+1] - v[i], v[j+1] - v[j])``."""
-    return v.roll(-1, -2) - v, v.roll(-1, -1) - v
+    return v.roll(-1, -2).sub_(v), v.roll(-1, -1).sub_(v)  # in place: fresh memory costs more than the sum
 
 
 def divergence(u: Gradient) -> Tensor:
     """Adjoint of `gradient` (the negative of what physics calls divergence)."""
-    return (u[0].roll(1, -2) - u[0]) + (u[1].roll(1, -1) - u[1])
+    return u[0].roll(1, -2).sub_(u[0]).add_(u[1].roll(1, -1)).sub_(u[1])
 
 
 def _squared_length(u: Gradient, variation: Variation) -> Tensor:
