@@ -14,6 +14,7 @@ from mwdn.errors import ParameterError, ShapeError
 from mwdn.solvers import admm, proximal
 from mwdn.solvers.admm import TEXTBOOK, Admm, Penalties
 from mwdn.solvers.fista import Fista
+from mwdn.solvers.pyramid import Pyramid
 
 # (sensor, PSF)
 SIZES = [
@@ -348,6 +349,7 @@ SOLVERS = {
     "isotropic": Admm(regularisation=1e-3, penalties=BRISK, iterations=15, variation="isotropic"),
     "balanced": Admm(iterations=15, balance_every=5),
     "fista": Fista(iterations=15),
+    "pyramid": Pyramid(),
 }
 
 

@@ -64,6 +64,9 @@ class Mismatch:
         background: even light under the PSF, as a part of its sum.
         colour_shift_px: displacement of red and blue against green.
         vignetting: relative loss of light in the corners of the measurement.
+        tilt: relative gain or loss of light at one side of the measurement against its centre, in any direction.
+        grain: relative error of the single pixels of the calibrated PSF, as its own noise leaves it.
+        full: draw the largest sizes always, with a random sign where there is one.
     """
 
     shift_px: float = 0.5
@@ -73,14 +76,27 @@ class Mismatch:
     background: float = 0.1
     colour_shift_px: float = 0.3
     vignetting: float = 0.1
+    tilt: float = 0.0
+    grain: float = 0.0
+    full: bool = False
 
     def __post_init__(self) -> None:
         for part in fields(self):
             if not getattr(self, part.name) >= 0:
                 raise ParameterError(f"`{part.name}` ({getattr(self, part.name)}) must not be negative: it is a size.")
-        for name in ("scale", "background", "vignetting"):
+        for name in ("scale", "background", "vignetting", "tilt"):
             if not getattr(self, name) < 1:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) must be below 1.")
+
+    def size(self, generators: list[torch.Generator], largest: float) -> Tensor:
+        """(B, 1) draws from [0, largest]."""
+        drawn = uniform(generators, 0.0, 1.0)
+        return largest * (torch.ones_like(drawn) if self.full else drawn)
+
+    def signed(self, generators: list[torch.Generator], largest: float, count: int = 1) -> Tensor:
+        """(B, count) draws from [-largest, largest]."""
+        drawn = uniform(generators, -1.0, 1.0, count)
+        return largest * (torch.where(drawn < 0, -1.0, 1.0) if self.full else drawn)
 
 
 EXACT = Mismatch(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -183,9 +199,14 @@ class SimulatedPairs:
         return _resample(pictures, theta, (height, width))
 
     def _shading(self, generators: list[torch.Generator], size: Size) -> Tensor:
-        loss = uniform(generators, 0.0, self.mismatch.vignetting)[..., None, None]
+        loss = self.mismatch.size(generators, self.mismatch.vignetting)[..., None, None]
         y, x = torch.linspace(-1, 1, size[0])[:, None], torch.linspace(-1, 1, size[1])
-        return 1 - loss * (y.square() + x.square()) / 2
+        shading = 1 - loss * (y.square() + x.square()) / 2
+        if self.mismatch.tilt:
+            tilt = self.mismatch.size(generators, self.mismatch.tilt)[..., None, None]
+            angle = uniform(generators, 0.0, 2 * math.pi)[..., None, None]
+            shading = shading * (1 + tilt * (y * angle.sin() + x * angle.cos()))
+        return shading
 
     def _expose(self, light: Tensor, generator: torch.Generator) -> Tensor:
         if light.device.type != "cpu":
@@ -213,12 +234,12 @@ def perturb(psf: Psf, mismatch: Mismatch, generators: list[torch.Generator]) -> 
         return psf
     batch, channels, height, width = psf.shape
     colours = torch.tensor([-1.0, 0.0, 1.0]) if channels == 3 else torch.zeros(channels)
-    base = uniform(generators, -mismatch.shift_px, mismatch.shift_px, 2)
-    spread = uniform(generators, -mismatch.colour_shift_px, mismatch.colour_shift_px, 2)
+    base = mismatch.signed(generators, mismatch.shift_px, 2)
+    spread = mismatch.signed(generators, mismatch.colour_shift_px, 2)
     shift = base[:, None] + colours[:, None] * spread[:, None]
     # The PSF's centre is pixel n // 2, half a pixel from the middle of an even frame: turn about it.
-    turn = torch.deg2rad(uniform(generators, -1.0, 1.0)[:, 0] * mismatch.turn_degrees).repeat_interleave(channels)
-    scale = (1 + uniform(generators, -1.0, 1.0)[:, 0] * mismatch.scale).repeat_interleave(channels)
+    turn = torch.deg2rad(mismatch.signed(generators, mismatch.turn_degrees)[:, 0]).repeat_interleave(channels)
+    scale = (1 + mismatch.signed(generators, mismatch.scale)[:, 0]).repeat_interleave(channels)
     half = torch.tensor([height, width]) / 2
     centre = (torch.tensor([height // 2 + 0.5, width // 2 + 0.5]) - half) / half
     theta = affine(turn, scale, scale, shift.flatten(0, 1) / half, width / height)
@@ -227,10 +248,13 @@ def perturb(psf: Psf, mismatch: Mismatch, generators: list[torch.Generator]) -> 
     planes = psf.reshape(batch * channels, 1, height, width)
     grid = F.affine_grid(theta.to(psf), list(planes.shape), align_corners=False)
     moved = F.grid_sample(planes, grid, mode="bilinear", align_corners=False)
-    sigma = uniform(generators, 0.0, mismatch.blur_px)[:, 0].repeat_interleave(channels)
+    sigma = mismatch.size(generators, mismatch.blur_px)[:, 0].repeat_interleave(channels)
     blurred = _blur(moved, sigma.to(psf)).reshape(psf.shape)
+    if mismatch.grain:
+        noise = torch.stack([torch.randn(blurred.shape[1:], generator=g) for g in generators]).to(blurred)
+        blurred = blurred * (1 + mismatch.grain * noise).clamp(min=0)
     blurred = blurred / blurred.sum((-2, -1), keepdim=True).clamp(min=1e-12)
-    haze = uniform(generators, 0.0, mismatch.background)[..., None, None].to(psf)
+    haze = mismatch.size(generators, mismatch.background)[..., None, None].to(psf)
     return (1 - haze) * blurred + haze / (height * width)
 
 

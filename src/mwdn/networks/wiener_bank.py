@@ -4,26 +4,35 @@ import math
 
 import torch
 from torch import nn
+from torch.nn import functional as F
 
 from mwdn.errors import ParameterError
 from mwdn.fourier import Boundary, wiener
 from mwdn.networks.blocks import Decoder, Encoder, Pooling, paper_widths, peak_one
+from mwdn.solvers.pyramid import explain
 from mwdn.types import Measurement, Psf, Scene
 
 
 class WienerBank(nn.Module):
-    """Several Wiener filters, from strong to weak regularisation, in picture space; a U-Net picks from their estimates.
+    """Several Wiener filters, from strong to weak regularisation, in picture space; a U-Net corrects their estimates.
 
     A strong lambda leaves a smooth picture of right brightness, a weak one keeps detail and amplifies noise; no single
-    one serves all frequencies. Everything is measured in units of the smoothest estimate's brightest pixel and scaled
-    back at the end, so exposure and gain cannot matter: the network of a scaled measurement is the scaled scene.
+    one serves all frequencies. No linear filter knows that the sensor crops the pattern and that light is not negative,
+    which decides about shading and colour. So a few coarse iterations that know both (`mwdn.solvers.pyramid`) explain
+    what they can, and the bank filters the rest. The U-Net learns what is then wrong with the middle estimate.
+
+    Everything is measured in units of the smoothest estimate's brightest pixel and scaled back at the end, so exposure
+    and gain cannot matter: the network of a scaled measurement is the scaled scene.
 
     Args:
         channels: colours of the measurement and the scene.
-        width: feature channels at full resolution.
+        width: feature channels at the U-Net's finest scale.
+        fold: pixels along each side of the blocks that the U-Net sees as one pixel of more channels. With 2 it takes
+            a quarter of the time and sees twice as far; the estimates it corrects keep the full resolution.
         regularisations: start values of lambda, for a PSF of unit sum, the strongest first.
+        crop_aware: filter what the coarse iterations left; else the measurement itself.
         pooling: between the encoder's scales.
-        boundary: see `mwdn.fourier.Boundary`.
+        boundary: what stands beyond the measurement unless ``crop_aware``, see `mwdn.fourier.Boundary`.
     """
 
     def __init__(
@@ -31,24 +40,41 @@ class WienerBank(nn.Module):
         *,
         channels: int = 3,
         width: int = 24,
-        regularisations: tuple[float, ...] = (3e-2, 3e-3, 5e-4, 7e-5, 1e-5),
+        fold: int = 2,
+        regularisations: tuple[float, ...] = (3e-3, 5e-4, 1e-4, 3e-5),
+        crop_aware: bool = True,
         pooling: Pooling = "max",
         boundary: Boundary = "taper",
     ) -> None:
         super().__init__()
         if not regularisations or min(regularisations) <= 0:
             raise ParameterError(f"`regularisations` {tuple(regularisations)} must be one or more positive numbers.")
-        self.channels, self.boundary = channels, boundary
+        if fold < 1:
+            raise ParameterError(f"`fold` ({fold}) must be at least 1.")
+        self.channels, self.fold, self.crop_aware, self.boundary = channels, fold, crop_aware, boundary
         self.log_regularisations = nn.Parameter(torch.tensor([math.log(value) for value in regularisations]))
-        self.encoder = Encoder(channels * (len(regularisations) + 1), paper_widths(width), pooling=pooling)
-        self.decoder = Decoder(channels, paper_widths(width))
+        pictures = len(regularisations) + (2 if crop_aware else 1)
+        self.encoder = Encoder(channels * pictures * fold**2, paper_widths(width), pooling=pooling)
+        self.decoder = Decoder(channels * fold**2, paper_widths(width))
+        with torch.no_grad():
+            self.decoder.head.weight.mul_(0.1)  # begin near the middle estimate
 
     def forward(self, measurement: Measurement, psf: Psf) -> Scene:
         """Scene (B, C, H, W), each colour deconvolved with its own PSF."""
         psf = peak_one(psf, measurement)
         psf = psf / psf.sum((-2, -1), keepdim=True)
-        lambdas = self.log_regularisations.exp()
-        estimates = [wiener(measurement, psf, value, boundary=self.boundary) for value in lambdas]
+        estimates = self.estimates(measurement, psf)
         unit = estimates[0].detach().amax((1, 2, 3), keepdim=True).clamp(min=1e-6)
-        features = self.encoder(torch.cat([*estimates, measurement], dim=1) / unit)
-        return unit * self.decoder(features)
+        seen = torch.cat([*estimates, measurement], dim=1) / unit
+        height, width = seen.shape[-2:]
+        folded = F.pixel_unshuffle(F.pad(seen, (0, -width % self.fold, 0, -height % self.fold)), self.fold)
+        correction = F.pixel_shuffle(self.decoder(self.encoder(folded)), self.fold)[..., :height, :width]
+        return estimates[len(estimates) // 2] + unit * correction
+
+    def estimates(self, measurement: Measurement, psf: Psf) -> list[Scene]:
+        """Estimates of the scene, the smoothest first."""
+        lambdas = self.log_regularisations.exp()
+        if not self.crop_aware:
+            return [wiener(measurement, psf, value, boundary=self.boundary) for value in lambdas]
+        found = explain(measurement, psf)
+        return [found.scene, *(found.scene + found.detail(value) for value in lambdas)]

@@ -5,13 +5,16 @@ from typing import Any
 from mwdn.errors import UnknownNameError
 from mwdn.solvers.admm import TEXTBOOK, Admm, Penalties, Progress
 from mwdn.solvers.fista import Fista
+from mwdn.solvers.pyramid import Pyramid
 from mwdn.solvers.wiener import Wiener, noise_level
 
-SOLVERS: dict[str, type[Admm | Fista | Wiener]] = {"admm": Admm, "fista": Fista, "wiener": Wiener}
+Solver = Admm | Fista | Pyramid | Wiener
+
+SOLVERS: dict[str, type[Solver]] = {"admm": Admm, "fista": Fista, "pyramid": Pyramid, "wiener": Wiener}
 """Every solver by the name that the command line uses."""
 
 
-def build(name: str, **options: Any) -> Admm | Fista | Wiener:  # noqa: ANN401
+def build(name: str, **options: Any) -> Solver:  # noqa: ANN401
     """Make a solver.
 
     Args:
@@ -26,4 +29,16 @@ def build(name: str, **options: Any) -> Admm | Fista | Wiener:  # noqa: ANN401
     return SOLVERS[name](**options)
 
 
-__all__ = ["SOLVERS", "TEXTBOOK", "Admm", "Fista", "Penalties", "Progress", "Wiener", "build", "noise_level"]
+__all__ = [
+    "SOLVERS",
+    "TEXTBOOK",
+    "Admm",
+    "Fista",
+    "Penalties",
+    "Progress",
+    "Pyramid",
+    "Solver",
+    "Wiener",
+    "build",
+    "noise_level",
+]

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mwdn.errors import ParameterError
 from mwdn.fourier import Size, check_fit, fast_length, inverse_spectrum, spectrum, transfer_function
-from mwdn.solvers.proximal import Gradient, Variation, divergence, gradient, shrink, total_variation
+from mwdn.solvers.proximal import Variation, divergence, gradient, shrink, total_variation
 from mwdn.types import Measurement, Psf, Scene, Spectrum
 
 
@@ -50,22 +50,23 @@ class Problem(NamedTuple):
 class State(NamedTuple):
     """The scene v, its gradient, what the sensor sees of it, and the multipliers xi, eta, rho.
 
-    The multipliers are kept divided by their penalties, which saves a multiplication at each of their uses.
+    The multipliers are kept divided by their penalties, which saves a multiplication at each of their uses. A
+    problem without total variation has neither slope nor eta: they are empty.
     """
 
     v: Tensor
     V: Spectrum
-    slope: Gradient
+    slope: tuple[Tensor, ...]
     Hv: Measurement
     xi: Measurement
-    eta: Gradient
+    eta: tuple[Tensor, ...]
     rho: Tensor
 
 
 class Splitting(NamedTuple):
     """The copies u = Psi v, x = H v and w = v of one iteration."""
 
-    u: Gradient
+    u: tuple[Tensor, ...]
     x: Measurement
     w: Tensor
 
@@ -87,13 +88,15 @@ def pose(measurement: Measurement, psf: Psf) -> Problem:
     return Problem(measurement.float(), H, adjoint, H.abs().square(), laplacian, (height, width))
 
 
-def start(problem: Problem) -> State:
-    """Zero scene, zero multipliers."""
+def start(problem: Problem, scene: Tensor | None = None, *, smooth: bool = True) -> State:
+    """Zero multipliers, and a zero scene unless one of the grid's size is given; ``smooth`` for total variation."""
     b = problem.measurement
-    v = b.new_zeros((*b.shape[:2], *problem.grid))
-    V = torch.zeros((*b.shape[:2], problem.grid[0], problem.grid[1] // 2 + 1), dtype=torch.complex64, device=b.device)
-    zero = torch.zeros_like(b)
-    return State(v, V, (v, v), zero, zero, (v, v), v)
+    zero = b.new_zeros((*b.shape[:2], *problem.grid))
+    v = zero if scene is None else scene
+    V = spectrum(v, problem.grid)
+    Hv = inverse_spectrum(problem.transfer * V, problem.grid, problem.sensor)
+    slope, eta = (gradient(v), (zero, zero)) if smooth else ((), ())
+    return State(v, V, slope, Hv, torch.zeros_like(b), eta, zero)
 
 
 def split(state: State, problem: Problem, mu: Penalties, tau: float | Tensor, variation: Variation) -> Splitting:
@@ -102,8 +105,10 @@ def split(state: State, problem: Problem, mu: Penalties, tau: float | Tensor, va
     Outside the sensor nothing is measured and the textbook's x obeys ``mu1 x - xi = mu1 H v``, so x and xi are
     kept on the sensor alone.
     """
-    (gy, gx), (ey, ex) = state.slope, state.eta
-    u = shrink((gy + ey, gx + ex), tau / mu.gradient, variation)
+    u: tuple[Tensor, ...] = ()
+    if state.slope:
+        (gy, gx), (ey, ex) = state.slope, state.eta
+        u = shrink((gy + ey, gx + ex), tau / mu.gradient, variation)
     x = (mu.data * (state.xi + state.Hv) + problem.measurement) / (1 + mu.data)
     w = (state.rho + state.v).clamp(min=0)
     return Splitting(u, x, w)
@@ -111,34 +116,40 @@ def split(state: State, problem: Problem, mu: Penalties, tau: float | Tensor, va
 
 def merge(state: State, copies: Splitting, problem: Problem, mu: Penalties) -> State:
     """Update the scene, which all copies must agree on, in the Fourier domain; then the multipliers."""
-    (uy, ux), x, w = copies
-    (ey, ex), H = state.eta, problem.transfer
+    u, x, w = copies
+    H = problem.transfer
     # Copy minus multiplier is what the scene is pulled to; the new multiplier is how far it then stays away.
-    pull_y, pull_x, pull_sensor, pull_w = uy - ey, ux - ex, x - state.xi, w - state.rho
-    prior = (mu.sign * pull_w).add_(mu.gradient * divergence((pull_y, pull_x)))
+    pull_sensor, pull_w = x - state.xi, w - state.rho
+    prior, stiffness = mu.sign * pull_w, mu.sign
+    if u:
+        pull_y, pull_x = u[0] - state.eta[0], u[1] - state.eta[1]
+        prior.add_(mu.gradient * divergence((pull_y, pull_x)))
+        stiffness = mu.gradient * problem.laplacian + mu.sign
     beyond = mu.data * (pull_sensor - state.Hv)  # what the sensor adds to mu1 H v
     power = mu.data * problem.power
     V = spectrum(prior, problem.grid).add_(power * state.V).add_(problem.adjoint * spectrum(beyond, problem.grid))
-    V = V / (power + (mu.gradient * problem.laplacian + mu.sign))
+    V = V / (power + stiffness)
     v = inverse_spectrum(V, problem.grid, problem.grid)
     Hv = inverse_spectrum(H * V, problem.grid, problem.sensor)
+    new = State(v, V, (), Hv, xi=Hv - pull_sensor, eta=(), rho=v - pull_w)
+    if not u:
+        return new
     gy, gx = gradient(v)
-    return State(v, V, (gy, gx), Hv, xi=Hv - pull_sensor, eta=(gy - pull_y, gx - pull_x), rho=v - pull_w)
+    return new._replace(slope=(gy, gx), eta=(gy - pull_y, gx - pull_x))
 
 
 def rescale(state: State, old: Penalties, new: Penalties) -> State:
     """Keep the multipliers what they are when the penalties change."""
-    ey, ex = state.eta
     ratio = old.gradient / new.gradient
-    return state._replace(
-        xi=state.xi * (old.data / new.data), eta=(ey * ratio, ex * ratio), rho=state.rho * (old.sign / new.sign)
-    )
+    eta = tuple(each * ratio for each in state.eta)
+    return state._replace(xi=state.xi * (old.data / new.data), eta=eta, rho=state.rho * (old.sign / new.sign))
 
 
 def objective(state: State, problem: Problem, tau: float, variation: Variation) -> Tensor:
     """Value of the minimised function at the scene v, one number a sample."""
     misfit = (state.Hv - problem.measurement).square().sum((1, 2, 3))
-    return 0.5 * misfit + tau * total_variation(state.slope, variation)
+    gy, gx = state.slope
+    return 0.5 * misfit + tau * total_variation((gy, gx), variation)
 
 
 class Residuals(NamedTuple):

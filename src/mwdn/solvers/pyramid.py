@@ -1,0 +1,163 @@
+"""Non-negative least squares from coarse to fine: the low frequencies of ADMM at a tenth of its price."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from mwdn.errors import ParameterError
+from mwdn.fourier import Size, check_fit, fast_length, inverse_spectrum, spectrum, transfer_function
+from mwdn.solvers.admm import Penalties, Problem, merge, split, start
+from mwdn.types import Measurement, Psf, Scene, Spectrum
+
+
+@dataclass(frozen=True)
+class Level:
+    """One size of the pyramid: ADMM with the sign constraint alone, from what the coarser size found.
+
+    Args:
+        shrink: pixels of the measurement along each side of one of its own; a power of two.
+        iterations: of ADMM.
+        penalties: mu of the data and of the sign; there is no total variation.
+    """
+
+    shrink: int
+    iterations: int
+    penalties: Penalties
+
+
+LEVELS = (
+    Level(8, 20, Penalties(0.15, 0.0, 0.6)),
+    Level(4, 20, Penalties(0.15, 0.0, 0.6)),
+    Level(2, 8, Penalties(0.2, 0.0, 0.9)),
+)
+"""Twenty iterations at an eighth of the size cost a third of one at the whole."""
+
+
+@dataclass(frozen=True)
+class Pyramid:
+    """Minimise ``1/2 |crop(h * v) - b|^2`` over scenes ``v >= 0``, first coarsely, then finer, then by a Wiener step.
+
+    A sensor crops the pattern, and what it lacks is mostly the low frequencies of the scene. They need many
+    iterations but few pixels: a picture of half the size shows half the band, and the PSF's low frequencies are all
+    that make it. The last step restores the detail: it adds the Wiener estimate of what is left unexplained.
+
+    Called with a measurement (B, C, H, W) and a PSF, it returns the part (B, C, H, W) of the scene that faces the
+    sensor.
+
+    Args:
+        levels: the coarsest first.
+        regularisation: lambda of the last step, for a PSF of unit sum. As it grows, detail and noise fade.
+
+    Raises:
+        ParameterError: ``regularisation`` is not positive, or the levels do not go from coarse to fine.
+        ShapeError: batch or channels of PSF and measurement do not fit.
+    """
+
+    regularisation: float = 1e-4
+    levels: tuple[Level, ...] = LEVELS
+
+    def __post_init__(self) -> None:
+        if not self.regularisation > 0:
+            raise ParameterError(f"`regularisation` ({self.regularisation}) must be positive; try 1e-4.")
+        sizes = [level.shrink for level in self.levels]
+        if not sizes or sizes != sorted(set(sizes), reverse=True) or any(s & (s - 1) for s in sizes):
+            raise ParameterError(f"`levels` must shrink by falling powers of two, for example 4 and 2, not {sizes}.")
+
+    @torch.no_grad()
+    def __call__(self, measurement: Measurement, psf: Psf) -> Scene:
+        """Reconstruct a batch."""
+        found = explain(measurement, psf, self.levels)
+        return (found.scene + found.detail(self.regularisation)).clamp(min=0) / psf.float().sum((-2, -1), keepdim=True)
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A smooth scene, and what it leaves unexplained of the measurement.
+
+    Args:
+        scene: (B, C, H, W), not negative, for a PSF of unit sum.
+        residual: spectrum of the measurement minus the camera's picture of the whole scene, zero off the sensor.
+        transfer: the PSF's transfer function on the same grid.
+        grid: its size.
+    """
+
+    scene: Scene
+    residual: Tensor
+    transfer: Tensor
+    grid: Size
+
+    def detail(self, regularisation: float | Tensor) -> Scene:
+        """Wiener estimate of the rest of the scene; ``regularisation`` as for `mwdn.fourier.wiener`."""
+        H = self.transfer
+        V = H.conj() * self.residual / (H.abs().square() + regularisation)
+        return inverse_spectrum(V, self.grid, (self.scene.shape[-2], self.scene.shape[-1]))
+
+
+def explain(measurement: Measurement, psf: Psf, levels: tuple[Level, ...] = LEVELS) -> Explanation:
+    """Find a smooth non-negative scene that explains the measurement, from coarse to fine. Differentiable.
+
+    Args:
+        measurement: (B, C, H, W).
+        psf: (1 or B, 1 or C, h, w), centred; any sum, the scene is for a unit sum of each colour.
+        levels: the coarsest first.
+
+    Raises:
+        ShapeError: batch or channels do not fit.
+    """
+    check_fit(measurement, psf, "measurement")
+    size = measurement.shape[-2], measurement.shape[-1]
+    coarsest = levels[0].shrink
+    # The grid of a linear convolution, divisible as often as the pyramid halves it.
+    rows, columns = (fast_length(-(-(s + p) // coarsest)) * coarsest for s, p in zip(size, psf.shape[-2:], strict=True))
+    grid = (rows, columns)
+    psf = psf.float() / psf.float().sum((-2, -1), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
+    H = transfer_function(psf, grid)
+    b = measurement.float()
+    sizes = {1: b}
+    while max(sizes) < coarsest:
+        sizes[2 * max(sizes)] = halve(sizes[max(sizes)])
+    scene: Tensor = b.new_zeros((1, 1, 1, 1))
+    for level in levels:
+        scene = _solve(sizes[level.shrink], low_band(H, grid, level.shrink), level, scene)
+    scene = F.interpolate(scene, size=grid, mode="bilinear").clamp(min=0)
+    explained = inverse_spectrum(H * spectrum(scene, grid), grid, size)
+    return Explanation(scene[..., : size[0], : size[1]], spectrum(b - explained, grid), H, grid)
+
+
+def halve(picture: Tensor) -> Tensor:
+    """Half the size, rounded up: binomial weights (1, 3, 3, 1) along each axis around each 2 x 2 pixels.
+
+    They keep out what half the pixels cannot show much better than the plain mean of 2 x 2.
+    """
+    height, width = picture.shape[-2:]
+    weights = torch.tensor([1.0, 3.0, 3.0, 1.0], device=picture.device) / 8
+    planes = picture.reshape(-1, 1, height, width)
+    planes = F.pad(planes, (1, 1 + width % 2, 1, 1 + height % 2), mode="replicate")
+    planes = F.conv2d(planes, weights[None, None, :, None], stride=(2, 1))
+    planes = F.conv2d(planes, weights[None, None, None, :], stride=(1, 2))
+    return planes.reshape(*picture.shape[:2], *planes.shape[-2:])
+
+
+def low_band(transfer: Spectrum, grid: Size, shrink: int) -> Tensor:
+    """Transfer function of the camera whose pixels are ``shrink`` times as long: the low frequencies."""
+    rows, columns = grid[0] // shrink, grid[1] // shrink
+    kept = torch.cat([transfer[..., : rows // 2, :], transfer[..., grid[0] - rows + rows // 2 :, :]], dim=-2)
+    return kept[..., : columns // 2 + 1].contiguous()
+
+
+def _solve(measurement: Tensor, H: Tensor, level: Level, coarser: Tensor) -> Tensor:
+    """Scene of the whole grid after the iterations of one level, from what the coarser one found."""
+    grid = H.shape[-2], 2 * (H.shape[-1] - 1)
+    # Penalties are stated for a PSF whose colours have a mean square sum of 1.
+    norm = inverse_spectrum(H, grid, grid).square().sum((-2, -1), keepdim=True).mean(1, keepdim=True).sqrt()
+    norm = norm.clamp(min=torch.finfo(torch.float32).tiny)
+    transfer = H / norm
+    power = transfer.abs().square()
+    problem = Problem(measurement, transfer, transfer.conj().resolve_conj(), power, power, grid)
+    known = F.interpolate(coarser, size=grid, mode="bilinear").clamp(min=0) * norm
+    state = start(problem, known.expand(*measurement.shape[:2], *grid), smooth=False)
+    for _ in range(level.iterations):
+        state = merge(state, split(state, problem, level.penalties, 0.0, "colour"), problem, level.penalties)
+    return state.v / norm

@@ -1,0 +1,84 @@
+"""The pyramid against scipy's least squares, an independent decimation, and what it is for: a cropped pattern."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import nnls
+
+import oracles
+from mwdn import fourier
+from mwdn.errors import ParameterError
+from mwdn.optics.patterns import contour_psf
+from mwdn.solvers.admm import Penalties
+from mwdn.solvers.pyramid import Level, Pyramid, explain, halve, low_band
+from mwdn.solvers.wiener import Wiener
+
+FINE = Penalties(0.5, 0.0, 0.5)
+
+
+def test_one_fine_level_reaches_the_least_squares_of_scipy(generator):
+    """On its own, a level of the whole size is non-negative least squares with the crop."""
+    sensor, psf = (5, 6), torch.rand(1, 1, 5, 6, generator=generator) ** 4
+    psf = psf / psf.sum()
+    b = torch.rand(1, 1, *sensor, generator=generator)
+    found = explain(b, psf, (Level(1, 3000, FINE),))
+    A = oracles.matrix(psf[0, 0].double().numpy(), sensor)
+    _, smallest = nnls(A.reshape(A.shape[0], -1), b.double().numpy().ravel())
+    unexplained = fourier.inverse_spectrum(found.residual, found.grid, sensor)
+    assert float(unexplained.norm()) == pytest.approx(smallest, abs=2e-3)
+
+
+def test_halving_keeps_place_and_light():
+    """A linear ramp halved is the ramp at the middles of pairs of pixels."""
+    ramp = torch.arange(16.0).expand(1, 1, 12, 16)
+    half = halve(ramp)
+    assert half.shape == (1, 1, 6, 8)
+    torch.testing.assert_close(half[..., 1:-1], (2 * torch.arange(8.0) + 0.5)[1:-1].expand(1, 1, 6, 6))
+    assert halve(torch.ones(2, 3, 7, 5)).shape == (2, 3, 4, 3)
+    torch.testing.assert_close(halve(torch.ones(1, 3, 7, 5)), torch.ones(1, 3, 4, 3))
+
+
+@pytest.mark.parametrize("shrink", [1, 2, 4])
+def test_low_band_takes_a_coarse_scene_where_the_fine_one_goes(shrink, generator):
+    """A scene of low frequencies alone may be sampled before or after the convolution."""
+    grid = (32, 48)
+    psf = torch.rand(1, 1, *grid, generator=generator, dtype=torch.float64)
+    spectrum = np.zeros(grid, complex)
+    for row, column in ((0, 1), (2, 0), (3, 5), (-2, 4)):
+        spectrum[row, column] = 1 + 2j
+    scene = torch.from_numpy(np.fft.ifft2(spectrum).real)[None, None]
+    H = fourier.transfer_function(psf, grid)
+    fine = fourier.inverse_spectrum(fourier.spectrum(scene, grid) * H, grid, grid)
+    small = grid[0] // shrink, grid[1] // shrink
+    coarse = fourier.spectrum(scene[..., ::shrink, ::shrink], small) * low_band(H, grid, shrink)
+    found = fourier.inverse_spectrum(coarse, small, small)
+    torch.testing.assert_close(found, fine[..., ::shrink, ::shrink], rtol=1e-4, atol=1e-5)
+
+
+def test_a_cropped_pattern_is_explained_far_better_than_by_a_wiener_filter(generator):
+    """Shading and colour of a scene that fills the field: what the crop takes from every linear filter."""
+    psf = contour_psf((96, 128), generator=generator)
+    scene = torch.full((1, 3, 96, 128), 0.1)
+    scene[..., 20:70, 30:90] = torch.tensor([0.8, 0.5, 0.2])[:, None, None]
+    measurement = fourier.convolve(scene, psf)
+    errors = [
+        float((method(measurement, psf) - scene).square().mean()) for method in (Pyramid(), Wiener(regularisation=1e-4))
+    ]
+    assert errors[0] < errors[1] / 5
+
+
+def test_what_is_explained_and_what_is_left_make_the_measurement(generator):
+    psf = torch.rand(1, 3, 20, 27, generator=generator) ** 6
+    measurement = torch.rand(2, 3, 20, 27, generator=generator)
+    found = explain(measurement, psf)
+    assert (found.scene >= 0).all()
+    left = fourier.inverse_spectrum(found.residual, found.grid, (20, 27))
+    assert (left.square().sum((1, 2, 3)) < measurement.square().sum((1, 2, 3))).all()
+
+
+def test_impossible_constants_are_refused():
+    with pytest.raises(ParameterError, match=r"`regularisation` \(0.0\) must be positive"):
+        Pyramid(0.0)
+    for sizes in ((), (2, 4), (3, 1), (2, 2)):
+        with pytest.raises(ParameterError, match="falling powers of two"):
+            Pyramid(levels=tuple(Level(size, 1, FINE) for size in sizes))
