@@ -10,7 +10,7 @@ import cyclopts
 from cyclopts import App, Parameter
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import Progress, track
+from rich.progress import Progress, ProgressColumn, track
 from torch import Tensor
 
 from mwdn import __version__
@@ -213,6 +213,8 @@ def train(  # noqa: PLR0913
 ) -> None:
     """Train a network for one camera on captures simulated through its PSF. Run again, it goes on where it stopped.
 
+    Several GPUs or machines: torchrun --nproc-per-node 4 -m mwdn train ...
+
     Args:
         recipe: TOML file, see recipes/.
         camera: calibration of the camera.
@@ -223,20 +225,25 @@ def train(  # noqa: PLR0913
         seed: instead of the recipe's.
         device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
     """
+    from mwdn.learning import distributed
     from mwdn.learning.session import prepare
 
-    trainer = prepare(read_recipe(recipe, steps=steps, batch=batch, seed=seed), camera.load(), photos, out, device)
-    with Progress(*Progress.get_default_columns(), "{task.fields[now]}", console=errors) as bars:
-        bar = bars.add_task("Training", total=trainer.schedule.steps, completed=trainer.step, now="")
+    changed = read_recipe(recipe, steps=steps, batch=batch, seed=seed)
+    columns: list[str | ProgressColumn] = [*Progress.get_default_columns(), "{task.fields[now]}"]
+    with distributed.processes():
+        trainer = prepare(changed, camera.load(), photos, out, device)
+        with Progress(*columns, console=errors, disable=distributed.rank() > 0) as bars:
+            bar = bars.add_task("Training", total=trainer.schedule.steps, completed=trainer.step, now="")
 
-        def show(report: Report) -> None:
-            now = f"{report.pictures_per_s:.1f} pictures/s, loss {report.loss:.4f}"
-            bars.update(bar, completed=report.step, now=now)
-            if report.psnr is not None:
-                bars.print(f"step {report.step}: validation {report.psnr:.2f} dB, best {trainer.best:.2f} dB")
+            def show(report: Report) -> None:
+                now = f"{report.pictures_per_s:.1f} pictures/s, loss {report.loss:.4f}"
+                bars.update(bar, completed=report.step, now=now)
+                if report.psnr is not None:
+                    bars.print(f"step {report.step}: validation {report.psnr:.2f} dB, best {trainer.best:.2f} dB")
 
-        trainer.run(show)
-    console.print(f"Weights in {out / 'best.safetensors'}", highlight=False, markup=False, soft_wrap=True)
+            trainer.run(show)
+        if distributed.rank() == 0:
+            console.print(f"Weights in {out / 'best.safetensors'}", highlight=False, markup=False, soft_wrap=True)
 
 
 @app.command

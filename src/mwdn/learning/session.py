@@ -4,14 +4,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
-import torch
-
 from mwdn.calibration import Calibration
 from mwdn.data.pair_writer import Attribute
 from mwdn.data.pairs import PairFile
 from mwdn.data.photographs import Photographs
 from mwdn.data.simulated import EXACT, SimulatedPairs
 from mwdn.errors import ParameterError
+from mwdn.learning import distributed
 from mwdn.learning.recipe import Recipe
 from mwdn.learning.train import Trainer
 from mwdn.types import Psf
@@ -34,9 +33,9 @@ def prepare(recipe: Recipe, calibration: Calibration, photos: Path, out: Path, d
         device: a GPU if there is one unless given.
 
     Raises:
-        MwdnError: a photograph cannot be read, or the folder holds another run.
+        MwdnError: torch cannot use the device, a photograph cannot be read, or the folder holds another run.
     """
-    place = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    place = distributed.device_here(device)
     training, validation = Photographs(photos).to(place).split(HELD_OUT)
     pairs = _source(recipe, training, calibration.psf.to(place))
     return Trainer(recipe, calibration, pairs, out, validation=replace(pairs, photographs=validation), device=place)
