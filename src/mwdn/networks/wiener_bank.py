@@ -67,7 +67,8 @@ class WienerBank(nn.Module):
         unit = estimates[0].detach().amax((1, 2, 3), keepdim=True).clamp(min=1e-6)
         seen = torch.cat([*estimates, measurement], dim=1) / unit
         height, width = seen.shape[-2:]
-        folded = F.pixel_unshuffle(F.pad(seen, (0, -width % self.fold, 0, -height % self.fold)), self.fold)
+        below, right = (max(-size % self.fold, 16 * self.fold - size) for size in (height, width))
+        folded = F.pixel_unshuffle(F.pad(seen, (0, right, 0, below)), self.fold)
         correction = F.pixel_shuffle(self.decoder(self.encoder(folded)), self.fold)[..., :height, :width]
         return estimates[len(estimates) // 2] + unit * correction
 
