@@ -6,7 +6,7 @@ many processes share it, and in whatever batches.
 
 import math
 from dataclasses import dataclass, fields
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -92,6 +92,14 @@ class Pair(NamedTuple):
 
     measurement: Measurement
     scene: Scene
+
+
+@runtime_checkable
+class Samples(Protocol):
+    """A source of pairs that are numbered without end: the same number is the same pair."""
+
+    def batch(self, numbers: range | list[int]) -> Pair:
+        """Pairs of these numbers, on one device."""
 
 
 def uniform(generators: list[torch.Generator], low: float, high: float, count: int = 1) -> Tensor:
