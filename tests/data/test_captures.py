@@ -59,3 +59,9 @@ def test_captures_of_different_channels(tmp_path):
     files = [tmp_path / "a.npy", tmp_path / "b.npy"]
     with pytest.raises(ShapeError, match=r"b\.npy` \(1 channels\) must have as many as the captures before it \(3\)"):
         read_captures(files, Calibration(torch.ones(1, 1, 2, 3) / 6))
+
+
+def test_capture_that_does_not_fit_is_named(tmp_path):
+    np.save(tmp_path / "a.npy", np.zeros((4, 6, 3), np.uint8))
+    with pytest.raises(ShapeError, match=r"`.*a\.npy`: `psf` \(2 x 3\) and the capture \(4 x 6\) must have the same"):
+        read_captures([tmp_path / "a.npy"], Calibration(torch.ones(1, 1, 2, 3) / 6))

@@ -335,6 +335,12 @@ def test_epochs_of_recorded_pairs(pairs, calibration, tmp_path):
     assert [line["step"] for line in log(tmp_path / "run") if line["psnr"] is not None] == [5, 10]
 
 
+def test_run_on_photographs_does_not_go_on_with_pairs(trainer, pairs, calibration, tmp_path):
+    trainer().run()
+    with pytest.raises(CheckpointError, match="or on other pairs"):
+        prepare(few(validation=3), calibration, None, tmp_path / "run", "cpu", pairs=pairs)
+
+
 def test_epochs_of_photographs(trainer):
     assert trainer(few(epochs=4, batch=2)).schedule.steps == 8  # of 3, which are fewer than 20, none is held out
 
@@ -394,7 +400,9 @@ def test_another_recipe_or_psf_in_the_same_folder(trainer, photos, calibration, 
         lambda: trainer(few(learning_rate=1e-4)),
         lambda: prepare(RECIPE, other, photos, tmp_path / "run", "cpu"),
     ):
-        with pytest.raises(CheckpointError, match=r"holds a run of another recipe or PSF\. Choose another folder"):
+        with pytest.raises(
+            CheckpointError, match=r"holds a run of another recipe or PSF, or on other pairs\. Choose another folder"
+        ):
             again()
     assert before == {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
 

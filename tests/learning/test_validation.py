@@ -19,6 +19,8 @@ RECIPE = Recipe({"name": "unet"}, Schedule(batch=2, validation=5), {"mse": 1.0, 
 class Numbered:
     """Pair n is drawn from a generator seeded by n; remembers what was asked for."""
 
+    name = "numbered"
+
     def __init__(self):
         self.asked = []
 

@@ -53,7 +53,10 @@ def read_captures(paths: Iterable[Path], calibration: Calibration) -> Measuremen
     """
     measurements: list[Measurement] = []
     for path in paths:
-        measurement = read_capture(path, calibration)
+        try:
+            measurement = read_capture(path, calibration)
+        except ShapeError as error:
+            raise ShapeError(f"`{path}`: {error}") from error
         if measurements and measurement.shape != measurements[0].shape:
             channels = measurements[0].shape[1]
             raise ShapeError(

@@ -73,6 +73,11 @@ class RecordedPairs:
     def __len__(self) -> int:
         return len(self.rows)
 
+    @property
+    def name(self) -> str:
+        """Says how many there are, on which the order depends."""
+        return f"{len(self):,} of {len(self.file):,} recorded"
+
     def batch(self, numbers: range | list[int]) -> Pair:
         """Read the samples of these numbers.
 

@@ -98,6 +98,10 @@ class Pair(NamedTuple):
 class Samples(Protocol):
     """A source of pairs that are numbered without end: the same number is the same pair."""
 
+    @property
+    def name(self) -> str:
+        """Tells it from another source, on which a run must not go on."""
+
     def batch(self, numbers: range | list[int]) -> Pair:
         """Pairs of these numbers, on one device."""
 
@@ -151,6 +155,11 @@ class SimulatedPairs:
     sensor: Sensor = Sensor()
     exposure: Range = (0.4, 0.95)
     seed: int = 0
+
+    @property
+    def name(self) -> str:
+        """The same for all photographs: more of them do not make another run."""
+        return "simulated"
 
     def batch(self, numbers: range | list[int]) -> Pair:
         """Make the samples of these numbers.

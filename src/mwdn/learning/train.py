@@ -59,7 +59,7 @@ class Trainer:
         alexnet: file of AlexNet's weights, where the loss needs them.
 
     Raises:
-        CheckpointError: the folder holds the state of another recipe or PSF, or a damaged one.
+        CheckpointError: the folder holds the state of another recipe, PSF or source of pairs, or a damaged one.
         ParameterError: the folder cannot be written to; found before training starts.
     """
 
@@ -93,7 +93,7 @@ class Trainer:
         self.step, self.best = 0, -math.inf
         # What a checkpoint must agree with to be gone on from.
         learned = {table: values for table, values in recipe.as_dict().items() if table != "sheet"}
-        self.identity = {"recipe": learned, "psf_hash": calibration.psf_hash}
+        self.identity = {"recipe": learned, "psf_hash": calibration.psf_hash, "pairs": pairs.name}
         self._resume()
         self._claim()
 
@@ -193,7 +193,8 @@ class Trainer:
             raise CheckpointError(f"`{path}` is damaged: {error}. Remove it to begin again.") from error
         if json.loads(header.get("identity", "null")) != json.loads(json.dumps(self.identity)):
             raise CheckpointError(
-                f"`{self.out}` holds a run of another recipe or PSF. Choose another folder, `--out`, or remove it."
+                f"`{self.out}` holds a run of another recipe or PSF, or on other pairs. "
+                "Choose another folder, `--out`, or remove it."
             )
         state = load_file(path, device=str(self.device))
         for prefix, module in (("network", self.network), ("average", self.average)):
