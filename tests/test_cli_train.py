@@ -110,6 +110,8 @@ def test_warning_of_a_reconstructor(camera):
         (TRAIN + " --captures runs", "`runs`"),
         (TRAIN.replace("train r.toml", "train r.tml"), "`r.tml` cannot be read as a recipe"),
         (TRAIN.replace("--steps 4", "--steps 0"), "`steps` (0) must be positive"),
+        (TRAIN.replace("--device cpu", "--device gpu"), "`device` (gpu) must be one that torch can use here"),
+        (TRAIN.replace("--device cpu", "--device cuda:99"), "`device` (cuda:99) must be one that torch can use here"),
         ("simulate photos --psf psf.npy --count 0", "`count` (0) must be at least 1"),
         ("simulate photos --psf psf.npy -o photos", "`photos` is a folder"),
         ("simulate nothing --psf psf.npy", "The folder `nothing` holds no photograph"),
@@ -177,6 +179,28 @@ def test_tensorboard_that_is_not_installed(run, camera, monkeypatch):
     assert code == 2
     assert "`tensorboard` must be installed: `pip install 'mwdn[tensorboard]'`." in flat(err)
     assert not (camera / "runs" / "x" / "log.jsonl").read_text()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit on the size of a file")
+def test_disk_that_refuses_is_one_message_and_leaves_the_last_state(run, camera):
+    """A file may not become as large as a state, as if the disk were full: the kernel refuses to write more."""
+    import resource
+
+    line = TRAIN.replace("--steps 4", "--steps 2")
+    assert run(line)[0] == 0
+    files = sorted(path.name for path in (camera / "runs/x").iterdir())
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, ((camera / "runs/x/state.safetensors").stat().st_size - 1, limits[1]))
+    try:
+        code, _, err = run(line.replace("runs/x", "runs/y"))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert code == 2
+    assert "Traceback" not in err
+    assert re.search(r"`runs/y` must be a folder that can be written to: .*File too large.* Make room and", flat(err))
+    files.remove("state.safetensors")
+    assert sorted(path.name for path in (camera / "runs/y").iterdir()) == files
+    assert run(line.replace("runs/x", "runs/y"))[0] == 0  # with room
 
 
 def test_simulate_then_evaluate(run, camera):

@@ -1,7 +1,7 @@
 """The command line: one short function a command."""
 
 import sys
-from contextlib import nullcontext
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,7 +11,7 @@ import cyclopts
 from cyclopts import App, Parameter
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import Progress, track
+from rich.progress import Progress, ProgressColumn, track
 from torch import Tensor
 
 from mwdn import __version__
@@ -219,6 +219,8 @@ def train(  # noqa: PLR0913
 
     Give either --photos or --pairs. Run again, it goes on where it stopped.
 
+    Several GPUs or machines: torchrun --nproc-per-node 4 -m mwdn train ...
+
     Args:
         recipe: TOML file, see recipes/.
         camera: calibration of the camera.
@@ -233,15 +235,19 @@ def train(  # noqa: PLR0913
         device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
         tensorboard: write progress to the folder tensorboard in --out, for `tensorboard --logdir`.
     """
+    from mwdn.learning import distributed
     from mwdn.learning.board import Board
     from mwdn.learning.session import prepare
 
     chosen = read_recipe(recipe, steps=steps, batch=batch, seed=seed)
     shown = [*(captures or map(Path, chosen.sheet.captures))]
     real = find_captures(shown, apart=(camera.psf, camera.dark)) if shown else []
-    trainer = prepare(chosen, camera.load(), photos, out, device, pairs=pairs, captures=real)
-    board = Board(out / "tensorboard", trainer.step) if tensorboard else nullcontext()
-    with board as write, Progress(*Progress.get_default_columns(), "{task.fields[now]}", console=errors) as bars:
+    columns: list[str | ProgressColumn] = [*Progress.get_default_columns(), "{task.fields[now]}"]
+    with distributed.processes(), ExitStack() as stack:
+        trainer = prepare(chosen, camera.load(), photos, out, device, pairs=pairs, captures=real)
+        first = distributed.rank() == 0
+        write = stack.enter_context(Board(out / "tensorboard", trainer.step)) if tensorboard and first else None
+        bars = stack.enter_context(Progress(*columns, console=errors, disable=not first))
         bar = bars.add_task("Training", total=trainer.schedule.steps, completed=trainer.step, now="")
 
         def show(report: Report) -> None:
@@ -254,7 +260,8 @@ def train(  # noqa: PLR0913
                 write(report)
 
         trainer.run(show)
-    console.print(f"Weights in {out / 'best.safetensors'}", highlight=False, markup=False, soft_wrap=True)
+    if first:
+        console.print(f"Weights in {out / 'best.safetensors'}", highlight=False, markup=False, soft_wrap=True)
 
 
 @app.command

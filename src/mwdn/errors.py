@@ -9,7 +9,8 @@
     ├── ImageError (ValueError)        a picture or frame that cannot be read or written
     ├── PsfError (ValueError)          a PSF that no reconstruction can trust
     ├── CheckpointError (ValueError)   weights that are damaged or belong to something else
-    └── DivergenceError                a loss that is not finite any more
+    ├── DivergenceError                a loss that is not finite any more
+    └── ProcessError                   another process of a distributed run has ended
 
 A message states what must hold, what was got, and the way out.
 """
@@ -60,3 +61,7 @@ class CheckpointError(MwdnError, ValueError):
 
 class DivergenceError(MwdnError):
     """The loss of a training run is not finite any more."""
+
+
+class ProcessError(MwdnError):
+    """Another process of a distributed run has ended or cannot be reached."""

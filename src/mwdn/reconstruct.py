@@ -14,6 +14,7 @@ from mwdn.data.images import write_linear, write_picture
 from mwdn.data.sheets import for_people
 from mwdn.errors import ParameterError, ShapeError, UnknownNameError
 from mwdn.learning.checkpoint import SUFFIXES, load_network, read_metadata
+from mwdn.learning.devices import usable
 from mwdn.types import Measurement, Psf, Scene
 
 Method = Callable[[Measurement, Psf], Scene]
@@ -40,18 +41,6 @@ def find_method(name: str | Path, regularisation: float | None = None) -> Method
     if path.suffix in SUFFIXES or path.is_file():
         return load_network(path)
     raise UnknownNameError("method", str(name), [*solvers.SOLVERS, "PATH/OF/CHECKPOINT.safetensors"])
-
-
-def _usable(device: str | torch.device) -> torch.device:
-    """Return the device once it has held a tensor."""
-    try:
-        torch.empty(1, device=device)
-    except (RuntimeError, AssertionError) as error:  # torch without CUDA asserts
-        raise ParameterError(
-            f"`device` ({device}) must be one that torch can use here: {str(error).splitlines()[0]} "
-            "Leave it out, or see `mwdn doctor`."
-        ) from error
-    return torch.device(device)
 
 
 def _other_camera(method: str | Path, calibration: Calibration) -> str | None:
@@ -94,7 +83,7 @@ class Reconstructor:
         regularisation: float | None = None,
         device: str | torch.device | None = None,
     ) -> None:
-        self.device = _usable(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        self.device = usable(device)
         self.calibration = calibration
         self.method = find_method(method, regularisation) if isinstance(method, str | Path) else method
         self.warning = _other_camera(method, calibration) if isinstance(method, str | Path) else None

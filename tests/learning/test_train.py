@@ -1,5 +1,6 @@
 """The training loop: it learns, and a run that is stopped anywhere ends as one that was not."""
 
+import errno
 import json
 import os
 import random
@@ -7,6 +8,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -24,6 +26,7 @@ from mwdn.learning.recipe import Plateau, Recipe, Schedule, Sheet
 from mwdn.learning.schedule import learning_rate
 from mwdn.learning.session import prepare, simulate
 from mwdn.learning.train import Trainer
+from mwdn.learning.validation import Validation
 from mwdn.optics.patterns import contour_psf
 
 RECIPE = Recipe(
@@ -140,6 +143,22 @@ def test_files_of_a_run(trainer, calibration, tmp_path):
     assert header["recipe"]["schedule"]["steps"] == 6
     assert read_metadata(out / "last.safetensors")["step"] == 6
     assert load_network(out / "best.safetensors")(torch.rand(1, 3, 32, 32), calibration.psf).shape == (1, 3, 32, 32)
+
+
+def test_network_with_an_unused_number_is_resumed(trainer, tmp_path):
+    """The authors' fifth lambda, which never has a gradient."""
+    network = {"name": "mwdn-cpsf", "width": 2, "authors_scalars": True}
+    recipe = replace(few(steps=2, validate_every=1), network=network)
+    trainer(recipe, "whole").run()
+
+    def stop(report):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        trainer(recipe, "halves").run(stop)
+    assert trainer(recipe, "halves").step == 1
+    trainer(recipe, "halves").run()
+    assert same(tmp_path / "whole" / "state.safetensors", tmp_path / "halves" / "state.safetensors")
 
 
 @pytest.mark.parametrize("recipe", [RECIPE, few(bfloat16=False)], ids=["bfloat16", "float32"])
@@ -306,7 +325,7 @@ def test_plateau_goes_on_where_it_was(trainer, tmp_path, stop):
 def test_gradients_are_clipped_or_left(trainer, clip):
     run = trainer(few(clip=clip))
     run.advance()
-    norm = torch.stack([p.grad.norm() for p in run.network.parameters()]).norm()
+    norm = torch.stack([p.grad.norm() for p in run.network.parameters() if p.grad is not None]).norm()
     assert norm > 0.01 if clip == 0 else norm == pytest.approx(1e-3, rel=1e-3)
 
 
@@ -426,6 +445,34 @@ def test_folder_that_cannot_be_written_is_found_before_training(trainer, tmp_pat
     with pytest.raises(ParameterError, match="must be a folder that can be written to"):
         trainer(folder="run/deeper")
     assert (tmp_path / "run").read_text() == "a file"
+
+
+@pytest.mark.parametrize("refused", ["last.safetensors", "best.safetensors", "state.safetensors"])
+def test_full_disk_leaves_the_state(trainer, tmp_path, monkeypatch, refused):
+    """As soon as one of the three files of a checkpoint cannot be finished."""
+    run, folder = trainer(), tmp_path / "run"
+    for _ in range(3):
+        run.advance()
+    run.save(Validation(-100.0, 1.0))
+    before = (folder / "state.safetensors").read_bytes()
+    rename = Path.replace
+
+    def full(path, target):
+        if target.name == refused:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "replace", full)
+    with pytest.raises(ParameterError, match=r"`.*run` must be .*: No space left on device\. Make room and give the"):
+        run.run()
+    monkeypatch.undo()
+    assert (folder / "state.safetensors").read_bytes() == before
+    assert not list(folder.glob(".*"))
+    for name in ("last", "best"):
+        load_network(folder / f"{name}.safetensors")
+    trainer().run()
+    trainer(folder="whole").run()
+    assert same(folder / "state.safetensors", tmp_path / "whole" / "state.safetensors")
 
 
 def test_divergence_leaves_the_state(trainer, tmp_path):

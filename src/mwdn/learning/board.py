@@ -39,7 +39,8 @@ class Board:
         scalars |= {"learning_rate": report.learning_rate, "pictures_per_s": report.pictures_per_s}
         if report.validation is not None:
             scalars |= {"validation/psnr": report.validation.psnr, "validation/loss": report.validation.loss}
-            self._writer.add_image("validation", srgb_encode(report.validation.sheet[0]), report.step)
+            if report.validation.sheet is not None:
+                self._writer.add_image("validation", srgb_encode(report.validation.sheet[0]), report.step)
         for name, value in scalars.items():
             self._writer.add_scalar(name, value, report.step)
 

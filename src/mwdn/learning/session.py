@@ -5,8 +5,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
-import torch
-
 from mwdn.calibration import Calibration
 from mwdn.data.captures import find_captures, read_captures
 from mwdn.data.pair_writer import Attribute
@@ -15,6 +13,7 @@ from mwdn.data.photographs import Photographs
 from mwdn.data.recorded import RecordedPairs, recorded_pairs
 from mwdn.data.simulated import EXACT, SimulatedPairs
 from mwdn.errors import ParameterError
+from mwdn.learning import distributed
 from mwdn.learning.recipe import Recipe
 from mwdn.learning.train import Trainer
 from mwdn.learning.validation import SHOWN
@@ -50,7 +49,8 @@ def prepare(
 
     Raises:
         ParameterError: not exactly one of photographs and pairs, or not enough of them.
-        MwdnError: a file cannot be read or does not fit the camera, or the folder holds another run.
+        MwdnError: torch cannot use the device, a file cannot be read or does not fit the camera, or the folder holds
+            another run.
     """
     if photos is None and pairs is None:
         raise ParameterError("Name what to learn from: photographs, `--photos FOLDER`, or pairs, `--pairs FILE`.")
@@ -58,7 +58,7 @@ def prepare(
         raise ParameterError(
             f"`--photos` ({photos}) and `--pairs` ({pairs}) exclude each other. Leave one of them out."
         )
-    place = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    place = distributed.device_here(device)
     shown = [*captures] or recipe.sheet.captures
     real = read_captures(find_captures(shown)[:SHOWN], calibration) if shown else None
     training: RecordedPairs | SimulatedPairs

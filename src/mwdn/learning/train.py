@@ -4,12 +4,13 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import load_file, save_file
+from safetensors import SafetensorError
+from safetensors.torch import load, save_file
 from torch import Tensor, nn
 
 from mwdn.calibration import Calibration
@@ -17,6 +18,7 @@ from mwdn.data.images import write_picture
 from mwdn.data.simulated import Samples
 from mwdn.data.writing import atomic
 from mwdn.errors import CheckpointError, DivergenceError, ParameterError
+from mwdn.learning import distributed
 from mwdn.learning.checkpoint import save_network
 from mwdn.learning.losses import Loss
 from mwdn.learning.precision import has_bfloat16
@@ -25,6 +27,8 @@ from mwdn.learning.schedule import begin, optimiser
 from mwdn.learning.validation import Validation, Validator
 from mwdn.networks import build
 from mwdn.types import Measurement
+
+_MAKE_ROOM = "Make room and give the same command again: it goes on from the last saved state."
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,9 @@ class Report:
 class Trainer:
     """One run in one folder. Made again on the same folder it goes on where the last one was stopped.
 
+    In a group of processes, `mwdn.learning.distributed`, each makes one and calls it alike; the first alone reads
+    and writes the folder.
+
     Args:
         recipe: the experiment.
         calibration: of the camera to learn.
@@ -60,7 +67,8 @@ class Trainer:
 
     Raises:
         CheckpointError: the folder holds the state of another recipe, PSF or source of pairs, or a damaged one.
-        ParameterError: the folder cannot be written to; found before training starts.
+        ParameterError: the folder cannot be written to, the batch is smaller than the number of processes, or these
+            were given different recipes or PSFs; found before training starts.
     """
 
     def __init__(  # noqa: PLR0913
@@ -86,6 +94,8 @@ class Trainer:
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = build(recipe.network["name"], **self.options).to(self.device).eval()
         self.average.load_state_dict(self.network.state_dict())
+        distributed.freeze_cancelled(self.network)
+        distributed.synchronise(self.network, self.device)
         self.loss = Loss(recipe.loss, alexnet=alexnet).to(self.device)
         self.optimiser = optimiser(self.network, self.schedule)
         self.course = begin(recipe)
@@ -94,11 +104,23 @@ class Trainer:
         # What a checkpoint must agree with to be gone on from.
         learned = {table: values for table, values in recipe.as_dict().items() if table != "sheet"}
         self.identity = {"recipe": learned, "psf_hash": calibration.psf_hash, "pairs": pairs.name}
+        distributed.check_alike(self.identity)
+        distributed.share(range(self.schedule.batch))  # refuses a batch that is too small
         self._resume()
-        self._claim()
+        if distributed.rank() == 0:
+            self._claim()
 
     def run(self, callback: Callable[[Report], None] = lambda report: None) -> float:
-        """Train to the end of the schedule; returns the best validation PSNR in dB."""
+        """Train to the end of the schedule; returns the best validation PSNR in dB.
+
+        Args:
+            callback: told of each step, on the first process.
+
+        Raises:
+            DivergenceError: as for `advance`.
+            ParameterError: the disk is full, or refuses otherwise; the last saved state stays as it was.
+            ProcessError: another process has ended.
+        """
         last = time.perf_counter()
         while self.step < self.schedule.steps and not self.course.finished:
             rate = self.course.rate(self.step)
@@ -108,22 +130,25 @@ class Trainer:
             due = self.step % self.schedule.validate_every == 0 or self.step == self.schedule.steps
             found = self.validate() if due else None
             report = Report(self.step, loss, parts, rate, speed, found)
-            self._log(report)  # before the state: a run killed between the two repeats the step, and its line
+            if distributed.rank() == 0:
+                self._log(report)  # before the state: a run killed between the two repeats the step, and its line
             if found is not None:
                 self.save(found)
                 last = time.perf_counter()
-            callback(report)
+            if distributed.rank() == 0:
+                callback(report)
         return self.best
 
     def advance(self) -> tuple[float, dict[str, float]]:
-        """One optimiser step; returns the loss and its parts.
+        """One optimiser step; returns the loss and its parts, over the batches of all processes.
 
         Raises:
             DivergenceError: the loss is not finite; the last saved state stays as it was.
         """
         first = self.step * self.schedule.batch
         numbers = range(first, first + self.schedule.batch)
-        measurement, scene = self.pairs.batch(numbers)
+        own = distributed.share(numbers)
+        measurement, scene = self.pairs.batch(own)
         for group in self.optimiser.param_groups:
             group["lr"] = self.course.rate(self.step)
         self.loss.weights = self.course.weights
@@ -131,19 +156,22 @@ class Trainer:
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
             found = self.network(measurement.contiguous(memory_format=torch.channels_last), self.psf)
         loss, parts = self.loss(found.float(), scene)
-        if not loss.isfinite():
+        weight = len(own) / len(numbers)  # losses are means over samples
+        total, *totals = distributed.total(weight * torch.stack([loss.detach(), *parts.values()]).double()).tolist()
+        if not math.isfinite(total):
             raise DivergenceError(
                 f"The loss of step {self.step} (samples {numbers.start} to {numbers.stop - 1}) is not finite. "
                 f"Lower the learning rate and go on from `{self.out / 'state.safetensors'}`."
             )
         self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
+        (weight * loss).backward()
+        distributed.add_gradients(self.network)
         if self.schedule.clip > 0:
             torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.schedule.clip)
         self.optimiser.step()
         self.step += 1
         self._average()
-        return loss.item(), {name: value.item() for name, value in parts.items()}
+        return total, dict(zip(parts, totals, strict=True))
 
     @torch.no_grad()
     def _average(self) -> None:
@@ -156,23 +184,46 @@ class Trainer:
                 mean.copy_(value)
 
     def validate(self) -> Validation:
-        """Measure the averaged weights, write the contact sheet, and let the course see the loss."""
-        found = self.validator(self.average, self.loss, f"step {self.step}")
-        write_picture(self.out / "validation.png", found.sheet)
-        self.course = self.course.after(found.loss)
-        return found
+        """Measure the averaged weights, write the contact sheet, and let the course see the loss.
+
+        The first process does it, and all go on with its numbers.
+        """
+        found = Validation(math.nan, math.nan)
+        if distributed.rank() == 0:
+            found = self.validator(self.average, self.loss, f"step {self.step}")
+        if found.sheet is not None:
+            write_picture(self.out / "validation.png", found.sheet)
+        psnr, loss = distributed.numbers_of_first([found.psnr, found.loss])
+        self.course = self.course.after(loss)
+        return Validation(psnr, loss, found.sheet)
 
     def save(self, found: Validation) -> None:
-        """Write last and, if it is, best weights, and the whole state, each atomically."""
+        """Write last and, if it is, best weights, and the whole state, each atomically.
+
+        Raises:
+            ParameterError: the disk is full, or refuses otherwise; the last saved state stays as it was.
+        """
         self.best = max(self.best, found.psnr)
+        if distributed.rank() > 0:
+            return
         metadata = {**self.identity, "step": self.step, "psnr": found.psnr}
-        for name in ("last", *(["best"] if found.psnr == self.best else [])):
-            network = self.recipe.network["name"]
-            save_network(self.out / f"{name}.safetensors", self.average, network, self.options, **metadata)
         header = {"identity": json.dumps(self.identity), "step": str(self.step), "best": repr(self.best)}
         header["course"] = json.dumps(self.course.state())
-        with atomic(self.out / "state.safetensors") as temporary:
-            save_file(dict(self._state()), temporary, metadata=header)
+        with self._writing(_MAKE_ROOM):
+            for name in ("last", *(["best"] if found.psnr == self.best else [])):
+                network = self.recipe.network["name"]
+                save_network(self.out / f"{name}.safetensors", self.average, network, self.options, **metadata)
+            with atomic(self.out / "state.safetensors") as temporary:
+                save_file(dict(self._state()), temporary, metadata=header)
+
+    @contextmanager
+    def _writing(self, way_out: str) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, SafetensorError) as error:  # safetensors has a type of its own for what the disk refuses
+            reason = getattr(error, "strerror", None) or error
+            message = f"`{self.out}` must be a folder that can be written to: {reason}. {way_out}"
+            raise ParameterError(message) from error
 
     def _state(self) -> Iterator[tuple[str, Tensor]]:
         for prefix, module in (("network", self.network), ("average", self.average)):
@@ -184,24 +235,25 @@ class Trainer:
 
     def _resume(self) -> None:
         path = self.out / "state.safetensors"
-        if not path.exists():
+        content = distributed.from_first(lambda: path.read_bytes() if path.exists() else b"")
+        if not content:
             return
         try:
-            with safe_open(path, framework="pt") as file:
-                header = file.metadata() or {}
+            state = load(content)
         except SafetensorError as error:
             raise CheckpointError(f"`{path}` is damaged: {error}. Remove it to begin again.") from error
+        header = _metadata(content)
         if json.loads(header.get("identity", "null")) != json.loads(json.dumps(self.identity)):
             raise CheckpointError(
                 f"`{self.out}` holds a run of another recipe or PSF, or on other pairs. "
                 "Choose another folder, `--out`, or remove it."
             )
-        state = load_file(path, device=str(self.device))
         for prefix, module in (("network", self.network), ("average", self.average)):
             _restore(module, prefix, state)
         for name, parameter in self.network.named_parameters():
-            keys = ("step", "exp_avg", "exp_avg_sq")
-            found = {key: state[f"optimiser.{name}.{key}"] for key in keys}
+            if f"optimiser.{name}.step" not in state:
+                continue  # never had a gradient
+            found = {key: state[f"optimiser.{name}.{key}"].to(self.device) for key in ("step", "exp_avg", "exp_avg_sq")}
             # Adam keeps its moments in the layout of the weights.
             form = torch.channels_last if parameter.ndim == 4 else torch.contiguous_format
             moments = {key: value.contiguous(memory_format=form) for key, value in found.items() if key != "step"}
@@ -212,22 +264,23 @@ class Trainer:
     def _claim(self) -> None:
         """Write to the folder once, so that one that refuses is found now and not after an hour."""
         log = self.out / "log.jsonl"
-        try:
+        with self._writing("Choose another one: `--out`."):
             with atomic(self.out / "recipe.json") as temporary:
                 temporary.write_text(json.dumps(self.identity, indent=2), encoding="utf-8")
             # One line a step; those after the saved step will be written again.
             lines = log.read_text(encoding="utf-8").splitlines(keepends=True) if log.exists() else []
             with atomic(log) as temporary:
                 temporary.write_text("".join(lines[: self.step]), encoding="utf-8")
-        except OSError as error:
-            raise ParameterError(
-                f"`{self.out}` must be a folder that can be written to: {error.strerror or error}. "
-                "Choose another one: `--out`."
-            ) from error
 
     def _log(self, report: Report) -> None:
-        with (self.out / "log.jsonl").open("a", encoding="utf-8") as file:
+        with self._writing(_MAKE_ROOM), (self.out / "log.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(report.line()) + "\n")
+
+
+def _metadata(content: bytes) -> dict[str, str]:
+    """Of a safetensors file: 8 bytes tell the length of a header in JSON."""
+    length = int.from_bytes(content[:8], "little")
+    return json.loads(content[8 : 8 + length]).get("__metadata__", {})
 
 
 def _restore(module: nn.Module, prefix: str, state: dict[str, Tensor]) -> None:

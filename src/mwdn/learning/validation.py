@@ -26,12 +26,12 @@ class Validation:
     Args:
         psnr: mean over the samples, in dB, of reconstructions clipped to [0, 1].
         loss: mean over the samples, with the weights of [loss], whichever the training is at.
-        sheet: (1, 3, H, W), linear light.
+        sheet: (1, 3, H, W), linear light; on the first process alone.
     """
 
     psnr: float
     loss: float
-    sheet: Image
+    sheet: Image | None = None
 
 
 @dataclass(frozen=True, eq=False)
