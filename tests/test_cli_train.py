@@ -1,5 +1,6 @@
 """`mwdn train` and `mwdn simulate` as a user types them, and what becomes of their files."""
 
+import json
 import re
 import sys
 
@@ -100,6 +101,13 @@ def test_warning_of_a_reconstructor(camera):
     [
         (TRAIN.replace("runs/x", "r.toml"), "`r.toml` must be a folder that can be written to"),
         (TRAIN.replace("--photos photos", "--photos runs"), "The folder `runs` holds no photograph"),
+        (TRAIN.replace("--photos photos", ""), "Name what to learn from: photographs, `--photos FOLDER`, or pairs,"),
+        (
+            TRAIN + " --pairs p.h5",
+            "`--photos` (photos) and `--pairs` (p.h5) exclude each other. Leave one of them out.",
+        ),
+        (TRAIN.replace("--photos photos", "--pairs p.h5"), "`p.h5` is no file"),
+        (TRAIN + " --captures runs", "`runs`"),
         (TRAIN.replace("train r.toml", "train r.tml"), "`r.tml` cannot be read as a recipe"),
         (TRAIN.replace("--steps 4", "--steps 0"), "`steps` (0) must be positive"),
         (TRAIN.replace("--device cpu", "--device gpu"), "`device` (gpu) must be one that torch can use here"),
@@ -115,6 +123,62 @@ def test_wrong_call_is_one_message_and_exit_2(run, camera, line, said):
     assert said in flat(err)
     assert "Traceback" not in err
     assert not list(camera.glob("*.h5"))
+
+
+def test_train_on_recorded_pairs(run, camera):
+    assert run("simulate photos --psf psf.npy -o pairs.h5 --count 20 --recipe r.toml")[0] == 0
+    line = TRAIN.replace("--photos photos", "--pairs pairs.h5")
+    code, out, err = run(line)
+    assert code == 0, err
+    assert "Weights in runs/x/best.safetensors" in out
+    assert run(f"{RECONSTRUCT} psf.npy")[0] == 0
+    np.save("large.npy", np.kron(np.load("psf.npy"), np.ones((2, 2, 1), np.float32)))
+    code, _, err = run(line.replace("psf.npy", "large.npy"))
+    assert code == 2
+    assert "The PSF is 2 times as large" in flat(err)
+    assert run(line.replace("psf.npy", "large.npy --psf-bin 2").replace("runs/x", "runs/y"))[0] == 0
+
+
+def test_tensorboard_and_captures(run, camera):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    np.save("second.npy", np.full((32, 40, 3), 0.1, np.float32))
+    code, _, err = run(f"{TRAIN} --tensorboard --captures capture.npy second.npy")
+    assert code == 0, err
+    events = EventAccumulator("runs/x/tensorboard").Reload()
+    lines = [json.loads(line) for line in (camera / "runs" / "x" / "log.jsonl").read_text().splitlines()]
+    for tag, key in (("loss/total", "loss"), ("loss/mse", "mse"), ("learning_rate", "learning_rate")):
+        assert [e.value for e in events.Scalars(tag)] == pytest.approx([line[key] for line in lines])
+    assert [e.step for e in events.Scalars("pictures_per_s")] == [1, 2, 3, 4]
+    for tag, key in (("validation/psnr", "psnr"), ("validation/loss", "validation_loss")):
+        measured = {line["step"]: pytest.approx(line[key]) for line in lines if line[key] is not None}
+        assert {e.step: e.value for e in events.Scalars(tag)} == measured
+        assert measured.keys() == {2, 4}
+    image = events.Images("validation")[-1]
+    sheet = read_frame("runs/x/validation.png")
+    assert (image.step, image.height, image.width) == (4, *sheet.shape[:2])
+    assert sheet.shape[1] == 5 * (300 + 6)  # measurement, reconstruction, scene; capture, reconstruction
+
+
+def test_captures_of_the_recipe_leave_the_psf_out(run, camera):
+    (camera / "frames").mkdir()
+    for name in ("psf.npy", "capture.npy"):
+        (camera / name).rename(camera / "frames" / name)
+    (camera / "r.toml").write_text(RECIPE + 'sheet = { captures = ["frames"] }', encoding="utf-8")
+    code, _, err = run(TRAIN.replace("psf.npy", "frames/psf.npy"))
+    assert code == 0, err
+    sheet = read_frame("runs/x/validation.png")
+    assert (sheet[26 + 240 + 6 :, 3 * 306 :] == 255).all()  # one capture, two pairs
+    assert not (sheet[26 : 26 + 240, 3 * 306 :] == 255).all()
+
+
+def test_tensorboard_that_is_not_installed(run, camera, monkeypatch):
+    for name in ["tensorboard", *(name for name in sys.modules if name.startswith("torch.utils.tensorboard"))]:
+        monkeypatch.setitem(sys.modules, name, None)
+    code, _, err = run(f"{TRAIN} --tensorboard")
+    assert code == 2
+    assert "`tensorboard` must be installed: `pip install 'mwdn[tensorboard]'`." in flat(err)
+    assert not (camera / "runs" / "x" / "log.jsonl").read_text()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit on the size of a file")

@@ -15,7 +15,7 @@ from mwdn.errors import CheckpointError, ImageError, ParameterError, ShapeError,
 from mwdn.learning import save_network
 from mwdn.networks import NETWORKS, build
 from mwdn.optics.patterns import contour_psf
-from mwdn.reconstruct import Reconstructor, find_captures, find_method, plan_outputs, reconstruct_file
+from mwdn.reconstruct import Reconstructor, find_method, plan_outputs, reconstruct_file
 from mwdn.solvers import SOLVERS, Admm, Wiener
 
 SIZE = 32, 40
@@ -41,27 +41,6 @@ def touch(folder, *names):
 
 
 # --- Files --------------------------------------------------------------------------------------------
-
-
-def test_captures_are_found_in_order_and_once(tmp_path):
-    b, a, _, upper = touch(tmp_path / "in", "b.png", "a.tif", "notes.txt", "c.PNG")
-    (tmp_path / "in" / "d.npy").mkdir()
-    single = touch(tmp_path, "single.raw")[0]  # named by the user: its content decides
-    assert find_captures([single, tmp_path / "in"]) == [single, a, b, upper]
-    assert find_captures([b, str(tmp_path / "in"), b]) == [b, a, upper]
-
-
-def test_psf_dark_frame_and_hidden_files_in_a_folder_are_no_captures(tmp_path):
-    a, psf, dark, _ = touch(tmp_path, "a.png", "psf.png", "dark.npy", "._a.png")
-    assert find_captures([tmp_path], apart=(psf, dark, None)) == [a]
-    assert find_captures([psf], apart=(psf,)) == [psf]  # named, so wanted
-
-
-def test_nothing_to_reconstruct(tmp_path):
-    with pytest.raises(ParameterError, match="Name at least one capture"):
-        find_captures([])
-    with pytest.raises(ParameterError, match=r"The folder `.*` holds no capture\. Readable: \.bmp, .*\.npy"):
-        find_captures([tmp_path])
 
 
 @pytest.mark.parametrize(("form", "suffix"), [("png", ".png"), ("png16", ".png"), ("tiff", ".tif"), ("npy", ".npy")])

@@ -1,6 +1,7 @@
 """The command line: one short function a command."""
 
 import sys
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from mwdn import __version__
 from mwdn.calibration import Calibration
+from mwdn.data.captures import find_captures
 from mwdn.data.images import write_picture
 from mwdn.data.importers import Layout, import_pairs
 from mwdn.data.sheets import contact_sheet, thumbnail
@@ -26,7 +28,6 @@ from mwdn.reconstruct import (
     SUMMARY,
     Format,
     Reconstructor,
-    find_captures,
     plan_outputs,
     reconstruct_file,
 )
@@ -204,46 +205,63 @@ def train(  # noqa: PLR0913
     recipe: Path,
     *,
     camera: CameraOptions,
-    photos: Path,
+    photos: Path | None = None,
+    pairs: Path | None = None,
+    captures: Annotated[list[Path] | None, Parameter(consume_multiple=True, negative=())] = None,
     out: Path = Path("runs/train"),
     steps: int | None = None,
     batch: int | None = None,
     seed: int | None = None,
     device: str | None = None,
+    tensorboard: Annotated[bool, Parameter(negative=())] = False,
 ) -> None:
-    """Train a network for one camera on captures simulated through its PSF. Run again, it goes on where it stopped.
+    """Train a network for one camera, on captures simulated through its PSF or on recorded pairs.
+
+    Give either --photos or --pairs. Run again, it goes on where it stopped.
 
     Several GPUs or machines: torchrun --nproc-per-node 4 -m mwdn train ...
 
     Args:
         recipe: TOML file, see recipes/.
         camera: calibration of the camera.
-        photos: folder of photographs, the more the better.
-        out: folder of the run: best.safetensors is what `mwdn reconstruct --method` takes.
-        steps: instead of the recipe's.
+        photos: folder of photographs, the more the better: captures of them are simulated.
+        pairs: HDF5 file of recorded pairs, from `mwdn import`; the recipe's [pairs] says which are for what.
+        captures: real captures, files or folders, to be shown on the contact sheet instead of the recipe's.
+        out: folder of the run: best.safetensors is what `mwdn reconstruct --method` takes, validation.png shows the
+            pictures of the latest validation.
+        steps: instead of the recipe's steps or epochs.
         batch: instead of the recipe's.
         seed: instead of the recipe's.
         device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
+        tensorboard: write progress to the folder tensorboard in --out, for `tensorboard --logdir`.
     """
     from mwdn.learning import distributed
+    from mwdn.learning.board import Board
     from mwdn.learning.session import prepare
 
-    changed = read_recipe(recipe, steps=steps, batch=batch, seed=seed)
+    chosen = read_recipe(recipe, steps=steps, batch=batch, seed=seed)
+    shown = [*(captures or map(Path, chosen.sheet.captures))]
+    real = find_captures(shown, apart=(camera.psf, camera.dark)) if shown else []
     columns: list[str | ProgressColumn] = [*Progress.get_default_columns(), "{task.fields[now]}"]
-    with distributed.processes():
-        trainer = prepare(changed, camera.load(), photos, out, device)
-        with Progress(*columns, console=errors, disable=distributed.rank() > 0) as bars:
-            bar = bars.add_task("Training", total=trainer.schedule.steps, completed=trainer.step, now="")
+    with distributed.processes(), ExitStack() as stack:
+        trainer = prepare(chosen, camera.load(), photos, out, device, pairs=pairs, captures=real)
+        first = distributed.rank() == 0
+        write = stack.enter_context(Board(out / "tensorboard", trainer.step)) if tensorboard and first else None
+        bars = stack.enter_context(Progress(*columns, console=errors, disable=not first))
+        bar = bars.add_task("Training", total=trainer.schedule.steps, completed=trainer.step, now="")
 
-            def show(report: Report) -> None:
-                now = f"{report.pictures_per_s:.1f} pictures/s, loss {report.loss:.4f}"
-                bars.update(bar, completed=report.step, now=now)
-                if report.psnr is not None:
-                    bars.print(f"step {report.step}: validation {report.psnr:.2f} dB, best {trainer.best:.2f} dB")
+        def show(report: Report) -> None:
+            now = f"{report.pictures_per_s:.1f} pictures/s, loss {report.loss:.4f}"
+            bars.update(bar, completed=report.step, now=now)
+            if report.validation is not None:
+                psnr = report.validation.psnr
+                bars.print(f"step {report.step}: validation {psnr:.2f} dB, best {trainer.best:.2f} dB")
+            if write is not None:
+                write(report)
 
-            trainer.run(show)
-        if distributed.rank() == 0:
-            console.print(f"Weights in {out / 'best.safetensors'}", highlight=False, markup=False, soft_wrap=True)
+        trainer.run(show)
+    if first:
+        console.print(f"Weights in {out / 'best.safetensors'}", highlight=False, markup=False, soft_wrap=True)
 
 
 @app.command

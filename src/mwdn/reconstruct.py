@@ -9,7 +9,8 @@ from torch import nn
 
 from mwdn import solvers
 from mwdn.calibration import Calibration
-from mwdn.data.images import READABLE, read_frame, write_linear, write_picture
+from mwdn.data.captures import read_capture
+from mwdn.data.images import write_linear, write_picture
 from mwdn.data.sheets import for_people
 from mwdn.errors import ParameterError, ShapeError, UnknownNameError
 from mwdn.learning.checkpoint import SUFFIXES, load_network, read_metadata
@@ -129,31 +130,6 @@ _SUFFIX = {"png": ".png", "png16": ".png", "tiff": ".tif", "npy": ".npy"}
 SUMMARY = "summary.png"
 
 
-def find_captures(paths: Iterable[str | Path], *, apart: Iterable[Path | None] = ()) -> list[Path]:
-    """Files as named, and every readable file of each folder, in the order of their names; each once.
-
-    Args:
-        paths: files and folders.
-        apart: files that are no captures where a folder holds them: the PSF, the dark frame. Hidden ones are none.
-
-    Raises:
-        ParameterError: nothing was named, or a folder holds no picture.
-    """
-    found: list[Path] = []
-    others = {path.resolve() for path in apart if path is not None}
-    for path in map(Path, paths):
-        inside = [path]
-        if path.is_dir():
-            inside = sorted(f for f in path.iterdir() if f.suffix.lower() in READABLE and f.is_file())
-            inside = [f for f in inside if not f.name.startswith(".") and f.resolve() not in others]
-        if not inside:
-            raise ParameterError(f"The folder `{path}` holds no capture. Readable: {', '.join(sorted(READABLE))}.")
-        found += inside
-    if not found:
-        raise ParameterError("Name at least one capture, or a folder of captures.")
-    return list(dict.fromkeys(found))
-
-
 def plan_outputs(captures: list[Path], out: Path, form: Format, *, protected: Iterable[Path | None] = ()) -> list[Path]:
     """Where each capture's reconstruction goes: its name, in ``out``.
 
@@ -186,8 +162,7 @@ def reconstruct_file(
     Raises:
         MwdnError: the capture cannot be read or does not fit the camera, or the picture cannot be written.
     """
-    calibration = reconstruct.calibration
-    measurement = calibration.correct(read_frame(capture, bgr=calibration.bgr))
+    measurement = read_capture(capture, reconstruct.calibration)
     scene = reconstruct(measurement)
     if form in ("tiff", "npy"):
         write_linear(output, scene)

@@ -1,5 +1,6 @@
 """Training by two processes: the same as by one, to rounding, and exact after any interruption."""
 
+import json
 import os
 import random
 import select
@@ -39,7 +40,7 @@ bfloat16 = false
 """
 CPSF = """
 network = { name = "mwdn-cpsf", width = 4 }
-schedule = { steps = 4, batch = 5, warmup = 2, validate_every = 4, validation = 3, bfloat16 = false }
+schedule = { steps = 4, batch = 5, course = "plateau", validate_every = 2, validation = 3, bfloat16 = false }
 loss = { l1 = 0.5, mse = 1.0 }
 """
 
@@ -150,6 +151,14 @@ def test_two_processes_end_as_one_in_float64(worked):
     assert states[0]["network.decoder.head.weight"].dtype == torch.float64
     for key, value in states[0].items():
         torch.testing.assert_close(states[1][key], value, rtol=1e-7, atol=1e-10, msg=lambda m, k=key: f"{k}: {m}")
+
+
+def test_both_processes_have_the_course_of_the_first(worked):
+    """Only the first validates."""
+    courses = [json.loads((worked / f"course-{rank}.json").read_text()) for rank in (0, 1)]
+    assert courses[0] == courses[1]
+    losses = [line["validation_loss"] for line in log(worked / "double" / "two")]
+    assert courses[0]["best"] == min(loss for loss in losses if loss is not None)
 
 
 def test_run_begun_by_one_process_goes_on_with_two(one, worked):

@@ -60,6 +60,10 @@ def test_overrides(read):
         ('[network]\nname = "mwdm"\n', "No network named 'mwdm'. Did you mean 'mwdn'?"),
         (NETWORK + "widht = 3\n", "No option of the network 'wiener-bank' named 'widht'. Did you mean 'width'?"),
         (NETWORK + "[loss]\nmsee = 1\n", "No loss named 'msee'. Did you mean 'mse'?"),
+        (NETWORK + "[later_loss]\nmsee = 1\n", "No loss named 'msee'. Did you mean 'mse'?"),
+        (NETWORK + '[schedule]\ncourse = "plato"\n', "No course named 'plato'. Did you mean 'plateau'?"),
+        (NETWORK + '[schedule]\noptimiser = "adamv"\n', "No optimiser named 'adamv'. Did you mean 'adam'?"),
+        (NETWORK + "[pairs]\nsplitt = 3\n", "No key of [pairs] named 'splitt'. Did you mean 'split'?"),
     ],
 )
 def test_mistyped_names_get_the_nearest(read, text, said):
@@ -81,6 +85,18 @@ def test_mistyped_names_get_the_nearest(read, text, said):
         (NETWORK + "[schedule]\nema = 1", "`ema` (1.0) must be in [0, 1)."),
         (NETWORK + "[schedule]\nlearning_rate = nan", "`learning_rate` (nan) must be positive."),
         (NETWORK + "[schedule]\nwarmup = -1", "`warmup` (-1) must not be negative."),
+        (NETWORK + "[schedule]\nepochs = -1", "`epochs` (-1) must not be negative."),
+        (NETWORK + "[plateau]\nfactor = 1", "`factor` (1.0) must be in (0, 1)"),
+        (NETWORK + "[plateau]\npatience = -1", "`patience` (-1) must not be negative"),
+        (NETWORK + "[plateau]\npatience = 3", "[plateau] belongs to another course than 'cosine'. Leave it out"),
+        (NETWORK + "[later_loss]\nmse = 1", "[later_loss] belongs to another course than 'cosine'"),
+        (
+            NETWORK + '[schedule]\ncourse = "plateau"\n[later_loss]\nl1 = 1',
+            "[later_loss] (l1) must have the parts of [loss] (mse). Give a part that shall not count the weight 0.",
+        ),
+        (NETWORK + "[sheet]\ncaptures = [3]", "`captures` of [sheet] ([3]) must be of the same kind"),
+        (NETWORK + '[sheet]\ncaptures = "a.png"', "`captures` of [sheet] ('a.png') must be of the same kind"),
+        (NETWORK + "[pairs]\nfractions = [1, 0]", "`fractions` of [pairs] ([1, 0]) must be of the same kind"),
         (NETWORK + "[placement]\nextent = 0.3", "`extent` of [placement] (0.3) must be of the same"),
         (NETWORK + "[placement]\nextent = [0.7, 0.3]", "`extent` (0.7, 0.3) must be a range"),
         (NETWORK + "[placement]\nextent = [0, 0.3]", "`extent` (0.0, 0.3) must be positive"),
@@ -97,6 +113,37 @@ def test_mistyped_names_get_the_nearest(read, text, said):
 def test_bad_values(read, text, said):
     with pytest.raises(ParameterError, match=re.escape(said)):
         read(text)
+
+
+def test_captures_are_beside_the_recipe(read, tmp_path):
+    recipe = read(NETWORK + f'[sheet]\ncaptures = ["a.png", "../b", "{tmp_path}/c"]')
+    assert recipe.sheet.captures == (f"{tmp_path}/a.png", f"{tmp_path}/../b", f"{tmp_path}/c")
+    assert read(NETWORK + "[sheet]\ncaptures = []").sheet.captures == ()
+
+
+def test_steps_replace_epochs(read):
+    text = NETWORK + "[schedule]\nepochs = 3\n"
+    assert read(text).schedule.epochs == 3
+    assert read(text, batch=2).schedule.epochs == 3
+    assert (read(text, steps=5).schedule.epochs, read(text, steps=5).schedule.steps) == (0, 5)
+
+
+def test_recipe_of_the_paper():
+    """Training in section 4 of the paper and in its public code; its camera in section 4."""
+    recipe = read_recipe(ROOT / "recipes" / "paper.toml")
+    schedule, plateau = recipe.schedule, recipe.plateau
+    assert sum(p.numel() for p in build(**recipe.network).parameters()) == 17_267_531
+    assert (schedule.optimiser, schedule.learning_rate, schedule.weight_decay) == ("adam", 1e-4, 1e-4)
+    assert (schedule.course, schedule.batch, schedule.epochs, schedule.validation) == ("plateau", 16, 300, 2500)
+    assert (schedule.clip, schedule.ema, schedule.bfloat16) == (0, 0, False)
+    assert (plateau.factor, plateau.patience, plateau.later, plateau.stop) == (0.1, 5, 1e-6, 2e-8)
+    assert recipe.loss == {"mse": 1, "feature_mse": 1}
+    assert recipe.later_loss == {"mse": 1, "feature_mse": 0.05}
+    assert recipe.pairs.split == "paper"
+    # A scene of 137 x 137, padded by 94 at the top and 89 on the left to 320 x 320.
+    extent, room = 137 / 320, 1 - 137 / 320
+    assert recipe.placement.extent == pytest.approx((extent, extent), abs=1e-3)
+    assert recipe.placement.offset * room * 160 == pytest.approx(94 - (320 - 137) / 2, abs=0.3)
 
 
 def test_no_such_file(tmp_path):

@@ -1,7 +1,6 @@
 """The training loop: it learns, and a run that is stopped anywhere ends as one that was not."""
 
 import errno
-import itertools
 import json
 import os
 import random
@@ -18,13 +17,16 @@ import torch
 from safetensors.torch import load_file
 
 from mwdn.calibration import Calibration
+from mwdn.data.pairs import PairFile
 from mwdn.data.photographs import Photographs
 from mwdn.data.simulated import SimulatedPairs
-from mwdn.errors import CheckpointError, ParameterError
+from mwdn.errors import CheckpointError, DivergenceError, ParameterError, ShapeError
 from mwdn.learning.checkpoint import load_network, read_metadata
-from mwdn.learning.recipe import Recipe, Schedule
-from mwdn.learning.session import prepare
-from mwdn.learning.train import DivergenceError, Trainer, learning_rate
+from mwdn.learning.recipe import Plateau, Recipe, Schedule, Sheet
+from mwdn.learning.schedule import learning_rate
+from mwdn.learning.session import prepare, simulate
+from mwdn.learning.train import Trainer
+from mwdn.learning.validation import Validation
 from mwdn.optics.patterns import contour_psf
 
 RECIPE = Recipe(
@@ -93,18 +95,6 @@ def test_overfits_four_pairs(photos, calibration, tmp_path):
     assert best > -10 * torch.log10(scenes.square().mean())  # better than black
 
 
-def test_learning_rate_rises_then_falls_as_half_a_cosine():
-    schedule = Schedule(steps=110, warmup=10, learning_rate=2.0)
-    rates = [learning_rate(step, schedule) for step in range(111)]
-    assert rates[:10] == pytest.approx([0.2 * (step + 1) for step in range(10)])
-    assert rates[10] == pytest.approx(2.0)
-    assert rates[35] == pytest.approx(2.0 * (0.01 + 0.99 * (1 + 0.5**0.5) / 2))  # an eighth of a period
-    assert rates[60] == pytest.approx(2.0 * (0.01 + 0.99 / 2))
-    assert rates[110] == pytest.approx(0.02)
-    assert all(a > b for a, b in itertools.pairwise(rates[10:]))
-    assert learning_rate(0, Schedule(warmup=0, learning_rate=2.0)) == 2.0
-
-
 def test_each_step_has_its_learning_rate(trainer):
     run = trainer()
     for step in range(4):
@@ -146,6 +136,7 @@ def test_files_of_a_run(trainer, calibration, tmp_path):
     assert [line["step"] for line in lines] == [1, 2, 3, 4, 5, 6]
     assert [line["step"] for line in lines if line["psnr"] is not None] == [3, 6]
     assert best == max(line["psnr"] for line in lines if line["psnr"] is not None)
+    assert [line["learning_rate"] for line in lines] == [learning_rate(step, RECIPE.schedule) for step in range(6)]
     assert [report.loss for report in reports] == [line["loss"] for line in lines]
     header = read_metadata(out / "best.safetensors")
     assert (header["name"], header["psf_hash"], header["psnr"]) == ("wiener-bank", calibration.psf_hash, best)
@@ -262,6 +253,161 @@ def test_killed_runs_end_as_one_that_was_not(photos, calibration, tmp_path):
     assert log(tmp_path / "killed") == log(tmp_path / "whole")
 
 
+# --- The paper's schedule ------------------------------------------------------------------------------
+
+# It learns too fast to go on falling, so that each phase is reached soon.
+PAPER = Recipe(
+    {"name": "wiener"},
+    Schedule(
+        steps=400,
+        batch=2,
+        course="plateau",
+        learning_rate=1.0,
+        optimiser="adam",
+        clip=0.0,
+        ema=0.0,
+        bfloat16=False,
+        validate_every=2,
+        validation=3,
+    ),
+    {"mse": 1.0, "l1": 1.0},
+    plateau=Plateau(patience=1, later=1e-2, stop=2e-4),
+    later_loss={"mse": 1.0, "l1": 0.05},
+)
+
+
+def test_plateau_switches_phase_and_stops_when_torchs_scheduler_does(trainer, tmp_path):
+    trainer(PAPER).run()
+    optim = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
+    oracle = torch.optim.lr_scheduler.ReduceLROnPlateau(optim, factor=0.1, patience=1)
+    lines, phases = log(tmp_path / "run"), []
+    for line in lines:
+        rate = optim.param_groups[0]["lr"]
+        assert rate >= 2e-4  # else there should be no such step
+        assert line["learning_rate"] == rate
+        weight = 1.0 if rate > 1.0001e-2 else 0.05
+        assert line["loss"] == pytest.approx(line["mse"] + weight * line["l1"])
+        phases.append(weight)
+        assert (line["psnr"] is not None) == (line["validation_loss"] is not None) == (line["step"] % 2 == 0)
+        if line["validation_loss"] is not None:
+            oracle.step(line["validation_loss"])
+    assert set(phases) == {1.0, 0.05}
+    assert optim.param_groups[0]["lr"] < 2e-4  # stopped by it, not by the number of steps
+    assert len(lines) < 400
+    assert read_metadata(tmp_path / "run" / "last.safetensors")["step"] == len(lines)
+
+
+@pytest.mark.parametrize("stop", [2, 8, 15, 20])
+def test_plateau_goes_on_where_it_was(trainer, tmp_path, stop):
+    trainer(PAPER, "whole").run()
+
+    def interrupt(report):
+        if report.step == stop:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        trainer(PAPER, "halves").run(interrupt)
+    second = trainer(PAPER, "halves")
+    assert second.step == stop - stop % 2
+    second.run()
+    assert log(tmp_path / "whole") == log(tmp_path / "halves")
+    for name in ("last", "best", "state"):
+        assert same(tmp_path / "whole" / f"{name}.safetensors", tmp_path / "halves" / f"{name}.safetensors")
+    steps = second.step
+    third = trainer(PAPER, "halves")
+    assert third.course == second.course
+    assert third.course.finished
+    third.run()
+    assert third.step == steps  # it has ended, though not by the number of steps
+
+
+@pytest.mark.parametrize("clip", [0.0, 1e-3])
+def test_gradients_are_clipped_or_left(trainer, clip):
+    run = trainer(few(clip=clip))
+    run.advance()
+    norm = torch.stack([p.grad.norm() for p in run.network.parameters() if p.grad is not None]).norm()
+    assert norm > 0.01 if clip == 0 else norm == pytest.approx(1e-3, rel=1e-3)
+
+
+# --- Recorded pairs -----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def pairs(photos, calibration, tmp_path):
+    path = tmp_path / "pairs.h5"
+    simulate(RECIPE, calibration, photos, path, 23)
+    return path
+
+
+def test_epochs_of_recorded_pairs(pairs, calibration, tmp_path):
+    """23 pairs: 2 for test, 2 for validation, 19 for training, which are 5 steps of 4."""
+    run = prepare(few(epochs=2, batch=4), calibration, None, tmp_path / "run", "cpu", pairs=pairs)
+    assert (run.schedule.steps, run.schedule.validate_every, run.schedule.validation) == (10, 5, 2)
+    seen = []
+    read = PairFile.__getitem__
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(PairFile, "__getitem__", lambda self, row: (seen.append(row), read(self, row))[1])
+        run.run()
+    training = [row for row in seen if row >= 4]
+    assert sorted(training[:19]) == sorted(training[19:38]) == list(range(4, 23))
+    assert [row for row in seen if row < 4] in ([2, 3] * 2, [3, 2] * 2)
+    assert [line["step"] for line in log(tmp_path / "run") if line["psnr"] is not None] == [5, 10]
+
+
+def test_run_on_photographs_does_not_go_on_with_pairs(trainer, pairs, calibration, tmp_path):
+    trainer().run()
+    with pytest.raises(CheckpointError, match="or on other pairs"):
+        prepare(few(validation=3), calibration, None, tmp_path / "run", "cpu", pairs=pairs)
+
+
+def test_epochs_of_photographs(trainer):
+    assert trainer(few(epochs=4, batch=2)).schedule.steps == 8  # of 3, which are fewer than 20, none is held out
+
+
+def test_resumed_run_on_recorded_pairs_ends_bit_identical(pairs, calibration, tmp_path):
+    def make(folder):
+        return prepare(few(steps=14), calibration, None, tmp_path / folder, "cpu", pairs=pairs)
+
+    make("whole").run()
+
+    def interrupt(report):
+        if report.step == 10:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make("halves").run(interrupt)
+    assert make("halves").step == 9
+    make("halves").run()
+    assert same(tmp_path / "whole" / "state.safetensors", tmp_path / "halves" / "state.safetensors")
+    assert log(tmp_path / "whole") == log(tmp_path / "halves")
+
+
+def test_captures_on_the_sheet_change_nothing_else(trainer, photos, calibration, tmp_path):
+    trainer(folder="without").run()
+    np.save(tmp_path / "capture.npy", np.random.default_rng(0).random((32, 32, 3), np.float32))
+    for number, name in enumerate(("named", "recipe")):
+        (tmp_path / "folder").mkdir(exist_ok=True)
+        np.save(tmp_path / "folder" / "a.npy", np.full((32, 32, 3), 0.5, np.float32))
+        recipe = replace(RECIPE, sheet=Sheet((str(tmp_path / "folder"),)))
+        captures = [tmp_path / "capture.npy"] if number == 0 else []
+        out = tmp_path / name
+        prepare(recipe, calibration, photos, out, "cpu", captures=captures).run()
+        assert same(tmp_path / "without" / "state.safetensors", out / "state.safetensors")
+        assert read_metadata(out / "best.safetensors") == read_metadata(tmp_path / "without" / "best.safetensors")
+    sheets = [cv2.imread(str(tmp_path / name / "validation.png")) for name in ("without", "named", "recipe")]
+    assert sheets[1].shape == sheets[2].shape != sheets[0].shape
+    assert (sheets[1] != sheets[2]).any()
+
+
+def test_capture_that_does_not_fit_is_found_before_training(calibration, photos, tmp_path):
+    grey = Calibration(calibration.psf[:, :1].contiguous())
+    np.save(tmp_path / "grey.npy", np.ones((32, 32, 1), np.float32))
+    np.save(tmp_path / "small.npy", np.ones((30, 32, 3), np.float32))
+    for camera, name, said in ((calibration, "small", "same height and width"), (grey, "grey", "channels")):
+        with pytest.raises(ShapeError, match=said):
+            prepare(RECIPE, camera, photos, tmp_path / "run", "cpu", captures=[tmp_path / f"{name}.npy"])
+
+
 # --- What is refused ----------------------------------------------------------------------------------
 
 
@@ -273,7 +419,9 @@ def test_another_recipe_or_psf_in_the_same_folder(trainer, photos, calibration, 
         lambda: trainer(few(learning_rate=1e-4)),
         lambda: prepare(RECIPE, other, photos, tmp_path / "run", "cpu"),
     ):
-        with pytest.raises(CheckpointError, match=r"holds a run of another recipe or PSF\. Choose another folder"):
+        with pytest.raises(
+            CheckpointError, match=r"holds a run of another recipe or PSF, or on other pairs\. Choose another folder"
+        ):
             again()
     assert before == {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
 
@@ -305,7 +453,7 @@ def test_full_disk_leaves_the_state(trainer, tmp_path, monkeypatch, refused):
     run, folder = trainer(), tmp_path / "run"
     for _ in range(3):
         run.advance()
-    run.save(-100.0)
+    run.save(Validation(-100.0, 1.0))
     before = (folder / "state.safetensors").read_bytes()
     rename = Path.replace
 

@@ -1,5 +1,6 @@
 """What one of two processes does; `test_distributed.py` starts them by torchrun and judges the files they leave."""
 
+import json
 import os
 from contextlib import contextmanager
 from dataclasses import replace
@@ -89,7 +90,9 @@ def main():
     with distributed.processes():
         batch_norm()
         with double_precision():
-            start("double/two", read_recipe("cpsf.toml"), precise).run()
+            run = start("double/two", read_recipe("cpsf.toml"), precise)
+            run.run()
+        Path(f"course-{number}.json").write_text(json.dumps(run.course.state()))
         start("mixed").run()  # begun by one process
         attempt(lambda: start("small", replace(recipe, schedule=replace(recipe.schedule, batch=1))))
         attempt(lambda: distributed.device_here("cuda:0"))

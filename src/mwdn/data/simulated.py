@@ -6,7 +6,7 @@ many processes share it, and in whatever batches.
 
 import math
 from dataclasses import dataclass, fields
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -110,6 +110,18 @@ class Pair(NamedTuple):
     scene: Scene
 
 
+@runtime_checkable
+class Samples(Protocol):
+    """A source of pairs that are numbered without end: the same number is the same pair."""
+
+    @property
+    def name(self) -> str:
+        """Tells it from another source, on which a run must not go on."""
+
+    def batch(self, numbers: range | list[int]) -> Pair:
+        """Pairs of these numbers, on one device."""
+
+
 def uniform(generators: list[torch.Generator], low: float, high: float, count: int = 1) -> Tensor:
     """(B, count) numbers, each row from its own generator."""
     return torch.stack([torch.rand(count, generator=g) for g in generators]) * (high - low) + low
@@ -159,6 +171,11 @@ class SimulatedPairs:
     sensor: Sensor = Sensor()
     exposure: Range = (0.4, 0.95)
     seed: int = 0
+
+    @property
+    def name(self) -> str:
+        """The same for all photographs: more of them do not make another run."""
+        return "simulated"
 
     def batch(self, numbers: range | list[int]) -> Pair:
         """Make the samples of these numbers.

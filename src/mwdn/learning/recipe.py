@@ -3,12 +3,13 @@
 import dataclasses
 import json
 import tomllib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
 
+from mwdn.data.recorded import Division
 from mwdn.data.simulated import Mismatch, Placement
 from mwdn.errors import MwdnError, ParameterError, UnknownNameError
 from mwdn.learning.losses import checked_weights
@@ -17,17 +18,25 @@ from mwdn.optics.sensor import Sensor
 
 T = TypeVar("T")
 
+COURSES = ("cosine", "plateau")
+OPTIMISERS = ("adam", "adamw")
+
 
 @dataclass(frozen=True)
 class Schedule:
     """How long and how fast to learn.
 
     Args:
-        steps: optimiser steps.
+        steps: optimiser steps, at most.
+        epochs: passes over the training pairs, or as many samples as there are training photographs. If positive,
+            `steps` and `validate_every` follow from it: a validation after each.
         batch: samples a step, over all processes together.
-        learning_rate: at its highest, after the warm-up; it then falls to 1 % as half a cosine.
-        warmup: steps of linear rise.
-        weight_decay: of AdamW, on convolution weights alone.
+        course: of the learning rate: "cosine", or the paper's "plateau", see `Plateau`.
+        learning_rate: at its highest, after the warm-up; the cosine then falls to 1 % of it in half a period.
+        warmup: steps of linear rise, before the cosine alone.
+        optimiser: "adamw", or the paper's "adam"; see `mwdn.learning.schedule.optimiser`.
+        weight_decay: of the optimiser.
+        clip: longer gradients, over all parameters, are shortened to this norm; 0 leaves them as they are.
         ema: the checkpoint holds a running mean of the weights, with this decay a step; 0 for the last weights.
         bfloat16: compute convolutions in bfloat16 where the hardware has it.
         validate_every: steps between validations, checkpoints and contact sheets.
@@ -36,10 +45,14 @@ class Schedule:
     """
 
     steps: int = 2000
+    epochs: int = 0
     batch: int = 4
+    course: str = "cosine"
     learning_rate: float = 1e-3
     warmup: int = 50
+    optimiser: str = "adamw"
     weight_decay: float = 1e-4
+    clip: float = 1.0
     ema: float = 0.99
     bfloat16: bool = True
     validate_every: int = 250
@@ -50,11 +63,52 @@ class Schedule:
         for name in ("steps", "batch", "learning_rate", "validate_every", "validation"):
             if not getattr(self, name) > 0:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) must be positive.")
-        for name in ("warmup", "weight_decay"):
+        for name in ("epochs", "warmup", "weight_decay", "clip"):
             if not getattr(self, name) >= 0:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) must not be negative.")
         if not 0 <= self.ema < 1:
             raise ParameterError(f"`ema` ({self.ema}) must be in [0, 1).")
+        for kind, name, known in (("course", self.course, COURSES), ("optimiser", self.optimiser, OPTIMISERS)):
+            if name not in known:
+                raise UnknownNameError(kind, name, known)
+
+
+@dataclass(frozen=True)
+class Plateau:
+    """The paper's course of the learning rate: it falls when the validation loss does not. Defaults are the paper's.
+
+    The loss that is watched has the weights of [loss] throughout.
+
+    Args:
+        factor: by which the learning rate is multiplied.
+        patience: validations without a new lowest loss that are borne; the next such one lowers the learning rate.
+        later: from this learning rate on, the loss has the weights of [later_loss].
+        stop: below this learning rate the run ends.
+    """
+
+    factor: float = 0.1
+    patience: int = 5
+    later: float = 1e-6
+    stop: float = 2e-8
+
+    def __post_init__(self) -> None:
+        if not 0 < self.factor < 1:
+            raise ParameterError(f"`factor` ({self.factor}) must be in (0, 1): the learning rate falls.")
+        for name in ("patience", "later", "stop"):
+            if not getattr(self, name) >= 0:
+                raise ParameterError(f"`{name}` ({getattr(self, name)}) must not be negative.")
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """What the contact sheet of a validation shows besides simulated or recorded pairs.
+
+    Args:
+        captures: files and folders of real captures, which have no scene to compare with; the first six are shown.
+            Their paths begin at the recipe's folder. They change nothing of what is learned.
+    """
+
+    captures: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -65,6 +119,10 @@ class Recipe:
         network: its name, and options under their own names; empty only where nothing is trained.
         schedule: see `Schedule`.
         loss: weights of its parts, see `mwdn.learning.losses.Loss`.
+        plateau: see `Plateau`; of that course only.
+        later_loss: weights that replace those of ``loss`` at the end of that course; none to leave them.
+        pairs: which of recorded pairs are for what, see `mwdn.data.recorded.Division`.
+        sheet: see `Sheet`.
         placement: see `mwdn.data.simulated.Placement`.
         mismatch: see `mwdn.data.simulated.Mismatch`.
         sensor: see `mwdn.optics.sensor.Sensor`.
@@ -73,9 +131,27 @@ class Recipe:
     network: dict[str, Any] = field(default_factory=dict)
     schedule: Schedule = Schedule()
     loss: dict[str, float] = field(default_factory=lambda: {"mse": 1.0})
+    plateau: Plateau = Plateau()
+    later_loss: dict[str, float] = field(default_factory=dict)
+    pairs: Division = Division()
+    sheet: Sheet = Sheet()
     placement: Placement = Placement()
     mismatch: Mismatch = Mismatch()
     sensor: Sensor = Sensor()
+
+    def __post_init__(self) -> None:
+        of_plateau = {"plateau": self.plateau != Plateau(), "later_loss": bool(self.later_loss)}
+        if self.schedule.course != "plateau" and any(of_plateau.values()):
+            name = next(name for name, given in of_plateau.items() if given)
+            raise ParameterError(
+                f"[{name}] belongs to another course than '{self.schedule.course}'. "
+                'Leave it out, or set `course = "plateau"` in [schedule].'
+            )
+        if self.later_loss and self.later_loss.keys() != self.loss.keys():
+            raise ParameterError(
+                f"[later_loss] ({', '.join(self.later_loss)}) must have the parts of [loss] ({', '.join(self.loss)}). "
+                "Give a part that shall not count the weight 0."
+            )
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values that JSON can hold."""
@@ -106,17 +182,21 @@ def read_recipe(path: str | Path, **schedule: Any) -> Recipe:  # noqa: ANN401
     if not isinstance(content.get("network", {}).get("name"), str):
         raise ParameterError(f'`{path}` must name a network: [network] name = "mwdn".')
     _try(content["network"])
-    if "loss" in content:
-        content["loss"] = checked_weights(content["loss"])
+    for table in {"loss", "later_loss"} & content.keys():
+        content[table] = checked_weights(content[table])
     changes = {name: value for name, value in schedule.items() if value is not None}
+    if "steps" in changes:  # instead of the recipe's, in whatever unit it counts
+        changes["epochs"] = 0
     content["schedule"] = content.get("schedule", {}) | changes
-    kinds = {"schedule": Schedule, "placement": Placement, "mismatch": Mismatch, "sensor": Sensor}
-    return Recipe(**{name: _fill(kinds[name], table) if name in kinds else table for name, table in content.items()})
+    kinds: dict[str, Any] = {name: type(f.default) for name, f in fields.items() if is_dataclass(f.default)}
+    tables = {name: _fill(kinds[name], name, table) for name, table in content.items() if name in kinds}
+    recipe = Recipe(**(content | tables))
+    captures = tuple(str(Path(path).parent / capture) for capture in recipe.sheet.captures)
+    return dataclasses.replace(recipe, sheet=Sheet(captures))
 
 
-def _fill(kind: type[T], table: dict[str, Any]) -> T:
+def _fill(kind: type[T], name: str, table: dict[str, Any]) -> T:
     known = {f.name: f.default for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    name = kind.__name__.lower()
     for key, value in table.items():
         if key not in known:
             raise UnknownNameError(f"key of [{name}]", key, known)
@@ -132,14 +212,15 @@ def _listless(value: Any) -> Any:  # noqa: ANN401
 
 def _alike(value: object, example: object) -> bool:
     if isinstance(value, tuple) and isinstance(example, tuple):
-        return len(value) == len(example) and all(map(_alike, value, example))
+        # Where the default is empty, any number of texts.
+        return all(map(_alike, value, example or ("",) * len(value))) and len(value) == len(example or value)
     return type(value) is type(example) or (type(value) is int and type(example) is float)
 
 
 def _as_float(value: Any, example: object) -> Any:  # noqa: ANN401
     """TOML's 12 where 12.0 is meant."""
     if isinstance(value, tuple) and isinstance(example, tuple):
-        return tuple(map(_as_float, value, example))
+        return tuple(map(_as_float, value, example or value))
     return float(value) if isinstance(example, float) else value
 
 

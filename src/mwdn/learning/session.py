@@ -1,18 +1,22 @@
-"""What a user does with a recipe, a calibration and a folder of photographs: train, or make a file of pairs."""
+"""What a user does with a recipe, a calibration and pictures: train, or make a file of pairs."""
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
 from mwdn.calibration import Calibration
+from mwdn.data.captures import find_captures, read_captures
 from mwdn.data.pair_writer import Attribute
 from mwdn.data.pairs import PairFile
 from mwdn.data.photographs import Photographs
+from mwdn.data.recorded import RecordedPairs, recorded_pairs
 from mwdn.data.simulated import EXACT, SimulatedPairs
 from mwdn.errors import ParameterError
 from mwdn.learning import distributed
 from mwdn.learning.recipe import Recipe
 from mwdn.learning.train import Trainer
+from mwdn.learning.validation import SHOWN
 from mwdn.types import Psf
 
 HELD_OUT = 20
@@ -22,23 +26,58 @@ FILE_START = 2 * 10**12
 """Number of the first sample of a file: a network trained with the same seed has seen none of them."""
 
 
-def prepare(recipe: Recipe, calibration: Calibration, photos: Path, out: Path, device: str | None = None) -> Trainer:
-    """Read the photographs and set the run up.
+def prepare(
+    recipe: Recipe,
+    calibration: Calibration,
+    photos: Path | None,
+    out: Path,
+    device: str | None = None,
+    *,
+    pairs: Path | None = None,
+    captures: Iterable[Path] = (),
+) -> Trainer:
+    """Read what there is to learn from and set the run up.
 
     Args:
         recipe: the experiment.
         calibration: of the camera.
-        photos: folder of photographs; every 20th is held out for validation.
+        photos: folder of photographs, through which captures are simulated; every 20th is held out for validation.
         out: folder of the run.
         device: a GPU if there is one unless given.
+        pairs: file of recorded pairs, in place of photographs.
+        captures: real ones to show on the contact sheets, files and folders; in place of the recipe's.
 
     Raises:
-        MwdnError: torch cannot use the device, a photograph cannot be read, or the folder holds another run.
+        ParameterError: not exactly one of photographs and pairs, or not enough of them.
+        MwdnError: torch cannot use the device, a file cannot be read or does not fit the camera, or the folder holds
+            another run.
     """
+    if photos is None and pairs is None:
+        raise ParameterError("Name what to learn from: photographs, `--photos FOLDER`, or pairs, `--pairs FILE`.")
+    if photos is not None and pairs is not None:
+        raise ParameterError(
+            f"`--photos` ({photos}) and `--pairs` ({pairs}) exclude each other. Leave one of them out."
+        )
     place = distributed.device_here(device)
-    training, validation = Photographs(photos).to(place).split(HELD_OUT)
-    pairs = _source(recipe, training, calibration.psf.to(place))
-    return Trainer(recipe, calibration, pairs, out, validation=replace(pairs, photographs=validation), device=place)
+    shown = [*captures] or recipe.sheet.captures
+    real = read_captures(find_captures(shown)[:SHOWN], calibration) if shown else None
+    training: RecordedPairs | SimulatedPairs
+    validation: RecordedPairs | SimulatedPairs
+    if pairs is not None:
+        seed = recipe.schedule.seed
+        training, validation = recorded_pairs(pairs, calibration.psf, recipe.pairs, seed=seed, device=place)
+        recipe = _within(recipe, len(validation))
+        count = len(training)
+    elif photos is not None:
+        learned, held_out = Photographs(photos).to(place).split(HELD_OUT)
+        training = _source(recipe, learned, calibration.psf.to(place))
+        validation = replace(training, photographs=held_out)
+        count = len(learned)
+    trainer = Trainer(
+        _in_steps(recipe, count), calibration, training, out, validation=validation, captures=real, device=place
+    )
+    trainer.validator.captured(trainer.average)  # a capture that does not fit the network is found now
+    return trainer
 
 
 def simulate(
@@ -87,3 +126,17 @@ def _source(recipe: Recipe, photographs: Photographs, psf: Psf) -> SimulatedPair
         sensor=recipe.sensor,
         seed=recipe.schedule.seed,
     )
+
+
+def _within(recipe: Recipe, most: int) -> Recipe:
+    """No recorded pair counts twice in a validation."""
+    return replace(recipe, schedule=replace(recipe.schedule, validation=min(recipe.schedule.validation, most)))
+
+
+def _in_steps(recipe: Recipe, count: int) -> Recipe:
+    """Epochs of so many samples become steps: as many of them as hold an epoch, and a validation after each."""
+    schedule = recipe.schedule
+    if schedule.epochs == 0:
+        return recipe
+    steps = math.ceil(count / schedule.batch)
+    return replace(recipe, schedule=replace(schedule, steps=schedule.epochs * steps, validate_every=steps))

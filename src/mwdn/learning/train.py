@@ -1,4 +1,4 @@
-"""The training loop: simulated pairs in, checkpoint out."""
+"""The training loop: pairs in, checkpoint out."""
 
 import json
 import math
@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from safetensors import SafetensorError
@@ -16,19 +15,18 @@ from torch import Tensor, nn
 
 from mwdn.calibration import Calibration
 from mwdn.data.images import write_picture
-from mwdn.data.sheets import contact_sheet
-from mwdn.data.simulated import SimulatedPairs
+from mwdn.data.simulated import Samples
 from mwdn.data.writing import atomic
 from mwdn.errors import CheckpointError, DivergenceError, ParameterError
 from mwdn.learning import distributed
 from mwdn.learning.checkpoint import save_network
 from mwdn.learning.losses import Loss
 from mwdn.learning.precision import has_bfloat16
-from mwdn.learning.recipe import Recipe, Schedule
+from mwdn.learning.recipe import Recipe
+from mwdn.learning.schedule import begin, optimiser
+from mwdn.learning.validation import Validation, Validator
 from mwdn.networks import build
-
-VALIDATION_START = 10**12
-"""Samples are numbered; those of the validation start here, where no training ever arrives."""
+from mwdn.types import Measurement
 
 _MAKE_ROOM = "Make room and give the same command again: it goes on from the last saved state."
 
@@ -40,16 +38,15 @@ class Report:
     step: int
     loss: float
     parts: dict[str, float]
+    learning_rate: float
     pictures_per_s: float
-    psnr: float | None = None
+    validation: Validation | None = None
 
-
-def learning_rate(step: int, schedule: Schedule) -> float:
-    """Linear warm-up, then half a cosine down to 1 % of the highest rate."""
-    if step < schedule.warmup:
-        return schedule.learning_rate * (step + 1) / schedule.warmup
-    progress = (step - schedule.warmup) / max(1, schedule.steps - schedule.warmup)
-    return schedule.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * progress)))
+    def line(self) -> dict[str, float | int | None]:
+        """What the log says of the step."""
+        line = {"step": self.step, "loss": self.loss, **self.parts, "learning_rate": self.learning_rate}
+        psnr, loss = (None, None) if self.validation is None else (self.validation.psnr, self.validation.loss)
+        return {**line, "psnr": psnr, "validation_loss": loss}
 
 
 class Trainer:
@@ -61,33 +58,36 @@ class Trainer:
     Args:
         recipe: the experiment.
         calibration: of the camera to learn.
-        pairs: the source of its simulated captures.
+        pairs: what to learn from.
         out: folder of the run: ``best.safetensors``, ``last.safetensors``, ``state.safetensors``, ``log.jsonl``.
         validation: source of other pairs, for the validation; ``pairs`` unless given.
+        captures: (B, C, H, W), real ones, to be shown on the contact sheets.
         device: where to compute.
         alexnet: file of AlexNet's weights, where the loss needs them.
 
     Raises:
-        CheckpointError: the folder holds the state of another recipe or PSF, or a damaged one.
+        CheckpointError: the folder holds the state of another recipe, PSF or source of pairs, or a damaged one.
         ParameterError: the folder cannot be written to, the batch is smaller than the number of processes, or these
             were given different recipes or PSFs; found before training starts.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         recipe: Recipe,
         calibration: Calibration,
-        pairs: SimulatedPairs,
+        pairs: Samples,
         out: Path,
         *,
-        validation: SimulatedPairs | None = None,
+        validation: Samples | None = None,
+        captures: Measurement | None = None,
         device: torch.device | str = "cpu",
         alexnet: Path | None = None,
     ) -> None:
         self.recipe, self.schedule, self.out = recipe, recipe.schedule, out
         self.device, self.pairs, self.calibration = torch.device(device), pairs, calibration
-        self.validation = validation or pairs
         self.psf = calibration.psf.to(self.device)
+        real = None if captures is None else captures.to(self.device)
+        self.validator = Validator(recipe, validation or pairs, self.psf, real)
         torch.manual_seed(self.schedule.seed)
         self.options = {key: value for key, value in recipe.network.items() if key != "name"}
         self.network = build(recipe.network["name"], **self.options).to(self.device)
@@ -97,25 +97,18 @@ class Trainer:
         distributed.freeze_cancelled(self.network)
         distributed.synchronise(self.network, self.device)
         self.loss = Loss(recipe.loss, alexnet=alexnet).to(self.device)
-        self.optimiser = torch.optim.AdamW(self._groups(), lr=self.schedule.learning_rate)
+        self.optimiser = optimiser(self.network, self.schedule)
+        self.course = begin(recipe)
         self.bfloat16 = self.schedule.bfloat16 and has_bfloat16(self.device)
         self.step, self.best = 0, -math.inf
         # What a checkpoint must agree with to be gone on from.
-        self.identity = {"recipe": recipe.as_dict(), "psf_hash": calibration.psf_hash}
+        learned = {table: values for table, values in recipe.as_dict().items() if table != "sheet"}
+        self.identity = {"recipe": learned, "psf_hash": calibration.psf_hash, "pairs": pairs.name}
         distributed.check_alike(self.identity)
         distributed.share(range(self.schedule.batch))  # refuses a batch that is too small
         self._resume()
         if distributed.rank() == 0:
             self._claim()
-
-    def _groups(self) -> list[dict[str, Any]]:
-        """Weight decay pulls convolution weights to zero; biases, BatchNorm, w and lambda stay free."""
-        decayed = [p for p in self.network.parameters() if p.ndim > 1]
-        others = [p for p in self.network.parameters() if p.ndim <= 1]
-        return [
-            {"params": decayed, "weight_decay": self.schedule.weight_decay},
-            {"params": others, "weight_decay": 0.0},
-        ]
 
     def run(self, callback: Callable[[Report], None] = lambda report: None) -> float:
         """Train to the end of the schedule; returns the best validation PSNR in dB.
@@ -129,18 +122,18 @@ class Trainer:
             ProcessError: another process has ended.
         """
         last = time.perf_counter()
-        while self.step < self.schedule.steps:
+        while self.step < self.schedule.steps and not self.course.finished:
+            rate = self.course.rate(self.step)
             loss, parts = self.advance()
             now = time.perf_counter()
             speed, last = self.schedule.batch / (now - last), now
-            psnr = None
-            if self.step % self.schedule.validate_every == 0 or self.step == self.schedule.steps:
-                psnr = distributed.first_computes(self.validate)
-            report = Report(self.step, loss, parts, speed, psnr)
+            due = self.step % self.schedule.validate_every == 0 or self.step == self.schedule.steps
+            found = self.validate() if due else None
+            report = Report(self.step, loss, parts, rate, speed, found)
             if distributed.rank() == 0:
                 self._log(report)  # before the state: a run killed between the two repeats the step, and its line
-            if psnr is not None:
-                self.save(psnr)
+            if found is not None:
+                self.save(found)
                 last = time.perf_counter()
             if distributed.rank() == 0:
                 callback(report)
@@ -157,7 +150,8 @@ class Trainer:
         own = distributed.share(numbers)
         measurement, scene = self.pairs.batch(own)
         for group in self.optimiser.param_groups:
-            group["lr"] = learning_rate(self.step, self.schedule)
+            group["lr"] = self.course.rate(self.step)
+        self.loss.weights = self.course.weights
         self.network.train()
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
             found = self.network(measurement.contiguous(memory_format=torch.channels_last), self.psf)
@@ -172,7 +166,8 @@ class Trainer:
         self.optimiser.zero_grad(set_to_none=True)
         (weight * loss).backward()
         distributed.add_gradients(self.network)
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        if self.schedule.clip > 0:
+            torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.schedule.clip)
         self.optimiser.step()
         self.step += 1
         self._average()
@@ -188,34 +183,34 @@ class Trainer:
             else:
                 mean.copy_(value)
 
-    @torch.no_grad()
-    def validate(self) -> float:
-        """Mean PSNR in dB of the averaged weights on the validation samples; writes a contact sheet."""
-        scores, rows = [], []
-        numbers = range(VALIDATION_START, VALIDATION_START + self.schedule.validation)
-        for start in range(0, len(numbers), self.schedule.batch):
-            measurement, scene = self.validation.batch(numbers[start : start + self.schedule.batch])
-            found = self.average(measurement, self.psf)
-            scores.append(-10 * torch.log10((found.clamp(0, 1) - scene).square().mean((1, 2, 3))))
-            rows += [[m[None], f[None], s[None]] for m, f, s in zip(measurement, found, scene, strict=True)]
-        cpu = [[picture.cpu() for picture in row] for row in rows[:6]]
-        sheet = contact_sheet(cpu, ["measurement", f"step {self.step}", "scene"])
-        write_picture(self.out / "validation.png", sheet)
-        return float(torch.cat(scores).mean())
+    def validate(self) -> Validation:
+        """Measure the averaged weights, write the contact sheet, and let the course see the loss.
 
-    def save(self, psnr: float) -> None:
+        The first process does it, and all go on with its numbers.
+        """
+        found = Validation(math.nan, math.nan)
+        if distributed.rank() == 0:
+            found = self.validator(self.average, self.loss, f"step {self.step}")
+        if found.sheet is not None:
+            write_picture(self.out / "validation.png", found.sheet)
+        psnr, loss = distributed.numbers_of_first([found.psnr, found.loss])
+        self.course = self.course.after(loss)
+        return Validation(psnr, loss, found.sheet)
+
+    def save(self, found: Validation) -> None:
         """Write last and, if it is, best weights, and the whole state, each atomically.
 
         Raises:
             ParameterError: the disk is full, or refuses otherwise; the last saved state stays as it was.
         """
-        self.best = max(self.best, psnr)
+        self.best = max(self.best, found.psnr)
         if distributed.rank() > 0:
             return
-        metadata = {**self.identity, "step": self.step, "psnr": psnr}
+        metadata = {**self.identity, "step": self.step, "psnr": found.psnr}
         header = {"identity": json.dumps(self.identity), "step": str(self.step), "best": repr(self.best)}
+        header["course"] = json.dumps(self.course.state())
         with self._writing(_MAKE_ROOM):
-            for name in ("last", *(["best"] if psnr == self.best else [])):
+            for name in ("last", *(["best"] if found.psnr == self.best else [])):
                 network = self.recipe.network["name"]
                 save_network(self.out / f"{name}.safetensors", self.average, network, self.options, **metadata)
             with atomic(self.out / "state.safetensors") as temporary:
@@ -250,7 +245,8 @@ class Trainer:
         header = _metadata(content)
         if json.loads(header.get("identity", "null")) != json.loads(json.dumps(self.identity)):
             raise CheckpointError(
-                f"`{self.out}` holds a run of another recipe or PSF. Choose another folder, `--out`, or remove it."
+                f"`{self.out}` holds a run of another recipe or PSF, or on other pairs. "
+                "Choose another folder, `--out`, or remove it."
             )
         for prefix, module in (("network", self.network), ("average", self.average)):
             _restore(module, prefix, state)
@@ -263,6 +259,7 @@ class Trainer:
             moments = {key: value.contiguous(memory_format=form) for key, value in found.items() if key != "step"}
             self.optimiser.state[parameter] = {"step": found["step"].cpu(), **moments}
         self.step, self.best = int(header["step"]), float(header["best"])
+        self.course = begin(self.recipe, **json.loads(header["course"]))
 
     def _claim(self) -> None:
         """Write to the folder once, so that one that refuses is found now and not after an hour."""
@@ -276,9 +273,8 @@ class Trainer:
                 temporary.write_text("".join(lines[: self.step]), encoding="utf-8")
 
     def _log(self, report: Report) -> None:
-        line = {"step": report.step, "loss": report.loss, **report.parts, "psnr": report.psnr}
         with self._writing(_MAKE_ROOM), (self.out / "log.jsonl").open("a", encoding="utf-8") as file:
-            file.write(json.dumps(line) + "\n")
+            file.write(json.dumps(report.line()) + "\n")
 
 
 def _metadata(content: bytes) -> dict[str, str]:

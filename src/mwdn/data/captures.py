@@ -1,0 +1,67 @@
+"""Real captures: where they are, and as measurements."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import torch
+
+from mwdn.calibration import Calibration
+from mwdn.data.images import READABLE, read_frame
+from mwdn.errors import ParameterError, ShapeError
+from mwdn.types import Measurement
+
+
+def find_captures(paths: Iterable[str | Path], *, apart: Iterable[Path | None] = ()) -> list[Path]:
+    """Files as named, and every readable file of each folder, in the order of their names; each once.
+
+    Args:
+        paths: files and folders.
+        apart: files that are no captures where a folder holds them: the PSF, the dark frame. Hidden ones are none.
+
+    Raises:
+        ParameterError: nothing was named, or a folder holds no picture.
+    """
+    found: list[Path] = []
+    others = {path.resolve() for path in apart if path is not None}
+    for path in map(Path, paths):
+        inside = [path]
+        if path.is_dir():
+            inside = sorted(f for f in path.iterdir() if f.suffix.lower() in READABLE and f.is_file())
+            inside = [f for f in inside if not f.name.startswith(".") and f.resolve() not in others]
+        if not inside:
+            raise ParameterError(f"The folder `{path}` holds no capture. Readable: {', '.join(sorted(READABLE))}.")
+        found += inside
+    if not found:
+        raise ParameterError("Name at least one capture, or a folder of captures.")
+    return list(dict.fromkeys(found))
+
+
+def read_capture(path: Path, calibration: Calibration) -> Measurement:
+    """Read a raw frame as a measurement, (1, C, H, W).
+
+    Raises:
+        MwdnError: it cannot be read, or does not fit the camera.
+    """
+    return calibration.correct(read_frame(path, bgr=calibration.bgr))
+
+
+def read_captures(paths: Iterable[Path], calibration: Calibration) -> Measurement:
+    """Read raw frames as one batch of measurements, (B, C, H, W).
+
+    Raises:
+        MwdnError: one cannot be read, does not fit the camera, or has other channels than the first.
+    """
+    measurements: list[Measurement] = []
+    for path in paths:
+        try:
+            measurement = read_capture(path, calibration)
+        except ShapeError as error:
+            raise ShapeError(f"`{path}`: {error}") from error
+        if measurements and measurement.shape != measurements[0].shape:
+            channels = measurements[0].shape[1]
+            raise ShapeError(
+                f"`{path}` ({measurement.shape[1]} channels) must have as many as the captures before it ({channels}). "
+                "Take all in one mode of the camera."
+            )
+        measurements.append(measurement)
+    return torch.cat(measurements)

@@ -1,0 +1,147 @@
+"""Recorded pairs as a source of numbered samples, like the simulated ones."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from mwdn.data.pairs import PairFile
+from mwdn.data.simulated import Pair
+from mwdn.data.splits import split
+from mwdn.errors import ParameterError, ShapeError
+from mwdn.types import Psf
+
+HELD_OUT = 20
+"""Where a split has no validation part, every 20th of its training pairs is held out for it."""
+
+
+@dataclass(frozen=True)
+class Division:
+    """Which pairs of a file are for training, and which for validation.
+
+    Args:
+        split: see `mwdn.data.splits.split`. The published ones count positions, so that no pair may be missing.
+        fractions: of training, validation and test; of "random" only.
+        seed: of "random" only.
+    """
+
+    split: str = "paper"
+    fractions: tuple[float, float, float] = (0.8, 0.1, 0.1)
+    seed: int = 0
+
+    def of(self, count: int) -> tuple[range | list[int], range | list[int]]:
+        """Positions of the pairs for training and of those for validation; the test part is in neither.
+
+        Raises:
+            UnknownNameError: no such split.
+            ParameterError: it does not fit the count, or leaves no pair for training.
+        """
+        parts = split(count, self.split, fractions=self.fractions, seed=self.seed)
+        train, validation = parts["train"], parts.get("validation", [])
+        if not validation:
+            held = train[HELD_OUT - 1 :: HELD_OUT]
+            train, validation = sorted(set(train) - set(held)), held
+        if not train or not validation:
+            raise ParameterError(
+                f"The split '{self.split}' of {count:,} pairs leaves {len(train):,} for training and "
+                f"{len(validation):,} for validation; both need some. Name other `fractions` in [pairs]."
+            )
+        return train, validation
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedPairs:
+    """A source of the pairs of a file: each once, in another order, in each epoch.
+
+    Args:
+        file: of the pairs, opened when the first one is read.
+        rows: positions of those to use.
+        seed: of the orders.
+        shuffled: in the order of ``rows`` otherwise, over and over.
+        device: where to put the pairs.
+    """
+
+    file: PairFile
+    rows: range | list[int]
+    seed: int = 0
+    shuffled: bool = True
+    device: torch.device = torch.device("cpu")  # noqa: RUF009
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @property
+    def name(self) -> str:
+        """Says how many there are, on which the order depends."""
+        return f"{len(self):,} of {len(self.file):,} recorded"
+
+    def batch(self, numbers: range | list[int]) -> Pair:
+        """Read the samples of these numbers.
+
+        Returns:
+            measurement and scene, (B, C, H, W) each, linear light, nominally in [0, 1].
+
+        Raises:
+            ImageError: a pair cannot be read.
+        """
+        pairs = [self.file[self.row(number)] for number in numbers]
+        measurement, scene = (torch.stack(part).to(self.device) for part in zip(*pairs, strict=True))
+        return Pair(measurement, scene)
+
+    def row(self, number: int) -> int:
+        """Position in the file of a sample."""
+        epoch, place = divmod(number, len(self.rows))
+        return self.rows[int(_order(len(self.rows), self.seed, epoch)[place]) if self.shuffled else place]
+
+
+def recorded_pairs(
+    path: Path, psf: Psf, division: Division, *, seed: int = 0, device: torch.device | str = "cpu"
+) -> tuple[RecordedPairs, RecordedPairs]:
+    """Pairs for training and for validation.
+
+    Args:
+        path: of the file.
+        psf: of the camera that took them.
+        division: which are for what.
+        seed: of the order in each epoch.
+        device: where to put them.
+
+    Raises:
+        ImageError: no such file; damaged, or something else than pairs.
+        ShapeError: the pairs do not fit the PSF.
+        ParameterError: the division does not fit their number.
+    """
+    file = PairFile(path)
+    _check(file, psf)
+    train, validation = division.of(len(file))
+    place = torch.device(device)
+    return RecordedPairs(file, train, seed, device=place), RecordedPairs(file, validation, seed, False, place)
+
+
+def _check(file: PairFile, psf: Psf) -> None:
+    (h, w, channels), (H, W), colours = file.measurement_shape, psf.shape[-2:], psf.shape[1]
+    if (h, w) != (H, W):
+        factor = H // h
+        way_out = "Use the PSF of the camera that took them, cropped and binned as they are: `--crop`, `--psf-bin`."
+        if factor > 1 and (h * factor, w * factor) == (H, W):
+            way_out = f"The PSF is {factor} times as large: bin it by {factor} times as much, `--psf-bin`."
+        raise ShapeError(f"`psf` ({H} x {W}) and the measurements of `{file.path}` ({h} x {w}) must match. {way_out}")
+    if colours not in (1, channels):
+        raise ShapeError(
+            f"`psf` ({colours} channels) must be grey, or have the channels of the measurements of `{file.path}` "
+            f"({channels}). Calibrate in the mode in which they were taken."
+        )
+    if file.scene_shape[:2] != (h, w):
+        (a, b) = file.scene_shape[:2]
+        raise ShapeError(
+            f"The scenes of `{file.path}` ({a} x {b}) must have the size of its measurements ({h} x {w}). "
+            "Make the file again with scenes of that size: `mwdn import --scene-size`."
+        )
+
+
+@lru_cache(maxsize=4)
+def _order(count: int, seed: int, epoch: int) -> npt.NDArray[np.int64]:
+    return np.random.default_rng((seed & (2**63 - 1), epoch)).permutation(count)

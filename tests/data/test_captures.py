@@ -1,0 +1,67 @@
+"""Real captures: which files are some, and how they become measurements."""
+
+import numpy as np
+import pytest
+import torch
+
+from mwdn.calibration import Calibration
+from mwdn.data.captures import find_captures, read_capture, read_captures
+from mwdn.errors import ParameterError, ShapeError
+
+
+def touch(folder, *names):
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        (folder / name).write_bytes(b"")
+    return [folder / name for name in names]
+
+
+def test_captures_are_found_in_order_and_once(tmp_path):
+    b, a, _, upper = touch(tmp_path / "in", "b.png", "a.tif", "notes.txt", "c.PNG")
+    (tmp_path / "in" / "d.npy").mkdir()
+    single = touch(tmp_path, "single.raw")[0]  # named by the user: its content decides
+    assert find_captures([single, tmp_path / "in"]) == [single, a, b, upper]
+    assert find_captures([b, str(tmp_path / "in"), b]) == [b, a, upper]
+
+
+def test_psf_dark_frame_and_hidden_files_in_a_folder_are_no_captures(tmp_path):
+    a, psf, dark, _ = touch(tmp_path, "a.png", "psf.png", "dark.npy", "._a.png")
+    assert find_captures([tmp_path], apart=(psf, dark, None)) == [a]
+    assert find_captures([psf], apart=(psf,)) == [psf]  # named, so wanted
+
+
+def test_nothing_to_reconstruct(tmp_path):
+    with pytest.raises(ParameterError, match="Name at least one capture"):
+        find_captures([])
+    with pytest.raises(ParameterError, match=r"The folder `.*` holds no capture\. Readable: \.bmp, .*\.npy"):
+        find_captures([tmp_path])
+
+
+def test_captures_are_corrected_by_the_calibration(tmp_path):
+    """Twice as large, 4 bits, dark level 3, upside down, blue first: each of it must be undone."""
+    stored = np.full((4, 6, 3), 3, np.uint8)
+    stored[2:, :2] = 3 + np.array([8, 4, 2], np.uint8)  # BGR; the file's lower left
+    np.save(tmp_path / "a.npy", stored)
+    np.save(tmp_path / "b.npy", np.full((4, 6, 3), 15, np.uint8))
+    dark = torch.full((1, 1, 4, 6), 3 / 15)
+    calibration = Calibration(torch.ones(1, 3, 2, 3) / 6, 4, dark, binning=2, upside_down=True, bgr=True)
+    both = read_captures([tmp_path / "a.npy", tmp_path / "b.npy"], calibration)
+    expected = torch.zeros(2, 3, 2, 3)
+    expected[0, :, 0, 0] = torch.tensor([2, 4, 8]) / 15
+    expected[1] = 12 / 15
+    torch.testing.assert_close(both, expected)
+    assert torch.equal(read_capture(tmp_path / "b.npy", calibration), both[1:])
+
+
+def test_captures_of_different_channels(tmp_path):
+    for name, channels in (("a", 3), ("b", 1)):
+        np.save(tmp_path / f"{name}.npy", np.zeros((2, 3, channels), np.uint8))
+    files = [tmp_path / "a.npy", tmp_path / "b.npy"]
+    with pytest.raises(ShapeError, match=r"b\.npy` \(1 channels\) must have as many as the captures before it \(3\)"):
+        read_captures(files, Calibration(torch.ones(1, 1, 2, 3) / 6))
+
+
+def test_capture_that_does_not_fit_is_named(tmp_path):
+    np.save(tmp_path / "a.npy", np.zeros((4, 6, 3), np.uint8))
+    with pytest.raises(ShapeError, match=r"`.*a\.npy`: `psf` \(2 x 3\) and the capture \(4 x 6\) must have the same"):
+        read_captures([tmp_path / "a.npy"], Calibration(torch.ones(1, 1, 2, 3) / 6))

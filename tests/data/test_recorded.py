@@ -1,0 +1,136 @@
+"""Recorded pairs as numbered samples: each once an epoch, and only those that are for training."""
+
+import itertools
+import re
+
+import pytest
+import torch
+
+from mwdn.data.pairs import PairFile
+from mwdn.data.recorded import Division, RecordedPairs, recorded_pairs
+from mwdn.data.simulated import Samples
+from mwdn.errors import ImageError, ParameterError, ShapeError, UnknownNameError
+
+
+@pytest.fixture
+def pairs(tmp_path):
+    """``pairs(count)``: measurement number n is n / 255, its scene 1 - n / 255."""
+
+    def make(count=30, size=(4, 6), channels=3, scene=None):
+        shape = (*size, channels)
+        path = tmp_path / "pairs.h5"
+        with PairFile.create(path, measurement_shape=shape, scene_shape=scene or shape, dtype="uint8") as file:
+            for number in range(count):
+                measurement = torch.full((channels, *size), number / 255)
+                whole = torch.full((scene[2], *scene[:2]), 1.0) if scene else torch.ones_like(measurement)
+                file.append(measurement, whole - number / 255)
+        return path
+
+    return make
+
+
+def psf(size=(4, 6), channels=3):
+    return torch.ones(1, channels, *size) / (size[0] * size[1])
+
+
+def drawn(source, numbers):
+    measurement, scene = source.batch(numbers)
+    torch.testing.assert_close(measurement + scene, torch.ones_like(scene))  # still a pair
+    return (measurement[:, 0, 0, 0] * 255).round().int().tolist()
+
+
+def test_parts_are_the_papers(pairs):
+    """8:1:1 by position, test first: of 30, 3 for test, then 3 for validation, then 24 for training."""
+    train, validation = recorded_pairs(pairs(), psf(), Division())
+    assert isinstance(train, Samples)
+    assert len(train) == 24
+    assert sorted(drawn(train, range(24))) == list(range(6, 30))
+    assert sorted(drawn(validation, range(10**12, 10**12 + 3))) == [3, 4, 5]
+    assert drawn(validation, range(10**12, 10**12 + 3)) == drawn(validation, range(10**12 + 3, 10**12 + 6))
+
+
+def test_each_epoch_has_each_pair_once_in_an_order_of_its_own(pairs):
+    train, _ = recorded_pairs(pairs(), psf(), Division(), seed=4)
+    epochs = [drawn(train, range(start, start + 24)) for start in range(0, 96, 24)]
+    assert all(sorted(epoch) == list(range(6, 30)) for epoch in epochs)
+    assert all(one != other for one, other in itertools.combinations([*epochs, list(range(6, 30))], 2))
+    other, _ = recorded_pairs(pairs(), psf(), Division(), seed=5)
+    assert drawn(other, range(24)) != epochs[0]
+    negative, _ = recorded_pairs(pairs(), psf(), Division(), seed=-1)
+    assert sorted(drawn(negative, range(24))) == list(range(6, 30))
+
+
+def test_a_number_is_the_same_pair_in_whatever_batch_and_process(pairs):
+    path = pairs()
+    once, again = (recorded_pairs(path, psf(), Division(), seed=1)[0] for _ in range(2))
+    whole = drawn(once, range(60))
+    assert drawn(again, [50, 7, 23, 24]) == [whole[n] for n in (50, 7, 23, 24)]
+    assert [drawn(again, [n])[0] for n in range(20, 30)] == whole[20:30]
+    # A fixed answer, so that no update changes the order in the middle of somebody's run.
+    assert [once.row(n) for n in range(5)] == [7, 27, 13, 23, 22]
+
+
+def test_the_file_is_opened_when_the_first_pair_is_read(pairs):
+    train, _ = recorded_pairs(pairs(), psf(), Division())
+    assert train.file._file is None
+    train.batch([0])
+    assert train.file._file is not None
+
+
+def test_a_split_without_validation_holds_some_training_pairs_out():
+    train, validation = Division("diffusercam").of(1100)
+    assert list(validation) == [1019, 1039, 1059, 1079, 1099]
+    assert sorted([*train, *validation]) == list(range(1000, 1100))
+    train, validation = Division("random", fractions=(0.5, 0.25, 0.25), seed=3).of(40)
+    assert (len(train), len(validation)) == (20, 10)
+    assert not set(train) & set(validation)
+
+
+@pytest.mark.parametrize(
+    ("division", "count", "said"),
+    [
+        (Division("diffusercam"), 1010, "of 1,010 pairs leaves 10 for training and 0 for validation; both need some"),
+        (Division("random", (0.0, 0.5, 0.5)), 10, "leaves 0 for training and 5 for validation"),
+        (Division("paper"), 9, "`count` (9) must be at least 10 for the split 'paper'"),
+    ],
+)
+def test_too_few_pairs(division, count, said):
+    with pytest.raises(ParameterError, match=re.escape(said)):
+        division.of(count)
+
+
+def test_unknown_split():
+    with pytest.raises(UnknownNameError, match="Did you mean 'paper'"):
+        Division("papr").of(100)
+
+
+@pytest.mark.parametrize(
+    ("file", "own", "said"),
+    [
+        ({}, psf((8, 12)), "`psf` (8 x 12) and the measurements of"),
+        ({}, psf((8, 12)), "The PSF is 2 times as large: bin it by 2 times as much, `--psf-bin`."),
+        ({}, psf((8, 8)), "Use the PSF of the camera that took them"),
+        ({}, psf((3, 6)), "(4 x 6) must match"),
+        ({"channels": 1}, psf(), "`psf` (3 channels) must be grey, or have the channels of the measurements of"),
+        ({"scene": (8, 12, 3)}, psf(), "The scenes of"),
+        ({"scene": (8, 12, 3)}, psf(), "(8 x 12) must have the size of its measurements (4 x 6)"),
+    ],
+)
+def test_pairs_that_do_not_fit_the_psf(pairs, file, own, said):
+    with pytest.raises(ShapeError, match=re.escape(said)):
+        recorded_pairs(pairs(**file), own, Division())
+
+
+def test_grey_psf_serves_pairs_in_colour(pairs):
+    train, _ = recorded_pairs(pairs(), psf(channels=1), Division())
+    assert train.batch([0, 1]).measurement.shape == (2, 3, 4, 6)
+
+
+def test_no_such_file(tmp_path):
+    with pytest.raises(ImageError, match=r"none\.h5` is no file"):
+        recorded_pairs(tmp_path / "none.h5", psf(), Division())
+
+
+def test_pairs_are_put_on_a_device(pairs):
+    file = PairFile(pairs())
+    assert RecordedPairs(file, [0], device=torch.device("meta")).batch([0]).scene.device.type == "meta"
