@@ -55,6 +55,12 @@ def inverse_spectrum(spectrum: Tensor, grid: Size, size: Size) -> Image:
     return torch.fft.irfft(rows, n=grid[1])[..., : size[1]]
 
 
+def frequencies(grid: Size, *, device: torch.device | str | None = None) -> tuple[Tensor, Tensor]:
+    """Frequencies of a `spectrum`'s rows, (H, 1), and columns, (1, W // 2 + 1), in cycles per pixel."""
+    rows = torch.fft.fftfreq(grid[0], device=device)[:, None]
+    return rows, torch.fft.rfftfreq(grid[1], device=device)[None]
+
+
 def transfer_function(psf: Psf, grid: Size, origin: Size | None = None) -> Spectrum:
     """Spectrum of a PSF whose pixel ``origin`` is moved to (0, 0).
 
