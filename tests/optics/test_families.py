@@ -9,7 +9,7 @@ import torch
 from mwdn.calibration import Calibration
 from mwdn.errors import ParameterError, UnknownNameError
 from mwdn.optics import FAMILIES, Variety, families, sample_camera
-from mwdn.optics.patterns import contour_lines, scatter_light, smooth_field
+from mwdn.optics.drawing import contour_lines, scatter_light, smooth_field
 
 SIZE = 61, 84
 CLEAN = Variety(

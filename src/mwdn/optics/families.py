@@ -13,8 +13,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.errors import ParameterError, UnknownNameError
-from mwdn.fourier import Size, fast_length, frequencies, inverse_spectrum, spectrum
-from mwdn.optics.patterns import contour_lines, scatter_light, smooth_field
+from mwdn.fourier import Size, fast_length, frequency_grid, inverse_spectrum, spectrum
+from mwdn.optics.drawing import contour_lines, scatter_light, smooth_field
 from mwdn.types import Psf
 
 Range = tuple[float, float]
@@ -136,8 +136,10 @@ def _aperture(draw: _Draw) -> _Aperture:
 
 def _contours(draw: _Draw, aperture: _Aperture) -> Tensor:
     """Contour phase mask (PhlatCam): even, sharp lines that hardly ever meet."""
-    field = draw.field(2 * draw.detail(), draw.uniform(0.03, 0.5))
-    return contour_lines(field, draw.range("line_px")) * aperture.light
+    spacing = draw.detail()
+    field = draw.field(2 * spacing, draw.uniform(0.03, 0.5))
+    # A third of its usual slope: flatter places would become wide blots.
+    return contour_lines(field, draw.range("line_px"), 0.3 * math.pi / spacing) * aperture.light
 
 
 def _caustics(draw: _Draw, aperture: _Aperture) -> Tensor:
@@ -284,7 +286,7 @@ def _blur(draw: _Draw, psf: Tensor) -> Tensor:
     # Three standard deviations of darkness beside the frame; less than 1e-3 of the halo comes back over them.
     margin = math.ceil(3 * wide)
     grid = fast_length(height + margin), fast_length(width + margin)
-    rows, columns = frequencies(grid, device=draw.device)
+    rows, columns = frequency_grid(grid, device=draw.device)
     exponent = -2 * math.pi**2 * (rows.square() + columns.square())
     widths = [narrow * (1 + colour * difference) for colour in (-1, 0, 1)]
     pass_narrow = torch.stack([torch.exp(exponent * sigma**2) for sigma in widths])

@@ -2,10 +2,11 @@
 
 from typing import Any
 
+from mwdn.calibration.frames import noise_level
 from mwdn.errors import UnknownNameError
 from mwdn.solvers.admm import TEXTBOOK, Admm, Penalties, Progress
 from mwdn.solvers.fista import Fista
-from mwdn.solvers.wiener import Wiener, noise_level
+from mwdn.solvers.wiener import Wiener
 
 SOLVERS: dict[str, type[Admm | Fista | Wiener]] = {"admm": Admm, "fista": Fista, "wiener": Wiener}
 """Every solver by the name that the command line uses."""
