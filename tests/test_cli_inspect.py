@@ -1,13 +1,15 @@
 """`mwdn inspect` as a user types it."""
 
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
-from mwdn.cli import main
+from mwdn.cli import CameraOptions, main
+from mwdn.cli_inspect import _own_resolution
 from mwdn.optics import sample_camera
 
 
@@ -41,19 +43,21 @@ def test_page_json_and_words(run, tmp_path):
         assert " ".join(finding["text"].split()) in words
 
 
-def test_json_alone(run):
-    code, shown, _ = run("my psf.png", "--json")
+def test_json_alone_with_the_options_of_the_camera(run):
+    code, shown, _ = run("my psf.png", "--json", "--crop", "32", "36", "--bin", "2")
     assert code == 0
     content = json.loads(shown)
     assert content["file"] == "my psf.png"
     assert len(content["noise_gain"]) == 6
-
-
-def test_options_of_the_camera_count(run):
-    content = json.loads(run("my psf.png", "--json", "--crop", "32", "36", "--bin", "2")[1])
     assert content["size"] == [16, 18]
-    content = json.loads(run("my psf.png", "--json", "--crop", "32", "36", "--psf-bin", "2")[1])
-    assert content["size"] == [32, 36]
+
+
+def test_psf_at_its_own_resolution():
+    """Captures of 32 x 36 raw pixels; the PSF was taken at twice the resolution."""
+    own = _own_resolution(CameraOptions(Path("psf.png"), dark=Path("dark.png"), crop=(32, 36), psf_bin=2))
+    assert (own.bin, own.crop, own.psf_bin, own.dark) == (2, (64, 72), None, None)
+    same = CameraOptions(Path("psf.png"), bin=2, psf_bin=2)
+    assert _own_resolution(same) is same
 
 
 def test_saturated_psf_is_refused(run):

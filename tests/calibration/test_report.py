@@ -119,6 +119,10 @@ def test_floats_have_no_full_scale(tmp_path, psf):
     report = inspect_psf(Calibration.from_file(tmp_path / "psf.npy"), read_frame(tmp_path / "psf.npy"))
     assert report.levels.steps == 0
     assert said(report, "floats", "cannot be seen")
+    level = 0.05 * psf.max() + psf
+    np.save(tmp_path / "psf.npy", level[0].movedim(0, -1).numpy())
+    report = inspect_psf(Calibration.from_file(tmp_path / "psf.npy"), read_frame(tmp_path / "psf.npy"))
+    assert said(report, f"{0.05 / 1.05:.3f}", "of the brightest pixel")
 
 
 def test_without_a_frame_nothing_is_said_about_levels(psf):

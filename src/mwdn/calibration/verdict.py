@@ -68,7 +68,9 @@ def _levels(report: PsfReport) -> Iterator[Finding]:
 def _background(report: PsfReport) -> Iterator[Finding]:
     levels = report.levels
     assert levels is not None
-    level = ", ".join(f"{value:.3f}" for value in levels.background)
+    # Floats have no full scale: their brightest pixel stands for it.
+    scale, unit = (1.0, "full scale") if levels.integers else (levels.peak, "brightest pixel")
+    level = ", ".join(f"{value / scale:.3f}" for value in levels.background)
     if levels.integers and levels.between - max(levels.subtracted, default=0.0) > 0.05 * levels.peak:
         text = (
             f"Between its lines the file is not black but at {levels.between:.2f} of the full scale, and this was not "
@@ -80,13 +82,13 @@ def _background(report: PsfReport) -> Iterator[Finding]:
         yield Finding("mind", text)
     if levels.pedestal > 0.02 and not any(levels.subtracted):
         text = (
-            f"An even background of {level} of the full scale holds {_percent(levels.pedestal)} of the light and was "
+            f"An even background of {level} of the {unit} holds {_percent(levels.pedestal)} of the light and was "
             "kept. Leave out `--background 0` to have it estimated and subtracted."
         )
         yield Finding("bad" if levels.pedestal > 0.3 else "mind", text)
     elif levels.pedestal > 0.02:
         text = (
-            f"An even background of {level} of the full scale, {_percent(levels.pedestal)} of the file's light, was "
+            f"An even background of {level} of the {unit}, {_percent(levels.pedestal)} of the file's light, was "
             "estimated and subtracted. Other programs must do so too."
         )
         yield Finding("mind", text)
@@ -138,7 +140,7 @@ def _detail(report: PsfReport) -> Iterator[Finding]:
     if width > 8:
         text = (
             f"Its finest lines are about {width / 2**0.5:.1f} px wide: finer detail is lost, and binning by "
-            f"{int(width / 4)} loses nothing."
+            f"{int(width / 4)} loses little."
         )
         yield Finding("mind", text)
     else:
