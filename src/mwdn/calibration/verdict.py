@@ -139,7 +139,7 @@ def _detail(report: PsfReport) -> Iterator[Finding]:
     width = report.peak_width_px
     if width > 8:
         text = (
-            f"Its finest lines are about {width / 2**0.5:.1f} px wide: finer detail is lost, and binning by "
+            f"Its lines are about {width / 2**0.5:.1f} px wide: finer detail comes back faint and noisy. Binning by "
             f"{int(width / 4)} loses little."
         )
         yield Finding("mind", text)
