@@ -28,7 +28,7 @@ TIERS = [
     ("reconstruct",),
     ("capture",),
     ("preview",),
-    ("demo", "doctor", "cli", "__main__"),
+    ("demo", "doctor", "cli", "cli_inspect", "__main__"),
     ("",),  # mwdn/__init__.py: the public names
 ]
 RANK = {name: rank for rank, names in enumerate(TIERS) for name in names}

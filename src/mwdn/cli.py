@@ -2,7 +2,7 @@
 
 import sys
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, NoReturn
@@ -48,6 +48,7 @@ class CameraOptions:
 
     psf: Path
     """Picture of a point source: PNG, TIFF or NPY, linear in light."""
+    _: KW_ONLY
     dark: Path | None = None
     """Frame taken without light, subtracted from PSF and captures."""
     background: float | None = None
@@ -313,6 +314,9 @@ def doctor() -> None:
     from mwdn.doctor import report
 
     report(console)
+
+
+app.command("mwdn.cli_inspect:inspect")  # imported when it is called
 
 
 def _warn(*reconstructors: Reconstructor) -> None:

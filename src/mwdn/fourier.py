@@ -42,6 +42,12 @@ def fast_length(length: int) -> int:
         candidate += 2
 
 
+def frequency_grid(grid: Size, *, device: torch.device | str | None = None) -> tuple[Tensor, Tensor]:
+    """Frequencies of a `spectrum`'s rows, (H, 1), and columns, (1, W // 2 + 1), in cycles per pixel."""
+    rows = torch.fft.fftfreq(grid[0], device=device)[:, None]
+    return rows, torch.fft.rfftfreq(grid[1], device=device)[None]
+
+
 def spectrum(image: Tensor, grid: Size) -> Spectrum:
     """Real Fourier transform of a picture, zero-padded at the bottom and the right to ``grid``."""
     # Rows first, so that the rows which are only padding are never transformed.

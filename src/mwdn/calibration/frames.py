@@ -8,7 +8,7 @@ from torch import Tensor
 
 from mwdn.errors import ParameterError, ShapeError
 from mwdn.fourier import Size
-from mwdn.types import Frame, Image
+from mwdn.types import Frame, Image, Measurement
 
 Background = float | Literal["estimate"]
 """A level as a part of the full scale, or ``"estimate"``."""
@@ -85,3 +85,18 @@ def estimate_background(image: Image) -> Tensor:
     """
     pixels = image.flatten(2).sort(dim=-1).values
     return pixels[..., int(0.05 * pixels.shape[-1])][..., None, None]
+
+
+def noise_level(measurement: Measurement) -> Tensor:
+    """Standard deviation of the noise of each channel, (B, C, 1, 1), if it is white.
+
+    A caustic pattern is smooth from pixel to pixel, so the mixed second difference of 2 x 2 pixels holds nothing
+    but noise, with twice its standard deviation; the median of its size keeps the few sharp edges out.
+
+    References:
+        D. L. Donoho and I. M. Johnstone, Biometrika 81, 425 (1994), for the median of the finest detail.
+    """
+    b = measurement.float()
+    detail = b[..., 1:, 1:] - b[..., :-1, 1:] - b[..., 1:, :-1] + b[..., :-1, :-1]
+    median = detail.abs().flatten(2).median(dim=-1).values if detail.numel() else b.new_zeros(b.shape[:2])
+    return (median / (2 * 0.6745))[..., None, None]

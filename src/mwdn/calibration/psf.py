@@ -188,18 +188,24 @@ def _turn(image: Tensor) -> Tensor:
     return turned.roll(1, -2) if image.shape[-2] % 2 == 0 else turned
 
 
-def _refuse_saturated(frame: Frame, bit_depth: int | None) -> None:
+def saturated(frame: Frame, bit_depth: int | None) -> tuple[int, int]:
+    """How many pixels of a raw frame of integers are at its sensor's maximum, and that maximum; 0 pixels of floats."""
     if frame.dtype.kind == "f":
-        return
+        return 0, 1
     top = int(full_scale(frame, bit_depth))
     # Sensors that store 12 bits as the upper ones of 16 saturate at 65,520: the largest number found counts.
     # So it does where 10, 12 or 14 bits lie in the lower ones and nobody said so.
     unsaid = bit_depth is None and top > 255 and frame.max() in (1023, 4095, 16383)
     top = int(frame.max()) if unsaid or frame.max() > 0.98 * top else top
-    full = frame.max(axis=-1) >= top
-    if full.sum() > SATURATED_PART * full.size:
+    return int((frame.max(axis=-1) >= top).sum()), top
+
+
+def _refuse_saturated(frame: Frame, bit_depth: int | None) -> None:
+    full, top = saturated(frame, bit_depth)
+    pixels = frame.shape[0] * frame.shape[1]
+    if full > SATURATED_PART * pixels:
         raise PsfError(
-            f"PSF is saturated: {full.sum():,} of {full.size:,} pixels are at the {top.bit_length()}-bit maximum "
+            f"PSF is saturated: {full:,} of {pixels:,} pixels are at the {top.bit_length()}-bit maximum "
             f"{top}. Lower the exposure and capture it again."
         )
 

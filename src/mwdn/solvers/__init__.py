@@ -2,11 +2,12 @@
 
 from typing import Any
 
+from mwdn.calibration.frames import noise_level
 from mwdn.errors import UnknownNameError
 from mwdn.solvers.admm import TEXTBOOK, Admm, Penalties, Progress
 from mwdn.solvers.fista import Fista
 from mwdn.solvers.pyramid import Pyramid
-from mwdn.solvers.wiener import Wiener, noise_level
+from mwdn.solvers.wiener import Wiener
 
 Solver = Admm | Fista | Pyramid | Wiener
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from mwdn.calibration.frames import noise_level
 from mwdn.errors import ParameterError
 from mwdn.fourier import (
     Boundary,
@@ -16,21 +17,6 @@ from mwdn.fourier import (
     transfer_function,
 )
 from mwdn.types import Measurement, Psf, Scene
-
-
-def noise_level(measurement: Measurement) -> Tensor:
-    """Standard deviation of the noise of each channel, (B, C, 1, 1), if it is white.
-
-    A caustic pattern is smooth from pixel to pixel, so the mixed second difference of 2 x 2 pixels holds nothing
-    but noise, with twice its standard deviation; the median of its size keeps the few sharp edges out.
-
-    References:
-        D. L. Donoho and I. M. Johnstone, Biometrika 81, 425 (1994), for the median of the finest detail.
-    """
-    b = measurement.float()
-    detail = b[..., 1:, 1:] - b[..., :-1, 1:] - b[..., 1:, :-1] + b[..., :-1, :-1]
-    median = detail.abs().flatten(2).median(dim=-1).values if detail.numel() else b.new_zeros(b.shape[:2])
-    return (median / (2 * 0.6745))[..., None, None]
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,201 @@
+"""What can be said about a PSF: its measures, gathered."""
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mwdn.calibration import measures
+from mwdn.calibration.frames import estimate_background, full_scale, noise_level
+from mwdn.calibration.psf import Calibration, saturated
+from mwdn.data.writing import atomic
+from mwdn.errors import ImageError
+from mwdn.fourier import Size
+from mwdn.types import Frame, Psf
+
+LAMBDAS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
+"""Regularisations that the noise gain is told for."""
+
+NOISES = (0.01, 0.003, 0.001)
+"""Noise of a measurement over its mean that the resolution is told for: 10,000, 100,000 and 1,000,000 electrons."""
+
+
+@dataclass(frozen=True)
+class Levels:
+    """How the PSF's file was exposed.
+
+    Args:
+        integers: the file holds a sensor's integers; floats have no full scale.
+        peak: largest number, as a part of the full scale.
+        steps: the same, in steps of the file's numbers; 0 of floats.
+        saturated: pixels at the sensor's maximum.
+        background: level of each channel's darkest 5 % of pixels, as a part of the full scale.
+        subtracted: level that was subtracted from each channel.
+        pedestal: part of the file's light that this background is.
+        between: level between the lines, as a part of the full scale, of the mean of the colours.
+        noise: standard deviation of a pixel's noise, as a part of the full scale.
+        noise_floor: its power in |H|^2, for the PSF of unit sum.
+    """
+
+    integers: bool
+    peak: float
+    steps: int
+    saturated: int
+    background: tuple[float, ...]
+    subtracted: tuple[float, ...]
+    pedestal: float
+    between: float
+    noise: float
+    noise_floor: float
+
+
+@dataclass(frozen=True)
+class PsfReport:
+    """A PSF's measures.
+
+    Args:
+        psf_hash: of the calibration.
+        size: height and width.
+        levels: of the file, if there is one.
+        support: where the light is.
+        peak_width_px: of the autocorrelation at half its height; lines are narrower by about sqrt(2).
+        side_lobe: highest value of the autocorrelation beside its peak, and where: (down, along) pixels.
+        weak_part: part of the frequencies with less than 1/100 of their ring's power; 0.01 for any random mask.
+        dark_rings: frequencies, in cycles per pixel, that the camera does not see in any direction.
+        effective_rank: how many separable patterns it is made of.
+        colour_likeness: correlation of the two colours that differ most; 1 if grey.
+        noise_gain: variance of the Wiener estimate's noise over the measurement's, of the worst channel, by lambda.
+        detail_kept: part of a picture's details that this estimate keeps, of the worst channel, by lambda.
+        resolution_px: width of the finest lines that a photograph shows, by the measurement's noise over its mean;
+            infinite if it shows none.
+        known_frequency: up to which the file's picture of the PSF stands out of its own noise; 0.5 at most.
+        depth: correlation with the PSF it is designed for, by the distance of the point; empty unless asked for.
+        angle: likewise by the angle.
+    """
+
+    psf_hash: str
+    size: Size
+    levels: Levels | None
+    support: measures.Support
+    peak_width_px: float
+    side_lobe: tuple[float, tuple[int, int]]
+    weak_part: float
+    dark_rings: tuple[float, ...]
+    effective_rank: float
+    colour_likeness: float
+    noise_gain: dict[float, float]
+    detail_kept: dict[float, float]
+    resolution_px: dict[float, float]
+    known_frequency: float
+    depth: dict[float, float] = field(default_factory=dict)
+    angle: dict[float, float] = field(default_factory=dict)
+
+    def content(self) -> dict[str, Any]:
+        """Everything as JSON has it: keys are strings, and ``null`` stands for an infinite resolution."""
+        plain = asdict(self)
+        for name, value in plain.items():
+            if isinstance(value, dict):
+                plain[name] = {str(key): None if each == float("inf") else each for key, each in value.items()}
+        return plain
+
+
+def inspect_psf(
+    calibration: Calibration,
+    frame: Frame | None = None,
+    *,
+    depth: dict[float, Psf] | None = None,
+    angle: dict[float, Psf] | None = None,
+) -> PsfReport:
+    """Measure a PSF.
+
+    Args:
+        calibration: that holds it.
+        frame: the file's numbers, as `mwdn.read_frame` gives them; without them nothing is said about levels.
+        depth: the PSFs of points at other distances than the calibration's, by the distance.
+        angle: likewise, by the angle. `mwdn.calibration.measures.sensitivity` does the same for a function.
+    """
+    psf = calibration.psf.float().cpu()
+    colours = [psf[:, [c]] for c in range(psf.shape[1])]
+    pairs = [(a, b) for i, a in enumerate(colours) for b in colours[:i]]
+    peak, weak = measures.autocorrelation(psf), measures.zeros(psf)
+    levels = _levels(calibration, frame) if frame is not None else None
+    return PsfReport(
+        psf_hash=calibration.psf_hash,
+        size=calibration.size,
+        levels=levels,
+        support=measures.support(psf),
+        peak_width_px=peak.width,
+        side_lobe=(peak.lobe, peak.lobe_at),
+        weak_part=weak[0],
+        dark_rings=weak[1],
+        effective_rank=measures.effective_rank(psf),
+        colour_likeness=min((measures.likeness(a, b) for a, b in pairs), default=1.0),
+        noise_gain={value: max(measures.noise_gain(psf, value)) for value in LAMBDAS},
+        detail_kept={value: min(measures.detail_kept(psf, value)) for value in LAMBDAS},
+        resolution_px={noise: _resolution(colours, noise) for noise in NOISES},
+        known_frequency=_known(psf, levels.noise_floor if levels else 0.0),
+        depth=_likenesses(psf, depth),
+        angle=_likenesses(psf, angle),
+    )
+
+
+def _likenesses(psf: Psf, others: dict[float, Psf] | None) -> dict[float, float]:
+    return {place: measures.likeness(other, psf) for place, other in (others or {}).items()}
+
+
+def _resolution(colours: list[Psf], noise: float) -> float:
+    """Half the shortest visible period, of the colour that sees least."""
+    frequency = min(measures.resolved_frequency(colour, noise) for colour in colours)
+    return 0.5 / frequency if frequency > 0 else float("inf")
+
+
+def _known(psf: Psf, floor: float) -> float:
+    """Lowest frequency from which on the PSF's power is not even twice that of its noise."""
+    ring = measures.rings(psf)
+    lost = (ring.power < 2 * floor).flip(0).long().cumprod(0).flip(0).nonzero()
+    return float(ring.frequency[lost[0, 0]]) if len(lost) else 0.5
+
+
+def _levels(calibration: Calibration, frame: Frame) -> Levels:
+    image = calibration.prepare(frame)
+    upright = image.flip(-2) if calibration.upside_down else image
+    background = estimate_background(image)
+    integers = frame.dtype.kind != "f"
+    full, _ = saturated(frame, calibration.bit_depth)
+    # As deep as the file says: numbers left by binning lie between its steps.
+    scale = full_scale(frame, calibration.bit_depth) if integers else 1.0
+    noise = noise_level(image)
+    if integers:
+        # Rounding alone leaves step / sqrt(12), which the median of an 8-bit frame's differences often misses.
+        noise = noise.clamp(min=1 / (12**0.5 * scale * calibration.binning))
+    subtracted = torch.tensor(calibration.background or (0.0,) * image.shape[1])[:, None, None]
+    light = (image - subtracted).clamp(min=0).sum((-2, -1), keepdim=True).clamp(min=1e-30)
+    pixels = image.shape[-2] * image.shape[-1]
+    share = background.clamp(min=0) * pixels / image.clamp(min=0).sum((-2, -1), keepdim=True).clamp(min=1e-30)
+    return Levels(
+        integers=integers,
+        peak=float(frame.max()) / scale,
+        steps=int(frame.max()) if integers else 0,
+        saturated=full,
+        background=tuple(background.flatten().tolist()),
+        subtracted=calibration.background,
+        pedestal=float(share.max()),
+        between=measures.between_lines(upright.mean((0, 1))[measures.lit_box(calibration.psf)]),
+        noise=float(noise.max()),
+        noise_floor=float((pixels * (noise / light).square()).max()),
+    )
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write a report as JSON, atomically.
+
+    Raises:
+        ImageError: the disk refuses.
+    """
+    try:
+        with atomic(path) as temporary:
+            temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise ImageError(f"`{path}` cannot be written: {error.strerror}. Choose another folder.") from error

@@ -1,0 +1,206 @@
+"""Where shift invariance ends: a camera whose PSF changes over its field of view."""
+
+import math
+from dataclasses import dataclass, field, fields
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional as F
+
+from mwdn.errors import ParameterError, ShapeError
+from mwdn.fourier import Size, convolve, correlate, fast_length, frequency_grid, inverse_spectrum, spectrum
+from mwdn.optics.sensor import Sensor
+from mwdn.types import Image, Measurement, Psf, Scene
+
+FieldPsfs = Float[Tensor, "rows columns psf_channel psf_height psf_width"]
+"""PSFs of points on a grid that spans the scene from corner to corner, each centred as that of a point on the axis."""
+
+
+@dataclass(frozen=True)
+class Aberration:
+    """How a PSF changes from the axis to the corner of the field; in between with the square of the distance.
+
+    Args:
+        scale: relative magnification of the PSF at the corner.
+        stretch: relative lengthening along the direction to the axis only: the shear of oblique light.
+        blur_px: standard deviation of a Gaussian blur at the corner; the blur's variance grows with the square of
+            the distance.
+        vignetting: part of the light that is lost at the corner.
+
+    Raises:
+        ParameterError: a blur that is negative, a vignetting outside [0, 1], a PSF shrunk to nothing.
+    """
+
+    scale: float = 0.0
+    stretch: float = 0.0
+    blur_px: float = 0.0
+    vignetting: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.blur_px >= 0:
+            raise ParameterError(f"`blur_px` ({self.blur_px}) must not be negative: it is a standard deviation.")
+        if not 0 <= self.vignetting <= 1:
+            raise ParameterError(f"`vignetting` ({self.vignetting}) must be in [0, 1]: a part of the light.")
+        for name in ("scale", "stretch"):
+            if not getattr(self, name) > -0.9:
+                raise ParameterError(f"`{name}` ({getattr(self, name)}) must be above -0.9: a relative change.")
+
+    def __mul__(self, factor: float) -> "Aberration":
+        """Every change ``factor`` times as large."""
+        return Aberration(**{part.name: getattr(self, part.name) * factor for part in fields(self)})
+
+    def at(self, psf: Psf, y: float, x: float) -> Psf:
+        """Change a PSF into that of a point away from the axis.
+
+        Args:
+            psf: (1, C, h, w) on the axis.
+            y: position of the point below the axis, over half the field's height: 1 at its lower border.
+            x: likewise to the right.
+
+        Returns:
+            (1, C, h, w), its sum smaller by the vignetting and by what leaves the frame.
+        """
+        square = (y * y + x * x) / 2
+        if not square:
+            return psf
+        # Direction e to the axis: 1 + scale along all directions, and stretch along e e^T besides.
+        e = torch.tensor([y, x]) / math.hypot(y, x)
+        matrix = (1 + self.scale * square) * torch.eye(2) + self.stretch * square * torch.outer(e, e)
+        changed = _warp(psf, matrix) if self.scale or self.stretch else psf
+        if self.blur_px:
+            changed = gaussian_blur(changed, self.blur_px * math.sqrt(square)).clamp(min=0)
+        # The warp kept the brightness; a larger PSF has the same light on more pixels.
+        return changed * (1 - self.vignetting * square) / float(matrix.det())
+
+
+def field_psfs(psf: Psf, grid: Size, aberration: Aberration) -> FieldPsfs:
+    """PSFs at the points of a grid, (rows, columns, C, h, w), of a camera with this PSF on its axis.
+
+    Raises:
+        ParameterError: a grid of no points.
+    """
+    if min(grid) < 1:
+        raise ParameterError(f"`grid` {grid} must hold at least one point.")
+    rows, columns = ([2 * i / (n - 1) - 1 if n > 1 else 0.0 for i in range(n)] for n in grid)
+    return torch.stack([torch.stack([aberration.at(psf, y, x)[0] for x in columns]) for y in rows])
+
+
+@dataclass(frozen=True, eq=False)
+class FieldCamera:
+    """A camera whose PSF changes smoothly over the field: ``crop(sum_k h_k * (w_k . scene))``, then a sensor.
+
+    A point at scene pixel p casts the PSF ``sum_k w_k(p) h_k``, displaced to p. With one h_k and w_k = 1 it is
+    `mwdn.Camera`.
+
+    Args:
+        kernels: h_k, (K, 1 or C, h, w), centred at ``(h // 2, w // 2)``; they may be negative.
+        weights: w_k, (K, 1, H, W) over the scene.
+        size: height and width of the sensor; the scene's unless given.
+        sensor: what turns light into numbers.
+        truncation: what the kernels leave out of the PSFs they were made from, as a part of their norm.
+
+    References:
+        N. Antipa et al., Optica 5, 1 (2018), for the local convolution model; R. C. Flicker and F. J. Rigaut,
+        J. Opt. Soc. Am. A 22, 504 (2005), for PSFs as sums of a few.
+    """
+
+    kernels: Float[Tensor, "rank psf_channel psf_height psf_width"]
+    weights: Float[Tensor, "rank 1 scene_height scene_width"]
+    size: Size | None = None
+    sensor: Sensor = field(default_factory=Sensor)
+    truncation: float = 0.0
+
+    @classmethod
+    def from_psfs(
+        cls, psfs: FieldPsfs, scene_size: Size, *, rank: int | None = None, size: Size | None = None
+    ) -> "FieldCamera":
+        """Make the best camera of a rank from PSFs on a grid; between its points PSFs are interpolated bilinearly.
+
+        Args:
+            psfs: (rows, columns, C, h, w): the first one is that of the scene's upper left corner.
+            scene_size: height and width of scenes.
+            rank: how many kernels; that of the PSFs unless given, which is exact. Of all cameras of this rank it has
+                the least squared error, summed over the grid's PSFs: that of the singular values left out.
+            size: of the sensor; the scene's unless given.
+
+        Raises:
+            ParameterError: a rank below 1.
+        """
+        if rank is not None and rank < 1:
+            raise ParameterError(f"`rank` ({rank}) must be at least 1.")
+        rows, columns, *shape = psfs.shape
+        left, values, right = torch.linalg.svd(psfs.reshape(rows * columns, -1), full_matrices=False)
+        kept = min(rank or int((values > 1e-6 * values[0]).sum()), len(values))
+        coefficients = (left[:, :kept] * values[:kept]).T.reshape(kept, 1, rows, columns)
+        weights = F.interpolate(coefficients, scene_size, mode="bilinear", align_corners=True)
+        lost = float(values[kept:].norm() / values.norm().clamp(min=1e-30))
+        return cls(right[:kept].reshape(kept, *shape), weights, size, truncation=lost)
+
+    @property
+    def rank(self) -> int:
+        """How many kernels there are."""
+        return self.kernels.shape[0]
+
+    @property
+    def scene_size(self) -> Size:
+        """Height and width of scenes."""
+        return self.weights.shape[-2], self.weights.shape[-1]
+
+    @property
+    def sensor_size(self) -> Size:
+        """Height and width of a measurement."""
+        return self.size or self.scene_size
+
+    def psf_at(self, row: int, column: int) -> Psf:
+        """PSF (1, C, h, w) of the point at a scene pixel, as if the point were on the axis."""
+        return (self.weights[:, :, row, column][..., None, None] * self.kernels).sum(0, keepdim=True)
+
+    def forward(self, scene: Scene) -> Measurement:
+        """Light on the sensor.
+
+        Raises:
+            ShapeError: the scene does not have the size of the weights.
+        """
+        if (scene.shape[-2], scene.shape[-1]) != self.scene_size:
+            raise ShapeError(
+                f"`scene` {tuple(scene.shape)} must have the height and width of the field {self.scene_size}. "
+                "Make the camera for this size: `FieldCamera.from_psfs(psfs, scene_size)`."
+            )
+        parts = (convolve(scene * w, h[None], size=self.sensor_size) for h, w in self._terms())
+        return torch.stack(list(parts)).sum(0)
+
+    def adjoint(self, measurement: Measurement) -> Scene:
+        """Exact adjoint of `forward`."""
+        parts = (w * correlate(measurement, h[None], size=self.scene_size) for h, w in self._terms())
+        return torch.stack(list(parts)).sum(0)
+
+    def simulate(self, scene: Scene, *, generator: torch.Generator | None = None) -> Image:
+        """A capture: `forward`, then the sensor; see `mwdn.Camera.simulate`."""
+        return self.sensor.expose(self.forward(scene), generator=generator)
+
+    def _terms(self) -> list[tuple[Tensor, Tensor]]:
+        return list(zip(self.kernels, self.weights, strict=True))
+
+
+def gaussian_blur(image: Image, sigma: float) -> Image:
+    """Blur pictures by a Gaussian of standard deviation ``sigma`` in pixels; darkness lies beyond their border."""
+    size = image.shape[-2], image.shape[-1]
+    # Four standard deviations beside the picture: 6e-5 of the light at its border comes back over them.
+    margin = math.ceil(4 * sigma)
+    grid = fast_length(size[0] + margin), fast_length(size[1] + margin)
+    rows, columns = frequency_grid(grid, device=image.device)
+    transfer = torch.exp(-2 * math.pi**2 * sigma**2 * (rows.square() + columns.square()))
+    return inverse_spectrum(spectrum(image, grid) * transfer, grid, size)
+
+
+def _warp(psf: Psf, matrix: Tensor) -> Psf:
+    """Map a PSF by a 2 x 2 matrix of (row, column) displacements from its centre ``(h // 2, w // 2)``."""
+    height, width = psf.shape[-2:]
+    y = torch.arange(height, device=psf.device)[:, None] - height // 2
+    x = torch.arange(width, device=psf.device)[None] - width // 2
+    inverse = torch.linalg.inv(matrix).tolist()
+    rows = inverse[0][0] * y + inverse[0][1] * x + height // 2
+    columns = inverse[1][0] * y + inverse[1][1] * x + width // 2
+    grid = torch.stack([(2 * columns + 1) / width - 1, (2 * rows + 1) / height - 1], -1)
+    return F.grid_sample(psf, grid[None].to(psf), mode="bicubic", align_corners=False).clamp(min=0)

@@ -1,0 +1,235 @@
+"""The report of a PSF: levels of its file, and a verdict that is true."""
+
+import json
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from mwdn.calibration import Calibration, measures
+from mwdn.calibration.report import inspect_psf, write_json
+from mwdn.calibration.verdict import headline, verdict
+from mwdn.data.images import read_frame
+from mwdn.errors import ImageError
+from mwdn.optics import sample_camera
+from mwdn.optics.families import Variety
+from mwdn.optics.patterns import contour_psf
+
+SIZE = 96, 80
+CLEAN = Variety(support=(0.6, 0.6), offset=0.0, halo=(0.0, 0.0), glow=(0.0, 0.0), background=(0.0, 0.0))
+
+
+def said(report, *words):
+    """Findings that contain all of these words."""
+    return [finding for finding in verdict(report) if all(word in finding.text for word in words)]
+
+
+def frame_of(psf, *, level=0.0, peak=0.9, bits=16, noise=0.0, generator=None):
+    """(H, W, C) integers: the PSF over an even level, its brightest pixel at ``peak`` of the full scale."""
+    light = (peak - level) * psf / psf.max() + level
+    light = light + noise * torch.randn(light.shape, generator=generator)
+    top = 2**bits - 1
+    return (light.clamp(0, 1) * top).round().numpy()[0].transpose(1, 2, 0).astype("u1" if bits == 8 else "u2")
+
+
+def report_of(tmp_path, frame, **options):
+    path = tmp_path / "psf.png"
+    assert cv2.imwrite(str(path), frame[..., ::-1])
+    return inspect_psf(Calibration.from_file(path, **options), read_frame(path))
+
+
+@pytest.fixture
+def psf():
+    return sample_camera(5, SIZE, family="contours", variety=CLEAN)
+
+
+def test_a_good_psf_has_nothing_to_mind(tmp_path, psf):
+    report = report_of(tmp_path, frame_of(psf))
+    assert headline(report) == "A good PSF: nothing to mind."
+    assert {finding.weight for finding in verdict(report)} == {"good"}
+    assert report.levels.peak == pytest.approx(0.9, abs=1e-4)
+    assert report.levels.saturated == 0
+    assert report.size == SIZE
+
+
+def test_background_is_found_and_said(tmp_path, psf):
+    """An even level of 0.1 of the full scale, as the file of the paper's camera has between its lines."""
+    frame = frame_of(psf, level=0.1)
+    report = report_of(tmp_path, frame)
+    assert report.levels.background == pytest.approx((0.1,) * 3, abs=2e-3)
+    share = 0.1 * SIZE[0] * SIZE[1] / (frame / 65535).sum((0, 1)).min()
+    assert report.levels.pedestal == pytest.approx(share, rel=0.02)
+    assert [finding.weight for finding in said(report, "0.100", "estimated and subtracted")] == ["mind"]
+    kept = report_of(tmp_path, frame, background=0.0)
+    assert said(kept, "0.100", "was kept", "--background 0")
+    assert said(kept, "at 0.10 of the full scale", "--dark")
+    assert kept.support.glow > report.support.glow + 0.3
+
+
+def test_light_between_the_lines_that_the_estimate_leaves(tmp_path, psf):
+    """The level lies only where the mask is lit, so the darkest 5 % of the frame know nothing of it."""
+    lit = torch.zeros(SIZE)
+    lit[16:80, 12:68] = 0.1
+    light = 0.8 * psf / psf.max() + lit
+    frame = (light * 65535).round().numpy()[0].transpose(1, 2, 0).astype("u2")
+    report = report_of(tmp_path, frame)
+    assert max(report.levels.background) == 0
+    assert report.levels.between == pytest.approx(0.1, abs=0.005)
+    assert said(report, "at 0.10 of the full scale", "not subtracted", "--dark")
+    assert not said(report, "that alone was")
+
+
+def test_noise_of_the_file(tmp_path, psf, generator):
+    """In the frame as drawn, and in |H|^2: white noise s of N pixels over the light L is N s^2 / L^2 everywhere."""
+    frame = frame_of(psf, noise=0.01, level=0.1, generator=generator)
+    report = report_of(tmp_path, frame, background=0.1)
+    assert report.levels.noise == pytest.approx(0.01, rel=0.3)
+    light = (0.8 * psf / psf.max()).sum((-2, -1)).min().item()
+    # The dark half of the noise is cut with the background, so that a little light is left over.
+    expected = SIZE[0] * SIZE[1] * 0.01**2 / light**2
+    assert 0.3 * expected < report.levels.noise_floor < 1.7 * expected
+    clean = report_of(tmp_path, frame_of(psf))
+    assert clean.levels.noise_floor < 1e-3 * report.levels.noise_floor
+
+
+def test_a_noisy_picture_of_a_blurred_psf_says_how_far_it_is_known(tmp_path, generator):
+    y, x = torch.arange(96.0)[:, None] - 48, torch.arange(80.0) - 40
+    blurred = torch.exp(-0.5 * (y.square() + x.square()) / 3.0**2)[None, None]
+    report = report_of(tmp_path, frame_of(blurred, noise=0.02, level=0.1, generator=generator), background=0.1)
+    # exp(-4 pi^2 9 f^2) meets twice the floor at f of sqrt(-ln(2 floor) / (36 pi^2)).
+    expected = math.sqrt(-math.log(2 * report.levels.noise_floor) / (36 * math.pi**2))
+    assert report.known_frequency == pytest.approx(expected, abs=0.02)
+    assert said(report, "mostly its own noise")
+
+
+def test_exposure(tmp_path, psf):
+    assert said(report_of(tmp_path, frame_of(psf, peak=0.2)), "20 % of the full scale", "expose longer")
+    assert said(report_of(tmp_path, frame_of(psf, bits=8)), "230 steps", "16 bits")
+    frame = frame_of(psf)
+    frame.reshape(-1, 3)[np.argsort(frame[..., 1].ravel())[-5:]] = 65535
+    report = report_of(tmp_path, frame)
+    assert report.levels.saturated == 5
+    assert said(report, "5 pixels are at the sensor's maximum")
+
+
+def test_floats_have_no_full_scale(tmp_path, psf):
+    np.save(tmp_path / "psf.npy", psf[0].movedim(0, -1).numpy())
+    report = inspect_psf(Calibration.from_file(tmp_path / "psf.npy"), read_frame(tmp_path / "psf.npy"))
+    assert report.levels.steps == 0
+    assert said(report, "floats", "cannot be seen")
+    level = 0.05 * psf.max() + psf
+    np.save(tmp_path / "psf.npy", level[0].movedim(0, -1).numpy())
+    report = inspect_psf(Calibration.from_file(tmp_path / "psf.npy"), read_frame(tmp_path / "psf.npy"))
+    assert said(report, f"{0.05 / 1.05:.3f}", "of the brightest pixel")
+
+
+def test_without_a_frame_nothing_is_said_about_levels(psf):
+    report = inspect_psf(Calibration(psf))
+    assert report.levels is None
+    assert not said(report, "exposed")
+    assert not said(report, "full scale")
+
+
+def test_cut_psf(psf):
+    assert said(inspect_psf(Calibration(psf)), "all within the frame")
+    cut = psf[..., 30:66, 24:56]
+    assert said(inspect_psf(Calibration(cut / cut.sum((-2, -1), keepdim=True))), "is cut")
+
+
+def test_a_mask_that_repeats_itself(generator):
+    tile = (torch.rand(16, 16, generator=generator) < 0.05).float()
+    psf = tile.repeat(6, 5)[None, None]
+    report = inspect_psf(Calibration(psf / psf.sum()))
+    assert report.side_lobe[0] > 0.6
+    assert all(place % 16 == 0 for place in report.side_lobe[1])
+    assert [finding.weight for finding in said(report, "ghosts")] == ["bad"]
+    assert headline(report).startswith("A poor PSF")
+
+
+def test_defocused_pinhole():
+    y, x = torch.arange(96)[:, None] - 48, torch.arange(96) - 48
+    disc = ((y.square() + x.square()) <= 12**2).float()[None, None]
+    report = inspect_psf(Calibration(disc / disc.sum()))
+    assert said(report, "sees nothing at")
+    assert report.dark_rings
+
+
+def test_blurred_psf_can_be_binned():
+    y, x = torch.arange(300.0)[:, None] - 150, torch.arange(300.0) - 150
+    blurred = torch.exp(-0.5 * (y.square() + x.square()) / 5.0**2)[None, None]
+    assert said(inspect_psf(Calibration(blurred / blurred.sum())), "px wide", "Binning by")
+
+
+def test_colours_that_differ():
+    planes = [contour_psf((64, 64), cell=10, generator=torch.Generator().manual_seed(seed)) for seed in range(3)]
+    report = inspect_psf(Calibration(torch.cat(planes, 1)))
+    assert report.colour_likeness < 0.5
+    assert [finding.weight for finding in said(report, "colours differ")] == ["bad"]
+
+
+def test_centroid_beside_the_centre(psf):
+    moved = psf.roll((12, -8), (-2, -1))
+    before, after = (inspect_psf(Calibration(each)).support.offset for each in (psf, moved))
+    assert [b - a for a, b in zip(before, after, strict=True)] == pytest.approx([12, -8], abs=0.5)
+    assert said(inspect_psf(Calibration(moved)), "px below", "to the left")
+
+
+def test_distance_and_angle(psf):
+    others = {10.0: psf, 20.0: psf.flip(-1)}
+    report = inspect_psf(Calibration(psf), depth=others, angle={5.0: psf})
+    assert report.depth[10.0] == pytest.approx(1, abs=1e-4)
+    assert report.depth[20.0] == measures.likeness(psf.flip(-1), psf)
+    assert said(report, "distance", "at 20 the camera needs another PSF")
+    assert said(report, "every angle asked for", "1.00")
+
+
+def test_numbers_are_those_of_the_measures(psf):
+    report = inspect_psf(Calibration(psf))
+    assert report.noise_gain[1e-3] == max(measures.noise_gain(psf, 1e-3))
+    gains, kept = list(report.noise_gain.values()), list(report.detail_kept.values())
+    assert gains == sorted(gains, reverse=True)
+    assert kept == sorted(kept, reverse=True)
+    worst = min(measures.resolved_frequency(psf[:, [c]], 0.003) for c in range(3))
+    assert report.resolution_px[0.003] == 0.5 / worst
+
+
+def test_json(tmp_path, psf):
+    report = inspect_psf(Calibration(psf))
+    write_json(tmp_path / "new" / "report.json", report.content())
+    content = json.loads((tmp_path / "new" / "report.json").read_text())
+    assert content["size"] == list(SIZE)
+    assert content["noise_gain"]["0.001"] == report.noise_gain[1e-3]
+    assert content["psf_hash"] == report.psf_hash
+    with pytest.raises(ImageError, match="another folder"):
+        write_json(tmp_path, content)
+
+
+@pytest.mark.parametrize("size", [(8, 8), (9, 31)])
+def test_small_psfs(size):
+    for seed in range(5):
+        report = inspect_psf(Calibration(sample_camera(seed, size)))
+        json.dumps(report.content(), allow_nan=False)
+        assert verdict(report)
+
+
+@pytest.mark.parametrize(
+    ("file", "options", "words"),
+    [
+        ("mwdn-camera/psf_480.tif", {}, ["at 0.10 of the full scale", "not subtracted"]),
+        ("mwdn-camera/psf_320.png", {}, ["at 0.10 of the full scale", "that alone was"]),
+        ("mwdn-camera/psf_320.png", {}, ["is cut"]),
+        ("mwdn-camera/psf_raw_1920.png", {"binning": 6}, ["all within the frame"]),
+        ("diffusercam-tutorial/psf_sample.tif", {"binning": 4}, ["192 pixels", "maximum"]),
+        ("diffusercam/psf_recovered_270x480.npy", {"upside_down": True, "bgr": True}, ["floats"]),
+        ("phlatcam/psf_384x640.npy", {}, ["Sharp"]),
+    ],
+)
+def test_measured_psfs(file, options, words, data):
+    calibration = Calibration.from_file(data / file, **options)
+    report = inspect_psf(calibration, read_frame(data / file, bgr=calibration.bgr))
+    assert said(report, *words)
+    assert not [finding for finding in verdict(report) if finding.weight == "bad"]
+    assert report.side_lobe[0] < 0.2
+    assert 1 < report.resolution_px[0.001] < 6
