@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 
@@ -62,6 +62,7 @@ class Mask:
         return Mask(self.kind, self.values[top : top + h, left : left + w], self.pitch_um, self.index, self.step_um)
 
 
+@runtime_checkable
 class MaskDesign(Protocol):
     """A few physical numbers that determine a mask."""
 
