@@ -49,7 +49,7 @@ def contours(
 
     They are the zeros of noise of one wavelength and all directions. Its period is two lines; contours of ordinary
     Perlin noise, with lines in clusters and empty places between them, lack the ring in the spectrum that the measured
-    PSF of the paper's camera has at one line in 118 um.
+    PSF of the paper's camera has at one line in about 118 um.
 
     Args:
         size: height and width in samples.

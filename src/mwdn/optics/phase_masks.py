@@ -43,7 +43,7 @@ class Contour:
     levels: int = 8
     step_nm: float = 145.0
     line_um: float = 8.0
-    spacing_um: float = 112.0
+    spacing_um: float = 104.0
     irregularity: float = 0.15
     iterations: int = 20
     seed: int = 0
