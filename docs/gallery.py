@@ -64,10 +64,11 @@ gives the best picture where the light does not matter, and needs the longest ex
 
 ![designed PSF, and its curves beside the measured ones](paper-camera.jpg)
 
-The ring at one line in 12 pixels and the fall towards high frequencies, that is the width of the lines, agree. What the
-design lacks is the even haze that fills the aperture's shadow in the measured PSF. With that part of the light left
-unbent (chosen such that the spectra's median agrees) the curves come together; errors of etching and reflections are
-likely sources of it.
+The ring of the lines' even distance (a period of 11 to 12 pixels) and the fall towards high frequencies, that is the
+width of the lines, agree. What the design lacks is the even haze that fills the aperture's shadow in the measured PSF:
+about half of its light. With that part left unbent (chosen such that the spectra's median agrees) the modulus is 0.6 to
+1.15 times the measured one from 0.05 periods a pixel on, lowest below the ring, and the autocorrelation at most 0.07
+away. Errors of etching and reflections are likely sources of the haze.
 """
 
 
