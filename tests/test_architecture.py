@@ -28,7 +28,8 @@ TIERS = [
     ("reconstruct",),
     ("capture",),
     ("preview",),
-    ("demo", "doctor", "cli", "cli_inspect", "__main__"),
+    ("design",),
+    ("demo", "doctor", "cli_optics", "cli_inspect", "cli", "__main__"),
     ("",),  # mwdn/__init__.py: the public names
 ]
 RANK = {name: rank for rank, names in enumerate(TIERS) for name in names}

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from mwdn import __version__
 from mwdn.calibration import Calibration
+from mwdn.cli_optics import design
 from mwdn.data.captures import find_captures
 from mwdn.data.images import write_picture
 from mwdn.data.importers import Layout, import_pairs
@@ -37,6 +38,7 @@ app = App(
     version=__version__,
     help="From the caustic pattern of a lensless camera to a picture. Add --debug to see where an error comes from.",
 )
+app.command(design)
 console = Console()
 errors = Console(stderr=True)
 

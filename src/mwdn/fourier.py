@@ -61,6 +61,23 @@ def inverse_spectrum(spectrum: Tensor, grid: Size, size: Size) -> Image:
     return torch.fft.irfft(rows, n=grid[1])[..., : size[1]]
 
 
+def frequencies(length: int) -> Tensor:
+    """Frequencies of a grid's transform in cycles a sample, float64, origin first."""
+    return torch.fft.fftfreq(length, dtype=torch.float64)
+
+
+def filter_field(field: Tensor, transfer: Tensor) -> Tensor:
+    """Multiply the spectrum of a complex field, zero-padded at the bottom and the right, with a transfer function.
+
+    Args:
+        field: complex, at most as large as ``transfer``.
+        transfer: complex, of the whole grid, origin first.
+    """
+    # Rows first and columns last, so that rows which are only padding are never transformed.
+    rows = torch.fft.fft(field.to(torch.complex64), n=transfer.shape[1])
+    return torch.fft.ifft2(torch.fft.fft(rows, n=transfer.shape[0], dim=0).mul_(transfer))
+
+
 def transfer_function(psf: Psf, grid: Size, origin: Size | None = None) -> Spectrum:
     """Spectrum of a PSF whose pixel ``origin`` is moved to (0, 0).
 

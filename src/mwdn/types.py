@@ -30,6 +30,12 @@ Psf = Float[Tensor, "psf_batch psf_channel psf_height psf_width"]
 Spectrum = Complex[Tensor, "batch channel height half_width"]
 """Half of a real picture's Fourier transform, origin first."""
 
+Field = Complex[Tensor, "_height _width"]
+"""Monochromatic light on a plane, one number a sample, of any size; its squared modulus is the intensity."""
+
+Plane = Float[Tensor, "_height _width"]
+"""One real number a sample, of any size: a height, a transmission, an intensity."""
+
 Frame = npt.NDArray[Any]
 """(height, width, channel), RGB, uint8, uint16 or float, as stored."""
 

@@ -1,17 +1,30 @@
-"""A camera that does not exist yet: its forward models, its sensor, and random PSFs of every kind of mask."""
+"""A camera that does not exist yet: its mask, the light behind it, its forward models and its sensor."""
 
+from mwdn.optics.amplitude_masks import CodedAperture, Pinholes, ZoneAperture
 from mwdn.optics.camera import Camera
 from mwdn.optics.families import FAMILIES, Variety, sample_camera
 from mwdn.optics.field import Aberration, FieldCamera, field_psfs
+from mwdn.optics.masks import Mask, mask_psf
+from mwdn.optics.phase_masks import Contour, Diffuser, Lenslets
 from mwdn.optics.sensor import Sensor
+from mwdn.optics.setup import Setup
 
 __all__ = [
-    "FAMILIES",
     "Aberration",
     "Camera",
+    "CodedAperture",
+    "Contour",
+    "Diffuser",
+    "FAMILIES",
     "FieldCamera",
+    "Lenslets",
+    "Mask",
+    "Pinholes",
     "Sensor",
+    "Setup",
     "Variety",
+    "ZoneAperture",
     "field_psfs",
+    "mask_psf",
     "sample_camera",
 ]

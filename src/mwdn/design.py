@@ -1,0 +1,167 @@
+"""A designed camera in files: mask, PSF, numbers and a picture."""
+
+import dataclasses
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mwdn.calibration import Calibration
+from mwdn.data.images import write_linear, write_picture
+from mwdn.data.sheets import contact_sheet, thumbnail
+from mwdn.data.writing import atomic
+from mwdn.errors import ImageError
+from mwdn.fourier import correlate, frequencies, spectrum
+from mwdn.optics.mask_files import write_gds, write_mask, write_stl
+from mwdn.optics.masks import Mask, MaskDesign, mask_psf, numbers
+from mwdn.optics.setup import Setup
+from mwdn.types import Image, Psf
+
+
+@dataclass(frozen=True, eq=False)
+class Designed:
+    """A camera that can be built, or simulated: ``Camera(designed.psf)``.
+
+    Args:
+        name: of the kind of mask.
+        design: the numbers that it was made from.
+        setup: everything but the mask.
+        mask: what was made.
+        light: PSF in parts of the light that falls onto the aperture, see `mwdn.optics.mask_psf`.
+    """
+
+    name: str
+    design: MaskDesign
+    setup: Setup
+    mask: Mask
+    light: Psf
+
+    @property
+    def psf(self) -> Psf:
+        """The PSF with the sum 1 in each channel."""
+        return _unit(self.light)
+
+    @property
+    def stored(self) -> Psf:
+        """The same with the maximum 1, as in psf.tif."""
+        return self.psf / self.psf.max()
+
+    def report(self) -> dict[str, Any]:
+        """All numbers, as plain values that JSON can hold; a source at infinity is None."""
+        rows, columns = self.setup.size
+        pitch_mm = self.setup.pitch_um / 1e3
+        width = sharpness(self.psf)
+        far = {"source_mm": None if math.isinf(self.setup.source_mm) else self.setup.source_mm}  # JSON has no infinity
+        return {
+            "mask": {"name": self.name} | dataclasses.asdict(self.design),  # type: ignore[call-overload]
+            "setup": dataclasses.asdict(self.setup) | far,
+            "made": numbers(self.mask, self.light)
+            | {
+                "psf_size": [rows, columns],
+                "psf_pitch_um": self.setup.pitch_um,
+                "psf_hash": Calibration(_unit(self.stored)).psf_hash,
+                "autocorrelation_width_px": round(width, 3),
+                "resolution_mrad": round(1e3 * width * pitch_mm / self.setup.distance_mm, 3),
+                "field_degrees": [
+                    round(2 * math.degrees(math.atan(n / 2 * pitch_mm / self.setup.distance_mm)), 2)
+                    for n in (rows, columns)
+                ],
+            },
+        }
+
+    def write(self, out: Path) -> None:
+        """Write mask.tif, psf.tif, camera.json and preview.png; files of the same names are replaced.
+
+        Args:
+            out: a folder; created if missing.
+
+        Raises:
+            ImageError: a file cannot be written.
+        """
+        write_mask(out / "mask.tif", self.mask)
+        write_linear(out / "psf.tif", self.stored)
+        write_picture(out / "preview.png", contact_sheet([self.pictures()], ["mask (middle)", "PSF", "spectrum"]))
+        try:
+            with atomic(out / "camera.json") as temporary:
+                temporary.write_text(json.dumps(self.report(), indent=2), encoding="utf-8")
+        except OSError as error:
+            raise ImageError(f"`{out}` cannot be written to: {error.strerror or error}.") from error
+
+    def pictures(self) -> list[Tensor]:
+        """Middle of the mask, PSF and its spectrum, for `contact_sheet`."""
+        values = self.mask.middle((480, 480)).values[None, None]
+        return [thumbnail(values / values.max().clamp(min=1e-12)), self.psf, decades(self.psf)]
+
+
+def design_camera(name: str, design: MaskDesign, setup: Setup) -> Designed:
+    """Compute mask and PSF.
+
+    Raises:
+        ParameterError: a number that no such mask or camera can have.
+    """
+    mask = design.build(setup)
+    return Designed(name, design, setup, mask, mask_psf(mask, setup))
+
+
+def write_fabrication(designed: Designed, out: Path, *, gds: bool, stl: bool, stl_every: int = 1) -> None:
+    """Write mask.gds and mask.stl, those that are asked for, into a folder."""
+    if gds:
+        write_gds(out / "mask.gds", designed.mask)
+    if stl:
+        write_stl(out / "mask.stl", designed.mask, every=stl_every)
+
+
+def sharpness(psf: Psf) -> float:
+    """Full width at half maximum, in pixels, of the PSF's autocorrelation, averaged over directions and channels.
+
+    It is what a point becomes when the measurement is correlated with the PSF: about 1.4 times as wide as the PSF's
+    finest structure.
+    """
+    profile = radial_autocorrelation(psf)
+    below = int((profile < 0.5).nonzero()[0]) if (profile < 0.5).any() else len(profile) - 1
+    step = (profile[below - 1] - 0.5) / (profile[below - 1] - profile[below]).clamp(min=1e-12)
+    return 2 * (below - 1 + step.item())
+
+
+def radial_autocorrelation(psf: Psf, reach: int = 40) -> Tensor:
+    """Autocorrelation of the PSF less its mean at 0, 1, 2 ... pixels, over all directions and channels; 1 at 0."""
+    centred = psf - psf.mean((-2, -1), keepdim=True)
+    channels = centred.transpose(0, 1)
+    both = torch.cat([correlate(one[None], one[None]) for one in channels]).sum((0, 1))
+    rows, columns = (torch.arange(n) - n // 2 for n in both.shape)
+    return _rings(both, torch.hypot(rows[:, None].double(), columns.double()), min(reach, min(both.shape) // 2))
+
+
+def radial_spectrum(psf: Psf, bins: int = 60) -> Tensor:
+    """Modulus of the transfer function, root mean square over directions and channels; up to half a period a pixel."""
+    size = (psf.shape[-2], psf.shape[-1])
+    power = spectrum(psf, size).abs().square().mean((0, 1))
+    v, u = frequencies(size[0]), frequencies(size[1])[: size[1] // 2 + 1].abs()
+    return (_rings(power, torch.hypot(v[:, None], u) * 2 * bins, bins) * power[0, 0]).sqrt()
+
+
+def decades(psf: Psf, lowest: float = 3.0) -> Image:
+    """Modulus of the transfer function as a picture, origin in the middle; white is 1, black 10^-lowest."""
+    size = (psf.shape[-2], psf.shape[-1])
+    half = spectrum(psf.mean(1, keepdim=True), size).abs()
+    # A real picture's spectrum is the same at opposite points: the missing half is the other, turned.
+    rest = half[..., 1 : size[1] - size[1] // 2].flip(-1)
+    rest = torch.cat([rest[..., :1, :], rest[..., 1:, :].flip(-2)], dim=-2)
+    whole = torch.cat([half, rest], dim=-1).roll((size[0] // 2, (size[1] - 1) // 2), dims=(-2, -1))
+    return (1 + (whole / whole.amax()).clamp(min=10**-lowest).log10() / lowest) ** 2.2
+
+
+def _unit(psf: Psf) -> Psf:
+    return psf / psf.sum((-2, -1), keepdim=True)
+
+
+def _rings(values: Tensor, radius: Tensor, count: int) -> Tensor:
+    index = radius.round().long().flatten()
+    inside = index < count
+    sums = torch.zeros(count, dtype=torch.float64).index_add_(0, index[inside], values.double().flatten()[inside])
+    means = sums / torch.bincount(index[inside], minlength=count).clamp(min=1)
+    return means / means[0]

@@ -1,0 +1,212 @@
+"""A mask in files: a 16-bit height map that can be read back, GDSII layers and an STL surface for those who make it."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from mwdn.data.writing import atomic
+from mwdn.errors import ImageError, MwdnError, ParameterError
+from mwdn.optics.masks import Mask
+
+_FORMAT = "mwdn mask 1"
+_DEEPEST = 256
+"""Levels into which a continuous surface is divided for GDSII: 8 layers."""
+
+MAX_STL_SAMPLES = 4_000_000
+"""A sample makes two triangles of 50 bytes: 400 MB, about what programs for printers still open."""
+
+
+def write_mask(path: str | Path, mask: Mask) -> None:
+    """Write a mask as 16-bit grey TIFF, atomically: ``value = number * scale``.
+
+    The scale, the pitch and the index stand as JSON in the tag ImageDescription, the pitch in the resolution tags too.
+
+    Args:
+        path: of the TIFF.
+        mask: heights of levels are kept exactly, others to 1/131,070 of the highest.
+
+    Raises:
+        ImageError: the file cannot be written.
+        ParameterError: a height or amplitude is negative.
+    """
+    import tifffile
+
+    values = mask.values.numpy().astype(np.float64)
+    highest = float(values.max())
+    if values.min() < 0 or (mask.kind == "amplitude" and highest > 1):
+        raise ParameterError(f"`values` of a mask ({values.min():g} to {highest:g}) must not be negative or above 1.")
+    scale = highest / 65535 if highest > 0 else 1.0
+    if mask.step_um > 0:
+        levels = max(1, round(highest / mask.step_um))
+        scale = mask.step_um / (65535 // levels)
+    about = {
+        "format": _FORMAT,
+        "kind": mask.kind,
+        "scale": scale,
+        "unit": "um" if mask.kind == "phase" else "amplitude",
+    }
+    about |= {"pitch_um": mask.pitch_um, "index": mask.index, "step_um": mask.step_um}
+    numbers = np.rint(values / scale).astype(np.uint16)
+    per_cm = 1e4 / mask.pitch_um
+    try:
+        with atomic(Path(path)) as temporary:
+            tifffile.imwrite(
+                temporary,
+                numbers,
+                photometric="minisblack",
+                compression="zlib",
+                description=json.dumps(about),
+                metadata=None,
+                resolution=(per_cm, per_cm),
+                resolutionunit="CENTIMETER",
+            )
+    except OSError as error:
+        raise ImageError(f"`{path}` cannot be written: {error.strerror or error}. Choose another folder.") from error
+
+
+def read_mask(path: str | Path) -> Mask:
+    """Read what `write_mask` has written.
+
+    Raises:
+        ImageError: the file cannot be read, or is not such a TIFF.
+    """
+    import tifffile
+
+    try:
+        with tifffile.TiffFile(path) as file:
+            about = json.loads(str(file.pages[0].tags["ImageDescription"].value))  # type: ignore[union-attr]
+            numbers = file.pages[0].asarray()
+        if about["format"] != _FORMAT or numbers.ndim != 2:
+            raise KeyError("format")
+        values = torch.from_numpy((numbers * about["scale"]).astype(np.float32))
+        return Mask(about["kind"], values, about["pitch_um"], about["index"], about["step_um"])
+    except MwdnError:
+        raise
+    except OSError as error:
+        raise ImageError(f"`{path}` cannot be read: {error.strerror or error}. Check the name.") from error
+    except Exception as error:  # tifffile and json raise whatever a foreign file makes them stumble on
+        raise ImageError(f"`{path}` is no mask of `mwdn design` ({error!r}). Give its mask.tif.") from error
+
+
+def write_gds(path: str | Path, mask: Mask) -> None:
+    """Write what is etched, or open, as GDSII: one layer a lithography mask, unit 1 um, y upwards, middle at 0.
+
+    The heights of N levels are binary numbers: layer k (from 0 on) holds the squares whose level has bit k set, to be
+    raised (or the complement etched) by ``2^k`` steps; 3 layers for 8 levels. A continuous surface is divided into 256
+    levels. Of a blocking mask, layer 0 holds what is open.
+
+    Args:
+        path: of the file.
+        mask: of any kind.
+
+    Raises:
+        ParameterError: gdstk is not installed.
+        ImageError: the file cannot be written.
+    """
+    try:
+        import gdstk
+    except ImportError as error:
+        raise ParameterError("GDSII needs gdstk: pip install 'mwdn[fabrication]'.") from error
+    level = _levels(mask)
+    rows, columns = level.shape
+    library = gdstk.Library("mwdn", unit=1e-6, precision=1e-9)
+    cell = library.new_cell("MASK")
+    for layer in range(max(1, int(level.max()).bit_length())):
+        for top, bottom, left, right in _rectangles((level >> layer) & 1).tolist():
+            # Sample i covers i - 1/2 to i + 1/2 around the middle sample n // 2; rows count downwards.
+            corner = ((left - columns // 2 - 0.5) * mask.pitch_um, -(top - rows // 2 - 0.5) * mask.pitch_um)
+            other = ((right - columns // 2 - 0.5) * mask.pitch_um, -(bottom - rows // 2 - 0.5) * mask.pitch_um)
+            cell.add(gdstk.rectangle(corner, other, layer=layer))
+    try:
+        with atomic(Path(path)) as temporary:
+            library.write_gds(temporary)
+    except OSError as error:
+        raise ImageError(f"`{path}` cannot be written: {error.strerror or error}. Choose another folder.") from error
+
+
+def write_stl(path: str | Path, mask: Mask, *, base_um: float = 100.0, every: int = 1) -> None:
+    """Write a phase mask as a closed body in binary STL, in um: its surface, four walls and a flat bottom.
+
+    Args:
+        path: of the file.
+        mask: with heights; a level is a slope between two samples, as wide as the pitch.
+        base_um: thickness below the height 0.
+        every: take one sample of so many along each axis.
+
+    Raises:
+        ParameterError: a blocking mask, a base that is not positive, or too many samples.
+        ImageError: the file cannot be written.
+    """
+    if mask.kind != "phase":
+        raise ParameterError("A blocking mask has no heights for an STL. Make it from its GDSII: `--gds`.")
+    if not base_um > 0 or every < 1:
+        raise ParameterError(f"`base_um` ({base_um:g}) must be positive and `every` ({every}) at least 1.")
+    heights = mask.values.numpy()[::every, ::every].astype(np.float64)
+    if heights.size > MAX_STL_SAMPLES or min(heights.shape) < 2:
+        needed = int(np.ceil(np.sqrt(mask.values.numel() / MAX_STL_SAMPLES)))
+        raise ParameterError(
+            f"An STL of {heights.shape[0]:,} x {heights.shape[1]:,} samples must have 2 a side and at most "
+            f"{MAX_STL_SAMPLES:,}: try `--stl-every {needed}`, or use GDSII."
+        )
+    triangles = np.concatenate(list(_body(heights, mask.pitch_um * every, base_um)))
+    sides = triangles[:, 1:] - triangles[:, :1]
+    normals = np.cross(sides[:, 0], sides[:, 1])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    facets = np.zeros(len(triangles), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("_", "<u2")])
+    facets["normal"], facets["corners"] = normals, triangles
+    try:
+        with atomic(Path(path)) as temporary, temporary.open("wb") as file:
+            file.write(b"mwdn mask, unit um".ljust(80))
+            file.write(np.uint32(len(facets)).tobytes())
+            facets.tofile(file)
+    except OSError as error:
+        raise ImageError(f"`{path}` cannot be written: {error.strerror or error}. Choose another folder.") from error
+
+
+def _levels(mask: Mask) -> npt.NDArray[np.int64]:
+    values = mask.values.numpy().astype(np.float64)
+    if mask.kind == "amplitude":
+        return (values > 0.5).astype(np.int64)
+    step = mask.step_um or max(float(values.max()), 1e-12) / (_DEEPEST - 1)
+    return np.rint(values / step).astype(np.int64)
+
+
+def _rectangles(filled: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Rectangles (top, bottom, left, right) that cover what is filled: runs of a row, joined with equal runs below."""
+    change = np.diff(np.pad(filled, ((0, 0), (1, 1))), axis=1)
+    (row, left), (_, right) = np.nonzero(change == 1), np.nonzero(change == -1)
+    order = np.lexsort((row, right, left))
+    row, left, right = row[order], left[order], right[order]
+    if not len(row):
+        return np.empty((0, 4), np.int64)
+    joined = (np.diff(row) == 1) & (np.diff(left) == 0) & (np.diff(right) == 0)
+    first = np.flatnonzero(np.r_[True, ~joined])
+    last = np.r_[first[1:] - 1, len(row) - 1]
+    return np.stack([row[first], row[last] + 1, left[first], right[first]], axis=1)
+
+
+def _body(heights: npt.NDArray[Any], pitch_um: float, base_um: float) -> Any:  # noqa: ANN401
+    """Triangles (n, 3 corners, xyz), counter-clockwise from outside: top, four walls, bottom.
+
+    The bottom is a fan around its middle to every point of the border, so that each edge belongs to two triangles.
+    """
+    rows, columns = heights.shape
+    y, x = np.meshgrid(-np.arange(rows) * pitch_um, np.arange(columns) * pitch_um, indexing="ij")
+    top = np.stack([x, y, heights + base_um], axis=-1)
+    a, b, c, d = top[:-1, :-1], top[:-1, 1:], top[1:, :-1], top[1:, 1:]
+    yield np.stack([a, c, d], axis=-2).reshape(-1, 3, 3)
+    yield np.stack([a, d, b], axis=-2).reshape(-1, 3, 3)
+    # Around the border, counter-clockwise seen from above: down the left side, along the bottom row, up, back.
+    border = np.concatenate([top[:-1, 0], top[-1, :-1], top[:0:-1, -1], top[0, :0:-1]])
+    following = np.roll(border, -1, axis=0)
+    low, low_following = (
+        np.concatenate([points[:, :2], np.zeros((len(points), 1))], 1) for points in (border, following)
+    )
+    yield np.stack([border, low, low_following], axis=1)
+    yield np.stack([border, low_following, following], axis=1)
+    middle = np.broadcast_to(np.array([x.mean(), y.mean(), 0.0]), low.shape)
+    yield np.stack([low_following, low, middle], axis=1)

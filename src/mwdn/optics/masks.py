@@ -1,0 +1,178 @@
+"""A mask as an optical element, and the PSF of a camera that has it."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import torch
+
+from mwdn.errors import ParameterError
+from mwdn.fourier import Size
+from mwdn.optics.propagation import UM_PER_MM, UM_PER_NM, integrate, overlap, point_source, positive, propagate
+from mwdn.optics.setup import Setup
+from mwdn.types import Field, Plane, Psf
+
+Kind = Literal["phase", "amplitude"]
+
+
+@dataclass(frozen=True, eq=False)
+class Mask:
+    """A thin element that delays light (phase) or blocks it (amplitude), opaque beyond its border.
+
+    Args:
+        kind: what ``values`` are.
+        values: heights in um, or transmitted amplitudes in [0, 1]. Row 0 at the top, seen from the scene.
+        pitch_um: distance of the samples.
+        index: refractive index of a phase mask, taken as the same for all wavelengths: fused silica's changes by
+            2 % of its excess over 1 from green to the ends of the visible.
+        step_um: height of one level; 0 for a continuous surface.
+
+    Raises:
+        ParameterError: a number that no mask can have.
+    """
+
+    kind: Kind
+    values: Plane
+    pitch_um: float
+    index: float = 1.0
+    step_um: float = 0.0
+
+    def __post_init__(self) -> None:
+        positive(pitch_um=self.pitch_um)
+        if self.kind == "phase" and not self.index > 1:
+            raise ParameterError(f"`index` ({self.index:g}) must be above 1, that of air: 1.46 for fused silica.")
+
+    @property
+    def size_mm(self) -> tuple[float, float]:
+        """Height and width."""
+        height, width = self.values.shape
+        return height * self.pitch_um / UM_PER_MM, width * self.pitch_um / UM_PER_MM
+
+    def field(self, wavelength_nm: float) -> Field:
+        """What the mask does to light of one wavelength: a complex factor for each sample."""
+        if self.kind == "amplitude":
+            return torch.complex(self.values, torch.zeros_like(self.values))
+        turns = self.values * ((self.index - 1) / (wavelength_nm * UM_PER_NM))
+        return torch.polar(torch.ones_like(turns), 2 * math.pi * turns.frac())
+
+    def middle(self, size: Size) -> "Mask":
+        """The part of at most ``size`` samples around the centre, which stays the centre."""
+        (height, width), (h, w) = self.values.shape, (min(a, b) for a, b in zip(self.values.shape, size, strict=True))
+        top, left = height // 2 - h // 2, width // 2 - w // 2
+        return Mask(self.kind, self.values[top : top + h, left : left + w], self.pitch_um, self.index, self.step_um)
+
+
+@runtime_checkable
+class MaskDesign(Protocol):
+    """A few physical numbers that determine a mask."""
+
+    def build(self, setup: Setup) -> Mask:
+        """Compute the mask for a camera."""
+
+
+def samples(size_mm: tuple[float, float], pitch_um: float) -> Size:
+    """Rows and columns of a mask.
+
+    Raises:
+        ParameterError: a length is not positive, or there would be fewer than 2 or more than 20,000 samples a side.
+    """
+    positive(size_mm=min(size_mm), pitch_um=pitch_um)
+    rows, columns = (round(side * UM_PER_MM / pitch_um) for side in size_mm)
+    if not 2 <= min(rows, columns) <= max(rows, columns) <= 20_000:
+        raise ParameterError(
+            f"`pitch_um` ({pitch_um:g}) makes {rows:,} x {columns:,} samples of `size_mm` {size_mm}; "
+            "2 to 20,000 a side are possible."
+        )
+    return rows, columns
+
+
+def quantised(height_um: Plane, levels: int | None) -> tuple[Plane, float]:
+    """Heights rounded to ``levels`` even steps from 0 to the highest, and the step; unchanged and 0 if ``None``.
+
+    Raises:
+        ParameterError: fewer than 2 levels or more than 65,536.
+    """
+    if levels is None:
+        return height_um, 0.0
+    check_levels(levels)
+    step = height_um.max().item() / (levels - 1)
+    return (height_um / step).round() * step, step
+
+
+def check_levels(levels: int) -> None:
+    """Refuse a number of levels that no mask has."""
+    if not 2 <= levels <= 65_536:
+        raise ParameterError(f"`levels` ({levels}) must be 2 to 65,536. Leave it out for a continuous surface.")
+
+
+def mask_psf(mask: Mask, setup: Setup, *, angle_degrees: tuple[float, float] = (0.0, 0.0)) -> Psf:
+    """PSF of a camera: light of a point through the mask, on the sensor, summed over wavelengths.
+
+    Args:
+        mask: in the plane of the aperture; of it, only what the aperture leaves open matters.
+        setup: everything else.
+        angle_degrees: of the point from the axis, downwards and to the right. The sensor stays where it is.
+
+    Returns:
+        (1, 1 or 3, *setup.size). The light that falls onto the aperture is 1 in each channel, so the sum is the part
+        of it that arrives on the sensor; divide by it for a `Camera`.
+
+    Raises:
+        ParameterError: the mask's pitch cannot sample the light behind it; the message says which could.
+    """
+    pitch = mask.pitch_um
+    opening = tuple(side * UM_PER_MM for side in setup.aperture_mm)
+    mask = mask.middle((2 * math.ceil(opening[0] / pitch / 2) + 1, 2 * math.ceil(opening[1] / pitch / 2) + 1))
+    down, across = (overlap(1, side, n, pitch)[0] for side, n in zip(opening, mask.values.shape, strict=True))
+    aperture = torch.outer(down, across).float()
+    wavelengths, weights = setup.spectrum()
+    _check_slope(mask, setup, min(wavelengths), angle_degrees)
+    window = tuple(math.ceil(n * setup.pitch_um / pitch / 2) * 2 + 2 for n in setup.size)
+    shape = mask.values.shape[0], mask.values.shape[1]
+    psf = torch.zeros(len(weights), *setup.size)
+    for wavelength, weight in zip(wavelengths, weights.T, strict=True):
+        light: dict[str, Any] = {"pitch_um": pitch, "wavelength_nm": wavelength}
+        field = point_source(shape, distance_mm=setup.source_mm, angle_degrees=angle_degrees, **light) * aperture
+        sensor = propagate(
+            field * mask.field(wavelength), distance_mm=setup.distance_mm, size=(window[0], window[1]), **light
+        )
+        power = sensor.real.square() + sensor.imag.square()
+        pixels = integrate(power, pitch_um=pitch, size=setup.size, pixel_um=setup.pitch_um)
+        psf += weight[:, None, None].float() * pixels
+    return psf[None] / (opening[0] * opening[1] / pitch**2)
+
+
+def _check_slope(mask: Mask, setup: Setup, wavelength_nm: float, angle_degrees: tuple[float, float]) -> None:
+    """A surface turns light by its slope times ``index - 1``; two samples a period must carry the wave behind it.
+
+    A surface of levels or a blocking mask has no slope: its samples are the structure itself.
+    """
+    if mask.kind == "amplitude" or mask.step_um > 0:
+        return
+    steepest = 0.0
+    for axis, angle in enumerate(angle_degrees):
+        slope = mask.values.diff(dim=axis).abs().max().item() / mask.pitch_um * (mask.index - 1)
+        half = mask.size_mm[axis] / 2 / setup.source_mm
+        steepest = max(steepest, slope + math.sin(math.atan(math.tan(math.radians(abs(angle))) + half)))
+    needed = wavelength_nm * UM_PER_NM / (2 * max(steepest, 1e-12))
+    if mask.pitch_um > needed * (1 + 1e-6):
+        turn = math.degrees(math.asin(min(1.0, steepest)))
+        raise ParameterError(
+            f"`pitch_um` ({mask.pitch_um:g}) cannot sample a surface that turns light of {wavelength_nm:g} nm by "
+            f"{turn:.2g} degrees: use at most {needed:.3g} um, or a flatter surface."
+        )
+
+
+def numbers(mask: Mask, psf: Psf) -> dict[str, Any]:
+    """What a report says of a mask and its PSF, as plain values."""
+    found: dict[str, Any] = {
+        "kind": mask.kind,
+        "samples": list(mask.values.shape),
+        "size_mm": list(mask.size_mm),
+        "pitch_um": mask.pitch_um,
+        "light_on_sensor": [round(value, 6) for value in psf.sum((-2, -1))[0].tolist()],
+    }
+    if mask.kind == "phase":
+        highest = round(mask.values.max().item(), 6)
+        return found | {"index": mask.index, "step_um": mask.step_um, "highest_um": highest}
+    return found | {"open_part": round(mask.values.square().mean().item(), 6)}
