@@ -34,7 +34,7 @@ def psf(size=(4, 6), channels=3):
 
 
 def drawn(source, numbers):
-    measurement, scene = source.batch(numbers)
+    measurement, scene, _ = source.batch(numbers)
     torch.testing.assert_close(measurement + scene, torch.ones_like(scene))  # still a pair
     return (measurement[:, 0, 0, 0] * 255).round().int().tolist()
 

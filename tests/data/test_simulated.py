@@ -101,7 +101,7 @@ def test_exact_camera_without_noise_is_the_forward_model(photographs, psf):
     The measurement is in units of the scene: full scale is brightest / exposure of it.
     """
     pairs = SimulatedPairs(photographs, psf, placement=PLAIN, mismatch=EXACT, sensor=CLEAN, exposure=(0.8, 0.8))
-    measurement, scene = pairs.batch(range(3))
+    measurement, scene, _ = pairs.batch(range(3))
     expected = Camera(psf).forward(scene)
     full_scale = expected.amax((1, 2, 3), keepdim=True) / 0.8
     error = ((measurement - expected) / full_scale).abs()
@@ -143,7 +143,7 @@ def test_noise_of_a_flat_scene_is_the_sensors(tmp_path):
         sensor=sensor,
         exposure=(0.5, 0.5),
     )
-    measurement, scene = pairs.batch(range(4))
+    measurement, scene, _ = pairs.batch(range(4))
     assert torch.equal(scene, torch.ones_like(scene))
     n = measurement.numel()
     # Relative to the full scale, then in units of the scene: divided by the gain 0.5.

@@ -104,10 +104,11 @@ EXACT = Mismatch(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class Pair(NamedTuple):
-    """What the network sees and what it should give."""
+    """What the network sees and what it should give; and each sample's PSF where cameras differ."""
 
     measurement: Measurement
     scene: Scene
+    psf: Psf | None = None
 
 
 @runtime_checkable

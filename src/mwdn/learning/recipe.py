@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 import torch
 
+from mwdn.data.cameras import Cameras
 from mwdn.data.recorded import Division
 from mwdn.data.simulated import Mismatch, Placement
 from mwdn.errors import MwdnError, ParameterError, UnknownNameError
@@ -42,6 +43,7 @@ class Schedule:
         validate_every: steps between validations, checkpoints and contact sheets.
         validation: samples in a validation.
         seed: of initial weights and data.
+        start: weights to begin with instead, `universal` or the path of a checkpoint of the same network.
     """
 
     steps: int = 2000
@@ -58,6 +60,7 @@ class Schedule:
     validate_every: int = 250
     validation: int = 16
     seed: int = 0
+    start: str = ""
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "learning_rate", "validate_every", "validation"):
@@ -123,6 +126,7 @@ class Recipe:
         later_loss: weights that replace those of ``loss`` at the end of that course; none to leave them.
         pairs: which of recorded pairs are for what, see `mwdn.data.recorded.Division`.
         sheet: see `Sheet`.
+        cameras: random ones to learn from in place of the one that is given, see `mwdn.data.cameras.Cameras`.
         placement: see `mwdn.data.simulated.Placement`.
         mismatch: see `mwdn.data.simulated.Mismatch`.
         sensor: see `mwdn.optics.sensor.Sensor`.
@@ -135,6 +139,7 @@ class Recipe:
     later_loss: dict[str, float] = field(default_factory=dict)
     pairs: Division = Division()
     sheet: Sheet = Sheet()
+    cameras: Cameras = Cameras()
     placement: Placement = Placement()
     mismatch: Mismatch = Mismatch()
     sensor: Sensor = Sensor()

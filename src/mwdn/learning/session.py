@@ -6,12 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from mwdn.calibration import Calibration
+from mwdn.data.cameras import CameraPairs
 from mwdn.data.captures import find_captures, read_captures
 from mwdn.data.pair_writer import Attribute
 from mwdn.data.pairs import PairFile
 from mwdn.data.photographs import Photographs
-from mwdn.data.recorded import RecordedPairs, recorded_pairs
-from mwdn.data.simulated import EXACT, SimulatedPairs
+from mwdn.data.recorded import recorded_pairs
+from mwdn.data.simulated import EXACT, Samples, SimulatedPairs
 from mwdn.errors import ParameterError
 from mwdn.learning import distributed
 from mwdn.learning.recipe import Recipe
@@ -61,17 +62,21 @@ def prepare(
     place = distributed.device_here(device)
     shown = [*captures] or recipe.sheet.captures
     real = read_captures(find_captures(shown)[:SHOWN], calibration) if shown else None
-    training: RecordedPairs | SimulatedPairs
-    validation: RecordedPairs | SimulatedPairs
+    training: Samples
+    validation: Samples
     if pairs is not None:
+        if recipe.cameras.sizes:
+            raise ParameterError("Recorded pairs, `--pairs`, are of one camera: leave [cameras] out of the recipe.")
         seed = recipe.schedule.seed
         training, validation = recorded_pairs(pairs, calibration.psf, recipe.pairs, seed=seed, device=place)
         recipe = _within(recipe, len(validation))
         count = len(training)
     elif photos is not None:
         learned, held_out = Photographs(photos).to(place).split(HELD_OUT)
-        training = _source(recipe, learned, calibration.psf.to(place))
-        validation = replace(training, photographs=held_out)
+        source = _source(recipe, learned, calibration.psf.to(place))
+        validation = replace(source, photographs=held_out)
+        across = recipe.cameras.sizes
+        training = CameraPairs(source, recipe.cameras, recipe.schedule.batch) if across else source
         count = len(learned)
     trainer = Trainer(
         _in_steps(recipe, count), calibration, training, out, validation=validation, captures=real, device=place
@@ -114,7 +119,7 @@ def simulate(
     with file:
         for start in track(range(0, count, recipe.schedule.batch)):
             end = min(start + recipe.schedule.batch, count)
-            file.append(*pairs.batch(range(FILE_START + start, FILE_START + end)))
+            file.append(*pairs.batch(range(FILE_START + start, FILE_START + end))[:2])
 
 
 def _source(recipe: Recipe, photographs: Photographs, psf: Psf) -> SimulatedPairs:

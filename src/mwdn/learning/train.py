@@ -19,7 +19,7 @@ from mwdn.data.simulated import Samples
 from mwdn.data.writing import atomic
 from mwdn.errors import CheckpointError, DivergenceError, ParameterError
 from mwdn.learning import distributed
-from mwdn.learning.checkpoint import save_network
+from mwdn.learning.checkpoint import load_network, save_network
 from mwdn.learning.losses import Loss
 from mwdn.learning.precision import has_bfloat16
 from mwdn.learning.recipe import Recipe
@@ -91,6 +91,8 @@ class Trainer:
         torch.manual_seed(self.schedule.seed)
         self.options = {key: value for key, value in recipe.network.items() if key != "name"}
         self.network = build(recipe.network["name"], **self.options).to(self.device)
+        if self.schedule.start:
+            self._begin_with(self.schedule.start)
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = build(recipe.network["name"], **self.options).to(self.device).eval()
         self.average.load_state_dict(self.network.state_dict())
@@ -103,7 +105,8 @@ class Trainer:
         self.step, self.best = 0, -math.inf
         # What a checkpoint must agree with to be gone on from.
         learned = {table: values for table, values in recipe.as_dict().items() if table != "sheet"}
-        self.identity = {"recipe": learned, "psf_hash": calibration.psf_hash, "pairs": pairs.name}
+        one = None if recipe.cameras.sizes else calibration.psf_hash  # of many, the given one is for the validation
+        self.identity = {"recipe": learned, "psf_hash": one, "pairs": pairs.name}
         distributed.check_alike(self.identity)
         distributed.share(range(self.schedule.batch))  # refuses a batch that is too small
         self._resume()
@@ -148,13 +151,14 @@ class Trainer:
         first = self.step * self.schedule.batch
         numbers = range(first, first + self.schedule.batch)
         own = distributed.share(numbers)
-        measurement, scene = self.pairs.batch(own)
+        measurement, scene, psf = self.pairs.batch(own)
         for group in self.optimiser.param_groups:
             group["lr"] = self.course.rate(self.step)
         self.loss.weights = self.course.weights
         self.network.train()
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
-            found = self.network(measurement.contiguous(memory_format=torch.channels_last), self.psf)
+            seen = measurement.contiguous(memory_format=torch.channels_last)
+            found = self.network(seen, self.psf if psf is None else psf)
         loss, parts = self.loss(found.float(), scene)
         weight = len(own) / len(numbers)  # losses are means over samples
         total, *totals = distributed.total(weight * torch.stack([loss.detach(), *parts.values()]).double()).tolist()
@@ -232,6 +236,15 @@ class Trainer:
         for name, parameter in self.network.named_parameters():
             for key, value in self.optimiser.state[parameter].items():
                 yield f"optimiser.{name}.{key}", value.contiguous()
+
+    def _begin_with(self, start: str) -> None:
+        known = load_network(start)
+        try:
+            self.network.load_state_dict(known.state_dict())
+        except RuntimeError as error:
+            raise CheckpointError(
+                f"`start` ('{start}') must hold the network of the recipe, {self.recipe.network}: {error}"
+            ) from error
 
     def _resume(self) -> None:
         path = self.out / "state.safetensors"

@@ -63,8 +63,8 @@ class Validator:
         rows: list[list[Tensor]] = []
         for start in range(0, schedule.validation, schedule.batch):
             numbers = range(START + start, START + min(start + schedule.batch, schedule.validation))
-            measurement, scene = self.pairs.batch(numbers)
-            found = network(measurement, self.psf)
+            measurement, scene, psf = self.pairs.batch(numbers)
+            found = network(measurement, self.psf if psf is None else psf)
             psnrs.append(-10 * torch.log10((found.clamp(0, 1) - scene).square().mean((1, 2, 3))))
             parts = loss(found, scene)[1]
             losses.append(len(numbers) * sum(weight * parts[name].item() for name, weight in self.recipe.loss.items()))
