@@ -17,6 +17,7 @@ import torch
 from safetensors.torch import load_file
 
 from mwdn.calibration import Calibration
+from mwdn.data.cameras import Cameras
 from mwdn.data.pairs import PairFile
 from mwdn.data.photographs import Photographs
 from mwdn.data.simulated import SimulatedPairs
@@ -487,3 +488,23 @@ def test_divergence_leaves_the_state(trainer, tmp_path):
         run.run()
     assert (tmp_path / "run" / "state.safetensors").read_bytes() == before
     assert trainer(few(steps=9)).step == 3
+
+
+# --- Across cameras, and from known weights -----------------------------------------------------------
+
+
+def test_a_network_of_all_cameras_belongs_to_none(trainer, tmp_path):
+    recipe = replace(few(steps=3), cameras=Cameras(("32x32", "32x48")))
+    trainer(recipe).run()
+    assert read_metadata(tmp_path / "run" / "last.safetensors")["psf_hash"] is None
+
+
+def test_a_run_begins_with_the_weights_it_is_given(trainer, tmp_path):
+    trainer(few(steps=3)).run()
+    start = str(tmp_path / "run" / "last.safetensors")
+    first = trainer(few(start=start), "second").network
+    known = load_network(start)
+    assert all(torch.equal(a, b) for a, b in zip(first.state_dict().values(), known.state_dict().values(), strict=True))
+    wider = replace(few(start=start), network={**RECIPE.network, "width": 8})
+    with pytest.raises(CheckpointError, match="must hold the network of the recipe"):
+        trainer(wider, "third")
