@@ -43,6 +43,8 @@ class Schedule:
         validate_every: steps between validations, checkpoints and contact sheets.
         validation: samples in a validation.
         seed: of initial weights and data.
+        pool: keep so many samples and what the network computes of them before its learned part, and use them again,
+            mirrored; 0 makes every sample a new one. For `wiener-bank`.
         start: weights to begin with instead, `universal` or the path of a checkpoint of the same network.
     """
 
@@ -60,13 +62,14 @@ class Schedule:
     validate_every: int = 250
     validation: int = 16
     seed: int = 0
+    pool: int = 0
     start: str = ""
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "learning_rate", "validate_every", "validation"):
             if not getattr(self, name) > 0:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) must be positive.")
-        for name in ("epochs", "warmup", "weight_decay", "clip"):
+        for name in ("epochs", "warmup", "weight_decay", "clip", "pool"):
             if not getattr(self, name) >= 0:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) must not be negative.")
         if not 0 <= self.ema < 1:

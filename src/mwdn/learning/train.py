@@ -21,6 +21,7 @@ from mwdn.errors import CheckpointError, DivergenceError, ParameterError
 from mwdn.learning import distributed
 from mwdn.learning.checkpoint import load_network, save_network
 from mwdn.learning.losses import Loss
+from mwdn.learning.pool import Pool
 from mwdn.learning.precision import has_bfloat16
 from mwdn.learning.recipe import Recipe
 from mwdn.learning.schedule import begin, optimiser
@@ -98,6 +99,8 @@ class Trainer:
         self.average.load_state_dict(self.network.state_dict())
         distributed.freeze_cancelled(self.network)
         distributed.synchronise(self.network, self.device)
+        size, seed = self.schedule.pool, self.schedule.seed
+        self.pool = Pool(pairs, self.network, self.psf, size=size, seed=seed) if size else None
         self.loss = Loss(recipe.loss, alexnet=alexnet).to(self.device)
         self.optimiser = optimiser(self.network, self.schedule)
         self.course = begin(recipe)
@@ -151,14 +154,12 @@ class Trainer:
         first = self.step * self.schedule.batch
         numbers = range(first, first + self.schedule.batch)
         own = distributed.share(numbers)
-        measurement, scene, psf = self.pairs.batch(own)
         for group in self.optimiser.param_groups:
             group["lr"] = self.course.rate(self.step)
         self.loss.weights = self.course.weights
         self.network.train()
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
-            seen = measurement.contiguous(memory_format=torch.channels_last)
-            found = self.network(seen, self.psf if psf is None else psf)
+            found, scene = self._reconstruct(own)
         loss, parts = self.loss(found.float(), scene)
         weight = len(own) / len(numbers)  # losses are means over samples
         total, *totals = distributed.total(weight * torch.stack([loss.detach(), *parts.values()]).double()).tolist()
@@ -176,6 +177,15 @@ class Trainer:
         self.step += 1
         self._average()
         return total, dict(zip(parts, totals, strict=True))
+
+    def _reconstruct(self, numbers: range) -> tuple[Tensor, Tensor]:
+        """Reconstructions of the samples of these numbers, and their scenes."""
+        if self.pool is not None:
+            estimates, scene = self.pool.batch(numbers)
+            return self.network.correct(estimates), scene  # type: ignore[operator]
+        measurement, scene, psf = self.pairs.batch(numbers)
+        seen = measurement.contiguous(memory_format=torch.channels_last)
+        return self.network(seen, self.psf if psf is None else psf), scene
 
     @torch.no_grad()
     def _average(self) -> None:

@@ -1,9 +1,7 @@
 """A bank of Wiener estimates in front of a U-Net; not from the paper."""
 
-import math
-
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mwdn.errors import ParameterError
@@ -18,19 +16,20 @@ class WienerBank(nn.Module):
 
     A strong lambda leaves a smooth picture of right brightness, a weak one keeps detail and amplifies noise; no single
     one serves all frequencies. No linear filter knows that the sensor crops the pattern and that light is not negative,
-    which decides about shading and colour. So a few coarse iterations that know both (`mwdn.solvers.pyramid`) explain
-    what they can, and the bank filters the rest. The U-Net learns what is then wrong with the middle estimate.
+    which decides about shading and colour. So a few iterations that know both (`mwdn.solvers.pyramid`) explain what
+    they can, and the bank filters the rest. The U-Net learns what is then still wrong.
 
-    Everything is measured in units of the smoothest estimate's brightest pixel and scaled back at the end, so exposure
-    and gain cannot matter: the network of a scaled measurement is the scaled scene.
+    Nothing before the U-Net is learned: `estimates` of a sample can be kept. Everything is measured in units of the
+    smoothest estimate's brightest pixel and scaled back at the end, so exposure and gain cannot matter: the network of
+    a scaled measurement is the scaled scene.
 
     Args:
         channels: colours of the measurement and the scene.
         width: feature channels at the U-Net's finest scale.
         fold: pixels along each side of the blocks that the U-Net sees as one pixel of more channels. With 2 it takes
             a quarter of the time and sees twice as far; the estimates it corrects keep the full resolution.
-        regularisations: start values of lambda, for a PSF of unit sum, the strongest first.
-        crop_aware: filter what the coarse iterations left; else the measurement itself.
+        regularisations: lambda of each estimate, for a PSF of unit sum, the strongest first.
+        crop_aware: filter what the iterations left; else the measurement itself.
         pooling: between the encoder's scales.
         boundary: what stands beyond the measurement unless ``crop_aware``, see `mwdn.fourier.Boundary`.
     """
@@ -41,7 +40,7 @@ class WienerBank(nn.Module):
         channels: int = 3,
         width: int = 24,
         fold: int = 2,
-        regularisations: tuple[float, ...] = (3e-3, 5e-4, 1e-4, 3e-5),
+        regularisations: tuple[float, ...] = (1e-3, 1e-4, 2e-5),
         crop_aware: bool = True,
         pooling: Pooling = "max",
         boundary: Boundary = "taper",
@@ -51,31 +50,36 @@ class WienerBank(nn.Module):
             raise ParameterError(f"`regularisations` {tuple(regularisations)} must be one or more positive numbers.")
         if fold < 1:
             raise ParameterError(f"`fold` ({fold}) must be at least 1.")
-        self.channels, self.fold, self.crop_aware, self.boundary = channels, fold, crop_aware, boundary
-        self.log_regularisations = nn.Parameter(torch.tensor([math.log(value) for value in regularisations]))
+        self.channels, self.fold, self.regularisations = channels, fold, regularisations
+        self.crop_aware, self.boundary = crop_aware, boundary
         pictures = len(regularisations) + (2 if crop_aware else 1)
         self.encoder = Encoder(channels * pictures * fold**2, paper_widths(width), pooling=pooling)
         self.decoder = Decoder(channels * fold**2, paper_widths(width))
         with torch.no_grad():
-            self.decoder.head.weight.mul_(0.1)  # begin near the middle estimate
+            self.decoder.head.weight.mul_(0.1)  # begin near the estimate
 
     def forward(self, measurement: Measurement, psf: Psf) -> Scene:
         """Scene (B, C, H, W), each colour deconvolved with its own PSF."""
+        return self.correct(self.estimates(measurement, psf))
+
+    def estimates(self, measurement: Measurement, psf: Psf) -> Tensor:
+        """Estimates of the scene, the smoothest first, and the measurement: (B, C * pictures, H, W)."""
         psf = peak_one(psf, measurement)
         psf = psf / psf.sum((-2, -1), keepdim=True)
-        estimates = self.estimates(measurement, psf)
-        unit = estimates[0].detach().amax((1, 2, 3), keepdim=True).clamp(min=1e-6)
-        seen = torch.cat([*estimates, measurement], dim=1) / unit
-        height, width = seen.shape[-2:]
-        below, right = (max(-size % self.fold, 16 * self.fold - size) for size in (height, width))
-        folded = F.pixel_unshuffle(F.pad(seen, (0, right, 0, below)), self.fold)
-        correction = F.pixel_shuffle(self.decoder(self.encoder(folded)), self.fold)[..., :height, :width]
-        return estimates[len(estimates) // 2] + unit * correction
+        if self.crop_aware:
+            found = explain(measurement, psf)
+            scenes = [found.scene, *(found.scene + found.detail(value) for value in self.regularisations)]
+        else:
+            scenes = [wiener(measurement, psf, value, boundary=self.boundary) for value in self.regularisations]
+        return torch.cat([*scenes, measurement.float()], dim=1)
 
-    def estimates(self, measurement: Measurement, psf: Psf) -> list[Scene]:
-        """Estimates of the scene, the smoothest first."""
-        lambdas = self.log_regularisations.exp()
-        if not self.crop_aware:
-            return [wiener(measurement, psf, value, boundary=self.boundary) for value in lambdas]
-        found = explain(measurement, psf)
-        return [found.scene, *(found.scene + found.detail(value) for value in lambdas)]
+    def correct(self, estimates: Tensor) -> Scene:
+        """Scene (B, C, H, W) from `estimates`: the learned part, a correction of the smoothest."""
+        first = estimates[:, : self.channels]
+        unit = first.detach().amax((1, 2, 3), keepdim=True).clamp(min=1e-6)
+        height, width = estimates.shape[-2:]
+        below, right = (max(-size % self.fold, 16 * self.fold - size) for size in (height, width))
+        folded = F.pixel_unshuffle(F.pad(estimates / unit, (0, right, 0, below)), self.fold)
+        folded = folded.contiguous(memory_format=torch.channels_last)
+        correction = F.pixel_shuffle(self.decoder(self.encoder(folded)), self.fold)[..., :height, :width]
+        return first + unit * correction

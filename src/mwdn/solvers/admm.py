@@ -79,13 +79,18 @@ def pose(measurement: Measurement, psf: Psf) -> Problem:
     """
     check_fit(measurement, psf, "measurement")
     height, width = (fast_length(s + p) for s, p in zip(measurement.shape[-2:], psf.shape[-2:], strict=True))
+    return posed(measurement.float(), transfer_function(psf, (height, width)))
+
+
+def posed(measurement: Tensor, transfer: Tensor) -> Problem:
+    """The same from the PSF's transfer function, (B, C, height, width // 2 + 1) on a grid of even width."""
+    height, width = transfer.shape[-2], 2 * (transfer.shape[-1] - 1)
     # |Psi|^2 of periodic forward differences is 4 sin^2 along each axis.
-    rows = torch.arange(height, device=psf.device)[:, None] * (math.pi / height)
-    columns = torch.arange(width // 2 + 1, device=psf.device) * (math.pi / width)
+    rows = torch.arange(height, device=transfer.device)[:, None] * (math.pi / height)
+    columns = torch.arange(width // 2 + 1, device=transfer.device) * (math.pi / width)
     laplacian = 4 * rows.sin().square() + 4 * columns.sin().square()
-    H = transfer_function(psf, (height, width))
-    adjoint = H.conj().resolve_conj()  # a lazy conjugate would be copied at each use
-    return Problem(measurement.float(), H, adjoint, H.abs().square(), laplacian, (height, width))
+    adjoint = transfer.conj().resolve_conj()  # a lazy conjugate would be copied at each use
+    return Problem(measurement, transfer, adjoint, transfer.abs().square(), laplacian, (height, width))
 
 
 def start(problem: Problem, scene: Tensor | None = None, *, smooth: bool = True) -> State:

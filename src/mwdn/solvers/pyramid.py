@@ -1,4 +1,4 @@
-"""Non-negative least squares from coarse to fine: the low frequencies of ADMM at a tenth of its price."""
+"""ADMM from coarse to fine: better than a hundred iterations of it at a fraction of their price."""
 
 from dataclasses import dataclass
 
@@ -8,40 +8,44 @@ from torch.nn import functional as F
 
 from mwdn.errors import ParameterError
 from mwdn.fourier import Size, check_fit, fast_length, inverse_spectrum, spectrum, transfer_function
-from mwdn.solvers.admm import Penalties, Problem, merge, split, start
+from mwdn.solvers.admm import Penalties, merge, posed, split, start
 from mwdn.types import Measurement, Psf, Scene, Spectrum
 
 
 @dataclass(frozen=True)
 class Level:
-    """One size of the pyramid: ADMM with the sign constraint alone, from what the coarser size found.
+    """One size of the pyramid: ADMM from what the coarser size found, its multipliers forgotten.
 
     Args:
         shrink: pixels of the measurement along each side of one of its own; a power of two.
         iterations: of ADMM.
-        penalties: mu of the data and of the sign; there is no total variation.
+        penalties: mu of the data, the gradient and the sign.
+        regularisation: tau, weight of the total variation; 0 for none, whatever the gradient's mu.
     """
 
     shrink: int
     iterations: int
     penalties: Penalties
+    regularisation: float = 0.0
 
 
 LEVELS = (
     Level(8, 20, Penalties(0.15, 0.0, 0.6)),
     Level(4, 20, Penalties(0.15, 0.0, 0.6)),
     Level(2, 8, Penalties(0.2, 0.0, 0.9)),
+    Level(1, 10, Penalties(0.1, 1.5, 1.5), 0.01),
 )
-"""Twenty iterations at an eighth of the size cost a third of one at the whole."""
+"""What the coarse levels found lets the last one begin where it would be after a hundred iterations."""
 
 
 @dataclass(frozen=True)
 class Pyramid:
-    """Minimise ``1/2 |crop(h * v) - b|^2`` over scenes ``v >= 0``, first coarsely, then finer, then by a Wiener step.
+    """Minimise ``1/2 |crop(h * v) - b|^2 + tau |Psi v|_1`` over scenes ``v >= 0``, from coarse to fine.
 
     A sensor crops the pattern, and what it lacks is mostly the low frequencies of the scene. They need many
     iterations but few pixels: a picture of half the size shows half the band, and the PSF's low frequencies are all
-    that make it. The last step restores the detail: it adds the Wiener estimate of what is left unexplained.
+    that make it. The finest level smooths by total variation; a last step adds the Wiener estimate of what is then
+    unexplained.
 
     Called with a measurement (B, C, H, W) and a PSF, it returns the part (B, C, H, W) of the scene that faces the
     sensor.
@@ -55,7 +59,7 @@ class Pyramid:
         ShapeError: batch or channels of PSF and measurement do not fit.
     """
 
-    regularisation: float = 1e-4
+    regularisation: float = 1e-3
     levels: tuple[Level, ...] = LEVELS
 
     def __post_init__(self) -> None:
@@ -69,7 +73,9 @@ class Pyramid:
     def __call__(self, measurement: Measurement, psf: Psf) -> Scene:
         """Reconstruct a batch."""
         found = explain(measurement, psf, self.levels)
-        return (found.scene + found.detail(self.regularisation)).clamp(min=0) / psf.float().sum((-2, -1), keepdim=True)
+        tiny = torch.finfo(torch.float32).tiny
+        total = psf.float().sum((-2, -1), keepdim=True).clamp(min=tiny)
+        return (found.scene + found.detail(self.regularisation)).clamp(min=0) / total
 
 
 @dataclass(frozen=True)
@@ -107,23 +113,26 @@ def explain(measurement: Measurement, psf: Psf, levels: tuple[Level, ...] = LEVE
         ShapeError: batch or channels do not fit.
     """
     check_fit(measurement, psf, "measurement")
+    tiny = torch.finfo(torch.float32).tiny
     size = measurement.shape[-2], measurement.shape[-1]
     coarsest = levels[0].shrink
     # The grid of a linear convolution, divisible as often as the pyramid halves it.
     rows, columns = (fast_length(-(-(s + p) // coarsest)) * coarsest for s, p in zip(size, psf.shape[-2:], strict=True))
     grid = (rows, columns)
-    psf = psf.float() / psf.float().sum((-2, -1), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
+    psf = psf.float() / psf.float().sum((-2, -1), keepdim=True).clamp(min=tiny)
     H = transfer_function(psf, grid)
-    b = measurement.float()
+    # tau is stated for a measurement of unit mean square.
+    brightness = measurement.float().square().mean((1, 2, 3), keepdim=True).sqrt().clamp(min=tiny)
+    b = measurement.float() / brightness
     sizes = {1: b}
     while max(sizes) < coarsest:
         sizes[2 * max(sizes)] = halve(sizes[max(sizes)])
     scene: Tensor = b.new_zeros((1, 1, 1, 1))
     for level in levels:
         scene = _solve(sizes[level.shrink], low_band(H, grid, level.shrink), level, scene)
-    scene = F.interpolate(scene, size=grid, mode="bilinear").clamp(min=0)
+    scene = F.interpolate(scene, size=grid, mode="bilinear").clamp(min=0) * brightness
     explained = inverse_spectrum(H * spectrum(scene, grid), grid, size)
-    return Explanation(scene[..., : size[0], : size[1]], spectrum(b - explained, grid), H, grid)
+    return Explanation(scene[..., : size[0], : size[1]], spectrum(measurement - explained, grid), H, grid)
 
 
 def halve(picture: Tensor) -> Tensor:
@@ -131,13 +140,13 @@ def halve(picture: Tensor) -> Tensor:
 
     They keep out what half the pixels cannot show much better than the plain mean of 2 x 2.
     """
+    # Sums, not convolutions, which autocast would round to half precision.
     height, width = picture.shape[-2:]
-    weights = torch.tensor([1.0, 3.0, 3.0, 1.0], device=picture.device) / 8
-    planes = picture.reshape(-1, 1, height, width)
-    planes = F.pad(planes, (1, 1 + width % 2, 1, 1 + height % 2), mode="replicate")
-    planes = F.conv2d(planes, weights[None, None, :, None], stride=(2, 1))
-    planes = F.conv2d(planes, weights[None, None, None, :], stride=(1, 2))
-    return planes.reshape(*picture.shape[:2], *planes.shape[-2:])
+    padded = F.pad(picture, (1, 1 + width % 2, 1, 1 + height % 2), mode="replicate")
+    a, b, c, d = (padded[..., i : padded.shape[-2] - 3 + i : 2, :] for i in range(4))
+    rows = (a + d + 3 * (b + c)) / 8
+    a, b, c, d = (rows[..., i : padded.shape[-1] - 3 + i : 2] for i in range(4))
+    return (a + d + 3 * (b + c)) / 8
 
 
 def low_band(transfer: Spectrum, grid: Size, shrink: int) -> Tensor:
@@ -153,11 +162,10 @@ def _solve(measurement: Tensor, H: Tensor, level: Level, coarser: Tensor) -> Ten
     # Penalties are stated for a PSF whose colours have a mean square sum of 1.
     norm = inverse_spectrum(H, grid, grid).square().sum((-2, -1), keepdim=True).mean(1, keepdim=True).sqrt()
     norm = norm.clamp(min=torch.finfo(torch.float32).tiny)
-    transfer = H / norm
-    power = transfer.abs().square()
-    problem = Problem(measurement, transfer, transfer.conj().resolve_conj(), power, power, grid)
+    problem = posed(measurement, H / norm)
     known = F.interpolate(coarser, size=grid, mode="bilinear").clamp(min=0) * norm
-    state = start(problem, known.expand(*measurement.shape[:2], *grid), smooth=False)
+    state = start(problem, known.expand(*measurement.shape[:2], *grid), smooth=level.regularisation > 0)
     for _ in range(level.iterations):
-        state = merge(state, split(state, problem, level.penalties, 0.0, "colour"), problem, level.penalties)
+        copies = split(state, problem, level.penalties, level.regularisation, "colour")
+        state = merge(state, copies, problem, level.penalties)
     return state.v / norm
