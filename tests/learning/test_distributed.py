@@ -63,7 +63,7 @@ def folder(tmp_path_factory):
 def torchrun(folder, *command):
     """Start a command twice."""
     options = {"cwd": folder, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    here = {"GLOO_SOCKET_IFNAME": "lo"} if sys.platform == "linux" else {}
+    here = {"PYTHONFAULTHANDLER": "1"} | ({"GLOO_SOCKET_IFNAME": "lo"} if sys.platform == "linux" else {})
     launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     return subprocess.Popen([*launch, *command], env={**os.environ, **here, "OMP_NUM_THREADS": "1"}, **options)
 
