@@ -508,3 +508,14 @@ def test_a_run_begins_with_the_weights_it_is_given(trainer, tmp_path):
     wider = replace(few(start=start), network={**RECIPE.network, "width": 8})
     with pytest.raises(CheckpointError, match="must hold the network of the recipe"):
         trainer(wider, "third")
+
+
+def test_a_run_with_a_pool_that_is_stopped_ends_as_one_that_was_not(trainer, tmp_path):
+    pooled = few(pool=3)
+    trainer(pooled, "whole").run()
+    stopped = trainer(pooled, "stopped")
+    while stopped.step < 3:
+        stopped.advance()
+    stopped.save(stopped.validate())
+    trainer(pooled, "stopped").run()
+    assert same(tmp_path / "whole" / "last.safetensors", tmp_path / "stopped" / "last.safetensors")

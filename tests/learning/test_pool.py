@@ -1,0 +1,79 @@
+"""Kept samples: computed once, used as often as an epoch comes round, mirrored, and the same after a stop."""
+
+import pytest
+import torch
+from torch import nn
+
+from mwdn.data.simulated import Pair
+from mwdn.errors import ParameterError
+from mwdn.learning.pool import Pool
+from mwdn.networks import build
+
+
+class Counted:
+    """A source whose sample n is the number n, in one corner twice that."""
+
+    name = "counted"
+
+    def __init__(self, size=(4, 4)):
+        self.size, self.asked = size, []
+
+    def batch(self, numbers):
+        self.asked += numbers
+        picture = torch.stack([torch.full((1, *self.size), float(number)) for number in numbers])
+        picture[..., 0, 0] *= 2
+        return Pair(picture, picture + 100)
+
+
+class Same(nn.Module):
+    def estimates(self, measurement, psf):
+        return measurement
+
+    def correct(self, estimates):
+        return estimates
+
+
+def pool(pairs, size=3):
+    return Pool(pairs, Same(), torch.ones(1, 1, *pairs.size), size=size, seed=0)
+
+
+def test_each_epoch_has_each_sample_once_and_computes_none_twice():
+    pairs = Counted()
+    kept = pool(pairs)
+    for epoch in range(4):
+        estimates, scenes = kept.batch(range(3 * epoch, 3 * epoch + 3))
+        assert sorted(estimates.amin((1, 2, 3)).tolist()) == [0, 1, 2]
+        torch.testing.assert_close(scenes, estimates + 100)
+    assert sorted(pairs.asked) == [0, 1, 2]
+
+
+def test_a_sample_comes_in_all_ways_a_square_can_lie():
+    kept = pool(Counted(), size=1)
+    marked = Counted()
+    marked.batch = lambda numbers: Pair(*2 * (torch.arange(16.0).view(1, 1, 4, 4),))
+    kept.pairs = marked
+    ways = {tuple(kept.batch([number])[0].flatten().tolist()) for number in range(8)}
+    assert len(ways) == 8
+
+
+def test_a_frame_of_two_lengths_keeps_them():
+    kept = pool(Counted((4, 6)), size=1)
+    assert {tuple(kept.batch([number])[0].shape) for number in range(8)} == {(1, 1, 4, 6)}
+
+
+def test_a_number_is_the_same_sample_whatever_came_before():
+    one, other = pool(Counted()), pool(Counted())
+    other.batch(range(7))
+    torch.testing.assert_close(one.batch([7])[0], other.batch([7])[0])
+
+
+def test_a_network_that_learns_from_the_first_step_on_is_refused():
+    with pytest.raises(ParameterError, match=r"`pool` \(5\) keeps .*UNet learns from the first step on"):
+        Pool(Counted(), build("unet", width=2), torch.ones(1, 1, 4, 4), size=5, seed=0)
+
+
+def test_the_bank_is_its_correction_of_its_estimates(generator):
+    network = build("wiener-bank", width=2).eval()
+    psf = torch.rand(1, 3, 32, 32, generator=generator)
+    measurement = torch.rand(2, 3, 32, 32, generator=generator)
+    torch.testing.assert_close(network.correct(network.estimates(measurement, psf)), network(measurement, psf))
