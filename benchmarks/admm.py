@@ -17,7 +17,7 @@ import scipy.fft
 import torch
 
 from mwdn.optics.patterns import contour_psf
-from mwdn.solvers import TEXTBOOK, Admm
+from mwdn.solvers import TEXTBOOK, Admm, Pyramid
 
 SIZE, ITERATIONS = (270, 480), 100
 
@@ -73,6 +73,7 @@ def main():
         "textbook, float32": lambda: textbook(b[0].numpy(), h[0].numpy(), np.float32),
         "mwdn, same constants": lambda: solver(b, h)[0].numpy(),
         "mwdn, defaults": lambda: Admm(iterations=ITERATIONS)(b, h)[0].numpy(),
+        "mwdn, pyramid": lambda: Pyramid()(b, h)[0].numpy(),
     }
     seconds, results = {name: [] for name in contenders}, {}
     for _ in range(arguments.repeats):

@@ -98,7 +98,7 @@ def reconstruct(
     Args:
         captures: raw frames of the camera.
         camera: its calibration.
-        method: admm, wiener, fista, or the path of a checkpoint.
+        method: admm, pyramid, wiener, fista, or the path of a checkpoint.
         regularisation: tau of admm or lambda of wiener; less keeps more detail and more noise.
         out: folder for the pictures; summary.png shows the first twelve beside their measurements.
         format: png and png16 are sRGB for people, tiff and npy hold the linear float32 values.
@@ -171,7 +171,7 @@ def evaluate(
     """Compare methods on pairs of measurements and scenes: quality, time, memory.
 
     Args:
-        methods: admm, wiener, fista, or paths of checkpoints.
+        methods: admm, pyramid, wiener, fista, or paths of checkpoints.
         data: HDF5 file of pairs.
         camera: calibration of the camera that took them.
         protocol: full, centre-128 (the paper's), or rows and columns such as 60:270,60:440 (DiffuserCam's).

@@ -33,22 +33,22 @@ class Same(nn.Module):
         return estimates
 
 
-def pool(pairs, size=3):
-    return Pool(pairs, Same(), torch.ones(1, 1, *pairs.size), size=size, seed=0)
+def pool(pairs, size=6, batch=2):
+    return Pool(pairs, Same(), torch.ones(1, 1, *pairs.size), size=size, batch=batch, seed=0)
 
 
 def test_each_epoch_has_each_sample_once_and_computes_none_twice():
     pairs = Counted()
     kept = pool(pairs)
     for epoch in range(4):
-        estimates, scenes = kept.batch(range(3 * epoch, 3 * epoch + 3))
-        assert sorted(estimates.amin((1, 2, 3)).tolist()) == [0, 1, 2]
+        estimates, scenes = kept.batch(range(6 * epoch, 6 * epoch + 6))
+        assert sorted(estimates.amin((1, 2, 3)).tolist()) == [0, 1, 2, 3, 4, 5]
         torch.testing.assert_close(scenes, estimates + 100)
-    assert sorted(pairs.asked) == [0, 1, 2]
+    assert sorted(pairs.asked) == [0, 1, 2, 3, 4, 5]
 
 
 def test_a_sample_comes_in_all_ways_a_square_can_lie():
-    kept = pool(Counted(), size=1)
+    kept = pool(Counted(), size=1, batch=1)
     marked = Counted()
     marked.batch = lambda numbers: Pair(*2 * (torch.arange(16.0).view(1, 1, 4, 4),))
     kept.pairs = marked
@@ -57,7 +57,7 @@ def test_a_sample_comes_in_all_ways_a_square_can_lie():
 
 
 def test_a_frame_of_two_lengths_keeps_them():
-    kept = pool(Counted((4, 6)), size=1)
+    kept = pool(Counted((4, 6)), size=1, batch=1)
     assert {tuple(kept.batch([number])[0].shape) for number in range(8)} == {(1, 1, 4, 6)}
 
 
@@ -67,9 +67,20 @@ def test_a_number_is_the_same_sample_whatever_came_before():
     torch.testing.assert_close(one.batch([7])[0], other.batch([7])[0])
 
 
+def test_a_place_in_the_batch_has_samples_of_its_own():
+    """So a process, which always has the same places, computes no sample of another."""
+    pairs = Counted()
+    kept = pool(pairs)
+    for number in range(0, 24, 2):
+        kept.batch([number])
+    assert sorted(pairs.asked) == [0, 2, 4]
+
+
 def test_a_network_that_learns_from_the_first_step_on_is_refused():
     with pytest.raises(ParameterError, match=r"`pool` \(5\) keeps .*UNet learns from the first step on"):
-        Pool(Counted(), build("unet", width=2), torch.ones(1, 1, 4, 4), size=5, seed=0)
+        Pool(Counted(), build("unet", width=2), torch.ones(1, 1, 4, 4), size=5, batch=1, seed=0)
+    with pytest.raises(ParameterError, match=r"`pool` \(5\) must be a multiple of `batch` \(2\)"):
+        pool(Counted(), size=5)
 
 
 def test_the_bank_is_its_correction_of_its_estimates(generator):

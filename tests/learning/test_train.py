@@ -511,7 +511,7 @@ def test_a_run_begins_with_the_weights_it_is_given(trainer, tmp_path):
 
 
 def test_a_run_with_a_pool_that_is_stopped_ends_as_one_that_was_not(trainer, tmp_path):
-    pooled = few(pool=3)
+    pooled = few(pool=4)
     trainer(pooled, "whole").run()
     stopped = trainer(pooled, "stopped")
     while stopped.step < 3:

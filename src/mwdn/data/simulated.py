@@ -61,6 +61,7 @@ class Mismatch:
         turn_degrees: rotation of the PSF.
         scale: relative magnification of the PSF.
         blur_px: standard deviation of a Gaussian blur of the PSF.
+        sharpen: how much finer than its calibration the PSF is: weight of what a blur by one pixel takes from it.
         background: even light under the PSF, as a part of its sum.
         colour_shift_px: displacement of red and blue against green.
         vignetting: relative loss of light in the corners of the measurement.
@@ -78,6 +79,7 @@ class Mismatch:
     vignetting: float = 0.1
     tilt: float = 0.0
     grain: float = 0.0
+    sharpen: float = 0.0
     full: bool = False
 
     def __post_init__(self) -> None:
@@ -266,6 +268,10 @@ def perturb(psf: Psf, mismatch: Mismatch, generators: list[torch.Generator]) -> 
     planes = psf.reshape(batch * channels, 1, height, width)
     grid = F.affine_grid(theta.to(psf), list(planes.shape), align_corners=False)
     moved = F.grid_sample(planes, grid, mode="bilinear", align_corners=False)
+    if mismatch.sharpen:
+        amount = mismatch.size(generators, mismatch.sharpen)[:, 0].repeat_interleave(channels)[:, None, None, None]
+        fine = moved - _blur(moved, torch.ones(len(moved), device=moved.device))
+        moved = (moved + amount.to(moved) * fine).clamp(min=0)
     sigma = mismatch.size(generators, mismatch.blur_px)[:, 0].repeat_interleave(channels)
     blurred = _blur(moved, sigma.to(psf)).reshape(psf.shape)
     if mismatch.grain:

@@ -18,20 +18,24 @@ class Pool:
         pairs: where the samples come from; its numbers 0 to ``size`` - 1 are used.
         network: computes the estimates.
         psf: of the camera, where the pairs have none of their own.
-        size: how many samples are kept, as half precision in memory: 4 MB each at 320 x 320.
-        seed: of their order and of the ways they are turned.
+        size: how many samples are kept, as half precision in memory: 4 MB each at 320 x 320. A multiple of ``batch``.
+        batch: samples of a step. Each place in a batch has samples of its own, so that each process keeps its own.
+        seed: of their order.
 
     Raises:
-        ParameterError: the network learns in its estimates, or has none.
+        ParameterError: the network learns in its estimates, or has none; or the size is no multiple of the batch.
     """
 
-    def __init__(self, pairs: Samples, network: nn.Module, psf: Psf, *, size: int, seed: int) -> None:
+    def __init__(self, pairs: Samples, network: nn.Module, psf: Psf, *, size: int, batch: int, seed: int) -> None:
+        if size % batch:
+            raise ParameterError(f"`pool` ({size}) must be a multiple of `batch` ({batch}).")
         if not (hasattr(network, "estimates") and hasattr(network, "correct")):
             raise ParameterError(
                 f"`pool` ({size}) keeps what a network computes before it learns; {type(network).__name__} learns from "
                 "the first step on. Set `pool = 0`."
             )
-        self.pairs, self.network, self.psf, self.size, self.seed = pairs, network, psf, size, seed
+        self.pairs, self.network, self.psf = pairs, network, psf
+        self.size, self.together, self.seed = size, batch, seed
         self.kept: dict[int, tuple[Tensor, Tensor]] = {}
 
     def batch(self, numbers: range | list[int]) -> tuple[Tensor, Tensor]:
@@ -43,8 +47,10 @@ class Pool:
 
     def _turned(self, number: int) -> tuple[Tensor, Tensor]:
         epoch, place = divmod(number, self.size)
-        order = torch.randperm(self.size, generator=torch.Generator().manual_seed(self.seed * 1_000_003 + epoch))
-        estimates, scene = self._sample(int(order[place]))
+        step, slot = divmod(place, self.together)
+        generator = torch.Generator().manual_seed((self.seed * 1_000_003 + epoch) * self.together + slot)
+        order = torch.randperm(self.size // self.together, generator=generator)
+        estimates, scene = self._sample(int(order[step]) * self.together + slot)
         # The mirror images of a square; a frame of two lengths is not turned on its side.
         way = epoch + place
         axes = [axis for axis, bit in ((-1, 1), (-2, 2)) if way & bit]

@@ -99,8 +99,8 @@ class Trainer:
         self.average.load_state_dict(self.network.state_dict())
         distributed.freeze_cancelled(self.network)
         distributed.synchronise(self.network, self.device)
-        size, seed = self.schedule.pool, self.schedule.seed
-        self.pool = Pool(pairs, self.network, self.psf, size=size, seed=seed) if size else None
+        size, batch, seed = self.schedule.pool, self.schedule.batch, self.schedule.seed
+        self.pool = Pool(pairs, self.network, self.psf, size=size, batch=batch, seed=seed) if size else None
         self.loss = Loss(recipe.loss, alexnet=alexnet).to(self.device)
         self.optimiser = optimiser(self.network, self.schedule)
         self.course = begin(recipe)
