@@ -3,11 +3,11 @@
 import math
 
 import torch
-from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.errors import ParameterError
 from mwdn.fourier import Size, filter_field, frequencies
+from mwdn.optics.drawing import contour_lines
 from mwdn.types import Plane, Psf
 
 
@@ -38,7 +38,7 @@ def contour_psf(size: Size, *, line: float = 1.2, cell: int = 24, generator: tor
     y = torch.linspace(-1, 1, height)[:, None]
     x = torch.linspace(-1, 1, width)
     aperture = ((1 - y.abs()) / 0.25).clamp(0, 1) * ((1 - x.abs()) / 0.25).clamp(0, 1)
-    psf = _zero_lines(field, line, 1e-3) * aperture
+    psf = contour_lines(field, line, 1e-3) * aperture
     return psf / psf.sum()
 
 
@@ -75,11 +75,4 @@ def contours(
     field = filter_field(torch.randn(size, generator=generator).to(torch.complex64), ring).real
     # The steepest slopes of such noise are about pi / spacing of its standard deviation; a place where it only
     # touches zero, with hardly any slope, would otherwise become a wide blot.
-    return _zero_lines(field / field.std(), line, 0.3 * math.pi / spacing)
-
-
-def _zero_lines(field: Tensor, line: float, flattest: float) -> Tensor:
-    slope = torch.stack(torch.gradient(field, dim=(-2, -1))).square().sum(0).sqrt()
-    # Distance from the zero contour in pixels is value over slope; a line is a Gaussian of it.
-    distance = field / slope.clamp(min=flattest)
-    return torch.exp(-0.5 * (distance / (line / 2.355)).square())
+    return contour_lines(field / field.std(), line, 0.3 * math.pi / spacing)
