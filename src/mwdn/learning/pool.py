@@ -11,7 +11,8 @@ from mwdn.types import Psf
 class Pool:
     """A finite number of samples, used again and again, each time mirrored or turned another way.
 
-    For networks whose forward pass is ``correct(estimates(measurement, psf))`` with nothing to learn in ``estimates``.
+    For networks whose forward pass is ``correct(estimates, unit(estimates))``, where ``estimates`` of the measurement
+    and the PSF have nothing to learn.
     A sample enters when it is first needed, so a run begins at once and a stopped one goes on as it would have.
 
     Args:
@@ -19,6 +20,7 @@ class Pool:
         network: computes the estimates.
         psf: of the camera, where the pairs have none of their own.
         size: how many samples are kept, as half precision in memory: 4 MB each at 320 x 320. A multiple of ``batch``.
+        crop: side of the square that is cut out at random each time; 0 for the whole frame.
         batch: samples of a step. Each place in a batch has samples of its own, so that each process keeps its own.
         seed: of their order.
 
@@ -26,7 +28,9 @@ class Pool:
         ParameterError: the network learns in its estimates, or has none; or the size is no multiple of the batch.
     """
 
-    def __init__(self, pairs: Samples, network: nn.Module, psf: Psf, *, size: int, batch: int, seed: int) -> None:
+    def __init__(
+        self, pairs: Samples, network: nn.Module, psf: Psf, *, size: int, batch: int, crop: int, seed: int
+    ) -> None:
         if size % batch:
             raise ParameterError(f"`pool` ({size}) must be a multiple of `batch` ({batch}).")
         if not (hasattr(network, "estimates") and hasattr(network, "correct")):
@@ -35,34 +39,42 @@ class Pool:
                 "the first step on. Set `pool = 0`."
             )
         self.pairs, self.network, self.psf = pairs, network, psf
-        self.size, self.together, self.seed = size, batch, seed
-        self.kept: dict[int, tuple[Tensor, Tensor]] = {}
+        self.size, self.together, self.crop, self.seed = size, batch, crop, seed
+        self.kept: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
 
-    def batch(self, numbers: range | list[int]) -> tuple[Tensor, Tensor]:
-        """Estimates and scenes of the samples of these numbers, which may be of any epoch."""
+    def batch(self, numbers: range | list[int]) -> tuple[Tensor, Tensor, Tensor]:
+        """Estimates, units and scenes of the samples of these numbers, which may be of any epoch."""
         with torch.autocast(self.psf.device.type, enabled=False):
             samples = [self._turned(number) for number in numbers]
-            estimates, scenes = zip(*samples, strict=True)
-            return torch.stack(estimates).float(), torch.stack(scenes).float()
+            estimates, units, scenes = (torch.stack(each).float() for each in zip(*samples, strict=True))
+        return estimates, units, scenes
 
-    def _turned(self, number: int) -> tuple[Tensor, Tensor]:
+    def _turned(self, number: int) -> tuple[Tensor, Tensor, Tensor]:
         epoch, place = divmod(number, self.size)
         step, slot = divmod(place, self.together)
         generator = torch.Generator().manual_seed((self.seed * 1_000_003 + epoch) * self.together + slot)
         order = torch.randperm(self.size // self.together, generator=generator)
-        estimates, scene = self._sample(int(order[step]) * self.together + slot)
+        generator.manual_seed(self.seed * 1_000_003 + number + 1)  # now for this sample alone
+        estimates, unit, scene = self._sample(int(order[step]) * self.together + slot)
         # The mirror images of a square; a frame of two lengths is not turned on its side.
         way = epoch + place
         axes = [axis for axis, bit in ((-1, 1), (-2, 2)) if way & bit]
         estimates, scene = estimates.flip(axes), scene.flip(axes)
         if way & 4 and scene.shape[-2] == scene.shape[-1]:
             estimates, scene = estimates.transpose(-2, -1), scene.transpose(-2, -1)
-        return estimates, scene
+        if self.crop:
+            height, width = (min(self.crop, length) for length in scene.shape[-2:])
+            at = torch.rand(2, generator=generator)
+            top, left = (int(at[i] * (scene.shape[i - 2] - side + 1)) for i, side in enumerate((height, width)))
+            part = (..., slice(top, top + height), slice(left, left + width))
+            estimates, scene = estimates[part], scene[part]
+        return estimates, unit, scene
 
     @torch.no_grad()
-    def _sample(self, row: int) -> tuple[Tensor, Tensor]:
+    def _sample(self, row: int) -> tuple[Tensor, Tensor, Tensor]:
         if row not in self.kept:
             measurement, scene, psf = self.pairs.batch([row])
             estimates = self.network.estimates(measurement, self.psf if psf is None else psf)  # type: ignore[operator]
-            self.kept[row] = estimates[0].half(), scene[0].half()
+            unit = self.network.unit(estimates)  # type: ignore[operator]
+            self.kept[row] = estimates[0].half(), unit[0], scene[0].half()
         return self.kept[row]

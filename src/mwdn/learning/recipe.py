@@ -45,6 +45,7 @@ class Schedule:
         seed: of initial weights and data.
         pool: keep so many samples and what the network computes of them before its learned part, and use them again,
             mirrored; 0 makes every sample a new one. For `wiener-bank`.
+        crop: side of the square of a kept sample that is learned from at a time; 0 for all of it.
         start: weights to begin with instead, `universal` or the path of a checkpoint of the same network.
     """
 
@@ -63,13 +64,14 @@ class Schedule:
     validation: int = 16
     seed: int = 0
     pool: int = 0
+    crop: int = 0
     start: str = ""
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "learning_rate", "validate_every", "validation"):
             if not getattr(self, name) > 0:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) must be positive.")
-        for name in ("epochs", "warmup", "weight_decay", "clip", "pool"):
+        for name in ("epochs", "warmup", "weight_decay", "clip", "pool", "crop"):
             if not getattr(self, name) >= 0:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) must not be negative.")
         if not 0 <= self.ema < 1:

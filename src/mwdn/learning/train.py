@@ -99,8 +99,9 @@ class Trainer:
         self.average.load_state_dict(self.network.state_dict())
         distributed.freeze_cancelled(self.network)
         distributed.synchronise(self.network, self.device)
-        size, batch, seed = self.schedule.pool, self.schedule.batch, self.schedule.seed
-        self.pool = Pool(pairs, self.network, self.psf, size=size, batch=batch, seed=seed) if size else None
+        kept = {name: getattr(self.schedule, name) for name in ("batch", "crop", "seed")}
+        size = self.schedule.pool
+        self.pool = Pool(pairs, self.network, self.psf, size=size, **kept) if size else None
         self.loss = Loss(recipe.loss, alexnet=alexnet).to(self.device)
         self.optimiser = optimiser(self.network, self.schedule)
         self.course = begin(recipe)
@@ -181,8 +182,8 @@ class Trainer:
     def _reconstruct(self, numbers: range) -> tuple[Tensor, Tensor]:
         """Reconstructions of the samples of these numbers, and their scenes."""
         if self.pool is not None:
-            estimates, scene = self.pool.batch(numbers)
-            return self.network.correct(estimates), scene  # type: ignore[operator]
+            estimates, unit, scene = self.pool.batch(numbers)
+            return self.network.correct(estimates, unit), scene  # type: ignore[operator]
         measurement, scene, psf = self.pairs.batch(numbers)
         seen = measurement.contiguous(memory_format=torch.channels_last)
         return self.network(seen, self.psf if psf is None else psf), scene

@@ -60,7 +60,8 @@ class WienerBank(nn.Module):
 
     def forward(self, measurement: Measurement, psf: Psf) -> Scene:
         """Scene (B, C, H, W), each colour deconvolved with its own PSF."""
-        return self.correct(self.estimates(measurement, psf))
+        estimates = self.estimates(measurement, psf)
+        return self.correct(estimates, self.unit(estimates))
 
     def estimates(self, measurement: Measurement, psf: Psf) -> Tensor:
         """Estimates of the scene, the smoothest first, and the measurement: (B, C * pictures, H, W)."""
@@ -73,10 +74,13 @@ class WienerBank(nn.Module):
             scenes = [wiener(measurement, psf, value, boundary=self.boundary) for value in self.regularisations]
         return torch.cat([*scenes, measurement.float()], dim=1)
 
-    def correct(self, estimates: Tensor) -> Scene:
-        """Scene (B, C, H, W) from `estimates`: the learned part, a correction of the smoothest."""
+    def unit(self, estimates: Tensor) -> Tensor:
+        """Brightest pixel of the smoothest of `estimates`, (B, 1, 1, 1)."""
+        return estimates[:, : self.channels].detach().amax((1, 2, 3), keepdim=True).clamp(min=1e-6)
+
+    def correct(self, estimates: Tensor, unit: Tensor) -> Scene:
+        """Scene (B, C, H, W) from `estimates`, or a part of them: the learned part, a correction of the smoothest."""
         first = estimates[:, : self.channels]
-        unit = first.detach().amax((1, 2, 3), keepdim=True).clamp(min=1e-6)
         height, width = estimates.shape[-2:]
         below, right = (max(-size % self.fold, 16 * self.fold - size) for size in (height, width))
         folded = F.pixel_unshuffle(F.pad(estimates / unit, (0, right, 0, below)), self.fold)

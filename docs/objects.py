@@ -1,0 +1,39 @@
+"""Real objects of the paper's camera by ADMM, by ADMM from coarse to fine, and by a trained network.
+
+    python docs/objects.py ../shared/data/mwdn-camera runs/mine/best.safetensors [docs/objects.jpg]
+
+The network was trained for `psf_320.png`; the larger captures are of the same mask through `psf_480.tif`.
+"""
+
+import sys
+from pathlib import Path
+
+import cv2
+import torch
+
+from mwdn import Calibration, Reconstructor, for_people, read_frame
+from mwdn.data.images import srgb_encode
+from mwdn.data.sheets import contact_sheet
+
+
+def main(camera: Path, weights: str, out: Path = Path("docs/objects.jpg")) -> None:
+    """Reconstruct all captures and draw the sheet."""
+    rows = []
+    for pattern, psf in (("object_*", "psf_320.png"), ("scene*", "psf_480.tif")):
+        calibration = Calibration.from_file(camera / psf)
+        methods = [Reconstructor(method, calibration) for method in ("admm", "pyramid", weights)]
+        for capture in sorted((camera / "real-objects").glob(pattern)):
+            measurement = calibration.correct(read_frame(capture))
+            found = [for_people(method(measurement)) for method in methods]
+            top = (found[0].shape[-1] - 200) // 2  # the objects stand in the middle 200 x 200 pixels
+            rows.append([picture[..., top : top + 200, top : top + 200] for picture in found])
+    # Two halves beside each other: a page is wider than high.
+    half = (len(rows) + 1) // 2
+    pairs = [left + right for left, right in zip(rows[:half], rows[half:], strict=True)]
+    sheet = srgb_encode(contact_sheet(pairs, 2 * ["ADMM", "pyramid", "network"], height=200))
+    cv2.imwrite(str(out), (sheet[0].flip(0).permute(1, 2, 0) * 255).round().byte().numpy())
+
+
+if __name__ == "__main__":
+    with torch.inference_mode():
+        main(Path(sys.argv[1]), sys.argv[2], *map(Path, sys.argv[3:]))
