@@ -13,7 +13,7 @@ from mwdn.data.captures import read_capture
 from mwdn.data.images import write_linear, write_picture
 from mwdn.data.sheets import for_people
 from mwdn.errors import ParameterError, ShapeError, UnknownNameError
-from mwdn.learning.checkpoint import PRETRAINED, SUFFIXES, load_network, read_metadata
+from mwdn.learning.checkpoint import SUFFIXES, load_network, read_metadata
 from mwdn.learning.devices import usable
 from mwdn.types import Measurement, Psf, Scene
 
@@ -22,7 +22,7 @@ Method = Callable[[Measurement, Psf], Scene]
 
 
 def find_method(name: str | Path, regularisation: float | None = None) -> Method:
-    """Find a solver or pretrained network by its name, or a network by the path of its checkpoint.
+    """Find a solver by its name, or a network by the path of its checkpoint.
 
     Args:
         name: the name or the path.
@@ -38,9 +38,9 @@ def find_method(name: str | Path, regularisation: float | None = None) -> Method
     if str(name) in solvers.SOLVERS:
         return solvers.build(str(name), **({} if regularisation is None else {"regularisation": regularisation}))
     path = Path(name)
-    if str(name) in PRETRAINED or path.suffix in SUFFIXES or path.is_file():
+    if path.suffix in SUFFIXES or path.is_file():
         return load_network(path)
-    raise UnknownNameError("method", str(name), [*PRETRAINED, *solvers.SOLVERS, "PATH/OF/CHECKPOINT.safetensors"])
+    raise UnknownNameError("method", str(name), [*solvers.SOLVERS, "PATH/OF/CHECKPOINT.safetensors"])
 
 
 def _other_camera(method: str | Path, calibration: Calibration) -> str | None:

@@ -18,9 +18,6 @@ from mwdn.networks import build
 SUFFIXES = frozenset({".safetensors", ".pt", ".pth", ".tar", ".ckpt"})
 """Suffixes of files that hold weights."""
 
-PRETRAINED = {"universal": Path(__file__).parents[1] / "weights" / "universal.safetensors"}
-"""Weights that come with the package, by the name that ``--method`` and a recipe's ``start`` know them by."""
-
 
 def save_network(
     path: str | Path,
@@ -81,13 +78,13 @@ def load_network(path: str | Path) -> nn.Module:
     """Build the network that a file describes, with its weights, on the CPU, in evaluation mode.
 
     Args:
-        path: one of `PRETRAINED`, a checkpoint of this package (``.safetensors``), or one of the MWDN authors
-            (``.tar`` and the like, read without unpickling code).
+        path: a checkpoint of this package (``.safetensors``), or one of the MWDN authors (``.tar`` and the like,
+            read without unpickling code).
 
     Raises:
         CheckpointError: damaged, of unknown layout, or its weights do not fit its network.
     """
-    path = PRETRAINED.get(str(path), Path(path))
+    path = Path(path)
     if not path.is_file():
         raise CheckpointError(f"No checkpoint at `{path}`. Check the name; the current folder is `{Path.cwd()}`.")
     if path.suffix != ".safetensors":

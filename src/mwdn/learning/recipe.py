@@ -46,7 +46,7 @@ class Schedule:
         pool: keep so many samples and what the network computes of them before its learned part, and use them again,
             mirrored; 0 makes every sample a new one. For `wiener-bank`.
         crop: side of the square of a kept sample that is learned from at a time; 0 for all of it.
-        start: weights to begin with instead, `universal` or the path of a checkpoint of the same network.
+        start: weights to begin with instead, the path of a checkpoint of the same network.
     """
 
     steps: int = 2000
