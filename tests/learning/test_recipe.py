@@ -6,6 +6,7 @@ import re
 import pytest
 
 from conftest import ROOT
+from mwdn.data.cameras import Cameras
 from mwdn.data.simulated import Mismatch, Placement
 from mwdn.errors import ParameterError, UnknownNameError
 from mwdn.learning.recipe import Recipe, Schedule, read_recipe
@@ -152,3 +153,10 @@ def test_recipe_of_the_paper():
 def test_no_such_file(tmp_path):
     with pytest.raises(ParameterError, match=r"`.*none\.toml` cannot be read as a recipe"):
         read_recipe(tmp_path / "none.toml")
+
+
+def test_kept_samples_of_several_sizes_need_a_crop():
+    several = Cameras(("32x32", "48x32"))
+    with pytest.raises(ParameterError, match="Set `crop`"):
+        Recipe(schedule=Schedule(pool=4), cameras=several)
+    assert Recipe(schedule=Schedule(pool=4, crop=32), cameras=several).cameras == several

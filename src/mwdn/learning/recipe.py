@@ -157,6 +157,10 @@ class Recipe:
                 f"[{name}] belongs to another course than '{self.schedule.course}'. "
                 'Leave it out, or set `course = "plateau"` in [schedule].'
             )
+        if self.schedule.pool and not self.schedule.crop and len(set(self.cameras.sizes)) > 1:
+            raise ParameterError(
+                "Kept samples of several sizes, [cameras], make no batch. Set `crop` in [schedule] to the smallest side."
+            )
         if self.later_loss and self.later_loss.keys() != self.loss.keys():
             raise ParameterError(
                 f"[later_loss] ({', '.join(self.later_loss)}) must have the parts of [loss] ({', '.join(self.loss)}). "
