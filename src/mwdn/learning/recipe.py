@@ -159,7 +159,7 @@ class Recipe:
             )
         if self.schedule.pool and not self.schedule.crop and len(set(self.cameras.sizes)) > 1:
             raise ParameterError(
-                "Kept samples of several sizes, [cameras], make no batch. Set `crop` in [schedule] to the smallest side."
+                "Kept samples of several sizes, [cameras], make no batch. Set `crop` of [schedule] to the least side."
             )
         if self.later_loss and self.later_loss.keys() != self.loss.keys():
             raise ParameterError(
