@@ -82,7 +82,7 @@ class WienerBank(nn.Module):
         """Scene (B, C, H, W) from `estimates`, or a part of them: the learned part, a correction of the smoothest."""
         first = estimates[:, : self.channels]
         height, width = estimates.shape[-2:]
-        below, right = (max(-size % self.fold, 16 * self.fold - size) for size in (height, width))
+        below, right = (max(-size % self.fold, 32 * self.fold - size) for size in (height, width))
         folded = F.pixel_unshuffle(F.pad(estimates / unit, (0, right, 0, below)), self.fold)
         folded = folded.contiguous(memory_format=torch.channels_last)
         correction = F.pixel_shuffle(self.decoder(self.encoder(folded)), self.fold)[..., :height, :width]
