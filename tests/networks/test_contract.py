@@ -144,7 +144,7 @@ def test_overfits_four_pairs(name, generator):
     network = small(name, width=16).train()
     optimiser = torch.optim.Adam(network.parameters(), lr=5e-3 if name != "wiener" else 1e-1)
     losses = []
-    for _ in range(60):
+    for _ in range(120):
         loss = F.mse_loss(network(b, h), scene)
         optimiser.zero_grad()
         loss.backward()
