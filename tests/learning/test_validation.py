@@ -47,7 +47,7 @@ def test_means_over_the_samples_whatever_the_batch(batch):
     loss = Loss({"mse": 1.0, "l1": 0.0})  # the training is at another weighting
     found = Validator(recipe, pairs, PSF)(Darker(), loss, "step 3")
     assert pairs.asked == list(range(START, START + 5))
-    measurement, scene = Numbered().batch(pairs.asked)
+    measurement, scene, _ = Numbered().batch(pairs.asked)
     error = 1.5 * measurement - 0.2 - scene
     clipped = (1.5 * measurement - 0.2).clamp(0, 1) - scene
     assert found.loss == pytest.approx(float(error.square().mean() + 0.5 * error.abs().mean()), rel=1e-5)
@@ -61,7 +61,7 @@ def test_captures_stand_beside_the_pairs(shown):
     captures = torch.rand(shown, 3, *SIZE)
     network = Darker()
     sheet = Validator(RECIPE, Numbered(), PSF, captures)(network, Loss(RECIPE.loss), "step 3").sheet
-    measurement, scene = Numbered().batch(range(START, START + 5))
+    measurement, scene, _ = Numbered().batch(range(START, START + 5))
     white = torch.ones(1, 1, *SIZE)
     rows = [[m[None], network(m[None], PSF), s[None]] for m, s in zip(measurement, scene, strict=True)]
     rows += [[white] * 3] * (min(shown, 6) - 5)
@@ -73,6 +73,6 @@ def test_captures_stand_beside_the_pairs(shown):
 
 def test_sheet_without_captures():
     sheet = Validator(RECIPE, Numbered(), PSF)(Darker(), Loss(RECIPE.loss), "step 3").sheet
-    measurement, scene = Numbered().batch(range(START, START + 5))
+    measurement, scene, _ = Numbered().batch(range(START, START + 5))
     rows = [[m[None], 1.5 * m[None] - 0.2, s[None]] for m, s in zip(measurement, scene, strict=True)]
     torch.testing.assert_close(sheet, contact_sheet(rows, ["measurement", "step 3", "scene"]))
