@@ -154,3 +154,16 @@ def test_designed_camera_keeps_its_light():
     assert 0.9 < designed.light.sum((-2, -1)).min() <= designed.light.sum((-2, -1)).max() < 1.02
     other = design_camera("diffuser", replace(Diffuser(size_mm=(0.5, 0.5)), seed=1), setup)
     assert other.report()["made"]["psf_hash"] != designed.report()["made"]["psf_hash"]
+
+
+def test_sensitivity_falls_with_the_distance_from_where_the_psf_was_taken(run, tmp_path):
+    status, _, said = run("diffuser", "--size-mm", "0.5", "0.5", *SMALL, "--sensitivity")
+    assert status == 0, said
+    likeness = json.loads((tmp_path / "cam" / "camera.json").read_text())["likeness"]
+    angles = likeness["angle_degrees"]
+    # So small an aperture moves its pattern and hardly changes it.
+    assert all(0.8 < value < 1 for value in angles.values())
+    assert "10" not in angles  # the pitch of 2 um cannot sample it
+    near, half, far = (likeness["source_mm"][key] for key in ("50", "100", "800"))
+    assert 0.8 < near < half < 1
+    assert near < far < 1  # the wave from far away is nearly flat already

@@ -43,6 +43,8 @@ class Output:
     """Folder for mask.tif, psf.tif, camera.json and preview.png."""
     recipe: Path | None = None
     """TOML file with options of this command; those on the command line go before."""
+    sensitivity: bool = False
+    """Say how alike the PSFs of nearer, farther and off-axis points are. Takes several times as long."""
     gds: bool = False
     """Write mask.gds too: one layer a lithography mask."""
     stl: bool = False
@@ -55,7 +57,7 @@ class Output:
         from mwdn.design import design_camera, write_fabrication
 
         designed = design_camera(name, mask, setup)
-        designed.write(self.out)
+        designed.write(self.out, sensitive=self.sensitivity)
         write_fabrication(designed, self.out, gds=self.gds, stl=self.stl, stl_every=self.stl_every)
         made = designed.report()["made"]
         light = ", ".join(f"{part:.1%}" for part in made["light_on_sensor"])

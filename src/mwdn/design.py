@@ -11,15 +11,19 @@ import torch
 from torch import Tensor
 
 from mwdn.calibration import Calibration
+from mwdn.calibration.measures import sensitivity
 from mwdn.data.images import write_linear, write_picture
 from mwdn.data.sheets import contact_sheet, thumbnail
 from mwdn.data.writing import atomic
-from mwdn.errors import ImageError
+from mwdn.errors import ImageError, ParameterError
 from mwdn.fourier import correlate, frequencies, spectrum
 from mwdn.optics.mask_files import write_gds, write_mask, write_stl
 from mwdn.optics.masks import Mask, MaskDesign, mask_psf, numbers
 from mwdn.optics.setup import Setup
 from mwdn.types import Image, Psf
+
+ANGLES = (1.0, 2.0, 5.0, 10.0)
+"""Degrees off the axis at which `Designed.sensitivity` looks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,21 +77,52 @@ class Designed:
             },
         }
 
-    def write(self, out: Path) -> None:
+    def sensitivity(self) -> dict[str, dict[str, float]]:
+        """Likeness of the PSF with that of a point nearer, farther, or off the axis; 1 where it is the same.
+
+        See `mwdn.calibration.measures.likeness`. Three wavelengths stand for the band. Angles stop where the mask's
+        pitch cannot sample the light any more.
+        """
+        quick = dataclasses.replace(self.setup, wavelengths=min(3, self.setup.wavelengths))
+        source = self.setup.source_mm
+
+        def at_distance(mm: float) -> Psf:
+            return mask_psf(self.mask, dataclasses.replace(quick, source_mm=mm))
+
+        def at_angle(degrees: float) -> Psf:
+            return mask_psf(self.mask, quick, angle_degrees=(0.0, degrees))
+
+        far = 1e3 * self.setup.distance_mm  # beyond a thousand times it, nothing changes any more
+        distances = [part * min(source, far) for part in (0.25, 0.5, 2.0, 4.0)]
+        alike = sensitivity(at_distance, distances, reference=source)
+        aside: dict[str, float] = {}
+        for angle in ANGLES:
+            try:
+                aside[f"{angle:g}"] = round(sensitivity(at_angle, [angle])[0], 4)
+            except ParameterError:
+                break  # steeper light than the mask's pitch can sample
+        return {
+            "source_mm": {f"{mm:g}": round(value, 4) for mm, value in zip(distances, alike, strict=True)},
+            "angle_degrees": aside,
+        }
+
+    def write(self, out: Path, *, sensitive: bool = False) -> None:
         """Write mask.tif, psf.tif, camera.json and preview.png; files of the same names are replaced.
 
         Args:
             out: a folder; created if missing.
+            sensitive: camera.json holds `sensitivity` too.
 
         Raises:
             ImageError: a file cannot be written.
         """
+        report = self.report() | ({"likeness": self.sensitivity()} if sensitive else {})
         write_mask(out / "mask.tif", self.mask)
         write_linear(out / "psf.tif", self.stored)
         write_picture(out / "preview.png", contact_sheet([self.pictures()], ["mask (middle)", "PSF", "spectrum"]))
         try:
             with atomic(out / "camera.json") as temporary:
-                temporary.write_text(json.dumps(self.report(), indent=2), encoding="utf-8")
+                temporary.write_text(json.dumps(report, indent=2), encoding="utf-8")
         except OSError as error:
             raise ImageError(f"`{out}` cannot be written to: {error.strerror or error}.") from error
 
