@@ -100,7 +100,9 @@ def test_exact_camera_without_noise_is_the_forward_model(photographs, psf):
 
     The measurement is in units of the scene: full scale is brightest / exposure of it.
     """
-    pairs = SimulatedPairs(photographs, psf, placement=PLAIN, mismatch=EXACT, sensor=CLEAN, exposure=(0.8, 0.8))
+    pairs = SimulatedPairs(
+        photographs, psf, placement=replace(PLAIN, exposure=(0.8, 0.8)), mismatch=EXACT, sensor=CLEAN
+    )
     measurement, scene, _ = pairs.batch(range(3))
     expected = Camera(psf).forward(scene)
     full_scale = expected.amax((1, 2, 3), keepdim=True) / 0.8
@@ -123,11 +125,13 @@ def test_exposure_sets_brightness_over_saturation(photographs, psf):
     """The brightest pixel in steps of 4 bits; beyond saturation many pixels are equally bright."""
     coarse = replace(CLEAN, bit_depth=4)
     for exposure, levels in ((0.4, 6), (0.8, 12), (1.0, 15)):
-        pairs = SimulatedPairs(photographs, psf, mismatch=EXACT, sensor=coarse, exposure=(exposure, exposure))
+        light = Placement(exposure=(exposure, exposure))
+        pairs = SimulatedPairs(photographs, psf, placement=light, mismatch=EXACT, sensor=coarse)
         for measurement in pairs.batch(range(3)).measurement:
             step = measurement[measurement > 1e-6].min()  # of the converter, in units of the scene
             assert round(float(measurement.max() / step)) == levels
-    over = SimulatedPairs(photographs, psf, mismatch=EXACT, sensor=CLEAN, exposure=(2.0, 2.0)).batch(range(2))
+    bright = Placement(exposure=(2.0, 2.0))
+    over = SimulatedPairs(photographs, psf, placement=bright, mismatch=EXACT, sensor=CLEAN).batch(range(2))
     for measurement in over.measurement:
         assert (measurement > 0.999 * measurement.max()).sum() > 10
 
@@ -138,10 +142,9 @@ def test_noise_of_a_flat_scene_is_the_sensors(tmp_path):
     pairs = SimulatedPairs(
         one(tmp_path, np.full((16, 16, 3), 255, np.uint8)),
         delta(96, 96),
-        placement=replace(PLAIN, extent=(1.5, 1.5)),
+        placement=replace(PLAIN, extent=(1.5, 1.5), exposure=(0.5, 0.5)),
         mismatch=EXACT,
         sensor=sensor,
-        exposure=(0.5, 0.5),
     )
     measurement, scene, _ = pairs.batch(range(4))
     assert torch.equal(scene, torch.ones_like(scene))

@@ -31,7 +31,7 @@ RECIPE = f"""
 name = "wiener-bank"
 width = 4
 fold = 1
-crop_aware = false
+finest = 0
 [schedule]
 steps = {STEPS}
 batch = 3
@@ -122,7 +122,7 @@ def assert_alike(found, expected):
     found, expected = load_file(found / "state.safetensors"), load_file(expected / "state.safetensors")
     assert found.keys() == expected.keys()
     torch.manual_seed(0)
-    start = build("wiener-bank", width=4, fold=1, crop_aware=False)
+    start = build("wiener-bank", width=4, fold=1, finest=0)
     names = [name for name, _ in start.named_parameters()]
     moved = torch.cat([(expected[f"network.{n}"] - start.state_dict()[n]).flatten() for n in names])
     apart = torch.cat([(expected[f"network.{n}"] - found[f"network.{n}"]).flatten() for n in names])
@@ -173,7 +173,7 @@ def test_run_begun_by_one_process_goes_on_with_two(one, worked):
 def test_bias_before_batch_norm_is_not_learned(one):
     """Its gradient is rounding noise, of which Adam would make steps as large as any."""
     torch.manual_seed(0)
-    network = build("wiener-bank", width=4, fold=1, crop_aware=False)
+    network = build("wiener-bank", width=4, fold=1, finest=0)
     distributed.freeze_cancelled(network)
     frozen = [name for name, parameter in network.named_parameters() if not parameter.requires_grad]
     assert len(frozen) == 18  # two in each of five and four scales

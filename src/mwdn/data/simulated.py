@@ -32,6 +32,7 @@ class Placement:
         turn_degrees: drawn from [-turn, turn].
         offset: displacement of its centre, over half the space beside it; 1 lets it touch the border.
         ambient: light that reaches the whole sensor from elsewhere, over the mean of the measurement.
+        exposure: brightest pixel of the measurement over saturation: the less, the noisier.
     """
 
     extent: Range = (0.3, 0.7)
@@ -39,13 +40,16 @@ class Placement:
     turn_degrees: float = 10.0
     offset: float = 0.6
     ambient: Range = (0.0, 0.05)
+    exposure: Range = (0.4, 0.95)
 
     def __post_init__(self) -> None:
-        for name, (low, high) in (("extent", self.extent), ("ambient", self.ambient)):
+        for name in ("extent", "ambient", "exposure"):
+            low, high = getattr(self, name)
             if not 0 <= low <= high:
                 raise ParameterError(f"`{name}` ({low}, {high}) must be a range: not negative, the smaller one first.")
-        if not self.extent[0] > 0:
-            raise ParameterError(f"`extent` {self.extent} must be positive: a part of the sensor's shorter side.")
+        for name, of in (("extent", "the sensor's shorter side"), ("exposure", "saturation")):
+            if not getattr(self, name)[0] > 0:
+                raise ParameterError(f"`{name}` {getattr(self, name)} must be positive: a part of {of}.")
         if not self.aspect >= 1:
             raise ParameterError(f"`aspect` ({self.aspect}) must be at least 1, a square.")
         if not 0 <= self.offset <= 1:
@@ -163,7 +167,6 @@ class SimulatedPairs:
         placement: how photographs stand in the scene.
         mismatch: how the camera differs from its calibration.
         sensor: noise, black level and saturation.
-        exposure: brightest pixel of a measurement over saturation, a range.
         seed: of everything.
     """
 
@@ -172,7 +175,6 @@ class SimulatedPairs:
     placement: Placement = Placement()
     mismatch: Mismatch = Mismatch()
     sensor: Sensor = Sensor()
-    exposure: Range = (0.4, 0.95)
     seed: int = 0
 
     @property
@@ -196,7 +198,7 @@ class SimulatedPairs:
         ambient = uniform(generators, *self.placement.ambient)[..., None, None].to(light)
         light = light + ambient * light.mean((1, 2, 3), keepdim=True)
         brightest = light.amax((1, 2, 3), keepdim=True).clamp(min=1e-6)
-        gain = uniform(generators, *self.exposure)[..., None, None].to(light) / brightest
+        gain = uniform(generators, *self.placement.exposure)[..., None, None].to(light) / brightest
         exposed = torch.cat([self._expose(one, g) for one, g in zip(light * gain, generators, strict=True)])
         return Pair(exposed / gain, scene)
 

@@ -6,8 +6,9 @@ from torch.nn import functional as F
 
 from mwdn.errors import ParameterError
 from mwdn.fourier import Boundary, wiener
-from mwdn.networks.blocks import Decoder, Encoder, Pooling, paper_widths, peak_one
-from mwdn.solvers.pyramid import explain
+from mwdn.networks.blocks import Decoder, Encoder, paper_widths, peak_one
+from mwdn.solvers.alignment import align
+from mwdn.solvers.pyramid import LEVELS, explain
 from mwdn.types import Measurement, Psf, Scene
 
 
@@ -29,9 +30,11 @@ class WienerBank(nn.Module):
         fold: pixels along each side of the blocks that the U-Net sees as one pixel of more channels. With 2 it takes
             a quarter of the time and sees twice as far; the estimates it corrects keep the full resolution.
         regularisations: lambda of each estimate, for a PSF of unit sum, the strongest first.
-        crop_aware: filter what the iterations left; else the measurement itself.
-        pooling: between the encoder's scales.
-        boundary: what stands beyond the measurement unless ``crop_aware``, see `mwdn.fourier.Boundary`.
+        finest: pixels of the measurement along each side of those of the finest iterations: 1, 2, 4 or 8. With 4 they
+            take a tenth of the time and leave the detail to the bank. 0 for none: the bank filters the measurement.
+        align: turn and scale the PSF first until it explains the measurement (`mwdn.solvers.alignment`). In training
+            PSFs are taken as they are: let the captures be mismatched by what the alignment leaves.
+        boundary: what stands beyond the measurement if ``finest`` is 0, see `mwdn.fourier.Boundary`.
     """
 
     def __init__(
@@ -41,25 +44,30 @@ class WienerBank(nn.Module):
         width: int = 24,
         fold: int = 2,
         regularisations: tuple[float, ...] = (1e-3, 1e-4, 2e-5),
-        crop_aware: bool = True,
-        pooling: Pooling = "max",
+        finest: int = 1,
+        align: bool = True,
         boundary: Boundary = "taper",
     ) -> None:
         super().__init__()
         if not regularisations or min(regularisations) <= 0:
             raise ParameterError(f"`regularisations` {tuple(regularisations)} must be one or more positive numbers.")
+        if finest not in (0, *(level.shrink for level in LEVELS)):
+            raise ParameterError(f"`finest` ({finest}) must be 0 or one of {[level.shrink for level in LEVELS]}.")
         if fold < 1:
             raise ParameterError(f"`fold` ({fold}) must be at least 1.")
         self.channels, self.fold, self.regularisations = channels, fold, regularisations
-        self.crop_aware, self.boundary = crop_aware, boundary
-        pictures = len(regularisations) + (2 if crop_aware else 1)
-        self.encoder = Encoder(channels * pictures * fold**2, paper_widths(width), pooling=pooling)
+        self.align, self.boundary = align, boundary
+        self.levels = tuple(level for level in LEVELS if finest and level.shrink >= finest)
+        pictures = len(regularisations) + (2 if self.levels else 1)
+        self.encoder = Encoder(channels * pictures * fold**2, paper_widths(width))
         self.decoder = Decoder(channels * fold**2, paper_widths(width))
         with torch.no_grad():
             self.decoder.head.weight.mul_(0.1)  # begin near the estimate
 
     def forward(self, measurement: Measurement, psf: Psf) -> Scene:
         """Scene (B, C, H, W), each colour deconvolved with its own PSF."""
+        if self.align and not self.training:
+            psf = align(measurement, psf).move(psf)
         estimates = self.estimates(measurement, psf)
         return self.correct(estimates, self.unit(estimates))
 
@@ -67,8 +75,8 @@ class WienerBank(nn.Module):
         """Estimates of the scene, the smoothest first, and the measurement: (B, C * pictures, H, W)."""
         psf = peak_one(psf, measurement)
         psf = psf / psf.sum((-2, -1), keepdim=True)
-        if self.crop_aware:
-            found = explain(measurement, psf)
+        if self.levels:
+            found = explain(measurement, psf, self.levels)
             scenes = [found.scene, *(found.scene + found.detail(value) for value in self.regularisations)]
         else:
             scenes = [wiener(measurement, psf, value, boundary=self.boundary) for value in self.regularisations]

@@ -11,6 +11,7 @@ from torch.nn import functional as F
 from mwdn.errors import ParameterError, ShapeError
 from mwdn.fourier import Size, convolve, correlate, fast_length, frequency_grid, inverse_spectrum, spectrum
 from mwdn.optics.sensor import Sensor
+from mwdn.optics.warp import warp
 from mwdn.types import Image, Measurement, Psf, Scene
 
 FieldPsfs = Float[Tensor, "rows columns psf_channel psf_height psf_width"]
@@ -67,7 +68,7 @@ class Aberration:
         # Direction e to the axis: 1 + scale along all directions, and stretch along e e^T besides.
         e = torch.tensor([y, x]) / math.hypot(y, x)
         matrix = (1 + self.scale * square) * torch.eye(2) + self.stretch * square * torch.outer(e, e)
-        changed = _warp(psf, matrix) if self.scale or self.stretch else psf
+        changed = warp(psf, matrix) if self.scale or self.stretch else psf
         if self.blur_px:
             changed = gaussian_blur(changed, self.blur_px * math.sqrt(square)).clamp(min=0)
         # The warp kept the brightness; a larger PSF has the same light on more pixels.
@@ -192,15 +193,3 @@ def gaussian_blur(image: Image, sigma: float) -> Image:
     rows, columns = frequency_grid(grid, device=image.device)
     transfer = torch.exp(-2 * math.pi**2 * sigma**2 * (rows.square() + columns.square()))
     return inverse_spectrum(spectrum(image, grid) * transfer, grid, size)
-
-
-def _warp(psf: Psf, matrix: Tensor) -> Psf:
-    """Map a PSF by a 2 x 2 matrix of (row, column) displacements from its centre ``(h // 2, w // 2)``."""
-    height, width = psf.shape[-2:]
-    y = torch.arange(height, device=psf.device)[:, None] - height // 2
-    x = torch.arange(width, device=psf.device)[None] - width // 2
-    inverse = torch.linalg.inv(matrix).tolist()
-    rows = inverse[0][0] * y + inverse[0][1] * x + height // 2
-    columns = inverse[1][0] * y + inverse[1][1] * x + width // 2
-    grid = torch.stack([(2 * columns + 1) / width - 1, (2 * rows + 1) / height - 1], -1)
-    return F.grid_sample(psf, grid[None].to(psf), mode="bicubic", align_corners=False).clamp(min=0)

@@ -1,0 +1,28 @@
+"""Turn, scale and shear PSFs about their centre."""
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from mwdn.types import Psf
+
+
+def warp(psf: Psf, matrix: Tensor) -> Tensor:
+    """Map PSFs by 2 x 2 matrices of (row, column) displacements from their centre ``(h // 2, w // 2)``; bicubic.
+
+    Args:
+        psf: (1 or B, C, h, w). Its brightness is kept, so its sum changes with the matrix's determinant.
+        matrix: (2, 2), or (B, 2, 2) for one of each PSF.
+
+    Returns:
+        (B, C, h, w), not negative; darkness comes in from beyond the frame.
+    """
+    height, width = psf.shape[-2:]
+    inverse = torch.linalg.inv(matrix.to(psf)).expand(max(len(psf), len(matrix.reshape(-1, 2, 2))), 2, 2)
+    y = torch.arange(height, device=psf.device)[:, None] - height // 2
+    x = torch.arange(width, device=psf.device)[None] - width // 2
+    a, b, c, d = inverse.flatten(1).T[..., None, None]
+    rows, columns = a * y + b * x + height // 2, c * y + d * x + width // 2
+    grid = torch.stack([(2 * columns + 1) / width - 1, (2 * rows + 1) / height - 1], -1)
+    psf = psf.expand(len(grid), -1, -1, -1)
+    return F.grid_sample(psf, grid, mode="bicubic", align_corners=False).clamp(min=0)

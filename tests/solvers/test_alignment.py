@@ -1,0 +1,89 @@
+"""Poses found from captures alone, of cameras that scipy has turned and magnified."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import affine_transform
+
+from mwdn.errors import ShapeError
+from mwdn.optics.camera import Camera
+from mwdn.optics.patterns import contour_psf
+from mwdn.solvers.alignment import Pose, align
+from mwdn.solvers.pyramid import Pyramid
+
+SIZE = (144, 160)
+
+
+@pytest.fixture(scope="module")
+def psf():
+    return contour_psf(SIZE, generator=torch.Generator().manual_seed(4))
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    """Two scenes of coloured rectangles."""
+    generator = torch.Generator().manual_seed(5)
+    scenes = torch.zeros(2, 3, *SIZE)
+    for scene in scenes:
+        for _ in range(25):
+            top, left = torch.randint(30, 100, (2,), generator=generator).tolist()
+            scene[:, top : top + 12, left : left + 16] = torch.rand(3, 1, 1, generator=generator)
+    return scenes
+
+
+def turned(psf, degrees, scale):
+    """Cubic splines and a matrix that asks where each pixel comes from: nothing of `warp`."""
+    angle, (rows, columns) = np.deg2rad(degrees), psf.shape[-2:]
+    # Clockwise on the screen, rows downward: what was to the right goes down.
+    forward = scale * np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    inverse, centre = np.linalg.inv(forward), np.array([rows // 2, columns // 2])
+    planes = [affine_transform(p, inverse, centre - inverse @ centre) for p in psf[0].double().numpy()]
+    moved = torch.from_numpy(np.stack(planes)).float()[None].clamp(min=0)
+    return moved / moved.sum((-2, -1), keepdim=True)
+
+
+def captured(psf, scenes):
+    light = Camera(psf).forward(scenes)
+    noise = torch.randn(light.shape, generator=torch.Generator().manual_seed(1))
+    return light + 0.003 * light.amax() * noise
+
+
+@pytest.mark.parametrize(("degrees", "scale"), [(1.2, 1.0), (-0.8, 1.015), (0.6, 0.985), (0.0, 1.0)])
+def test_the_pose_is_found_from_the_capture_alone(psf, scenes, degrees, scale):
+    pose = align(captured(turned(psf, degrees, scale), scenes), psf, steps=3)
+    torch.testing.assert_close(pose.turn_degrees, torch.full((2,), degrees), rtol=0, atol=0.15)
+    torch.testing.assert_close(pose.scale, torch.full((2,), scale - 1), rtol=0, atol=0.003)
+
+
+def test_a_turned_psf_equals_scipys(psf):
+    moved = Pose(torch.tensor([2.0, -3.0]), torch.tensor([0.03, -0.02])).move(psf)
+    for one, expected in zip(moved, (turned(psf, 2.0, 1.03), turned(psf, -3.0, 0.98)), strict=True):
+        inside = (slice(None), slice(8, -8), slice(8, -8))
+        error = (one[inside] - expected[0][inside]).norm() / expected[0][inside].norm()
+        assert error < 0.06  # bicubic convolution against cubic splines, on lines of two pixels
+    torch.testing.assert_close(moved.sum((-2, -1)), torch.ones(2, moved.shape[1]))
+
+
+def test_each_capture_has_its_own_pose_whatever_its_brightness(psf, scenes):
+    measurement = torch.cat([captured(turned(psf, 1.0, 1.0), scenes[:1]), captured(psf, scenes[1:])])
+    together = align(measurement * torch.tensor([7.0, 0.1])[:, None, None, None], psf)
+    for number in range(2):
+        alone = align(measurement[number : number + 1], 5 * psf)
+        assert together.turn_degrees[number] == pytest.approx(float(alone.turn_degrees), abs=0.01)
+        assert together.scale[number] == pytest.approx(float(alone.scale), abs=2e-4)
+    assert together.turn_degrees[0] > 0.8 > 0.2 > abs(together.turn_degrees[1])
+
+
+def test_pictures_gain_what_the_calibration_had_lost(psf, scenes):
+    measurement = captured(turned(psf, 1.2, 1.015), scenes)
+    found = align(measurement, psf, steps=3).move(psf)
+    solve = Pyramid()
+    before, after = ((solve(measurement, each) - scenes).square().mean() for each in (psf, found))
+    assert after < 0.6 * before
+
+
+def test_darkness_and_odd_sizes_leave_the_psf_alone(psf):
+    pose = align(torch.zeros(1, 3, 51, 43), psf[..., :37, :39])
+    assert pose.turn_degrees.item() == pose.scale.item() == 0.0
+    with pytest.raises(ShapeError, match="channels"):
+        align(torch.zeros(1, 3, 51, 43), psf.expand(1, 2, -1, -1))
