@@ -33,7 +33,7 @@ def save_network(
         network: as built by ``build(name, **options)``.
         name: of the network.
         options: it was built with; plain values that JSON can hold.
-        **metadata: more to remember, for example the recipe, the PSF's hash, metrics.
+        **metadata: more to remember, for example the recipe, the PSF's hash, metrics, the version that trained it.
 
     Raises:
         CheckpointError: another suffix.
@@ -42,7 +42,7 @@ def save_network(
 
     if Path(path).suffix != ".safetensors":
         raise CheckpointError(f"`{path}` must end in .safetensors, not '{Path(path).suffix}'. Rename it.")
-    header = {"name": name, "options": options, "version": __version__, **metadata}
+    header = {"version": __version__, **metadata, "name": name, "options": options}
     tensors = {key: value.detach().cpu().contiguous() for key, value in network.state_dict().items()}
     with atomic(Path(path)) as temporary:
         save_file(tensors, temporary, metadata={"mwdn": json.dumps(header)})
@@ -100,7 +100,7 @@ def load_network(path: str | Path) -> nn.Module:
     with safe_open(path, framework="pt") as file:
         state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     try:
-        network.load_state_dict(state)
+        network.load_state_dict(state)  # float16 in files that come with the package, float32 here
     except RuntimeError as error:
         raise CheckpointError(f"`{path}` does not fit the network '{header['name']}' it names: {error}") from error
     return network.eval()
