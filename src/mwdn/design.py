@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from mwdn.calibration import Calibration
-from mwdn.calibration.measures import sensitivity
+from mwdn.calibration.measures import likeness
 from mwdn.data.images import write_linear, write_picture
 from mwdn.data.sheets import contact_sheet, thumbnail
 from mwdn.data.writing import atomic
@@ -84,27 +84,21 @@ class Designed:
         pitch cannot sample the light any more.
         """
         quick = dataclasses.replace(self.setup, wavelengths=min(3, self.setup.wavelengths))
-        source = self.setup.source_mm
-
-        def at_distance(mm: float) -> Psf:
-            return mask_psf(self.mask, dataclasses.replace(quick, source_mm=mm))
-
-        def at_angle(degrees: float) -> Psf:
-            return mask_psf(self.mask, quick, angle_degrees=(0.0, degrees))
-
-        far = 1e3 * self.setup.distance_mm  # beyond a thousand times it, nothing changes any more
-        distances = [part * min(source, far) for part in (0.25, 0.5, 2.0, 4.0)]
-        alike = sensitivity(at_distance, distances, reference=source)
+        known = mask_psf(self.mask, quick)
+        # Beyond a thousand times the distance of mask and sensor, nothing changes any more.
+        source = min(self.setup.source_mm, 1e3 * self.setup.distance_mm)
+        away: dict[str, float] = {}
+        for mm in (part * source for part in (0.25, 0.5, 2.0, 4.0)):
+            psf = mask_psf(self.mask, dataclasses.replace(quick, source_mm=mm))
+            away[f"{mm:g}"] = round(likeness(psf, known), 4)
         aside: dict[str, float] = {}
         for angle in ANGLES:
             try:
-                aside[f"{angle:g}"] = round(sensitivity(at_angle, [angle])[0], 4)
+                psf = mask_psf(self.mask, quick, angle_degrees=(0.0, angle))
             except ParameterError:
                 break  # steeper light than the mask's pitch can sample
-        return {
-            "source_mm": {f"{mm:g}": round(value, 4) for mm, value in zip(distances, alike, strict=True)},
-            "angle_degrees": aside,
-        }
+            aside[f"{angle:g}"] = round(likeness(psf, known), 4)
+        return {"source_mm": away, "angle_degrees": aside}
 
     def write(self, out: Path, *, sensitive: bool = False) -> None:
         """Write mask.tif, psf.tif, camera.json and preview.png; files of the same names are replaced.
