@@ -1,7 +1,6 @@
 """A designed camera in files: mask, PSF, numbers and a picture."""
 
 import dataclasses
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +11,10 @@ from torch import Tensor
 
 from mwdn.calibration import Calibration
 from mwdn.calibration.measures import likeness
+from mwdn.calibration.report import write_json
 from mwdn.data.images import write_linear, write_picture
 from mwdn.data.sheets import contact_sheet, thumbnail
-from mwdn.data.writing import atomic
-from mwdn.errors import ImageError, ParameterError
+from mwdn.errors import ParameterError
 from mwdn.fourier import correlate, frequencies, spectrum
 from mwdn.optics.mask_files import write_gds, write_mask, write_stl
 from mwdn.optics.masks import Mask, MaskDesign, mask_psf, numbers
@@ -55,14 +54,13 @@ class Designed:
         return self.psf / self.psf.max()
 
     def report(self) -> dict[str, Any]:
-        """All numbers, as plain values that JSON can hold; a source at infinity is None."""
+        """All numbers, as plain values that JSON can hold; None is infinite: a source's distance, a focal length."""
         rows, columns = self.setup.size
         pitch_mm = self.setup.pitch_um / 1e3
         width = sharpness(self.psf)
-        far = {"source_mm": None if math.isinf(self.setup.source_mm) else self.setup.source_mm}  # JSON has no infinity
         return {
-            "mask": {"name": self.name} | dataclasses.asdict(self.design),  # type: ignore[call-overload]
-            "setup": dataclasses.asdict(self.setup) | far,
+            "mask": {"name": self.name} | _plain(dataclasses.asdict(self.design)),  # type: ignore[call-overload]
+            "setup": _plain(dataclasses.asdict(self.setup)),
             "made": numbers(self.mask, self.light)
             | {
                 "psf_size": [rows, columns],
@@ -114,11 +112,7 @@ class Designed:
         write_mask(out / "mask.tif", self.mask)
         write_linear(out / "psf.tif", self.stored)
         write_picture(out / "preview.png", contact_sheet([self.pictures()], ["mask (middle)", "PSF", "spectrum"]))
-        try:
-            with atomic(out / "camera.json") as temporary:
-                temporary.write_text(json.dumps(report, indent=2), encoding="utf-8")
-        except OSError as error:
-            raise ImageError(f"`{out}` cannot be written to: {error.strerror or error}.") from error
+        write_json(out / "camera.json", report)
 
     def pictures(self) -> list[Tensor]:
         """Middle of the mask, PSF and its spectrum, for `contact_sheet`."""
@@ -182,6 +176,11 @@ def decades(psf: Psf, lowest: float = 3.0) -> Image:
     rest = torch.cat([rest[..., :1, :], rest[..., 1:, :].flip(-2)], dim=-2)
     whole = torch.cat([half, rest], dim=-1).roll((size[0] // 2, (size[1] - 1) // 2), dims=(-2, -1))
     return (1 + (whole / whole.amax()).clamp(min=10**-lowest).log10() / lowest) ** 2.2
+
+
+def _plain(numbers: dict[str, Any]) -> dict[str, Any]:
+    """JSON has no infinity."""
+    return {name: None if value == math.inf else value for name, value in numbers.items()}
 
 
 def _unit(psf: Psf) -> Psf:
