@@ -1,6 +1,5 @@
 """What a PSF can do, in numbers: autocorrelation, spectrum, noise gain, resolution, support."""
 
-import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -9,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mwdn.errors import ParameterError
-from mwdn.fourier import Size, fast_length, frequency_grid, inverse_spectrum, spectrum
+from mwdn.fourier import Size, fast_length, frequency_grid, gaussian_transfer, inverse_spectrum, spectrum
 from mwdn.types import Psf
 
 CONTRAST = 0.5
@@ -176,9 +175,7 @@ def autocorrelation(psf: Psf) -> Autocorrelation:
 
 def _detail(plane: Tensor, grid: Size) -> Tensor:
     """Spectrum of a picture without what is wider than 1/20 of its shorter side (standard deviation)."""
-    rows, columns = frequency_grid(grid, device=plane.device)
-    sigma = min(plane.shape) / 20
-    smooth = torch.exp(-2 * math.pi**2 * sigma**2 * (rows.square() + columns.square()))
+    smooth = gaussian_transfer(grid, min(plane.shape) / 20, device=plane.device)
     return spectrum(plane[None, None], grid)[0, 0] * (1 - smooth)
 
 
