@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mwdn.calibration import Calibration
-from mwdn.calibration.measures import likeness
+from mwdn.calibration.measures import likeness, ring_means
 from mwdn.calibration.report import write_json
 from mwdn.data.images import write_linear, write_picture
 from mwdn.data.sheets import contact_sheet, thumbnail
@@ -156,7 +156,9 @@ def radial_autocorrelation(psf: Psf, reach: int = 40) -> Tensor:
     channels = centred.transpose(0, 1)
     both = torch.cat([correlate(one[None], one[None]) for one in channels]).sum((0, 1))
     rows, columns = (torch.arange(n) - n // 2 for n in both.shape)
-    return _rings(both, torch.hypot(rows[:, None].double(), columns.double()), min(reach, min(both.shape) // 2))
+    distance = torch.hypot(rows[:, None].double(), columns.double())
+    means = ring_means(both, distance, min(reach, min(both.shape) // 2))
+    return means / means[0]
 
 
 def radial_spectrum(psf: Psf, bins: int = 60) -> Tensor:
@@ -164,7 +166,8 @@ def radial_spectrum(psf: Psf, bins: int = 60) -> Tensor:
     size = (psf.shape[-2], psf.shape[-1])
     power = spectrum(psf, size).abs().square().mean((0, 1))
     v, u = frequencies(size[0]), frequencies(size[1])[: size[1] // 2 + 1].abs()
-    return (_rings(power, torch.hypot(v[:, None], u) * 2 * bins, bins) * power[0, 0]).sqrt()
+    means = ring_means(power, torch.hypot(v[:, None], u) * 2 * bins, bins)
+    return (means / means[0] * power[0, 0]).sqrt()
 
 
 def decades(psf: Psf, lowest: float = 3.0) -> Image:
@@ -185,11 +188,3 @@ def _plain(numbers: dict[str, Any]) -> dict[str, Any]:
 
 def _unit(psf: Psf) -> Psf:
     return psf / psf.sum((-2, -1), keepdim=True)
-
-
-def _rings(values: Tensor, radius: Tensor, count: int) -> Tensor:
-    index = radius.round().long().flatten()
-    inside = index < count
-    sums = torch.zeros(count, dtype=torch.float64).index_add_(0, index[inside], values.double().flatten()[inside])
-    means = sums / torch.bincount(index[inside], minlength=count).clamp(min=1)
-    return means / means[0]
