@@ -11,7 +11,7 @@ from mwdn.data.captures import find_captures, read_captures
 from mwdn.data.pair_writer import Attribute
 from mwdn.data.pairs import PairFile
 from mwdn.data.photographs import Photographs
-from mwdn.data.recorded import recorded_pairs
+from mwdn.data.recorded import HELD_OUT, recorded_pairs
 from mwdn.data.simulated import EXACT, Samples, SimulatedPairs
 from mwdn.errors import ParameterError
 from mwdn.learning import distributed
@@ -19,9 +19,6 @@ from mwdn.learning.recipe import Recipe
 from mwdn.learning.train import Trainer
 from mwdn.learning.validation import SHOWN
 from mwdn.types import Psf
-
-HELD_OUT = 20
-"""Every 20th photograph is for validation."""
 
 FILE_START = 2 * 10**12
 """Number of the first sample of a file: a network trained with the same seed has seen none of them."""
