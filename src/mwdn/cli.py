@@ -2,7 +2,7 @@
 
 import sys
 from contextlib import ExitStack
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, NoReturn
@@ -23,7 +23,7 @@ from mwdn.data.importers import Layout, import_pairs
 from mwdn.data.sheets import contact_sheet, thumbnail
 from mwdn.errors import MwdnError
 from mwdn.evaluation import Variant
-from mwdn.learning.recipe import Recipe, Schedule, read_recipe
+from mwdn.learning.recipe import Recipe, Schedule, Sheet, read_recipe
 from mwdn.learning.train import Report
 from mwdn.reconstruct import (
     SUMMARY,
@@ -243,11 +243,12 @@ def train(  # noqa: PLR0913
     from mwdn.learning.session import prepare
 
     chosen = read_recipe(recipe, steps=steps, batch=batch, seed=seed)
-    shown = [*(captures or map(Path, chosen.sheet.captures))]
-    real = find_captures(shown, apart=(camera.psf, camera.dark)) if shown else []
+    if captures:
+        chosen = replace(chosen, sheet=Sheet(tuple(map(str, captures))))
     columns: list[str | ProgressColumn] = [*Progress.get_default_columns(), "{task.fields[now]}"]
     with distributed.processes(), ExitStack() as stack:
-        trainer = prepare(chosen, camera.load(), photos, out, device, pairs=pairs, captures=real)
+        apart = camera.psf, camera.dark
+        trainer = prepare(chosen, camera.load(), photos, out, device, pairs=pairs, apart=apart)
         first = distributed.rank() == 0
         write = stack.enter_context(Board(out / "tensorboard", trainer.step)) if tensorboard and first else None
         bars = stack.enter_context(Progress(*columns, console=errors, disable=not first))
