@@ -29,7 +29,7 @@ TIERS = [
     ("capture",),
     ("preview",),
     ("design",),
-    ("demo", "doctor", "cli_optics", "cli_inspect", "cli", "__main__"),
+    ("demo", "doctor", "cli_camera", "cli_optics", "cli_inspect", "cli_train", "cli", "__main__"),
     ("",),  # mwdn/__init__.py: the public names
 ]
 RANK = {name: rank for rank, names in enumerate(TIERS) for name in names}

@@ -143,6 +143,7 @@ def test_tensorboard_and_captures(run, camera):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     np.save("second.npy", np.full((32, 40, 3), 0.1, np.float32))
+    (camera / "r.toml").write_text(RECIPE + 'sheet = { captures = ["none.npy"] }', encoding="utf-8")  # not looked for
     code, _, err = run(f"{TRAIN} --tensorboard --captures capture.npy second.npy")
     assert code == 0, err
     events = EventAccumulator("runs/x/tensorboard").Reload()

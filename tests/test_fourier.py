@@ -84,6 +84,14 @@ def test_spectrum_is_numpys(grid, generator):
     close(fourier.inverse_spectrum(found, grid, picture.shape[-2:]), picture)
 
 
+@pytest.mark.parametrize("grid", [(40, 46), (41, 45)])
+def test_gaussian_transfer_blurs_a_point_to_a_gaussian(grid):
+    found = fourier.inverse_spectrum(fourier.gaussian_transfer(grid, 2.5)[None, None], grid, grid)[0, 0]
+    y, x = (torch.minimum(torch.arange(n), n - torch.arange(n)) for n in grid)
+    expected = torch.exp(-(y[:, None].square() + x.square()) / (2 * 2.5**2)) / (2 * torch.pi * 2.5**2)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-7)
+
+
 @pytest.mark.parametrize(("scene", "psf", "size"), SIZES)
 def test_convolve_is_the_sum_over_points(scene, psf, size, generator):
     v, h = noise((1, 1, *scene), generator), noise((1, 1, *psf), generator)

@@ -1,30 +1,27 @@
 """The command line: one short function a command."""
 
 import sys
-from contextlib import ExitStack
-from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, NoReturn
 
 import cyclopts
 from cyclopts import App, Parameter
-from rich.console import Console
 from rich.markup import escape
-from rich.progress import Progress, ProgressColumn, track
+from rich.progress import Progress, track
 from torch import Tensor
 
 from mwdn import __version__
-from mwdn.calibration import Calibration
+from mwdn.cli_camera import CameraOptions, console, errors
+from mwdn.cli_inspect import inspect
 from mwdn.cli_optics import design
+from mwdn.cli_train import simulate, train
 from mwdn.data.captures import find_captures
 from mwdn.data.images import write_picture
 from mwdn.data.importers import Layout, import_pairs
 from mwdn.data.sheets import contact_sheet, thumbnail
 from mwdn.errors import MwdnError
 from mwdn.evaluation import Variant
-from mwdn.learning.recipe import Recipe, Schedule, read_recipe
-from mwdn.learning.train import Report
 from mwdn.reconstruct import (
     SUMMARY,
     Format,
@@ -38,49 +35,8 @@ app = App(
     version=__version__,
     help="From the caustic pattern of a lensless camera to a picture. Add --debug to see where an error comes from.",
 )
-app.command(design)
-console = Console()
-errors = Console(stderr=True)
-
-
-@Parameter(name="*")
-@dataclass(frozen=True)
-class CameraOptions:
-    """The camera's calibration and how its raw frames are stored."""
-
-    psf: Path
-    """Picture of a point source: PNG, TIFF or NPY, linear in light."""
-    _: KW_ONLY
-    dark: Path | None = None
-    """Frame taken without light, subtracted from PSF and captures."""
-    background: float | None = None
-    """Even light under the PSF, as a part of the full scale; estimated unless given."""
-    bit_depth: int | None = None
-    """Bits of the sensor, where its numbers do not fill the file's type."""
-    crop: tuple[int, int] | None = None
-    """Height and width of the middle part of each frame to use."""
-    bin: int = 1
-    """Average blocks of so many pixels along each axis."""
-    psf_bin: int | None = None
-    """The same for the PSF, where it was taken at another resolution than the captures."""
-    upside_down: bool = False
-    """The files' first row is the picture's last (DiffuserCam's .npy)."""
-    bgr: bool = False
-    """The files' channels are blue, green, red (DiffuserCam's .npy)."""
-
-    def load(self) -> Calibration:
-        """Read the calibration."""
-        return Calibration.from_file(
-            self.psf,
-            dark=self.dark,
-            background="estimate" if self.background is None else self.background,
-            bit_depth=self.bit_depth,
-            crop=self.crop,
-            binning=self.bin,
-            psf_binning=self.psf_bin,
-            upside_down=self.upside_down,
-            bgr=self.bgr,
-        )
+for command in (design, inspect, simulate, train):
+    app.command(command)
 
 
 @app.command
@@ -204,100 +160,6 @@ def evaluate(
 
 
 @app.command
-def train(  # noqa: PLR0913
-    recipe: Path,
-    *,
-    camera: CameraOptions,
-    photos: Path | None = None,
-    pairs: Path | None = None,
-    captures: Annotated[list[Path] | None, Parameter(consume_multiple=True, negative=())] = None,
-    out: Path = Path("runs/train"),
-    steps: int | None = None,
-    batch: int | None = None,
-    seed: int | None = None,
-    device: str | None = None,
-    tensorboard: Annotated[bool, Parameter(negative=())] = False,
-) -> None:
-    """Train a network for one camera, on captures simulated through its PSF or on recorded pairs.
-
-    Give either --photos or --pairs. Run again, it goes on where it stopped.
-
-    Several GPUs or machines: torchrun --nproc-per-node 4 -m mwdn train ...
-
-    Args:
-        recipe: TOML file, see recipes/.
-        camera: calibration of the camera.
-        photos: folder of photographs, the more the better: captures of them are simulated.
-        pairs: HDF5 file of recorded pairs, from `mwdn import`; the recipe's [pairs] says which are for what.
-        captures: real captures, files or folders, to be shown on the contact sheet instead of the recipe's.
-        out: folder of the run: best.safetensors is what `mwdn reconstruct --method` takes, validation.png shows the
-            pictures of the latest validation.
-        steps: instead of the recipe's steps or epochs.
-        batch: instead of the recipe's.
-        seed: instead of the recipe's.
-        device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
-        tensorboard: write progress to the folder tensorboard in --out, for `tensorboard --logdir`.
-    """
-    from mwdn.learning import distributed
-    from mwdn.learning.board import Board
-    from mwdn.learning.session import prepare
-
-    chosen = read_recipe(recipe, steps=steps, batch=batch, seed=seed)
-    shown = [*(captures or map(Path, chosen.sheet.captures))]
-    real = find_captures(shown, apart=(camera.psf, camera.dark)) if shown else []
-    columns: list[str | ProgressColumn] = [*Progress.get_default_columns(), "{task.fields[now]}"]
-    with distributed.processes(), ExitStack() as stack:
-        trainer = prepare(chosen, camera.load(), photos, out, device, pairs=pairs, captures=real)
-        first = distributed.rank() == 0
-        write = stack.enter_context(Board(out / "tensorboard", trainer.step)) if tensorboard and first else None
-        bars = stack.enter_context(Progress(*columns, console=errors, disable=not first))
-        bar = bars.add_task("Training", total=trainer.schedule.steps, completed=trainer.step, now="")
-
-        def show(report: Report) -> None:
-            now = f"{report.pictures_per_s:.1f} pictures/s, loss {report.loss:.4f}"
-            bars.update(bar, completed=report.step, now=now)
-            if report.validation is not None:
-                psnr = report.validation.psnr
-                bars.print(f"step {report.step}: validation {psnr:.2f} dB, best {trainer.best:.2f} dB")
-            if write is not None:
-                write(report)
-
-        trainer.run(show)
-    if first:
-        console.print(f"Weights in {out / 'best.safetensors'}", highlight=False, markup=False, soft_wrap=True)
-
-
-@app.command
-def simulate(
-    photos: Path,
-    *,
-    camera: CameraOptions,
-    out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("pairs.h5"),
-    count: int = 100,
-    recipe: Path | None = None,
-    seed: int | None = None,
-    exact: bool = False,
-) -> None:
-    """Write a file of pairs: photographs as scenes, and what the camera would capture of them.
-
-    Args:
-        photos: folder of photographs.
-        camera: calibration of the camera.
-        out: the file of pairs; one that exists is replaced when all has gone well.
-        count: of pairs.
-        recipe: TOML file whose placement, mismatch, sensor and seed are used, see recipes/; defaults unless given.
-        seed: instead of the recipe's.
-        exact: simulate a camera that is exactly what its calibration says.
-    """
-    from mwdn.learning import session
-
-    chosen = read_recipe(recipe, seed=seed) if recipe else Recipe(schedule=Schedule(seed=seed or 0))
-    progress = partial(track, description="Simulating", console=errors, transient=True)
-    session.simulate(chosen, camera.load(), photos, out, count, exact=exact, track=progress)
-    console.print(f"{count:,} pairs written to {out}", markup=False, highlight=False, soft_wrap=True)
-
-
-@app.command
 def demo(*, out: Path = Path("results/demo"), seed: int = 0) -> None:
     """Make a small synthetic camera, capture pictures with it and reconstruct them with every untrained method.
 
@@ -316,9 +178,6 @@ def doctor() -> None:
     from mwdn.doctor import report
 
     report(console)
-
-
-app.command("mwdn.cli_inspect:inspect")  # imported when it is called
 
 
 def _warn(*reconstructors: Reconstructor) -> None:

@@ -10,7 +10,7 @@ from rich.markup import escape
 
 from mwdn.calibration.report import inspect_psf, write_json
 from mwdn.calibration.verdict import headline, verdict
-from mwdn.cli import CameraOptions, console
+from mwdn.cli_camera import CameraOptions, console
 from mwdn.data.images import read_frame
 
 _STYLES = {"bad": "bold red", "mind": "yellow", "good": "green"}

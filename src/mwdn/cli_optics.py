@@ -6,13 +6,11 @@ from typing import Annotated, Any
 
 from cyclopts import App, Parameter
 from cyclopts.config import Toml
-from rich.console import Console
 
+from mwdn.cli_camera import console
 from mwdn.errors import ParameterError
 from mwdn.optics import CodedAperture, Contour, Diffuser, Lenslets, Pinholes, Setup, ZoneAperture
 from mwdn.optics.masks import MaskDesign
-
-console = Console()
 
 
 def _recipe(app: App, commands: tuple[str, ...], arguments: Any) -> None:  # noqa: ANN401

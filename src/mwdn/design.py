@@ -1,7 +1,6 @@
 """A designed camera in files: mask, PSF, numbers and a picture."""
 
 import dataclasses
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,11 +10,11 @@ import torch
 from torch import Tensor
 
 from mwdn.calibration import Calibration
-from mwdn.calibration.measures import sensitivity
+from mwdn.calibration.measures import likeness, ring_means
+from mwdn.calibration.report import write_json
 from mwdn.data.images import write_linear, write_picture
 from mwdn.data.sheets import contact_sheet, thumbnail
-from mwdn.data.writing import atomic
-from mwdn.errors import ImageError, ParameterError
+from mwdn.errors import ParameterError
 from mwdn.fourier import correlate, frequencies, spectrum
 from mwdn.optics.mask_files import write_gds, write_mask, write_stl
 from mwdn.optics.masks import Mask, MaskDesign, mask_psf, numbers
@@ -55,14 +54,13 @@ class Designed:
         return self.psf / self.psf.max()
 
     def report(self) -> dict[str, Any]:
-        """All numbers, as plain values that JSON can hold; a source at infinity is None."""
+        """All numbers, as plain values that JSON can hold; None is infinite: a source's distance, a focal length."""
         rows, columns = self.setup.size
         pitch_mm = self.setup.pitch_um / 1e3
         width = sharpness(self.psf)
-        far = {"source_mm": None if math.isinf(self.setup.source_mm) else self.setup.source_mm}  # JSON has no infinity
         return {
-            "mask": {"name": self.name} | dataclasses.asdict(self.design),  # type: ignore[call-overload]
-            "setup": dataclasses.asdict(self.setup) | far,
+            "mask": {"name": self.name} | _plain(dataclasses.asdict(self.design)),  # type: ignore[call-overload]
+            "setup": _plain(dataclasses.asdict(self.setup)),
             "made": numbers(self.mask, self.light)
             | {
                 "psf_size": [rows, columns],
@@ -84,27 +82,21 @@ class Designed:
         pitch cannot sample the light any more.
         """
         quick = dataclasses.replace(self.setup, wavelengths=min(3, self.setup.wavelengths))
-        source = self.setup.source_mm
-
-        def at_distance(mm: float) -> Psf:
-            return mask_psf(self.mask, dataclasses.replace(quick, source_mm=mm))
-
-        def at_angle(degrees: float) -> Psf:
-            return mask_psf(self.mask, quick, angle_degrees=(0.0, degrees))
-
-        far = 1e3 * self.setup.distance_mm  # beyond a thousand times it, nothing changes any more
-        distances = [part * min(source, far) for part in (0.25, 0.5, 2.0, 4.0)]
-        alike = sensitivity(at_distance, distances, reference=source)
+        known = mask_psf(self.mask, quick)
+        # Beyond a thousand times the distance of mask and sensor, nothing changes any more.
+        source = min(self.setup.source_mm, 1e3 * self.setup.distance_mm)
+        away: dict[str, float] = {}
+        for mm in (part * source for part in (0.25, 0.5, 2.0, 4.0)):
+            psf = mask_psf(self.mask, dataclasses.replace(quick, source_mm=mm))
+            away[f"{mm:g}"] = round(likeness(psf, known), 4)
         aside: dict[str, float] = {}
         for angle in ANGLES:
             try:
-                aside[f"{angle:g}"] = round(sensitivity(at_angle, [angle])[0], 4)
+                psf = mask_psf(self.mask, quick, angle_degrees=(0.0, angle))
             except ParameterError:
                 break  # steeper light than the mask's pitch can sample
-        return {
-            "source_mm": {f"{mm:g}": round(value, 4) for mm, value in zip(distances, alike, strict=True)},
-            "angle_degrees": aside,
-        }
+            aside[f"{angle:g}"] = round(likeness(psf, known), 4)
+        return {"source_mm": away, "angle_degrees": aside}
 
     def write(self, out: Path, *, sensitive: bool = False) -> None:
         """Write mask.tif, psf.tif, camera.json and preview.png; files of the same names are replaced.
@@ -120,11 +112,7 @@ class Designed:
         write_mask(out / "mask.tif", self.mask)
         write_linear(out / "psf.tif", self.stored)
         write_picture(out / "preview.png", contact_sheet([self.pictures()], ["mask (middle)", "PSF", "spectrum"]))
-        try:
-            with atomic(out / "camera.json") as temporary:
-                temporary.write_text(json.dumps(report, indent=2), encoding="utf-8")
-        except OSError as error:
-            raise ImageError(f"`{out}` cannot be written to: {error.strerror or error}.") from error
+        write_json(out / "camera.json", report)
 
     def pictures(self) -> list[Tensor]:
         """Middle of the mask, PSF and its spectrum, for `contact_sheet`."""
@@ -168,7 +156,9 @@ def radial_autocorrelation(psf: Psf, reach: int = 40) -> Tensor:
     channels = centred.transpose(0, 1)
     both = torch.cat([correlate(one[None], one[None]) for one in channels]).sum((0, 1))
     rows, columns = (torch.arange(n) - n // 2 for n in both.shape)
-    return _rings(both, torch.hypot(rows[:, None].double(), columns.double()), min(reach, min(both.shape) // 2))
+    distance = torch.hypot(rows[:, None].double(), columns.double())
+    means = ring_means(both, distance, min(reach, min(both.shape) // 2))
+    return means / means[0]
 
 
 def radial_spectrum(psf: Psf, bins: int = 60) -> Tensor:
@@ -176,7 +166,8 @@ def radial_spectrum(psf: Psf, bins: int = 60) -> Tensor:
     size = (psf.shape[-2], psf.shape[-1])
     power = spectrum(psf, size).abs().square().mean((0, 1))
     v, u = frequencies(size[0]), frequencies(size[1])[: size[1] // 2 + 1].abs()
-    return (_rings(power, torch.hypot(v[:, None], u) * 2 * bins, bins) * power[0, 0]).sqrt()
+    means = ring_means(power, torch.hypot(v[:, None], u) * 2 * bins, bins)
+    return (means / means[0] * power[0, 0]).sqrt()
 
 
 def decades(psf: Psf, lowest: float = 3.0) -> Image:
@@ -190,13 +181,10 @@ def decades(psf: Psf, lowest: float = 3.0) -> Image:
     return (1 + (whole / whole.amax()).clamp(min=10**-lowest).log10() / lowest) ** 2.2
 
 
+def _plain(numbers: dict[str, Any]) -> dict[str, Any]:
+    """JSON has no infinity."""
+    return {name: None if value == math.inf else value for name, value in numbers.items()}
+
+
 def _unit(psf: Psf) -> Psf:
     return psf / psf.sum((-2, -1), keepdim=True)
-
-
-def _rings(values: Tensor, radius: Tensor, count: int) -> Tensor:
-    index = radius.round().long().flatten()
-    inside = index < count
-    sums = torch.zeros(count, dtype=torch.float64).index_add_(0, index[inside], values.double().flatten()[inside])
-    means = sums / torch.bincount(index[inside], minlength=count).clamp(min=1)
-    return means / means[0]

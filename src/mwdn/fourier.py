@@ -6,6 +6,7 @@ half-precision transforms do not exist on CPUs and lose the small values of a sp
 A PSF enters centred at ``(height // 2, width // 2)``; the shift to the origin happens here and nowhere else.
 """
 
+import math
 from functools import cache
 from typing import Literal
 
@@ -46,6 +47,12 @@ def frequency_grid(grid: Size, *, device: torch.device | str | None = None) -> t
     """Frequencies of a `spectrum`'s rows, (H, 1), and columns, (1, W // 2 + 1), in cycles per pixel."""
     rows = torch.fft.fftfreq(grid[0], device=device)[:, None]
     return rows, torch.fft.rfftfreq(grid[1], device=device)[None]
+
+
+def gaussian_transfer(grid: Size, sigma: float, *, device: torch.device | str | None = None) -> Tensor:
+    """What a blur by a Gaussian of standard deviation ``sigma`` in pixels multiplies a `spectrum` with."""
+    rows, columns = frequency_grid(grid, device=device)
+    return torch.exp(-2 * math.pi**2 * sigma**2 * (rows.square() + columns.square()))
 
 
 def spectrum(image: Tensor, grid: Size) -> Spectrum:

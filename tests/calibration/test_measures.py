@@ -28,6 +28,20 @@ def point(size):
     return psf
 
 
+def test_ring_means_are_a_plain_sum_over_pixels(generator):
+    values, radius = torch.rand(5, 6, generator=generator), 6 * torch.rand(5, 6, generator=generator)
+    radius[radius.round() == 2] = 3.0
+    counts = torch.randint(1, 3, (5, 6), generator=generator).float()
+    for often in (1.0, counts):
+        found = measures.ring_means(values, radius, 5, counts=often)
+        expected = [0.0] * 5
+        for ring in (0, 1, 3, 4):
+            here = (radius >= ring - 0.5) & (radius < ring + 0.5)
+            weights = (counts if often is counts else torch.ones(5, 6))[here].tolist()
+            expected[ring] = sum(w * v for w, v in zip(weights, values[here].tolist(), strict=True)) / sum(weights)
+        assert found.tolist() == pytest.approx(expected)
+
+
 @pytest.mark.parametrize("size", [(48, 40), (31, 45), (40, 33)])
 @pytest.mark.parametrize("regularisation", [1e-4, 1e-2])
 def test_noise_gain_is_what_the_wiener_estimate_does_to_noise(size, regularisation, generator):

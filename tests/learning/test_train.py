@@ -386,16 +386,14 @@ def test_resumed_run_on_recorded_pairs_ends_bit_identical(pairs, calibration, tm
 def test_captures_on_the_sheet_change_nothing_else(trainer, photos, calibration, tmp_path):
     trainer(folder="without").run()
     np.save(tmp_path / "capture.npy", np.random.default_rng(0).random((32, 32, 3), np.float32))
-    for number, name in enumerate(("named", "recipe")):
-        (tmp_path / "folder").mkdir(exist_ok=True)
-        np.save(tmp_path / "folder" / "a.npy", np.full((32, 32, 3), 0.5, np.float32))
-        recipe = replace(RECIPE, sheet=Sheet((str(tmp_path / "folder"),)))
-        captures = [tmp_path / "capture.npy"] if number == 0 else []
-        out = tmp_path / name
-        prepare(recipe, calibration, photos, out, "cpu", captures=captures).run()
+    (tmp_path / "folder").mkdir()
+    np.save(tmp_path / "folder" / "a.npy", np.full((32, 32, 3), 0.5, np.float32))
+    for name, capture in (("one", "capture.npy"), ("other", "folder")):
+        recipe, out = replace(RECIPE, sheet=Sheet((str(tmp_path / capture),))), tmp_path / name
+        prepare(recipe, calibration, photos, out, "cpu").run()
         assert same(tmp_path / "without" / "state.safetensors", out / "state.safetensors")
         assert read_metadata(out / "best.safetensors") == read_metadata(tmp_path / "without" / "best.safetensors")
-    sheets = [cv2.imread(str(tmp_path / name / "validation.png")) for name in ("without", "named", "recipe")]
+    sheets = [cv2.imread(str(tmp_path / name / "validation.png")) for name in ("without", "one", "other")]
     assert sheets[1].shape == sheets[2].shape != sheets[0].shape
     assert (sheets[1] != sheets[2]).any()
 
@@ -405,8 +403,9 @@ def test_capture_that_does_not_fit_is_found_before_training(calibration, photos,
     np.save(tmp_path / "grey.npy", np.ones((32, 32, 1), np.float32))
     np.save(tmp_path / "small.npy", np.ones((30, 32, 3), np.float32))
     for camera, name, said in ((calibration, "small", "same height and width"), (grey, "grey", "channels")):
+        recipe = replace(RECIPE, sheet=Sheet((str(tmp_path / f"{name}.npy"),)))
         with pytest.raises(ShapeError, match=said):
-            prepare(RECIPE, camera, photos, tmp_path / "run", "cpu", captures=[tmp_path / f"{name}.npy"])
+            prepare(recipe, camera, photos, tmp_path / "run", "cpu")
 
 
 # --- What is refused ----------------------------------------------------------------------------------

@@ -1,6 +1,5 @@
 """What a PSF can do, in numbers: autocorrelation, spectrum, noise gain, resolution, support."""
 
-import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -9,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mwdn.errors import ParameterError
-from mwdn.fourier import Size, fast_length, frequency_grid, inverse_spectrum, spectrum
+from mwdn.fourier import Size, fast_length, frequency_grid, gaussian_transfer, inverse_spectrum, spectrum
 from mwdn.types import Psf
 
 CONTRAST = 0.5
@@ -31,6 +30,23 @@ def _power(psf: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def _mean(values: Tensor, counts: Tensor) -> Tensor:
     return (values.double() * counts).sum((-2, -1)) / counts.sum()
+
+
+def ring_means(values: Tensor, radius: Tensor, count: int, *, counts: Tensor | float = 1.0) -> Tensor:
+    """Mean of the values on each ring around the origin, (count,) float64; 0 where a ring is empty.
+
+    Args:
+        values: (H, W).
+        radius: of each value, (H, W); those that round to i are ring i.
+        count: of rings; what lies beyond them is left out.
+        counts: how often each value stands, (H, W).
+    """
+    ring, often = radius.round().long(), torch.as_tensor(counts, device=values.device).double().expand(values.shape)
+    inside = ring < count
+    total, weight = torch.zeros(2, count, dtype=torch.float64, device=values.device)
+    total.index_add_(0, ring[inside], (values.double() * often)[inside])
+    weight.index_add_(0, ring[inside], often[inside])
+    return total / weight.clamp(min=1)
 
 
 def noise_gain(psf: Psf, regularisation: float) -> tuple[float, ...]:
@@ -65,14 +81,9 @@ class Rings(NamedTuple):
 def rings(psf: Psf) -> Rings:
     """Radial spectrum of a PSF, the mean of its channels' power."""
     power, counts, frequency = _power(psf)
-    power = power.mean((0, 1))
     count = max(min(psf.shape[-2:]) // 2, 1)
-    ring = (frequency * 2 * count).round().long()
-    inside = ring <= count
-    total, weight = torch.zeros(2, count + 1, dtype=torch.float64, device=psf.device)
-    total.index_add_(0, ring[inside], (power * counts)[inside].double())
-    weight.index_add_(0, ring[inside], counts[inside].double())
-    return Rings(torch.arange(count + 1) / (2 * count), (total / weight.clamp(min=1)).float().cpu())
+    mean = ring_means(power.mean((0, 1)), frequency * 2 * count, count + 1, counts=counts)
+    return Rings(torch.arange(count + 1) / (2 * count), mean.float().cpu())
 
 
 def zeros(psf: Psf) -> tuple[float, tuple[float, ...]]:
@@ -176,20 +187,15 @@ def autocorrelation(psf: Psf) -> Autocorrelation:
 
 def _detail(plane: Tensor, grid: Size) -> Tensor:
     """Spectrum of a picture without what is wider than 1/20 of its shorter side (standard deviation)."""
-    rows, columns = frequency_grid(grid, device=plane.device)
-    sigma = min(plane.shape) / 20
-    smooth = torch.exp(-2 * math.pi**2 * sigma**2 * (rows.square() + columns.square()))
+    smooth = gaussian_transfer(grid, min(plane.shape) / 20, device=plane.device)
     return spectrum(plane[None, None], grid)[0, 0] * (1 - smooth)
 
 
 def _half_width(image: Tensor, distance: Tensor) -> float:
     """Twice the distance at which the mean over a ring falls to 1/2, on the line between two rings."""
-    ring, far = distance.round().long().flatten(), distance.flatten()
-    total, mean_distance, count = torch.zeros(3, int(ring.max()) + 1)
-    count.index_add_(0, ring, torch.ones(len(ring)))
-    mean = total.index_add_(0, ring, image.flatten()) / count.clamp(min=1)
+    count = int(distance.max().round()) + 1
     # A ring holds the pixels of more or less its distance; not exactly so near the peak.
-    radius = mean_distance.index_add_(0, ring, far) / count.clamp(min=1)
+    mean, radius = (ring_means(values, distance, count) for values in (image, distance))
     below = (mean < 0.5).nonzero()
     if not len(below):
         return 2 * float(radius[-1])

@@ -15,7 +15,7 @@ from mwdn.errors import ParameterError, ShapeError
 from mwdn.types import Psf
 
 HELD_OUT = 20
-"""Where a split has no validation part, every 20th of its training pairs is held out for it."""
+"""Every 20th is held out for validation: of photographs, and of the training pairs of a split without such a part."""
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from rich.markup import escape
 from rich.table import Table
 from torch import Tensor
 
+from mwdn.calibration.report import write_json
 from mwdn.data.images import write_picture
 from mwdn.data.sheets import contact_sheet
-from mwdn.data.writing import atomic
-from mwdn.errors import ImageError, UnknownNameError
+from mwdn.errors import UnknownNameError
 from mwdn.evaluation.metrics import LARGER_IS_BETTER, METRICS, bootstrap
 
 JSON = "report.json"
@@ -105,6 +105,9 @@ class Report:
 
         ``null`` stands for a number that is missing, and for the infinite PSNR of a picture without any error.
         """
+        return json.dumps(self._content(), indent=2, allow_nan=False)
+
+    def _content(self) -> dict[str, Any]:
         content = {
             "version": version("mwdn"),
             "torch": torch.__version__,
@@ -114,7 +117,7 @@ class Report:
             "missing": self.missing,
             "methods": {name: _plain(scores) for name, scores in self.methods.items()},
         }
-        return json.dumps(_finite(content), indent=2, allow_nan=False)
+        return _finite(content)
 
     def sheet(self) -> Tensor:
         """Arrange the first pictures, (1, 3, H, W) in linear light: scene, measurement, then each method."""
@@ -126,11 +129,7 @@ class Report:
         Raises:
             ImageError: the folder cannot be written to.
         """
-        try:
-            with atomic(out / JSON) as temporary:
-                temporary.write_text(self.json() + "\n", encoding="utf-8")
-        except OSError as error:
-            raise ImageError(f"`{out / JSON}` cannot be written: {error.strerror}. Choose another folder.") from error
+        write_json(out / JSON, self._content())
         if self.rows:
             write_picture(out / SHEET, self.sheet())
 

@@ -11,7 +11,7 @@ from mwdn.data.captures import find_captures, read_captures
 from mwdn.data.pair_writer import Attribute
 from mwdn.data.pairs import PairFile
 from mwdn.data.photographs import Photographs
-from mwdn.data.recorded import recorded_pairs
+from mwdn.data.recorded import HELD_OUT, recorded_pairs
 from mwdn.data.simulated import EXACT, Samples, SimulatedPairs
 from mwdn.errors import ParameterError
 from mwdn.learning import distributed
@@ -19,9 +19,6 @@ from mwdn.learning.recipe import Recipe
 from mwdn.learning.train import Trainer
 from mwdn.learning.validation import SHOWN
 from mwdn.types import Psf
-
-HELD_OUT = 20
-"""Every 20th photograph is for validation."""
 
 FILE_START = 2 * 10**12
 """Number of the first sample of a file: a network trained with the same seed has seen none of them."""
@@ -35,7 +32,7 @@ def prepare(
     device: str | None = None,
     *,
     pairs: Path | None = None,
-    captures: Iterable[Path] = (),
+    apart: Iterable[Path | None] = (),
 ) -> Trainer:
     """Read what there is to learn from and set the run up.
 
@@ -46,7 +43,7 @@ def prepare(
         out: folder of the run.
         device: a GPU if there is one unless given.
         pairs: file of recorded pairs, in place of photographs.
-        captures: real ones to show on the contact sheets, files and folders; in place of the recipe's.
+        apart: files that are no captures, though a folder of the recipe's [sheet] holds them: the PSF, the dark frame.
 
     Raises:
         ParameterError: not exactly one of photographs and pairs, or not enough of them.
@@ -60,8 +57,8 @@ def prepare(
             f"`--photos` ({photos}) and `--pairs` ({pairs}) exclude each other. Leave one of them out."
         )
     place = distributed.device_here(device)
-    shown = [*captures] or recipe.sheet.captures
-    real = read_captures(find_captures(shown)[:SHOWN], calibration) if shown else None
+    shown = recipe.sheet.captures
+    real = read_captures(find_captures(shown, apart=apart)[:SHOWN], calibration) if shown else None
     training: Samples
     validation: Samples
     if pairs is not None:

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load, save_file
-from torch import Tensor, nn
+from torch import Tensor
 
 from mwdn.calibration import Calibration
 from mwdn.data.images import write_picture
@@ -25,6 +24,7 @@ from mwdn.learning.pool import Pool
 from mwdn.learning.precision import has_bfloat16
 from mwdn.learning.recipe import Recipe
 from mwdn.learning.schedule import begin, optimiser
+from mwdn.learning.state import read_state, restore, write_state
 from mwdn.learning.validation import Validation, Validator
 from mwdn.networks import build
 from mwdn.types import Measurement
@@ -99,9 +99,7 @@ class Trainer:
         self.average.load_state_dict(self.network.state_dict())
         distributed.freeze_cancelled(self.network)
         distributed.synchronise(self.network, self.device)
-        kept = {name: getattr(self.schedule, name) for name in ("batch", "crop", "seed")}
-        size = self.schedule.pool
-        self.pool = Pool(pairs, self.network, self.psf, size=size, **kept) if size else None
+        self.pool = self._pool() if self.schedule.pool else None
         self.loss = Loss(recipe.loss, alexnet=alexnet).to(self.device)
         self.optimiser = optimiser(self.network, self.schedule)
         self.course = begin(recipe)
@@ -228,8 +226,8 @@ class Trainer:
             for name in ("last", *(["best"] if found.psnr == self.best else [])):
                 network = self.recipe.network["name"]
                 save_network(self.out / f"{name}.safetensors", self.average, network, self.options, **metadata)
-            with atomic(self.out / "state.safetensors") as temporary:
-                save_file(dict(self._state()), temporary, metadata=header)
+            path = self.out / "state.safetensors"
+            write_state(path, header, network=self.network, average=self.average, optimiser=self.optimiser)
 
     @contextmanager
     def _writing(self, way_out: str) -> Iterator[None]:
@@ -240,13 +238,9 @@ class Trainer:
             message = f"`{self.out}` must be a folder that can be written to: {reason}. {way_out}"
             raise ParameterError(message) from error
 
-    def _state(self) -> Iterator[tuple[str, Tensor]]:
-        for prefix, module in (("network", self.network), ("average", self.average)):
-            for name, value in module.state_dict().items():
-                yield f"{prefix}.{name}", value.contiguous()
-        for name, parameter in self.network.named_parameters():
-            for key, value in self.optimiser.state[parameter].items():
-                yield f"optimiser.{name}.{key}", value.contiguous()
+    def _pool(self) -> Pool:
+        s = self.schedule
+        return Pool(self.pairs, self.network, self.psf, size=s.pool, batch=s.batch, crop=s.crop, seed=s.seed)
 
     def _begin_with(self, start: str) -> None:
         known = load_network(start)
@@ -262,26 +256,13 @@ class Trainer:
         content = distributed.from_first(lambda: path.read_bytes() if path.exists() else b"")
         if not content:
             return
-        try:
-            state = load(content)
-        except SafetensorError as error:
-            raise CheckpointError(f"`{path}` is damaged: {error}. Remove it to begin again.") from error
-        header = _metadata(content)
+        state, header = read_state(path, content)
         if json.loads(header.get("identity", "null")) != json.loads(json.dumps(self.identity)):
             raise CheckpointError(
                 f"`{self.out}` holds a run of another recipe or PSF, or on other pairs. "
                 "Choose another folder, `--out`, or remove it."
             )
-        for prefix, module in (("network", self.network), ("average", self.average)):
-            _restore(module, prefix, state)
-        for name, parameter in self.network.named_parameters():
-            if f"optimiser.{name}.step" not in state:
-                continue  # never had a gradient
-            found = {key: state[f"optimiser.{name}.{key}"].to(self.device) for key in ("step", "exp_avg", "exp_avg_sq")}
-            # Adam keeps its moments in the layout of the weights.
-            form = torch.channels_last if parameter.ndim == 4 else torch.contiguous_format
-            moments = {key: value.contiguous(memory_format=form) for key, value in found.items() if key != "step"}
-            self.optimiser.state[parameter] = {"step": found["step"].cpu(), **moments}
+        restore(state, network=self.network, average=self.average, optimiser=self.optimiser)
         self.step, self.best = int(header["step"]), float(header["best"])
         self.course = begin(self.recipe, **json.loads(header["course"]))
 
@@ -299,14 +280,3 @@ class Trainer:
     def _log(self, report: Report) -> None:
         with self._writing(_MAKE_ROOM), (self.out / "log.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(report.line()) + "\n")
-
-
-def _metadata(content: bytes) -> dict[str, str]:
-    """Of a safetensors file: 8 bytes tell the length of a header in JSON."""
-    length = int.from_bytes(content[:8], "little")
-    return json.loads(content[8 : 8 + length]).get("__metadata__", {})
-
-
-def _restore(module: nn.Module, prefix: str, state: dict[str, Tensor]) -> None:
-    start = prefix + "."
-    module.load_state_dict({key.removeprefix(start): v for key, v in state.items() if key.startswith(start)})

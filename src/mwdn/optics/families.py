@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.errors import ParameterError, UnknownNameError
-from mwdn.fourier import Size, fast_length, frequency_grid, inverse_spectrum, spectrum
+from mwdn.fourier import Size, fast_length, gaussian_transfer, inverse_spectrum, spectrum
 from mwdn.optics.drawing import contour_lines, scatter_light, smooth_field
 from mwdn.types import Psf
 
@@ -286,9 +286,7 @@ def _blur(draw: _Draw, psf: Tensor) -> Tensor:
     # Three standard deviations of darkness beside the frame; less than 1e-3 of the halo comes back over them.
     margin = math.ceil(3 * wide)
     grid = fast_length(height + margin), fast_length(width + margin)
-    rows, columns = frequency_grid(grid, device=draw.device)
-    exponent = -2 * math.pi**2 * (rows.square() + columns.square())
     widths = [narrow * (1 + colour * difference) for colour in (-1, 0, 1)]
-    pass_narrow = torch.stack([torch.exp(exponent * sigma**2) for sigma in widths])
-    transfer = (1 - halo) * pass_narrow + halo * torch.exp(exponent * wide**2)
+    pass_narrow = torch.stack([gaussian_transfer(grid, sigma, device=draw.device) for sigma in widths])
+    transfer = (1 - halo) * pass_narrow + halo * gaussian_transfer(grid, wide, device=draw.device)
     return inverse_spectrum(spectrum(psf, grid) * transfer, grid, draw.size).clamp(min=0)

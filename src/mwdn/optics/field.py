@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.errors import ParameterError, ShapeError
-from mwdn.fourier import Size, convolve, correlate, fast_length, frequency_grid, inverse_spectrum, spectrum
+from mwdn.fourier import Size, convolve, correlate, fast_length, gaussian_transfer, inverse_spectrum, spectrum
 from mwdn.optics.sensor import Sensor
 from mwdn.optics.warp import warp
 from mwdn.types import Image, Measurement, Psf, Scene
@@ -190,6 +190,5 @@ def gaussian_blur(image: Image, sigma: float) -> Image:
     # Four standard deviations beside the picture: 6e-5 of the light at its border comes back over them.
     margin = math.ceil(4 * sigma)
     grid = fast_length(size[0] + margin), fast_length(size[1] + margin)
-    rows, columns = frequency_grid(grid, device=image.device)
-    transfer = torch.exp(-2 * math.pi**2 * sigma**2 * (rows.square() + columns.square()))
+    transfer = gaussian_transfer(grid, sigma, device=image.device)
     return inverse_spectrum(spectrum(image, grid) * transfer, grid, size)

@@ -126,11 +126,7 @@ class Diffuser:
         """
         size = samples(self.size_mm, self.pitch_um)
         positive(feature_um=self.feature_um, deflection_degrees=self.deflection_degrees, index=self.index - 1)
-        if not 4 * self.pitch_um <= self.feature_um <= min(self.size_mm) * UM_PER_MM:
-            raise ParameterError(
-                f"`feature_um` ({self.feature_um:g}) must be at least 4 samples ({4 * self.pitch_um:g} um) and at most "
-                f"the mask's smaller side."
-            )
+        _fits("feature_um", self.feature_um, self.pitch_um, self.size_mm)
         field = _hills(size, self.feature_um / self.pitch_um, torch.Generator().manual_seed(self.seed))
         slope = torch.stack([field.diff(dim=axis).square().mean() for axis in (0, 1)]).mean().sqrt().item()
         wanted = math.tan(math.radians(self.deflection_degrees)) / (self.index - 1) * self.pitch_um
@@ -175,11 +171,7 @@ class Lenslets:
         size = samples(self.size_mm, self.pitch_um)
         focal = 1 / (1 / setup.distance_mm + 1 / setup.source_mm) if self.focal_mm is None else self.focal_mm
         positive(focal_mm=focal, index=self.index - 1)
-        if not 4 * self.pitch_um <= self.spacing_um <= min(self.size_mm) * UM_PER_MM:
-            raise ParameterError(
-                f"`spacing_um` ({self.spacing_um:g}) must be at least 4 samples ({4 * self.pitch_um:g} um) and at most "
-                f"the mask's smaller side."
-            )
+        _fits("spacing_um", self.spacing_um, self.pitch_um, self.size_mm)
         if not 0 <= self.irregularity <= 0.5:
             raise ParameterError(f"`irregularity` ({self.irregularity:g}) must be in [0, 0.5].")
         away = _from_nearest_lens(self, size)
@@ -187,6 +179,13 @@ class Lenslets:
         surface = -away / (2 * focal * UM_PER_MM * (self.index - 1))
         height, step = quantised((surface - surface.min()).float(), self.levels)
         return Mask("phase", height, self.pitch_um, self.index, step)
+
+
+def _fits(name: str, um: float, pitch_um: float, size_mm: tuple[float, float]) -> None:
+    if not 4 * pitch_um <= um <= min(size_mm) * UM_PER_MM:
+        raise ParameterError(
+            f"`{name}` ({um:g}) must be at least 4 samples ({4 * pitch_um:g} um) and at most the mask's smaller side."
+        )
 
 
 def _hills(size: Size, feature: float, generator: torch.Generator) -> Tensor:

@@ -1,0 +1,103 @@
+"""`mwdn train` and `mwdn simulate`: what is learned, and what can be learned from."""
+
+from contextlib import ExitStack
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+from rich.progress import Progress, ProgressColumn, track
+
+from mwdn.cli_camera import CameraOptions, console, errors
+from mwdn.learning import distributed, session
+from mwdn.learning.board import Board
+from mwdn.learning.recipe import Recipe, Schedule, Sheet, read_recipe
+from mwdn.learning.train import Report
+
+
+def train(  # noqa: PLR0913
+    recipe: Path,
+    *,
+    camera: CameraOptions,
+    photos: Path | None = None,
+    pairs: Path | None = None,
+    captures: Annotated[list[Path] | None, Parameter(consume_multiple=True, negative=())] = None,
+    out: Path = Path("runs/train"),
+    steps: int | None = None,
+    batch: int | None = None,
+    seed: int | None = None,
+    device: str | None = None,
+    tensorboard: Annotated[bool, Parameter(negative=())] = False,
+) -> None:
+    """Train a network for one camera, on captures simulated through its PSF or on recorded pairs.
+
+    Give either --photos or --pairs. Run again, it goes on where it stopped.
+
+    Several GPUs or machines: torchrun --nproc-per-node 4 -m mwdn train ...
+
+    Args:
+        recipe: TOML file, see recipes/.
+        camera: calibration of the camera.
+        photos: folder of photographs, the more the better: captures of them are simulated.
+        pairs: HDF5 file of recorded pairs, from `mwdn import`; the recipe's [pairs] says which are for what.
+        captures: real captures, files or folders, to be shown on the contact sheet instead of the recipe's.
+        out: folder of the run: best.safetensors is what `mwdn reconstruct --method` takes, validation.png shows the
+            pictures of the latest validation.
+        steps: instead of the recipe's steps or epochs.
+        batch: instead of the recipe's.
+        seed: instead of the recipe's.
+        device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
+        tensorboard: write progress to the folder tensorboard in --out, for `tensorboard --logdir`.
+    """
+    chosen = read_recipe(recipe, steps=steps, batch=batch, seed=seed)
+    if captures:
+        chosen = replace(chosen, sheet=Sheet(tuple(map(str, captures))))
+    columns: list[str | ProgressColumn] = [*Progress.get_default_columns(), "{task.fields[now]}"]
+    with distributed.processes(), ExitStack() as stack:
+        apart = camera.psf, camera.dark
+        trainer = session.prepare(chosen, camera.load(), photos, out, device, pairs=pairs, apart=apart)
+        first = distributed.rank() == 0
+        write = stack.enter_context(Board(out / "tensorboard", trainer.step)) if tensorboard and first else None
+        bars = stack.enter_context(Progress(*columns, console=errors, disable=not first))
+        bar = bars.add_task("Training", total=trainer.schedule.steps, completed=trainer.step, now="")
+
+        def show(report: Report) -> None:
+            now = f"{report.pictures_per_s:.1f} pictures/s, loss {report.loss:.4f}"
+            bars.update(bar, completed=report.step, now=now)
+            if report.validation is not None:
+                psnr = report.validation.psnr
+                bars.print(f"step {report.step}: validation {psnr:.2f} dB, best {trainer.best:.2f} dB")
+            if write is not None:
+                write(report)
+
+        trainer.run(show)
+    if first:
+        console.print(f"Weights in {out / 'best.safetensors'}", highlight=False, markup=False, soft_wrap=True)
+
+
+def simulate(
+    photos: Path,
+    *,
+    camera: CameraOptions,
+    out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("pairs.h5"),
+    count: int = 100,
+    recipe: Path | None = None,
+    seed: int | None = None,
+    exact: bool = False,
+) -> None:
+    """Write a file of pairs: photographs as scenes, and what the camera would capture of them.
+
+    Args:
+        photos: folder of photographs.
+        camera: calibration of the camera.
+        out: the file of pairs; one that exists is replaced when all has gone well.
+        count: of pairs.
+        recipe: TOML file whose placement, mismatch, sensor and seed are used, see recipes/; defaults unless given.
+        seed: instead of the recipe's.
+        exact: simulate a camera that is exactly what its calibration says.
+    """
+    chosen = read_recipe(recipe, seed=seed) if recipe else Recipe(schedule=Schedule(seed=seed or 0))
+    progress = partial(track, description="Simulating", console=errors, transient=True)
+    session.simulate(chosen, camera.load(), photos, out, count, exact=exact, track=progress)
+    console.print(f"{count:,} pairs written to {out}", markup=False, highlight=False, soft_wrap=True)
