@@ -37,7 +37,7 @@ def test_parts_of_the_counts():
 
 
 def test_published_settings_are_of_known_networks():
-    assert set(PUBLISHED) <= {*NETWORKS, "flatnet", "svdeconv"}
+    assert set(PUBLISHED) <= set(NETWORKS)
     assert PUBLISHED["updn"].rate == 5e-4
     assert all(each.rate is None or 0 < each.rate < 1 for each in PUBLISHED.values())
 

@@ -6,11 +6,14 @@ from typing import Any
 from torch import nn
 
 from mwdn.errors import UnknownNameError
+from mwdn.networks.flatnet import FlatNet
+from mwdn.networks.ifin import Ifin
 from mwdn.networks.le_admm import LeAdmm
 from mwdn.networks.le_admm_u import LeAdmmU
 from mwdn.networks.mmcn import Mmcn
 from mwdn.networks.mwdn import Mwdn
 from mwdn.networks.mwdn_cpsf import MwdnCpsf
+from mwdn.networks.svdeconv import SvDeconv
 from mwdn.networks.unet import UNet
 from mwdn.networks.updn import Updn
 from mwdn.networks.wiener import WienerNetwork
@@ -28,6 +31,9 @@ NETWORKS: dict[str, type[nn.Module]] = {
     "le-admm-u": LeAdmmU,
     "mmcn": Mmcn,
     "updn": Updn,
+    "flatnet": FlatNet,
+    "svdeconv": SvDeconv,
+    "ifin": Ifin,
 }
 """Every network by the name that recipes and the command line use."""
 
@@ -54,11 +60,14 @@ def build(name: str, **options: Any) -> nn.Module:  # noqa: ANN401
 
 __all__ = [
     "NETWORKS",
+    "FlatNet",
+    "Ifin",
     "LeAdmm",
     "LeAdmmU",
     "Mmcn",
     "Mwdn",
     "MwdnCpsf",
+    "SvDeconv",
     "UNet",
     "Updn",
     "WienerBank",
