@@ -8,7 +8,7 @@ A PSF enters centred at ``(height // 2, width // 2)``; the shift to the origin h
 
 import math
 from functools import cache
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -165,6 +165,29 @@ def correlate(measurement: Measurement, psf: Psf, *, size: Size | None = None, c
     size = size or (measurement.shape[-2], measurement.shape[-1])
     transfer, grid = _operator(psf, size, (measurement.shape[-2], measurement.shape[-1]), circular=circular)
     return inverse_spectrum(spectrum(measurement, grid) * transfer.conj(), grid, size)
+
+
+class Convolution(NamedTuple):
+    """`convolve` and `correlate` between fixed sizes, for a method that needs both many times: see `convolution`."""
+
+    transfer: Spectrum
+    grid: Size
+    scene: Size
+    sensor: Size
+
+    def forward(self, scene: Scene) -> Image:
+        """What the sensor sees of a scene."""
+        return inverse_spectrum(spectrum(scene, self.grid) * self.transfer, self.grid, self.sensor)
+
+    def adjoint(self, measurement: Measurement) -> Scene:
+        """Exact adjoint of `forward`."""
+        return inverse_spectrum(spectrum(measurement, self.grid) * self.transfer.conj(), self.grid, self.scene)
+
+
+def convolution(psf: Psf, scene: Size, sensor: Size) -> Convolution:
+    """Linear convolution of scenes with a PSF that is transformed once, here."""
+    transfer, grid = _operator(psf, scene, sensor, circular=False)
+    return Convolution(transfer, grid, scene, sensor)
 
 
 def extend(image: Image, grid: Size, boundary: Boundary) -> Tensor:

@@ -1,5 +1,6 @@
 """Networks in files of this package and of the paper's authors; files that are neither."""
 
+import inspect
 import json
 import pickle
 from pathlib import Path
@@ -17,7 +18,8 @@ from mwdn.networks import NETWORKS, build
 
 
 def small(name):
-    options = {"weight": 0.02} if name == "wiener" else {"width": 4, "pooling": "average"}
+    wanted = {"width": 4, "pooling": "average", "size": (9, 9), **({"weight": 0.02} if name == "wiener" else {})}
+    options = {key: wanted[key] for key in wanted.keys() & inspect.signature(NETWORKS[name]).parameters.keys()}
     return build(name, **options), options
 
 

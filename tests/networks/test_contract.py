@@ -11,13 +11,19 @@ from mwdn import fourier
 from mwdn.errors import MwdnError, UnknownNameError
 from mwdn.networks import NETWORKS, build
 
+FEW = ("wiener", "le-admm")
+"""Networks of so few numbers that they learn the camera's constants at most."""
+
+WIDENED = ("le-admm-u", "mmcn", "flatnet", "svdeconv")
+"""Networks whose U-Net continues these small pictures to 64 pixels: a smaller width does."""
+
 BOTTOMED = [name for name in NETWORKS if "outputs" in inspect.signature(NETWORKS[name]).parameters]
 
 
 def small(name, **options):
     """The network at an eighth of its width, without the options that it does not have."""
     known = inspect.signature(NETWORKS[name]).parameters
-    options = {"width": 8, **options}
+    options = {"width": 8, "size": (24, 24), **options}
     return build(name, **{key: value for key, value in options.items() if key in known})
 
 
@@ -139,22 +145,20 @@ def test_scene_may_have_other_channels_than_the_measurement(name, channels, outp
 
 
 def test_overfits_four_pairs(name, generator):
-    """Networks learn the pictures, not just their mean; two numbers learn the camera's scale at most."""
+    """Networks learn the pictures, not just their mean; a few numbers learn the camera's constants at most."""
     b, h, scene = pair(generator, (16, 16), batch=4)
-    network = small(name, width=16).train()
-    optimiser = torch.optim.Adam(network.parameters(), lr=5e-3 if name != "wiener" else 1e-1)
+    network = small(name, width=8 if name in WIDENED else 16).train()
+    optimiser = torch.optim.Adam(network.parameters(), lr=5e-3 if name not in FEW else 1e-1)
     losses = []
     for _ in range(120):
         loss = F.mse_loss(network(b, h), scene)
+        losses.append(loss.item())
+        if losses[-1] < (0.99 * losses[0] if name in FEW else min(0.15 * losses[0], 0.6 * scene.var().item())):
+            return
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-        losses.append(loss.item())
-    if name == "wiener":
-        assert losses[-1] < 0.99 * losses[0]
-    else:
-        assert losses[-1] < 0.15 * losses[0]
-        assert losses[-1] < 0.6 * scene.var().item()
+    pytest.fail(f"loss from {losses[0]} to {losses[-1]} only, of pictures of variance {scene.var()}")
 
 
 def test_weights_survive_a_file(name, generator, tmp_path):
@@ -234,7 +238,7 @@ def test_wiener_constants_stay_positive_whatever_the_step(name):
 def test_unknown_network_gets_the_nearest_name():
     with pytest.raises(UnknownNameError, match=r"No network named 'mwdm'\. Did you mean 'mwdn'\? Known: .*wiener-unet"):
         build("mwdm")
-    with pytest.raises(MwdnError, match="Known: mwdn, mwdn-cpsf, unet, wiener, wiener-bank, wiener-unet"):
+    with pytest.raises(MwdnError, match="Known: " + ", ".join(sorted(NETWORKS))):
         build("?")
 
 

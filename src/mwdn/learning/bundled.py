@@ -1,6 +1,6 @@
 """Trained networks by name: those that come with the package, and those on the Hugging Face hub.
 
-    python -m mwdn.learning.bundled runs/universal/best.safetensors universal    # put weights into the package
+``python -m mwdn.learning.bundled runs/universal/best.safetensors universal`` puts weights into the package.
 """
 
 import sys

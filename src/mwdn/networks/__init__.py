@@ -6,9 +6,16 @@ from typing import Any
 from torch import nn
 
 from mwdn.errors import UnknownNameError
+from mwdn.networks.flatnet import FlatNet
+from mwdn.networks.ifin import Ifin
+from mwdn.networks.le_admm import LeAdmm
+from mwdn.networks.le_admm_u import LeAdmmU
+from mwdn.networks.mmcn import Mmcn
 from mwdn.networks.mwdn import Mwdn
 from mwdn.networks.mwdn_cpsf import MwdnCpsf
+from mwdn.networks.svdeconv import SvDeconv
 from mwdn.networks.unet import UNet
+from mwdn.networks.updn import Updn
 from mwdn.networks.wiener import WienerNetwork
 from mwdn.networks.wiener_bank import WienerBank
 from mwdn.networks.wiener_unet import WienerUNet
@@ -20,6 +27,13 @@ NETWORKS: dict[str, type[nn.Module]] = {
     "mwdn": Mwdn,
     "mwdn-cpsf": MwdnCpsf,
     "wiener-bank": WienerBank,
+    "le-admm": LeAdmm,
+    "le-admm-u": LeAdmmU,
+    "mmcn": Mmcn,
+    "updn": Updn,
+    "flatnet": FlatNet,
+    "svdeconv": SvDeconv,
+    "ifin": Ifin,
 }
 """Every network by the name that recipes and the command line use."""
 
@@ -44,4 +58,20 @@ def build(name: str, **options: Any) -> nn.Module:  # noqa: ANN401
     return NETWORKS[name](**{key: tuple(v) if isinstance(v, list) else v for key, v in options.items()})
 
 
-__all__ = ["NETWORKS", "Mwdn", "MwdnCpsf", "UNet", "WienerBank", "WienerNetwork", "WienerUNet", "build"]
+__all__ = [
+    "NETWORKS",
+    "FlatNet",
+    "Ifin",
+    "LeAdmm",
+    "LeAdmmU",
+    "Mmcn",
+    "Mwdn",
+    "MwdnCpsf",
+    "SvDeconv",
+    "UNet",
+    "Updn",
+    "WienerBank",
+    "WienerNetwork",
+    "WienerUNet",
+    "build",
+]

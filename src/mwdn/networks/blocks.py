@@ -1,6 +1,7 @@
 """The parts that the paper's networks share: convolution block, encoder, decoder, learned Wiener filter."""
 
 import math
+from itertools import pairwise
 from typing import Literal
 
 import torch
@@ -8,10 +9,12 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mwdn.errors import ParameterError, ShapeError
-from mwdn.fourier import Boundary, wiener
+from mwdn.fourier import Boundary, Size, wiener
 from mwdn.types import Image, Measurement, Psf
 
 Pooling = Literal["max", "average"]
+
+Normalisation = Literal["batch", "group"]
 
 
 def halve(kind: Pooling) -> nn.Module:
@@ -22,17 +25,31 @@ def halve(kind: Pooling) -> nn.Module:
     return kinds[kind](2)
 
 
-def double_convolution(inputs: int, outputs: int, inner: int | None = None) -> nn.Sequential:
-    """(3x3 convolution, BatchNorm, ReLU) twice."""
-    inner = inner or outputs
-    return nn.Sequential(
-        nn.Conv2d(inputs, inner, 3, padding=1),
-        nn.BatchNorm2d(inner),
-        nn.ReLU(inplace=True),
-        nn.Conv2d(inner, outputs, 3, padding=1),
-        nn.BatchNorm2d(outputs),
-        nn.ReLU(inplace=True),
-    )
+def normalisation(kind: Normalisation, channels: int) -> nn.Module:
+    """Normalise features over the batch, or over groups of channels of each sample (8 groups, of 2 or more)."""
+    if kind == "batch":
+        return nn.BatchNorm2d(channels)
+    if kind != "group":
+        raise ParameterError(f"`norm` must be batch or group, not {kind!r}.")
+    return nn.GroupNorm(math.gcd(8, channels // 2) if channels % 2 == 0 else 1, channels)
+
+
+def convolutions(*widths: int, bias: bool = True, norm: Normalisation = "batch") -> nn.Sequential:
+    """(3x3 convolution, normalisation, ReLU) from each of ``widths`` to the next."""
+    layers: list[nn.Module] = []
+    for inputs, outputs in pairwise(widths):
+        layers += [nn.Conv2d(inputs, outputs, 3, padding=1, bias=bias), normalisation(norm, outputs)]
+        layers.append(nn.ReLU(inplace=True))
+    return nn.Sequential(*layers)
+
+
+def check_channels(picture: Image, channels: int) -> None:
+    """Raise a `ShapeError` unless a measurement or PSF has as many channels as the network."""
+    if picture.shape[1] != channels:
+        raise ShapeError(
+            f"A picture or PSF {tuple(picture.shape)} must have {channels} channels for this network. "
+            f"Train one with `channels={picture.shape[1]}`, or calibrate with frames of {channels}."
+        )
 
 
 class Encoder(nn.Module):
@@ -42,14 +59,18 @@ class Encoder(nn.Module):
         channels: of the picture.
         widths: feature channels at each scale, (64, 128, 256, 512, 512) in the paper.
         pooling: between the scales; the paper's figure shows max-pooling, the authors' code averages.
+        norm: what follows each convolution.
     """
 
-    def __init__(self, channels: int, widths: tuple[int, ...], *, pooling: Pooling = "max") -> None:
+    def __init__(
+        self, channels: int, widths: tuple[int, ...], *, pooling: Pooling = "max", norm: Normalisation = "batch"
+    ) -> None:
         super().__init__()
         self.channels = channels
         self.pool = halve(pooling)
         self.scales = nn.ModuleList(
-            double_convolution(inputs, outputs) for inputs, outputs in zip((channels, *widths), widths, strict=False)
+            convolutions(inputs, width, width, norm=norm)
+            for inputs, width in zip((channels, *widths), widths, strict=False)
         )
 
     def forward(self, picture: Image) -> list[Tensor]:
@@ -58,11 +79,7 @@ class Encoder(nn.Module):
         Raises:
             ShapeError: the picture has another number of channels.
         """
-        if picture.shape[1] != self.channels:
-            raise ShapeError(
-                f"A picture or PSF {tuple(picture.shape)} must have {self.channels} channels for this network. "
-                f"Train one with `channels={picture.shape[1]}`, or calibrate with frames of {self.channels}."
-            )
+        check_channels(picture, self.channels)
         features = [self.scales[0](picture)]
         for scale in self.scales[1:]:
             features.append(scale(self.pool(features[-1])))
@@ -75,16 +92,18 @@ class Decoder(nn.Module):
     Args:
         channels: of the reconstruction.
         widths: those of the encoder.
+        norm: what follows each convolution.
     """
 
-    def __init__(self, channels: int, widths: tuple[int, ...]) -> None:
+    def __init__(self, channels: int, widths: tuple[int, ...], *, norm: Normalisation = "batch") -> None:
         super().__init__()
         first, *skips = widths[::-1]
         # 512 + 512 -> 256, 256 + 256 -> 128, 128 + 128 -> 64, 64 + 64 -> 64: what comes up has the skip's width.
         following = (*skips[1:], skips[-1])
         joined = [a + b for a, b in zip((first, *following), skips, strict=False)]
         self.scales = nn.ModuleList(
-            double_convolution(inputs, outputs, inputs // 2) for inputs, outputs in zip(joined, following, strict=True)
+            convolutions(inputs, inputs // 2, outputs, norm=norm)
+            for inputs, outputs in zip(joined, following, strict=True)
         )
         self.head = nn.Conv2d(following[-1], channels, 1)
 
@@ -144,9 +163,27 @@ def peak_one(psf: Psf, measurement: Measurement) -> Psf:
     Raises:
         ShapeError: the PSF does not have the height and width of the measurement.
     """
+    check_size(psf, measurement)
+    return psf / psf.amax(dim=(1, 2, 3), keepdim=True)
+
+
+def check_size(psf: Psf, measurement: Measurement) -> None:
+    """Raise a `ShapeError` unless the PSF has the height and width of the measurement."""
     if psf.shape[-2:] != measurement.shape[-2:]:
         raise ShapeError(
             f"`psf` {tuple(psf.shape)} and `measurement` {tuple(measurement.shape)} must have the same height "
             "and width. Bin or crop the PSF: `--bin`, `--crop`."
         )
-    return psf / psf.amax(dim=(1, 2, 3), keepdim=True)
+
+
+def at_least(picture: Tensor, side: int) -> Tensor:
+    """Continue a picture smaller than ``side`` to that height or width, by its last row or column."""
+    height, width = picture.shape[-2:]
+    return F.pad(picture, (0, max(0, side - width), 0, max(0, side - height)), mode="replicate")
+
+
+def stretched(image: Tensor, size: Size) -> Tensor:
+    """The picture of another size: what was learned at one serves at another, as a binned PSF does a binned capture."""
+    if tuple(image.shape[-2:]) == tuple(size):
+        return image
+    return F.interpolate(image, size=size, mode="bilinear", align_corners=False, antialias=True)

@@ -1,0 +1,85 @@
+"""FlatNet for masks of any kind: a learnable inverse filter, then a U-Net."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from mwdn.errors import ParameterError
+from mwdn.fourier import (
+    Boundary,
+    Size,
+    deconvolution_grid,
+    extend,
+    inverse_spectrum,
+    spectrum,
+    transfer_function,
+)
+from mwdn.networks.blocks import one_each_colour, stretched
+from mwdn.networks.generator import Generator
+from mwdn.types import Measurement, Psf, Scene
+
+
+class FlatNet(nn.Module):
+    """FlatNet-gen without its adversarial part: deconvolve with a filter that is learned tap by tap, then denoise.
+
+    From the source: an inverse filter as large as the PSF, which begins as the Wiener filter of the measured PSF and
+    which all colours share; the measurement continued by its border before; a U-Net with GroupNorm of 8 groups over
+    blocks of 2 x 2 pixels, of 128 to 1,024 channels; an output of limited range. The separable masks of FlatNet-sep,
+    and the discriminator, are left out.
+
+    Different here: what is learned is the filter's difference from the Wiener filter of the measured PSF, which is an
+    input. The differences belong to one size of sensor, ``size``, and are stretched to any other. Inferred: the
+    U-Net is built of this package's blocks (max-pooling and bilinear up-sampling, where the code has strides and
+    sub-pixel convolutions), and the range, [0, 1], is kept by a sigmoid. 34,669,260 learnable numbers, of which 129,600
+    are the filter's at 270 x 480; a count that no source gives.
+
+    Args:
+        channels: colours of the measurement.
+        outputs: colours of the scene; as many unless given.
+        width: feature channels at the U-Net's finest scale.
+        size: height and width of the sensor whose filter is learned; ``None`` keeps the Wiener filter.
+        regularisation: lambda of the Wiener filter that it begins as, for a PSF of unit sum.
+        boundary: what stands beyond the measurement, see `mwdn.fourier.Boundary`.
+
+    References:
+        S. S. Khan et al., FlatNet: towards photorealistic scene reconstruction from lensless measurements, IEEE Trans.
+        Pattern Anal. Mach. Intell. 44, 1934 (2020); github.com/siddiquesalman/flatnet.
+    """
+
+    def __init__(
+        self,
+        *,
+        channels: int = 3,
+        outputs: int | None = None,
+        width: int = 128,
+        size: Size | None = (270, 480),
+        regularisation: float = 1e-3,
+        boundary: Boundary = "replicate",
+    ) -> None:
+        super().__init__()
+        if not regularisation > 0:
+            raise ParameterError(f"`regularisation` ({regularisation}) must be positive; try 1e-3.")
+        self.regularisation, self.boundary = regularisation, boundary
+        self.correction = None if size is None else nn.Parameter(torch.zeros(1, 1, *size))
+        self.generator = Generator(channels, outputs or channels, width=width)
+
+    def inverse(self, measurement: Measurement, psf: Psf) -> Tensor:
+        """The measurement (B, C, H, W) through the learned filter."""
+        psf = one_each_colour(psf, measurement)
+        size = measurement.shape[-2], measurement.shape[-1]
+        grid = deconvolution_grid(size, self.boundary)
+        H = transfer_function(psf / psf.sum((-2, -1), keepdim=True), grid)
+        W = H.conj() / (H.abs().square() + self.regularisation)
+        if self.correction is not None:
+            # All N taps moved by s together move W by N s at frequency 0, where it is about 1. Learned in units of
+            # 1 / sqrt(N), a step of 3e-4 is at most 3e-4 sqrt(129,600) = 0.1 there, and 3e-4 where signs are random.
+            # (The source gives the filter a rate a millionth of the U-Net's.) At N' pixels taps are N / N' as large.
+            taps = stretched(self.correction, size) * (math.sqrt(self.correction.numel()) / (size[0] * size[1]))
+            W = W + transfer_function(taps, grid)
+        B = spectrum(extend(measurement.float(), grid, self.boundary), grid)
+        return inverse_spectrum(W * B, grid, size)
+
+    def forward(self, measurement: Measurement, psf: Psf) -> Scene:
+        """Scene (B, outputs, H, W), between 0 and 1."""
+        return torch.sigmoid(self.generator(self.inverse(measurement, psf)).float())

@@ -1,0 +1,90 @@
+"""Learned ADMM: a few unrolled iterations whose constants are trained."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from mwdn.errors import ParameterError
+from mwdn.networks.blocks import check_size
+from mwdn.solvers.admm import Penalties, merge, pose, rescale, split, start
+from mwdn.solvers.proximal import Variation
+from mwdn.types import Measurement, Psf, Scene
+
+
+class LeAdmm(nn.Module):
+    """Five iterations of ADMM with total variation, each with its own mu1, mu2, mu3 and tau: 20 learnable numbers.
+
+    From the source: five iterations from a zero scene; a grey PSF, the sum of the colours at unit L2 norm, shared by
+    all colours; a grid of twice the sensor; mu start at 1e-4; the result is divided by its maximum, so brightness is
+    not recovered. Its paper shrinks the gradient by tau / mu2; its code, followed here, learns that quotient as one
+    number, which starts at 2e-4 (1000 times as much in its notebook). Both are the same family of iterations.
+
+    Different here: the measurement is divided by its maximum first, so that the start values mean the same at every
+    exposure (the source's data come so); all four are stored as logarithms, which keeps them positive. Calibration has
+    subtracted the PSF's background already. The source cannot train with tau: the length of a zero gradient, which
+    the first iteration has everywhere, has an infinite derivative. `mwdn.solvers.proximal.shrink` has none.
+
+    Args:
+        iterations: how many; each adds 4 learnable numbers.
+        penalty: start value of mu1, mu2 and mu3.
+        threshold: start value of tau / mu2, in brightness of the scene for a PSF of unit L2 norm.
+        variation: which total variation; the source's is isotropic.
+
+    Raises:
+        ParameterError: a start value is not positive, or no iteration is asked for.
+
+    References:
+        K. Monakhova et al., Learned reconstructions for practical mask-based lensless imaging, Optics Express 27,
+        28075 (2019); github.com/Waller-Lab/LenslessLearning.
+    """
+
+    def __init__(
+        self,
+        *,
+        iterations: int = 5,
+        penalty: float = 1e-4,
+        threshold: float = 2e-4,
+        variation: Variation = "isotropic",
+    ) -> None:
+        super().__init__()
+        if iterations < 1:
+            raise ParameterError(f"`iterations` ({iterations}) must be at least 1.")
+        for name, value in (("penalty", penalty), ("threshold", threshold)):
+            if not value > 0:
+                raise ParameterError(f"`{name}` ({value}) must be positive: its logarithm is what is learned.")
+        self.variation = variation
+        self.log_data, self.log_gradient, self.log_sign = (
+            nn.Parameter(torch.full((iterations,), math.log(penalty))) for _ in range(3)
+        )
+        self.log_threshold = nn.Parameter(torch.full((iterations,), math.log(threshold)))
+
+    def forward(self, measurement: Measurement, psf: Psf) -> Scene:
+        """Scene (B, C, H, W), its brightest pixel 1."""
+        return brightest_one(self.iterates(measurement, psf)[-1])
+
+    def iterates(self, measurement: Measurement, psf: Psf) -> list[Tensor]:
+        """The scene after each iteration, (B, C, H, W), for a measurement of peak 1 and a PSF of unit L2 norm.
+
+        Not yet clipped: as in any ADMM, single pixels are negative before it has converged.
+        """
+        check_size(psf, measurement)
+        grey = psf.float().sum(1, keepdim=True)
+        problem = pose(
+            brightest_one(measurement.float()), grey / torch.linalg.vector_norm(grey, dim=(1, 2, 3), keepdim=True)
+        )
+        height, width = problem.sensor
+        state, scenes, last = start(problem), [], None
+        constants = (self.log_data, self.log_gradient, self.log_sign, self.log_threshold)
+        for data, gradient, sign, threshold in zip(*(each.exp() for each in constants), strict=True):
+            mu = Penalties(data, gradient, sign)
+            state = state if last is None else rescale(state, last, mu)
+            copies = split(state, problem, mu, threshold * gradient, self.variation)
+            state, last = merge(state, copies, problem, mu), mu
+            scenes.append(state.v[..., :height, :width])
+        return scenes
+
+
+def brightest_one(picture: Tensor) -> Tensor:
+    """Divide each picture by its largest value."""
+    return picture / picture.amax((1, 2, 3), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
