@@ -67,7 +67,7 @@ class Aberration:
         # Direction e to the axis: 1 + scale along all directions, and stretch along e e^T besides.
         e = torch.tensor([y, x]) / math.hypot(y, x)
         matrix = (1 + self.scale * square) * torch.eye(2) + self.stretch * square * torch.outer(e, e)
-        changed = _warp(psf, matrix) if self.scale or self.stretch else psf
+        changed = warp(psf, matrix) if self.scale or self.stretch else psf
         if self.blur_px:
             changed = gaussian_blur(changed, self.blur_px * math.sqrt(square)).clamp(min=0)
         # The warp kept the brightness; a larger PSF has the same light on more pixels.
@@ -194,11 +194,17 @@ def gaussian_blur(image: Image, sigma: float) -> Image:
     return inverse_spectrum(spectrum(image, grid) * transfer, grid, size)
 
 
-def _warp(psf: Psf, matrix: Tensor) -> Psf:
-    """Map a PSF by a 2 x 2 matrix of (row, column) displacements from its centre ``(h // 2, w // 2)``."""
+def warp(psf: Psf, matrix: Tensor, shift: tuple[float, float] = (0.0, 0.0)) -> Psf:
+    """Map a PSF about its centre ``(h // 2, w // 2)``; it keeps its brightness, and so changes its sum.
+
+    Args:
+        psf: (1, C, h, w); darkness lies beyond its border.
+        matrix: 2 x 2, of (row, column) displacements from the centre.
+        shift: down and right, in pixels, after that.
+    """
     height, width = psf.shape[-2:]
-    y = torch.arange(height, device=psf.device)[:, None] - height // 2
-    x = torch.arange(width, device=psf.device)[None] - width // 2
+    y = torch.arange(height, device=psf.device)[:, None] - height // 2 - shift[0]
+    x = torch.arange(width, device=psf.device)[None] - width // 2 - shift[1]
     inverse = torch.linalg.inv(matrix).tolist()
     rows = inverse[0][0] * y + inverse[0][1] * x + height // 2
     columns = inverse[1][0] * y + inverse[1][1] * x + width // 2
