@@ -28,8 +28,9 @@ TIERS = [
     ("reconstruct",),
     ("capture",),
     ("preview",),
-    ("design",),
-    ("demo", "doctor", "cli_optics", "cli_inspect", "cli", "__main__"),
+    ("design", "doctor"),
+    ("benchmark",),
+    ("demo", "cli_optics", "cli_inspect", "cli_benchmark", "cli", "__main__"),
     ("",),  # mwdn/__init__.py: the public names
 ]
 RANK = {name: rank for rank, names in enumerate(TIERS) for name in names}

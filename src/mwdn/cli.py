@@ -319,6 +319,7 @@ def doctor() -> None:
 
 
 app.command("mwdn.cli_inspect:inspect")  # imported when it is called
+app.command("mwdn.cli_benchmark:benchmark")
 
 
 def _warn(*reconstructors: Reconstructor) -> None:

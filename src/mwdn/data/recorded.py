@@ -117,13 +117,18 @@ def recorded_pairs(
         ParameterError: the division does not fit their number.
     """
     file = PairFile(path)
-    _check(file, psf)
+    check_pairs(file, psf)
     train, validation = division.of(len(file))
     place = torch.device(device)
     return RecordedPairs(file, train, seed, device=place), RecordedPairs(file, validation, seed, False, place)
 
 
-def _check(file: PairFile, psf: Psf) -> None:
+def check_pairs(file: PairFile, psf: Psf) -> None:
+    """See that a file's pairs are of a camera with this PSF.
+
+    Raises:
+        ShapeError: another size or other channels.
+    """
     (h, w, channels), (H, W), colours = file.measurement_shape, psf.shape[-2:], psf.shape[1]
     if (h, w) != (H, W):
         factor = H // h
