@@ -229,6 +229,15 @@ def test_mistakes_of_a_recipe(tmp_path, before, after, kind, message):
         read_benchmark(tmp_path / "r.toml")
 
 
+def test_widths_shrink_alike(tmp_path):
+    text = RECIPE.replace("shared.network = { width = 2 }", "width_factor = 0.25").replace(
+        "mwdn = {} }", 'mwdn = {}, own = { name = "mwdn", width = 5 } }'
+    )
+    (tmp_path / "r.toml").write_text(text, encoding="utf-8")
+    found = {method.label: method.options for method in read_benchmark(tmp_path / "r.toml").methods}
+    assert found == {"quick": {"iterations": 3}, "wiener": {}, "mwdn": {"width": 16}, "own": {"width": 5}}
+
+
 @pytest.mark.parametrize("name", ["benchmark-small", "benchmark-paper"])
 def test_recipes_that_come_along(name, monkeypatch):
     monkeypatch.setenv("MWDN_DATA", "/data")

@@ -3,7 +3,7 @@
 import io
 import math
 import statistics
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -74,7 +74,7 @@ def curves(name: str, runs: dict[str, tuple[list[tuple[int, float]], list[tuple[
     figure = Figure(figsize=(12, 4.2), dpi=110, layout="constrained")
     left, right = figure.subplots(1, 2)
     for number, (label, (losses, psnrs)) in enumerate(runs.items()):
-        style = {"color": f"C{number % 10}", "ls": ("-", "--")[number // 10 % 2], "lw": 1.2}
+        style: dict[str, Any] = {"color": f"C{number % 10}", "ls": ("-", "--")[number // 10 % 2], "lw": 1.2}
         left.semilogy([step for step, _ in losses], _smooth([loss for _, loss in losses]), **style)
         right.plot(*zip(*psnrs, strict=True), label=label, marker=".", **style)
     left.set(xlabel="step", ylabel="training loss, running mean")
@@ -120,8 +120,8 @@ def robustness(label: str, sweeps: dict[str, Sweep]) -> Picture:
     return Picture(f"robustness-{label}.png", _png(figure), words)
 
 
-def _draw(panel: "Axes", found: dict[float, list[float]], **style: float | str) -> None:
-    panel.plot(list(found), [statistics.fmean(values) for values in found.values()], **style)  # type: ignore[arg-type]
+def _draw(panel: "Axes", found: dict[float, list[float]], **style: Any) -> None:  # noqa: ANN401
+    panel.plot(list(found), [statistics.fmean(values) for values in found.values()], **style)
 
 
 def _png(figure: "Figure") -> bytes:

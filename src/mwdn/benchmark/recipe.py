@@ -68,6 +68,7 @@ class Benchmark:
         ablation: labels of the paper's ablation, in its order.
         compared: label that all others are compared with, picture by picture.
         shown: test pictures to show of each data set.
+        width_factor: every network's own width times this, the same for all; a line of the recipe may say otherwise.
         robustness: see `Robustness`.
         alexnet: file of AlexNet's weights; found or downloaded unless given.
         heads: file of LPIPS's heads; likewise.
@@ -84,6 +85,7 @@ class Benchmark:
     ablation: tuple[str, ...] = ()
     compared: str = ""
     shown: int = 4
+    width_factor: float = 1.0
     robustness: Robustness = Robustness()
     alexnet: str = ""
     heads: str = ""
@@ -111,10 +113,8 @@ def read_benchmark(path: str | Path) -> Benchmark:
         if key not in known:
             raise UnknownNameError("key of a benchmark's recipe", key, known)
     shared = content.pop("shared", {})
-    methods = (
-        *_methods("solvers", content.pop("solvers", {}), SOLVERS, {}),
-        *_methods("networks", content.pop("networks", {}), NETWORKS, shared.get("network", {})),
-    )
+    learned = _methods("networks", content.pop("networks", {}), NETWORKS, shared.get("network", {}))
+    methods = *_methods("solvers", content.pop("solvers", {}), SOLVERS, {}), *learned
     folder = Path(path).parent
     data = {n: _data_set(n, {**shared.get("data", {}), **t}, folder) for n, t in content.pop("data", {}).items()}
     schedule = fill(Schedule, "schedule", content.pop("schedule", {}))
@@ -124,6 +124,7 @@ def read_benchmark(path: str | Path) -> Benchmark:
         content[name] = _place(content.get(name, ""), folder)
     plain = fill(_Plain, "the recipe", content)
     values = {f.name: getattr(plain, f.name) for f in fields(_Plain)}
+    methods = tuple(_narrowed(method, plain.width_factor) for method in methods)
     found = Benchmark(
         methods=methods, data=data, schedule=schedule, loss=loss, robustness=robustness, path=str(path), **values
     )
@@ -141,6 +142,7 @@ class _Plain:
     ablation: tuple[str, ...] = ()
     compared: str = ""
     shown: int = 4
+    width_factor: float = 1.0
     alexnet: str = ""
     heads: str = ""
 
@@ -162,6 +164,16 @@ def _methods(table: str, content: dict[str, Any], registry: Mapping[str, Any], s
         common = {key: value for key, value in shared.items() if key in has}
         found.append(Method(label, name, {**common, **own}, table == "networks"))
     return found
+
+
+def _narrowed(method: Method, factor: float) -> Method:
+    """With its own width times a factor, where it has one and nobody said another."""
+    if not factor > 0:
+        raise ParameterError(f"`width_factor` ({factor}) must be positive.")
+    width = signature(NETWORKS[method.name]).parameters.get("width") if method.learned else None
+    if factor == 1 or width is None or "width" in method.options:
+        return method
+    return replace(method, options={**method.options, "width": max(1, round(factor * width.default))})
 
 
 def _data_set(name: str, table: dict[str, Any], folder: Path) -> DataSet:

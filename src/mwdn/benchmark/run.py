@@ -20,6 +20,7 @@ from mwdn.benchmark.training import train
 from mwdn.data.writing import atomic
 from mwdn.errors import ParameterError
 from mwdn.evaluation import Perceptual
+from mwdn.learning.alexnet import SMALLEST
 from mwdn.learning.devices import usable
 from mwdn.learning.train import Report
 
@@ -103,6 +104,10 @@ def _told(watch: Watch, report: Report) -> None:
     watch.done(report.step, f"loss {report.loss:.4f}{psnr}")
 
 
+def _same(perceptual: Perceptual) -> Perceptual:
+    return perceptual
+
+
 def _checkpoint(method: Method, opened: Opened, out: Path) -> Path | None:
     if not method.learned:
         return None
@@ -113,12 +118,15 @@ def _score_all(
     benchmark: Benchmark, opened: dict[str, Opened], out: Path, place: torch.device, watch: Watch
 ) -> dict[str, dict[str, Scored]]:
     @cache
-    def perceptual() -> Perceptual:
+    def loaded() -> Perceptual:
         return Perceptual.load(benchmark.alexnet or None, benchmark.heads or None)
 
     found: dict[str, dict[str, Scored]] = {}
     for name, each in opened.items():
         found[name] = {}
+        sides = each.data.part().crop(each.calibration.psf).shape[-2:]
+        small = Perceptual.none(f"the part {each.data.part().name} has less than {SMALLEST} pixels a side, for AlexNet")
+        perceptual = loaded if min(sides) >= SMALLEST else partial(_same, small)
         for number, method in enumerate(benchmark.methods):
             watch.stage(f"{name}: scoring {method.label}", len(benchmark.methods))
             watch.done(number, "")

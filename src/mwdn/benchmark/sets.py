@@ -181,6 +181,7 @@ def open_set(name: str, data: DataSet, folder: Path, device: torch.device, track
         MwdnError: a file cannot be read, or does not fit the camera; or ``folder`` holds other pairs of this name.
     """
     calibration = data.calibration()
+    data.part().crop(calibration.psf)  # refuses a part that does not fit before anything is trained
     simulates = not data.pairs
     path = folder / f"{name}.h5" if simulates or data.kind else Path(data.pairs)
     shown = {"psf", "captures", "protocol"}

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib import import_module
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,10 @@ from mwdn.benchmark.recipe import Benchmark, Method
 from mwdn.benchmark.sets import Opened
 from mwdn.data.writing import atomic
 from mwdn.errors import ParameterError
+from mwdn.fourier import Size
 from mwdn.learning.recipe import OPTIMISERS, Recipe, Schedule
 from mwdn.learning.train import Report, Trainer
+from mwdn.networks import NETWORKS
 
 CLOCK = "clock.json"
 """Seconds that a run has trained, up to its last saved state."""
@@ -40,13 +43,13 @@ def settings(method: Method, benchmark: Benchmark) -> Settings:
     if found is None:
         return Settings(benchmark.schedule, "the recipe's")
     optimiser = str(found.optimiser).lower()
-    changes: dict[str, Any] = {"learning_rate": float(found.rate) * benchmark.rate_factor}
+    changes: dict[str, Any] = {"weight_decay": float(found.weight_decay)}
     if optimiser in OPTIMISERS:
         changes["optimiser"] = optimiser
-    decay = getattr(found, "weight_decay", None)
-    if decay is not None:
-        changes["weight_decay"] = float(decay)
-    factor = f", its rate times {benchmark.rate_factor:g}" if benchmark.rate_factor != 1 else ""
+    factor = ""
+    if found.rate is not None:
+        changes["learning_rate"] = float(found.rate) * benchmark.rate_factor
+        factor = f"; its rate times {benchmark.rate_factor:g}" if benchmark.rate_factor != 1 else ""
     return Settings(replace(benchmark.schedule, **changes), f"{found.source}{factor}")
 
 
@@ -57,6 +60,13 @@ def _published(name: str) -> Any:  # noqa: ANN401
         return None
     tables = (table for table in vars(module).values() if isinstance(table, dict))
     return next((table[name] for table in tables if name in table), None)
+
+
+def options(method: Method, size: Size) -> dict[str, Any]:
+    """What a network is built with for pictures of this size, which those are told that learn a PSF of it."""
+    if "size" in signature(NETWORKS[method.name]).parameters:
+        return {"size": list(size), **method.options}
+    return method.options
 
 
 def train(
@@ -88,7 +98,7 @@ def train(
         raise ParameterError(f"Nothing is trained on `{opened.name}`: its networks are those of `trained_on`.")
     training, validation = opened.training
     schedule = replace(settings(method, benchmark).schedule, validation=len(validation))
-    recipe = Recipe({"name": method.name, **method.options}, schedule, benchmark.loss)
+    recipe = Recipe({"name": method.name, **options(method, opened.calibration.size)}, schedule, benchmark.loss)
     trainer = Trainer(
         recipe,
         opened.calibration,
