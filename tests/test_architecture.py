@@ -28,8 +28,9 @@ TIERS = [
     ("reconstruct",),
     ("capture",),
     ("preview",),
-    ("design",),
-    ("demo", "doctor", "cli_camera", "cli_optics", "cli_inspect", "cli_train", "cli", "__main__"),
+    ("design", "doctor"),
+    ("benchmark",),
+    ("demo", "cli_camera", "cli_optics", "cli_inspect", "cli_benchmark", "cli_train", "cli", "__main__"),
     ("",),  # mwdn/__init__.py: the public names
 ]
 RANK = {name: rank for rank, names in enumerate(TIERS) for name in names}

@@ -12,6 +12,7 @@ from rich.progress import Progress, track
 from torch import Tensor
 
 from mwdn import __version__
+from mwdn.cli_benchmark import benchmark
 from mwdn.cli_camera import CameraOptions, console, errors
 from mwdn.cli_inspect import inspect
 from mwdn.cli_optics import design
@@ -35,7 +36,7 @@ app = App(
     version=__version__,
     help="From the caustic pattern of a lensless camera to a picture. Add --debug to see where an error comes from.",
 )
-for command in (design, inspect, simulate, train):
+for command in (design, inspect, simulate, train, benchmark):
     app.command(command)
 
 

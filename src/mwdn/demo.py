@@ -1,6 +1,5 @@
 """A synthetic camera, captures through it, and every method that needs no training."""
 
-import html
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
@@ -16,6 +15,7 @@ from mwdn.data.sheets import contact_sheet, for_people
 from mwdn.data.writing import atomic
 from mwdn.design import design_camera
 from mwdn.evaluation import psnr
+from mwdn.evaluation.tables import html_table
 from mwdn.optics import Camera, Contour, Setup
 from mwdn.reconstruct import Reconstructor
 from mwdn.types import Scene
@@ -61,7 +61,7 @@ def run(out: Path, seed: int, console: Console) -> None:
     write_picture(out / "psf.png", for_people(camera.psf))
     write_picture(out / "comparison.png", contact_sheet(rows, ["scene", "measurement", *METHODS]))
     with atomic(out / "index.html") as temporary:
-        temporary.write_text(_page(table), encoding="utf-8")
+        temporary.write_text(_PAGE.format(table=html_table(table)), encoding="utf-8")
     console.print(table)
     console.print(f"Look at {out / 'index.html'}", highlight=False, markup=False, soft_wrap=True)
 
@@ -79,17 +79,6 @@ records is the scene convolved with it.</p>
 <img src="psf.png" alt="point spread function" width="320">
 <p>None of the reconstructions below needed any training.</p>
 <img src="comparison.png" alt="scene, measurement and reconstructions">
-<h2>PSNR in dB</h2>
-<table><tr>{head}</tr>{body}</table>
+{table}
 </html>
 """
-
-
-def _page(table: Table) -> str:
-    columns = [[str(cell) for cell in column.cells] for column in table.columns]
-    head = "".join(f"<th>{html.escape(str(column.header))}</th>" for column in table.columns)
-    body = "".join(
-        f"<tr><th>{html.escape(name)}</th>" + "".join(f"<td>{value}</td>" for value in values) + "</tr>"
-        for name, *values in zip(*columns, strict=True)
-    )
-    return _PAGE.format(head=head, body=body)

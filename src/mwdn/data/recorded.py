@@ -1,5 +1,6 @@
 """Recorded pairs as a source of numbered samples, like the simulated ones."""
 
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -8,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from mwdn.data.pair_writer import Attribute
 from mwdn.data.pairs import PairFile
-from mwdn.data.simulated import Pair
+from mwdn.data.simulated import Pair, Samples
 from mwdn.data.splits import split
 from mwdn.errors import ParameterError, ShapeError
 from mwdn.types import Psf
@@ -115,13 +117,18 @@ def recorded_pairs(
         ParameterError: the division does not fit their number.
     """
     file = PairFile(path)
-    _check(file, psf)
+    check_pairs(file, psf)
     train, validation = division.of(len(file))
     place = torch.device(device)
     return RecordedPairs(file, train, seed, device=place), RecordedPairs(file, validation, seed, False, place)
 
 
-def _check(file: PairFile, psf: Psf) -> None:
+def check_pairs(file: PairFile, psf: Psf) -> None:
+    """See that a file's pairs are of a camera with this PSF.
+
+    Raises:
+        ShapeError: another size or other channels.
+    """
     (h, w, channels), (H, W), colours = file.measurement_shape, psf.shape[-2:], psf.shape[1]
     if (h, w) != (H, W):
         factor = H // h
@@ -140,6 +147,36 @@ def _check(file: PairFile, psf: Psf) -> None:
             f"The scenes of `{file.path}` ({a} x {b}) must have the size of its measurements ({h} x {w}). "
             "Make the file again with scenes of that size: `mwdn import --scene-size`."
         )
+
+
+def record(
+    path: Path,
+    parts: Iterable[tuple[Samples, range]],
+    psf: Psf,
+    *,
+    batch: int = 4,
+    attributes: Mapping[str, Attribute] | None = None,
+    track: Callable[[list[range]], Iterable[range]] = iter,
+) -> None:
+    """Write samples to a file of pairs, one part after the other; the file is there only once it is whole.
+
+    Args:
+        path: of the file; one that exists is replaced when all has gone well.
+        parts: sources, and the numbers of their samples.
+        psf: of the calibration.
+        batch: samples that are made at once.
+        attributes: see `PairFile.create`.
+        track: shows the progress of each part.
+
+    Raises:
+        MwdnError: a sample cannot be made, or the file cannot be written.
+    """
+    shape = (psf.shape[-2], psf.shape[-1], 3)
+    with PairFile.create(path, measurement_shape=shape, scene_shape=shape, attributes=attributes, psf=psf) as file:
+        for samples, numbers in parts:
+            for some in track([numbers[i : i + batch] for i in range(0, len(numbers), batch)]):
+                measurement, scene, _ = samples.batch(some)
+                file.append(measurement.cpu(), scene.cpu())
 
 
 @lru_cache(maxsize=4)

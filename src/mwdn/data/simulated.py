@@ -16,6 +16,7 @@ from mwdn.data.photographs import Photographs
 from mwdn.errors import ParameterError
 from mwdn.fourier import Size
 from mwdn.optics.camera import Camera
+from mwdn.optics.field import FieldCamera
 from mwdn.optics.sensor import Sensor
 from mwdn.types import Measurement, Psf, Scene
 
@@ -168,6 +169,7 @@ class SimulatedPairs:
         mismatch: how the camera differs from its calibration.
         sensor: noise, black level and saturation.
         seed: of everything.
+        camera: the true one, where it is known and always the same; no PSF is perturbed then.
     """
 
     photographs: Photographs
@@ -176,6 +178,7 @@ class SimulatedPairs:
     mismatch: Mismatch = Mismatch()
     sensor: Sensor = Sensor()
     seed: int = 0
+    camera: FieldCamera | None = None
 
     @property
     def name(self) -> str:
@@ -192,8 +195,8 @@ class SimulatedPairs:
         # Two neighbouring seeds share no sample before the millionth; torch looks at the lower 32 bits alone.
         generators = [torch.Generator().manual_seed((self.seed * 1_000_003 + n) & (2**63 - 1)) for n in numbers]
         scene = self.scenes(generators)
-        psf = perturb(self.psf.expand(len(scene), -1, -1, -1), self.mismatch, generators)
-        light = Camera(psf).forward(scene)
+        camera = self.camera or Camera(perturb(self.psf.expand(len(scene), -1, -1, -1), self.mismatch, generators))
+        light = camera.forward(scene)
         light = light * self._shading(generators, (light.shape[-2], light.shape[-1])).to(light)
         ambient = uniform(generators, *self.placement.ambient)[..., None, None].to(light)
         light = light + ambient * light.mean((1, 2, 3), keepdim=True)

@@ -4,7 +4,9 @@ import sys
 import time
 import typing
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from torch import nn
@@ -135,12 +137,14 @@ def _synchronise(device: torch.device) -> None:
 def _warm_up(method: Bound, measurement: Measurement) -> int | None:
     """Reconstruct twice, so that plans, caches and clocks have settled; returns the peak memory in bytes.
 
-    On a GPU, all that torch holds there at its highest, weights included. On a CPU, by how much the highest
-    memory of the whole process rises: the method's own need beyond anything before it, and 0 if that is less.
+    On a GPU, all that torch holds there at its highest, weights included. On a CPU, by how much the memory of the
+    whole process rises above what it holds before. Where that peak cannot be forgotten (Linux can), above the highest
+    it ever held: 0 if the method needs less than another one before it.
     """
     device = _device(method)
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
+    _forget_peak()
     before = _highest_resident()
     for _ in range(2):
         _timed(method, measurement)
@@ -148,6 +152,12 @@ def _warm_up(method: Bound, measurement: Measurement) -> int | None:
         return torch.cuda.max_memory_allocated(device)
     after = _highest_resident()
     return None if before is None or after is None or device.type != "cpu" else after - before
+
+
+def _forget_peak() -> None:
+    """Let `_highest_resident` begin again at what the process holds now; see proc_pid_clear_refs(5)."""
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 
 
 def _highest_resident() -> int | None:

@@ -3,6 +3,7 @@
 import json
 import math
 import statistics
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -34,7 +35,7 @@ class Scores:
         values: of each metric, one number a picture; NaN where it is missing.
         seconds: for each picture, warmed up, from the measurement in the host's memory to the reconstruction.
         peak_bytes: memory for one picture, ``None`` where it is unknown. On a GPU the highest total of torch,
-            weights included. On a CPU only what goes beyond the highest memory of the process before this method.
+            weights included. On a CPU what the method takes beside its weights and all that the process holds.
         device: kind of device that the method used.
         learnable: count of learnable numbers.
     """
@@ -61,6 +62,17 @@ class Scores:
         """For one picture."""
         return statistics.median(self.seconds)
 
+    def content(self) -> dict[str, Any]:
+        """Everything, with the means and their intervals, in values that JSON can hold."""
+        return _finite(_plain(self))
+
+    @classmethod
+    def read(cls, content: Mapping[str, Any]) -> "Scores":
+        """From what `content` gave; an infinite PSNR is missing then."""
+        numbers = {m: tuple(math.nan if v is None else v for v in row) for m, row in content["values"].items()}
+        seconds = tuple(content["seconds"])
+        return cls(numbers, seconds, content["peak_bytes"], content["device"], content["learnable"])
+
 
 @dataclass(frozen=True)
 class Report:
@@ -86,18 +98,24 @@ class Report:
         """How many were compared."""
         return len(next(iter(self.methods.values())).seconds)
 
-    def table(self) -> Table:
-        """Means with their 95 % confidence intervals, the best in bold; time, memory, learnable numbers."""
+    def table(self, more: Mapping[str, Mapping[str, str]] | None = None) -> Table:
+        """Means with their 95 % confidence intervals, the best in bold; time, memory, learnable numbers.
+
+        Args:
+            more: further columns: by their heading, what to say of each method.
+        """
+        more = more or {}
         title = f"{self.pictures} pictures, protocol {self.protocol}, {self.variant}: mean [95 % confidence]"
         caption = "\n".join(f"{_TITLES[name]} is missing: {escape(reason)}" for name, reason in self.missing.items())
         table = Table("method", title=title, caption=caption or None)
         measured = [metric for metric in METRICS if metric not in self.missing]
-        for heading in (*(_TITLES[metric] for metric in measured), "ms / picture", "memory", "learnable"):
+        for heading in (*(_TITLES[metric] for metric in measured), "ms / picture", "memory", "learnable", *more):
             table.add_column(heading, justify="right")
         best = {metric: self._best(metric) for metric in measured}
         for name, scores in self.methods.items():
             cells = [_cell(metric, scores.summary(metric), name in best[metric]) for metric in measured]
-            table.add_row(escape(name), *cells, *_costs(scores))
+            said = (escape(column.get(name, "")) for column in more.values())
+            table.add_row(escape(name), *cells, *_costs(scores), *said)
         return table
 
     def json(self) -> str:
@@ -115,7 +133,7 @@ class Report:
             "variant": self.variant,
             "pictures": self.pictures,
             "missing": self.missing,
-            "methods": {name: _plain(scores) for name, scores in self.methods.items()},
+            "methods": {name: scores.content() for name, scores in self.methods.items()},
         }
         return _finite(content)
 

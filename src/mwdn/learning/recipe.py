@@ -203,13 +203,24 @@ def read_recipe(path: str | Path, **schedule: Any) -> Recipe:  # noqa: ANN401
         changes["epochs"] = 0
     content["schedule"] = content.get("schedule", {}) | changes
     kinds: dict[str, Any] = {name: type(f.default) for name, f in fields.items() if is_dataclass(f.default)}
-    tables = {name: _fill(kinds[name], name, table) for name, table in content.items() if name in kinds}
+    tables = {name: fill(kinds[name], name, table) for name, table in content.items() if name in kinds}
     recipe = Recipe(**(content | tables))
     captures = tuple(str(Path(path).parent / capture) for capture in recipe.sheet.captures)
     return dataclasses.replace(recipe, sheet=Sheet(captures))
 
 
-def _fill(kind: type[T], name: str, table: dict[str, Any]) -> T:
+def fill(kind: type[T], name: str, table: dict[str, Any]) -> T:
+    """Make a dataclass of a table of TOML.
+
+    Args:
+        kind: of which every field has a default, whose type the table's value must have.
+        name: of the table, for messages.
+        table: values by the fields' names.
+
+    Raises:
+        UnknownNameError: a key that the dataclass has not.
+        ParameterError: a value of another kind than its default, or outside its range.
+    """
     known = {f.name: f.default for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
     for key, value in table.items():
         if key not in known:

@@ -9,9 +9,8 @@ from mwdn.calibration import Calibration
 from mwdn.data.cameras import CameraPairs
 from mwdn.data.captures import find_captures, read_captures
 from mwdn.data.pair_writer import Attribute
-from mwdn.data.pairs import PairFile
 from mwdn.data.photographs import Photographs
-from mwdn.data.recorded import HELD_OUT, recorded_pairs
+from mwdn.data.recorded import HELD_OUT, record, recorded_pairs
 from mwdn.data.simulated import EXACT, Samples, SimulatedPairs
 from mwdn.errors import ParameterError
 from mwdn.learning import distributed
@@ -90,7 +89,7 @@ def simulate(
     count: int,
     *,
     exact: bool = False,
-    track: Callable[[range], Iterable[int]] = iter,
+    track: Callable[[list[range]], Iterable[range]] = iter,
 ) -> None:
     """Write simulated pairs to a file, which is there only once it is whole.
 
@@ -111,12 +110,8 @@ def simulate(
     pairs = _source(recipe, Photographs(photos), calibration.psf)
     pairs = replace(pairs, mismatch=EXACT) if exact else pairs
     attributes: dict[str, Attribute] = {"psf_hash": calibration.psf_hash, "seed": pairs.seed}
-    shape = (*calibration.size, 3)
-    file = PairFile.create(out, measurement_shape=shape, scene_shape=shape, attributes=attributes, psf=calibration.psf)
-    with file:
-        for start in track(range(0, count, recipe.schedule.batch)):
-            end = min(start + recipe.schedule.batch, count)
-            file.append(*pairs.batch(range(FILE_START + start, FILE_START + end))[:2])
+    part = pairs, range(FILE_START, FILE_START + count)
+    record(out, [part], calibration.psf, batch=recipe.schedule.batch, attributes=attributes, track=track)
 
 
 def _source(recipe: Recipe, photographs: Photographs, psf: Psf) -> SimulatedPairs:

@@ -2,6 +2,7 @@
 
 from mwdn.optics.amplitude_masks import CodedAperture, Pinholes, ZoneAperture
 from mwdn.optics.camera import Camera
+from mwdn.optics.deviation import Deviation
 from mwdn.optics.families import FAMILIES, Variety, sample_camera
 from mwdn.optics.field import Aberration, FieldCamera, field_psfs
 from mwdn.optics.masks import Mask, mask_psf
@@ -14,6 +15,7 @@ __all__ = [
     "Camera",
     "CodedAperture",
     "Contour",
+    "Deviation",
     "Diffuser",
     "FAMILIES",
     "FieldCamera",

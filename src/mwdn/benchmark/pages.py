@@ -1,0 +1,112 @@
+"""A page of words, tables and pictures, as one HTML file and as Markdown."""
+
+import base64
+import html
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.table import Table
+
+from mwdn.data.writing import atomic
+from mwdn.evaluation.tables import html_table, markdown_table
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture in a file's bytes.
+
+    Args:
+        name: of the file, with its suffix: png or jpg.
+        content: its bytes.
+        words: what it shows.
+    """
+
+    name: str
+    content: bytes
+    words: str
+
+
+@dataclass(frozen=True)
+class Code:
+    """Text to be shown as it is."""
+
+    text: str
+
+
+Block = str | Table | Picture | Code
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading and what stands under it."""
+
+    title: str
+    blocks: list[Block]
+
+
+_HTML = """<!doctype html>
+<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{title}</title>
+<style>
+body {{ font: 15px/1.5 system-ui, sans-serif; max-width: 88rem; margin: 2rem auto; padding: 0 1rem; color: #222; }}
+nav a {{ margin-right: 1rem; }} img {{ max-width: 100%; }} div.wide {{ overflow-x: auto; margin: 1rem 0; }}
+table {{ border-collapse: collapse; font-size: 13px; font-variant-numeric: tabular-nums; white-space: nowrap; }}
+caption {{ text-align: left; color: #555; padding-bottom: .3rem; }}
+td, th {{ padding: .15rem .8rem; text-align: right; border-bottom: 1px solid #e4e4e4; font-weight: normal; }}
+tr:first-child th {{ border-bottom: 1px solid #888; }} th:first-child {{ text-align: left; }} b {{ color: #06540c; }}
+pre {{ background: #f5f5f5; padding: .8rem; overflow-x: auto; font-size: 12px; }}
+</style>
+<h1>{title}</h1>
+<nav>{links}</nav>
+{body}
+</html>
+"""
+
+
+def write_html(path: Path, title: str, sections: list[Section]) -> None:
+    """Write a page that needs no other file, atomically."""
+    links = "".join(f'<a href="#s{i}">{html.escape(section.title)}</a> ' for i, section in enumerate(sections))
+    body = "\n".join(
+        f'<h2 id="s{i}">{html.escape(section.title)}</h2>\n' + "\n".join(map(_as_html, section.blocks))
+        for i, section in enumerate(sections)
+    )
+    with atomic(path) as temporary:
+        page = _HTML.format(title=html.escape(title), links=links, body=body)
+        temporary.write_text(page, encoding="utf-8")
+
+
+def write_markdown(path: Path, title: str, sections: list[Section]) -> None:
+    """Write a page and, in the folder ``pictures`` beside it, its pictures, each atomically."""
+    parts = [f"# {title}"]
+    for section in sections:
+        parts.append(f"## {section.title}")
+        for block in section.blocks:
+            if isinstance(block, Picture):
+                with atomic(path.parent / "pictures" / block.name) as temporary:
+                    temporary.write_bytes(block.content)
+            parts.append(_as_markdown(block))
+    with atomic(path) as temporary:
+        temporary.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
+
+
+def _as_html(block: Block) -> str:
+    match block:
+        case Table():
+            return f'<div class="wide">{html_table(block)}</div>'
+        case Picture():
+            kind = "jpeg" if block.name.endswith(".jpg") else "png"
+            data = base64.b64encode(block.content).decode("ascii")
+            return f'<p><img src="data:image/{kind};base64,{data}" alt="{html.escape(block.words)}"></p>'
+        case Code():
+            return f"<pre>{html.escape(block.text)}</pre>"
+    return f"<p>{html.escape(block)}</p>"
+
+
+def _as_markdown(block: Block) -> str:
+    match block:
+        case Table():
+            return markdown_table(block)
+        case Picture():
+            return f"![{block.words}](pictures/{block.name})"
+        case Code():
+            return f"```\n{block.text}\n```"
+    return block

@@ -1,0 +1,156 @@
+"""A benchmark from its recipe to its page; begun again, it goes on where it was interrupted."""
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+
+import torch
+
+from mwdn.benchmark.compose import sections
+from mwdn.benchmark.exports import csv_text, json_content
+from mwdn.benchmark.found import Found
+from mwdn.benchmark.pages import write_html, write_markdown
+from mwdn.benchmark.recipe import Benchmark, Method
+from mwdn.benchmark.robustness import Sweep, sweep
+from mwdn.benchmark.scoring import Scored, bind, identity, score
+from mwdn.benchmark.sets import Opened, open_set
+from mwdn.benchmark.training import train
+from mwdn.data.writing import atomic
+from mwdn.errors import ParameterError
+from mwdn.evaluation import Perceptual
+from mwdn.learning.alexnet import SMALLEST
+from mwdn.learning.devices import usable
+from mwdn.learning.train import Report
+
+PAGE = "index.html"
+
+
+@dataclass(frozen=True)
+class Watch:
+    """Who is told of the progress.
+
+    Args:
+        stage: of what begins, and of how many parts it has; 0 if nobody knows.
+        done: how many are done, and a note.
+    """
+
+    stage: Callable[[str, int], None] = lambda title, parts: None
+    done: Callable[[int, str], None] = lambda parts, note: None
+
+    def track(self, title: str, rows: list[range]) -> Iterator[range]:
+        """Pass rows through, and tell of each."""
+        self.stage(title, len(rows))
+        for number, row in enumerate(rows):
+            yield row
+            self.done(number + 1, "")
+
+
+def run(
+    benchmark: Benchmark, out: Path, *, device: str | None = None, command: str = "", watch: Watch = Watch()
+) -> Found:
+    """Make data, train, score, sweep, and write the page.
+
+    What is finished stays: files of pairs, trained networks, scores. A network whose training was interrupted goes on
+    from its last saved state.
+
+    Args:
+        benchmark: the recipe.
+        out: folder: ``index.html``, ``benchmark.md``, ``benchmark.json``, ``benchmark.csv``, and in folders ``data``,
+            ``runs``, ``scores``, ``robustness`` what they are made of.
+        device: where to compute; a GPU if there is one unless given.
+        command: that was given, for the page.
+        watch: told of the progress.
+
+    Raises:
+        MwdnError: a file cannot be read, a method does not fit, training diverges, or ``out`` holds another benchmark.
+    """
+    place = usable(device)
+    opened = {n: open_set(n, data, out / "data", place, watch.track) for n, data in benchmark.data.items()}
+    runs = {name: each for name, each in opened.items() if each.training is not None}
+    for name, each in runs.items():
+        for method in (m for m in benchmark.methods if m.learned):
+            watch.stage(f"{name}: training {method.label}", benchmark.schedule.steps)
+            train(method, each, benchmark, out / "runs" / name / method.label, device=place, show=partial(_told, watch))
+    scored = _score_all(benchmark, opened, out, place, watch)
+    sweeps = _sweep(benchmark, opened, out, place, watch)
+    found = Found(benchmark, opened, scored, sweeps, out / "runs", place, command)
+    write(found, out)
+    return found
+
+
+def write(found: Found, out: Path) -> None:
+    """Write the page in its four forms.
+
+    Raises:
+        ParameterError: the disk refuses.
+    """
+    title = found.benchmark.title
+    try:
+        parts = sections(found)
+        write_html(out / PAGE, title, parts)
+        write_markdown(out / "benchmark.md", title, parts)
+        texts = {"benchmark.json": json.dumps(json_content(found), indent=1) + "\n", "benchmark.csv": csv_text(found)}
+        for name, text in texts.items():
+            with atomic(out / name) as temporary:
+                temporary.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ParameterError(f"`{out}` must be a folder that can be written to: {error.strerror}.") from error
+
+
+def _told(watch: Watch, report: Report) -> None:
+    psnr = f", {report.validation.psnr:.2f} dB" if report.validation else ""
+    watch.done(report.step, f"loss {report.loss:.4f}{psnr}")
+
+
+def _same(perceptual: Perceptual) -> Perceptual:
+    return perceptual
+
+
+def _checkpoint(method: Method, opened: Opened, out: Path) -> Path | None:
+    if not method.learned:
+        return None
+    return out / "runs" / (opened.data.trained_on or opened.name) / method.label / "best.safetensors"
+
+
+def _score_all(
+    benchmark: Benchmark, opened: dict[str, Opened], out: Path, place: torch.device, watch: Watch
+) -> dict[str, dict[str, Scored]]:
+    @cache
+    def loaded() -> Perceptual:
+        return Perceptual.load(benchmark.alexnet or None, benchmark.heads or None)
+
+    found: dict[str, dict[str, Scored]] = {}
+    for name, each in opened.items():
+        found[name] = {}
+        sides = each.data.part().crop(each.calibration.psf).shape[-2:]
+        small = Perceptual.none(f"the part {each.data.part().name} has less than {SMALLEST} pixels a side, for AlexNet")
+        perceptual = loaded if min(sides) >= SMALLEST else partial(_same, small)
+        for number, method in enumerate(benchmark.methods):
+            watch.stage(f"{name}: scoring {method.label}", len(benchmark.methods))
+            watch.done(number, "")
+            found[name][method.label] = score(
+                method,
+                _checkpoint(method, each, out),
+                each,
+                out / "scores" / name,
+                device=place,
+                perceptual=perceptual,
+                shown=benchmark.shown,
+            )
+    return found
+
+
+def _sweep(
+    benchmark: Benchmark, opened: dict[str, Opened], out: Path, place: torch.device, watch: Watch
+) -> dict[str, Sweep]:
+    wanted = benchmark.robustness
+    if not (wanted.data and wanted.sizes):
+        return {}
+    each = opened[wanted.data]
+    paths = {method.label: _checkpoint(method, each, out) for method in benchmark.methods}
+    methods = {m.label: partial(bind, m, paths[m.label], each, place) for m in benchmark.methods}
+    identities = {m.label: identity(m, paths[m.label], each) for m in benchmark.methods}
+    folder = out / "robustness" / wanted.data
+    return sweep(methods, identities, each, wanted, folder, tell=lambda text: watch.stage(text, 0))

@@ -1,0 +1,275 @@
+"""Data sets of a benchmark: what is simulated, what was recorded, and which of it is for what."""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mwdn.calibration import Calibration
+from mwdn.calibration.frames import Background
+from mwdn.data.importers import Layout, import_pairs
+from mwdn.data.pair_writer import Attribute
+from mwdn.data.pairs import PairFile
+from mwdn.data.photographs import Photographs
+from mwdn.data.recorded import HELD_OUT, Division, RecordedPairs, check_pairs, record
+from mwdn.data.simulated import EXACT, Placement, Samples, SimulatedPairs
+from mwdn.data.splits import split
+from mwdn.data.writing import atomic
+from mwdn.errors import ParameterError
+from mwdn.evaluation import Protocol
+from mwdn.learning.session import FILE_START
+from mwdn.learning.validation import START
+from mwdn.optics import Deviation, Sensor
+
+Track = Callable[[str, list[range]], Iterable[range]]
+"""Shows the progress of an iteration under a title."""
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """Pairs of one camera: simulated from photographs, or recorded.
+
+    Args:
+        psf: of the calibration, a file.
+        bin: average blocks of so many pixels of the PSF and of captures; the protocol shrinks with them.
+        psf_bin: of the PSF besides, where it was taken at so many times the resolution of the captures.
+        background: even light under the PSF, as a part of the full scale; estimated if negative.
+        upside_down: files have their first row at the bottom.
+        bgr: files have their channels in the order blue, green, red.
+        photos: folder to simulate training from; every 20th photograph is for validation.
+        test_photos: folder to simulate the test from.
+        train: pairs to train on that are made once; 0 makes every sample a new one.
+        validation: pairs to choose the best weights by.
+        test: pairs to be scored on; of recorded ones at most so many, 0 for all.
+        seed: of all that is simulated.
+        placement: how a photograph stands in the scene.
+        deviation: how the true camera differs from its calibration, which is all that methods are told.
+        sensor: its noise.
+        pairs: recorded ones in place of photographs: a file of ``mwdn import``, or a data set of this ``kind``.
+        kind: how they are laid out, see `mwdn.data.importers.KINDS`; empty for a file of pairs.
+        split: which are for what, see `mwdn.data.splits.split`; empty if all are for the test.
+        trained_on: another data set, of the same camera, whose networks are tested here; nothing is trained.
+        captures: real ones without a scene, files and folders, to be shown.
+        protocol: the part of each picture that counts, in pixels before ``bin``.
+    """
+
+    psf: str = ""
+    bin: int = 1
+    psf_bin: int = 1
+    background: float = -1.0
+    upside_down: bool = False
+    bgr: bool = False
+    photos: str = ""
+    test_photos: str = ""
+    train: int = 1000
+    validation: int = 16
+    test: int = 24
+    seed: int = 0
+    placement: Placement = Placement()
+    deviation: Deviation = Deviation()
+    sensor: Sensor = Sensor()
+    pairs: str = ""
+    kind: str = ""
+    split: str = ""
+    trained_on: str = ""
+    captures: tuple[str, ...] = ()
+    protocol: str = "full"
+
+    def part(self) -> Protocol:
+        """The protocol at the size of the binned pictures: of "centre-128", binned by 2, "centre-64"."""
+        whole = Protocol.parse(self.protocol)
+        if whole.centre:
+            return Protocol.parse(f"centre-{whole.centre // self.bin}")
+        if whole.rows and whole.columns:
+            (top, bottom), (left, right) = whole.rows, whole.columns
+            top, bottom, left, right = (number // self.bin for number in (top, bottom, left, right))
+            return Protocol.parse(f"{top}:{bottom},{left}:{right}")
+        return whole
+
+    def calibration(self) -> Calibration:
+        """Read the PSF."""
+        background: Background = self.background if self.background >= 0 else "estimate"
+        return Calibration.from_file(
+            self.psf,
+            background=background,
+            binning=self.bin,
+            psf_binning=self.bin * self.psf_bin,
+            upside_down=self.upside_down,
+            bgr=self.bgr,
+        )
+
+
+_PAPER = DataSet(protocol="centre-128")
+_DIFFUSERCAM = DataSet(background=0.0, upside_down=True, bgr=True, protocol="60:270,60:440")
+_PHLATCAM = DataSet(background=0.0)
+_REAL = Deviation(turn_degrees=0.5, background=0.1, off_axis=1.0)
+
+PRESETS: dict[str, DataSet] = {
+    # The display took 137 of 320 pixels, 2.5 of the 91.5 beside it off the centre.
+    "mwdn-sim": replace(_PAPER, placement=Placement((0.428, 0.428), 1.0, 0.0, 0.027), deviation=_REAL),
+    # Scenes of many sizes about the 210 x 380 that its display filled; the noise explains its captures.
+    "diffusercam-sim": replace(
+        _DIFFUSERCAM,
+        placement=Placement((0.7, 1.5), 1.6, 5.0, 0.8),
+        deviation=replace(_REAL, turn_degrees=0.3),
+        sensor=Sensor(5000.0, 7.0),
+    ),
+    # Scenes of 384 x 384 in the middle of 384 x 640: where they stood is not published.
+    "phlatcam-sim": replace(
+        _PHLATCAM, placement=Placement((1.0, 1.0), 1.0, 0.0, 0.0), deviation=_REAL, protocol="0:384,128:512"
+    ),
+    "diffusercam-real": replace(_DIFFUSERCAM, kind="diffusercam", trained_on="diffusercam-sim", test=0),
+    # The public sets in their own layouts, and their own splits.
+    "mwdn": replace(_PAPER, kind="mwdn", split="paper", test=0),
+    "diffusercam": replace(_DIFFUSERCAM, kind="diffusercam", split="diffusercam", test=0),
+    "phlatcam": replace(_PHLATCAM, kind="phlatcam", split="phlatcam", test=0),
+}
+"""What is known of the data sets of the paper; a recipe names the files, and overrides what it likes."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Some pairs of a file, by their positions."""
+
+    file: PairFile
+    rows: range | list[int]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
+        return self.file[self.rows[index]]
+
+
+@dataclass(frozen=True, eq=False)
+class Opened:
+    """A data set that is ready.
+
+    Args:
+        name: as in the recipe.
+        data: what the recipe says of it.
+        calibration: of its camera, as the methods know it.
+        test: pairs to be scored on.
+        training: what to learn from, and what to choose weights by; ``None`` where other networks are tested.
+        identity: tells it from another one of the same name.
+    """
+
+    name: str
+    data: DataSet
+    calibration: Calibration
+    test: Part
+    training: tuple[Samples, RecordedPairs] | None
+    identity: dict[str, Any]
+
+
+def open_set(name: str, data: DataSet, folder: Path, device: torch.device, track: Track) -> Opened:
+    """Make a data set's file of pairs, unless it is there, and open it.
+
+    Args:
+        name: of the data set.
+        data: what the recipe says.
+        folder: for its files.
+        device: where to simulate, and where training takes place.
+        track: shows progress.
+
+    Raises:
+        MwdnError: a file cannot be read, or does not fit the camera; or ``folder`` holds other pairs of this name.
+    """
+    calibration = data.calibration()
+    data.part().crop(calibration.psf)  # refuses a part that does not fit before anything is trained
+    simulates = not data.pairs
+    path = folder / f"{name}.h5" if simulates or data.kind else Path(data.pairs)
+    shown = {"psf", "captures", "protocol"}
+    identity = {key: value for key, value in asdict(data).items() if key not in shown}
+    identity = json.loads(json.dumps({**identity, "psf_hash": calibration.psf_hash}))
+    note = folder / f"{name}.json"
+    made = json.loads(note.read_text(encoding="utf-8")) if note.is_file() and path.is_file() else None
+    if made not in (None, identity):
+        raise ParameterError(
+            f"`{path}` holds pairs that another recipe made. Choose another folder, `--out`, or remove it."
+        )
+    if made is None:
+        if simulates:
+            _simulate(data, calibration, path, device, lambda rows: track(f"{name}: simulating", rows))
+        elif data.kind:
+            size = calibration.size if data.bin > 1 else None
+            import_pairs(data.kind, data.pairs, path, layout=Layout(bin=data.bin, scene_size=size))
+        with atomic(note) as temporary:
+            temporary.write_text(json.dumps(identity, indent=2), encoding="utf-8")
+    file = PairFile(path)
+    check_pairs(file, calibration.psf)
+    rows = _rows(data, len(file), simulates)
+    training = None if data.trained_on else _training(data, calibration, file, rows, device)
+    return Opened(name, data, calibration, Part(file, rows["test"]), training, identity)
+
+
+def simulated(
+    data: DataSet, calibration: Calibration, photographs: Photographs, device: torch.device
+) -> SimulatedPairs:
+    """The source of a data set's simulated pairs."""
+    psf = calibration.psf.to(device)
+    return SimulatedPairs(
+        photographs.to(device),
+        psf,
+        placement=data.placement,
+        mismatch=EXACT,
+        sensor=data.sensor,
+        seed=data.seed,
+        camera=data.deviation.camera(psf),
+    )
+
+
+def file_hash(path: Path) -> str:
+    """First 16 hexadecimal digits of the SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:16]
+
+
+def _simulate(
+    data: DataSet,
+    calibration: Calibration,
+    path: Path,
+    device: torch.device,
+    track: Callable[[list[range]], Iterable[range]],
+) -> None:
+    """Training, validation and test, in this order, from three sets of photographs that share none."""
+    learned, held_out = Photographs(data.photos).split(HELD_OUT)
+    parts = [
+        (simulated(data, calibration, photographs, device), range(start, start + count))
+        for photographs, start, count in (
+            (learned, 0, data.train),
+            (held_out, START, data.validation),
+            (Photographs(data.test_photos), FILE_START, data.test),
+        )
+    ]
+    attributes: dict[str, Attribute] = {"psf_hash": calibration.psf_hash, "seed": data.seed}
+    record(path, parts, calibration.psf, attributes=attributes, track=track)
+
+
+def _rows(data: DataSet, count: int, simulates: bool) -> dict[str, range | list[int]]:
+    if simulates:
+        first, second = data.train, data.train + data.validation
+        return {"train": range(first), "validation": range(first, second), "test": range(second, count)}
+    if not data.split:
+        return {"test": range(min(data.test or count, count))}
+    train, validation = Division(data.split, seed=data.seed).of(count)
+    test = split(count, data.split, seed=data.seed)["test"]
+    return {"train": train, "validation": validation[: data.validation], "test": test[: data.test or len(test)]}
+
+
+def _training(
+    data: DataSet,
+    calibration: Calibration,
+    file: PairFile,
+    rows: dict[str, range | list[int]],
+    device: torch.device,
+) -> tuple[Samples, RecordedPairs]:
+    validation = RecordedPairs(file, rows["validation"], data.seed, False, device)
+    if not data.pairs and not data.train:
+        return simulated(data, calibration, Photographs(data.photos).split(HELD_OUT)[0], device), validation
+    return RecordedPairs(file, rows["train"], data.seed, device=device), validation

@@ -1,0 +1,250 @@
+"""A benchmark from its recipe to its page, killed on the way, on a camera of 48 x 64 pixels."""
+
+import csv
+import json
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mwdn.benchmark import read_benchmark, run
+from mwdn.cli import main
+from mwdn.data.pairs import PairFile
+from mwdn.errors import CheckpointError, ParameterError, UnknownNameError
+from mwdn.evaluation import bootstrap
+from mwdn.optics.patterns import contour_psf
+
+RECIPE = """
+title = "Two networks & a solver"
+ablation = ["wiener", "mwdn"]
+compared = "mwdn"
+shown = 2
+alexnet = "nowhere.pth"
+networks = { wiener = {}, mwdn = {} }
+solvers = { quick = { name = "admm", iterations = 3 } }
+shared.network = { width = 2 }
+shared.data = { photos = "photos", test_photos = "test", background = 0.0 }
+schedule = { steps = 6, batch = 2, validate_every = 2, warmup = 0, bfloat16 = false }
+robustness = { data = "caustic", count = 2, noise = [2], shift_px = [1] }
+
+[data]
+caustic = { psf = "psf.npy", train = 4, validation = 2, test = 3, deviation = { turn_degrees = 1, off_axis = 1 } }
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, generator):
+    """psf.npy, photos, test, a capture, r.toml."""
+    psf = contour_psf((48, 64), cell=12, generator=generator).expand(1, 3, -1, -1)
+    np.save(tmp_path / "psf.npy", (0.9 * psf / psf.max())[0].movedim(0, -1).numpy())
+    for number in range(24):
+        part = tmp_path / ("photos" if number < 21 else "test")
+        part.mkdir(exist_ok=True)
+        small = np.random.default_rng(number).integers(0, 256, (4, 4, 3), np.uint8)
+        cv2.imwrite(str(part / f"{number}.png"), cv2.resize(small, (24, 24), interpolation=cv2.INTER_CUBIC))
+    (tmp_path / "r.toml").write_text(RECIPE, encoding="utf-8")
+    return tmp_path
+
+
+def values(out):
+    """All scores and the sweep, without the times."""
+    content = json.loads((out / "benchmark.json").read_text())
+    methods = content["sets"]["caustic"]["methods"]
+    return {label: found["values"] for label, found in methods.items()}, content["robustness"]
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+import torch
+torch.set_num_threads(1)
+from mwdn.benchmark import read_benchmark, run, scoring
+from mwdn.learning import train
+
+calls = {"save": 0, "measure": 0}
+def counted(name, then, last):
+    def call(*arguments, **options):
+        result = then(*arguments, **options)
+        calls[name] += 1
+        if calls[name] == last:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return result
+    return call
+
+where = sys.argv[1]
+if where == "save":     # the second network has saved once: 1 x 3 + 1
+    train.Trainer.save = counted("save", train.Trainer.save, 4)
+else:                   # the second method's scores are known, and not yet written
+    scoring._measure = counted("measure", scoring._measure, 2)
+run(read_benchmark("r.toml"), Path("out"), device="cpu")
+"""
+
+
+def killed(folder, where):
+    call = [sys.executable, "-W", "error", "-c", KILLED, where]
+    done = subprocess.run(call, cwd=folder, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+
+
+def test_goes_on_where_it_was_killed(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    killed(folder, "save")
+    first, second = (folder / "out" / "runs" / "caustic" / label for label in ("wiener", "mwdn"))
+    assert len((first / "log.jsonl").read_text().splitlines()) == 6
+    assert len((second / "log.jsonl").read_text().splitlines()) == 2
+    assert not (folder / "out" / "scores").exists()
+    weights = (first / "best.safetensors").stat()
+    pairs = (folder / "out" / "data" / "caustic.h5").stat()
+
+    killed(folder, "measure")
+    assert len((second / "log.jsonl").read_text().splitlines()) == 6
+    scored = {path.name for path in (folder / "out" / "scores" / "caustic").glob("*.json")}
+    assert scored == {"quick.json"}
+    written = (folder / "out" / "scores" / "caustic" / "quick.json").stat()
+
+    run(read_benchmark("r.toml"), Path("out"), device="cpu")
+    assert (first / "best.safetensors").stat().st_mtime_ns == weights.st_mtime_ns
+    assert (folder / "out" / "data" / "caustic.h5").stat().st_mtime_ns == pairs.st_mtime_ns
+    assert (folder / "out" / "scores" / "caustic" / "quick.json").stat().st_mtime_ns == written.st_mtime_ns
+
+    run(read_benchmark("r.toml"), Path("whole"), device="cpu")
+    found, swept = values(folder / "out")
+    wanted, wanted_sweep = values(folder / "whole")
+    assert found.keys() == {"quick", "wiener", "mwdn"}
+    for label, metrics in wanted.items():
+        for metric, numbers in metrics.items():
+            # A process of its own may add in another order.
+            assert found[label][metric] == pytest.approx(numbers, rel=1e-4, nan_ok=True), (label, metric)
+        for axis, sizes in wanted_sweep[label].items():
+            for size, numbers in sizes.items():
+                assert swept[label][axis][size] == pytest.approx(numbers, rel=1e-4), (label, axis, size)
+
+
+@pytest.fixture
+def done(folder, monkeypatch, capsys):
+    """The command has been run."""
+    monkeypatch.chdir(folder)
+    with pytest.raises(SystemExit) as stopped:
+        main(["benchmark", "r.toml", "--out", "out", "--device", "cpu"])
+    shown = capsys.readouterr()
+    assert stopped.value.code == 0, shown.err
+    assert "Look at out/index.html" in shown.out
+    return folder / "out"
+
+
+def test_the_page_says_what_was_found(done, folder):
+    page = (done / "index.html").read_text()
+    assert "<title>Two networks &amp; a solver</title>" in page
+    assert not re.search(r'(src|href)="(?!data:|#)', page), "the page must need no other file"
+    content = json.loads((done / "benchmark.json").read_text())
+    found = content["sets"]["caustic"]
+    assert (found["protocol"], found["variant"]) == ("full", "clipped")
+    assert found["data"]["deviation"]["turn_degrees"] == 1.0
+    assert {"lpips", "feature_mse"} <= found["missing"].keys()
+    lines = {row["method"]: row for row in csv.DictReader((done / "benchmark.csv").open())}
+    assert list(lines) == ["quick", "wiener", "mwdn"]
+    markdown = (done / "benchmark.md").read_text()
+    for label, scores in found["methods"].items():
+        mean, low, high = bootstrap(scores["values"]["psnr"])
+        assert f"{mean:.2f}" in markdown
+        assert f"[{low:.2f}, {high:.2f}]" in page
+        assert float(lines[label]["psnr"]) == pytest.approx(mean)
+        assert lines[label]["lpips"] == ""
+        assert int(lines[label]["learnable"]) == scores["learnable"]
+        assert (scores["training_seconds"] is None) == (label == "quick")
+    assert found["methods"]["wiener"]["learnable"] == 2
+    for name in re.findall(r"\(pictures/([^)]+)\)", markdown):
+        picture = cv2.imread(str(done / "pictures" / name))
+        assert picture.std() > 5, name
+    assert {"caustic.jpg", "caustic-curves.png", "robustness-mwdn.png"} <= {
+        p.name for p in (done / "pictures").iterdir()
+    }
+    for word in ("torch", "iterations = 3", "mwdn benchmark", "mwdn minus its", "off_axis 1"):
+        assert word in page
+
+
+def test_the_test_part_is_no_part_of_the_training(done):
+    """21 photographs and 3 others: 4 pairs to learn from, then 2 of held-out photographs, then 3 of the others."""
+    file = PairFile(done / "data" / "caustic.h5")
+    assert len(file) == 4 + 2 + 3
+    scenes = [file[i][1] for i in range(9)]
+    for i in range(9):
+        assert not any(scenes[i].equal(scenes[j]) for j in range(i))
+
+
+def test_another_recipe_needs_another_folder(done, folder):
+    text = RECIPE.replace("turn_degrees = 1", "turn_degrees = 2")
+    (folder / "r.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(ParameterError, match="another recipe made"):
+        run(read_benchmark(folder / "r.toml"), done, device="cpu")
+    (folder / "r.toml").write_text(RECIPE.replace("steps = 6", "steps = 8"), encoding="utf-8")
+    with pytest.raises(CheckpointError, match="another recipe"):
+        run(read_benchmark(folder / "r.toml"), done, device="cpu")
+
+
+def test_another_method_and_another_set_are_a_line_each(done, folder):
+    more = RECIPE.replace("mwdn = {} }", 'mwdn = {}, plain = { name = "unet" } }')
+    more += 'real = { psf = "psf.npy", pairs = "out/data/caustic.h5", trained_on = "caustic", test = 2 }\n'
+    (folder / "r.toml").write_text(more, encoding="utf-8")
+    before = (done / "runs" / "caustic" / "mwdn" / "best.safetensors").stat().st_mtime_ns
+    found = run(read_benchmark(folder / "r.toml"), done, device="cpu")
+    assert (done / "runs" / "caustic" / "mwdn" / "best.safetensors").stat().st_mtime_ns == before
+    assert list(found.scored["real"]) == ["quick", "wiener", "mwdn", "plain"]
+    assert found.report("real").pictures == 2
+    assert not (done / "runs" / "real").exists()
+    assert found.training_seconds("real", "plain") == found.training_seconds("caustic", "plain")
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "kind", "message"),
+    [
+        ("mwdn = {} }", "mwdm = {} }", UnknownNameError, "Did you mean 'mwdn'?"),
+        ("mwdn = {} }", "mwdn = { widht = 3 } }", UnknownNameError, "Did you mean 'width'?"),
+        ("mwdn = {} }", "mwdn = 3 }", ParameterError, "must be a table of options"),
+        ("quick = { name", "wiener = { name", ParameterError, "stands in \\[networks\\] and in \\[solvers\\]"),
+        ('compared = "mwdn"', 'compared = "unet"', UnknownNameError, "method of this recipe"),
+        ('compared = "mwdn"', 'compered = "mwdn"', UnknownNameError, "Did you mean 'compared'?"),
+        ('compared = "mwdn"', "compared = 3", ParameterError, "must be of the same kind as its default"),
+        ("off_axis = 1 }", "of_axis = 1 }", UnknownNameError, "Did you mean 'off_axis'?"),
+        ("off_axis = 1 }", "off_axis = -1 }", ParameterError, "must not be negative"),
+        ("train = 4", "train = -4", ParameterError, "at least 0"),
+        ('psf = "psf.npy", ', "", ParameterError, "must name a PSF"),
+        ('psf = "psf.npy"', 'psf = "$MWDN_NOWHERE/psf.npy"', ParameterError, "`MWDN_NOWHERE`.*is not set"),
+        ("noise = [2]", "noise = []", ParameterError, "must be a list of numbers"),
+        ("noise = [2]", "nois = [2]", UnknownNameError, "Did you mean 'noise'?"),
+        ('data = "caustic"', 'data = "castic"', UnknownNameError, "Did you mean 'caustic'?"),
+        ("steps = 6", "epochs = 6", ParameterError, "counts in steps"),
+        ("test = 3", 'test = 3, pairs = "a.h5"', ParameterError, "`split`, or be `trained_on`"),
+    ],
+)
+def test_mistakes_of_a_recipe(tmp_path, before, after, kind, message):
+    assert before in RECIPE
+    (tmp_path / "r.toml").write_text(RECIPE.replace(before, after, 1), encoding="utf-8")
+    with pytest.raises(kind, match=message):
+        read_benchmark(tmp_path / "r.toml")
+
+
+def test_widths_shrink_alike(tmp_path):
+    text = RECIPE.replace("shared.network = { width = 2 }", "width_factor = 0.25").replace(
+        "mwdn = {} }", 'mwdn = {}, own = { name = "mwdn", width = 5 } }'
+    )
+    (tmp_path / "r.toml").write_text(text, encoding="utf-8")
+    found = {method.label: method.options for method in read_benchmark(tmp_path / "r.toml").methods}
+    assert found == {"quick": {"iterations": 3}, "wiener": {}, "mwdn": {"width": 16}, "own": {"width": 5}}
+
+
+@pytest.mark.parametrize("name", ["benchmark-small", "benchmark-paper"])
+def test_recipes_that_come_along(name, monkeypatch):
+    monkeypatch.setenv("MWDN_DATA", "/data")
+    monkeypatch.setenv("MWDN_PUBLIC", "/public")
+    found = read_benchmark(Path(__file__).parents[2] / "recipes" / f"{name}.toml")
+    assert {"wiener", "unet", "wiener-unet", "mwdn", "mwdn-cpsf"} <= {method.label for method in found.methods}
+    assert found.data["mwdn-sim"].psf == "/data/mwdn-camera/psf_320.png"
+    assert found.data["diffusercam-real"].trained_on == "diffusercam-sim"
+    for data in found.data.values():
+        assert data.part().name == "full" or data.part().rows or data.part().centre

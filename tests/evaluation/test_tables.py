@@ -1,0 +1,42 @@
+"""A table of the terminal as HTML and as Markdown; scores through a file and back."""
+
+import json
+import math
+
+from rich.table import Table
+
+from mwdn.evaluation import Scores
+from mwdn.evaluation.tables import html_table, markdown_table
+
+
+def table():
+    made = Table("method", "a | b", title="x < y")
+    made.add_row("one & two", "[bold]1.5[/bold] \\[1, 2]")
+    made.add_row("three", "0.5")
+    return made
+
+
+def test_html():
+    assert html_table(table()) == (
+        "<table><caption>x &lt; y</caption><tr><th>method</th><th>a | b</th></tr>"
+        "<tr><th>one &amp; two</th><td><b>1.5</b> [1, 2]</td></tr><tr><th>three</th><td>0.5</td></tr></table>"
+    )
+
+
+def test_markdown():
+    assert markdown_table(table()).splitlines() == [
+        "*x < y*",
+        "",
+        "| method | a \\| b |",
+        "| --- | ---: |",
+        "| one & two | **1.5** [1, 2] |",
+        "| three | 0.5 |",
+    ]
+
+
+def test_scores_survive_json():
+    scores = Scores({"psnr": (20.0, 21.5), "lpips": (math.nan, math.nan)}, (0.1, 0.2), None, "cpu", 7)
+    found = Scores.read(json.loads(json.dumps(scores.content(), allow_nan=False)))
+    assert found.values["psnr"] == scores.values["psnr"]
+    assert all(map(math.isnan, found.values["lpips"]))
+    assert (found.seconds, found.peak_bytes, found.device, found.learnable) == ((0.1, 0.2), None, "cpu", 7)
