@@ -6,11 +6,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from mwdn.fourier import check_fit, frequency_grid, inverse_spectrum
+from mwdn.fourier import Size, check_fit, frequency_grid, inverse_spectrum, spectrum
 from mwdn.optics.warp import warp
 from mwdn.solvers.admm import Penalties
 from mwdn.solvers.pyramid import Level, explain, halve
-from mwdn.types import Measurement, Psf
+from mwdn.types import Image, Measurement, Psf
 
 
 class Pose(NamedTuple):
@@ -92,6 +92,25 @@ def _better(pose: Tensor, left: Tensor, best: Tensor, least: Tensor) -> tuple[Te
     return torch.where((energy < least)[:, None], pose, best), torch.minimum(energy, least)
 
 
+@torch.no_grad()
+def misfit(measurement: Measurement, psf: Psf) -> Tensor:
+    """Part of each measurement's detail that no scene explains with this PSF as it is, (B,): what `align` makes small.
+
+    Args:
+        measurement: (B, C, H, W).
+        psf: (1 or B, 1 or C, h, w), centred.
+    """
+    small = halve(measurement.float())
+    left = _unexplained(small, psf, small.new_zeros(len(small), 1, 2))[:, 0].square().sum(1)
+    return left / fine_detail(small).square().sum((1, 2, 3)).clamp(min=torch.finfo(torch.float32).tiny)
+
+
+def fine_detail(image: Image) -> Image:
+    """What is finer than about 30 pixels in a picture, periodically continued."""
+    grid = image.shape[-2], image.shape[-1]
+    return inverse_spectrum(spectrum(image, grid) * _fine(grid, image.device), grid, grid)
+
+
 def _unexplained(measurement: Tensor, psf: Psf, poses: Tensor) -> Tensor:
     """Detail that is left of each measurement with each of its poses (B, K, 2): (B, K, pixels)."""
     count = poses.shape[1]
@@ -99,6 +118,10 @@ def _unexplained(measurement: Tensor, psf: Psf, poses: Tensor) -> Tensor:
     moved = Pose(*poses.flatten(0, 1).unbind(-1)).move(each)
     moved = F.avg_pool2d(F.pad(moved, (0, moved.shape[-1] % 2, 0, moved.shape[-2] % 2)), 2)
     found = explain(measurement.repeat_interleave(count, 0), moved, _LEVELS)
-    rows, columns = frequency_grid(found.grid, device=measurement.device)
-    fine = 1 - torch.exp(-(rows.square() + columns.square()) / (2 * _COARSE**2))
-    return inverse_spectrum(found.residual * fine, found.grid, found.grid).reshape(len(measurement), count, -1)
+    left = inverse_spectrum(found.residual * _fine(found.grid, measurement.device), found.grid, found.grid)
+    return left.reshape(len(measurement), count, -1)
+
+
+def _fine(grid: Size, device: torch.device) -> Tensor:
+    rows, columns = frequency_grid(grid, device=device)
+    return 1 - torch.exp(-(rows.square() + columns.square()) / (2 * _COARSE**2))

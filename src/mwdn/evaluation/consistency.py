@@ -1,0 +1,91 @@
+"""How far to trust a reconstruction without knowing the scene: does the camera, looking at it, see the capture?"""
+
+from dataclasses import dataclass
+
+import torch
+
+from mwdn.calibration.frames import noise_level
+from mwdn.errors import ShapeError
+from mwdn.fourier import convolve
+from mwdn.solvers.alignment import align, fine_detail, misfit
+from mwdn.types import Measurement, Psf, Scene
+
+DOUBTFUL = 1.25
+"""A PSF that leaves less than so many times less unexplained than its mirror images tells nothing about the camera."""
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """What one reconstruction explains of its measurement.
+
+    Detail is what is finer than 30 pixels: brightness and shading are explained by almost anything.
+
+    Args:
+        explained: part of the measurement's detail that the reconstruction explains, seen through the PSF.
+        possible: part that it could explain at most, because the rest is the sensor's noise.
+        contrast: detail that the best scene leaves unexplained through the PSF's mirror images, the best of three,
+            over what the best scene leaves through the PSF itself. A wrong PSF, mirrored, is as wrong: 1.
+        turn_degrees: turn of the PSF with which it explains the most.
+        scale: likewise its relative magnification. An object that is nearer than the calibration's point makes it
+            positive.
+    """
+
+    explained: float
+    possible: float
+    contrast: float
+    turn_degrees: float
+    scale: float
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the PSF seems not to be the camera's."""
+        return self.contrast < DOUBTFUL
+
+    @property
+    def sentence(self) -> str:
+        """For people."""
+        told = f"explains {self.explained:.1%} of the capture's detail, of {self.possible:.1%} that is not noise"
+        if self.doubtful:
+            return f"{told}; but the PSF mirrored explains about as much: it does not seem to be this camera's"
+        moved = abs(self.turn_degrees) > 0.2 or abs(self.scale) > 0.005
+        pose = f"; fits best with the PSF turned by {self.turn_degrees:.2f} degrees and scaled by {self.scale:+.1%}"
+        return told + (pose if moved else "")
+
+
+@torch.inference_mode()
+def consistency(measurement: Measurement, psf: Psf, scene: Scene) -> Consistency:
+    """Compare a measurement with what the camera would see of its reconstruction.
+
+    The PSF is first turned and scaled as fits best (`mwdn.solvers.alignment`); of each colour a gain and an even
+    light are free.
+
+    A PSF that is merely displaced goes unnoticed: it displaces the picture, and explains the capture as well.
+
+    Args:
+        measurement: (1, C, H, W).
+        psf: (1, 1 or C, h, w), centred.
+        scene: (1, C, H, W), the reconstruction.
+
+    Raises:
+        ShapeError: more than one measurement, or a scene of another shape.
+    """
+    if len(measurement) != 1 or scene.shape != measurement.shape:
+        raise ShapeError(
+            f"`measurement` {tuple(measurement.shape)} and `scene` {tuple(scene.shape)} must be one and of one shape."
+        )
+    pose = align(measurement, psf)
+    fitting = pose.move(psf)
+    seen, recorded = fine_detail(convolve(scene.float(), fitting)), fine_detail(measurement.float())
+    power = recorded.square().sum((-2, -1)).clamp(min=torch.finfo(torch.float32).tiny)
+    power, of_seen = (each.square().sum((-2, -1)).clamp(min=1e-30) for each in (recorded, seen))
+    explained = (seen * recorded).sum((-2, -1)).clamp(min=0).square() / of_seen
+    noise = noise_level(measurement)[..., 0, 0].square() * recorded[0, 0].numel()
+    mirrored = [fitting.flip(axes) for axes in ((-1,), (-2,), (-2, -1))]
+    left, *others = misfit(measurement.expand(4, -1, -1, -1), torch.cat([fitting, *mirrored])).tolist()
+    return Consistency(
+        explained=float(explained.sum() / power.sum()),
+        possible=float((1 - noise.sum() / power.sum()).clamp(min=0)),
+        contrast=min(others) / max(left, 1e-30),
+        turn_degrees=float(pose.turn_degrees),
+        scale=float(pose.scale),
+    )
