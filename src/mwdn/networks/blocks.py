@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mwdn.errors import ParameterError, ShapeError
-from mwdn.fourier import Boundary, wiener
+from mwdn.fourier import Boundary, Size, deconvolution_grid, filtered, wiener_transfer
 from mwdn.types import Image, Measurement, Psf
 
 Pooling = Literal["max", "average"]
@@ -127,9 +127,14 @@ class Wiener(nn.Module):
 
     def forward(self, features: Tensor, psf: Psf) -> Tensor:
         """Deconvolve each channel with the PSF, or with its own where the PSF has as many channels."""
+        grid = deconvolution_grid((features.shape[-2], features.shape[-1]), self.boundary)
+        return filtered(features, self.transfer(psf, grid), grid, self.boundary)
+
+    def transfer(self, psf: Psf, grid: Size) -> Tensor:
+        """Transfer function of the filter on a grid: all that it needs of a camera."""
         if hasattr(self, "log_weight"):
             psf = self.log_weight.exp() * psf
-        return wiener(features, psf, self.log_regularisation.exp(), boundary=self.boundary)
+        return wiener_transfer(psf, self.log_regularisation.exp(), grid)
 
 
 def one_each_colour(psf: Psf, measurement: Measurement) -> Tensor:
