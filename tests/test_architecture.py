@@ -26,6 +26,7 @@ TIERS = [
     ("data",),
     ("learning",),
     ("evaluation",),
+    ("engine",),
     ("reconstruct",),
     ("capture",),
     ("preview",),
