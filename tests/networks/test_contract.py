@@ -127,12 +127,14 @@ def test_psf_matters_but_not_its_scale(name, ready, generator):
     assert torch.equal(moved, found) == (name == "unet")
 
 
-def test_grey_psf_is_that_of_each_colour(name, ready, generator):
+def test_grey_psf_is_that_of_each_colour(name, ready, generator, request):
     """A monochrome calibration shot serves a colour camera, with weights trained on coloured ones too."""
     b, h, _ = pair(generator)
     network = ready(lively(small(name), generator))
     grey = h[:, :1]
-    torch.testing.assert_close(network(b, grey), network(b, grey.expand_as(h)), rtol=1e-4, atol=1e-5)
+    # A last digit of float32 may be a step of bfloat16: 0.4 % of one of many features.
+    atol = 1e-3 if request.node.callspec.params["ready"] == "fast" else 1e-5
+    torch.testing.assert_close(network(b, grey), network(b, grey.expand_as(h)), rtol=1e-4, atol=atol)
 
 
 def test_grey(name, ready, generator):
