@@ -28,6 +28,7 @@ acceptance: .venv/.ready  ## real captures (MWDN_DATA, or ../shared/data); pictu
 benchmark: .venv/.ready  ## speed against plain baselines in the same run
 	$(BIN)/python benchmarks/admm.py
 	$(BIN)/python benchmarks/train.py
+	$(BIN)/python benchmarks/engine.py --memory
 
 clean:
 	rm -rf .venv results .pytest_cache .mypy_cache .ruff_cache

@@ -16,6 +16,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 # that stands elsewhere: files are read and written from calibration on.
 TIERS = [
     ("errors", "types"),
+    ("planes",),
     ("fourier",),
     ("data.formats", "data.writing", "data.images"),
     ("optics",),
@@ -25,6 +26,7 @@ TIERS = [
     ("data",),
     ("learning",),
     ("evaluation",),
+    ("engine",),
     ("reconstruct",),
     ("capture",),
     ("preview",),
@@ -35,7 +37,7 @@ TIERS = [
 ]
 RANK = {name: rank for rank, names in enumerate(TIERS) for name in names}
 
-NETWORKS_MAY_IMPORT = {"errors", "types", "fourier", "solvers", "networks"}
+NETWORKS_MAY_IMPORT = {"errors", "types", "planes", "fourier", "solvers", "networks"}
 HEAVY = ["cv2", "h5py", "starlette", "matplotlib", "tifffile", "cyclopts", "skimage", "scipy"]
 
 

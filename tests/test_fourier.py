@@ -469,3 +469,42 @@ def test_regularisation_must_be_positive(value):
 def test_unknown_boundary_is_refused():
     with pytest.raises(ParameterError, match="`boundary` must be circular, zero, replicate or taper, not 'mirror'"):
         fourier.wiener(torch.ones(1, 1, 8, 8), torch.ones(1, 1, 8, 8), 0.1, boundary="mirror")
+
+
+@pytest.mark.parametrize("boundary", ["circular", "zero", "replicate", "taper"])
+@pytest.mark.parametrize(("psf_batch", "psf_channels"), [(1, 1), (1, 3), (2, 1), (2, 3)])
+def test_gradients_of_filtered_are_those_of_its_definition(boundary, psf_batch, psf_channels, generator):
+    """Its backward pass is written by hand; torch derives that of transform, product, transform."""
+    grid = fourier.deconvolution_grid((21, 26), boundary)
+    image = torch.rand(2, 3, 21, 26, generator=generator)
+    psf = torch.rand(psf_batch, psf_channels, 21, 26, generator=generator)
+    slope = torch.randn(image.shape, generator=generator)
+    found = []
+    for defined in (True, False):
+        x, h = image.clone().requires_grad_(), psf.clone().requires_grad_()
+        transfer = fourier.wiener_transfer(h, 0.1, grid)
+        if defined:
+            spread = fourier.spectrum(fourier.extend(x, grid, boundary), grid)
+            y = fourier.inverse_spectrum(transfer * spread, grid, (21, 26))
+        else:
+            y = fourier.filtered(x, transfer, grid, boundary)
+        y.backward(slope)
+        found.append((y, x.grad, h.grad))
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5 * one.abs().max().item())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_filtered_keeps_precision_and_memory_format(dtype, generator):
+    grid = fourier.deconvolution_grid((30, 33), "taper")
+    transfer = fourier.wiener_transfer(torch.rand(1, 1, 30, 33, generator=generator), 0.1, grid)
+    image = torch.rand(2, 6, 30, 33, generator=generator).to(dtype)
+    expected = fourier.filtered(image.float(), transfer, grid, "taper").to(dtype)
+    last = image.contiguous(memory_format=torch.channels_last)
+    part = torch.cat([last, last], dim=1)[:, 6:]  # what a gradient of a concatenation is
+    for given, form in ((image, torch.contiguous_format), (last, torch.channels_last), (part, torch.channels_last)):
+        found = fourier.filtered(given, transfer, grid, "taper")
+        assert found.dtype == dtype
+        assert torch.equal(found, expected)
+        if given is not part:
+            assert found.is_contiguous(memory_format=form)

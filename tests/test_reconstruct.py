@@ -112,7 +112,9 @@ def test_each_network_from_its_checkpoint(tmp_path, name, psf, measurement):
     expected = network.eval()(batch, psf).detach()
     for method in (path, str(path), network.train()):
         result = Reconstructor(method, Calibration(psf), device="cpu")(batch)
-        torch.testing.assert_close(result, expected)
+        assert (result - expected).norm() < 0.05 * expected.norm()
+        exact = Reconstructor(method, Calibration(psf), device="cpu", precision="exact")(batch)
+        torch.testing.assert_close(exact, expected, rtol=1e-4, atol=1e-5)
         assert not result.requires_grad
 
 

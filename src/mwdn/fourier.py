@@ -8,25 +8,18 @@ A PSF enters centred at ``(height // 2, width // 2)``; the shift to the origin h
 
 import math
 from functools import cache
-from typing import Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from mwdn.errors import ParameterError, ShapeError
+from mwdn.planes import Boundary as Boundary
+from mwdn.planes import Continuation, laid_out_as, planar, together
+from mwdn.planes import Size as Size
+from mwdn.planes import extend as extend
 from mwdn.types import Image, Measurement, Psf, Scene, Spectrum
-
-Size = tuple[int, int]
-"""(height, width)"""
-
-Boundary = Literal["circular", "zero", "replicate", "taper"]
-"""What stands beyond the measurement's border while it is deconvolved.
-
-- ``circular``: the opposite border. No padding: the form of the MWDN authors' code.
-- ``zero``: darkness.
-- ``replicate``: the border's own values, repeated.
-- ``taper``: the same, fading to darkness, so that the opposite ends of the grid meet without a step.
-"""
 
 
 @cache
@@ -65,7 +58,8 @@ def spectrum(image: Tensor, grid: Size) -> Spectrum:
 def inverse_spectrum(spectrum: Tensor, grid: Size, size: Size) -> Image:
     """Top left ``size`` of the picture on ``grid`` that has this spectrum."""
     rows = torch.fft.ifft(spectrum, dim=-2)[..., : size[0], :]
-    return torch.fft.irfft(rows, n=grid[1])[..., : size[1]]
+    # In one piece: MKL takes half as long again for rows that it must gather itself.
+    return torch.fft.irfft(rows.contiguous(), n=grid[1])[..., : size[1]]
 
 
 def frequencies(length: int) -> Tensor:
@@ -190,36 +184,6 @@ def convolution(psf: Psf, scene: Size, sensor: Size) -> Convolution:
     return Convolution(transfer, grid, scene, sensor)
 
 
-def extend(image: Image, grid: Size, boundary: Boundary) -> Tensor:
-    """Continue a picture to ``grid``: the new pixels come after the last row and column.
-
-    On a periodic grid "after the last" is also "before the first": the first half of the new pixels continues the
-    far border, the second half the near one.
-    """
-    if boundary not in ("circular", "zero", "replicate", "taper"):
-        raise ParameterError(f"`boundary` must be circular, zero, replicate or taper, not {boundary!r}.")
-    height, width = image.shape[-2:]
-    extra = grid[0] - height, grid[1] - width
-    if min(extra) < 0:
-        raise ShapeError(f"`grid` {grid} must not be smaller than the picture ({height} x {width}).")
-    if extra == (0, 0) or boundary == "circular":
-        return image
-    if boundary == "zero":
-        return torch.nn.functional.pad(image, (0, extra[1], 0, extra[0]))
-    for axis, length, more in ((-2, height, extra[0]), (-1, width, extra[1])):
-        position = torch.arange(more, device=image.device)
-        far = position < (more + 1) // 2
-        source = torch.where(far, length - 1, 0)
-        border = image.index_select(axis, source)
-        if boundary == "taper":
-            # A raised cosine: 1 next to either border, 0 in the middle of the padding.
-            distance = torch.where(far, position + 1, more - position) / (more / 2 + 1)
-            fade = (0.5 + 0.5 * torch.cos(torch.pi * distance)).to(image.dtype)
-            border = border * (fade[:, None] if axis == -2 else fade)
-        image = torch.cat([image, border], dim=axis)
-    return image
-
-
 def deconvolution_grid(size: Size, boundary: Boundary) -> Size:
     """Grid on which a measurement of ``size`` is deconvolved: 1.5 times as long, or itself if circular."""
     if boundary == "circular":
@@ -251,11 +215,89 @@ def wiener(
         N. Wiener, Extrapolation, Interpolation, and Smoothing of Stationary Time Series (1949).
     """
     check_fit(measurement, psf, "measurement")
+    grid = deconvolution_grid((measurement.shape[-2], measurement.shape[-1]), boundary)
+    return filtered(measurement.float(), wiener_transfer(psf, regularisation, grid), grid, boundary)
+
+
+def wiener_transfer(psf: Psf, regularisation: float | Tensor, grid: Size) -> Spectrum:
+    """Transfer function of the Wiener filter, ``conj(H) / (|H|^2 + lambda)``; what it needs of a camera.
+
+    Args:
+        psf: (B, C, h, w), centred, at most as large as ``grid``.
+        regularisation: lambda, as for `wiener`.
+        grid: see `deconvolution_grid`.
+
+    Raises:
+        ParameterError: ``regularisation`` is a number that is not positive.
+    """
     if not isinstance(regularisation, Tensor) and not regularisation > 0:
         raise ParameterError(f"`regularisation` ({regularisation}) must be positive; try 1e-3.")
-    size = measurement.shape[-2], measurement.shape[-1]
-    grid = deconvolution_grid(size, boundary)
     H = transfer_function(psf, grid)
-    B = spectrum(extend(measurement.float(), grid, boundary), grid)
-    V = H.conj() * B / (H.abs().square() + regularisation)
-    return inverse_spectrum(V, grid, size)
+    return H.conj() / (H.abs().square() + regularisation)
+
+
+def filtered(image: Tensor, transfer: Tensor, grid: Size, boundary: Boundary) -> Tensor:
+    """Multiply a picture's spectrum with a transfer function: the picture continued to ``grid``, the result cropped.
+
+    On a CPU a few channels at a time, whose planes stay in its cache: fresh memory for a whole spectrum costs more
+    than the transforms. The gradient transforms the picture again rather than keep its spectrum.
+
+    Args:
+        image: (B, C, H, W), also in half precision.
+        transfer: (1 or B, 1 or C, height, width // 2 + 1), complex.
+        grid: (height, width), at least (H, W).
+        boundary: see `Boundary`.
+
+    Returns:
+        Of the shape, the precision and the memory format of ``image``; computed in float32.
+    """
+    if torch.compiler.is_compiling():  # also an export: one transform of everything is simpler to write down
+        spread = spectrum(extend(image.float(), grid, boundary), grid)
+        return inverse_spectrum(transfer * spread, grid, (image.shape[-2], image.shape[-1])).to(image.dtype)
+    return _Filter.apply(image, transfer, grid, boundary)  # type: ignore[no-untyped-call]
+
+
+class _Filter(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, transfer: Tensor, grid: Size, boundary: Boundary) -> Tensor:  # noqa: ANN401
+        ctx.save_for_backward(image, transfer)
+        ctx.grid, ctx.boundary = grid, boundary
+        planes, size = planar(image), (image.shape[-2], image.shape[-1])
+        result = torch.empty_like(planes)
+        continued = Continuation(size, grid, boundary, planes)
+        for part in together(planes, grid):
+            V = torch.fft.rfft2(continued(planes[part])).mul_(_of(transfer, part))
+            result[part] = inverse_spectrum(V, grid, size)
+        return laid_out_as(image, result)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:  # noqa: ANN401
+        image, transfer = ctx.saved_tensors
+        (to_image, to_transfer, *_), grid, size = ctx.needs_input_grad, ctx.grid, (image.shape[-2], image.shape[-1])
+        slopes, planes = planar(gradient), planar(image) if to_transfer else image
+        image_slope = torch.empty_like(slopes) if to_image else None
+        transfer_slope = torch.zeros_like(transfer) if to_transfer else None
+        continued = Continuation(size, grid, ctx.boundary, slopes)
+        for part in together(slopes, grid):
+            G = torch.fft.rfft2(slopes[part].float(), s=grid)
+            if transfer_slope is not None:
+                of_part = _of(transfer_slope, part)
+                product = torch.fft.rfft2(continued(planes[part])).conj().resolve_conj().mul_(G)
+                of_part.add_(product if of_part.shape[1] > 1 else product.sum(1, keepdim=True))
+            if image_slope is not None:
+                G.mul_(_of(transfer, part).conj())
+                image_slope[part] = continued.adjoint(inverse_spectrum(G, grid, grid))
+        if transfer_slope is not None:
+            # Half a spectrum: a column stands for itself and its mirror image, but for the first and, of an even
+            # width, the last; and the inverse transform divides by the number of pixels.
+            transfer_slope.div_(grid[0] * grid[1])[..., 1 : (grid[1] + 1) // 2].mul_(2)
+        slope = None if image_slope is None else laid_out_as(image, image_slope).to(image.dtype)
+        return slope, transfer_slope, None, None
+
+
+def _of(transfer: Tensor, part: tuple[slice, slice]) -> Tensor:
+    """What of a transfer function belongs to some channels of a sample."""
+    sample, channels = part
+    own = transfer[sample] if len(transfer) > 1 else transfer
+    return own[:, channels] if own.shape[1] > 1 else own

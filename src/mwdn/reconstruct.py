@@ -12,6 +12,7 @@ from mwdn.calibration import Calibration
 from mwdn.data.captures import read_capture
 from mwdn.data.images import write_linear, write_picture
 from mwdn.data.sheets import for_people
+from mwdn.engine import Engine, Precision
 from mwdn.errors import ParameterError, ShapeError, UnknownNameError
 from mwdn.learning.checkpoint import SUFFIXES, load_network, read_metadata
 from mwdn.learning.devices import usable
@@ -65,14 +66,16 @@ class Reconstructor:
         calibration: of the camera that took the measurements.
         regularisation: of a solver given by its name, in place of its default.
         device: where to compute; a GPU if there is one, unless given.
+        precision: of a network, see `mwdn.engine.Precision`; solvers are always exact.
 
     Attributes:
+        method: what reconstructs, as given or found. A network is copied: later changes of it do not matter here.
         warning: why not to trust the result, or ``None``.
 
     Raises:
         UnknownNameError: no such method.
         CheckpointError: the checkpoint cannot be used.
-        ParameterError: no such device, or the method has no regularisation to set.
+        ParameterError: no such device or precision, or the method has no regularisation to set.
     """
 
     def __init__(
@@ -82,14 +85,14 @@ class Reconstructor:
         *,
         regularisation: float | None = None,
         device: str | torch.device | None = None,
+        precision: Precision = "fast",
     ) -> None:
         self.device = usable(device)
         self.calibration = calibration
         self.method = find_method(method, regularisation) if isinstance(method, str | Path) else method
         self.warning = _other_camera(method, calibration) if isinstance(method, str | Path) else None
-        if isinstance(self.method, nn.Module):
-            self.method = self.method.to(self.device).eval()
         self.psf = calibration.psf.to(self.device)
+        self.engine = Engine(self.method, self.psf, precision=precision) if isinstance(self.method, nn.Module) else None
 
     @torch.inference_mode()
     def __call__(self, measurement: Measurement) -> Scene:
@@ -111,7 +114,8 @@ class Reconstructor:
                 "height and width. Pass raw frames through `Calibration.correct` first."
             )
         try:
-            return self.method(measurement.to(self.device), self.psf).cpu()
+            seen = measurement.to(self.device)
+            return (self.engine(seen) if self.engine else self.method(seen, self.psf)).cpu()
         except (MemoryError, RuntimeError) as error:
             # On a CPU torch has no type of its own for this.
             short = isinstance(error, MemoryError | torch.OutOfMemoryError) or "can't allocate memory" in str(error)

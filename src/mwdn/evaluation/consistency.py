@@ -1,4 +1,4 @@
-"""How far to trust a reconstruction without knowing the scene: does the camera, looking at it, see the capture?"""
+"""How far to trust a reconstruction of an unknown scene: whether the camera, looking at it, would see the capture."""
 
 from dataclasses import dataclass
 

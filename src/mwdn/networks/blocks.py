@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mwdn.errors import ParameterError, ShapeError
-from mwdn.fourier import Boundary, Size, wiener
+from mwdn.fourier import Boundary, Size, deconvolution_grid, filtered, wiener_transfer
 from mwdn.types import Image, Measurement, Psf
 
 Pooling = Literal["max", "average"]
@@ -146,9 +146,19 @@ class Wiener(nn.Module):
 
     def forward(self, features: Tensor, psf: Psf) -> Tensor:
         """Deconvolve each channel with the PSF, or with its own where the PSF has as many channels."""
+        return self.filtered(features, self.transfer(psf))
+
+    def transfer(self, psf: Psf) -> Tensor:
+        """Transfer function of the filter for features of the PSF's size: all that it needs of a camera."""
         if hasattr(self, "log_weight"):
             psf = self.log_weight.exp() * psf
-        return wiener(features, psf, self.log_regularisation.exp(), boundary=self.boundary)
+        grid = deconvolution_grid((psf.shape[-2], psf.shape[-1]), self.boundary)
+        return wiener_transfer(psf, self.log_regularisation.exp(), grid)
+
+    def filtered(self, features: Tensor, transfer: Tensor) -> Tensor:
+        """Deconvolve each channel with a `transfer` function, or with its own."""
+        grid = deconvolution_grid((features.shape[-2], features.shape[-1]), self.boundary)
+        return filtered(features, transfer, grid, self.boundary)
 
 
 def one_each_colour(psf: Psf, measurement: Measurement) -> Tensor:

@@ -54,7 +54,16 @@ class MwdnCpsf(nn.Module):
 
     def forward(self, measurement: Measurement, psf: Psf) -> Scene:
         """Scene (B, outputs, H, W) from a measurement and a PSF of the same height, width and colours."""
+        return self.reconstruct(measurement, self.bind(psf, measurement))
+
+    def bind(self, psf: Psf, measurement: Measurement) -> list[Tensor]:
+        """Transfer function of each scale's filter: all that the network needs of the PSF."""
         psfs = self.pyramid(one_each_colour(psf, measurement))
+        return [wiener.transfer(h) for wiener, h in zip(self.filters, psfs, strict=True)]  # type: ignore[operator]
+
+    def reconstruct(self, measurement: Measurement, bound: list[Tensor]) -> Scene:
+        """The same as `forward`, from what `bind` gave."""
         *skips, bottleneck = self.encoder(measurement)
-        deconvolved = [wiener(skip, h) for wiener, skip, h in zip(self.filters, skips, psfs, strict=True)]
+        each = zip(self.filters, skips, bound, strict=True)
+        deconvolved = [wiener.filtered(skip, transfer) for wiener, skip, transfer in each]  # type: ignore[operator]
         return self.decoder([*deconvolved, bottleneck])

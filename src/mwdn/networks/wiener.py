@@ -1,6 +1,6 @@
 """A single learned Wiener filter (section 3.2.3 of the paper)."""
 
-from torch import nn
+from torch import Tensor, nn
 
 from mwdn.fourier import Boundary
 from mwdn.networks.blocks import Wiener, peak_one
@@ -22,4 +22,12 @@ class WienerNetwork(nn.Module):
 
     def forward(self, measurement: Measurement, psf: Psf) -> Scene:
         """Scene (B, C, H, W), each colour deconvolved with its own PSF."""
-        return self.filter(measurement, peak_one(psf, measurement))
+        return self.reconstruct(measurement, self.bind(psf, measurement))
+
+    def bind(self, psf: Psf, measurement: Measurement) -> list[Tensor]:
+        """Transfer function of the filter: all that the network needs of the PSF."""
+        return [self.filter.transfer(peak_one(psf, measurement))]
+
+    def reconstruct(self, measurement: Measurement, bound: list[Tensor]) -> Scene:
+        """The same as `forward`, from what `bind` gave."""
+        return self.filter.filtered(measurement, *bound)

@@ -1,6 +1,6 @@
 """One Wiener filter, then a U-Net (section 3.2.3 of the paper)."""
 
-from torch import nn
+from torch import Tensor, nn
 
 from mwdn.fourier import Boundary
 from mwdn.networks.blocks import Pooling
@@ -40,3 +40,11 @@ class WienerUNet(nn.Module):
     def forward(self, measurement: Measurement, psf: Psf) -> Scene:
         """Scene (B, outputs, H, W)."""
         return self.unet(self.wiener(measurement, psf), psf)
+
+    def bind(self, psf: Psf, measurement: Measurement) -> list[Tensor]:
+        """Transfer function of the filter: all that the network needs of the PSF."""
+        return self.wiener.bind(psf, measurement)
+
+    def reconstruct(self, measurement: Measurement, bound: list[Tensor]) -> Scene:
+        """The same as `forward`, from what `bind` gave."""
+        return self.unet.decoder(self.unet.encoder(self.wiener.reconstruct(measurement, bound)))
