@@ -29,6 +29,7 @@ from mwdn.reconstruct import (
     Reconstructor,
     plan_outputs,
     reconstruct_file,
+    write_consistency,
 )
 
 app = App(
@@ -44,7 +45,7 @@ for command in (design, inspect, simulate, train, benchmark):
 def reconstruct(
     *captures: Path,
     camera: CameraOptions,
-    method: str = "admm",
+    method: str = "universal",
     regularisation: float | None = None,
     out: Path = Path("results/reconstruct"),
     format: Format = "png",
@@ -55,9 +56,11 @@ def reconstruct(
     Args:
         captures: raw frames of the camera.
         camera: its calibration.
-        method: admm, pyramid, wiener, fista, or the path of a checkpoint.
+        method: universal (a network for any camera), universal-small (a faster one), admm, pyramid, wiener, fista,
+            the path of a checkpoint, or hub:owner/name.
         regularisation: tau of admm or lambda of wiener; less keeps more detail and more noise.
-        out: folder for the pictures; summary.png shows the first twelve beside their measurements.
+        out: folder for the pictures, beside each a .json that says how far to trust it; summary.png shows the first
+            twelve beside their measurements.
         format: png and png16 are sRGB for people, tiff and npy hold the linear float32 values.
         device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
     """
@@ -73,10 +76,13 @@ def reconstruct(
     for file, output in track(list(zip(files, outputs, strict=True)), "Reconstructing", disable=len(files) == 1):
         try:
             pair = reconstruct_file(reconstructor, file, output, format)
+            trust = write_consistency(output, reconstructor, *pair)
         except MwdnError as error:
             failed += 1
             _complain(f"[red]{escape(str(file))}:[/]", error)
             continue
+        told = f"{file.name} {trust.sentence}"
+        (errors if trust.doubtful else console).print(told, highlight=False, markup=False, soft_wrap=True)
         if len(rows) < 12:
             rows.append([thumbnail(picture) for picture in pair])
     if rows:

@@ -1,6 +1,7 @@
 """A method bound to one calibrated camera: measurement in, picture out."""
 
 from collections.abc import Callable, Iterable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Literal
 
@@ -9,11 +10,14 @@ from torch import nn
 
 from mwdn import solvers
 from mwdn.calibration import Calibration
+from mwdn.calibration.report import write_json
 from mwdn.data.captures import read_capture
 from mwdn.data.images import write_linear, write_picture
 from mwdn.data.sheets import for_people
 from mwdn.engine import Engine, Precision
 from mwdn.errors import ParameterError, ShapeError, UnknownNameError
+from mwdn.evaluation.consistency import Consistency, consistency
+from mwdn.learning.bundled import BUNDLED, find_weights
 from mwdn.learning.checkpoint import SUFFIXES, load_network, read_metadata
 from mwdn.learning.devices import usable
 from mwdn.types import Measurement, Psf, Scene
@@ -23,10 +27,10 @@ Method = Callable[[Measurement, Psf], Scene]
 
 
 def find_method(name: str | Path, regularisation: float | None = None) -> Method:
-    """Find a solver by its name, or a network by the path of its checkpoint.
+    """Find a solver or a bundled network by its name, or a network by the path of its checkpoint.
 
     Args:
-        name: the name or the path.
+        name: the name or the path; ``hub:owner/name`` for a network on the Hugging Face hub.
         regularisation: of a solver that has one, in place of its default.
 
     Raises:
@@ -35,20 +39,21 @@ def find_method(name: str | Path, regularisation: float | None = None) -> Method
         ParameterError: the method has no regularisation to set.
     """
     if regularisation is not None and str(name) not in ("admm", "wiener"):
-        raise ParameterError(f"`regularisation` belongs to admm and wiener, not to '{name}'.")
+        raise ParameterError(f"`regularisation` belongs to admm and wiener, not to '{name}': `--method admm`.")
     if str(name) in solvers.SOLVERS:
         return solvers.build(str(name), **({} if regularisation is None else {"regularisation": regularisation}))
-    path = Path(name)
+    path = find_weights(str(name)) or Path(name)
     if path.suffix in SUFFIXES or path.is_file():
         return load_network(path)
-    raise UnknownNameError("method", str(name), [*solvers.SOLVERS, "PATH/OF/CHECKPOINT.safetensors"])
+    raise UnknownNameError("method", str(name), [*BUNDLED, *solvers.SOLVERS, "PATH/OF/CHECKPOINT.safetensors"])
 
 
 def _other_camera(method: str | Path, calibration: Calibration) -> str | None:
     """Say so, if a network was trained for another PSF than the calibration's."""
-    if Path(method).suffix != ".safetensors":
+    path = find_weights(str(method)) or Path(method)
+    if path.suffix != ".safetensors":
         return None
-    trained = read_metadata(method).get("psf_hash")
+    trained = read_metadata(path).get("psf_hash")
     if trained in (None, calibration.psf_hash):
         return None
     return (
@@ -62,7 +67,7 @@ class Reconstructor:
     """Reconstructs the measurements of one camera.
 
     Args:
-        method: a solver, a network, the name of a solver, or the path of a checkpoint.
+        method: a solver, a network, the name of a solver or of a bundled network, or the path of a checkpoint.
         calibration: of the camera that took the measurements.
         regularisation: of a solver given by its name, in place of its default.
         device: where to compute; a GPU if there is one, unless given.
@@ -144,7 +149,7 @@ def plan_outputs(captures: list[Path], out: Path, form: Format, *, protected: It
         raise ParameterError(f"`{out}` must be a folder, but is a file. Choose another one: `--out`.")
     outputs = [out / (capture.stem + _SUFFIX[form]) for capture in captures]
     inputs = {path.resolve() for path in (*captures, *protected) if path is not None}
-    for output in (*outputs, out / SUMMARY):
+    for output in (*outputs, *(each.with_suffix(".json") for each in outputs), out / SUMMARY):
         if output.resolve() in inputs:
             raise ParameterError(f"`{output}` would overwrite an input. Choose another folder: `--out`.")
     seen = {out / SUMMARY: "the summary picture"}
@@ -173,3 +178,11 @@ def reconstruct_file(
     else:
         write_picture(output, for_people(scene), bits=16 if form == "png16" else 8)
     return measurement, scene
+
+
+def write_consistency(output: Path, reconstruct: Reconstructor, measurement: Measurement, scene: Scene) -> Consistency:
+    """Write beside a picture, as ``.json``, how far to trust it."""
+    found = consistency(measurement, reconstruct.calibration.psf, scene)
+    content = {"psf_hash": reconstruct.calibration.psf_hash, **asdict(found), "doubtful": found.doubtful}
+    write_json(output.with_suffix(".json"), content)
+    return found

@@ -5,10 +5,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mwdn.errors import ParameterError
-from mwdn.fourier import Boundary, wiener
+from mwdn.fourier import Boundary, deconvolution_grid, extend, inverse_spectrum, spectrum, wiener_transfer
 from mwdn.networks.blocks import Decoder, Encoder, paper_widths, peak_one
 from mwdn.solvers.alignment import align
-from mwdn.solvers.pyramid import LEVELS, explain
+from mwdn.solvers.pyramid import LEVELS, Band, PsfPyramid
 from mwdn.types import Measurement, Psf, Scene
 
 
@@ -56,7 +56,7 @@ class WienerBank(nn.Module):
         if fold < 1:
             raise ParameterError(f"`fold` ({fold}) must be at least 1.")
         self.channels, self.fold, self.regularisations = channels, fold, regularisations
-        self.align, self.boundary = align, boundary
+        self.finest, self.align, self.boundary = finest, align, boundary
         self.levels = tuple(level for level in LEVELS if finest and level.shrink >= finest)
         pictures = len(regularisations) + (2 if self.levels else 1)
         self.encoder = Encoder(channels * pictures * fold**2, paper_widths(width))
@@ -66,21 +66,57 @@ class WienerBank(nn.Module):
 
     def forward(self, measurement: Measurement, psf: Psf) -> Scene:
         """Scene (B, C, H, W), each colour deconvolved with its own PSF."""
-        if self.align and not self.training:
-            psf = align(measurement, psf).move(psf)
-        estimates = self.estimates(measurement, psf)
+        return self.reconstruct(measurement, self.bind(psf, measurement))
+
+    def bind(self, psf: Psf, measurement: Measurement) -> list[Tensor]:
+        """The PSF where it is aligned to each measurement, else all that the estimates need of it."""
+        return [psf] if self.align else self._known(psf, measurement)
+
+    def reconstruct(self, measurement: Measurement, bound: list[Tensor]) -> Scene:
+        """The same as `forward`, from what `bind` gave."""
+        if self.align:
+            psf = bound[0] if self.training else align(measurement, bound[0]).move(bound[0])
+            bound = self._known(psf, measurement)
+        estimates = self._estimates(measurement, bound)
         return self.correct(estimates, self.unit(estimates))
 
     def estimates(self, measurement: Measurement, psf: Psf) -> Tensor:
-        """Estimates of the scene, the smoothest first, and the measurement: (B, C * pictures, H, W)."""
+        """Estimates of the scene, the smoothest first, and the measurement: (B, C * pictures, H, W).
+
+        The PSF is taken as it is.
+        """
+        return self._estimates(measurement, self._known(psf, measurement))
+
+    def _known(self, psf: Psf, measurement: Measurement) -> list[Tensor]:
+        """Transfer functions and norms of the iterations, then the transfer functions of the bank."""
         psf = peak_one(psf, measurement)
         psf = psf / psf.sum((-2, -1), keepdim=True)
-        if self.levels:
-            found = explain(measurement, psf, self.levels)
-            scenes = [found.scene, *(found.scene + found.detail(value) for value in self.regularisations)]
+        size = measurement.shape[-2], measurement.shape[-1]
+        bands = PsfPyramid.of(psf, size, self.levels).bands if self.levels else ()
+        known = [tensor for band in bands for tensor in (band.transfer, band.norm)]
+        if self.finest == 1:  # its last level has the bank's transfer function
+            return known
+        grid = deconvolution_grid(size, self.boundary)
+        return [*known, *(wiener_transfer(psf, value, grid) for value in self.regularisations)]
+
+    def _estimates(self, measurement: Measurement, known: list[Tensor]) -> Tensor:
+        b, count = measurement.float(), 2 * len(self.levels)
+        if not self.levels:
+            return torch.cat([*self._filtered(b, known, self.boundary), b], dim=1)
+        bands = [Band(*each) for each in zip(self.levels, known[:count:2], known[1:count:2], strict=True)]
+        found = PsfPyramid(tuple(bands)).explain(b)
+        if self.finest == 1:
+            details = [found.detail(value) for value in self.regularisations]
         else:
-            scenes = [wiener(measurement, psf, value, boundary=self.boundary) for value in self.regularisations]
-        return torch.cat([*scenes, measurement.float()], dim=1)
+            details = self._filtered(found.rest, known[count:], "zero")
+        return torch.cat([found.scene, *(found.scene + detail for detail in details), b], dim=1)
+
+    def _filtered(self, picture: Tensor, transfers: list[Tensor], boundary: Boundary) -> list[Tensor]:
+        """The bank: one spectrum, several filters."""
+        size = picture.shape[-2], picture.shape[-1]
+        grid = deconvolution_grid(size, self.boundary)
+        spread = spectrum(extend(picture, grid, boundary), grid)
+        return [inverse_spectrum(spread * transfer, grid, size) for transfer in transfers]
 
     def unit(self, estimates: Tensor) -> Tensor:
         """Brightest pixel of the smoothest of `estimates`, (B, 1, 1, 1)."""

@@ -118,7 +118,8 @@ def _unexplained(measurement: Tensor, psf: Psf, poses: Tensor) -> Tensor:
     moved = Pose(*poses.flatten(0, 1).unbind(-1)).move(each)
     moved = F.avg_pool2d(F.pad(moved, (0, moved.shape[-1] % 2, 0, moved.shape[-2] % 2)), 2)
     found = explain(measurement.repeat_interleave(count, 0), moved, _LEVELS)
-    left = inverse_spectrum(found.residual * _fine(found.grid, measurement.device), found.grid, found.grid)
+    grid = found.psf.bands[-1].grid
+    left = inverse_spectrum(found.residual * _fine(grid, measurement.device), grid, grid)
     return left.reshape(len(measurement), count, -1)
 
 

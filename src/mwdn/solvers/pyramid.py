@@ -1,6 +1,8 @@
 """ADMM from coarse to fine: better than a hundred iterations of it at a fraction of their price."""
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -84,21 +86,84 @@ class Explanation:
 
     Args:
         scene: (B, C, H, W), not negative, for a PSF of unit sum.
-        residual: spectrum of the measurement minus the camera's picture of the whole scene, zero off the sensor.
-        transfer: the PSF's transfer function on the same grid.
-        grid: its size.
+        rest: (B, C, H, W), the measurement minus the camera's picture of the whole scene.
+        psf: what the iterations knew of it.
     """
 
     scene: Scene
-    residual: Tensor
-    transfer: Tensor
-    grid: Size
+    rest: Measurement
+    psf: "PsfPyramid"
+
+    @cached_property
+    def residual(self) -> Tensor:
+        """Spectrum of the rest, zero off the sensor, on the grid of the finest level."""
+        return spectrum(self.rest, self.psf.bands[-1].grid)
 
     def detail(self, regularisation: float | Tensor) -> Scene:
-        """Wiener estimate of the rest of the scene; ``regularisation`` as for `mwdn.fourier.wiener`."""
-        H = self.transfer
+        """Wiener estimate of the rest of the scene; ``regularisation`` as for `mwdn.fourier.wiener`.
+
+        Of a pyramid that reaches the full size.
+        """
+        finest = self.psf.bands[-1]
+        H = finest.transfer * finest.norm
         V = H.conj() * self.residual / (H.abs().square() + regularisation)
-        return inverse_spectrum(V, self.grid, (self.scene.shape[-2], self.scene.shape[-1]))
+        return inverse_spectrum(V, finest.grid, (self.scene.shape[-2], self.scene.shape[-1]))
+
+
+class Band(NamedTuple):
+    """The PSF at one level: its transfer function over ``norm``, so that its colours have a mean square sum of 1."""
+
+    level: Level
+    transfer: Spectrum
+    norm: Tensor
+
+    @property
+    def grid(self) -> Size:
+        """Of the transfer function, which is half a spectrum of an even width."""
+        return self.transfer.shape[-2], 2 * (self.transfer.shape[-1] - 1)
+
+
+@dataclass(frozen=True)
+class PsfPyramid:
+    """What the pyramid needs of a PSF, computed once for many measurements of one size."""
+
+    bands: tuple[Band, ...]
+
+    @classmethod
+    def of(cls, psf: Psf, size: Size, levels: tuple[Level, ...] = LEVELS) -> "PsfPyramid":
+        """Prepare a PSF (1 or B, 1 or C, h, w), centred, of any sum, for measurements of ``size``."""
+        coarsest = levels[0].shrink
+        # The grid of a linear convolution, divisible as often as the pyramid halves it.
+        reach = zip(size, psf.shape[-2:], strict=True)
+        rows, columns = (fast_length(-(-(s + p) // coarsest)) * coarsest for s, p in reach)
+        tiny = torch.finfo(torch.float32).tiny
+        H = transfer_function(psf.float() / psf.float().sum((-2, -1), keepdim=True).clamp(min=tiny), (rows, columns))
+        bands = []
+        for level in levels:
+            low = low_band(H, (rows, columns), level.shrink)
+            grid = rows // level.shrink, columns // level.shrink
+            norm = inverse_spectrum(low, grid, grid).square().sum((-2, -1), keepdim=True).mean(1, keepdim=True).sqrt()
+            norm = norm.clamp(min=tiny)
+            bands.append(Band(level, low / norm, norm))
+        return cls(tuple(bands))
+
+    def explain(self, measurement: Measurement) -> Explanation:
+        """Find a smooth non-negative scene (B, C, H, W), from coarse to fine. Differentiable."""
+        size = measurement.shape[-2], measurement.shape[-1]
+        # tau is stated for a measurement of unit mean square.
+        brightness = measurement.float().square().mean((1, 2, 3), keepdim=True).sqrt()
+        brightness = brightness.clamp(min=torch.finfo(torch.float32).tiny)
+        b = measurement.float() / brightness
+        sizes = {1: b}
+        while max(sizes) < self.bands[0].level.shrink:
+            sizes[2 * max(sizes)] = halve(sizes[max(sizes)])
+        scene: Tensor = b.new_zeros((1, 1, 1, 1))
+        for band in self.bands:
+            scene = _solve(sizes[band.level.shrink], band, scene)
+        scene, shrink = scene.clamp(min=0) * brightness, band.level.shrink
+        sensor = -(-size[0] // shrink), -(-size[1] // shrink)
+        seen = inverse_spectrum(band.transfer * band.norm * spectrum(scene, band.grid), band.grid, sensor)
+        return Explanation(_enlarged(scene, shrink, size), measurement - _enlarged(seen, shrink, size), self)
 
 
 def explain(measurement: Measurement, psf: Psf, levels: tuple[Level, ...] = LEVELS) -> Explanation:
@@ -113,26 +178,14 @@ def explain(measurement: Measurement, psf: Psf, levels: tuple[Level, ...] = LEVE
         ShapeError: batch or channels do not fit.
     """
     check_fit(measurement, psf, "measurement")
-    tiny = torch.finfo(torch.float32).tiny
-    size = measurement.shape[-2], measurement.shape[-1]
-    coarsest = levels[0].shrink
-    # The grid of a linear convolution, divisible as often as the pyramid halves it.
-    rows, columns = (fast_length(-(-(s + p) // coarsest)) * coarsest for s, p in zip(size, psf.shape[-2:], strict=True))
-    grid = (rows, columns)
-    psf = psf.float() / psf.float().sum((-2, -1), keepdim=True).clamp(min=tiny)
-    H = transfer_function(psf, grid)
-    # tau is stated for a measurement of unit mean square.
-    brightness = measurement.float().square().mean((1, 2, 3), keepdim=True).sqrt().clamp(min=tiny)
-    b = measurement.float() / brightness
-    sizes = {1: b}
-    while max(sizes) < coarsest:
-        sizes[2 * max(sizes)] = halve(sizes[max(sizes)])
-    scene: Tensor = b.new_zeros((1, 1, 1, 1))
-    for level in levels:
-        scene = _solve(sizes[level.shrink], low_band(H, grid, level.shrink), level, scene)
-    scene = F.interpolate(scene, size=grid, mode="bilinear").clamp(min=0) * brightness
-    explained = inverse_spectrum(H * spectrum(scene, grid), grid, size)
-    return Explanation(scene[..., : size[0], : size[1]], spectrum(measurement - explained, grid), H, grid)
+    return PsfPyramid.of(psf, (measurement.shape[-2], measurement.shape[-1]), levels).explain(measurement)
+
+
+def _enlarged(picture: Tensor, shrink: int, size: Size) -> Tensor:
+    """The part of ``size`` of a picture whose pixels are ``shrink`` times as long."""
+    if shrink > 1:
+        picture = F.interpolate(picture, scale_factor=shrink, mode="bilinear")
+    return picture[..., : size[0], : size[1]]
 
 
 def halve(picture: Tensor) -> Tensor:
@@ -156,16 +209,14 @@ def low_band(transfer: Spectrum, grid: Size, shrink: int) -> Tensor:
     return kept[..., : columns // 2 + 1].contiguous()
 
 
-def _solve(measurement: Tensor, H: Tensor, level: Level, coarser: Tensor) -> Tensor:
-    """Scene of the whole grid after the iterations of one level, from what the coarser one found."""
-    grid = H.shape[-2], 2 * (H.shape[-1] - 1)
+def _solve(measurement: Tensor, band: Band, coarser: Tensor) -> Tensor:
+    """Scene of the whole grid after the iterations of one level from what the coarser one found."""
     # Penalties are stated for a PSF whose colours have a mean square sum of 1.
-    norm = inverse_spectrum(H, grid, grid).square().sum((-2, -1), keepdim=True).mean(1, keepdim=True).sqrt()
-    norm = norm.clamp(min=torch.finfo(torch.float32).tiny)
-    problem = posed(measurement, H / norm)
-    known = F.interpolate(coarser, size=grid, mode="bilinear").clamp(min=0) * norm
-    state = start(problem, known.expand(*measurement.shape[:2], *grid), smooth=level.regularisation > 0)
+    problem = posed(measurement, band.transfer)
+    known = F.interpolate(coarser, size=band.grid, mode="bilinear").clamp(min=0) * band.norm
+    level = band.level
+    state = start(problem, known.expand(*measurement.shape[:2], *band.grid), smooth=level.regularisation > 0)
     for _ in range(level.iterations):
         copies = split(state, problem, level.penalties, level.regularisation, "colour")
         state = merge(state, copies, problem, level.penalties)
-    return state.v / norm
+    return state.v / band.norm
