@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Callable
-from typing import Literal, TypeGuard, get_args
+from typing import Any, Literal, TypeGuard, get_args
 
 import torch
 from torch import Tensor, nn
@@ -118,6 +118,18 @@ class Convolution(nn.Module):
         return fused(features, self.packed, self.bias, self.padding, [1, 1], [1, 1], 1, last, [], "")
 
 
+class Float32(nn.Module):
+    """A layer that is left as it is, after others that compute in half precision."""
+
+    def __init__(self, layer: nn.Module) -> None:
+        super().__init__()
+        self.layer = layer
+
+    def forward(self, features: Tensor, **options: Any) -> Tensor:  # noqa: ANN401
+        """Features, in float32."""
+        return self.layer(features.float(), **options)
+
+
 def _packed(weight: Tensor, padding: list[int]) -> Tensor | None:
     """Weights in the order that oneDNN reads, where torch has it and can fuse the ReLU; else ``None``.
 
@@ -143,7 +155,9 @@ def fold(module: nn.Module, dtype: torch.dtype | None) -> nn.Module:
         return nn.Sequential(*_folded(list(module), dtype))
     for name, child in module.named_children():
         setattr(module, name, fold(child, dtype))
-    return Convolution(module, None, relu=False, dtype=dtype) if _plain(module) else module
+    if _plain(module):
+        return Convolution(module, None, relu=False, dtype=dtype)
+    return Float32(module) if isinstance(module, nn.Conv2d | nn.ConvTranspose2d | nn.Linear) else module
 
 
 def _folded(layers: list[nn.Module], dtype: torch.dtype | None) -> list[nn.Module]:

@@ -104,12 +104,14 @@ def test_measurement_and_psf_get_gradients(name, generator):
         assert h.grad.abs().max() > 0
 
 
-def test_samples_of_a_batch_do_not_meet_in_evaluation(name, ready, generator):
+def test_samples_of_a_batch_do_not_meet_in_evaluation(name, ready, generator, request):
     b, h, _ = pair(generator, batch=3)
     network = ready(lively(small(name), generator))
     together = network(b, h)
+    # Iterations amplify the last bits of float32, and half precision rounds these differently.
+    rtol = 1e-3 if request.node.callspec.params["ready"] == "fast" else 1e-4
     for i in range(3):
-        torch.testing.assert_close(together[i : i + 1], network(b[i : i + 1], h), rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(together[i : i + 1], network(b[i : i + 1], h), rtol=rtol, atol=1e-5)
 
 
 def test_each_sample_may_have_its_own_psf(name, generator):
@@ -162,7 +164,7 @@ def test_overfits_four_pairs(name, generator):
     network = small(name, width=8 if name in WIDENED else 16).train()
     optimiser = torch.optim.Adam(network.parameters(), lr=5e-3 if name not in FEW else 1e-1)
     losses = []
-    for _ in range(120):
+    for _ in range(160):
         loss = F.mse_loss(network(b, h), scene)
         losses.append(loss.item())
         if losses[-1] < (0.99 * losses[0] if name in FEW else min(0.15 * losses[0], 0.6 * scene.var().item())):
