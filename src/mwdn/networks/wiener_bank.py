@@ -70,10 +70,12 @@ class WienerBank(nn.Module):
 
     def bind(self, psf: Psf, measurement: Measurement) -> list[Tensor]:
         """The PSF where it is aligned to each measurement, else all that the estimates need of it."""
-        return [psf] if self.align else self._known(psf, measurement)
+        return [psf] if self.align else self._known(psf, measurement.expand(-1, self.channels, -1, -1))
 
     def reconstruct(self, measurement: Measurement, bound: list[Tensor]) -> Scene:
         """The same as `forward`, from what `bind` gave."""
+        if measurement.shape[1] == 1 < self.channels:  # a grey camera: three colours, all alike
+            return self.reconstruct(measurement.expand(-1, self.channels, -1, -1), bound).mean(1, keepdim=True)
         if self.align:
             psf = bound[0] if self.training else align(measurement, bound[0]).move(bound[0])
             bound = self._known(psf, measurement)

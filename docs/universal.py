@@ -1,0 +1,55 @@
+"""Real captures of cameras that the bundled network has never seen, beside ADMM.
+
+python docs/universal.py ../shared/data [docs/universal.jpg]
+"""
+
+import sys
+from pathlib import Path
+
+import cv2
+import torch
+
+from mwdn import Calibration, Reconstructor, for_people, read_frame
+from mwdn.data.images import srgb_encode
+from mwdn.data.sheets import contact_sheet
+
+DIFFUSERCAM = {"background": 0.0, "upside_down": True, "bgr": True}
+
+
+def rows(calibration: Calibration, captures: list[Path], *, middle: int = 0) -> list[list[torch.Tensor]]:
+    """ADMM's picture and the network's, and their middle pixels alone where an object stands there."""
+    methods = [Reconstructor(method, calibration) for method in ("admm", "universal")]
+    found = []
+    for capture in captures:
+        measurement = calibration.correct(read_frame(capture, bgr=calibration.bgr))
+        pictures = [for_people(method(measurement)) for method in methods]
+        rows, columns = ((size - (middle or size)) // 2 for size in pictures[0].shape[-2:])
+        found.append([p[..., rows : p.shape[-2] - rows, columns : p.shape[-1] - columns] for p in pictures])
+    return found
+
+
+def main(data: Path, out: Path = Path("docs/universal.jpg")) -> None:
+    """Reconstruct all captures and draw the sheet."""
+    camera, diffusercam, tutorial = data / "mwdn-camera", data / "diffusercam", data / "diffusercam-tutorial"
+    small = Calibration.from_file(camera / "psf_320.png")
+    large = Calibration.from_file(camera / "psf_480.tif")
+    found = [
+        *rows(small, sorted((camera / "real-objects").glob("object_*")), middle=200),
+        *rows(large, sorted((camera / "real-objects").glob("scene*")), middle=200),
+        *rows(large, [camera / "display_capture.tif"], middle=240),
+        *rows(Calibration.from_file(tutorial / "psf_sample.tif", binning=4), [tutorial / "rawdata_hand_sample.tif"]),
+        *rows(
+            Calibration.from_file(diffusercam / "psf_recovered_270x480.npy", **DIFFUSERCAM),
+            sorted((diffusercam / "diffuser_images").glob("*.npy")),
+        ),
+    ]
+    third = -(-len(found) // 3)
+    found += [[torch.zeros_like(p) for p in found[0]]] * (3 * third - len(found))
+    lines = [a + b + c for a, b, c in zip(found[:third], found[third : 2 * third], found[2 * third :], strict=True)]
+    sheet = srgb_encode(contact_sheet(lines, 3 * ["ADMM", "universal"], height=180))
+    cv2.imwrite(str(out), (sheet[0].flip(0).permute(1, 2, 0) * 255).round().byte().numpy())
+
+
+if __name__ == "__main__":
+    with torch.inference_mode():
+        main(Path(sys.argv[1]), *map(Path, sys.argv[2:]))
