@@ -10,7 +10,8 @@ from mwdn.evaluation.tables import html_table, markdown_table
 
 
 def table():
-    made = Table("method", "a | b", title="x < y")
+    made = Table("method", title="x < y")
+    made.add_column("a | b", justify="right")
     made.add_row("one & two", "[bold]1.5[/bold] \\[1, 2]")
     made.add_row("three", "0.5")
     return made
@@ -18,7 +19,7 @@ def table():
 
 def test_html():
     assert html_table(table()) == (
-        "<table><caption>x &lt; y</caption><tr><th>method</th><th>a | b</th></tr>"
+        '<table><caption>x &lt; y</caption><tr><th class="left">method</th><th>a | b</th></tr>'
         "<tr><th>one &amp; two</th><td><b>1.5</b> [1, 2]</td></tr><tr><th>three</th><td>0.5</td></tr></table>"
     )
 

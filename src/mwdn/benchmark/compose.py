@@ -33,7 +33,7 @@ def sections(found: Found) -> list[Section]:
 def _glance(found: Found) -> list[Block]:
     benchmark, schedule = found.benchmark, found.benchmark.schedule
     learned = sum(method.learned for method in benchmark.methods)
-    table = Table("method", *found.opened, title="PSNR / dB, mean over the test pictures")
+    table = _numbers(list(found.opened), "PSNR / dB, mean over the test pictures")
     reports = {name: found.report(name).methods for name in found.opened}
     means = {n: {label: s.summary("psnr")[0] for label, s in report.items()} for n, report in reports.items()}
     for method in benchmark.methods:
@@ -47,6 +47,14 @@ def _glance(found: Found) -> list[Block]:
         "sets. Numbers of different data sets must not be compared with each other.",
         table,
     ]
+
+
+def _numbers(heads: list[str], title: str) -> Table:
+    """A line for each method, and columns of numbers."""
+    table = Table("method", title=title)
+    for head in heads:
+        table.add_column(head, justify="right")
+    return table
 
 
 def _bold(text: str, best: bool) -> str:
@@ -113,7 +121,7 @@ def _differences(label: str, report: Report) -> Table:
     metrics = [metric for metric in METRICS[:3] if metric not in report.missing]
     heads = [f"{metric} of {label} minus its" for metric in metrics]
     title = f"{label} against each, picture by picture: mean difference [95 % confidence]; bold where 0 is outside"
-    table = Table("method", *heads, title=title)
+    table = _numbers(heads, title)
     own = report.methods[label].values
     for other, scores in report.methods.items():
         if other == label:
@@ -151,7 +159,7 @@ def _robustness(found: Found) -> list[Block]:
     wanted = found.benchmark.robustness
     axes = {axis: sizes[-1] for axis, sizes in wanted.sizes.items()}
     heads = [f"{axis} {size:g}" for axis, size in axes.items()]
-    table = Table("method", "as trained", *heads, title="PSNR / dB as trained, and what the largest mismatch changes")
+    table = _numbers(["as trained", *heads], "PSNR / dB as trained, and what the largest mismatch changes")
     for label, sweep in found.sweeps.items():
         start = statistics.fmean(next(iter(sweep.items()))[1][AXES[next(iter(sweep))]])
         ends = [statistics.fmean(sweep[axis][size]) - start for axis, size in axes.items()]

@@ -52,7 +52,8 @@ nav a {{ margin-right: 1rem; }} img {{ max-width: 100%; }} div.wide {{ overflow-
 table {{ border-collapse: collapse; font-size: 13px; font-variant-numeric: tabular-nums; white-space: nowrap; }}
 caption {{ text-align: left; color: #555; padding-bottom: .3rem; }}
 td, th {{ padding: .15rem .8rem; text-align: right; border-bottom: 1px solid #e4e4e4; font-weight: normal; }}
-tr:first-child th {{ border-bottom: 1px solid #888; }} th:first-child {{ text-align: left; }} b {{ color: #06540c; }}
+tr:first-child th {{ border-bottom: 1px solid #888; }} th:first-child, .left {{ text-align: left; }}
+b {{ color: #06540c; }}
 pre {{ background: #f5f5f5; padding: .8rem; overflow-x: auto; font-size: 12px; }}
 </style>
 <h1>{title}</h1>

@@ -201,7 +201,7 @@ def _place(text: str, folder: Path) -> str:
     if expanded.startswith("$"):
         name = expanded[1:].partition("/")[0]
         raise ParameterError(f"The environment variable `{name}` of `{text}` is not set: `export {name}=/the/folder`.")
-    return str(folder / expanded) if text else ""
+    return str((folder / expanded).resolve()) if text else ""  # the same from whatever folder it is read
 
 
 def _robustness(table: dict[str, Any]) -> Robustness:

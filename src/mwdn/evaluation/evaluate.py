@@ -1,5 +1,6 @@
 """The comparison of methods on one set of pairs, under one protocol."""
 
+import ctypes
 import sys
 import time
 import typing
@@ -155,7 +156,12 @@ def _warm_up(method: Bound, measurement: Measurement) -> int | None:
 
 
 def _forget_peak() -> None:
-    """Let `_highest_resident` begin again at what the process holds now; see proc_pid_clear_refs(5)."""
+    """Let `_highest_resident` begin again at what the process holds now; see proc_pid_clear_refs(5).
+
+    What methods before have freed, and glibc keeps for the next ones, is given back first: it would hide their need.
+    """
+    with suppress(OSError, AttributeError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 

@@ -8,10 +8,17 @@ from rich.text import Text
 
 
 def html_table(table: Table) -> str:
-    """A ``<table>`` with its title as caption; what is bold stays bold."""
+    """A ``<table>`` with its title as caption; what is bold stays bold, and columns keep their side."""
     rows = _rows(table, html.escape, lambda text: f"<b>{text}</b>")
-    heads = "".join(f"<th>{html.escape(str(column.header))}</th>" for column in table.columns)
-    lines = "".join(f"<tr><th>{first}</th>{''.join(f'<td>{cell}</td>' for cell in rest)}</tr>" for first, *rest in rows)
+    styles = ["" if column.justify == "right" else ' class="left"' for column in table.columns]
+    heads = "".join(
+        f"<th{style}>{html.escape(str(column.header))}</th>"
+        for column, style in zip(table.columns, styles, strict=True)
+    )
+    lines = "".join(
+        f"<tr><th>{first}</th>{''.join(f'<td{s}>{cell}</td>' for cell, s in zip(rest, styles[1:], strict=True))}</tr>"
+        for first, *rest in rows
+    )
     title = f"<caption>{html.escape(str(table.title))}</caption>" if table.title else ""
     return f"<table>{title}<tr>{heads}</tr>{lines}</table>"
 
@@ -19,7 +26,8 @@ def html_table(table: Table) -> str:
 def markdown_table(table: Table) -> str:
     """A Markdown table, its title in italics above it."""
     heads = [_unpiped(str(column.header)) for column in table.columns]
-    rows = [heads, ["---", *["---:"] * (len(heads) - 1)], *_rows(table, _unpiped, lambda text: f"**{text}**")]
+    rules = ["---:" if column.justify == "right" else "---" for column in table.columns]
+    rows = [heads, rules, *_rows(table, _unpiped, lambda text: f"**{text}**")]
     title = f"*{table.title}*\n\n" if table.title else ""
     return title + "\n".join("| " + " | ".join(row) + " |" for row in rows)
 
