@@ -4,7 +4,6 @@ import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from importlib import import_module
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from mwdn.fourier import Size
 from mwdn.learning.recipe import OPTIMISERS, Recipe, Schedule
 from mwdn.learning.train import Report, Trainer
 from mwdn.networks import NETWORKS
+from mwdn.networks.published import PUBLISHED
 
 CLOCK = "clock.json"
 """Seconds that a run has trained, up to its last saved state."""
@@ -39,7 +39,7 @@ class Settings:
 
 def settings(method: Method, benchmark: Benchmark) -> Settings:
     """The benchmark's schedule, with the optimiser that the network's source names where it does; the budget stays."""
-    found = _published(method.name) if benchmark.published else None
+    found = PUBLISHED.get(method.name) if benchmark.published else None
     if found is None:
         return Settings(benchmark.schedule, "the recipe's")
     optimiser = str(found.optimiser).lower()
@@ -51,15 +51,6 @@ def settings(method: Method, benchmark: Benchmark) -> Settings:
         changes["learning_rate"] = float(found.rate) * benchmark.rate_factor
         factor = f"; its rate times {benchmark.rate_factor:g}" if benchmark.rate_factor != 1 else ""
     return Settings(replace(benchmark.schedule, **changes), f"{found.source}{factor}")
-
-
-def _published(name: str) -> Any:  # noqa: ANN401
-    try:
-        module = import_module("mwdn.networks.published")
-    except ModuleNotFoundError:
-        return None
-    tables = (table for table in vars(module).values() if isinstance(table, dict))
-    return next((table[name] for table in tables if name in table), None)
 
 
 def options(method: Method, size: Size) -> dict[str, Any]:
