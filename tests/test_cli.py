@@ -1,6 +1,7 @@
 """The commands as a user types them: exit codes, messages, files."""
 
 import importlib.metadata
+import json
 import re
 import subprocess
 import sys
@@ -67,7 +68,11 @@ def test_one_file(run, camera):
     assert (code, err) == (0, "")
     assert re.search(r"PSF [0-9a-f]{16}, background 0\.\d{4}, 0\.\d{4}, 0\.\d{4} of the full scale", out)
     assert "1 of 1 captures reconstructed into out" in out
-    assert names(camera / "out") == ["a.png", "summary.png"]
+    assert names(camera / "out") == ["a.json", "a.png", "summary.png"]
+    assert "a.png explains" in out
+    trust = json.loads((camera / "out" / "a.json").read_text())
+    assert trust["explained"] > 0.8 * trust["possible"]
+    assert not trust["doubtful"]
     picture = read_frame("out/a.png")
     assert picture.shape == (*SIZE, 3)
     inside, outside = picture[12:18, 14:20].mean((0, 1)), picture[24:, 28:].mean((0, 1))
@@ -77,10 +82,13 @@ def test_one_file(run, camera):
 
 def test_many_files_and_a_folder(run, camera):
     code, out, _ = reconstruct(run, "captures/c.png", "captures/a.png", out="some")
-    assert (code, names(camera / "some")) == (0, ["a.png", "c.png", "summary.png"])
+    assert (code, names(camera / "some")) == (0, ["a.json", "a.png", "c.json", "c.png", "summary.png"])
     assert "2 of 2" in out
     code, _, _ = reconstruct(run, "captures", out="all")
-    assert (code, names(camera / "all")) == (0, ["a.png", "b.png", "c.png", "summary.png"])
+    assert (code, names(camera / "all")) == (
+        0,
+        [*(f"{name}.{kind}" for name in "abc" for kind in ("json", "png")), "summary.png"],
+    )
     for name in ("a.png", "c.png"):
         assert (camera / "some" / name).read_bytes() == (camera / "all" / name).read_bytes()
 
@@ -91,7 +99,7 @@ def test_formats_and_checkpoint(run, camera):
     line = ("reconstruct", "captures/a.png", "--psf", "psf.png", "--out", "out", "--method", "net.safetensors")
     assert run(*line, "--format", "npy", "--device", "cpu")[0] == 0
     assert read_frame("out/a.npy").dtype == np.float32
-    assert names(camera / "out") == ["a.npy", "summary.png"]
+    assert names(camera / "out") == ["a.json", "a.npy", "summary.png"]
 
 
 def test_options_of_the_camera(run, camera):
@@ -109,7 +117,12 @@ def test_one_bad_file_among_many(run, camera):
     code, out, err = reconstruct(run, "captures", "captures/none.png")
     assert code == 1
     assert "3 of 5 captures reconstructed into out" in out
-    assert names(camera / "out") == ["a.png", "b.png", "c.png", "summary.png"]
+    assert [name for name in names(camera / "out") if name.endswith("png")] == [
+        "a.png",
+        "b.png",
+        "c.png",
+        "summary.png",
+    ]
     first, second = err.splitlines()  # each message on one line, brackets and all
     assert first.startswith("captures/b[red].png: `captures/b[red].png` is cut off")
     assert second.startswith("captures/none.png: `captures/none.png` does not exist")
@@ -190,7 +203,7 @@ def test_existing_output_is_replaced(run, camera):
     assert reconstruct(run, "captures/a.png")[0] == 0
     assert read_frame("out/a.png").shape == (*SIZE, 3)
     assert (camera / "out" / "keep.txt").read_text() == "mine"
-    assert names(camera / "out") == ["a.png", "keep.txt", "summary.png"]
+    assert names(camera / "out") == ["a.json", "a.png", "keep.txt", "summary.png"]
 
 
 # --- The others ---------------------------------------------------------------------------------------
@@ -205,6 +218,7 @@ def test_demo(run, tmp_path):
         for words in (re.findall(r"[\w.]+", line) for line in out.splitlines() if line.startswith("│"))
     }
     assert set(rows) == {"astronaut", "coffee", "cat"}
+    assert all(row["universal"] > 24.5 for row in rows.values()), rows
     assert all(row["admm"] > 24 for row in rows.values()), rows
     assert all(row["admm"] > row["fista"] > row["wiener"] > 15 for row in rows.values()), rows
     page = (tmp_path / "demo" / "index.html").read_text(encoding="utf-8")

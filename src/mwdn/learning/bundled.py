@@ -1,9 +1,5 @@
-"""Trained networks by name: those that come with the package, and those on the Hugging Face hub.
+"""Trained networks by name: those that come with the package, and those on the Hugging Face hub."""
 
-``python -m mwdn.learning.bundled runs/universal/best.safetensors universal`` puts weights into the package.
-"""
-
-import sys
 from importlib.resources import files
 from pathlib import Path
 
@@ -62,7 +58,3 @@ def bundle(checkpoint: Path, out: Path) -> None:
     if not all(torch.isfinite(value).all() for value in network.state_dict().values()):
         raise CheckpointError(f"`{checkpoint}` holds weights beyond the range of float16, 65504.")
     save_network(out, network, header.pop("name"), header.pop("options"), **header)
-
-
-if __name__ == "__main__":
-    bundle(Path(sys.argv[1]), _FOLDER / f"{sys.argv[2]}.safetensors")

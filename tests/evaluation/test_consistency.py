@@ -1,0 +1,79 @@
+"""The score on captures whose camera, noise and scene are known."""
+
+import pytest
+import torch
+
+from mwdn.errors import ShapeError
+from mwdn.evaluation.consistency import Consistency, consistency
+from mwdn.optics.camera import Camera
+from mwdn.optics.patterns import contour_psf
+from mwdn.solvers.alignment import Pose, fine_detail
+from mwdn.solvers.pyramid import Pyramid
+
+SIZE, NOISE = (128, 144), 0.004
+
+
+@pytest.fixture(scope="module")
+def known():
+    """A PSF, a scene of coloured rectangles, and its capture with white noise."""
+    generator = torch.Generator().manual_seed(2)
+    psf = contour_psf(SIZE, generator=generator).expand(-1, 3, -1, -1)
+    scene = torch.zeros(1, 3, *SIZE)
+    for _ in range(25):
+        top, left = torch.randint(25, 90, (2,), generator=generator).tolist()
+        scene[..., top : top + 12, left : left + 16] = torch.rand(3, 1, 1, generator=generator)
+    light = Camera(psf).forward(scene)
+    return psf, scene, light + NOISE * light.amax() * torch.randn(light.shape, generator=generator)
+
+
+def test_the_true_scene_explains_all_that_is_not_noise(known):
+    psf, scene, measurement = known
+    found = consistency(measurement, psf, scene)
+    assert found.explained == pytest.approx(found.possible, abs=0.02)
+    assert found.contrast > 1.5
+    assert not found.doubtful
+
+
+def test_possible_is_what_white_noise_leaves(known):
+    psf, scene, _ = known
+    light = Camera(psf).forward(scene)
+    # The finest patterns count as noise too, a little.
+    clean = consistency(light, psf, scene)
+    assert clean.possible > 0.99
+    noise = 0.5 * light.std() * torch.randn(light.shape, generator=torch.Generator().manual_seed(3))
+    noisy = consistency(light + noise, psf, scene)
+    detail = fine_detail(light).square().sum()
+    share = detail / (detail + noise.square().sum())
+    assert noisy.possible == pytest.approx(float(share), abs=0.1)
+
+
+def test_wrong_psfs_are_doubted_and_a_turned_one_is_found(known):
+    psf, _, measurement = known
+    for wrong in (psf.flip(-1), psf.flip(-2), psf.flip(-1, -2)):
+        assert consistency(measurement, wrong, Pyramid()(measurement, wrong)).doubtful
+    turned = Pose(torch.tensor([-0.9]), torch.tensor([0.0])).move(psf)
+    found = consistency(measurement, turned, Pyramid()(measurement, psf))
+    assert not found.doubtful
+    assert found.turn_degrees == pytest.approx(0.9, abs=0.2)
+    assert "turned by" in found.sentence
+
+
+def test_gain_and_even_light_do_not_matter(known):
+    psf, scene, measurement = known
+    plain = consistency(measurement, psf, scene)
+    found = consistency(3 * measurement + 0.5, 7 * psf, 0.2 * scene)
+    assert found.explained == pytest.approx(plain.explained, abs=5e-3)
+
+
+def test_sentences():
+    assert "mirrored" in Consistency(0.9, 0.95, 0.8, 0.0, 0.0).sentence
+    assert "little" in Consistency(0.2, 0.95, 1.2, 0.0, 0.0).sentence
+    assert Consistency(0.9, 0.95, 1.2, 0.0, 0.0).sentence == (
+        "explains 90.0% of the capture's detail, of 95.0% that is not noise"
+    )
+
+
+def test_one_capture_at_a_time(known):
+    psf, scene, measurement = known
+    with pytest.raises(ShapeError, match="one shape"):
+        consistency(measurement, psf, scene[..., 1:])
