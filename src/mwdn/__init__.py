@@ -2,7 +2,7 @@
 
 >>> from mwdn import Calibration, Reconstructor, for_people, read_frame, write_picture
 >>> calibration = Calibration.from_file("psf.png")
->>> reconstruct = Reconstructor("admm", calibration)
+>>> reconstruct = Reconstructor("universal", calibration)
 >>> scene = reconstruct(calibration.correct(read_frame("capture.png")))
 >>> write_picture("scene.png", for_people(scene))
 """

@@ -1,10 +1,12 @@
 """Metrics, protocols and the comparison of methods."""
 
+from mwdn.evaluation.consistency import Consistency, consistency
 from mwdn.evaluation.evaluate import First, evaluate, learnable_numbers
 from mwdn.evaluation.metrics import Perceptual, Protocol, Variant, bootstrap, measure, psnr
 from mwdn.evaluation.report import Report, Scores
 
 __all__ = [
+    "Consistency",
     "First",
     "Perceptual",
     "Protocol",
@@ -12,6 +14,7 @@ __all__ = [
     "Scores",
     "Variant",
     "bootstrap",
+    "consistency",
     "evaluate",
     "learnable_numbers",
     "measure",

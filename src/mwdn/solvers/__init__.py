@@ -5,6 +5,7 @@ from typing import Any
 from mwdn.calibration.frames import noise_level
 from mwdn.errors import UnknownNameError
 from mwdn.solvers.admm import TEXTBOOK, Admm, Penalties, Progress
+from mwdn.solvers.alignment import Pose, align
 from mwdn.solvers.fista import Fista
 from mwdn.solvers.pyramid import Pyramid
 from mwdn.solvers.wiener import Wiener
@@ -36,10 +37,12 @@ __all__ = [
     "Admm",
     "Fista",
     "Penalties",
+    "Pose",
     "Progress",
     "Pyramid",
     "Solver",
     "Wiener",
+    "align",
     "build",
     "noise_level",
 ]
