@@ -62,7 +62,7 @@ FETCH = "import sys; from mwdn.learning.bundled import find_weights; print(find_
 
 @pytest.fixture
 def hub(tmp_path):
-    """``hub(name)`` fetches from a server that has one file, as `huggingface_hub` asks for it; nothing else is there."""
+    """``hub(name)`` fetches from a server that has one file, in the way of `huggingface_hub`."""
     pytest.importorskip("huggingface_hub", reason="needs `pip install 'mwdn[hub]'`")
     content = find_weights("universal-small").read_bytes()
 
