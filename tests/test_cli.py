@@ -227,7 +227,7 @@ def test_demo(run, tmp_path):
     assert 'src="psf.png"' in page
     assert 'src="comparison.png"' in page
     assert str(tmp_path / "demo" / "index.html") in out  # on one line, to be clicked or copied
-    assert read_frame(tmp_path / "demo" / "comparison.png").shape == (26 + 3 * 246, 5 * 246, 3)
+    assert read_frame(tmp_path / "demo" / "comparison.png").shape == (26 + 3 * 246, 7 * 246, 3)
 
 
 def test_doctor(run):

@@ -68,7 +68,8 @@ def test_train_then_reconstruct(run, camera):
     assert "Weights in runs/x/best.safetensors" in out
     assert re.search(r"step 4: validation \d+\.\d\d dB, best \d+\.\d\d dB", flat(err))
     code, out, err = run(f"{RECONSTRUCT} psf.npy")
-    assert (code, err) == (0, "")
+    assert code == 0
+    assert "capture.npy explains" in out + err
     assert read_frame("results/reconstruct/capture.png").shape == (32, 40, 3)
     assert run(TRAIN)[0] == 0  # nothing left to do
 
@@ -78,7 +79,7 @@ def test_checkpoint_of_another_camera_is_used_with_a_warning(run, camera):
     trained, given = (Calibration.from_file(f"{name}.npy").psf_hash for name in ("psf", "other"))
     code, _, err = run(f"{RECONSTRUCT} other.npy")
     assert code == 0
-    assert err.count("Warning:") == len(err.splitlines()) == 1
+    assert err.count("Warning:") == 1
     said = f"`runs/x/best.safetensors` was trained for the camera of PSF {trained}, but the PSF given is {given}."
     assert said in err
     assert "Expect blur, ghosts and invented detail" in err

@@ -24,7 +24,8 @@ def read(tmp_path):
     return call
 
 
-TRAININGS = [path for path in sorted((ROOT / "recipes").glob("*.toml")) if not path.stem.startswith("camera-")]
+OTHERS = ("camera-", "benchmark-")
+TRAININGS = [path for path in sorted((ROOT / "recipes").glob("*.toml")) if not path.stem.startswith(OTHERS)]
 
 
 @pytest.mark.parametrize("path", TRAININGS, ids=lambda path: path.stem)
