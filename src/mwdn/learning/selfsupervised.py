@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from mwdn.data.unpaired import UnpairedCaptures
 from mwdn.fourier import convolve
 from mwdn.learning.losses import Loss
-from mwdn.learning.validation import Judged, Validator
+from mwdn.learning.validation import START, Judged, Validator
 from mwdn.types import Image, Measurement
 
 
@@ -89,3 +89,9 @@ class BlindValidator(Validator):
         assert isinstance(self.pairs, UnpairedCaptures)
         found = judge(self.pairs, network, loss, numbers)
         return Judged(-10 * torch.log10(found.loss).expand(len(numbers)), float(found.loss), found.pictures)
+
+    @torch.no_grad()
+    def captured(self, network: nn.Module) -> list[list[Tensor]]:
+        """The first capture and its reconstruction: whether it fits the network is found before training."""
+        measurement, _, _ = self.pairs.batch([START])
+        return [[measurement.cpu(), network(measurement, self.psf).cpu()]]
