@@ -30,9 +30,10 @@ def train(  # noqa: PLR0913
     device: str | None = None,
     tensorboard: Annotated[bool, Parameter(negative=())] = False,
 ) -> None:
-    """Train a network for one camera, on captures simulated through its PSF or on recorded pairs.
+    """Train a network for one camera: on captures simulated through its PSF, on recorded pairs, or on captures alone.
 
-    Give either --photos or --pairs. Run again, it goes on where it stopped.
+    Give either --photos or --pairs, or --captures alone with a recipe that has [selfsupervised].
+    Run again, it goes on where it stopped.
 
     Several GPUs or machines: torchrun --nproc-per-node 4 -m mwdn train ...
 
@@ -41,7 +42,8 @@ def train(  # noqa: PLR0913
         camera: calibration of the camera.
         photos: folder of photographs, the more the better: captures of them are simulated.
         pairs: HDF5 file of recorded pairs, from `mwdn import`; the recipe's [pairs] says which are for what.
-        captures: real captures, files or folders, to be shown on the contact sheet instead of the recipe's.
+        captures: real captures, files or folders: to be shown on the contact sheet instead of the recipe's, or, with
+            [selfsupervised], to be learned from.
         out: folder of the run: best.safetensors is what `mwdn reconstruct --method` takes, validation.png shows the
             pictures of the latest validation.
         steps: instead of the recipe's steps or epochs.

@@ -12,6 +12,7 @@ import torch
 from mwdn.data.cameras import Cameras
 from mwdn.data.recorded import Division
 from mwdn.data.simulated import Mismatch, Placement
+from mwdn.data.unpaired import SelfSupervised
 from mwdn.errors import MwdnError, ParameterError, UnknownNameError
 from mwdn.learning.losses import checked_weights
 from mwdn.networks import build
@@ -46,7 +47,8 @@ class Schedule:
         pool: keep so many samples and what the network computes of them before its learned part, and use them again,
             mirrored; 0 makes every sample a new one. For `wiener-bank`.
         crop: side of the square of a kept sample that is learned from at a time; 0 for all of it.
-        start: weights to begin with instead, the path of a checkpoint of the same network.
+        start: weights to begin with instead: those that come with the package, "universal", or the path of a
+            checkpoint; of the same network.
     """
 
     steps: int = 2000
@@ -131,6 +133,7 @@ class Recipe:
         later_loss: weights that replace those of ``loss`` at the end of that course; none to leave them.
         pairs: which of recorded pairs are for what, see `mwdn.data.recorded.Division`.
         sheet: see `Sheet`.
+        selfsupervised: learn from captures alone, see `mwdn.data.unpaired.SelfSupervised`.
         cameras: random ones to learn from in place of the one that is given, see `mwdn.data.cameras.Cameras`.
         placement: see `mwdn.data.simulated.Placement`.
         mismatch: see `mwdn.data.simulated.Mismatch`.
@@ -144,6 +147,7 @@ class Recipe:
     later_loss: dict[str, float] = field(default_factory=dict)
     pairs: Division = Division()
     sheet: Sheet = Sheet()
+    selfsupervised: SelfSupervised = SelfSupervised()
     cameras: Cameras = Cameras()
     placement: Placement = Placement()
     mismatch: Mismatch = Mismatch()
@@ -160,6 +164,11 @@ class Recipe:
         if self.schedule.pool and not self.schedule.crop and len(set(self.cameras.sizes)) > 1:
             raise ParameterError(
                 "Kept samples of several sizes, [cameras], make no batch. Set `crop` of [schedule] to the least side."
+            )
+        if self.selfsupervised.consistency and (self.schedule.pool or self.cameras.sizes):
+            raise ParameterError(
+                "[selfsupervised] learns from one camera's captures, none of which is ever the same: "
+                "leave `pool` of [schedule] and [cameras] out."
             )
         if self.later_loss and self.later_loss.keys() != self.loss.keys():
             raise ParameterError(

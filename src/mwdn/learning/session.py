@@ -12,6 +12,7 @@ from mwdn.data.pair_writer import Attribute
 from mwdn.data.photographs import Photographs
 from mwdn.data.recorded import HELD_OUT, record, recorded_pairs
 from mwdn.data.simulated import EXACT, Samples, SimulatedPairs
+from mwdn.data.unpaired import UnpairedCaptures
 from mwdn.errors import ParameterError
 from mwdn.learning import distributed
 from mwdn.learning.recipe import Recipe
@@ -41,26 +42,28 @@ def prepare(
         photos: folder of photographs, through which captures are simulated; every 20th is held out for validation.
         out: folder of the run.
         device: a GPU if there is one unless given.
-        pairs: file of recorded pairs, in place of photographs.
+        pairs: file of recorded pairs, in place of photographs. A recipe with [selfsupervised] takes neither: it
+            learns from all the captures of its [sheet].
         apart: files that are no captures, though a folder of the recipe's [sheet] holds them: the PSF, the dark frame.
 
     Raises:
-        ParameterError: not exactly one of photographs and pairs, or not enough of them.
+        ParameterError: not exactly one of photographs, pairs and captures, as the recipe needs, or not enough of them.
         MwdnError: torch cannot use the device, a file cannot be read or does not fit the camera, or the folder holds
             another run.
     """
-    if photos is None and pairs is None:
-        raise ParameterError("Name what to learn from: photographs, `--photos FOLDER`, or pairs, `--pairs FILE`.")
-    if photos is not None and pairs is not None:
-        raise ParameterError(
-            f"`--photos` ({photos}) and `--pairs` ({pairs}) exclude each other. Leave one of them out."
-        )
+    _check_one(recipe, photos, pairs)
     place = distributed.device_here(device)
-    shown = recipe.sheet.captures
-    real = read_captures(find_captures(shown, apart=apart)[:SHOWN], calibration) if shown else None
+    shown, alone = recipe.sheet.captures, recipe.selfsupervised.consistency > 0
+    files = find_captures(shown, apart=apart) if shown else []
+    real = read_captures(files if alone else files[:SHOWN], calibration) if files else None
     training: Samples
     validation: Samples
-    if pairs is not None:
+    if alone and real is not None:
+        psf, seed = calibration.psf.to(place), recipe.schedule.seed
+        training = validation = UnpairedCaptures(real.to(place), psf, recipe.selfsupervised, seed)
+        count, real = len(training), None
+        recipe = _within(recipe, count)
+    elif pairs is not None:
         if recipe.cameras.sizes:
             raise ParameterError("Recorded pairs, `--pairs`, are of one camera: leave [cameras] out of the recipe.")
         seed = recipe.schedule.seed
@@ -112,6 +115,24 @@ def simulate(
     attributes: dict[str, Attribute] = {"psf_hash": calibration.psf_hash, "seed": pairs.seed}
     part = pairs, range(FILE_START, FILE_START + count)
     record(out, [part], calibration.psf, batch=recipe.schedule.batch, attributes=attributes, track=track)
+
+
+def _check_one(recipe: Recipe, photos: Path | None, pairs: Path | None) -> None:
+    if recipe.selfsupervised.consistency:
+        if photos is not None or pairs is not None or not recipe.sheet.captures:
+            raise ParameterError(
+                "A recipe with [selfsupervised] learns from captures alone: name them, `--captures FOLDER`, "
+                "and neither `--photos` nor `--pairs`."
+            )
+    elif photos is None and pairs is None:
+        raise ParameterError(
+            "Name what to learn from: photographs, `--photos FOLDER`, or pairs, `--pairs FILE`. "
+            "To learn from captures alone, take recipes/selfsupervised.toml."
+        )
+    elif photos is not None and pairs is not None:
+        raise ParameterError(
+            f"`--photos` ({photos}) and `--pairs` ({pairs}) exclude each other. Leave one of them out."
+        )
 
 
 def _source(recipe: Recipe, photographs: Photographs, psf: Psf) -> SimulatedPairs:

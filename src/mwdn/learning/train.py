@@ -15,15 +15,18 @@ from torch import Tensor
 from mwdn.calibration import Calibration
 from mwdn.data.images import write_picture
 from mwdn.data.simulated import Samples
+from mwdn.data.unpaired import UnpairedCaptures
 from mwdn.data.writing import atomic
 from mwdn.errors import CheckpointError, DivergenceError, ParameterError
 from mwdn.learning import distributed
+from mwdn.learning.bundled import find_weights
 from mwdn.learning.checkpoint import load_network, save_network
 from mwdn.learning.losses import Loss
 from mwdn.learning.pool import Pool
 from mwdn.learning.precision import has_bfloat16
 from mwdn.learning.recipe import Recipe
 from mwdn.learning.schedule import begin, optimiser
+from mwdn.learning.selfsupervised import BlindValidator, judge
 from mwdn.learning.state import read_state, restore, write_state
 from mwdn.learning.validation import Validation, Validator
 from mwdn.networks import build
@@ -88,7 +91,8 @@ class Trainer:
         self.device, self.pairs, self.calibration = torch.device(device), pairs, calibration
         self.psf = calibration.psf.to(self.device)
         real = None if captures is None else captures.to(self.device)
-        self.validator = Validator(recipe, validation or pairs, self.psf, real)
+        kind = BlindValidator if isinstance(pairs, UnpairedCaptures) else Validator
+        self.validator = kind(recipe, validation or pairs, self.psf, real)
         torch.manual_seed(self.schedule.seed)
         self.options = {key: value for key, value in recipe.network.items() if key != "name"}
         self.network = build(recipe.network["name"], **self.options).to(self.device)
@@ -106,7 +110,8 @@ class Trainer:
         self.bfloat16 = self.schedule.bfloat16 and has_bfloat16(self.device)
         self.step, self.best = 0, -math.inf
         # What a checkpoint must agree with to be gone on from.
-        learned = {table: values for table, values in recipe.as_dict().items() if table != "sheet"}
+        without = {"sheet"} if recipe.selfsupervised.consistency else {"sheet", "selfsupervised"}
+        learned = {table: values for table, values in recipe.as_dict().items() if table not in without}
         one = None if recipe.cameras.sizes else calibration.psf_hash  # of many, the given one is for the validation
         self.identity = {"recipe": learned, "psf_hash": one, "pairs": pairs.name}
         distributed.check_alike(self.identity)
@@ -158,8 +163,7 @@ class Trainer:
         self.loss.weights = self.course.weights
         self.network.train()
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
-            found, scene = self._reconstruct(own)
-        loss, parts = self.loss(found.float(), scene)
+            loss, parts = self._judge(own)
         weight = len(own) / len(numbers)  # losses are means over samples
         total, *totals = distributed.total(weight * torch.stack([loss.detach(), *parts.values()]).double()).tolist()
         if not math.isfinite(total):
@@ -168,7 +172,7 @@ class Trainer:
                 f"Lower the learning rate and go on from `{self.out / 'state.safetensors'}`."
             )
         self.optimiser.zero_grad(set_to_none=True)
-        (weight * loss).backward()
+        torch.autograd.backward(weight * loss)
         distributed.add_gradients(self.network)
         if self.schedule.clip > 0:
             torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.schedule.clip)
@@ -176,6 +180,14 @@ class Trainer:
         self.step += 1
         self._average()
         return total, dict(zip(parts, totals, strict=True))
+
+    def _judge(self, numbers: range) -> tuple[Tensor, dict[str, Tensor]]:
+        """Loss of the samples of these numbers, and its parts."""
+        if isinstance(self.pairs, UnpairedCaptures):
+            blind = judge(self.pairs, self.network, self.loss, numbers)
+            return blind.loss, blind.parts
+        found, scene = self._reconstruct(numbers)
+        return self.loss(found.float(), scene)
 
     def _reconstruct(self, numbers: range) -> tuple[Tensor, Tensor]:
         """Reconstructions of the samples of these numbers, and their scenes."""
@@ -243,7 +255,7 @@ class Trainer:
         return Pool(self.pairs, self.network, self.psf, size=s.pool, batch=s.batch, crop=s.crop, seed=s.seed)
 
     def _begin_with(self, start: str) -> None:
-        known = load_network(start)
+        known = load_network(find_weights(start) or start)
         try:
             self.network.load_state_dict(known.state_dict())
         except RuntimeError as error:

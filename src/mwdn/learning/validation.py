@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from itertools import zip_longest
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -34,6 +35,14 @@ class Validation:
     sheet: Image | None = None
 
 
+class Judged(NamedTuple):
+    """What was found on a batch: a PSNR of each sample, the loss, and pictures to be shown."""
+
+    psnr: Tensor
+    loss: float
+    pictures: tuple[Tensor, Tensor, Tensor]
+
+
 @dataclass(frozen=True, eq=False)
 class Validator:
     """Validates a network, on the same samples each time.
@@ -50,6 +59,9 @@ class Validator:
     psf: Psf
     captures: Measurement | None = None
 
+    columns: ClassVar[tuple[str, str]] = "measurement", "scene"
+    """Titles on the sheet, left and right of the reconstruction's."""
+
     @torch.no_grad()
     def __call__(self, network: nn.Module, loss: Loss, title: str) -> Validation:
         """Validate a network that is on the device of the pairs, in evaluation mode.
@@ -63,16 +75,22 @@ class Validator:
         rows: list[list[Tensor]] = []
         for start in range(0, schedule.validation, schedule.batch):
             numbers = range(START + start, START + min(start + schedule.batch, schedule.validation))
-            measurement, scene, psf = self.pairs.batch(numbers)
-            found = network(measurement, self.psf if psf is None else psf)
-            psnrs.append(-10 * torch.log10((found.clamp(0, 1) - scene).square().mean((1, 2, 3))))
-            parts = loss(found, scene)[1]
-            losses.append(len(numbers) * sum(weight * parts[name].item() for name, weight in self.recipe.loss.items()))
-            rows += _rows(*(pictures[: SHOWN - len(rows)] for pictures in (measurement, found, scene)))
+            judged = self.judged(network, loss, numbers)
+            psnrs.append(judged.psnr)
+            losses.append(len(numbers) * judged.loss)
+            rows += _rows(*(pictures[: SHOWN - len(rows)] for pictures in judged.pictures))
         columns = [rows, *([self.captured(network)] if self.captures is not None else [])]
-        return Validation(
-            float(torch.cat(psnrs).mean()), sum(losses) / schedule.validation, _sheet(columns, title, self.psf)
-        )
+        sheet = _sheet(columns, (self.columns[0], title, self.columns[1]), self.psf)
+        return Validation(float(torch.cat(psnrs).mean()), sum(losses) / schedule.validation, sheet)
+
+    def judged(self, network: nn.Module, loss: Loss, numbers: range) -> Judged:
+        """Compare reconstructions of the pairs of these numbers with their scenes."""
+        measurement, scene, psf = self.pairs.batch(numbers)
+        found = network(measurement, self.psf if psf is None else psf)
+        psnr = -10 * torch.log10((found.clamp(0, 1) - scene).square().mean((1, 2, 3)))
+        parts = loss(found, scene)[1]
+        weighted = sum(weight * parts[name].item() for name, weight in self.recipe.loss.items())
+        return Judged(psnr, weighted, (measurement, found, scene))
 
     @torch.no_grad()
     def captured(self, network: nn.Module) -> list[list[Tensor]]:
@@ -85,9 +103,9 @@ def _rows(*pictures: Tensor) -> list[list[Tensor]]:
     return [[picture[None].cpu() for picture in row] for row in zip(*pictures, strict=True)]
 
 
-def _sheet(columns: list[list[list[Tensor]]], title: str, psf: Psf) -> Image:
+def _sheet(columns: list[list[list[Tensor]]], heads: tuple[str, str, str], psf: Psf) -> Image:
     """Pairs on the left, captures on the right; white where one has fewer than the other."""
-    titles = ["measurement", title, "scene", *(["capture", title] if len(columns) > 1 else [])]
+    titles = [*heads, *(["capture", heads[1]] if len(columns) > 1 else [])]
     white = torch.ones(1, 1, *psf.shape[-2:])
     blanks = [[white] * len(column[0]) for column in columns]
     lines = [
