@@ -1,5 +1,6 @@
 """Learning from captures alone: what the loss prefers, that it falls, and that a stopped run goes on."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -177,14 +178,14 @@ def run(scenes, calibration, tmp_path):
 
 
 def test_the_loss_falls(run):
-    recipe = replace(RECIPE, schedule=replace(RECIPE.schedule, steps=24, validate_every=24))
-    trainer = run(recipe)
+    trainer = run(replace(RECIPE, schedule=replace(RECIPE.schedule, steps=40, validate_every=40)))
     with torch.no_grad():
         trainer.network.decoder.head.weight.mul_(30)  # begin with wrong pictures
         trainer.average.load_state_dict(trainer.network.state_dict())
-    before = trainer.validate()
-    best = trainer.run()
-    assert best > before.psnr + 1
+    trainer.run()
+    lines = (trainer.out / "log.jsonl").read_text(encoding="utf-8").splitlines()
+    losses = [json.loads(line)["loss"] for line in lines]
+    assert sum(losses[-8:]) < 0.7 * sum(losses[:8])
     assert trainer.validator.recipe.schedule.validation == 3
     assert (trainer.out / "validation.png").is_file()
 
@@ -217,14 +218,6 @@ def test_what_is_missing_or_does_not_fit(run, calibration, tmp_path):
     np.save(tmp_path / "captures" / "9.npy", np.ones((32, 40, 3), np.float32))
     with pytest.raises(ShapeError, match=r"9.npy`: .*same height and width"):
         run()
-
-
-def test_a_grey_capture_is_found_before_training(run, calibration, tmp_path):
-    calibration = Calibration(calibration.psf[:, :1].contiguous())
-    np.save(tmp_path / "grey.npy", np.random.default_rng(0).random((64, 64, 1), np.float32))
-    recipe = replace(RECIPE, sheet=Sheet((str(tmp_path / "grey.npy"),)))
-    with pytest.raises(ShapeError, match="channels"):
-        prepare(recipe, calibration, None, tmp_path / "run", "cpu")
 
 
 def test_a_run_begins_with_the_weights_of_the_package(run, tmp_path, monkeypatch):
