@@ -109,7 +109,7 @@ def test_samples_of_a_batch_do_not_meet_in_evaluation(name, ready, generator, re
     network = ready(lively(small(name), generator))
     together = network(b, h)
     # Iterations amplify the last bits of float32, and half precision rounds these differently.
-    tolerance = (1e-3, 1e-3) if request.node.callspec.params["ready"] == "fast" else (1e-4, 1e-5)
+    tolerance = (1e-2, 1e-2) if request.node.callspec.params["ready"] == "fast" else (1e-4, 1e-5)
     for i in range(3):
         alone = network(b[i : i + 1], h)
         torch.testing.assert_close(together[i : i + 1], alone, rtol=tolerance[0], atol=tolerance[1])

@@ -3,6 +3,7 @@
 Without torchrun there is one process, and nothing here does anything.
 """
 
+import atexit
 import ctypes
 import itertools
 import json
@@ -57,6 +58,17 @@ def processes() -> Iterator[None]:
     # Not after an error: NCCL would wait for processes that may have ended.
     total(torch.zeros(1))  # nobody hangs up while another still writes the last checkpoint
     dist.destroy_process_group()
+    atexit.register(_leave)
+
+
+def _leave() -> None:
+    """End at once: on a busy machine torch's own threads may outlive what they use, which then aborts the process.
+
+    All is written, and the other processes have parted.
+    """
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0)
 
 
 def _end_with_parent() -> None:
