@@ -16,7 +16,7 @@ OUT = Path("results/acceptance")
 
 def reconstruct(*arguments: str | Path) -> None:
     with pytest.raises(SystemExit) as ended:
-        main(["reconstruct", *map(str, arguments), "--format", "npy"])
+        main(["reconstruct", *map(str, arguments), "--method", "admm", "--format", "npy"])
     assert ended.value.code == 0
 
 
