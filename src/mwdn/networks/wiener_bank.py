@@ -11,6 +11,10 @@ from mwdn.solvers.alignment import align
 from mwdn.solvers.pyramid import LEVELS, Band, PsfPyramid
 from mwdn.types import Measurement, Psf, Scene
 
+BLOCK = 32
+"""Pixels along each side of the blocks whose mean light stays as the iterations found it. They know the crop, and
+measure shading and colour better than a U-Net guesses them: 1 dB with an exact PSF."""
+
 
 class WienerBank(nn.Module):
     """Several Wiener filters, from strong to weak regularisation, in picture space; a U-Net corrects their estimates.
@@ -32,8 +36,6 @@ class WienerBank(nn.Module):
         regularisations: lambda of each estimate, for a PSF of unit sum, the strongest first.
         finest: pixels of the measurement along each side of those of the finest iterations: 1, 2, 4 or 8. With 4 they
             take a tenth of the time and leave the detail to the bank. 0 for none: the bank filters the measurement.
-        held: pixels along each side of the blocks whose mean light stays as the iterations found it: they know the crop,
-            and measure shading and colour better than the U-Net guesses them (1 dB with an exact PSF). 0 holds nothing.
         align: turn and scale the PSF first until it explains the measurement (`mwdn.solvers.alignment`). In training
             PSFs are taken as they are: let the captures be mismatched by what the alignment leaves.
         boundary: what stands beyond the measurement if ``finest`` is 0, see `mwdn.fourier.Boundary`.
@@ -47,7 +49,6 @@ class WienerBank(nn.Module):
         fold: int = 2,
         regularisations: tuple[float, ...] = (1e-3, 1e-4, 2e-5),
         finest: int = 1,
-        held: int = 32,
         align: bool = True,
         boundary: Boundary = "taper",
     ) -> None:
@@ -56,11 +57,10 @@ class WienerBank(nn.Module):
             raise ParameterError(f"`regularisations` {tuple(regularisations)} must be one or more positive numbers.")
         if finest not in (0, *(level.shrink for level in LEVELS)):
             raise ParameterError(f"`finest` ({finest}) must be 0 or one of {[level.shrink for level in LEVELS]}.")
-        if fold < 1 or held < 0:
-            raise ParameterError(f"`fold` ({fold}) must be at least 1, `held` ({held}) not negative.")
+        if fold < 1:
+            raise ParameterError(f"`fold` ({fold}) must be at least 1.")
         self.channels, self.fold, self.regularisations = channels, fold, regularisations
         self.finest, self.align, self.boundary = finest, align, boundary
-        self.held = held if finest else 0
         self.levels = tuple(level for level in LEVELS if finest and level.shrink >= finest)
         pictures = len(regularisations) + (2 if self.levels else 1)
         self.encoder = Encoder(channels * pictures * fold**2, paper_widths(width))
@@ -136,14 +136,14 @@ class WienerBank(nn.Module):
         folded = F.pixel_unshuffle(F.pad(estimates / unit, (0, right, 0, below)), self.fold)
         folded = folded.contiguous(memory_format=torch.channels_last)
         correction = F.pixel_shuffle(self.decoder(self.encoder(folded)), self.fold)[..., :height, :width]
-        if self.held:
-            correction = correction - _mean_light(correction, self.held)
+        if self.levels:
+            correction = correction - _mean_light(correction)
         return first + unit * correction
 
 
-def _mean_light(picture: Tensor, block: int) -> Tensor:
+def _mean_light(picture: Tensor) -> Tensor:
     """The smooth picture, (B, C, H, W), through the means of its blocks."""
     height, width = picture.shape[-2:]
-    means = F.avg_pool2d(picture, block, ceil_mode=True, count_include_pad=False)
-    whole = [size + -size % block for size in (height, width)]
+    means = F.avg_pool2d(picture, BLOCK, ceil_mode=True, count_include_pad=False)
+    whole = [size + -size % BLOCK for size in (height, width)]
     return F.interpolate(means, size=whole, mode="bilinear")[..., :height, :width]
