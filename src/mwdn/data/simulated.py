@@ -33,7 +33,7 @@ class Placement:
         turn_degrees: drawn from [-turn, turn].
         offset: displacement of its centre, over half the space beside it; 1 lets it touch the border.
         ambient: light that reaches the whole sensor from elsewhere, over the mean of the measurement.
-        exposure: brightest pixel of the measurement over saturation: the less, the noisier.
+        exposure: brightest pixel of the measurement over saturation: the less, the noisier. Each stop is as likely.
     """
 
     extent: Range = (0.3, 0.7)
@@ -201,7 +201,8 @@ class SimulatedPairs:
         ambient = uniform(generators, *self.placement.ambient)[..., None, None].to(light)
         light = light + ambient * light.mean((1, 2, 3), keepdim=True)
         brightest = light.amax((1, 2, 3), keepdim=True).clamp(min=1e-6)
-        gain = uniform(generators, *self.placement.exposure)[..., None, None].to(light) / brightest
+        stops = uniform(generators, *map(math.log, self.placement.exposure))
+        gain = stops.exp()[..., None, None].to(light) / brightest
         exposed = torch.cat([self._expose(one, g) for one, g in zip(light * gain, generators, strict=True)])
         return Pair(exposed / gain, scene)
 
