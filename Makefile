@@ -15,7 +15,7 @@ demo: .venv/.ready  ## a synthetic camera, its captures, every untrained method
 	$(BIN)/mwdn demo
 
 test: .venv/.ready  ## everything but the slow checks on real captures
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal
 
 check: .venv/.ready  ## lint, format, types
 	$(BIN)/ruff check .

@@ -16,7 +16,7 @@ jaxtyping.install_import_hook("mwdn", "beartype.beartype")
 
 import torch  # noqa: E402
 
-torch.set_num_threads(2)
+torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else 2)
 
 ROOT = Path(__file__).resolve().parents[1]
 
