@@ -1,0 +1,137 @@
+"""What limits reconstructions of the real DiffuserCam pairs: each cause taken away with the truth's help.
+
+    python benchmarks/limits.py ../shared/data
+
+Everything is linear light at 270 x 480; correlations are of detail, of green, a blur over 21 pixels taken off.
+"""
+
+import argparse
+import tempfile
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from mwdn import Calibration, convolve, correlate
+from mwdn.data.importers import import_pairs
+from mwdn.data.pairs import PairFile
+from mwdn.evaluation.metrics import Protocol
+from mwdn.solvers import Pyramid, align
+
+PART = Protocol.parse("60:270,60:440")
+
+
+def blurred(pictures: Tensor, width: int) -> Tensor:
+    return F.avg_pool2d(F.pad(pictures, (width // 2,) * 4, mode="reflect"), width, 1)
+
+
+def correlation(a: Tensor, b: Tensor) -> float:
+    detail = [(x - blurred(x, 21)).flatten() for x in (a, b)]
+    return float(torch.corrcoef(torch.stack(detail))[0, 1])
+
+
+def fitted(found: Tensor, truth: Tensor) -> Tensor:
+    """Best gain and offset."""
+    columns = torch.stack([found.flatten(), torch.ones(found.numel())], 1).double()
+    return (columns @ torch.linalg.lstsq(columns, truth.flatten().double()[:, None]).solution).float().view_as(truth)
+
+
+def psnr(found: Tensor, truth: Tensor) -> float:
+    return float(-10 * torch.log10((found.clamp(0, 1) - truth).square().mean()))
+
+
+def score(found: Tensor, truths: Tensor) -> float:
+    cut = [PART.crop(x) for x in (found, truths)]
+    return sum(psnr(fitted(a, b), b) for a, b in zip(*cut, strict=True)) / len(truths)
+
+
+def smooth_kept(found: Tensor, truths: Tensor, block: int) -> float:
+    """The score if the mean light of blocks were the truth's."""
+    total = 0.0
+    for a, b in zip(PART.crop(found), PART.crop(truths), strict=True):
+        a = fitted(a, b)
+        coarse = F.avg_pool2d((b - a)[None], block, ceil_mode=True, count_include_pad=False)
+        whole = [size + -size % block for size in b.shape[-2:]]
+        change = F.interpolate(coarse, size=whole, mode="bilinear")[0, :, : b.shape[-2], : b.shape[-1]]
+        total += psnr(a + change, b)
+    return total / len(truths)
+
+
+def refitted(psf: Tensor, scenes: Tensor, measurements: Tensor, weight: float, steps: int = 40) -> Tensor:
+    """The PSF changed until it explains these measurements: conjugate gradients, ``weight`` on the change."""
+    gains = torch.stack([m.std() for m in measurements])[:, None, None, None]
+    scenes, measurements = scenes / gains, measurements / gains
+
+    def normal(change: Tensor) -> Tensor:
+        return correlate(convolve(scenes, change), scenes).sum(0, keepdim=True)
+
+    slope = correlate(measurements - convolve(scenes, psf), scenes).sum(0, keepdim=True)
+    probe = torch.randn_like(slope)
+    for _ in range(5):
+        probe = normal(probe / probe.norm())
+    weight, change, rest, along = weight * float(probe.norm()), torch.zeros_like(psf), slope.clone(), slope.clone()
+    for _ in range(steps):
+        image = normal(along) + weight * along
+        length = rest.square().sum() / (along * image).sum()
+        change, old, rest = change + length * along, rest.square().sum(), rest - length * image
+        along = rest + rest.square().sum() / old * along
+    return psf + change
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("data", type=Path)
+    folder = parser.parse_args().data / "diffusercam"
+    calibration = Calibration.from_file(
+        folder / "psf_recovered_270x480.npy", background=0.0, upside_down=True, bgr=True
+    )
+    psf = calibration.psf / calibration.psf.sum((-2, -1), keepdim=True)
+    with tempfile.TemporaryDirectory() as scratch:
+        import_pairs("diffusercam", folder, Path(scratch) / "pairs.h5")
+        pairs = [PairFile(Path(scratch) / "pairs.h5")[n] for n in range(8)]
+    measurements, scenes = (torch.stack(each) for each in zip(*pairs, strict=True))
+
+    print("Correlation of the measurements' detail with that of the true scenes through the PSF")
+    green = slice(1, 2)
+    for tone in (0.5, 1.0, 1.5, 2.2):
+        told = zip(convolve(scenes[:, green] ** tone, psf[:, green]), measurements[:, green], strict=True)
+        print(f"  scenes to the power {tone}: " + " ".join(f"{correlation(*each):.2f}" for each in told))
+    for held in (0, 3, 6):
+        others = [n for n in range(8) if n != held]
+        fit = refitted(psf[:, green], scenes[others][:, green], measurements[others][:, green], weight=1e-3)
+        before, after = (
+            correlation(convolve(scenes[held : held + 1, green], each)[0], measurements[held, green])
+            for each in (psf[:, green], fit)
+        )
+        print(f"  pair {held}, PSF fitted anew to the other seven: {before:.2f} before, {after:.2f} after")
+
+    predicted = torch.stack(
+        [
+            torch.stack([fitted(a, b) for a, b in zip(*each, strict=True)])
+            for each in zip(convolve(scenes, psf), measurements, strict=True)
+        ]
+    )
+    unexplained = blurred(measurements - predicted, 25)
+    parts = unexplained.std((1, 2, 3)) / measurements.mean((1, 2, 3))
+    print(f"Smooth light that nothing explains: {100 * parts.min():.0f} to {100 * parts.max():.0f} % of the mean")
+
+    poses = [align(each[None], psf).move(psf) for each in measurements]
+
+    def by_pyramid(given: Tensor) -> Tensor:
+        return torch.cat([Pyramid()(each[None], pose) for each, pose in zip(given, poses, strict=True)])
+
+    found = by_pyramid(measurements)
+    print(f"Pyramid, PSF aligned: {score(found, scenes):.2f} dB")
+    shares = unexplained / measurements.mean((1, 2, 3), keepdim=True)
+    common = torch.stack([shares[[n for n in range(8) if n != m]].mean(0) for m in range(8)])
+    without = measurements - common * measurements.mean((1, 2, 3), keepdim=True)
+    print(f"  without what the others share of that light: {score(by_pyramid(without.clamp(min=0)), scenes):.2f} dB")
+    print(f"  without their own: {score(by_pyramid((measurements - unexplained).clamp(min=0)), scenes):.2f} dB")
+    for block in (64, 32, 16):
+        print(f"  with the true mean light of blocks of {block} pixels: {smooth_kept(found, scenes, block):.2f} dB")
+
+
+if __name__ == "__main__":
+    with torch.inference_mode():
+        main()
