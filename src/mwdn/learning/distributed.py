@@ -8,6 +8,7 @@ import ctypes
 import itertools
 import json
 import os
+import secrets
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -61,14 +62,20 @@ def processes() -> Iterator[None]:
     atexit.register(_leave)
 
 
-def _leave() -> None:
+def _leave(status: int = 0) -> None:
     """End at once: on a busy machine torch's own threads may outlive what they use, which then aborts the process.
 
     All is written, and the other processes have parted.
     """
     sys.stdout.flush()
     sys.stderr.flush()
-    os._exit(0)
+    os._exit(status)
+
+
+def end_with(status: int) -> None:
+    """Exit status of this process, where several have parted."""
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        atexit.register(_leave, status)  # before the one above: the last one registered comes first
 
 
 def _end_with_parent() -> None:
@@ -164,6 +171,20 @@ def share(numbers: range) -> range:
             f"Make it larger, `--batch {world()}`, or start fewer processes."
         )
     return numbers[rank() * count // world() : (rank() + 1) * count // world()]
+
+
+def handed_out(count: int) -> Iterator[int]:
+    """The numbers below ``count``, each to one process alone: to whichever asks first."""
+    if world() == 1:
+        yield from range(count)
+        return
+    # The server of torchrun outlives its processes: each start counts under a name of its own.
+    name = from_first(lambda: secrets.token_hex(8).encode()).decode()
+    with _together():
+        address = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
+        store = dist.TCPStore(*address, is_master=False)  # type: ignore[attr-defined]
+        while (number := store.add(name, 1) - 1) < count:
+            yield number
 
 
 def add_gradients(network: nn.Module) -> None:
