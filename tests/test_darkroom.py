@@ -3,6 +3,10 @@
 import json
 import os
 import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -285,3 +289,126 @@ def test_old_judgement_never_stands_beside_a_new_picture(tmp_path, psf, captures
     (job,) = darkroom(psf, out, Wiener(regularisation=1.0)).develop(captures[:1])
     assert str(job.error) == "full"
     assert [path.name for path in out.iterdir()] == ["0.png"]
+
+
+# --- Several processes --------------------------------------------------------------------------------
+
+COUNT = 16
+
+
+@pytest.fixture(scope="module")
+def shop(tmp_path_factory):
+    """Folder with psf.npy and `in`, where there are `COUNT` captures and one that is damaged."""
+    folder = tmp_path_factory.mktemp("shop")
+    (folder / "in").mkdir()
+    generator = torch.Generator().manual_seed(3)
+    psf = contour_psf(SIZE, cell=10, generator=generator).expand(1, 3, -1, -1)
+    np.save(folder / "psf.npy", (0.9 * psf / psf.max())[0].movedim(0, -1).numpy())
+    for number in range(COUNT):
+        scene = torch.zeros(1, 3, *SIZE)
+        scene[..., 10:20, 5 + number : 15 + number] = 0.9
+        seen = Camera(psf).simulate(scene, generator=generator)
+        np.save(folder / f"in/{number:02}.npy", seen[0].movedim(0, -1).numpy())
+    (folder / "in" / "damaged.npy").write_bytes(b"\x93NUMPY")
+    return folder
+
+
+def start(folder, out, *launch):
+    """``python`` with the command, or with torchrun and the command."""
+    line = f"-m mwdn reconstruct in --psf psf.npy --method admm --format npy --device cpu --out {out}"
+    here = {"PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"}
+    here |= {"GLOO_SOCKET_IFNAME": "lo"} if sys.platform == "linux" else {}
+    options = {"cwd": folder, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen([sys.executable, *launch, *line.split()], env={**os.environ, **here}, **options)
+
+
+def two(folder, out, restarts=0):
+    options = f"-m torch.distributed.run --standalone --nproc-per-node 2 --max-restarts {restarts}"
+    return start(folder, out, *options.split())
+
+
+def told(output):
+    """Captures of which the output says that they were done."""
+    return re.findall(r"^(\d\d\.npy) explains", output, re.MULTILINE)
+
+
+def whole(out):
+    """Time of writing of each picture that is done, and of what says so."""
+    done = [path.with_suffix(".npy") for path in out.glob("??.json")]
+    return {path: path.stat().st_mtime_ns for one in done for path in (one, one.with_suffix(".json"))}
+
+
+@pytest.fixture(scope="module")
+def single(shop):
+    """What one process writes."""
+    process = start(shop, "single")
+    out, err = process.communicate(timeout=300)
+    assert process.returncode == 1, err  # for the damaged one
+    assert told(out) == [f"{number:02}.npy" for number in range(COUNT)]
+    assert f"{COUNT} of {COUNT + 1} captures reconstructed into single\n" in out
+    return {path.name: path.read_bytes() for path in (shop / "single").iterdir()}
+
+
+def kill_one(process, out, goal):
+    """Kill a worker when so many captures are done; returns its number."""
+    while len(list(out.glob("??.json"))) < goal:
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(0.02)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    assert len(children) == 2
+    os.kill(int(children[1]), signal.SIGKILL)
+
+
+def assert_finished(out, single):
+    """All is there, the same as from one process, and nothing else but what the killed one was writing."""
+    found = {path.name: path.read_bytes() for path in out.iterdir() if not path.name.startswith(".mwdn-")}
+    assert found == single
+
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells the children of a process in /proc")
+
+
+def test_two_processes_share_the_captures(shop, single):
+    process = two(shop, "two")
+    out, err = process.communicate(timeout=300)
+    assert process.returncode == 1, err
+    assert sorted(told(out)) == [f"{number:02}.npy" for number in range(COUNT)]
+    assert err.count("damaged.npy: ") == 1
+    assert out.count(f"{COUNT} of {COUNT + 1} captures reconstructed into two\n") == 1
+    assert_finished(shop / "two", single)
+
+
+@linux
+def test_killed_work_goes_on_where_it_was(shop, single):
+    process = two(shop, "killed")
+    kill_one(process, shop / "killed", goal=4)
+    first, _ = process.communicate(timeout=300)
+    assert process.returncode == 1
+    before = whole(shop / "killed")
+    process = two(shop, "killed")
+    second, err = process.communicate(timeout=300)
+    assert f"{COUNT} of {COUNT + 1} captures reconstructed into killed, {len(before) // 2} of them before" in second, (
+        err
+    )
+    # Nothing was done twice: what was there is still as it was, and the rest was done.
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    there = {path.name for path in before}
+    assert 4 <= len(there) // 2 < COUNT
+    assert set(told(first)) <= there
+    assert sorted(told(second)) == [
+        name for name in sorted(single) if re.match(r"\d\d\.npy", name) and name not in there
+    ]
+    assert_finished(shop / "killed", single)
+
+
+@linux
+def test_torchrun_starts_killed_workers_again(shop, single):
+    (shop / "in" / "damaged.npy").rename(shop / "damaged.npy")  # or the status would start them once more
+    process = two(shop, "again", restarts=1)
+    kill_one(process, shop / "again", goal=4)
+    out, err = process.communicate(timeout=300)
+    (shop / "damaged.npy").rename(shop / "in" / "damaged.npy")
+    assert process.returncode == 0, err
+    assert re.search(rf"{COUNT} of {COUNT} captures reconstructed into again, \d+ of them before", out)
+    assert len(set(told(out))) == len(told(out)) <= COUNT
+    assert_finished(shop / "again", single)
