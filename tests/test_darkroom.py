@@ -15,7 +15,7 @@ import torch
 
 from mwdn import Camera, read_frame
 from mwdn.calibration import Calibration
-from mwdn.darkroom import Darkroom, check_outputs, output_of
+from mwdn.darkroom import Darkroom, check_outputs, output_name
 from mwdn.data.images import srgb_decode
 from mwdn.data.sheets import for_people
 from mwdn.errors import ImageError, ParameterError
@@ -66,7 +66,7 @@ def test_outputs_have_the_captures_names(tmp_path, form, suffix):
     captures = touch(tmp_path / "in", "a.tif", "b.c.npy")
     out = tmp_path / "out"
     check_outputs(captures, out, form)
-    assert [output_of(capture, out, form) for capture in captures] == [out / f"a{suffix}", out / f"b.c{suffix}"]
+    assert [out / output_name(capture, form) for capture in captures] == [out / f"a{suffix}", out / f"b.c{suffix}"]
     assert not out.exists()
 
 
