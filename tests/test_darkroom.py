@@ -402,6 +402,21 @@ def test_killed_work_goes_on_where_it_was(shop, single):
 
 
 @linux
+def test_interrupted_work_ends_quietly_and_leaves_whole_files(shop, single):
+    process, out = start(shop, "interrupted"), shop / "interrupted"
+    while len(list(out.glob("??.json"))) < 2:
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(0.02)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=300)
+    assert process.returncode == 130
+    assert "Traceback" not in err
+    found = {path.name: path.read_bytes() for path in out.iterdir()}
+    assert 4 <= len(found) < len(single)
+    assert found == {name: single[name] for name in found}
+
+
+@linux
 def test_torchrun_starts_killed_workers_again(shop, single):
     (shop / "in" / "damaged.npy").rename(shop / "damaged.npy")  # or the status would start them once more
     process = two(shop, "again", restarts=1)

@@ -217,12 +217,13 @@ class Darkroom:
 
     @cached_property
     def _setting(self) -> str:
-        method, calibration = self.reconstruct.method, self.reconstruct.calibration
+        method, calibration, engine = self.reconstruct.method, self.reconstruct.calibration, self.reconstruct.engine
         camera = {field.name: getattr(calibration, field.name) for field in fields(calibration)}
-        if not isinstance(method, nn.Module):
-            return _digest(__version__, self.form, camera, method)
-        options = {name: value for name, value in vars(method).items() if name[0] != "_"}
-        return _digest(__version__, self.form, camera, type(method).__name__, options, method.state_dict())
+        how: tuple[object, ...] = (method,)
+        if isinstance(method, nn.Module):
+            options = {name: value for name, value in vars(method).items() if name[0] != "_"}
+            how = (type(method).__name__, options, method.state_dict(), engine and engine.precision)
+        return _digest(__version__, self.form, camera, *how)
 
     def _is_there(self, job: Job) -> bool:
         try:

@@ -42,7 +42,7 @@ class Engine:
     def __init__(self, network: nn.Module, psf: Psf, *, precision: Precision = "fast") -> None:
         if precision not in get_args(Precision):
             raise ParameterError(f"`precision` must be fast or exact, not {precision!r}.")
-        self.psf = psf
+        self.psf, self.precision = psf, precision
         # Copied before it is moved: the PSF branch stays exact, and the caller's network where it is.
         self.network = copy.deepcopy(network).to(psf.device).eval().requires_grad_(False)
         self.folded = fold(copy.deepcopy(self.network), half_precision(psf.device) if precision == "fast" else None)

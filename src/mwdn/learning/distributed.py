@@ -53,8 +53,12 @@ def processes() -> Iterator[None]:
         return
     _end_with_parent()
     # Tensors meet where they are: small messages through the CPU, gradients from GPU to GPU.
+    backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
     with _together():
-        dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
+        store, rank, world = next(dist.rendezvous("env://"))  # type: ignore[attr-defined]
+        # After a restart torchrun's store still holds where the processes before could be reached.
+        store = dist.PrefixStore(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"), store)  # type: ignore[attr-defined]
+        dist.init_process_group(backend, store=store, rank=rank, world_size=world)
     yield
     # Not after an error: NCCL would wait for processes that may have ended.
     total(torch.zeros(1))  # nobody hangs up while another still writes the last checkpoint
