@@ -15,7 +15,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 # Data flows downward through this list and imports only point upward. A dotted name is one file of a folder
 # that stands elsewhere: files are read and written from calibration on.
 TIERS = [
-    ("errors", "types"),
+    ("errors", "types", "streams"),
     ("planes",),
     ("fourier",),
     ("data.formats", "data.writing", "data.images"),
@@ -28,11 +28,22 @@ TIERS = [
     ("evaluation",),
     ("engine",),
     ("reconstruct",),
+    ("darkroom",),
     ("capture",),
     ("preview",),
     ("design", "doctor"),
     ("benchmark",),
-    ("demo", "cli_camera", "cli_optics", "cli_inspect", "cli_benchmark", "cli_train", "cli", "__main__"),
+    (
+        "demo",
+        "cli_camera",
+        "cli_optics",
+        "cli_inspect",
+        "cli_benchmark",
+        "cli_train",
+        "cli_reconstruct",
+        "cli",
+        "__main__",
+    ),
     ("",),  # mwdn/__init__.py: the public names
 ]
 RANK = {name: rank for rank, names in enumerate(TIERS) for name in names}

@@ -206,6 +206,27 @@ def test_existing_output_is_replaced(run, camera):
     assert names(camera / "out") == ["a.json", "a.png", "keep.txt", "summary.png"]
 
 
+def test_resume_leaves_out_what_is_there(run, camera):
+    assert reconstruct(run, "captures/a.png")[0] == 0
+    line = ("reconstruct", "captures", "--psf", "psf.png", "--out", "out", "--method", "wiener", "--resume")
+    before = (camera / "out" / "a.png").stat().st_mtime_ns
+    code, out, _ = run(*line)
+    assert code == 0
+    assert "3 of 3 captures reconstructed into out, 1 of them before" in out
+    assert "a.png explains" not in out
+    assert (camera / "out" / "a.png").stat().st_mtime_ns == before
+    assert "3 of 3 captures reconstructed into out\n" in run(*line, "--regularisation", "1e-3")[1]
+
+
+def test_without_trust(run, camera):
+    line = ("reconstruct", "captures/a.png", "--psf", "psf.png", "--out", "out", "--method", "wiener", "--no-trust")
+    code, out, err = run(*line)
+    assert (code, err) == (0, "")
+    assert "explains" not in out
+    assert names(camera / "out") == ["a.json", "a.png", "summary.png"]
+    assert set(json.loads((camera / "out" / "a.json").read_text())) == {"method", "psf_hash", "origin"}
+
+
 # --- The others ---------------------------------------------------------------------------------------
 
 

@@ -1,22 +1,19 @@
-"""Captures found, outputs planned, and a method bound to one camera."""
+"""A method bound to one camera, for single captures and for streams."""
 
 import inspect
 import re
 
-import cv2
 import numpy as np
 import pytest
 import torch
 
-from mwdn import Camera, read_frame
+from mwdn import Camera, solvers
 from mwdn.calibration import Calibration
-from mwdn.data.images import srgb_decode
-from mwdn.data.sheets import for_people
-from mwdn.errors import CheckpointError, ImageError, ParameterError, ShapeError, UnknownNameError
+from mwdn.errors import CheckpointError, ParameterError, ShapeError, UnknownNameError
 from mwdn.learning import save_network
 from mwdn.networks import NETWORKS, build
 from mwdn.optics.patterns import contour_psf
-from mwdn.reconstruct import Reconstructor, find_method, plan_outputs, reconstruct_file
+from mwdn.reconstruct import Reconstructor, find_method
 from mwdn.solvers import SOLVERS, Admm, Wiener
 
 SIZE = 32, 40
@@ -39,49 +36,6 @@ def touch(folder, *names):
     for name in names:
         (folder / name).write_bytes(b"")
     return [folder / name for name in names]
-
-
-# --- Files --------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("form", "suffix"), [("png", ".png"), ("png16", ".png"), ("tiff", ".tif"), ("npy", ".npy")])
-def test_outputs_have_the_captures_names(tmp_path, form, suffix):
-    captures = touch(tmp_path / "in", "a.tif", "b.c.npy")
-    out = tmp_path / "out"
-    assert plan_outputs(captures, out, form) == [out / f"a{suffix}", out / f"b.c{suffix}"]
-    assert not out.exists()
-
-
-def test_two_captures_of_one_name(tmp_path):
-    one, two = touch(tmp_path, "a.tif", "a.png")
-    message = f"`{two}` and `{one}` would both be written to `{tmp_path / 'out' / 'a.png'}`"
-    with pytest.raises(ParameterError, match=re.escape(message)):
-        plan_outputs([one, two], tmp_path / "out", "png")
-
-
-def test_capture_called_summary(tmp_path):
-    captures = touch(tmp_path, "summary.tif")
-    with pytest.raises(ParameterError, match=r"summary\.tif` and the summary picture would both be written"):
-        plan_outputs(captures, tmp_path / "out", "png")
-    assert plan_outputs(captures, tmp_path / "out", "tiff") == [tmp_path / "out" / "summary.tif"]
-
-
-@pytest.mark.parametrize("taken", ["a.png", "psf.png", "summary.png"])
-def test_no_input_is_overwritten(tmp_path, taken):
-    captures = touch(tmp_path, "a.png")
-    captures += touch(tmp_path / "other", "psf.tif") if taken == "psf.png" else []
-    psf = touch(tmp_path, taken)[0]
-    out = tmp_path / "other" / ".."  # another spelling of the same folder
-    (tmp_path / "other").mkdir(exist_ok=True)
-    captures = captures if taken == "a.png" else [tmp_path / "other" / "x.png", *captures[1:]]
-    with pytest.raises(ParameterError, match=rf"{taken}` would overwrite an input\. Choose another folder: `--out`"):
-        plan_outputs(captures, out, "png", protected=(psf, None))
-
-
-def test_out_is_a_file(tmp_path):
-    file, capture = touch(tmp_path, "out", "a.png")
-    with pytest.raises(ParameterError, match=r"`.*out` must be a folder, but is a file"):
-        plan_outputs([capture], file, "png")
 
 
 # --- Method -------------------------------------------------------------------------------------------
@@ -161,56 +115,95 @@ def test_network_of_other_colours(name, psf):
         Reconstructor(build(name, width=2), Calibration(psf[:, :1]))(torch.rand(1, 1, *SIZE))
 
 
-# --- What is written ----------------------------------------------------------------------------------
+# --- Poses and streams --------------------------------------------------------------------------------
 
 
 @pytest.fixture
-def capture(tmp_path, measurement):
-    frame = (measurement[0].movedim(0, -1).clamp(0, 1) * 65535).round().numpy().astype(np.uint16)
-    cv2.imwrite(str(tmp_path / "capture.png"), frame[..., ::-1])
-    return tmp_path / "capture.png"
+def bank():
+    return build("wiener-bank", width=2, finest=4).eval()
 
 
-@pytest.mark.parametrize(("form", "suffix"), [("tiff", ".tif"), ("npy", ".npy")])
-def test_linear_formats_hold_what_the_reconstructor_returns(tmp_path, form, suffix, capture, psf):
-    reconstruct = Reconstructor("admm", Calibration(psf))
-    output = tmp_path / "out" / f"capture{suffix}"
-    b, scene = reconstruct_file(reconstruct, capture, output, form)
-    assert torch.equal(b, reconstruct.calibration.correct(read_frame(capture)))
-    assert torch.equal(scene, reconstruct(b))
-    found = read_frame(output)
-    assert found.dtype == np.float32
-    assert np.array_equal(found, scene[0].movedim(0, -1).numpy())
+@pytest.fixture
+def frames(psf, generator):
+    """Raw 16-bit frames of a square that goes to the right."""
+    found = []
+    for number in range(5):
+        scene = torch.zeros(1, 3, *SIZE)
+        scene[..., 10:20, 12 + number : 22 + number] = torch.tensor([0.9, 0.5, 0.2])[:, None, None]
+        seen = Camera(psf).simulate(scene, generator=generator)[0].movedim(0, -1)
+        found.append((seen.clamp(0, 1) * 65535).round().numpy().astype(np.uint16))
+    return found
 
 
-@pytest.mark.parametrize(("form", "steps"), [("png", 255), ("png16", 65535)])
-def test_png_is_the_same_picture_in_srgb(tmp_path, form, steps, capture, psf):
-    output = tmp_path / "out.png"
-    _, scene = reconstruct_file(Reconstructor("wiener", Calibration(psf)), capture, output, form)
-    stored = read_frame(output)
-    assert np.iinfo(stored.dtype).max == steps
-    light = srgb_decode(torch.from_numpy(stored.astype(np.float32) / steps))
-    # Half a step of the code is at most 2.275 / 1.055 ... of it in light: the steepest part is at white.
-    torch.testing.assert_close(light, for_people(scene)[0].movedim(0, -1), rtol=0, atol=0.5 * 2.3 / steps + 1e-6)
+@pytest.fixture
+def aligned(monkeypatch):
+    """Measurements whose poses were asked for."""
+    asked, align = [], solvers.align
+    monkeypatch.setattr(solvers, "align", lambda b, h: asked.append(b) or align(b, h))
+    return asked
 
 
-def test_captures_are_read_as_the_calibration_says(tmp_path, psf, measurement):
-    """Blue first and the last row first in the file: the same picture as from a plain file."""
-    frame = measurement[0].movedim(0, -1).clamp(0, 1).numpy()
-    np.save(tmp_path / "plain.npy", frame)
-    np.save(tmp_path / "twisted.npy", frame[::-1, :, ::-1])
-    plain = Reconstructor("wiener", Calibration(psf))
-    twisted = Reconstructor("wiener", Calibration(psf, bgr=True, upside_down=True))
-    one, two = (
-        reconstruct_file(method, tmp_path / f"{name}.npy", tmp_path / f"{name}.tif", "tiff")
-        for method, name in ((plain, "plain"), (twisted, "twisted"))
-    )
-    assert torch.equal(one[0], two[0])
-    assert torch.equal(one[1], two[1])
+@pytest.mark.parametrize("precision", ["exact", "fast"])
+def test_pose_given_is_the_pose_found(precision, bank, psf, measurement):
+    reconstruct = Reconstructor(bank, Calibration(psf), device="cpu", precision=precision)
+    both = torch.cat([measurement, measurement.roll(3, -1)])
+    found = reconstruct.at(solvers.align(both, psf))(both)
+    torch.testing.assert_close(found, reconstruct(both), rtol=1e-4, atol=1e-5)
+    turned = reconstruct.at(solvers.Pose(torch.tensor([5.0]), torch.tensor([0.0])))
+    assert (turned(measurement) - found[:1]).norm() > 0.02 * found[:1].norm()
+    assert torch.equal(reconstruct(both), Reconstructor(bank, Calibration(psf), precision=precision)(both))
 
 
-def test_nothing_is_written_of_a_bad_capture(tmp_path, psf):
-    (tmp_path / "bad.png").write_bytes(b"\x89PNG\r\n\x1a\n")
-    with pytest.raises(ImageError, match=r"bad\.png"):
-        reconstruct_file(Reconstructor("wiener", Calibration(psf)), tmp_path / "bad.png", tmp_path / "o.png", "png")
-    assert not (tmp_path / "o.png").exists()
+def test_pose_does_not_matter_to_others(psf, measurement):
+    pose = solvers.Pose(torch.tensor([5.0]), torch.tensor([0.01]))
+    for method in ("wiener", build("wiener-bank", width=2, align=False)):
+        reconstruct = Reconstructor(method, Calibration(psf), device="cpu")
+        assert torch.equal(reconstruct.at(pose)(measurement), reconstruct(measurement))
+
+
+@pytest.mark.parametrize(("refresh", "asked"), [(0, [0]), (2, [0, 2, 4]), (100, [0])])
+def test_stream_keeps_the_pose(refresh, asked, bank, psf, frames, aligned):
+    calibration = Calibration(psf)
+    reconstruct = Reconstructor(bank, calibration, device="cpu", precision="exact")
+    seen = list(reconstruct.stream(frames, refresh=refresh))
+    poses = aligned.copy()
+    assert len(poses) == len(asked)
+    for number, (measurement, scene) in enumerate(seen):
+        assert torch.equal(measurement, calibration.correct(frames[number]))
+        last = max(n for n in asked if n <= number)
+        assert torch.equal(poses[asked.index(last)], seen[last][0])
+        torch.testing.assert_close(scene, reconstruct.at(solvers.align(seen[last][0], psf))(measurement))
+
+
+@pytest.mark.parametrize("solver", [Admm(iterations=30), solvers.Fista(iterations=30)], ids=["admm", "fista"])
+def test_stream_goes_on_where_it_was(solver, psf, frames, aligned):
+    warm = solvers.Warm(solver)
+    reconstruct = Reconstructor(solver, Calibration(psf), device="cpu")
+    for _ in range(2):  # each stream begins anew
+        for measurement, scene in reconstruct.stream(frames):
+            assert torch.equal(scene, warm(measurement, psf))
+        warm = solvers.Warm(solver)
+    assert torch.equal(reconstruct(measurement), solver(measurement, psf))
+    assert aligned == []
+
+
+def test_stream_of_any_other_method_is_frame_by_frame(psf, frames):
+    reconstruct = Reconstructor("wiener", Calibration(psf), device="cpu")
+    for frame, (measurement, scene) in zip(frames, reconstruct.stream(frames), strict=True):
+        assert torch.equal(scene, reconstruct(measurement))
+        assert torch.equal(measurement, reconstruct.calibration.correct(frame))
+
+
+def test_stream_takes_frames_as_they_are_asked_for(psf, frames):
+    left = iter(frames)
+    stream = Reconstructor("wiener", Calibration(psf)).stream(left)
+    assert len(list(left)) == 5
+    assert list(stream) == []
+
+
+def test_stream_refuses(psf):
+    reconstruct = Reconstructor("wiener", Calibration(psf))
+    with pytest.raises(ParameterError, match=r"`refresh` \(-1\) must be a number of frames, or 0"):
+        reconstruct.stream([], refresh=-1)
+    with pytest.raises(ShapeError, match=r"must have the same height and width"):
+        next(reconstruct.stream([np.zeros((4, 4, 3), np.uint8)]))

@@ -9,87 +9,26 @@ import cyclopts
 from cyclopts import App, Parameter
 from rich.markup import escape
 from rich.progress import Progress, track
-from torch import Tensor
 
 from mwdn import __version__
 from mwdn.cli_benchmark import benchmark
-from mwdn.cli_camera import CameraOptions, console, errors
+from mwdn.cli_camera import CameraOptions, complain, console, errors, warn
 from mwdn.cli_inspect import inspect
 from mwdn.cli_optics import design
+from mwdn.cli_reconstruct import reconstruct
 from mwdn.cli_train import simulate, train
-from mwdn.data.captures import find_captures
-from mwdn.data.images import write_picture
 from mwdn.data.importers import Layout, import_pairs
-from mwdn.data.sheets import contact_sheet, thumbnail
 from mwdn.errors import MwdnError
 from mwdn.evaluation import Variant
-from mwdn.reconstruct import (
-    SUMMARY,
-    Format,
-    Reconstructor,
-    plan_outputs,
-    reconstruct_file,
-    write_consistency,
-)
+from mwdn.reconstruct import Reconstructor
 
 app = App(
     name="mwdn",
     version=__version__,
     help="From the caustic pattern of a lensless camera to a picture. Add --debug to see where an error comes from.",
 )
-for command in (design, inspect, simulate, train, benchmark):
+for command in (reconstruct, design, inspect, simulate, train, benchmark):
     app.command(command)
-
-
-@app.command
-def reconstruct(
-    *captures: Path,
-    camera: CameraOptions,
-    method: str = "universal",
-    regularisation: float | None = None,
-    out: Path = Path("results/reconstruct"),
-    format: Format = "png",
-    device: str | None = None,
-) -> int:
-    """Reconstruct captures: files, or folders of them.
-
-    Args:
-        captures: raw frames of the camera.
-        camera: its calibration.
-        method: universal (a network for any camera), universal-small (a faster one), admm, pyramid, wiener, fista,
-            the path of a checkpoint, or hub:owner/name.
-        regularisation: tau of admm or lambda of wiener; less keeps more detail and more noise.
-        out: folder for the pictures, beside each a .json that says how far to trust it; summary.png shows the first
-            twelve beside their measurements.
-        format: png and png16 are sRGB for people, tiff and npy hold the linear float32 values.
-        device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
-    """
-    calibration = camera.load()
-    files = find_captures(captures, apart=(camera.psf, camera.dark))
-    outputs = plan_outputs(files, out, format, protected=(camera.psf, camera.dark))
-    reconstructor = Reconstructor(method, calibration, regularisation=regularisation, device=device)
-    _warn(reconstructor)
-    levels = ", ".join(f"{level:.4f}" for level in calibration.background)
-    console.print(f"PSF {calibration.psf_hash}, background {levels} of the full scale subtracted")
-    failed = 0
-    rows: list[list[Tensor]] = []
-    for file, output in track(list(zip(files, outputs, strict=True)), "Reconstructing", disable=len(files) == 1):
-        try:
-            pair = reconstruct_file(reconstructor, file, output, format)
-            trust = write_consistency(output, reconstructor, *pair)
-        except MwdnError as error:
-            failed += 1
-            _complain(f"[red]{escape(str(file))}:[/]", error)
-            continue
-        told = f"{file.name} {trust.sentence}"
-        (errors if trust.doubtful else console).print(told, highlight=False, markup=False, soft_wrap=True)
-        if len(rows) < 12:
-            rows.append([thumbnail(picture) for picture in pair])
-    if rows:
-        write_picture(out / SUMMARY, contact_sheet(rows, ["measurement", f"reconstruction ({Path(method).name})"]))
-    done = f"{len(files) - failed} of {len(files)} captures reconstructed into {out}"
-    console.print(done, highlight=False, markup=False, soft_wrap=True)
-    return 1 if failed else 0
 
 
 @app.command(name="import")
@@ -149,7 +88,7 @@ def evaluate(
 
     part, calibration = evaluation.Protocol.parse(protocol), camera.load()
     reconstructors = {method: Reconstructor(method, calibration, device=device) for method in methods}
-    _warn(*reconstructors.values())
+    warn(*reconstructors.values())
     file = PairFile(data)
     pairs = evaluation.First(file, len(file) if first is None else first)
     with Progress(console=errors, transient=True) as bars:
@@ -187,17 +126,6 @@ def doctor() -> None:
     report(console)
 
 
-def _warn(*reconstructors: Reconstructor) -> None:
-    """Print why not to trust what they will give."""
-    for warning in filter(None, (reconstructor.warning for reconstructor in reconstructors)):
-        errors.print(f"[yellow]Warning:[/] {escape(warning)}", highlight=False, soft_wrap=True)
-
-
-def _complain(start: str, error: MwdnError) -> None:
-    """Print a message whole: its brackets are no markup, and its paths are not broken at the terminal's width."""
-    errors.print(f"{start} {escape(str(error))}", highlight=False, soft_wrap=True)
-
-
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the command line and exit: 0 if all went well, 1 if some captures failed, 2 on a wrong call."""
     arguments = sys.argv[1:] if arguments is None else arguments
@@ -209,6 +137,6 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     except MwdnError as error:
         if debug:
             errors.print_exception()
-        _complain("[bold red]Error:[/]", error)
+        complain("[bold red]Error:[/]", error)
         sys.exit(2)
     sys.exit(result if isinstance(result, int) else 0)

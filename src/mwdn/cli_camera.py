@@ -5,8 +5,11 @@ from pathlib import Path
 
 from cyclopts import Parameter
 from rich.console import Console
+from rich.markup import escape
 
 from mwdn.calibration import Calibration
+from mwdn.errors import MwdnError
+from mwdn.reconstruct import Reconstructor
 
 console = Console()
 errors = Console(stderr=True)
@@ -50,3 +53,14 @@ class CameraOptions:
             upside_down=self.upside_down,
             bgr=self.bgr,
         )
+
+
+def warn(*reconstructors: Reconstructor) -> None:
+    """Print why not to trust what they will give."""
+    for warning in filter(None, (reconstructor.warning for reconstructor in reconstructors)):
+        errors.print(f"[yellow]Warning:[/] {escape(warning)}", highlight=False, soft_wrap=True)
+
+
+def complain(start: str, error: MwdnError) -> None:
+    """Print a message whole: its brackets are no markup, and its paths are not broken at the terminal's width."""
+    errors.print(f"{start} {escape(str(error))}", highlight=False, soft_wrap=True)

@@ -10,6 +10,7 @@ from torch.nn import functional as F
 
 from mwdn.errors import ParameterError
 from mwdn.learning.precision import has_bfloat16
+from mwdn.solvers.alignment import Pose
 from mwdn.types import Measurement, Psf, Scene
 
 Precision = Literal["fast", "exact"]
@@ -27,7 +28,7 @@ class Engine:
 
     BatchNorm is folded into the convolutions, these take pixels with their channels side by side, and the transfer
     functions of the network's Wiener filters (with the whole PSF branch of MWDN-CPSF) are kept. On a GPU the
-    calculation of each shape of a batch is recorded when it is first met, and then replayed.
+    calculation of each shape of a batch is recorded when it is met again, and then replayed.
 
     Args:
         network: as trained; a copy is taken.
@@ -41,12 +42,12 @@ class Engine:
     def __init__(self, network: nn.Module, psf: Psf, *, precision: Precision = "fast") -> None:
         if precision not in get_args(Precision):
             raise ParameterError(f"`precision` must be fast or exact, not {precision!r}.")
-        self.psf = psf
+        self.psf, self.precision = psf, precision
         # Copied before it is moved: the PSF branch stays exact, and the caller's network where it is.
         self.network = copy.deepcopy(network).to(psf.device).eval().requires_grad_(False)
         self.folded = fold(copy.deepcopy(self.network), half_precision(psf.device) if precision == "fast" else None)
         self.bound: dict[int, list[Tensor]] = {}
-        self.recordings: dict[torch.Size, _Recording] = {}
+        self.recordings: dict[torch.Size, _Recording | None] = {}
 
     @torch.inference_mode()
     def __call__(self, measurement: Measurement) -> Scene:
@@ -56,8 +57,27 @@ class Engine:
         if measurement.shape not in self.recordings:
             if len(self.recordings) >= 4:  # each holds the memory of a whole reconstruction
                 self.recordings.clear()
-            self.recordings[measurement.shape] = _Recording(self._reconstruct, measurement)
-        return self.recordings[measurement.shape](measurement)
+            self.recordings[measurement.shape] = None
+            return self._reconstruct(measurement)
+        recording = self.recordings[measurement.shape]
+        if recording is None:
+            recording = self.recordings[measurement.shape] = _Recording(self._reconstruct, measurement)
+        return recording(measurement)
+
+    @property
+    def aligns(self) -> bool:
+        """Whether the network finds the pose of the PSF anew for each measurement."""
+        return bool(getattr(self.network, "align", False))
+
+    def at(self, pose: Pose) -> "Engine":
+        """The same with the PSF in a pose that is known, where the network aligns; else this engine itself."""
+        if not self.aligns:
+            return self
+        fixed = copy.copy(self)
+        fixed.psf, fixed.bound, fixed.recordings = pose.move(self.psf), {}, {}
+        fixed.network, fixed.folded = copy.copy(self.network), copy.copy(self.folded)  # of the same weights
+        fixed.network.align = fixed.folded.align = False  # type: ignore[assignment]
+        return fixed
 
     def _reconstruct(self, measurement: Tensor) -> Tensor:
         if not hasattr(self.folded, "bind"):
@@ -200,7 +220,8 @@ class _Recording:
         torch.cuda.current_stream().wait_stream(stream)
         graph = torch.cuda.CUDAGraph()
         try:
-            with torch.cuda.graph(graph):
+            # Other threads may read or judge other captures meanwhile.
+            with torch.cuda.graph(graph, capture_error_mode="thread_local"):
                 self.result = calculate(self.measurement)
         except RuntimeError:  # something that cannot be recorded: calculate each time
             return

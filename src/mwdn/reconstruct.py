@@ -1,26 +1,20 @@
 """A method bound to one calibrated camera: measurement in, picture out."""
 
-from collections.abc import Callable, Iterable
-from dataclasses import asdict
+import copy
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Literal
 
 import torch
 from torch import nn
 
 from mwdn import solvers
 from mwdn.calibration import Calibration
-from mwdn.calibration.report import write_json
-from mwdn.data.captures import read_capture
-from mwdn.data.images import write_linear, write_picture
-from mwdn.data.sheets import for_people
 from mwdn.engine import Engine, Precision
 from mwdn.errors import ParameterError, ShapeError, UnknownNameError
-from mwdn.evaluation.consistency import Consistency, consistency
 from mwdn.learning.bundled import BUNDLED, find_weights
 from mwdn.learning.checkpoint import SUFFIXES, load_network, read_metadata
 from mwdn.learning.devices import usable
-from mwdn.types import Measurement, Psf, Scene
+from mwdn.types import Frame, Measurement, Psf, Scene
 
 Method = Callable[[Measurement, Psf], Scene]
 """Anything that is called as ``method(measurement, psf)``: a solver or a network."""
@@ -99,6 +93,49 @@ class Reconstructor:
         self.psf = calibration.psf.to(self.device)
         self.engine = Engine(self.method, self.psf, precision=precision) if isinstance(self.method, nn.Module) else None
 
+    def at(self, pose: solvers.Pose) -> "Reconstructor":
+        """The same in a pose of the PSF that is known, for a network that else finds it for each measurement.
+
+        Any other method takes the PSF as it was calibrated, and is not changed. ``pose`` is that of one capture, for
+        those after it, or has an entry for each sample of a batch: `mwdn.solvers.align`.
+        """
+        fixed = copy.copy(self)
+        fixed.engine = self.engine and self.engine.at(pose)
+        return fixed
+
+    def stream(self, frames: Iterable[Frame], *, refresh: int = 100) -> Iterator[tuple[Measurement, Scene]]:
+        """Reconstruct one frame of the camera after another, faster than alone: the last one tells much of the next.
+
+        A network that aligns the PSF keeps the pose that it found on the first frame. ADMM and FISTA go on where they
+        were (`mwdn.solvers.Warm`). All else is as for single captures.
+
+        Every frame is reconstructed; of a live camera take the newest: ``stream(mwdn.streams.latest(camera))``.
+
+        Args:
+            frames: raw frames.
+            refresh: find the pose anew every so many frames; 0 for never.
+
+        Yields:
+            The measurement and the scene, as `__call__` gives it.
+
+        Raises:
+            ParameterError: ``refresh`` is negative.
+            MwdnError: a frame does not fit the camera.
+        """
+        if refresh < 0:
+            raise ParameterError(f"`refresh` ({refresh}) must be a number of frames, or 0.")
+        return self._stream(frames, refresh)
+
+    def _stream(self, frames: Iterable[Frame], refresh: int) -> Iterator[tuple[Measurement, Scene]]:
+        here = copy.copy(self)
+        if isinstance(self.method, solvers.Admm | solvers.Fista):
+            here.method = solvers.Warm(self.method)
+        for number, frame in enumerate(frames):
+            measurement = self.calibration.correct(frame)
+            if self.engine and self.engine.aligns and (number % refresh == 0 if refresh else number == 0):
+                here = self.at(solvers.align(measurement.to(self.device), self.psf))
+            yield measurement, here(measurement)
+
     @torch.inference_mode()
     def __call__(self, measurement: Measurement) -> Scene:
         """Reconstruct a batch.
@@ -130,59 +167,3 @@ class Reconstructor:
                 f"`measurement` {tuple(measurement.shape)} needs more memory than {self.device} has free. Bin or crop "
                 "it: `--bin 2`, `--crop 1000 1000`; or try `--device cpu`, `--method wiener`."
             ) from error
-
-
-Format = Literal["png", "png16", "tiff", "npy"]
-"""``png`` and ``png16`` are sRGB for people; ``tiff`` and ``npy`` hold the linear float32 values."""
-
-_SUFFIX = {"png": ".png", "png16": ".png", "tiff": ".tif", "npy": ".npy"}
-SUMMARY = "summary.png"
-
-
-def plan_outputs(captures: list[Path], out: Path, form: Format, *, protected: Iterable[Path | None] = ()) -> list[Path]:
-    """Where each capture's reconstruction goes: its name, in ``out``.
-
-    Raises:
-        ParameterError: two captures would go to one file, one would overwrite an input, or ``out`` is a file.
-    """
-    if out.exists() and not out.is_dir():
-        raise ParameterError(f"`{out}` must be a folder, but is a file. Choose another one: `--out`.")
-    outputs = [out / (capture.stem + _SUFFIX[form]) for capture in captures]
-    inputs = {path.resolve() for path in (*captures, *protected) if path is not None}
-    for output in (*outputs, *(each.with_suffix(".json") for each in outputs), out / SUMMARY):
-        if output.resolve() in inputs:
-            raise ParameterError(f"`{output}` would overwrite an input. Choose another folder: `--out`.")
-    seen = {out / SUMMARY: "the summary picture"}
-    for capture, output in zip(captures, outputs, strict=True):
-        if output in seen:
-            raise ParameterError(
-                f"`{capture}` and {seen[output]} would both be written to `{output}`. Reconstruct them into "
-                "two folders: `--out`."
-            )
-        seen[output] = f"`{capture}`"
-    return outputs
-
-
-def reconstruct_file(
-    reconstruct: Reconstructor, capture: Path, output: Path, form: Format
-) -> tuple[Measurement, Scene]:
-    """Read a capture, reconstruct it, write the picture; returns both for a summary.
-
-    Raises:
-        MwdnError: the capture cannot be read or does not fit the camera, or the picture cannot be written.
-    """
-    measurement = read_capture(capture, reconstruct.calibration)
-    scene = reconstruct(measurement)
-    if form in ("tiff", "npy"):
-        write_linear(output, scene)
-    else:
-        write_picture(output, for_people(scene), bits=16 if form == "png16" else 8)
-    return measurement, scene
-
-
-def write_consistency(output: Path, reconstruct: Reconstructor, measurement: Measurement, scene: Scene) -> Consistency:
-    """Write beside a picture, as ``.json``, how far to trust it."""
-    found = consistency(measurement, reconstruct.calibration.psf, scene)
-    content = {"psf_hash": reconstruct.calibration.psf_hash, **asdict(found), "doubtful": found.doubtful}
-    write_json(output.with_suffix(".json"), content)
-    return found

@@ -7,7 +7,7 @@ import torch
 from mwdn.calibration.frames import noise_level
 from mwdn.errors import ShapeError
 from mwdn.fourier import convolve
-from mwdn.solvers.alignment import align, fine_detail, misfit
+from mwdn.solvers.alignment import Pose, align, fine_detail, misfit
 from mwdn.types import Measurement, Psf, Scene
 
 LEAST = 0.5
@@ -55,7 +55,7 @@ class Consistency:
 
 
 @torch.inference_mode()
-def consistency(measurement: Measurement, psf: Psf, scene: Scene) -> Consistency:
+def consistency(measurement: Measurement, psf: Psf, scene: Scene, *, pose: Pose | None = None) -> Consistency:
     """Compare a measurement with what the camera would see of its reconstruction.
 
     The PSF is first turned and scaled as fits best (`mwdn.solvers.alignment`); of each colour a gain and an even
@@ -67,6 +67,7 @@ def consistency(measurement: Measurement, psf: Psf, scene: Scene) -> Consistency
         measurement: (1, C, H, W).
         psf: (1, 1 or C, h, w), centred.
         scene: (1, C, H, W), the reconstruction.
+        pose: in which the PSF fits best; found unless given.
 
     Raises:
         ShapeError: more than one measurement, or a scene of another shape.
@@ -75,7 +76,7 @@ def consistency(measurement: Measurement, psf: Psf, scene: Scene) -> Consistency
         raise ShapeError(
             f"`measurement` {tuple(measurement.shape)} and `scene` {tuple(scene.shape)} must be one and of one shape."
         )
-    pose = align(measurement, psf)
+    pose = pose or align(measurement, psf)
     fitting = pose.move(psf)
     seen, recorded = fine_detail(convolve(scene.float(), fitting)), fine_detail(measurement.float())
     power = recorded.square().sum((-2, -1)).clamp(min=torch.finfo(torch.float32).tiny)

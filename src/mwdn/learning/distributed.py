@@ -8,6 +8,7 @@ import ctypes
 import itertools
 import json
 import os
+import secrets
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -52,8 +53,12 @@ def processes() -> Iterator[None]:
         return
     _end_with_parent()
     # Tensors meet where they are: small messages through the CPU, gradients from GPU to GPU.
+    backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
     with _together():
-        dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
+        store, rank, world = next(dist.rendezvous("env://"))  # type: ignore[attr-defined]
+        # After a restart torchrun's store still holds where the processes before could be reached.
+        store = dist.PrefixStore(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"), store)  # type: ignore[attr-defined]
+        dist.init_process_group(backend, store=store, rank=rank, world_size=world)
     yield
     # Not after an error: NCCL would wait for processes that may have ended.
     total(torch.zeros(1))  # nobody hangs up while another still writes the last checkpoint
@@ -61,14 +66,20 @@ def processes() -> Iterator[None]:
     atexit.register(_leave)
 
 
-def _leave() -> None:
+def _leave(status: int = 0) -> None:
     """End at once: on a busy machine torch's own threads may outlive what they use, which then aborts the process.
 
     All is written, and the other processes have parted.
     """
     sys.stdout.flush()
     sys.stderr.flush()
-    os._exit(0)
+    os._exit(status)
+
+
+def end_with(status: int) -> None:
+    """Exit status of this process, where several have parted."""
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        atexit.register(_leave, status)  # before the one above: the last one registered comes first
 
 
 def _end_with_parent() -> None:
@@ -164,6 +175,20 @@ def share(numbers: range) -> range:
             f"Make it larger, `--batch {world()}`, or start fewer processes."
         )
     return numbers[rank() * count // world() : (rank() + 1) * count // world()]
+
+
+def handed_out(count: int) -> Iterator[int]:
+    """The numbers below ``count``, each to one process alone: to whichever asks first."""
+    if world() == 1:
+        yield from range(count)
+        return
+    # The server of torchrun outlives its processes: each start counts under a name of its own.
+    name = from_first(lambda: secrets.token_hex(8).encode()).decode()
+    with _together():
+        address = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
+        store = dist.TCPStore(*address, is_master=False)  # type: ignore[attr-defined]
+        while (number := store.add(name, 1) - 1) < count:
+            yield number
 
 
 def add_gradients(network: nn.Module) -> None:

@@ -8,6 +8,7 @@ from mwdn.solvers.admm import TEXTBOOK, Admm, Penalties, Progress
 from mwdn.solvers.alignment import Pose, align
 from mwdn.solvers.fista import Fista
 from mwdn.solvers.pyramid import Pyramid
+from mwdn.solvers.warm import Warm
 from mwdn.solvers.wiener import Wiener
 
 Solver = Admm | Fista | Pyramid | Wiener
@@ -41,6 +42,7 @@ __all__ = [
     "Progress",
     "Pyramid",
     "Solver",
+    "Warm",
     "Wiener",
     "align",
     "build",

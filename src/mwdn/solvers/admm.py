@@ -218,6 +218,14 @@ class Progress:
     penalties: Penalties
 
 
+class Reached(NamedTuple):
+    """Where the iterations for one measurement ended, and those for the next one may begin."""
+
+    problem: Problem
+    state: State
+    penalties: Penalties
+
+
 @dataclass(frozen=True)
 class Admm:
     """Minimise ``1/2 |crop(h * v) - b|^2 + tau |Psi v|_1`` over scenes ``v >= 0``.
@@ -266,10 +274,29 @@ class Admm:
         self, measurement: Measurement, psf: Psf, *, callback: Callable[[Progress], None] | None = None
     ) -> Scene:
         """Reconstruct a batch; ``callback`` is told of each iteration."""
+        return self.follow(measurement, psf, callback=callback)[0]
+
+    @torch.no_grad()
+    def follow(
+        self,
+        measurement: Measurement,
+        psf: Psf,
+        last: Reached | None = None,
+        *,
+        callback: Callable[[Progress], None] | None = None,
+    ) -> tuple[Scene, Reached]:
+        """Reconstruct a batch from where the iterations for the ``last`` one ended: of this shape, by this PSF.
+
+        Scene and multipliers go on, so a scene that stands still is that of all iterations so far.
+        """
         b_norm, h_norm = _norm(measurement)[:, None, None, None], _norm(psf)[:, None, None, None]
         b_norm = b_norm.clamp(min=torch.finfo(torch.float32).tiny)
-        problem = pose(measurement / b_norm, psf / h_norm)
-        state, mu, tau = start(problem), self.penalties, self.regularisation
+        b, tau = measurement / b_norm, self.regularisation
+        if last is None:
+            problem = pose(b, psf / h_norm)
+            state, mu = start(problem), self.penalties
+        else:
+            problem, state, mu = last.problem._replace(measurement=b.float()), last.state, last.penalties
         for iteration in range(1, self.iterations + 1):
             copies = split(state, problem, mu, tau, self.variation)
             state, old = merge(state, copies, problem, mu), state
@@ -288,4 +315,5 @@ class Admm:
                 balanced = balance(mu, found)
                 state, mu = rescale(state, mu, balanced), balanced
         height, width = problem.sensor
-        return state.v[..., :height, :width].clamp(min=0) * (b_norm / h_norm)
+        scene = state.v[..., :height, :width].clamp(min=0) * (b_norm / h_norm)
+        return scene, Reached(problem, state, mu)

@@ -2,14 +2,28 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from mwdn.errors import ParameterError
 from mwdn.fourier import inverse_spectrum, spectrum
-from mwdn.solvers.admm import pose
+from mwdn.solvers.admm import Problem, pose
 from mwdn.types import Measurement, Psf, Scene
+
+INERTIA = 50.0
+"""Momentum with which the next frame of a stream begins, at most: that of about 100 iterations. With it a slowly moving
+scene is followed best; one that grows without end would draw the old scene along for ever longer."""
+
+
+class Reached(NamedTuple):
+    """Where the iterations for one measurement ended, and those for the next one may begin."""
+
+    problem: Problem
+    v: Tensor
+    ahead: Tensor
+    momentum: float
 
 
 @dataclass(frozen=True)
@@ -38,12 +52,29 @@ class Fista:
         self, measurement: Measurement, psf: Psf, *, callback: Callable[[int, Tensor], None] | None = None
     ) -> Scene:
         """Reconstruct a batch; ``callback`` is told each iteration's number and objectives (B,)."""
-        problem = pose(measurement, psf)
+        return self.follow(measurement, psf, callback=callback)[0]
+
+    @torch.no_grad()
+    def follow(
+        self,
+        measurement: Measurement,
+        psf: Psf,
+        last: Reached | None = None,
+        *,
+        callback: Callable[[int, Tensor], None] | None = None,
+    ) -> tuple[Scene, Reached]:
+        """Reconstruct a batch from where the iterations for the ``last`` one ended: of this shape, by this PSF.
+
+        Scene and momentum go on, so a scene that stands still is that of all iterations so far, noise and all, until
+        the momentum reaches `INERTIA`.
+        """
+        problem = pose(measurement, psf) if last is None else last.problem._replace(measurement=measurement.float())
         b, H = problem.measurement, problem.transfer
         # The gradient's Lipschitz constant is at most max |H|^2, a step of 1/L can never overshoot.
         step = 1 / H.abs().square().amax((-2, -1), keepdim=True)
-        v = b.new_zeros((*b.shape[:2], *problem.grid))
-        ahead, momentum = v, 1.0
+        zero = b.new_zeros((*b.shape[:2], *problem.grid))
+        _, v, ahead, momentum = last or Reached(problem, zero, zero, 1.0)
+        momentum = momentum if last is None else min(momentum, INERTIA)
         for iteration in range(1, self.iterations + 1):
             residual = inverse_spectrum(H * spectrum(ahead, problem.grid), problem.grid, problem.sensor) - b
             slope = inverse_spectrum(H.conj() * spectrum(residual, problem.grid), problem.grid, problem.grid)
@@ -55,4 +86,4 @@ class Fista:
                 Hv = inverse_spectrum(H * spectrum(v, problem.grid), problem.grid, problem.sensor)
                 callback(iteration, 0.5 * (Hv - b).square().sum((1, 2, 3)))
         height, width = problem.sensor
-        return v[..., :height, :width]
+        return v[..., :height, :width], Reached(problem, v, ahead, momentum)

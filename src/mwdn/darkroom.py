@@ -1,0 +1,278 @@
+"""Captures to pictures in files: read, reconstructed, judged and written at the same time, by one process or many."""
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from mwdn import __version__
+from mwdn.calibration.report import write_json
+from mwdn.data.captures import read_capture
+from mwdn.data.images import read_frame, read_picture, write_linear, write_picture
+from mwdn.data.sheets import contact_sheet, for_people, thumbnail
+from mwdn.errors import ImageError, MwdnError, ParameterError
+from mwdn.evaluation.consistency import Consistency, consistency
+from mwdn.learning import distributed
+from mwdn.reconstruct import Reconstructor
+from mwdn.solvers import Pose, align
+from mwdn.streams import ahead
+from mwdn.types import Measurement, Scene
+
+Format = Literal["png", "png16", "tiff", "npy"]
+"""``png`` and ``png16`` are sRGB for people; ``tiff`` and ``npy`` hold the linear float32 values."""
+
+_SUFFIX = {"png": ".png", "png16": ".png", "tiff": ".tif", "npy": ".npy"}
+SUMMARY = "summary.png"
+SHOWN = 12
+"""Captures on the summary: the first ones."""
+
+
+def output_name(capture: str | Path, form: Format) -> str:
+    """Name of a capture's reconstruction: its own, with another suffix."""
+    return Path(capture).stem + _SUFFIX[form]
+
+
+def check_outputs(
+    captures: Sequence[str | Path], out: Path, form: Format, *, protected: Iterable[Path | None] = ()
+) -> None:
+    """Check that every capture has a place of its own in ``out``.
+
+    Raises:
+        ParameterError: two captures would go to one file, one would overwrite an input, or ``out`` is a file.
+    """
+    if out.exists() and not out.is_dir():
+        raise ParameterError(f"`{out}` must be a folder, but is a file. Choose another one: `--out`.")
+    real = _resolver()
+    inputs = {real(str(path)) for path in (*captures, *protected) if path is not None}
+
+    def check(output: str) -> None:
+        if real(output) in inputs:
+            raise ParameterError(f"`{output}` would overwrite an input. Choose another folder: `--out`.")
+
+    check(str(out / SUMMARY))
+    seen = {SUMMARY: "the summary picture"}
+    start = str(out / "x").removesuffix("x")
+    for capture in captures:
+        name = output_name(capture, form)
+        check(start + name)
+        check(start + name.removesuffix(_SUFFIX[form]) + ".json")
+        if name in seen:
+            raise ParameterError(
+                f"`{capture}` and {seen[name]} would both be written to `{start}{name}`. Reconstruct them into "
+                "two folders: `--out`."
+            )
+        seen[name] = f"`{capture}`"
+
+
+def _resolver() -> Callable[[str], str]:
+    """The same as `Path.resolve`, but each folder is looked at once: a million files take seconds, not minutes."""
+    folders: dict[str, tuple[str, dict[str, str]]] = {}
+
+    def look(folder: Path) -> tuple[str, dict[str, str]]:
+        links: dict[str, str] = {}
+        if folder.is_dir():
+            with os.scandir(folder) as entries:
+                links = {each.name: str(Path(each.path).resolve()) for each in entries if each.is_symlink()}
+        return str(folder.resolve() / "x").removesuffix("x"), links
+
+    def real(path: str) -> str:
+        folder, name = os.path.split(path)
+        if folder not in folders:
+            folders[folder] = look(Path(folder))
+        start, links = folders[folder]
+        return links.get(name) or start + name
+
+    return real
+
+
+@dataclass(frozen=True)
+class Job:
+    """One capture on its way to a picture.
+
+    Args:
+        capture: its file.
+        output: the picture's file.
+        number: of the capture, from 0.
+        origin: of what the picture is made, see `Darkroom.origin`.
+        measurement: (1, C, H, W); it and the next two are there only between the steps that need them.
+        pose: of the PSF, if the picture is judged.
+        scene: (1, C, H, W).
+        kept: the picture was there before.
+        trust: how far to trust the picture, if it is judged.
+        error: why there is no picture.
+    """
+
+    capture: Path
+    output: Path
+    number: int = 0
+    origin: str = ""
+    measurement: Measurement | None = None
+    pose: Pose | None = None
+    scene: Scene | None = None
+    kept: bool = False
+    trust: Consistency | None = None
+    error: MwdnError | None = None
+
+
+def _step(work: Callable[["Darkroom", Job], Job]) -> Callable[["Darkroom", Job], Job]:
+    """One that ends a job with the error that concerns this capture alone."""
+
+    def step(darkroom: "Darkroom", job: Job) -> Job:
+        try:
+            return work(darkroom, job)
+        except MwdnError as error:
+            return replace(job, measurement=None, pose=None, scene=None, error=error)
+
+    return step
+
+
+@dataclass(frozen=True)
+class Darkroom:
+    """Where the captures of one camera become pictures, by one method, in one folder.
+
+    Beside each picture is a ``.json`` that says how far to trust it and of what it was made. It is written after the
+    picture: where it is, the picture is whole.
+
+    Args:
+        reconstruct: the method and the camera.
+        method: its name, for people.
+        out: folder of the pictures.
+        form: of their files.
+        judge: find how far to trust each picture, which may take longer than to make it.
+        resume: leave out each capture whose picture is there, of the same `origin`.
+    """
+
+    reconstruct: Reconstructor
+    method: str
+    out: Path
+    form: Format = "png"
+    judge: bool = True
+    resume: bool = False
+
+    def develop(self, captures: Sequence[str | Path]) -> Generator[Job, None, None]:
+        """Turn captures into pictures, in their order; of several processes each turns those that no other does."""
+        numbers = distributed.handed_out(len(captures))
+        jobs = (Job(Path(captures[n]), self.out / output_name(captures[n], self.form), n) for n in numbers)
+        # To find the pose and to judge takes longer than most methods: on a CPU the three steps share its cores.
+        with ahead(self._read, jobs) as read, ahead(self._finish, map(self._reconstruct, read)) as finished:
+            yield from finished
+
+    @_step
+    def _read(self, job: Job) -> Job:
+        job = replace(job, origin=self.origin(job.capture))
+        if self.resume and self._is_there(job):
+            return replace(job, kept=True)
+        measurement = read_capture(job.capture, self.reconstruct.calibration)
+        pose = align(measurement.to(self.reconstruct.device), self.reconstruct.psf) if self.judge else None
+        return replace(job, measurement=measurement, pose=pose)
+
+    @_step
+    def _reconstruct(self, job: Job) -> Job:
+        if job.measurement is None:
+            return job
+        reconstruct = self.reconstruct.at(job.pose) if job.pose else self.reconstruct
+        return replace(job, scene=reconstruct(job.measurement))
+
+    @_step
+    def _finish(self, job: Job) -> Job:
+        if job.measurement is None or job.scene is None:
+            return job
+        beside, trust = job.output.with_suffix(".json"), None
+        content: dict[str, object] = {
+            "method": self.method,
+            "psf_hash": self.reconstruct.calibration.psf_hash,
+            "origin": job.origin,
+        }
+        if self.judge:
+            pair = job.measurement.to(self.reconstruct.device), self.reconstruct.psf
+            trust = consistency(*pair, job.scene.to(self.reconstruct.device), pose=job.pose)
+            content |= {**asdict(trust), "doubtful": trust.doubtful}
+        _remove(beside)  # or it would vouch for another picture than it was written for
+        if self.form in ("tiff", "npy"):
+            write_linear(job.output, job.scene)
+        else:
+            write_picture(job.output, for_people(job.scene), bits=16 if self.form == "png16" else 8)
+        write_json(beside, content)
+        return replace(job, measurement=None, pose=None, scene=None, trust=trust)
+
+    def origin(self, capture: Path) -> str:
+        """16 hexadecimal digits that are others if anything is another that a picture depends on.
+
+        This is the method with its weights, the calibration, the format, the version of this package, and the size of
+        the capture's file and when it was last changed.
+        """
+        try:
+            found = capture.stat()
+        except OSError:  # to read it will say why
+            return ""
+        return _digest(self._setting, found.st_size, found.st_mtime_ns)
+
+    @cached_property
+    def _setting(self) -> str:
+        method, calibration, engine = self.reconstruct.method, self.reconstruct.calibration, self.reconstruct.engine
+        camera = {field.name: getattr(calibration, field.name) for field in fields(calibration)}
+        how: tuple[object, ...] = (method,)
+        if isinstance(method, nn.Module):
+            options = {name: value for name, value in vars(method).items() if name[0] != "_"}
+            how = (type(method).__name__, options, method.state_dict(), engine and engine.precision)
+        return _digest(__version__, self.form, camera, *how)
+
+    def _is_there(self, job: Job) -> bool:
+        try:
+            content = json.loads(job.output.with_suffix(".json").read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return False
+        return isinstance(content, dict) and content.get("origin") == job.origin != "" and job.output.is_file()
+
+    def summarise(self, captures: Iterable[str | Path]) -> None:
+        """Show the first captures beside their pictures, as they are on the disk; nothing if there is none.
+
+        Raises:
+            ImageError: the summary cannot be written.
+        """
+        rows: list[list[Tensor]] = []
+        for capture in captures:
+            output = self.out / output_name(capture, self.form)
+            if len(rows) == SHOWN:
+                break
+            if output.is_file():
+                with suppress(MwdnError):
+                    pair = read_capture(Path(capture), self.reconstruct.calibration), _read_back(output)
+                    rows.append([thumbnail(picture) for picture in pair])
+        if rows:
+            titles = ["measurement", f"reconstruction ({Path(self.method).name})"]
+            write_picture(self.out / SUMMARY, contact_sheet(rows, titles))
+
+
+def _remove(path: Path) -> None:
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise ImageError(f"`{path}` cannot be replaced: {error.strerror}. Choose another folder.") from error
+
+
+def _read_back(path: Path) -> Tensor:
+    if path.suffix == ".png":
+        return read_picture(path)
+    return torch.from_numpy(read_frame(path)).movedim(-1, 0)[None]
+
+
+def _digest(*parts: object) -> str:
+    """First 16 hexadecimal digits of the SHA-256 of tensors' bytes and other things' `repr`, in mappings, too."""
+    digest = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, Mapping):
+            digest.update(_digest(*(each for item in part.items() for each in item)).encode())
+        elif isinstance(part, Tensor):
+            digest.update(repr((part.shape, part.dtype)).encode() + part.cpu().contiguous().numpy().tobytes())
+        else:
+            digest.update(repr(part).encode() + b"\0")
+    return digest.hexdigest()[:16]

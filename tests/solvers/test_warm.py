@@ -1,0 +1,105 @@
+"""Solvers of streams: begun where the last frame ended."""
+
+import pytest
+import torch
+from torch.nn import functional as F
+
+from mwdn import Camera
+from mwdn.errors import ParameterError
+from mwdn.optics.patterns import contour_psf
+from mwdn.solvers import Admm, Fista, Warm
+
+SIZE = 40, 48
+FRAMES = 8
+
+
+@pytest.fixture
+def psf(generator):
+    return contour_psf(SIZE, cell=10, generator=generator).expand(1, 3, -1, -1).contiguous()
+
+
+@pytest.fixture
+def film(psf, generator):
+    """Noisy measurements of a blotchy thing that moves to the left by 0.2 pixels a frame."""
+    thing = F.interpolate(torch.rand(1, 3, 6, 8, generator=generator), (24, 32), mode="bicubic").clamp(0, 1)
+    frames = []
+    for number in range(FRAMES):
+        part = 0.2 * number - int(0.2 * number)
+        moved = (1 - part) * F.pad(thing, (1, 0)) + part * F.pad(thing, (0, 1))
+        scene = F.pad(moved, (8 - int(0.2 * number), 7 + int(0.2 * number), 8, 8))
+        frames.append(Camera(psf).simulate(scene, generator=generator))
+    return frames
+
+
+def solvers(iterations):
+    return [Admm(iterations=iterations), Fista(iterations=iterations)]
+
+
+def pairs_of(solvers_):
+    return pytest.mark.parametrize("solver", solvers_, ids=["admm", "fista"])
+
+
+@pairs_of(solvers(100))
+@pytest.mark.parametrize("k", [5, 10])
+def test_few_warm_iterations_come_closer_to_the_end_than_as_many_cold_ones(solver, k, psf, film):
+    warm, cold = Warm(solver, iterations=k), type(solver)(iterations=k)
+    first, *_, found = (warm(frame, psf) for frame in film)
+    assert torch.equal(first, solver(film[0], psf))
+    end = type(solver)(iterations=500)(film[-1], psf)
+    assert (found - end).norm() < 0.7 * (cold(film[-1], psf) - end).norm()
+
+
+@pairs_of(solvers(20))
+def test_scene_that_stands_still_is_that_of_one_long_run(solver, psf, film):
+    warm = Warm(solver, iterations=10)
+    for _ in range(5):
+        found = warm(film[0], psf)
+    assert torch.equal(found, type(solver)(iterations=60)(film[0], psf))
+
+
+def test_balanced_penalties_go_on(psf, film):
+    warm = Warm(Admm(iterations=20, balance_every=5), iterations=10)
+    for _ in range(3):
+        found = warm(film[0], psf)
+    assert torch.equal(found, Admm(iterations=40, balance_every=5)(film[0], psf))
+
+
+@pairs_of(solvers(100))
+def test_another_scene_takes_its_few_frames(solver, psf, film):
+    """And ends where a stream of it alone ends."""
+    warm, end = Warm(solver), type(solver)(iterations=400)(film[0].flip(-2), psf)
+    warm(film[0], psf)
+    errors = [(warm(film[0].flip(-2), psf) - end).norm().item() for _ in range(20)]
+    assert errors[-1] < 0.3 * errors[0]
+    assert errors[-1] < 1.2 * (solver(film[0].flip(-2), psf) - end).norm().item()
+
+
+def test_admm_follows_an_exposure_at_once(psf, film):
+    """The state is kept in units of the measurement."""
+    warm, even = Warm(Admm(iterations=20)), Warm(Admm(iterations=20))
+    for number, frame in enumerate(film):
+        found, expected = warm(2.0**number * frame, psf), even(frame, psf)
+        torch.testing.assert_close(found / 2.0**number, expected, rtol=1e-4, atol=1e-5)
+
+
+@pairs_of(solvers(10))
+def test_each_first_frame_is_cold(solver, psf, film):
+    warm = Warm(solver, iterations=2)
+    warm(film[0], psf)
+    assert torch.equal(warm(film[1][..., :30], psf), solver(film[1][..., :30], psf))  # another shape
+    assert torch.equal(warm(film[1][..., :30], psf.clone()), solver(film[1][..., :30], psf))  # another PSF
+    both = torch.cat(film[:2])
+    torch.testing.assert_close(warm(both, psf), solver(both, psf))
+
+
+@pairs_of(solvers(10))
+def test_streams_of_a_batch_are_one_by_one(solver, psf, film):
+    together, alone = Warm(solver), Warm(solver)
+    for one, two in zip(film[:3], film[3:6], strict=True):
+        found = together(torch.cat([one, two]), psf)
+        torch.testing.assert_close(found[:1], alone(one, psf), rtol=1e-3, atol=1e-4)
+
+
+def test_no_iteration():
+    with pytest.raises(ParameterError, match=r"`iterations` \(0\) must be at least 1"):
+        Warm(Admm(), iterations=0)
