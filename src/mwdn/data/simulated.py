@@ -201,7 +201,8 @@ class SimulatedPairs:
         ambient = uniform(generators, *self.placement.ambient)[..., None, None].to(light)
         light = light + ambient * light.mean((1, 2, 3), keepdim=True)
         brightest = light.amax((1, 2, 3), keepdim=True).clamp(min=1e-6)
-        stops = uniform(generators, *map(math.log, self.placement.exposure))
+        darkest, lightest = self.placement.exposure
+        stops = uniform(generators, math.log(darkest), math.log(lightest))
         gain = stops.exp()[..., None, None].to(light) / brightest
         exposed = torch.cat([self._expose(one, g) for one, g in zip(light * gain, generators, strict=True)])
         return Pair(exposed / gain, scene)

@@ -1,5 +1,7 @@
 """A bank of Wiener estimates in front of a U-Net; not from the paper."""
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -62,6 +64,8 @@ class WienerBank(nn.Module):
         self.channels, self.fold, self.regularisations = channels, fold, regularisations
         self.finest, self.align, self.boundary = finest, align, boundary
         self.levels = tuple(level for level in LEVELS if finest and level.shrink >= finest)
+        if finest > 1:  # the bank has what total variation would smooth away
+            self.levels = tuple(replace(level, regularisation=0.0) for level in self.levels)
         pictures = len(regularisations) + (2 if self.levels else 1)
         self.encoder = Encoder(channels * pictures * fold**2, paper_widths(width))
         self.decoder = Decoder(channels * fold**2, paper_widths(width))

@@ -24,20 +24,30 @@ class Level:
         iterations: of ADMM.
         penalties: mu of the data, the gradient and the sign.
         regularisation: tau, weight of the total variation; 0 for none, whatever the gradient's mu. It grows with the
-            noise, see `QUIET`.
+            noise, see `QUIET`, and the gradient's mu with it.
+        poor: smooth in poor light alone. With total variation low frequencies need more iterations: only noise makes
+            it worth them.
     """
 
     shrink: int
     iterations: int
     penalties: Penalties
     regularisation: float = 0.0
+    poor: bool = False
+
+    def smoothing(self, caution: Tensor) -> tuple[Penalties, Tensor]:
+        """Weights mu and tau by how much more than usual the noise asks for, from 1 on."""
+        mu, amount = self.penalties, 1 - 1 / caution
+        if self.poor:
+            return mu._replace(gradient=mu.gradient * amount + 1e-4), caution * amount * self.regularisation
+        return mu._replace(gradient=mu.gradient * caution**0.6), caution * self.regularisation
 
 
 LEVELS = (
-    Level(8, 20, Penalties(0.15, 0.0, 0.6)),
-    Level(4, 20, Penalties(0.15, 0.0, 0.6)),
-    Level(2, 8, Penalties(0.2, 0.0, 0.9)),
-    Level(1, 14, Penalties(0.1, 1.5, 1.5), 0.01),
+    Level(8, 20, Penalties(0.15, 4.0, 0.6), 0.02, poor=True),
+    Level(4, 20, Penalties(0.15, 4.0, 0.6), 0.02, poor=True),
+    Level(2, 8, Penalties(0.2, 4.0, 0.9), 0.02, poor=True),
+    Level(1, 18, Penalties(0.1, 1.5, 1.5), 0.01),
 )
 """What the coarse levels found lets the last one begin where it would be after a hundred iterations."""
 
@@ -224,9 +234,8 @@ def _solve(measurement: Tensor, band: Band, coarser: Tensor, caution: Tensor) ->
     problem = posed(measurement, band.transfer)
     known = F.interpolate(coarser, size=band.grid, mode="bilinear").clamp(min=0) * band.norm
     level = band.level
-    tau = caution * level.regularisation
+    mu, tau = level.smoothing(caution)
     state = start(problem, known.expand(*measurement.shape[:2], *band.grid), smooth=level.regularisation > 0)
     for _ in range(level.iterations):
-        copies = split(state, problem, level.penalties, tau, "colour")
-        state = merge(state, copies, problem, level.penalties)
+        state = merge(state, split(state, problem, mu, tau, "colour"), problem, mu)
     return state.v / band.norm
