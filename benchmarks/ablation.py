@@ -1,0 +1,76 @@
+"""Which part of the bundled network does what: one part taken out at a time, without training again.
+
+    python benchmarks/ablation.py ../shared/data [--count 6]
+
+Captures as in benchmarks/universal.py, through the paper's PSF: 15,000 and 2,000 electrons, exact and mismatched.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import torch
+
+from mwdn import Calibration
+from mwdn.data.photographs import Photographs
+from mwdn.evaluation import Perceptual, Protocol, evaluate
+from mwdn.learning.recipe import read_recipe
+from mwdn.networks import wiener_bank
+from mwdn.reconstruct import find_method
+from mwdn.solvers import Pyramid, align
+from universal import FULL_WELLS, captures
+
+
+def parts(psf):
+    """The whole and what is left of it, as functions of the measurement."""
+    network = find_method("universal").eval()
+
+    def with_options(*, aligned=True, free=False):
+        def reconstruct(measurement):
+            kept, network.align = wiener_bank._mean_light, aligned
+            if free:
+                wiener_bank._mean_light = torch.zeros_like
+            try:
+                return network(measurement, psf)
+            finally:
+                network.align, wiener_bank._mean_light = True, kept
+
+        return reconstruct
+
+    return {
+        "whole": with_options(),
+        "PSF not aligned": with_options(aligned=False),
+        "U-Net free to change the mean light": with_options(free=True),
+        "no U-Net: pyramid, PSF aligned": lambda b: Pyramid()(b, align(b, psf).move(psf)),
+        "no U-Net: pyramid, PSF not aligned": lambda b: Pyramid()(b, psf),
+    }
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--count", type=int, default=6)
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/ablation.json"))
+    arguments = parser.parse_args()
+    recipe = read_recipe(Path(__file__).parents[1] / "recipes" / "mismatched.toml")
+    photographs, perceptual = Photographs(arguments.data / "photos" / "test"), Perceptual.load()
+    psf = Calibration.from_file(arguments.data / "mwdn-camera" / "psf_320.png").psf
+    found = {name: [] for name in parts(psf)}
+    for full_well in FULL_WELLS:
+        for exact in (True, False):
+            made = captures(psf, photographs, recipe, full_well, arguments.count, exact=exact)
+            report = evaluate(parts(psf), made, Protocol.parse("full"), perceptual=perceptual)
+            for name, rows in found.items():
+                rows.append([report.methods[name].summary(key)[0] for key in ("psnr", "lpips")])
+    print(f"PSNR in dB / LPIPS, means of {arguments.count}\n")
+    conditions = [f"{n:,.0f} e, {kind}" for n in FULL_WELLS for kind in ("exact", "mismatched")]
+    print("| |", " | ".join(conditions), "|")
+    print("| --- " * (1 + len(conditions)) + "|")
+    for name, rows in found.items():
+        print("|", name, "|", " | ".join(f"{psnr:.2f} / {lpips:.3f}" for psnr, lpips in rows), "|")
+    arguments.out.write_text(json.dumps({"count": arguments.count, "conditions": conditions, "found": found}, indent=1))
+
+
+if __name__ == "__main__":
+    with torch.inference_mode():
+        main()
