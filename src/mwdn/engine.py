@@ -50,8 +50,9 @@ class Engine:
         # Copied before it is moved: the caller's network stays where it is, and the PSF branch exact.
         own = copy.deepcopy(network).to(psf.device).eval().requires_grad_(False)
         half = half_precision(psf.device) if precision == "fast" else None
-        self.network = fold(copy.deepcopy(own), None)
-        self.folded = self.network if half is None else fold(own, half)
+        self.folded = fold(copy.deepcopy(own), half)
+        # What binds the PSF, if anything does.
+        self.network = fold(own, None) if half is not None and hasattr(own, "bind") else self.folded
         self.bound: dict[int, list[Tensor]] = {}
         self.recordings: dict[torch.Size, _Recording] = {}
 
