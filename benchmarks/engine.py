@@ -5,15 +5,22 @@
 Plain is the network as it is written: float32, contiguous tensors, nothing kept from call to call, the Wiener filter
 as eq. (2) says, each step over the whole array. All contenders take turns, round after round, so that other work on
 the machine meets all of them; the shortest time of each counts. ``exact`` is the engine in float32. Solvers are plain
-functions and stand there for comparison; `benchmarks/admm.py` has their textbook.
+functions and stand there for comparison; `benchmarks/admm.py` has their textbook. Where there is a GPU, everything is
+measured on it too.
+
+Left out: what would take longer than ``--longest`` seconds a call, judged by the next smaller size and the number of
+pixels; batches of more than 4 megapixels (64 on a GPU); the plain path above 4 megapixels on a CPU, where it needs tens
+of gigabytes. A call of more than 10 seconds is made once, any other once to warm up and ``--repeats`` times.
 
 Memory is the largest of a process of its own that reconstructs one capture, less that of the bare package; the engine's
-weights and what it keeps of the PSF are counted, the files of torch are not.
+weights and what it keeps of the PSF are counted, the files of torch are not. On a GPU it is what torch took there.
+
+A second table says where the time goes (`benchmarks/arithmetic.py`). What an earlier call wrote of other methods, sizes
+or threads stays in the files.
 """
 
 import argparse
 import json
-import resource
 import subprocess
 import sys
 import time
@@ -22,14 +29,26 @@ from unittest import mock
 
 import torch
 
+import arithmetic
 from mwdn import Calibration, Reconstructor
 from mwdn.fourier import extend, inverse_spectrum, spectrum
+from mwdn.learning.bundled import BUNDLED
 from mwdn.networks import NETWORKS, blocks, build
 from mwdn.optics.patterns import contour_psf
+from mwdn.reconstruct import find_method
 from mwdn.solvers import SOLVERS
 
 SOLVER_PREFIX = "solver:"
-METHODS = [*NETWORKS, *(SOLVER_PREFIX + name for name in SOLVERS)]
+METHODS = [*NETWORKS, *BUNDLED, *(SOLVER_PREFIX + name for name in SOLVERS)]
+USUAL = ["mwdn", "mwdn-cpsf", "unet", "wiener-unet", "le-admm", *BUNDLED, *METHODS[-len(SOLVERS) :]]
+SIZES = ["320x320", "270x480", "1080x1920", "3000x4000"]
+CONTENDERS = ("plain", "exact", "fast")
+MEGA = 10**6
+HEAD = (
+    "| method | size | device | threads | batch | plain / s | exact / s | | fast / s | | plain / MB | fast / MB |\n"
+    + "| --- " * 12
+    + "|"
+)
 
 
 def plain_filter(features, transfer, grid, boundary):
@@ -44,110 +63,174 @@ def problem(size, batch):
     return Calibration(psf / psf.sum((-2, -1), keepdim=True)), torch.rand(batch, 3, *size, generator=generator)
 
 
-def contenders(method, calibration):
+def contenders(method, calibration, device, names=CONTENDERS):
     """Functions of a batch by their names; plain first."""
     if method.startswith(SOLVER_PREFIX):
-        return {"fast": Reconstructor(method.removeprefix(SOLVER_PREFIX), calibration, device="cpu")}
+        return {"fast": Reconstructor(method.removeprefix(SOLVER_PREFIX), calibration, device=device)}
     torch.manual_seed(0)
-    network = build(method).eval()
+    network = (find_method(method) if method in BUNDLED else build(method)).eval()
+    runs = {
+        name: Reconstructor(network, calibration, device=device, precision=name) for name in names if name != "plain"
+    }
+    if "plain" not in names:
+        return runs
+    network, psf = network.to(device), calibration.psf.to(device)
 
     @torch.inference_mode()
     def plain(batch):
-        with mock.patch.object(blocks, "filtered", plain_filter):
-            return network(batch, calibration.psf)
+        with mock.patch.object(blocks, "filtered", plain_filter), mock.patch.object(blocks, "LARGEST", 2**60):
+            return network(batch.to(device), psf).cpu()
 
-    return {
-        "plain": plain,
-        "exact": Reconstructor(network, calibration, device="cpu", precision="exact"),
-        "fast": Reconstructor(network, calibration, device="cpu"),
-    }
+    return {"plain": plain, **runs}
 
 
 def seconds(runs, batch, repeats, clock):
     """Shortest time a picture of each."""
-    best = dict.fromkeys(runs, float("inf"))
+    best, slow = {}, set()
     for repeat in range(repeats + 1):
-        for name, run in runs.items():
+        for name in [name for name in runs if name not in slow]:
             start = clock()
-            run(batch)
-            if repeat:  # the first round warms up
-                best[name] = min(best[name], (clock() - start) / len(batch))
+            runs[name](batch)
+            spent = clock() - start
+            if spent > 10:
+                slow.add(name)
+            if repeat or name in slow:  # else the first round warms up
+                best[name] = min(best.get(name, float("inf")), spent / len(batch))
     return best
 
 
-def peak_mb(method, size, contender):
-    """Largest memory of a fresh process that reconstructs twice, above that of one with the imports alone."""
+def peak_mb(method, size, contender, device):
+    """Largest memory of a fresh process that reconstructs, above that of one with the imports alone."""
     code = "import sys; sys.path.insert(0, 'benchmarks'); import engine; engine.child(*sys.argv[1:])"
-    call = [sys.executable, "-c", code, method, *map(str, size), contender]
+    call = [sys.executable, "-c", code, method, *map(str, size), contender, device]
     done = subprocess.run(call, capture_output=True, text=True, check=False)
     return float(done.stdout) if done.returncode == 0 else None
 
 
-def child(method, height, width, contender):
+def child(method, height, width, contender, device):
     """Print the memory, in MB."""
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    before = highest_mb()
     calibration, batch = problem((int(height), int(width)), 1)
-    for _ in range(2):
-        contenders(method, calibration)[contender](batch)
-    print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024)
+    contenders(method, calibration, device, (contender,))[contender](batch)
+    print(torch.cuda.max_memory_reserved() / 2**20 if device == "cuda" else highest_mb() - before)
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--sizes", nargs="+", default=["320x320", "270x480"], help="3000x4000 is 12 megapixels")
-    parser.add_argument("--threads", nargs="+", type=int, default=[1, 2])
-    parser.add_argument("--methods", nargs="+", default=METHODS, choices=METHODS)
-    parser.add_argument("--batches", nargs="+", type=int, default=[1, 4])
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--cpu-time", action="store_true", help="count the process's own time: for a machine in use")
-    parser.add_argument("--memory", action="store_true", help="measure memory too")
-    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/engine.json"))
-    arguments = parser.parse_args()
-    clock = time.process_time if arguments.cpu_time else time.perf_counter
-    rows = []
-    print("| method | size | threads | batch | plain / s | exact / s | | fast / s | | memory / MB |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
-    for text in arguments.sizes:
-        size = tuple(int(length) for length in text.split("x"))
-        for method in arguments.methods:
-            memory = peak_mb(method, size, "fast") if arguments.memory else None
-            calibration, batch = problem(size, max(arguments.batches))
-            runs = contenders(method, calibration)
-            for threads in arguments.threads:
-                torch.set_num_threads(threads)
-                for count in arguments.batches:
-                    times = seconds(runs, batch[:count], arguments.repeats, clock)
-                    row = {"method": method, "size": text, "threads": threads, "batch": count}
-                    row["clock"] = "cpu" if arguments.cpu_time else "wall"
-                    row |= {f"{name}_s": value for name, value in times.items()}
-                    plain = times.get("plain")
-                    row |= {f"{name}_ratio": plain / times[name] for name in ("exact", "fast") if plain}
-                    rows.append(row | {"peak_mb": memory})
-                    print(line(rows[-1]), flush=True)
-            del runs
-    write(arguments.out, rows)
+def highest_mb():
+    """Of this process; getrusage would begin with its parent's."""
+    status = Path("/proc/self/status").read_text()
+    return int(status.split("VmHWM:")[1].split()[0]) / 1024
+
+
+class Measurement:
+    """All that is measured of the methods, size by size."""
+
+    def __init__(self, arguments):
+        self.arguments, self.rates = arguments, {}
+        self.clock = time.process_time if arguments.cpu_time else time.perf_counter
+
+    def of(self, method, size, device):
+        """Rows of one method at one size: threads and batches."""
+        pixels, names = size[0] * size[1], CONTENDERS
+        if device == "cpu" and pixels > 4 * MEGA:
+            names = CONTENDERS[1:]
+        if method.startswith(SOLVER_PREFIX):
+            names = ("fast",)
+        names = [name for name in names if self.seconds_of(name, method, device, pixels) <= self.arguments.longest]
+        memory = {name: peak_mb(method, size, name, device) for name in names if self.arguments.memory}
+        most = (64 if device == "cuda" else 4) * MEGA
+        batches = [count for count in self.arguments.batches if count == 1 or count * pixels <= most]
+        calibration, batch = problem(size, max(batches))
+        runs = contenders(method, calibration, device, names) if names else {}
+        for threads in self.arguments.threads if device == "cpu" else [torch.get_num_threads()]:
+            torch.set_num_threads(threads)
+            for count in batches:
+                known = self.seconds_of
+                own = {
+                    name: run
+                    for name, run in runs.items()
+                    if known(name, method, device, count * pixels, threads) <= self.arguments.longest
+                }
+                times = seconds(own, batch[:count], self.arguments.repeats, self.clock)
+                for name, value in times.items():
+                    self.rates[name, method, device, threads] = value / pixels
+                if times:
+                    row = {"method": method, "size": "{}x{}".format(*size), "device": device, "threads": threads}
+                    row |= {"batch": count, "clock": "cpu" if self.arguments.cpu_time else "wall"}
+                    yield row | ratios(times) | {f"{name}_mb": value for name, value in memory.items()}
+
+    def seconds_of(self, name, method, device, pixels, threads=None):
+        """What a call will take, by the last that was measured; the fewest of any number of threads unless given."""
+        known = [
+            rate
+            for (*key, count), rate in self.rates.items()
+            if key == [name, method, device] and threads in (None, count)
+        ]
+        return pixels * min(known, default=0)
+
+
+def ratios(times):
+    plain = times.get("plain")
+    found = {f"{name}_s": value for name, value in times.items()}
+    return found | {f"{name}_ratio": plain / times[name] for name in ("exact", "fast") if plain and name in times}
 
 
 def line(row):
     """A row of the table."""
-    cells = [row["method"].removeprefix(SOLVER_PREFIX), row["size"], row["threads"], row["batch"]]
+    cells = [row["method"].removeprefix(SOLVER_PREFIX), row["size"], row["device"], row["threads"], row["batch"]]
     for key in ("plain_s", "exact_s", "exact_ratio", "fast_s", "fast_ratio"):
         cells.append("" if key not in row else f"{row[key]:.3f}" if key.endswith("_s") else f"{row[key]:.2f} x")
-    cells.append("" if row["peak_mb"] is None else f"{row['peak_mb']:.0f}")
+    cells += ["" if row.get(key) is None else f"{row[key]:.0f}" for key in ("plain_mb", "fast_mb")]
     return f"| {' | '.join(map(str, cells))} |"
 
 
-def write(path, rows):
-    """JSON, and the table beside it; what another call measured of other methods or sizes stays."""
-    key = lambda row: (row["size"], row["method"], row["threads"], row["batch"])  # noqa: E731
-    known = json.loads(path.read_text())["rows"] if path.exists() else []
-    kept = {key(row): row for row in [*known, *rows]}
+def write(path, measured, profiled):
+    """JSON, and the tables beside it."""
+    known = json.loads(path.read_text()) if path.exists() else {}
+    keys = ("size", "method", "device", "threads", "batch", "precision", "part")
+    content = {"torch": torch.__version__, "cpu": torch.backends.cpu.get_cpu_capability()}
+    if torch.cuda.is_available():
+        content["gpu"] = torch.cuda.get_device_name()
+    for name, rows in (("rows", measured), ("profile", profiled)):
+        every = [{"device": "cpu", **row} for row in known.get(name, [])] + rows
+        content[name] = list({tuple(row.get(key) for key in keys): row for row in every}.values())
     path.parent.mkdir(parents=True, exist_ok=True)
-    content = {"torch": torch.__version__, "cpu": torch.backends.cpu.get_cpu_capability(), "rows": list(kept.values())}
     path.write_text(json.dumps(content, indent=2) + "\n")
-    head = "| method | size | threads | batch | plain / s | exact / s | | fast / s | | memory / MB |\n"
-    head += "| --- " * 10 + "|\n"
-    path.with_suffix(".md").write_text(head + "\n".join(map(line, kept.values())) + "\n")
+    parts = [HEAD, *map(line, content["rows"]), "", arithmetic.HEAD, "| --- " * 11 + "|"]
+    path.with_suffix(".md").write_text("\n".join([*parts, *map(arithmetic.line, content["profile"])]) + "\n")
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--sizes", nargs="+", default=SIZES, help="3000x4000 is 12 megapixels")
+    parser.add_argument("--threads", nargs="+", type=int, default=[1, 2])
+    parser.add_argument("--methods", nargs="+", default=USUAL, choices=METHODS)
+    parser.add_argument("--batches", nargs="+", type=int, default=[1, 4], help="add 16 64 on a GPU")
+    parser.add_argument("--devices", nargs="+", default=["cpu", *(["cuda"] if torch.cuda.is_available() else [])])
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--longest", type=float, default=120, help="seconds of a call that is not left out")
+    parser.add_argument("--cpu-time", action="store_true", help="count the process's own time: for a machine in use")
+    parser.add_argument("--memory", action="store_true", help="measure memory too")
+    parser.add_argument("--profile", nargs="*", default=["320x320", "1080x1920"], help="sizes of the second table")
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/engine.json"))
+    arguments = parser.parse_args()
+    measurement, sizes = Measurement(arguments), {text: tuple(map(int, text.split("x"))) for text in arguments.sizes}
+    print(HEAD)
+    for device in arguments.devices:
+        for size in sorted(sizes.values(), key=lambda size: size[0] * size[1]):
+            for method in arguments.methods:
+                for row in measurement.of(method, size, device):
+                    print(line(row), flush=True)
+                    write(arguments.out, [row], [])
+    print(f"\n{arithmetic.HEAD}\n{'| --- ' * 11}|")
+    for device in arguments.devices:
+        torch.set_num_threads(max(arguments.threads))
+        for size in (tuple(map(int, text.split("x"))) for text in arguments.profile):
+            calibration, picture = problem(size, 1)
+            for method in (method for method in arithmetic.METHODS if method in arguments.methods):
+                for precision in ("exact", "fast"):
+                    found = list(arithmetic.rows(method, size, calibration.psf.to(device), picture, precision))
+                    print(*map(arithmetic.line, found), sep="\n", flush=True)
+                    write(arguments.out, [], found)
 
 
 if __name__ == "__main__":

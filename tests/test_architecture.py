@@ -26,6 +26,7 @@ TIERS = [
     ("data",),
     ("learning",),
     ("evaluation",),
+    ("tiles",),
     ("engine",),
     ("reconstruct",),
     ("darkroom",),

@@ -114,12 +114,17 @@ def test_unknown_precision(generator):
 
 
 def learned(name, psf, generator):
-    """Sixty steps on blurred blobs: weights, and what BatchNorm makes of them, are no longer random."""
+    """A hundred steps on blurred blobs: weights, and what BatchNorm makes of them, are no longer random.
+
+    At half the PSF's size: it is the learning that takes the time of a test.
+    """
+    psf = F.avg_pool2d(psf, 2)
+    psf = psf / psf.sum((-2, -1), keepdim=True)
     network = build(name, width=16).train()
     optimiser = torch.optim.AdamW(network.parameters(), lr=2e-3)
-    for _ in range(60):
-        seeds = torch.rand(4, 3, 6, 6, generator=generator)
-        scene = F.pad(F.interpolate(seeds, (40, 40), mode="bicubic").clamp(0, 1), (20,) * 4)
+    for _ in range(100):
+        seeds = torch.rand(2, 3, 6, 6, generator=generator)
+        scene = F.pad(F.interpolate(seeds, (20, 20), mode="bicubic").clamp(0, 1), (10,) * 4)
         measurement = Camera(psf).forward(scene)
         measurement = measurement / measurement.amax((1, 2, 3), keepdim=True)
         measurement = measurement + 0.005 * torch.randn(scene.shape, generator=generator)
@@ -130,10 +135,9 @@ def learned(name, psf, generator):
     return network
 
 
-# Networks trained to the end that were at hand (wiener-bank) reach 72 to 78 dB at full size. The others are trained for
-# a minute here and ill-conditioned, so that a few dB less than the 50 that a finished one owes are let pass.
-@pytest.mark.parametrize(("name", "least"), [("wiener-bank", 50), ("unet", 45), ("mwdn", 45), ("mwdn-cpsf", 45)])
-def test_fast_against_exact_on_real_captures(name, least, data, generator):
+# Networks trained to the end that were at hand (wiener-bank) reach 72 to 78 dB at full size, these 54 to 61.
+@pytest.mark.parametrize("name", ["wiener-bank", "unet", "mwdn", "mwdn-cpsf"])
+def test_fast_against_exact_on_real_captures(name, data, generator):
     """PSNR, the brightest pixel of the exact picture taken as 1; captures and PSF binned by 4."""
     camera = data / "mwdn-camera"
     calibration = Calibration.from_file(camera / "psf_320.png")
@@ -147,4 +151,4 @@ def test_fast_against_exact_on_real_captures(name, least, data, generator):
     for path in files:
         measurement = F.avg_pool2d(calibration.correct(read_frame(path)), 4)
         measurement = measurement / measurement.amax()
-        assert psnr(fast(measurement), exact(measurement)) >= least, path
+        assert psnr(fast(measurement), exact(measurement)) >= 50, path

@@ -10,7 +10,9 @@ from torch.nn import functional as F
 
 from mwdn.errors import ParameterError
 from mwdn.learning.precision import has_bfloat16
+from mwdn.networks.blocks import Decoder, Encoder
 from mwdn.solvers.alignment import Pose
+from mwdn.tiles import StripDecoder, StripEncoder
 from mwdn.types import Measurement, Psf, Scene
 
 Precision = Literal["fast", "exact"]
@@ -30,6 +32,9 @@ class Engine:
     functions of the network's Wiener filters (with the whole PSF branch of MWDN-CPSF) are kept. On a GPU the
     calculation of each shape of a batch is recorded when it is met again, and then replayed.
 
+    Memory is bounded: a batch is taken a megapixel at a time (16 on a GPU), and of a larger picture the U-Net's
+    convolutions, a strip of rows at a time, see `mwdn.tiles`.
+
     Args:
         network: as trained; a copy is taken.
         psf: (1, C, H, W), of the camera.
@@ -43,15 +48,22 @@ class Engine:
         if precision not in get_args(Precision):
             raise ParameterError(f"`precision` must be fast or exact, not {precision!r}.")
         self.psf, self.precision = psf, precision
-        # Copied before it is moved: the PSF branch stays exact, and the caller's network where it is.
-        self.network = copy.deepcopy(network).to(psf.device).eval().requires_grad_(False)
-        self.folded = fold(copy.deepcopy(self.network), half_precision(psf.device) if precision == "fast" else None)
+        # Copied before it is moved: the caller's network stays where it is, and the PSF branch exact.
+        own = copy.deepcopy(network).to(psf.device).eval().requires_grad_(False)
+        half = half_precision(psf.device) if precision == "fast" else None
+        self.folded = fold(copy.deepcopy(own), half)
+        # What binds the PSF, if anything does.
+        self.network = fold(own, None) if half is not None and hasattr(own, "bind") else self.folded
         self.bound: dict[int, list[Tensor]] = {}
         self.recordings: dict[torch.Size, _Recording | None] = {}
 
     @torch.inference_mode()
     def __call__(self, measurement: Measurement) -> Scene:
         """Reconstruct a batch, (B, C, H, W), on the device of the PSF."""
+        pixels = 2**24 if measurement.device.type == "cuda" else 2**20
+        at_once = max(1, pixels // (measurement.shape[-2] * measurement.shape[-1]))
+        if len(measurement) > at_once and len(self.psf) == 1:
+            return torch.cat([self(part) for part in measurement.split(at_once)])  # type: ignore[no-untyped-call]
         if measurement.device.type != "cuda":
             return self._reconstruct(measurement)
         if measurement.shape not in self.recordings:
@@ -170,11 +182,18 @@ def _packed(weight: Tensor, padding: list[int]) -> Tensor | None:
 
 
 def fold(module: nn.Module, dtype: torch.dtype | None) -> nn.Module:
-    """Replace each convolution, with the BatchNorm and the ReLU right after it, by one `Convolution`; in place."""
+    """Replace each convolution, with the BatchNorm and the ReLU right after it, by one `Convolution`; in place.
+
+    The U-Nets that are then nothing else work in strips.
+    """
     if isinstance(module, nn.Sequential):
         return nn.Sequential(*_folded(list(module), dtype))
     for name, child in module.named_children():
         setattr(module, name, fold(child, dtype))
+    if isinstance(module, Encoder | Decoder) and all(
+        isinstance(layer, Convolution) for scale in module.scales for layer in scale.children()
+    ):
+        return StripEncoder(module) if isinstance(module, Encoder) else StripDecoder(module)
     if _plain(module):
         return Convolution(module, None, relu=False, dtype=dtype)
     return Float32(module) if isinstance(module, nn.Conv2d | nn.ConvTranspose2d | nn.Linear) else module

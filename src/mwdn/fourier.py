@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from mwdn.errors import ParameterError, ShapeError
 from mwdn.planes import Boundary as Boundary
-from mwdn.planes import Continuation, laid_out_as, planar, together
+from mwdn.planes import Continuation, in_parts, laid_out_as, planar, together
 from mwdn.planes import Size as Size
 from mwdn.planes import extend as extend
 from mwdn.types import Image, Measurement, Psf, Scene, Spectrum
@@ -91,7 +91,7 @@ def transfer_function(psf: Psf, grid: Size, origin: Size | None = None) -> Spect
     if height > grid[0] or width > grid[1]:
         raise ShapeError(f"`psf` ({height} x {width}) must not be larger than the grid ({grid[0]} x {grid[1]}).")
     row, column = (height // 2, width // 2) if origin is None else origin
-    padded = torch.nn.functional.pad(psf.float(), (0, grid[1] - width, 0, grid[0] - height))
+    padded = torch.nn.functional.pad(psf.float().contiguous(), (0, grid[1] - width, 0, grid[0] - height))
     return spectrum(padded.roll((-row, -column), dims=(-2, -1)), grid)
 
 
@@ -262,13 +262,7 @@ class _Filter(torch.autograd.Function):
     def forward(ctx: Any, image: Tensor, transfer: Tensor, grid: Size, boundary: Boundary) -> Tensor:  # noqa: ANN401
         ctx.save_for_backward(image, transfer)
         ctx.grid, ctx.boundary = grid, boundary
-        planes, size = planar(image), (image.shape[-2], image.shape[-1])
-        result = torch.empty_like(planes)
-        continued = Continuation(size, grid, boundary, planes)
-        for part in together(planes, grid):
-            V = torch.fft.rfft2(continued(planes[part])).mul_(_of(transfer, part))
-            result[part] = inverse_spectrum(V, grid, size)
-        return laid_out_as(image, result)
+        return in_parts(lambda few, own: _filtered(few, own, grid, boundary), image, transfer)
 
     @staticmethod
     @once_differentiable
@@ -294,6 +288,16 @@ class _Filter(torch.autograd.Function):
             transfer_slope.div_(grid[0] * grid[1])[..., 1 : (grid[1] + 1) // 2].mul_(2)
         slope = None if image_slope is None else laid_out_as(image, image_slope).to(image.dtype)
         return slope, transfer_slope, None, None
+
+
+def _filtered(image: Tensor, transfer: Tensor, grid: Size, boundary: Boundary) -> Tensor:
+    planes, size = planar(image), (image.shape[-2], image.shape[-1])
+    result = torch.empty_like(planes)
+    continued = Continuation(size, grid, boundary, planes)
+    for part in together(planes, grid):
+        V = torch.fft.rfft2(continued(planes[part])).mul_(_of(transfer, part))
+        result[part] = inverse_spectrum(V, grid, size)
+    return laid_out_as(image, result)
 
 
 def _of(transfer: Tensor, part: tuple[slice, slice]) -> Tensor:

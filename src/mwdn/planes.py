@@ -4,7 +4,7 @@ Convolutions are fast where the channels of a pixel lie side by side (channels-l
 do. Nothing here is transformed; that is `mwdn.fourier`.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Literal
 
 import torch
@@ -112,12 +112,28 @@ def _fades(length: int, whole: int, boundary: Boundary, like: Tensor, *, column:
 
 
 def together(planes: Tensor, grid: Size) -> Iterator[tuple[slice, slice]]:
-    """Samples and channels of (B, C, H, W) whose spectra are computed together: a megabyte on a CPU, else a sample."""
+    """Samples and channels of (B, C, H, W) transformed together: a megabyte on a CPU, at most a gigabyte on a GPU."""
     samples, channels = planes.shape[:2]
-    step = max(1, 2**18 // (grid[0] * grid[1])) if planes.device.type == "cpu" else channels
+    step = max(1, (2**18 if planes.device.type == "cpu" else 2**28) // (grid[0] * grid[1]))
     for sample in range(samples):
         for first in range(0, channels, step):
             yield slice(sample, sample + 1), slice(first, first + step)
+
+
+LARGEST = 2**26
+"""Numbers of a picture that are laid out anew at once."""
+
+
+def in_parts(function: Callable[[Tensor, Tensor], Tensor], image: Tensor, other: Tensor) -> Tensor:
+    """``function(image, other)`` of (B, C, H, W) and (B, 1 or C, ...), of a large picture a few channels at a time."""
+    step = max(1, LARGEST // max(1, image[:, :1].numel()))
+    if step >= image.shape[1]:
+        return function(image, other)
+    result = torch.empty_like(image)
+    for first in range(0, image.shape[1], step):
+        part = slice(first, first + step)
+        result[:, part] = function(image[:, part], other[:, part] if other.shape[1] > 1 else other)
+    return result
 
 
 def planar(image: Tensor) -> Tensor:

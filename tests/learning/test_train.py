@@ -96,6 +96,22 @@ def test_overfits_four_pairs(photos, calibration, tmp_path):
     assert best > -10 * torch.log10(scenes.square().mean())  # better than black
 
 
+def test_checkpointing_is_the_same_run(trainer, tmp_path):
+    """It may begin without and go on with it, where memory turns out too short."""
+    trainer(few(bfloat16=False), "kept").run()
+    first = trainer(few(bfloat16=False), "changed")
+    for _ in range(3):
+        first.advance()
+    first.save(first.validate())
+    second = trainer(few(bfloat16=False, checkpointing=True), "changed")
+    assert second.step == 3
+    second.run()
+    assert second.network.encoder.recompute
+    kept, changed = (load_file(tmp_path / name / "last.safetensors") for name in ("kept", "changed"))
+    for key, value in kept.items():
+        torch.testing.assert_close(changed[key], value, rtol=1e-3, atol=1e-5)
+
+
 def test_each_step_has_its_learning_rate(trainer):
     run = trainer()
     for step in range(4):

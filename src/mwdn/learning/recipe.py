@@ -41,6 +41,8 @@ class Schedule:
         clip: longer gradients, over all parameters, are shortened to this norm; 0 leaves them as they are.
         ema: the checkpoint holds a running mean of the weights, with this decay a step; 0 for the last weights.
         bfloat16: compute convolutions in bfloat16 where the hardware has it.
+        checkpointing: keep of each scale of the U-Nets what goes into it alone, and compute the rest again for the
+            gradient: for large frames, less memory for more time. The result is the same.
         validate_every: steps between validations, checkpoints and contact sheets.
         validation: samples in a validation.
         seed: of initial weights and data.
@@ -62,6 +64,7 @@ class Schedule:
     clip: float = 1.0
     ema: float = 0.99
     bfloat16: bool = True
+    checkpointing: bool = False
     validate_every: int = 250
     validation: int = 16
     seed: int = 0

@@ -30,6 +30,7 @@ from mwdn.learning.selfsupervised import BlindValidator, judge
 from mwdn.learning.state import read_state, restore, write_state
 from mwdn.learning.validation import Validation, Validator
 from mwdn.networks import build
+from mwdn.networks.recomputed import recompute
 from mwdn.types import Measurement
 
 _MAKE_ROOM = "Make room and give the same command again: it goes on from the last saved state."
@@ -103,6 +104,8 @@ class Trainer:
         self.average.load_state_dict(self.network.state_dict())
         distributed.freeze_cancelled(self.network)
         distributed.synchronise(self.network, self.device)
+        if self.schedule.checkpointing:
+            recompute(self.network)
         self.pool = self._pool() if self.schedule.pool else None
         self.loss = Loss(recipe.loss, alexnet=alexnet).to(self.device)
         self.optimiser = optimiser(self.network, self.schedule)
@@ -110,8 +113,10 @@ class Trainer:
         self.bfloat16 = self.schedule.bfloat16 and has_bfloat16(self.device)
         self.step, self.best = 0, -math.inf
         # What a checkpoint must agree with to be gone on from.
+        everything = recipe.as_dict()
+        del everything["schedule"]["checkpointing"]  # changes nothing but memory and time
         without = {"sheet"} if recipe.selfsupervised.consistency else {"sheet", "selfsupervised"}
-        learned = {table: values for table, values in recipe.as_dict().items() if table not in without}
+        learned = {name: values for name, values in everything.items() if name not in without}
         one = None if recipe.cameras.sizes else calibration.psf_hash  # of many, the given one is for the validation
         self.identity = {"recipe": learned, "psf_hash": one, "pairs": pairs.name}
         distributed.check_alike(self.identity)

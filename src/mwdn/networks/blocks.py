@@ -10,6 +10,7 @@ from torch.nn import functional as F
 
 from mwdn.errors import ParameterError, ShapeError
 from mwdn.fourier import Boundary, Size, deconvolution_grid, filtered, wiener_transfer
+from mwdn.networks.recomputed import Stages
 from mwdn.types import Image, Measurement, Psf
 
 Pooling = Literal["max", "average"]
@@ -52,7 +53,7 @@ def check_channels(picture: Image, channels: int) -> None:
         )
 
 
-class Encoder(nn.Module):
+class Encoder(Stages):
     """Left half of a U-Net: features at scales 1, 1/2, 1/4, ..., each a double convolution of the one before.
 
     Args:
@@ -80,13 +81,16 @@ class Encoder(nn.Module):
             ShapeError: the picture has another number of channels.
         """
         check_channels(picture, self.channels)
-        features = [self.scales[0](picture)]
+        features = [self.stage(self.scales[0], picture)]
         for scale in self.scales[1:]:
-            features.append(scale(self.pool(features[-1])))
+            features.append(self.stage(self._halved, scale, features[-1]))
         return features
 
+    def _halved(self, scale: nn.Module, features: Tensor) -> Tensor:
+        return scale(self.pool(features))
 
-class Decoder(nn.Module):
+
+class Decoder(Stages):
     """Right half of a U-Net: up-sample, join the skip connection, double convolution; then a 1x1 head.
 
     Args:
@@ -108,17 +112,28 @@ class Decoder(nn.Module):
         self.head = nn.Conv2d(following[-1], channels, 1)
 
     def forward(self, features: list[Tensor]) -> Image:
-        """Picture of the finest feature's size, from features, finest first."""
-        *skips, x = features
-        for scale, skip in zip(self.scales, reversed(skips), strict=True):
-            x = F.interpolate(x, size=skip.shape[-2:], mode="bilinear", align_corners=True)
-            x = scale(torch.cat([skip, x], dim=1))
+        """Picture of the finest feature's size, from features, finest first.
+
+        The list is emptied on the way: each feature is needed once, and of a large picture there is no room to spare.
+        """
+        x = features.pop()
+        for scale in self.scales:
+            x = self.stage(self._joined, scale, features.pop(), x)
         return self.head(x)
+
+    @staticmethod
+    def _joined(scale: nn.Module, skip: Tensor, x: Tensor) -> Tensor:
+        x = F.interpolate(x, size=skip.shape[-2:], mode="bilinear", align_corners=True)
+        return scale(torch.cat([skip, x], dim=1))
 
 
 def paper_widths(width: int) -> tuple[int, ...]:
     """Feature channels of the U-Net at scales 1 to 1/16, for ``width`` at scale 1 (64 in the paper)."""
     return (width, 2 * width, 4 * width, 8 * width, 8 * width)
+
+
+LARGEST = 2**28
+"""Pixels of all channels up to which transfer functions are kept: 1 GB. MWDN-CPSF has more at 1080 x 1920."""
 
 
 class Wiener(nn.Module):
@@ -146,19 +161,39 @@ class Wiener(nn.Module):
 
     def forward(self, features: Tensor, psf: Psf) -> Tensor:
         """Deconvolve each channel with the PSF, or with its own where the PSF has as many channels."""
-        return self.filtered(features, self.transfer(psf))
+        return self.filtered(features, self.known(psf))
+
+    def known(self, psf: Psf) -> Tensor:
+        """All that the filter needs of a camera: its `transfer` function, or the PSF where that would be large."""
+        grid = deconvolution_grid((psf.shape[-2], psf.shape[-1]), self.boundary)
+        if psf[:, :, 0, 0].numel() * grid[0] * grid[1] > LARGEST:
+            return psf.contiguous()
+        parts = [self.transfer(part) for part in psf.split(_together(grid), dim=1)]  # type: ignore[no-untyped-call]
+        return parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
 
     def transfer(self, psf: Psf) -> Tensor:
-        """Transfer function of the filter for features of the PSF's size: all that it needs of a camera."""
+        """Transfer function of the filter for features of the PSF's size."""
         if hasattr(self, "log_weight"):
             psf = self.log_weight.exp() * psf
         grid = deconvolution_grid((psf.shape[-2], psf.shape[-1]), self.boundary)
         return wiener_transfer(psf, self.log_regularisation.exp(), grid)
 
-    def filtered(self, features: Tensor, transfer: Tensor) -> Tensor:
-        """Deconvolve each channel with a `transfer` function, or with its own."""
+    def filtered(self, features: Tensor, known: Tensor) -> Tensor:
+        """Deconvolve each channel with what is `known` of the PSF, or with its own."""
         grid = deconvolution_grid((features.shape[-2], features.shape[-1]), self.boundary)
-        return filtered(features, transfer, grid, self.boundary)
+        if known.is_complex():
+            return filtered(features, known, grid, self.boundary)
+        result = torch.empty_like(features)
+        for first in range(0, known.shape[1], _together(grid)):
+            part = slice(first, first + _together(grid)) if known.shape[1] > 1 else slice(None)
+            transfer = self.transfer(known[:, part])
+            result[:, part] = filtered(features[:, part], transfer, grid, self.boundary)
+        return result
+
+
+def _together(grid: Size) -> int:
+    """Channels whose transfer functions are made at once: they need ten times the memory of what comes out."""
+    return max(1, LARGEST // (32 * grid[0] * grid[1]))
 
 
 def one_each_colour(psf: Psf, measurement: Measurement) -> Tensor:

@@ -58,13 +58,13 @@ class Mwdn(nn.Module):
         return self.reconstruct(measurement, self.bind(psf, measurement))
 
     def bind(self, psf: Psf, measurement: Measurement) -> list[Tensor]:
-        """Transfer function of each scale's filter: all that the network needs of the PSF."""
+        """What each scale's filter needs of the PSF: all that the network does."""
         psfs = self.pyramid(one_each_colour(psf, measurement))
-        return [wiener.transfer(h) for wiener, h in zip(self.filters, psfs, strict=True)]  # type: ignore[operator]
+        return [wiener.known(h) for wiener, h in zip(self.filters, psfs, strict=True)]  # type: ignore[operator]
 
     def reconstruct(self, measurement: Measurement, bound: list[Tensor]) -> Scene:
         """The same as `forward`, from what `bind` gave."""
-        *skips, bottleneck = self.encoder(measurement)
-        each = zip(self.filters, skips, bound, strict=True)
-        deconvolved = [wiener.filtered(skip, transfer) for wiener, skip, transfer in each]  # type: ignore[operator]
-        return self.decoder([*deconvolved, bottleneck])
+        features = self.encoder(measurement)
+        for scale, (wiener, known) in enumerate(zip(self.filters, bound, strict=True)):
+            features[scale] = wiener.filtered(features[scale], known)  # type: ignore[operator]
+        return self.decoder(features)

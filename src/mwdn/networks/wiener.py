@@ -26,7 +26,7 @@ class WienerNetwork(nn.Module):
 
     def bind(self, psf: Psf, measurement: Measurement) -> list[Tensor]:
         """Transfer function of the filter: all that the network needs of the PSF."""
-        return [self.filter.transfer(peak_one(psf, measurement))]
+        return [self.filter.known(peak_one(psf, measurement))]
 
     def reconstruct(self, measurement: Measurement, bound: list[Tensor]) -> Scene:
         """The same as `forward`, from what `bind` gave."""

@@ -1,0 +1,69 @@
+"""Gradients with the features of each scale computed again are those with all of them kept."""
+
+import copy
+
+import pytest
+import torch
+from torch import nn
+
+from mwdn.errors import ParameterError
+from mwdn.learning.distributed import GlobalBatchNorm2d
+from mwdn.networks import build
+from mwdn.networks.recomputed import Stages, recompute
+
+
+def learned_once(network, measurement, psf):
+    """Gradients of one step, the statistics after it, and the numbers that the step kept for the gradient."""
+    kept = {}
+
+    def count(tensor):
+        kept[tensor.data_ptr()] = tensor.numel()
+        return tensor
+
+    with torch.autograd.graph.saved_tensors_hooks(count, lambda tensor: tensor):
+        found = network(measurement, psf)
+    found.square().sum().backward()
+    gradients = {name: parameter.grad for name, parameter in network.named_parameters()}
+    return gradients, dict(network.named_buffers()), sum(kept.values())
+
+
+@pytest.mark.parametrize("synchronised", [False, True])
+@pytest.mark.parametrize("name", ["unet", "wiener-unet", "mwdn", "mwdn-cpsf", "wiener-bank"])
+def test_gradients_and_statistics_are_the_same(name, synchronised, generator):
+    network = build(name, width=8).train()
+    for module in network.modules():
+        if synchronised and isinstance(module, nn.BatchNorm2d):
+            module.__class__ = GlobalBatchNorm2d
+    psf = torch.rand(1, 3, 33, 47, generator=generator) ** 8
+    measurement = torch.rand(2, 3, 33, 47, generator=generator)
+    other = copy.deepcopy(network)
+    recompute(other)
+    gradients, statistics, kept = learned_once(network, measurement, psf)
+    same_gradients, same_statistics, kept_less = learned_once(other, measurement, psf)
+    for known, found in ((gradients, same_gradients), (statistics, same_statistics)):
+        assert known.keys() == found.keys()
+        for key in known:
+            torch.testing.assert_close(found[key], known[key], msg=lambda text, key=key: f"{key}: {text}")
+    counts = [value for key, value in statistics.items() if key.endswith("num_batches_tracked")]
+    assert counts
+    assert set(map(int, counts)) == {1}
+    assert kept_less < 0.7 * kept
+
+
+def test_settings_of_batchnorm_come_back(generator):
+    network = build("unet", width=8).train()
+    recompute(network)
+    norms = [module for module in network.modules() if isinstance(module, nn.BatchNorm2d)]
+    buffers = [norm.num_batches_tracked for norm in norms]
+    measurement = torch.rand(2, 3, 16, 16, generator=generator)
+    for count in (1, 2):
+        network(measurement, measurement[:1]).sum().backward()
+        assert {norm.momentum for norm in norms} == {0.1}
+        assert all(norm.num_batches_tracked is buffer for norm, buffer in zip(norms, buffers, strict=True))
+        assert set(map(int, buffers)) == {count}
+
+
+def test_network_without_scales():
+    with pytest.raises(ParameterError, match=r"`checkpointing` needs a network with the paper's U-Net, which LeAdmm"):
+        recompute(build("le-admm"))
+    assert not any(isinstance(module, Stages) for module in build("le-admm").modules())
