@@ -17,7 +17,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 TIERS = [
     ("errors", "types"),
     ("planes",),
-    ("fourier",),
+    ("fourier", "dft"),
     ("data.formats", "data.writing", "data.images"),
     ("optics",),
     ("calibration",),
@@ -28,11 +28,13 @@ TIERS = [
     ("evaluation",),
     ("engine",),
     ("reconstruct",),
+    ("onnx_graph", "onnx_operations", "onnx_program", "quantise"),
+    ("export",),
     ("capture",),
     ("preview",),
     ("design", "doctor"),
     ("benchmark",),
-    ("demo", "cli_camera", "cli_optics", "cli_inspect", "cli_benchmark", "cli_train", "cli", "__main__"),
+    ("demo", "cli_camera", "cli_optics", "cli_export", "cli_inspect", "cli_benchmark", "cli_train", "cli", "__main__"),
     ("",),  # mwdn/__init__.py: the public names
 ]
 RANK = {name: rank for rank, names in enumerate(TIERS) for name in names}

@@ -14,6 +14,7 @@ from torch import Tensor
 from mwdn import __version__
 from mwdn.cli_benchmark import benchmark
 from mwdn.cli_camera import CameraOptions, console, errors
+from mwdn.cli_export import export
 from mwdn.cli_inspect import inspect
 from mwdn.cli_optics import design
 from mwdn.cli_train import simulate, train
@@ -37,7 +38,7 @@ app = App(
     version=__version__,
     help="From the caustic pattern of a lensless camera to a picture. Add --debug to see where an error comes from.",
 )
-for command in (design, inspect, simulate, train, benchmark):
+for command in (design, inspect, simulate, train, export, benchmark):
     app.command(command)
 
 
