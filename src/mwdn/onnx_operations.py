@@ -80,6 +80,21 @@ def _norm(g: OnnxGraph, node: fx.Node, x: str, order: float = 2, axes: Sequence[
     return g("ReduceL2", x, g.integers(axes), keepdims=int(keep))
 
 
+def _deviation(g: OnnxGraph, node: fx.Node, x: str, axes: list[int], correction: int = 1, keepdim: bool = False) -> str:
+    if correction:
+        raise ExportError("A standard deviation with a correction cannot be written as ONNX. Export to .pt2 instead.")
+    away = g("Sub", x, g("ReduceMean", x, g.integers(axes)))
+    return g("Sqrt", g("ReduceMean", g("Mul", away, away), g.integers(axes), keepdims=int(keepdim)))
+
+
+def _stack(g: OnnxGraph, node: fx.Node, parts: list[str], axis: int = 0) -> str:
+    return g("Concat", *(g("Unsqueeze", part, g.integers([axis])) for part in parts), axis=axis)
+
+
+def _full(g: OnnxGraph, node: fx.Node, x: str, fill: float, **_: Any) -> str:  # noqa: ANN401
+    return g("Expand", fill, _shape(g, value(node).shape))
+
+
 def _median(g: OnnxGraph, node: fx.Node, x: str, axis: int, keep: bool = False) -> tuple[str, str]:
     """The lower of two middle values, as torch takes it: the largest of the smaller half."""
     smaller = g.integers([(source(node).shape[axis] + 1) // 2])
@@ -208,8 +223,10 @@ REAL: dict[Any, Handler] = {
     _aten.div.Tensor: _plain("Div"),
     _aten.exp.default: _plain("Exp"),
     _aten.expand.default: _expand,
+    _aten.full_like.default: _full,
     _aten.group_norm.default: _group_norm,
     _aten.linalg_vector_norm.default: _norm,
+    _aten.lt.Tensor: lambda g, node, a, b: g("Less", a, b),
     _aten.max_pool2d.default: _pool("MaxPool"),
     _aten.maximum.default: _plain("Max"),
     _aten.mean.dim: _reduce("ReduceMean"),
@@ -218,6 +235,7 @@ REAL: dict[Any, Handler] = {
     _aten.pad.default: _pad,
     _aten.pixel_shuffle.default: lambda g, node, x, block: g("DepthToSpace", x, blocksize=block, mode="CRD"),
     _aten.pixel_unshuffle.default: _unshuffle,
+    _aten.pow.Scalar: _plain("Pow"),
     _aten.pow.Tensor_Scalar: _plain("Pow"),
     _aten.relu.default: _plain("Relu"),
     _aten.roll.default: _roll,
@@ -227,9 +245,12 @@ REAL: dict[Any, Handler] = {
     _aten.split.Tensor: _split,
     _aten.sqrt.default: _plain("Sqrt"),
     _aten.square.default: lambda g, node, x: g("Mul", x, x),
+    _aten.stack.default: _stack,
+    _aten.std.correction: _deviation,
     _aten.sub.Tensor: _plain("Sub"),
     _aten.sum.dim_IntList: _reduce("ReduceSum"),
     _aten.unbind.int: _unbind,
     _aten.upsample_bilinear2d.vec: _enlarge,
+    _aten.where.self: lambda g, node, *given: g("Where", *given),
 }
 """Operations of real numbers."""
