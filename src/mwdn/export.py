@@ -130,7 +130,7 @@ def export(
         CheckpointError: the checkpoint cannot be used.
         ShapeError: the network takes another number of channels.
     """
-    _check(out, precision)
+    _check(out, precision, channels)
     name = str(method) if isinstance(method, str | Path) else type(method).__name__
     found = find_method(method, regularisation) if isinstance(method, str | Path) else method
     channels = channels or calibration.psf.shape[1]
@@ -142,28 +142,21 @@ def export(
     measurement = simulated(calibration, ("astronaut",), channels)
     expected = Reconstructor(found, calibration, device="cpu", precision="exact")(measurement)
     with torch.no_grad(), tempfile.TemporaryDirectory() as folder:
-        half = torch.float16 if precision == "float16" else None
-        program = _program(Bound(found, calibration.psf, channels, dtype=half).eval(), measurement)
+        bound = Bound(found, calibration.psf, channels, dtype=torch.float16 if precision == "float16" else None)
         file = Path(folder) / out.name
-        if out.suffix == ".pt2":
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # torch's own, of weights with their channels side by side
-                torch.export.save(program, file, extra_files={ABOUT: json.dumps(about)})
-        else:
-            _save_onnx(file, program, about)
-            if precision == "int8":
-                from mwdn.quantise import quantise
+        _save(file, _program(bound.eval(), measurement), about)
+        if precision == "int8":
+            from mwdn.quantise import quantise
 
-                quantise(file, simulated(calibration, ("cat", "coffee"), channels))
-        agreement = _agreement(run_file(file, measurement), expected)
-        least = LEAST[precision] if least is None else least
-        if not agreement >= least:
+            quantise(file, simulated(calibration, ("cat", "coffee"), channels))
+        reached, bar = agreement(run_file(file, measurement), expected), LEAST[precision] if least is None else least
+        if not reached >= bar:
             raise ExportError(
-                f"`{out}` would agree with `{name}` to {agreement:.1f} dB, but must to {least:.1f} dB; it is not "
-                f"written. {'Report this.' if precision == 'float32' else 'Use `--precision float32`, or `--least`.'}"
+                f"`{out}` must agree with `{name}` to {bar:.1f} dB, but does to {reached:.1f} dB; it is not written. "
+                f"{'Report this' if precision == 'float32' else 'Use `--precision float32`'}, or lower `--least`."
             )
         _publish(file, out)
-    return Exported(out, agreement, about)
+    return Exported(out, reached, about)
 
 
 def run_file(file: Path, measurement: Measurement) -> Scene:
@@ -193,8 +186,20 @@ def read_about(file: Path) -> dict[str, str]:
     return {entry.key: entry.value for entry in onnx.load(str(file)).metadata_props}
 
 
+def agreement(found: Scene, expected: Scene) -> float:
+    """PSNR in dB of the worst of a batch, its peak the brightest pixel of the batch as expected."""
+    error = (found - expected).square().mean((1, 2, 3)).amax()
+    return float(10 * torch.log10(expected.abs().max().square() / error))
+
+
 def simulated(calibration: Calibration, names: tuple[str, ...], channels: int) -> Measurement:
-    """Captures of the package's pictures in the dark: each bright, and dim and mirrored, (2 len(names), C, H, W)."""
+    """Captures of the package's pictures in the dark: each bright, and dim and mirrored, (2 len(names), C, H, W).
+
+    Args:
+        calibration: of the camera that is simulated.
+        names: of files in the folder ``pictures``.
+        channels: 1 or 3.
+    """
     height, width = calibration.size
     side = max(1, min(height, width) // 2)
     scenes = []
@@ -212,7 +217,9 @@ def simulated(calibration: Calibration, names: tuple[str, ...], channels: int) -
     return Sensor().expose(light, generator=torch.Generator().manual_seed(0))
 
 
-def _check(out: Path, precision: str) -> None:
+def _check(out: Path, precision: str, channels: int | None) -> None:
+    if channels not in (None, 1, 3):
+        raise ParameterError(f"`channels` ({channels}) must be 1 or 3: grey or RGB.")
     if precision not in get_args(Precision):
         raise ParameterError(f"`precision` must be float32, float16 or int8, not {precision!r}.")
     if out.suffix not in (".onnx", ".pt2"):
@@ -266,7 +273,12 @@ def _program(bound: Bound, measurement: Measurement) -> ExportedProgram:
         raise ExportError(f"`{type(bound.method).__name__}` cannot be exported: {reason}") from error
 
 
-def _save_onnx(file: Path, program: ExportedProgram, about: dict[str, str]) -> None:
+def _save(file: Path, program: ExportedProgram, about: dict[str, str]) -> None:
+    if file.suffix == ".pt2":
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torch's own, of weights with their channels side by side
+            torch.export.save(program, file, extra_files={ABOUT: json.dumps(about)})
+        return
     import onnx
 
     model = to_onnx(program)
@@ -277,12 +289,6 @@ def _save_onnx(file: Path, program: ExportedProgram, about: dict[str, str]) -> N
         raise ExportError(f"The file would have {size:.1f} GB; ONNX files hold 2. Export to .pt2, or `--bin 2`.")
     onnx.checker.check_model(model)
     onnx.save(model, str(file))
-
-
-def _agreement(found: Tensor, expected: Tensor) -> float:
-    """PSNR in dB of the worst of a batch, its peak the brightest pixel of the batch as expected."""
-    error = (found - expected).square().mean((1, 2, 3)).amax()
-    return float(10 * torch.log10(expected.abs().max().square() / error))
 
 
 def _publish(file: Path, out: Path) -> None:
