@@ -13,6 +13,7 @@ from rich.progress import Progress, track
 from mwdn import __version__
 from mwdn.cli_benchmark import benchmark
 from mwdn.cli_camera import CameraOptions, complain, console, errors, warn
+from mwdn.cli_export import export
 from mwdn.cli_inspect import inspect
 from mwdn.cli_optics import design
 from mwdn.cli_reconstruct import reconstruct
@@ -27,7 +28,7 @@ app = App(
     version=__version__,
     help="From the caustic pattern of a lensless camera to a picture. Add --debug to see where an error comes from.",
 )
-for command in (reconstruct, design, inspect, simulate, train, benchmark):
+for command in (reconstruct, design, inspect, simulate, train, export, benchmark):
     app.command(command)
 
 

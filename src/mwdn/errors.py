@@ -9,6 +9,7 @@
     ├── ImageError (ValueError)        a picture or frame that cannot be read or written
     ├── PsfError (ValueError)          a PSF that no reconstruction can trust
     ├── CheckpointError (ValueError)   weights that are damaged or belong to something else
+    ├── ExportError                    a method that cannot be exported, or came out as something else
     ├── DivergenceError                a loss that is not finite any more
     └── ProcessError                   another process of a distributed run has ended
 
@@ -57,6 +58,10 @@ class PsfError(MwdnError, ValueError):
 
 class CheckpointError(MwdnError, ValueError):
     """Weights are damaged, or belong to another network or camera."""
+
+
+class ExportError(MwdnError):
+    """A method cannot be written for another runtime, or gives another result there; nothing was written."""
 
 
 class DivergenceError(MwdnError):

@@ -70,11 +70,12 @@ class Wiener:
         """
         contrast = measurement.std((-2, -1), correction=0, keepdim=True)
         allowed = noise_level(measurement).square() + (self.tolerance * contrast).square()
-        power, filtered = B.abs().square(), H.abs().square()
-        power[..., 0, 0] = 0  # the mean says nothing about detail
         # Half a spectrum: a column stands for two, but for the first and, of an even width, the last.
         # Parseval: sum |B|^2 = pixels x variance.
-        power[..., 1 : (width + 1) // 2] *= 2
+        times = torch.ones(B.shape[-2:], device=B.device)
+        times[:, 1 : (width + 1) // 2] = 2
+        times[0, 0] = 0  # the mean says nothing about detail
+        power, filtered = B.abs().square() * times, H.abs().square()
         target = allowed * power.sum((-2, -1), keepdim=True) / contrast.square().clamp(min=1e-20)
         low, high = torch.full_like(target, -16.0), torch.full_like(target, 1.0)
         for _ in range(40):

@@ -1,0 +1,112 @@
+"""Exported files against the reconstructor: agreement, size, time.
+
+    python benchmarks/export.py --psf PSF [--captures FILE ...] [--methods universal-small] [--kinds .onnx:int8]
+
+Agreement is the PSNR against the exact reconstruction, its peak the brightest pixel of that, of the worst capture: of
+those simulated that decide about the file, and of real ones where some are given. All contenders take turns, and the
+shortest time of each counts. On a machine in use by others, `--cpu-time` with one thread counts the process's own time.
+"""
+
+import argparse
+import json
+import tempfile
+import time
+from pathlib import Path
+
+import torch
+
+from mwdn import Calibration, Reconstructor
+from mwdn.data.captures import find_captures, read_captures
+from mwdn.export import agreement, export
+
+KINDS = [(".onnx", "float32"), (".onnx", "float16"), (".onnx", "int8"), (".pt2", "float32"), (".pt2", "float16")]
+
+
+def opened(file, threads):
+    """A function of a measurement, ready to run."""
+    if file.suffix == ".pt2":
+        module = torch.export.load(file).module()
+        return torch.no_grad()(lambda measurement: module(measurement))
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
+    return lambda measurement: torch.from_numpy(session.run(None, {"measurement": measurement.numpy()})[0])
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--psf", type=Path, required=True)
+    parser.add_argument("--captures", type=Path, nargs="*", default=[], help="real ones, of the PSF's size")
+    parser.add_argument("--methods", nargs="+", default=["universal-small"])
+    parser.add_argument("--kinds", nargs="+", default=KINDS, type=lambda text: tuple(text.split(":")))
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--cpu-time", action="store_true", help="count the process's own time: for a machine in use")
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/export.json"))
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+    clock = time.process_time if arguments.cpu_time else time.perf_counter
+    calibration = Calibration.from_file(arguments.psf)
+    captures = read_captures(find_captures(arguments.captures), calibration) if arguments.captures else None
+    rows = []
+    print("| method | file | convolutions | MB | agreement / dB | on real captures / dB | export / s | s |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+    for method in arguments.methods:
+        for row in measured(method, calibration, captures, arguments, clock):
+            rows.append(row)
+            print(line(row), flush=True)
+    kept = json.loads(arguments.out.read_text())["rows"] if arguments.out.exists() else []
+    rows = [row for row in kept if row["method"] not in arguments.methods] + rows
+    content = {"torch": torch.__version__, "cpu": torch.backends.cpu.get_cpu_capability(), "threads": arguments.threads}
+    content |= {"clock": "cpu" if arguments.cpu_time else "wall", "size": list(calibration.size), "rows": rows}
+    arguments.out.write_text(json.dumps(content, indent=2) + "\n")
+
+
+def measured(method, calibration, captures, arguments, clock):
+    """One row a file, and two of the reconstructor."""
+    rows, runs = [], {}
+    with tempfile.TemporaryDirectory() as folder:
+        for suffix, precision in arguments.kinds:
+            start = clock()
+            file = Path(folder) / f"{precision}{suffix}"
+            done = export(method, calibration, file, precision=precision)
+            row = {"method": method, "file": suffix, "precision": precision, "mb": file.stat().st_size / 1e6}
+            rows.append(row | {"agreement_db": finite(done.agreement), "export_s": clock() - start})
+            runs[suffix, precision] = opened(file, arguments.threads)
+        network = Reconstructor(method, calibration, device="cpu").method
+        network.align = False  # as in the files
+        for precision in ("exact", "fast"):
+            rows.append({"method": method, "file": "mwdn", "precision": precision})
+            runs["mwdn", precision] = Reconstructor(network, calibration, device="cpu", precision=precision)
+        batch = torch.rand(1, 3, *calibration.size) if captures is None else captures[:1]
+        best = dict.fromkeys(runs, float("inf"))
+        for repeat in range(arguments.repeats + 1):
+            for name, run in runs.items():
+                start = clock()
+                run(batch)
+                if repeat:  # the first round warms up
+                    best[name] = min(best[name], clock() - start)
+        for row in rows:
+            key = row["file"], row["precision"]
+            row["s"] = best[key]
+            if captures is not None:
+                row["captures_db"] = finite(agreement(runs[key](captures), runs["mwdn", "exact"](captures)))
+    return rows
+
+
+def finite(decibels):
+    """What JSON can hold; ``None`` if there is no difference at all."""
+    return None if decibels == float("inf") else decibels
+
+
+def line(row):
+    """A row of the table."""
+    numbers = [row.get("mb"), row.get("agreement_db"), row.get("captures_db"), row.get("export_s")]
+    told = ["" if value is None else f"{value:.1f}" for value in numbers]
+    return f"| {row['method']} | {row['file']} | {row['precision']} | {' | '.join(told)} | {row['s']:.3f} |"
+
+
+if __name__ == "__main__":
+    main()
