@@ -10,7 +10,8 @@ measured on it too.
 
 Left out: what would take longer than ``--longest`` seconds a call, judged by the next smaller size and the number of
 pixels; batches of more than 4 megapixels (64 on a GPU); all but the fast path above 4 megapixels on a CPU, where the
-others need tens of gigabytes. A call of more than 10 seconds is made once, any other once to warm up and ``--repeats`` times.
+others need tens of gigabytes. A call of more than 10 seconds is made once, any other once to warm up and ``--repeats``
+times.
 
 Memory is the largest of a process of its own that reconstructs one capture, less that of the bare package; the engine's
 weights and what it keeps of the PSF are counted, the files of torch are not. On a GPU it is what torch took there.
