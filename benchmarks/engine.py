@@ -9,8 +9,9 @@ functions and stand there for comparison; `benchmarks/admm.py` has their textboo
 measured on it too.
 
 Left out: what would take longer than ``--longest`` seconds a call, judged by the next smaller size and the number of
-pixels; batches of more than 4 megapixels (64 on a GPU); the plain path above 4 megapixels on a CPU, where it needs tens
-of gigabytes. A call of more than 10 seconds is made once, any other once to warm up and ``--repeats`` times.
+pixels; batches of more than 4 megapixels (64 on a GPU); all but the fast path above 4 megapixels on a CPU, where the
+others need tens of gigabytes. A call of more than 10 seconds is made once, any other once to warm up and ``--repeats``
+times.
 
 Memory is the largest of a process of its own that reconstructs one capture, less that of the bare package; the engine's
 weights and what it keeps of the PSF are counted, the files of torch are not. On a GPU it is what torch took there.
@@ -132,7 +133,7 @@ class Measurement:
         """Rows of one method at one size: threads and batches."""
         pixels, names = size[0] * size[1], CONTENDERS
         if device == "cpu" and pixels > 4 * MEGA:
-            names = CONTENDERS[1:]
+            names = ("fast",)
         if method.startswith(SOLVER_PREFIX):
             names = ("fast",)
         names = [name for name in names if self.seconds_of(name, method, device, pixels) <= self.arguments.longest]
