@@ -5,6 +5,10 @@
 Agreement is the PSNR against the exact reconstruction, its peak the brightest pixel of that, of the worst capture: of
 those simulated that decide about the file, and of real ones where some are given. All contenders take turns, and the
 shortest time of each counts. On a machine in use by others, `--cpu-time` with one thread counts the process's own time.
+
+    python benchmarks/export.py --transforms
+
+compares ways to transform a plane there and back in onnxruntime: its own operation, and products with matrices.
 """
 
 import argparse
@@ -18,6 +22,9 @@ import torch
 from mwdn import Calibration, Reconstructor
 from mwdn.data.captures import find_captures, read_captures
 from mwdn.export import agreement, export
+from mwdn.fourier import deconvolution_grid, inverse_spectrum, spectrum
+from mwdn.onnx_graph import OnnxGraph
+from mwdn.onnx_program import to_onnx
 
 KINDS = [(".onnx", "float32"), (".onnx", "float16"), (".onnx", "int8"), (".pt2", "float32"), (".pt2", "float16")]
 
@@ -37,7 +44,8 @@ def opened(file, threads):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--psf", type=Path, required=True)
+    parser.add_argument("--transforms", action="store_true", help="compare ways to transform")
+    parser.add_argument("--psf", type=Path)
     parser.add_argument("--captures", type=Path, nargs="*", default=[], help="real ones, of the PSF's size")
     parser.add_argument("--methods", nargs="+", default=["universal-small"])
     parser.add_argument("--kinds", nargs="+", default=KINDS, type=lambda text: tuple(text.split(":")))
@@ -48,6 +56,14 @@ def main():
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     clock = time.process_time if arguments.cpu_time else time.perf_counter
+    if arguments.transforms:
+        transforms(arguments, clock)
+    else:
+        files(arguments, clock)
+
+
+def files(arguments, clock):
+    """A table and a JSON: one row a file, and two of the reconstructor."""
     calibration = Calibration.from_file(arguments.psf)
     captures = read_captures(find_captures(arguments.captures), calibration) if arguments.captures else None
     rows = []
@@ -65,7 +81,7 @@ def main():
 
 
 def measured(method, calibration, captures, arguments, clock):
-    """One row a file, and two of the reconstructor."""
+    """Rows of a method."""
     rows, runs = [], {}
     with tempfile.TemporaryDirectory() as folder:
         for suffix, precision in arguments.kinds:
@@ -81,19 +97,70 @@ def measured(method, calibration, captures, arguments, clock):
             rows.append({"method": method, "file": "mwdn", "precision": precision})
             runs["mwdn", precision] = Reconstructor(network, calibration, device="cpu", precision=precision)
         batch = torch.rand(1, 3, *calibration.size) if captures is None else captures[:1]
-        best = dict.fromkeys(runs, float("inf"))
-        for repeat in range(arguments.repeats + 1):
-            for name, run in runs.items():
-                start = clock()
-                run(batch)
-                if repeat:  # the first round warms up
-                    best[name] = min(best[name], clock() - start)
+        best = shortest(runs, batch, arguments.repeats, clock)
         for row in rows:
             key = row["file"], row["precision"]
             row["s"] = best[key]
             if captures is not None:
                 row["captures_db"] = finite(agreement(runs[key](captures), runs["mwdn", "exact"](captures)))
     return rows
+
+
+def shortest(runs, batch, repeats, clock):
+    """Seconds of each, which take turns."""
+    best = dict.fromkeys(runs, float("inf"))
+    for repeat in range(repeats + 1):
+        for name, run in runs.items():
+            start = clock()
+            run(batch)
+            if repeat:  # the first round warms up
+                best[name] = min(best[name], clock() - start)
+    return best
+
+
+class ThereAndBack(torch.nn.Module):
+    """A plane, continued with zeros to a grid, and back."""
+
+    def __init__(self, size):
+        super().__init__()
+        self.size, self.grid = size, deconvolution_grid(size, "zero")
+
+    def forward(self, measurement):
+        return inverse_spectrum(spectrum(measurement, self.grid), self.grid, self.size)
+
+
+def operation(size, grid, channels):
+    """The same with ONNX's own operation, which takes two axes one after the other."""
+    g = OnnxGraph()
+    whole = g("Pad", "measurement", g.integers([0] * 6 + [grid[0] - size[0], grid[1] - size[1]]))
+    found = g("Unsqueeze", whole, g.integers([4]))
+    for axis, options in ((3, {}), (2, {}), (2, {"inverse": 1}), (3, {"inverse": 1})):
+        found = g("DFT", found, None, axis=axis, **options)
+    found = g("Slice", found, g.integers([0, 0, 0]), g.integers([*size, 1]), g.integers([2, 3, 4]))
+    shape = [1, channels, *size]
+    return g.model(g("Squeeze", found, g.integers([4])), {"measurement": shape, "scene": shape})
+
+
+def transforms(arguments, clock):
+    """A table: milliseconds a plane, and the largest error."""
+    import onnx
+
+    channels = 8
+    print("| picture | grid | DFT / ms | error | products / ms | error | torch / ms |\n| --- " + "| --- " * 6 + "|")
+    with tempfile.TemporaryDirectory() as folder:
+        for size in ((320, 320), (270, 480), (341, 341)):
+            both = ThereAndBack(size)
+            batch = torch.rand(1, channels, *size)
+            models = operation(size, both.grid, channels), to_onnx(torch.export.export(both, (batch,)))
+            runs = {"torch": torch.no_grad()(both)}
+            for name, model in zip(("DFT", "products"), models, strict=True):
+                onnx.save(model, f"{folder}/{name}.onnx")
+                runs[name] = opened(Path(f"{folder}/{name}.onnx"), arguments.threads)
+            best = shortest(runs, batch, arguments.repeats, clock)
+            cells = [f"{a} x {b}" for a, b in (size, both.grid)]
+            for name in ("DFT", "products"):
+                cells += [f"{1e3 * best[name] / channels:.2f}", f"{(runs[name](batch) - batch).abs().max():.0e}"]
+            print(f"| {' | '.join(cells)} | {1e3 * best['torch'] / channels:.2f} |", flush=True)
 
 
 def finite(decibels):

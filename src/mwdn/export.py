@@ -34,8 +34,8 @@ Precision = Literal["float32", "float16", "int8"]
 """How the convolutions of a file compute; Fourier transforms are float32 in all.
 
 - ``float32``: as the network does.
-- ``float16``: half the size; faster where the hardware has such units, which few CPUs have.
-- ``int8``: a quarter of the size, ONNX alone: the range of each layer is found with simulated captures.
+- ``float16``: weights of half the size; faster where the hardware has such units, which few CPUs have.
+- ``int8``: weights of a quarter, ONNX alone: the range of each layer is found with simulated captures.
 """
 
 LEAST: dict[str, float] = {"float32": 80.0, "float16": 50.0, "int8": 30.0}

@@ -38,7 +38,7 @@ def to_onnx(program: ExportedProgram) -> "onnx.ModelProto":
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # torch's own, of how it copies a program
-        module = program.run_decompositions({}).module(check_guards=False)
+        module = program.run_decompositions({}).module()
     found, steps = _divided(module)
     g = OnnxGraph()
     shapes = {}
@@ -66,7 +66,7 @@ def _divided(module: fx.GraphModule) -> tuple[dict[fx.Node, Any], list[fx.Node]]
         elif node.op == "call_function" and all(given in values for given in node.all_input_nodes):
             arguments, options = fx.map_arg((node.args, node.kwargs), values.__getitem__)
             values[node] = node.target(*arguments, **options)
-        elif node.target is not _aten._assert_tensor_metadata.default:
+        elif node.op != "call_module" and node.target is not _aten._assert_tensor_metadata.default:  # only checks
             steps.append(node)
     pairs = {node: Pair(v.real, v.imag) for node, v in values.items() if isinstance(v, Tensor) and v.is_complex()}
     return values | pairs, steps
