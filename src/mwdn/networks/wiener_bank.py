@@ -148,6 +148,6 @@ class WienerBank(nn.Module):
 def _mean_light(picture: Tensor) -> Tensor:
     """The smooth picture, (B, C, H, W), through the means of its blocks."""
     height, width = picture.shape[-2:]
-    means = F.avg_pool2d(picture, BLOCK, ceil_mode=True, count_include_pad=False)
-    whole = [size + -size % BLOCK for size in (height, width)]
-    return F.interpolate(means, size=whole, mode="bilinear")[..., :height, :width]
+    beyond = (0, -width % BLOCK, 0, -height % BLOCK)
+    means = F.avg_pool2d(F.pad(picture, beyond, mode="replicate"), BLOCK)
+    return F.interpolate(means, scale_factor=BLOCK, mode="bilinear")[..., :height, :width]
