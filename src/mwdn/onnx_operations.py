@@ -162,8 +162,10 @@ def _convolution(g: OnnxGraph, node: fx.Node, x: str, *rest: Any) -> str:  # noq
 
 
 def _transposed(g: OnnxGraph, node: fx.Node, x: str, *rest: Any) -> str:  # noqa: ANN401
-    weight, bias, stride, padding = filled(rest, None, None, (1, 1), (0, 0))
-    return g("ConvTranspose", x, weight, bias, strides=stride, pads=[*padding, *padding])
+    defaults = None, None, (1, 1), (0, 0), (0, 0), 1, (1, 1)
+    weight, bias, stride, padding, more, groups, dilation = filled(rest, *defaults)
+    shape = {"strides": stride, "pads": [*padding, *padding], "output_padding": more, "dilations": dilation}
+    return g("ConvTranspose", x, weight, bias, group=groups, **shape)
 
 
 def _pool(operation: str) -> Handler:
