@@ -6,6 +6,7 @@ import re
 import signal
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -319,6 +320,8 @@ def start(folder, out, *launch):
     here = {"PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"}
     here |= {"GLOO_SOCKET_IFNAME": "lo"} if sys.platform == "linux" else {}
     options = {"cwd": folder, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    # A shell lets what it starts in the background ignore the interrupt, and so would this process.
+    options["preexec_fn"] = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     return subprocess.Popen([sys.executable, *launch, *line.split()], env={**os.environ, **here}, **options)
 
 
