@@ -153,7 +153,7 @@ def test_two_processes_end_as_one_in_float64(worked):
     assert states[0].keys() == states[1].keys()
     assert states[0]["network.decoder.head.weight"].dtype == torch.float64
     for key, value in states[0].items():
-        torch.testing.assert_close(states[1][key], value, rtol=1e-6, atol=1e-9, msg=lambda m, k=key: f"{k}: {m}")
+        torch.testing.assert_close(states[1][key], value, rtol=1e-5, atol=1e-8, msg=lambda m, k=key: f"{k}: {m}")
 
 
 def test_both_processes_have_the_course_of_the_first(worked):
