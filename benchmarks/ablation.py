@@ -27,13 +27,13 @@ def parts(psf):
 
     def with_options(*, aligned=True, free=False):
         def reconstruct(measurement):
-            kept, network.align = wiener_bank._mean_light, aligned
+            kept, network.align = wiener_bank.mean_light, aligned
             if free:
-                wiener_bank._mean_light = torch.zeros_like
+                wiener_bank.mean_light = torch.zeros_like
             try:
                 return network(measurement, psf)
             finally:
-                network.align, wiener_bank._mean_light = True, kept
+                network.align, wiener_bank.mean_light = True, kept
 
         return reconstruct
 

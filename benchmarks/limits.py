@@ -16,7 +16,8 @@ from torch.nn import functional as F
 from mwdn import Calibration, convolve, correlate
 from mwdn.data.importers import import_pairs
 from mwdn.data.pairs import PairFile
-from mwdn.evaluation.metrics import Protocol
+from mwdn.evaluation.metrics import Protocol, best_gain, psnr
+from mwdn.networks.wiener_bank import mean_light
 from mwdn.solvers import Pyramid, align
 
 PART = Protocol.parse("60:270,60:440")
@@ -31,31 +32,16 @@ def correlation(a: Tensor, b: Tensor) -> float:
     return float(torch.corrcoef(torch.stack(detail))[0, 1])
 
 
-def fitted(found: Tensor, truth: Tensor) -> Tensor:
-    """Best gain and offset."""
-    columns = torch.stack([found.flatten(), torch.ones(found.numel())], 1).double()
-    return (columns @ torch.linalg.lstsq(columns, truth.flatten().double()[:, None]).solution).float().view_as(truth)
-
-
-def psnr(found: Tensor, truth: Tensor) -> float:
-    return float(-10 * torch.log10((found.clamp(0, 1) - truth).square().mean()))
-
-
 def score(found: Tensor, truths: Tensor) -> float:
-    cut = [PART.crop(x) for x in (found, truths)]
-    return sum(psnr(fitted(a, b), b) for a, b in zip(*cut, strict=True)) / len(truths)
+    found, truths = PART.crop(found), PART.crop(truths)
+    return float(psnr(best_gain(found, truths).clamp(0, 1), truths).mean())
 
 
-def smooth_kept(found: Tensor, truths: Tensor, block: int) -> float:
+def with_true_mean_light(found: Tensor, truths: Tensor, block: int) -> float:
     """The score if the mean light of blocks were the truth's."""
-    total = 0.0
-    for a, b in zip(PART.crop(found), PART.crop(truths), strict=True):
-        a = fitted(a, b)
-        coarse = F.avg_pool2d((b - a)[None], block, ceil_mode=True, count_include_pad=False)
-        whole = [size + -size % block for size in b.shape[-2:]]
-        change = F.interpolate(coarse, size=whole, mode="bilinear")[0, :, : b.shape[-2], : b.shape[-1]]
-        total += psnr(a + change, b)
-    return total / len(truths)
+    found, truths = PART.crop(found), PART.crop(truths)
+    found = best_gain(found, truths)
+    return float(psnr((found + mean_light(truths - found, block)).clamp(0, 1), truths).mean())
 
 
 def refitted(psf: Tensor, scenes: Tensor, measurements: Tensor, weight: float, steps: int = 40) -> Tensor:
@@ -106,12 +92,8 @@ def main() -> None:
         )
         print(f"  pair {held}, PSF fitted anew to the other seven: {before:.2f} before, {after:.2f} after")
 
-    predicted = torch.stack(
-        [
-            torch.stack([fitted(a, b) for a, b in zip(*each, strict=True)])
-            for each in zip(convolve(scenes, psf), measurements, strict=True)
-        ]
-    )
+    each_colour = [x.flatten(0, 1)[:, None] for x in (convolve(scenes, psf), measurements)]
+    predicted = best_gain(*each_colour).view_as(measurements)
     unexplained = blurred(measurements - predicted, 25)
     parts = unexplained.std((1, 2, 3)) / measurements.mean((1, 2, 3))
     print(f"Smooth light that nothing explains: {100 * parts.min():.0f} to {100 * parts.max():.0f} % of the mean")
@@ -129,7 +111,8 @@ def main() -> None:
     print(f"  without what the others share of that light: {score(by_pyramid(without.clamp(min=0)), scenes):.2f} dB")
     print(f"  without their own: {score(by_pyramid((measurements - unexplained).clamp(min=0)), scenes):.2f} dB")
     for block in (64, 32, 16):
-        print(f"  with the true mean light of blocks of {block} pixels: {smooth_kept(found, scenes, block):.2f} dB")
+        reached = with_true_mean_light(found, scenes, block)
+        print(f"  with the true mean light of blocks of {block} pixels: {reached:.2f} dB")
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ TIERS = [
     ("solvers",),
     ("networks",),
     ("data",),
+    ("pictures",),
     ("learning",),
     ("evaluation",),
     ("tiles",),

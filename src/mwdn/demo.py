@@ -1,24 +1,22 @@
 """A synthetic camera, captures through it, and every method that needs no training of yours."""
 
 from dataclasses import replace
-from importlib.resources import files
 from pathlib import Path
 
 import torch
 from rich.console import Console
 from rich.table import Table
-from torch.nn import functional as F
 
 from mwdn.calibration import Calibration
-from mwdn.data.images import read_picture, write_picture
+from mwdn.data.images import write_picture
 from mwdn.data.sheets import contact_sheet, for_people
 from mwdn.data.writing import atomic
 from mwdn.design import design_camera
 from mwdn.evaluation import psnr
 from mwdn.evaluation.tables import html_table
 from mwdn.optics import Camera, Contour, Setup
+from mwdn.pictures import dark_scene
 from mwdn.reconstruct import Reconstructor
-from mwdn.types import Scene
 
 SETUP = Setup(wavelengths=9)
 """The paper's camera, in fewer colours."""
@@ -27,16 +25,6 @@ MASK = Contour(size_mm=(3.0, 2.5), pitch_um=4.0)
 """The part of the paper's mask that its aperture leaves open, of squares twice as large: a second's work."""
 
 METHODS = ("universal", "pyramid", "admm", "fista", "wiener")
-
-
-def scenes() -> dict[str, Scene]:
-    """The pictures that come with the package, each in the middle of a dark scene, by their names."""
-    found = {}
-    for name in ("astronaut", "coffee", "cat"):
-        picture = read_picture(str(files("mwdn") / "pictures" / f"{name}.jpg"))
-        margin = (SETUP.size[0] - picture.shape[-2]) // 2
-        found[name] = F.pad(picture, (margin,) * 4)
-    return found
 
 
 def run(out: Path, seed: int, console: Console) -> None:
@@ -55,7 +43,8 @@ def run(out: Path, seed: int, console: Console) -> None:
     for name in METHODS:
         table.add_column(name, justify="right")
     rows = []
-    for name, scene in scenes().items():
+    for name in ("astronaut", "coffee", "cat"):
+        scene = dark_scene(name, SETUP.size, side=200)
         measurement = camera.simulate(scene, generator=generator)
         results = [reconstruct(measurement) for reconstruct in reconstructors.values()]
         table.add_row(name, *(f"{psnr(result.clamp(0, 1), scene).item():.2f}" for result in results))
@@ -80,7 +69,7 @@ below, its point spread function, computed here from a mask of eight levels by d
 records is the scene convolved with it.</p>
 <img src="psf.png" alt="point spread function" width="320">
 <p>None of the reconstructions below needed any training for this camera: <em>universal</em> is a network that comes
-with the package and has learned from 1,200 random cameras; the others are classical.</p>
+with the package and has learned from 2,000 random cameras; the others are classical.</p>
 <img src="comparison.png" alt="scene, measurement and reconstructions">
 {table}
 </html>

@@ -10,7 +10,6 @@ import shutil
 import tempfile
 import warnings
 from dataclasses import dataclass
-from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal, get_args
@@ -18,15 +17,14 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
-from torch.nn import functional as F
 
 from mwdn.calibration import Calibration
-from mwdn.data.images import read_picture
 from mwdn.data.writing import atomic
 from mwdn.engine import Convolution, fold
 from mwdn.errors import ExportError, ParameterError
 from mwdn.onnx_program import to_onnx
 from mwdn.optics import Camera, Sensor
+from mwdn.pictures import dark_scene
 from mwdn.reconstruct import Method, Reconstructor, find_method
 from mwdn.types import Measurement, Psf, Scene
 
@@ -200,19 +198,11 @@ def simulated(calibration: Calibration, names: tuple[str, ...], channels: int) -
         names: of files in the folder ``pictures``.
         channels: 1 or 3.
     """
-    height, width = calibration.size
-    side = max(1, min(height, width) // 2)
-    scenes = []
-    for name in names:
-        picture = F.interpolate(
-            read_picture(str(files("mwdn") / "pictures" / f"{name}.jpg")), (side, side), mode="area"
-        )
-        picture = picture if channels == 3 else picture.mean(1, keepdim=True)
-        above, left = (height - side) // 2, (width - side) // 2
-        scene = F.pad(picture, (left, width - side - left, above, height - side - above))
-        scenes += [scene, scene.flip(-1)]
-    light = Camera(calibration.psf).forward(torch.cat(scenes))
-    exposure = torch.tensor([0.9, 0.3]).repeat(len(names))[:, None, None, None]
+    side = max(1, min(calibration.size) // 2)
+    scenes = torch.cat([dark_scene(name, calibration.size, side) for name in names])
+    scenes = scenes if channels == 3 else scenes.mean(1, keepdim=True)
+    light = Camera(calibration.psf).forward(torch.cat([scenes, scenes.flip(-1)]))
+    exposure = torch.tensor([0.9, 0.3]).repeat_interleave(len(names))[:, None, None, None]
     light = light * exposure / light.amax((1, 2, 3), keepdim=True)
     return Sensor().expose(light, generator=torch.Generator().manual_seed(0))
 

@@ -124,9 +124,14 @@ LARGEST = 2**26
 """Numbers of a picture that are laid out anew at once."""
 
 
-def in_parts(function: Callable[[Tensor, Tensor], Tensor], image: Tensor, other: Tensor) -> Tensor:
-    """``function(image, other)`` of (B, C, H, W) and (B, 1 or C, ...), of a large picture a few channels at a time."""
-    step = max(1, LARGEST // max(1, image[:, :1].numel()))
+def in_parts(
+    function: Callable[[Tensor, Tensor], Tensor], image: Tensor, other: Tensor, step: int | None = None
+) -> Tensor:
+    """``function(image, other)`` of (B, C, H, W) and (B, 1 or C, ...), ``step`` channels at a time.
+
+    Unless given, these are all, and of a large picture a few.
+    """
+    step = step or max(1, LARGEST // max(1, image[:, :1].numel()))
     if step >= image.shape[1]:
         return function(image, other)
     result = torch.empty_like(image)

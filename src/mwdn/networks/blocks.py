@@ -11,6 +11,7 @@ from torch.nn import functional as F
 from mwdn.errors import ParameterError, ShapeError
 from mwdn.fourier import Boundary, Size, deconvolution_grid, filtered, wiener_transfer
 from mwdn.networks.recomputed import Stages
+from mwdn.planes import in_parts
 from mwdn.types import Image, Measurement, Psf
 
 Pooling = Literal["max", "average"]
@@ -183,12 +184,11 @@ class Wiener(nn.Module):
         grid = deconvolution_grid((features.shape[-2], features.shape[-1]), self.boundary)
         if known.is_complex():
             return filtered(features, known, grid, self.boundary)
-        result = torch.empty_like(features)
-        for first in range(0, known.shape[1], _together(grid)):
-            part = slice(first, first + _together(grid)) if known.shape[1] > 1 else slice(None)
-            transfer = self.transfer(known[:, part])
-            result[:, part] = filtered(features[:, part], transfer, grid, self.boundary)
-        return result
+
+        def few(features: Tensor, psf: Tensor) -> Tensor:
+            return filtered(features, self.transfer(psf), grid, self.boundary)
+
+        return in_parts(few, features, known, _together(grid))
 
 
 def _together(grid: Size) -> int:

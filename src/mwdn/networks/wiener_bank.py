@@ -141,13 +141,13 @@ class WienerBank(nn.Module):
         folded = folded.contiguous(memory_format=torch.channels_last)
         correction = F.pixel_shuffle(self.decoder(self.encoder(folded)), self.fold)[..., :height, :width]
         if self.levels:
-            correction = correction - _mean_light(correction)
+            correction = correction - mean_light(correction)
         return first + unit * correction
 
 
-def _mean_light(picture: Tensor) -> Tensor:
+def mean_light(picture: Tensor, block: int = BLOCK) -> Tensor:
     """The smooth picture, (B, C, H, W), through the means of its blocks."""
     height, width = picture.shape[-2:]
-    beyond = (0, -width % BLOCK, 0, -height % BLOCK)
-    means = F.avg_pool2d(F.pad(picture, beyond, mode="replicate"), BLOCK)
-    return F.interpolate(means, scale_factor=BLOCK, mode="bilinear")[..., :height, :width]
+    beyond = (0, -width % block, 0, -height % block)
+    means = F.avg_pool2d(F.pad(picture, beyond, mode="replicate"), block)
+    return F.interpolate(means, scale_factor=block, mode="bilinear")[..., :height, :width]
