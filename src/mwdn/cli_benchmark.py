@@ -1,5 +1,6 @@
 """`mwdn benchmark`: every method of a recipe, trained and scored alike, on one page."""
 
+import os
 import shlex
 import sys
 from pathlib import Path
@@ -19,7 +20,8 @@ def benchmark(
 ) -> None:
     """Train every method of a recipe alike, score all under one protocol, and write one page.
 
-    Run again, it goes on where it stopped: finished networks and scores stay, an interrupted training goes on.
+    Run again, it goes on where it stopped: finished networks and scores stay, an interrupted training goes on. Run
+    several times at once with one folder, or by torchrun, each process trains other networks.
 
     Args:
         recipe: TOML file, see recipes/benchmark-*.toml. A method or a data set is one line of it.
@@ -31,7 +33,7 @@ def benchmark(
 
     chosen = read_benchmark(recipe)
     columns: list[str | ProgressColumn] = [*Progress.get_default_columns(), "{task.fields[note]}"]
-    with Progress(*columns, console=errors) as bars:
+    with Progress(*columns, console=errors, disable=os.environ.get("RANK", "0") != "0") as bars:
         bar = bars.add_task("Beginning", total=None, note="")
 
         def stage(title: str, parts: int) -> None:

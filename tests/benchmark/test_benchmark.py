@@ -139,6 +139,19 @@ def test_goes_on_where_it_was_killed(folder, monkeypatch):
                 assert swept[label][axis][size] == pytest.approx(numbers, rel=2e-3), (label, axis, size)
 
 
+def test_two_processes_share_the_networks(folder, done):
+    call = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "mwdn"]
+    call += ["benchmark", "r.toml", "--out", "out", "--device", "cpu"]
+    ended = subprocess.run(call, cwd=folder, capture_output=True, text=True, check=False, timeout=300)
+    assert ended.returncode == 0, ended.stderr
+    found, wanted = values(folder / "out")[0], values(done)[0]
+    for label in ("quick", "wiener", "mwdn"):
+        assert found[label]["psnr"] == pytest.approx(wanted[label]["psnr"], rel=2e-3), label
+    for label in ("wiener", "mwdn"):
+        log = (folder / "out" / "runs" / "caustic" / label / "log.jsonl").read_text()
+        assert len(log.splitlines()) == 6, label
+
+
 def test_the_page_says_what_was_found(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     with pytest.raises(SystemExit) as stopped:

@@ -1,7 +1,7 @@
 """What becomes of methods where the camera differs more from its calibration than in training."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,17 +31,15 @@ def noisier(sensor: Sensor, factor: float) -> Sensor:
     return replace(sensor, full_well=sensor.full_well / factor**2, read_noise=sensor.read_noise / factor)
 
 
-def pairs_at(
-    opened: Opened, axis: str, size: float, count: int, *, photographs: Photographs | None = None
-) -> tuple[Tensor, Tensor]:
+def pairs_at(opened: Opened, photographs: Photographs, count: int, axis: str, size: float) -> tuple[Tensor, Tensor]:
     """Test pairs through the data set's camera with more of one mismatch; photographs and places are the same.
 
     Args:
         opened: a simulated data set.
+        photographs: those of the test.
+        count: of pairs.
         axis: of `AXES`.
         size: of the mismatch, beyond what the camera had in training; of the noise, as a multiple.
-        count: of pairs.
-        photographs: those of the test, if they have been read.
 
     Returns:
         measurements and scenes, (count, 3, H, W).
@@ -51,59 +49,47 @@ def pairs_at(
         data = replace(data, sensor=noisier(data.sensor, size))
     else:
         data = replace(data, deviation=data.deviation.plus(axis, size))
-    photographs = photographs or Photographs(data.test_photos)
     source = simulated(data, opened.calibration, photographs, torch.device("cpu"))
     parts = [source.batch([FILE_START + number]) for number in range(count)]
     return torch.cat([part.measurement for part in parts]), torch.cat([part.scene for part in parts])
 
 
 def sweep(
-    methods: Mapping[str, Callable[[], Reconstructor]],
-    identities: Mapping[str, dict[str, Any]],
+    bind: Callable[[], Reconstructor],
+    identity: dict[str, Any],
     opened: Opened,
     wanted: Robustness,
-    folder: Path,
-    *,
-    tell: Callable[[str], None] = lambda text: None,
-) -> dict[str, Sweep]:
-    """PSNR of every method at every size of every axis, each kept as soon as it is known.
+    path: Path,
+    pairs: Callable[[str, float], tuple[Tensor, Tensor]],
+) -> Sweep:
+    """PSNR of a method at every size of every axis, each kept as soon as it is known.
 
     Args:
-        methods: how to bind each, by its label.
-        identities: what the numbers of each depend on.
+        bind: the method.
+        identity: what its numbers depend on.
         opened: a simulated data set.
         wanted: the sizes.
-        folder: for the numbers.
-        tell: told what is being done.
+        path: for the numbers.
+        pairs: of an axis and a size, see `pairs_at`.
     """
-    paths = {label: folder / f"{label}.json" for label in methods}
-    asked = {label: {**identities[label], "count": wanted.count} for label in methods}
-    known = {label: (read_kept(paths[label], asked[label]) or {"psnr": {}})["psnr"] for label in methods}
-    bound: dict[str, Reconstructor] = {}
-    photographs: Photographs | None = None
+    asked = {**identity, "count": wanted.count}
+    known = (read_kept(path, asked) or {"psnr": {}})["psnr"]
+    bound: Reconstructor | None = None
     for axis, sizes in wanted.sizes.items():
         for size in sizes:
-            # At its beginning every axis is the camera of the training.
-            place, key = ("none", "0") if size == AXES[axis] else (axis, repr(size))
-            missing = [label for label in methods if key not in known[label].get(place, {})]
-            if not missing:
+            place, key = _place(axis, size)
+            if key in known.get(place, {}):
                 continue
-            tell(f"robustness: {axis} {size:g}")
-            photographs = photographs or Photographs(opened.data.test_photos)
-            measurements, scenes = pairs_at(opened, axis, size, wanted.count, photographs=photographs)
-            for label in missing:
-                bound[label] = bound.get(label) or methods[label]()
-                found = [bound[label](one[None]) for one in measurements]
-                values = measure(torch.cat(found), scenes, opened.data.part())["psnr"]
-                known[label].setdefault(place, {})[key] = values.tolist()
-                with atomic(paths[label]) as temporary:
-                    content = {"identity": asked[label], "psnr": known[label]}
-                    temporary.write_text(json.dumps(content, indent=1), encoding="utf-8")
-    return {label: _sorted(found, wanted) for label, found in known.items()}
+            bound = bound or bind()
+            measurements, scenes = pairs(axis, size)
+            found = torch.cat([bound(one[None]) for one in measurements])
+            known.setdefault(place, {})[key] = measure(found, scenes, opened.data.part())["psnr"].tolist()
+            with atomic(path) as temporary:
+                temporary.write_text(json.dumps({"identity": asked, "psnr": known}, indent=1), encoding="utf-8")
+    places = {axis: {size: _place(axis, size) for size in sizes} for axis, sizes in wanted.sizes.items()}
+    return {axis: {size: known[at][key] for size, (at, key) in found.items()} for axis, found in places.items()}
 
 
-def _sorted(found: dict[str, dict[str, list[float]]], wanted: Robustness) -> Sweep:
-    return {
-        axis: {size: found["none"]["0"] if size == AXES[axis] else found[axis][repr(size)] for size in sizes}
-        for axis, sizes in wanted.sizes.items()
-    }
+def _place(axis: str, size: float) -> tuple[str, str]:
+    """Where a size is kept: at its beginning every axis is the camera of the training."""
+    return ("none", "0") if size == AXES[axis] else (axis, repr(size))

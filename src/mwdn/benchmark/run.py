@@ -7,21 +7,24 @@ from functools import cache, partial
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from mwdn.benchmark.compose import sections
 from mwdn.benchmark.exports import csv_text, json_content
 from mwdn.benchmark.found import Found
 from mwdn.benchmark.pages import write_html, write_markdown
 from mwdn.benchmark.recipe import Benchmark, Method
-from mwdn.benchmark.robustness import Sweep, sweep
+from mwdn.benchmark.robustness import Sweep, pairs_at, sweep
 from mwdn.benchmark.scoring import Scored, bind, identity, score
 from mwdn.benchmark.sets import Opened, open_set
+from mwdn.benchmark.sharing import held, shared
 from mwdn.benchmark.training import train
+from mwdn.data.photographs import Photographs
 from mwdn.data.writing import atomic
 from mwdn.errors import ParameterError
 from mwdn.evaluation import Perceptual
 from mwdn.learning.alexnet import SMALLEST
-from mwdn.learning.devices import usable
+from mwdn.learning.distributed import device_here
 from mwdn.learning.train import Report
 
 PAGE = "index.html"
@@ -53,7 +56,7 @@ def run(
     """Make data, train, score, sweep, and write the page.
 
     What is finished stays: files of pairs, trained networks, scores. A network whose training was interrupted goes on
-    from its last saved state.
+    from its last saved state. Several processes with one ``out`` share the networks, see `mwdn.benchmark.sharing`.
 
     Args:
         benchmark: the recipe.
@@ -66,17 +69,16 @@ def run(
     Raises:
         MwdnError: a file cannot be read, a method does not fit, training diverges, or ``out`` holds another benchmark.
     """
-    place = usable(device)
-    opened = {n: open_set(n, data, out / "data", place, watch.track) for n, data in benchmark.data.items()}
-    runs = {name: each for name, each in opened.items() if each.training is not None}
-    for name, each in runs.items():
-        for method in (m for m in benchmark.methods if m.learned):
-            watch.stage(f"{name}: training {method.label}", benchmark.schedule.steps)
-            train(method, each, benchmark, out / "runs" / name / method.label, device=place, show=partial(_told, watch))
-    scored = _score_all(benchmark, opened, out, place, watch)
+    place = device_here(device)
+    with held(out, "data"):
+        opened = {n: open_set(n, data, out / "data", place, watch.track) for n, data in benchmark.data.items()}
+    _train_all(benchmark, opened, out, place, watch)
+    with held(out, "scores"):  # by one process, while the others wait: times are measured
+        scored = _score_all(benchmark, opened, out, place, watch)
     sweeps = _sweep(benchmark, opened, out, place, watch)
     found = Found(benchmark, opened, scored, sweeps, out / "runs", place, command)
-    write(found, out)
+    with held(out, "page"):
+        write(found, out)
     return found
 
 
@@ -97,6 +99,21 @@ def write(found: Found, out: Path) -> None:
                 temporary.write_text(text, encoding="utf-8")
     except OSError as error:
         raise ParameterError(f"`{out}` must be a folder that can be written to: {error.strerror}.") from error
+
+
+def _train_all(benchmark: Benchmark, opened: dict[str, Opened], out: Path, place: torch.device, watch: Watch) -> None:
+    runs = {
+        f"{name}-{method.label}": (name, method)
+        for name, each in opened.items()
+        if each.training is not None
+        for method in benchmark.methods
+        if method.learned
+    }
+    for part in shared(out, list(runs)):
+        name, method = runs[part]
+        watch.stage(f"{name}: training {method.label}", benchmark.schedule.steps)
+        folder = out / "runs" / name / method.label
+        train(method, opened[name], benchmark, folder, device=place, show=partial(_told, watch))
 
 
 def _told(watch: Watch, report: Report) -> None:
@@ -148,9 +165,24 @@ def _sweep(
     wanted = benchmark.robustness
     if not (wanted.data and wanted.sizes):
         return {}
-    each = opened[wanted.data]
-    paths = {method.label: _checkpoint(method, each, out) for method in benchmark.methods}
-    methods = {m.label: partial(bind, m, paths[m.label], each, place) for m in benchmark.methods}
-    identities = {m.label: identity(m, paths[m.label], each) for m in benchmark.methods}
-    folder = out / "robustness" / wanted.data
-    return sweep(methods, identities, each, wanted, folder, tell=lambda text: watch.stage(text, 0))
+    each, methods, sweeps = opened[wanted.data], {m.label: m for m in benchmark.methods}, {}
+    photographs = Photographs(each.data.test_photos)
+
+    @cache
+    def pairs(axis: str, size: float) -> tuple[Tensor, Tensor]:
+        watch.stage(f"{wanted.data}: pairs, {axis} {size:g}", 0)
+        return pairs_at(each, photographs, wanted.count, axis, size)
+
+    for part in shared(out, [f"robustness-{label}" for label in methods]):
+        label = part.removeprefix("robustness-")
+        watch.stage(f"{wanted.data}: robustness of {label}", 0)
+        checkpoint = _checkpoint(methods[label], each, out)
+        sweeps[label] = sweep(
+            partial(bind, methods[label], checkpoint, each, place),
+            identity(methods[label], checkpoint, each),
+            each,
+            wanted,
+            out / "robustness" / wanted.data / f"{label}.json",
+            pairs,
+        )
+    return {label: sweeps[label] for label in methods}

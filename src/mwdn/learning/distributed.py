@@ -27,6 +27,11 @@ PSF_ENCODER = "psf_encoder"
 """Child of a network that sees the PSF alone, which all processes have whole."""
 
 
+def started() -> int:
+    """Number of processes that torchrun started, whether they have joined or not."""
+    return int(os.environ.get("WORLD_SIZE", "1"))
+
+
 def _joined() -> bool:
     return dist.is_available() and dist.is_initialized()
 
@@ -48,7 +53,7 @@ def processes() -> Iterator[None]:
     Raises:
         ProcessError: they cannot be reached.
     """
-    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+    if started() == 1:
         yield
         return
     _end_with_parent()
@@ -78,7 +83,7 @@ def _leave(status: int = 0) -> None:
 
 def end_with(status: int) -> None:
     """Exit status of this process, where several have parted."""
-    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+    if started() > 1:
         atexit.register(_leave, status)  # before the one above: the last one registered comes first
 
 
@@ -97,11 +102,11 @@ def device_here(device: str | torch.device | None = None) -> torch.device:
     Raises:
         ParameterError: torch cannot use it, or it names one GPU for several processes.
     """
-    if world() == 1:
+    if started() == 1:
         return usable(device)
     name = str(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     if name.startswith("cuda:"):
-        raise ParameterError(f"`device` ({name}) must be `cuda`: each of {world()} processes takes a GPU of its own.")
+        raise ParameterError(f"`device` ({name}) must be `cuda`: each of {started()} processes takes a GPU of its own.")
     # Asked for by its number at once: a first tensor on `cuda` would take memory of the first GPU.
     found = usable(f"cuda:{os.environ['LOCAL_RANK']}" if name == "cuda" else name)
     if found.type == "cuda":
