@@ -103,7 +103,7 @@ def write(found: Found, out: Path) -> None:
 
 def _train_all(benchmark: Benchmark, opened: dict[str, Opened], out: Path, place: torch.device, watch: Watch) -> None:
     runs = {
-        f"{name}-{method.label}": (name, method)
+        f"runs/{name}/{method.label}": (name, method)
         for name, each in opened.items()
         if each.training is not None
         for method in benchmark.methods
@@ -112,8 +112,7 @@ def _train_all(benchmark: Benchmark, opened: dict[str, Opened], out: Path, place
     for part in shared(out, list(runs)):
         name, method = runs[part]
         watch.stage(f"{name}: training {method.label}", benchmark.schedule.steps)
-        folder = out / "runs" / name / method.label
-        train(method, opened[name], benchmark, folder, device=place, show=partial(_told, watch))
+        train(method, opened[name], benchmark, out / part, device=place, show=partial(_told, watch))
 
 
 def _told(watch: Watch, report: Report) -> None:
@@ -166,15 +165,19 @@ def _sweep(
     if not (wanted.data and wanted.sizes):
         return {}
     each, methods, sweeps = opened[wanted.data], {m.label: m for m in benchmark.methods}, {}
-    photographs = Photographs(each.data.test_photos)
+
+    @cache
+    def photographs() -> Photographs:  # read once, and only if a number is missing
+        return Photographs(each.data.test_photos)
 
     @cache
     def pairs(axis: str, size: float) -> tuple[Tensor, Tensor]:
         watch.stage(f"{wanted.data}: pairs, {axis} {size:g}", 0)
-        return pairs_at(each, photographs, wanted.count, axis, size)
+        return pairs_at(each, photographs(), wanted.count, axis, size)
 
-    for part in shared(out, [f"robustness-{label}" for label in methods]):
-        label = part.removeprefix("robustness-")
+    parts = {f"robustness/{wanted.data}/{label}": label for label in methods}
+    for part in shared(out, list(parts)):
+        label = parts[part]
         watch.stage(f"{wanted.data}: robustness of {label}", 0)
         checkpoint = _checkpoint(methods[label], each, out)
         sweeps[label] = sweep(
@@ -182,7 +185,7 @@ def _sweep(
             identity(methods[label], checkpoint, each),
             each,
             wanted,
-            out / "robustness" / wanted.data / f"{label}.json",
+            out / f"{part}.json",
             pairs,
         )
     return {label: sweeps[label] for label in methods}

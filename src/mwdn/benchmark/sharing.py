@@ -14,7 +14,7 @@ from mwdn.errors import ParameterError
 
 
 def held(folder: Path, part: str) -> FileLock:
-    """The lock of a part: a context in which no other process is at it.
+    """The lock of a part, which may be a path: a context in which no other process is at it.
 
     Raises:
         ParameterError: the folder cannot be written to.

@@ -241,7 +241,8 @@ def _solve(measurement: Tensor, band: Band, coarser: Tensor, caution: Tensor, fi
     known = F.interpolate(coarser, size=band.grid, mode="bilinear").clamp(min=0) * band.norm
     level = band.level
     mu, tau = level.smoothing(caution)
+    tau = fineness * tau
     state = start(problem, known.expand(*measurement.shape[:2], *band.grid), smooth=level.regularisation > 0)
     for _ in range(level.iterations):
-        state = merge(state, split(state, problem, mu, fineness * tau, "colour"), problem, mu)
+        state = merge(state, split(state, problem, mu, tau, "colour"), problem, mu)
     return state.v / band.norm
