@@ -472,12 +472,19 @@ def test_unknown_boundary_is_refused():
 
 
 @pytest.mark.parametrize("boundary", ["circular", "zero", "replicate", "taper"])
-@pytest.mark.parametrize(("psf_batch", "psf_channels"), [(1, 1), (1, 3), (2, 1), (2, 3)])
-def test_gradients_of_filtered_are_those_of_its_definition(boundary, psf_batch, psf_channels, generator):
-    """Its backward pass is written by hand; torch derives that of transform, product, transform."""
-    grid = fourier.deconvolution_grid((21, 26), boundary)
-    image = torch.rand(2, 3, 21, 26, generator=generator)
-    psf = torch.rand(psf_batch, psf_channels, 21, 26, generator=generator)
+@pytest.mark.parametrize(
+    ("psf_batch", "psf_channels", "channels"),
+    [(1, 1, 3), (1, 3, 3), (2, 1, 3), (2, 3, 3), (1, 1, 4), (2, 1, 4), (2, 4, 4)],
+)
+@pytest.mark.parametrize("width", [25, 26])
+def test_filtered_and_its_gradients_are_those_of_its_definition(
+    boundary, psf_batch, psf_channels, channels, width, generator
+):
+    """Its passes are written by hand, of an even number of channels two at a time; torch derives those of
+    transform, product, transform."""
+    grid = fourier.deconvolution_grid((21, width), boundary)
+    image = torch.rand(2, channels, 21, width, generator=generator)
+    psf = torch.rand(psf_batch, psf_channels, 21, width, generator=generator)
     slope = torch.randn(image.shape, generator=generator)
     found = []
     for defined in (True, False):
@@ -485,7 +492,7 @@ def test_gradients_of_filtered_are_those_of_its_definition(boundary, psf_batch, 
         transfer = fourier.wiener_transfer(h, 0.1, grid)
         if defined:
             spread = fourier.spectrum(fourier.extend(x, grid, boundary), grid)
-            y = fourier.inverse_spectrum(transfer * spread, grid, (21, 26))
+            y = fourier.inverse_spectrum(transfer * spread, grid, (21, width))
         else:
             y = fourier.filtered(x, transfer, grid, boundary)
         y.backward(slope)

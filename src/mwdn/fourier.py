@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from mwdn.errors import ParameterError, ShapeError
 from mwdn.planes import Boundary as Boundary
-from mwdn.planes import Continuation, in_parts, laid_out_as, planar, together
+from mwdn.planes import Continuation, in_parts, laid_out_as, paired, planar, together, unpaired
 from mwdn.planes import Size as Size
 from mwdn.planes import extend as extend
 from mwdn.types import Image, Measurement, Psf, Scene, Spectrum
@@ -291,6 +291,8 @@ class _Filter(torch.autograd.Function):
 
 
 def _filtered(image: Tensor, transfer: Tensor, grid: Size, boundary: Boundary) -> Tensor:
+    if transfer.shape[1] == 1 and image.shape[1] % 2 == 0:
+        return _filtered_pairs(image, transfer, grid, boundary)
     planes, size = planar(image), (image.shape[-2], image.shape[-1])
     result = torch.empty_like(planes)
     continued = Continuation(size, grid, boundary, planes)
@@ -298,6 +300,28 @@ def _filtered(image: Tensor, transfer: Tensor, grid: Size, boundary: Boundary) -
         V = torch.fft.rfft2(continued(planes[part])).mul_(_of(transfer, part))
         result[part] = inverse_spectrum(V, grid, size)
     return laid_out_as(image, result)
+
+
+def _filtered_pairs(image: Tensor, transfer: Tensor, grid: Size, boundary: Boundary) -> Tensor:
+    """What one filter with a real kernel does to two channels, it does to both at once as a complex plane.
+
+    A complex transform of two axes is one call of MKL, there and back; back to real numbers it takes several, with
+    copies between them.
+    """
+    pairs, (height, width) = paired(image), (image.shape[-2], image.shape[-1])
+    result = torch.empty(pairs.shape, dtype=image.dtype, device=image.device)
+    continued = Continuation((height, width), grid, boundary, image)
+    whole = _whole(transfer, grid[1])
+    for part in together(pairs, grid):
+        V = torch.fft.fft2(continued(pairs[part])).mul_(_of(whole, part))
+        result[part] = torch.view_as_real(torch.fft.ifft2(V)[..., :height, :width])
+    return unpaired(result, image)
+
+
+def _whole(half: Spectrum, width: int) -> Tensor:
+    """The spectrum of a real picture of this width, from its half."""
+    mirrored = half[..., 1 : (width + 1) // 2].flip((-2, -1)).roll(1, -2).conj()
+    return torch.cat([half, mirrored], dim=-1)
 
 
 def _of(transfer: Tensor, part: tuple[slice, slice]) -> Tensor:
