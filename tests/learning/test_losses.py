@@ -1,5 +1,7 @@
 """Distances against other people's code and published numbers; gradients; the weighted sum."""
 
+import math
+
 import cv2
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 from mwdn.errors import CheckpointError, ParameterError, ShapeError, UnknownNameError
 from mwdn.learning import alexnet, losses
 from mwdn.learning.alexnet import AlexNet, Heads, load_alexnet, load_heads
-from mwdn.learning.losses import NAMES, Loss, feature_mse, l1, lpips, mse, ssim
+from mwdn.learning.losses import NAMES, Loss, feature_mse, l1, log_mse, lpips, mse, ssim
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +31,7 @@ def distances(networks):
     return {
         "mse": mse,
         "l1": l1,
+        "log_mse": log_mse,
         "ssim": ssim,
         "feature_mse": lambda x, y: feature_mse(x, y, networks[0]),
         "lpips": lambda x, y: lpips(x, y, *networks),
@@ -64,9 +67,10 @@ def test_ssim_is_that_of_scikit_image_and_torchmetrics(pair, channels):
     torch.testing.assert_close(found, windows[..., 5:-5, 5:-5].mean((1, 2, 3)), atol=2e-5, rtol=0)
 
 
-def test_mse_and_l1_by_hand():
+def test_mse_its_logarithm_and_l1_by_hand():
     image = torch.stack([torch.zeros(1, 2, 2), torch.tensor([[[0.0, 1], [2, 1]]])])
     assert mse(image, torch.ones_like(image)).tolist() == [1, 0.5]
+    assert log_mse(image, torch.ones_like(image)).tolist() == pytest.approx([0, math.log10(0.5)])
     assert l1(image, torch.ones_like(image)).tolist() == [1, 0.5]
 
 
@@ -100,7 +104,8 @@ def test_one_number_a_sample_whatever_the_batch(name, distances, pair):
 @pytest.mark.parametrize("name", NAMES)
 def test_identical_pictures_are_at_no_distance(name, distances, pair):
     same = distances[name](pair[0], pair[0])
-    torch.testing.assert_close(same, torch.full((2,), 1.0 if name == "ssim" else 0.0), atol=1e-6, rtol=0)
+    least = {"ssim": 1.0, "log_mse": -8.0}.get(name, 0.0)
+    torch.testing.assert_close(same, torch.full((2,), least), atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -124,7 +129,7 @@ def test_lpips_has_a_finite_gradient_where_no_feature_responds(pair, networks):
     assert image.grad.isfinite().all()
 
 
-@pytest.mark.parametrize("name", ["mse", "l1", "ssim"])
+@pytest.mark.parametrize("name", ["mse", "log_mse", "l1", "ssim"])
 def test_gradients_agree_with_differences(name, distances, generator):
     x, y, step = (torch.rand(1, 1, 12, 12, generator=generator) for _ in range(3))
     (slope,) = torch.autograd.grad(distances[name](x.requires_grad_(), y).sum(), x)

@@ -71,6 +71,28 @@ def l1(image: Image, reference: Image) -> Tensor:
     return (image - reference).abs().mean((1, 2, 3))
 
 
+@_comparing
+def log_mse(image: Image, reference: Image) -> Tensor:
+    """Logarithm to base 10 of each sample's mean squared error: minus a tenth of its PSNR in dB.
+
+    `mse` is decided by the samples that are spoiled most; here a decibel counts the same in each.
+
+    Args:
+        image: (B, C, H, W), any range.
+        reference: of the same shape.
+
+    Returns:
+        (B,), -8 for identical pictures.
+
+    Raises:
+        ShapeError: the shapes differ.
+
+    References:
+        L. Chen et al., "Simple baselines for image restoration", ECCV (2022), whose networks learn from PSNR.
+    """
+    return mse(image, reference).clamp(min=1e-8).log10()
+
+
 WINDOW = 11
 """Pixels along each side of the window of `ssim`."""
 
@@ -182,7 +204,7 @@ def _unit(features: Tensor) -> Tensor:
     return features / (torch.linalg.vector_norm(features, dim=1, keepdim=True) + 1e-10)
 
 
-NAMES = ("feature_mse", "l1", "lpips", "mse", "ssim")
+NAMES = ("feature_mse", "l1", "log_mse", "lpips", "mse", "ssim")
 """What a `Loss` can be made of."""
 
 
@@ -240,7 +262,7 @@ class Loss(nn.Module):
             return feature_mse(image, reference, self.alexnet)
         if name == "lpips" and self.alexnet is not None and self.heads is not None:
             return lpips(image, reference, self.alexnet, self.heads)
-        return {"mse": mse, "l1": l1}[name](image, reference)
+        return {"mse": mse, "l1": l1, "log_mse": log_mse}[name](image, reference)
 
 
 def checked_weights(weights: Mapping[str, Any]) -> dict[str, float]:
