@@ -32,10 +32,11 @@ import torch
 
 import arithmetic
 from mwdn import Calibration, Reconstructor
-from mwdn.fourier import extend, inverse_spectrum, spectrum
+from mwdn.fourier import inverse_spectrum, spectrum
 from mwdn.learning.bundled import BUNDLED
 from mwdn.networks import NETWORKS, blocks, build
 from mwdn.optics.patterns import contour_psf
+from mwdn.planes import extend
 from mwdn.reconstruct import find_method
 from mwdn.solvers import SOLVERS
 

@@ -21,8 +21,9 @@ import torch
 
 from mwdn import Calibration, Reconstructor
 from mwdn.data.captures import find_captures, read_captures
+from mwdn.deconvolution import deconvolution_grid
 from mwdn.export import agreement, export
-from mwdn.fourier import deconvolution_grid, inverse_spectrum, spectrum
+from mwdn.fourier import inverse_spectrum, spectrum
 from mwdn.onnx_graph import OnnxGraph
 from mwdn.onnx_program import to_onnx
 

@@ -18,6 +18,7 @@ TIERS = [
     ("errors", "types", "streams"),
     ("planes",),
     ("fourier", "dft"),
+    ("deconvolution",),
     ("data.formats", "data.writing", "data.images"),
     ("optics",),
     ("calibration",),
@@ -53,7 +54,7 @@ TIERS = [
 ]
 RANK = {name: rank for rank, names in enumerate(TIERS) for name in names}
 
-NETWORKS_MAY_IMPORT = {"errors", "types", "planes", "fourier", "solvers", "networks"}
+NETWORKS_MAY_IMPORT = {"errors", "types", "planes", "fourier", "deconvolution", "solvers", "networks"}
 HEAVY = ["cv2", "h5py", "starlette", "matplotlib", "tifffile", "cyclopts", "skimage", "scipy"]
 
 

@@ -15,10 +15,10 @@ from mwdn import Calibration, Reconstructor, for_people, read_frame
 from mwdn import export as exporting
 from mwdn.cli import main
 from mwdn.data.images import srgb_encode
+from mwdn.deconvolution import deconvolution_grid, filtered, wiener_transfer
 from mwdn.dft import column_matrices, inverse_row_matrix, row_matrix
 from mwdn.errors import ExportError, ParameterError
 from mwdn.export import LEAST, agreement, export, read_about, run_file, simulated
-from mwdn.fourier import deconvolution_grid, filtered, wiener_transfer
 from mwdn.networks import NETWORKS, build
 from mwdn.optics.patterns import contour_psf
 from mwdn.solvers import SOLVERS

@@ -10,10 +10,10 @@ from scipy.signal import convolve2d, fftconvolve
 from skimage import restoration
 
 import oracles
-from mwdn import fourier
+from mwdn import deconvolution, fourier, planes
 from mwdn.errors import MwdnError, ParameterError, ShapeError
 
-BOUNDARIES = get_args(fourier.Boundary)
+BOUNDARIES = get_args(planes.Boundary)
 
 # (scene, PSF, sensor): one pixel, odd, even, prime, not square; PSF and sensor smaller and larger than scene.
 SIZES = [
@@ -224,7 +224,7 @@ def test_psf_broadcasts_over_batch_and_channels(operation, batch, channels, gene
 def test_wiener_broadcasts_over_batch_and_channels(batch, channels, generator):
     b, h = noise((2, 3, 8, 9), generator), noise((batch, channels, 5, 6), generator)
     k = torch.rand(2, 3, 1, 1, generator=generator) + 0.1
-    found = fourier.wiener(b, h, k)
+    found = deconvolution.wiener(b, h, k)
     for i in range(2):
         for c in range(3):
             own = h[i % batch, c % channels].double()
@@ -234,7 +234,7 @@ def test_wiener_broadcasts_over_batch_and_channels(batch, channels, generator):
 OPERATIONS = {
     "convolve": fourier.convolve,
     "correlate": fourier.correlate,
-    "wiener": lambda b, h: fourier.wiener(b, h, 0.1),
+    "wiener": lambda b, h: deconvolution.wiener(b, h, 0.1),
 }
 
 
@@ -281,7 +281,7 @@ def test_gradients_of_wiener_are_finite_differences(boundary, generator):
     h = torch.rand(1, 1, 3, 4, generator=generator).requires_grad_()
     k = torch.tensor(0.3, requires_grad=True)
     y = noise((1, 1, 4, 5), generator)
-    (fourier.wiener(b, h, k, boundary=boundary) * y).sum().backward()
+    (deconvolution.wiener(b, h, k, boundary=boundary) * y).sum().backward()
     values = [t.detach().double().reshape(t.shape[-2:]).numpy() for t in (b, h, k)]
     for which, variable in enumerate((b, h, k)):
         expected = np.zeros(variable.shape[-2:])
@@ -302,7 +302,7 @@ def test_noise_free_wiener_inverts(size, generator):
     h = 0.25 * h / h.sum((-2, -1), keepdim=True)
     h[..., size[0] // 2, size[1] // 2] += 0.75
     b = fourier.convolve(v, h, circular=True)
-    close(fourier.wiener(b, h, 1e-6, boundary="circular"), v, 2e-5)
+    close(deconvolution.wiener(b, h, 1e-6, boundary="circular"), v, 2e-5)
 
 
 @pytest.mark.parametrize("boundary", BOUNDARIES)
@@ -319,7 +319,7 @@ def test_noise_free_wiener_inverts(size, generator):
 )
 def test_wiener_is_equation_2(size, psf, boundary, generator):
     b, h = noise((1, 1, *size), generator), noise((1, 1, *psf), generator)
-    found = fourier.wiener(b, h, 0.05, boundary=boundary)
+    found = deconvolution.wiener(b, h, 0.05, boundary=boundary)
     close(found[0, 0], oracles.wiener(b[0, 0], h[0, 0], 0.05, boundary), 2e-5)
 
 
@@ -331,26 +331,26 @@ def test_wiener_is_scikit_images_with_a_flat_prior(size, psf, generator):
     theirs = restoration.wiener(
         b[0, 0].double().numpy(), h[0, 0].double().numpy(), 0.02, reg=np.ones((1, 1)), clip=False
     )
-    close(fourier.wiener(b, h, 0.02, boundary="circular")[0, 0], theirs, 1e-5)
+    close(deconvolution.wiener(b, h, 0.02, boundary="circular")[0, 0], theirs, 1e-5)
 
 
 def test_more_regularisation_dims_the_estimate(generator):
     b, h = torch.rand(1, 1, 16, 16, generator=generator), torch.rand(1, 1, 16, 16, generator=generator)
-    energies = [fourier.wiener(b, h / h.sum(), k).norm().item() for k in (1e-4, 1e-3, 1e-2, 1e-1, 1.0)]
+    energies = [deconvolution.wiener(b, h / h.sum(), k).norm().item() for k in (1e-4, 1e-3, 1e-2, 1e-1, 1.0)]
     assert energies == sorted(energies, reverse=True)
 
 
 def test_weight_in_the_psf_is_the_papers_w(generator):
     """w conj(H) B / (|w H|^2 + lambda), with w = 3, is 1/3 of the filter without w at lambda / 9."""
     b, h = noise((1, 1, 9, 8), generator), noise((1, 1, 9, 8), generator)
-    close(fourier.wiener(b, 3 * h, 0.9), fourier.wiener(b, h, 0.1) / 3, 1e-5)
+    close(deconvolution.wiener(b, 3 * h, 0.9), deconvolution.wiener(b, h, 0.1) / 3, 1e-5)
 
 
 @pytest.mark.parametrize("boundary", BOUNDARIES)
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (2, 2), (17, 6), (33, 47)])
 def test_every_boundary_keeps_the_size(size, boundary, generator):
     b, h = torch.rand(2, 3, *size, generator=generator), torch.rand(1, 1, *size, generator=generator)
-    found = fourier.wiener(b, h, 1e-3, boundary=boundary)
+    found = deconvolution.wiener(b, h, 1e-3, boundary=boundary)
     assert found.shape == b.shape
     assert found.isfinite().all()
 
@@ -361,7 +361,7 @@ def test_constant_measurement_gives_a_constant_over_the_sum_of_the_psf(size, psf
     """Only frequency zero is there, so V = S B / (S^2 + lambda) exactly."""
     h = torch.rand(1, 1, *psf, generator=generator)
     S = h.sum().item()
-    found = fourier.wiener(torch.full((1, 1, *size), 0.7), h, 1e-4, boundary=boundary)
+    found = deconvolution.wiener(torch.full((1, 1, *size), 0.7), h, 1e-4, boundary=boundary)
     close(found, np.full((1, 1, *size), 0.7 * S / (S**2 + 1e-4)), 2e-5)
 
 
@@ -372,7 +372,7 @@ def test_constant_measurement_gives_a_constant_over_the_sum_of_the_psf(size, psf
 )
 def test_extend_is_numpys_edge_padding(size, grid, boundary, generator):
     picture = noise((2, 3, *size), generator)
-    found = fourier.extend(picture, grid, boundary)
+    found = planes.extend(picture, grid, boundary)
     assert torch.equal(found[..., : size[0], : size[1]], picture)
     for b in range(2):
         for c in range(3):
@@ -385,8 +385,8 @@ def test_extended_picture_is_continuous_at_both_borders(size, boundary):
     """Of a smooth picture, no step on the periodic grid may be much larger than the steps inside it."""
     rows, columns = torch.linspace(0, 1, size[0])[:, None], torch.linspace(0, 1, size[1])
     picture = (0.2 + 0.5 * rows + 0.3 * columns)[None, None]
-    grid = fourier.deconvolution_grid(size, boundary)
-    wide = fourier.extend(picture, grid, boundary)[0, 0]
+    grid = deconvolution.deconvolution_grid(size, boundary)
+    wide = planes.extend(picture, grid, boundary)[0, 0]
     height, width = size
     # The taper falls by at most pi/2 / (padding / 2) a pixel, and by the square of that next to the border.
     near = {"replicate": 0.0, "taper": 0.05}[boundary]
@@ -422,7 +422,7 @@ def test_letter_is_found_again_upright_and_in_place(boundary, generator):
     scene = letter_f()
     h = torch.rand(1, 1, 32, 32, generator=generator) ** 8
     b = fourier.convolve(scene, h / h.sum(), circular=boundary == "circular")
-    found = fourier.wiener(b, h / h.sum(), 1e-3, boundary=boundary)[0, 0].double().numpy()
+    found = deconvolution.wiener(b, h / h.sum(), 1e-3, boundary=boundary)[0, 0].double().numpy()
     found = found - found.mean()
     best = {}
     for turn in TURNS:
@@ -456,19 +456,19 @@ def test_psf_larger_than_the_grid_is_refused():
     with pytest.raises(ShapeError, match=message):
         fourier.convolve(torch.ones(1, 1, 8, 8), torch.ones(1, 1, 9, 4), circular=True)
     with pytest.raises(ShapeError, match=message):
-        fourier.wiener(torch.ones(1, 1, 8, 8), torch.ones(1, 1, 9, 4), 0.1, boundary="circular")
+        deconvolution.wiener(torch.ones(1, 1, 8, 8), torch.ones(1, 1, 9, 4), 0.1, boundary="circular")
 
 
 @pytest.mark.parametrize("value", [0.0, -1e-3, float("nan")])
 def test_regularisation_must_be_positive(value):
     with pytest.raises(ParameterError, match=r"`regularisation` \(.*\) must be positive"):
-        fourier.wiener(torch.ones(1, 1, 8, 8), torch.ones(1, 1, 8, 8), value)
+        deconvolution.wiener(torch.ones(1, 1, 8, 8), torch.ones(1, 1, 8, 8), value)
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_unknown_boundary_is_refused():
     with pytest.raises(ParameterError, match="`boundary` must be circular, zero, replicate or taper, not 'mirror'"):
-        fourier.wiener(torch.ones(1, 1, 8, 8), torch.ones(1, 1, 8, 8), 0.1, boundary="mirror")
+        deconvolution.wiener(torch.ones(1, 1, 8, 8), torch.ones(1, 1, 8, 8), 0.1, boundary="mirror")
 
 
 @pytest.mark.parametrize("boundary", ["circular", "zero", "replicate", "taper"])
@@ -482,19 +482,19 @@ def test_filtered_and_its_gradients_are_those_of_its_definition(
 ):
     """Its passes are written by hand, of an even number of channels two at a time; torch derives those of
     transform, product, transform."""
-    grid = fourier.deconvolution_grid((21, width), boundary)
+    grid = deconvolution.deconvolution_grid((21, width), boundary)
     image = torch.rand(2, channels, 21, width, generator=generator)
     psf = torch.rand(psf_batch, psf_channels, 21, width, generator=generator)
     slope = torch.randn(image.shape, generator=generator)
     found = []
     for defined in (True, False):
         x, h = image.clone().requires_grad_(), psf.clone().requires_grad_()
-        transfer = fourier.wiener_transfer(h, 0.1, grid)
+        transfer = deconvolution.wiener_transfer(h, 0.1, grid)
         if defined:
-            spread = fourier.spectrum(fourier.extend(x, grid, boundary), grid)
+            spread = fourier.spectrum(planes.extend(x, grid, boundary), grid)
             y = fourier.inverse_spectrum(transfer * spread, grid, (21, width))
         else:
-            y = fourier.filtered(x, transfer, grid, boundary)
+            y = deconvolution.filtered(x, transfer, grid, boundary)
         y.backward(slope)
         found.append((y, x.grad, h.grad))
     for one, other in zip(*found, strict=True):
@@ -503,14 +503,14 @@ def test_filtered_and_its_gradients_are_those_of_its_definition(
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_filtered_keeps_precision_and_memory_format(dtype, generator):
-    grid = fourier.deconvolution_grid((30, 33), "taper")
-    transfer = fourier.wiener_transfer(torch.rand(1, 1, 30, 33, generator=generator), 0.1, grid)
+    grid = deconvolution.deconvolution_grid((30, 33), "taper")
+    transfer = deconvolution.wiener_transfer(torch.rand(1, 1, 30, 33, generator=generator), 0.1, grid)
     image = torch.rand(2, 6, 30, 33, generator=generator).to(dtype)
-    expected = fourier.filtered(image.float(), transfer, grid, "taper").to(dtype)
+    expected = deconvolution.filtered(image.float(), transfer, grid, "taper").to(dtype)
     last = image.contiguous(memory_format=torch.channels_last)
     part = torch.cat([last, last], dim=1)[:, 6:]  # what a gradient of a concatenation is
     for given, form in ((image, torch.contiguous_format), (last, torch.channels_last), (part, torch.channels_last)):
-        found = fourier.filtered(given, transfer, grid, "taper")
+        found = deconvolution.filtered(given, transfer, grid, "taper")
         assert found.dtype == dtype
         assert torch.equal(found, expected)
         if given is not part:

@@ -10,8 +10,9 @@
 from mwdn.calibration import Calibration
 from mwdn.data import read_frame, read_picture, write_linear, write_picture
 from mwdn.data.sheets import for_people
+from mwdn.deconvolution import wiener
 from mwdn.errors import MwdnError
-from mwdn.fourier import convolve, correlate, wiener
+from mwdn.fourier import convolve, correlate
 from mwdn.networks import build
 from mwdn.optics import Camera, Sensor
 from mwdn.reconstruct import Reconstructor

@@ -170,7 +170,7 @@ def paired(image: Tensor) -> Tensor:
     Where channels lie side by side, two are moved as one number: half the work of `planar`.
     """
     if image.stride(1) != 1:
-        return image.unflatten(1, (-1, 2)).movedim(2, -1)
+        return image.unflatten(1, (-1, 2)).movedim(2, -1)  # type: ignore[no-untyped-call]
     batch, channels, height, width = image.shape
     result = torch.empty((batch, channels // 2, height, width, 2), dtype=image.dtype, device=image.device)
     _transpose(_two_as_one(_pixels(image)), _two_as_one(result.flatten(2)))

@@ -9,8 +9,8 @@ from scipy.signal import correlate2d
 from scipy.special import k1
 
 from mwdn.calibration import measures
+from mwdn.deconvolution import wiener
 from mwdn.errors import ParameterError
-from mwdn.fourier import wiener
 from mwdn.optics import sample_camera
 from mwdn.optics.patterns import contour_psf
 

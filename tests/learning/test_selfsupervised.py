@@ -11,8 +11,9 @@ from torch import nn
 from mwdn.calibration import Calibration
 from mwdn.calibration.frames import noise_level
 from mwdn.data.unpaired import SelfSupervised, UnpairedCaptures
+from mwdn.deconvolution import wiener
 from mwdn.errors import CheckpointError, ParameterError, ShapeError
-from mwdn.fourier import convolve, wiener
+from mwdn.fourier import convolve
 from mwdn.learning import bundled
 from mwdn.learning.losses import Loss
 from mwdn.learning.recipe import Recipe, Schedule, Sheet

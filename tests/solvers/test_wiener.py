@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mwdn import fourier
+from mwdn import deconvolution, fourier, planes
 from mwdn.errors import ParameterError, ShapeError
 from mwdn.optics import Camera, Sensor
 from mwdn.optics.patterns import contour_psf
@@ -31,9 +31,9 @@ def chosen(measurement, psf, **options):
     """Lambda (B, C, 1, 1) as the solver finds it."""
     solver = Wiener(**options)
     size = tuple(measurement.shape[-2:])
-    grid = fourier.deconvolution_grid(size, solver.boundary)
+    grid = deconvolution.deconvolution_grid(size, solver.boundary)
     H = fourier.transfer_function(psf / psf.sum((-2, -1), keepdim=True), grid)
-    B = fourier.spectrum(fourier.extend(measurement, grid, solver.boundary), grid)
+    B = fourier.spectrum(planes.extend(measurement, grid, solver.boundary), grid)
     return solver._discrepancy(measurement, B, H, grid[1])
 
 
@@ -89,7 +89,7 @@ def test_residual_has_the_power_of_noise_and_tolerance(size, tolerance, generato
     light = fourier.convolve(scene, psf, circular=True)
     measurement = light + 0.003 * torch.randn(light.shape, generator=generator)
     regularisation = chosen(measurement, psf, tolerance=tolerance, boundary="circular")
-    estimate = fourier.wiener(measurement, psf, regularisation, boundary="circular")
+    estimate = deconvolution.wiener(measurement, psf, regularisation, boundary="circular")
     assert (regularisation < 1).all()
     residual = measurement - fourier.convolve(estimate, psf, circular=True)
     power = residual.var((-2, -1), correction=0, keepdim=True)  # the mean is left out
@@ -108,9 +108,9 @@ def test_chosen_lambda_is_better_than_one_far_from_it(full_well, psf, scene, gen
 
 def test_solver_is_eq_2_with_the_chosen_lambda(psf, scene, generator):
     b = Camera(psf).simulate(scene, generator=generator)
-    expected = fourier.wiener(b, psf, chosen(b, psf)).clamp(min=0)
+    expected = deconvolution.wiener(b, psf, chosen(b, psf)).clamp(min=0)
     torch.testing.assert_close(Wiener()(b, psf), expected)
-    given = fourier.wiener(b, psf, 1e-3, boundary="replicate").clamp(min=0)
+    given = deconvolution.wiener(b, psf, 1e-3, boundary="replicate").clamp(min=0)
     torch.testing.assert_close(Wiener(regularisation=1e-3, boundary="replicate")(b, psf), given)
 
 

@@ -8,10 +8,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from mwdn.deconvolution import deconvolution_grid, filtered, wiener_transfer
 from mwdn.errors import ParameterError, ShapeError
-from mwdn.fourier import Boundary, Size, deconvolution_grid, filtered, wiener_transfer
+from mwdn.fourier import Size
 from mwdn.networks.recomputed import Stages
-from mwdn.planes import in_parts
+from mwdn.planes import Boundary, in_parts
 from mwdn.types import Image, Measurement, Psf
 
 Pooling = Literal["max", "average"]
@@ -145,7 +146,7 @@ class Wiener(nn.Module):
     Args:
         weight: start value of w; ``None`` leaves w out (MWDN-CPSF, whose PSF is learned).
         regularisation: start value of lambda.
-        boundary: see `mwdn.fourier.Boundary`.
+        boundary: see `mwdn.planes.Boundary`.
     """
 
     def __init__(

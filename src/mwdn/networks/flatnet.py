@@ -5,18 +5,12 @@ import math
 import torch
 from torch import Tensor, nn
 
+from mwdn.deconvolution import deconvolution_grid
 from mwdn.errors import ParameterError
-from mwdn.fourier import (
-    Boundary,
-    Size,
-    deconvolution_grid,
-    extend,
-    inverse_spectrum,
-    spectrum,
-    transfer_function,
-)
+from mwdn.fourier import inverse_spectrum, spectrum, transfer_function
 from mwdn.networks.blocks import one_each_colour, stretched
 from mwdn.networks.generator import Generator
+from mwdn.planes import Boundary, Size, extend
 from mwdn.types import Measurement, Psf, Scene
 
 
@@ -40,7 +34,7 @@ class FlatNet(nn.Module):
         width: feature channels at the U-Net's finest scale.
         size: height and width of the sensor whose filter is learned; ``None`` keeps the Wiener filter.
         regularisation: lambda of the Wiener filter that it begins as, for a PSF of unit sum.
-        boundary: what stands beyond the measurement, see `mwdn.fourier.Boundary`.
+        boundary: what stands beyond the measurement, see `mwdn.planes.Boundary`.
 
     References:
         S. S. Khan et al., FlatNet: towards photorealistic scene reconstruction from lensless measurements, IEEE Trans.

@@ -6,9 +6,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from mwdn.deconvolution import deconvolution_grid, wiener_transfer
 from mwdn.errors import ParameterError
-from mwdn.fourier import Boundary, deconvolution_grid, extend, inverse_spectrum, spectrum, wiener_transfer
+from mwdn.fourier import inverse_spectrum, spectrum
 from mwdn.networks.blocks import Decoder, Encoder, paper_widths, peak_one
+from mwdn.planes import Boundary, extend
 from mwdn.solvers.alignment import align
 from mwdn.solvers.pyramid import LEVELS, Band, PsfPyramid
 from mwdn.types import Measurement, Psf, Scene
@@ -43,7 +45,7 @@ class WienerBank(nn.Module):
             take a tenth of the time and leave the detail to the bank. 0 for none: the bank filters the measurement.
         align: turn and scale the PSF first until it explains the measurement (`mwdn.solvers.alignment`). In training
             PSFs are taken as they are: let the captures be mismatched by what the alignment leaves.
-        boundary: what stands beyond the measurement if ``finest`` is 0, see `mwdn.fourier.Boundary`.
+        boundary: what stands beyond the measurement if ``finest`` is 0, see `mwdn.planes.Boundary`.
     """
 
     def __init__(

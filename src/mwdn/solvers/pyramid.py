@@ -122,7 +122,7 @@ class Explanation:
         return spectrum(self.rest, self.psf.bands[-1].grid)
 
     def detail(self, regularisation: float | Tensor) -> Scene:
-        """Wiener estimate of the rest of the scene; ``regularisation`` as for `mwdn.fourier.wiener`.
+        """Wiener estimate of the rest of the scene; ``regularisation`` as for `mwdn.deconvolution.wiener`.
 
         Of a pyramid that reaches the full size.
         """

@@ -6,16 +6,10 @@ import torch
 from torch import Tensor
 
 from mwdn.calibration.frames import noise_level
+from mwdn.deconvolution import deconvolution_grid
 from mwdn.errors import ParameterError
-from mwdn.fourier import (
-    Boundary,
-    check_fit,
-    deconvolution_grid,
-    extend,
-    inverse_spectrum,
-    spectrum,
-    transfer_function,
-)
+from mwdn.fourier import check_fit, inverse_spectrum, spectrum, transfer_function
+from mwdn.planes import Boundary, extend
 from mwdn.types import Measurement, Psf, Scene
 
 
@@ -31,7 +25,7 @@ class Wiener:
             measurement to within ``tolerance``.
         tolerance: part of the measurement's contrast that may stay unexplained besides its noise: what a crop,
             a PSF that was measured, and a field that is not quite shift-invariant cost.
-        boundary: see `mwdn.fourier.Boundary`.
+        boundary: see `mwdn.planes.Boundary`.
 
     Raises:
         ParameterError: a constant is not positive.
