@@ -7,7 +7,15 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mwdn.errors import ParameterError
-from mwdn.fourier import check_fit, fast_length, filter_field, inverse_spectrum, spectrum, transfer_function
+from mwdn.fourier import (
+    check_fit,
+    fast_length,
+    filter_field,
+    inverse_spectrum,
+    plane_spectrum,
+    spectrum,
+    transfer_function,
+)
 from mwdn.planes import (
     Boundary,
     Continuation,
@@ -113,10 +121,10 @@ class _Filter(torch.autograd.Function):
         transfer_slope = torch.zeros_like(transfer) if to_transfer else None
         continued = Continuation(size, grid, ctx.boundary, slopes)
         for part in together(slopes, grid):
-            G = spectrum(slopes[part], grid)
+            G = plane_spectrum(slopes[part], grid)
             if transfer_slope is not None:
                 of_part = _of(transfer_slope, part)
-                product = spectrum(continued(planes[part]), grid).conj().resolve_conj().mul_(G)
+                product = plane_spectrum(continued(planes[part]), grid).conj().resolve_conj().mul_(G)
                 of_part.add_(product if of_part.shape[1] > 1 else product.sum(1, keepdim=True))
             if image_slope is not None:
                 G.mul_(_of(transfer, part).conj())
@@ -136,7 +144,7 @@ def _filtered(image: Tensor, transfer: Tensor, grid: Size, boundary: Boundary) -
     result = torch.empty_like(planes)
     continued = Continuation(size, grid, boundary, planes)
     for part in together(planes, grid):
-        V = spectrum(continued(planes[part]), grid).mul_(_of(transfer, part))
+        V = plane_spectrum(continued(planes[part]), grid).mul_(_of(transfer, part))
         result[part] = inverse_spectrum(V, grid, size)
     return laid_out_as(image, result)
 

@@ -46,12 +46,14 @@ def gaussian_transfer(grid: Size, sigma: float, *, device: torch.device | str | 
 
 def spectrum(image: Tensor, grid: Size) -> Spectrum:
     """Real Fourier transform of a picture, zero-padded at the bottom and the right to ``grid``."""
-    # The whole grid is one call; an export knows one axis at a time.
-    if image.shape[-2:] == torch.Size(grid) and not torch.compiler.is_compiling():
-        return torch.fft.rfft2(image.float())
     # Rows first, so that the rows which are only padding are never transformed.
     rows = torch.fft.rfft(image.float(), n=grid[1])
     return torch.fft.fft(rows, n=grid[0], dim=-2)
+
+
+def plane_spectrum(planes: Tensor, grid: Size) -> Spectrum:
+    """The same in one call, quicker where little is padded."""
+    return torch.fft.rfft2(planes.float(), s=grid)
 
 
 def inverse_spectrum(spectrum: Tensor, grid: Size, size: Size) -> Image:
