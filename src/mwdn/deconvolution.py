@@ -109,6 +109,9 @@ class _Filter(torch.autograd.Function):
     def forward(ctx: Any, image: Tensor, transfer: Tensor, grid: Size, boundary: Boundary) -> Tensor:  # noqa: ANN401
         ctx.save_for_backward(image, transfer)
         ctx.grid, ctx.boundary = grid, boundary
+        if transfer.shape[1] == 1 and image.shape[1] % 2 == 0:
+            whole = _whole(transfer, grid[1])  # once, however many parts there are
+            return in_parts(lambda few, own: _filtered_pairs(few, own, grid, boundary), image, whole)
         return in_parts(lambda few, own: _filtered(few, own, grid, boundary), image, transfer)
 
     @staticmethod
@@ -138,8 +141,6 @@ class _Filter(torch.autograd.Function):
 
 
 def _filtered(image: Tensor, transfer: Tensor, grid: Size, boundary: Boundary) -> Tensor:
-    if transfer.shape[1] == 1 and image.shape[1] % 2 == 0:
-        return _filtered_pairs(image, transfer, grid, boundary)
     planes, size = planar(image), (image.shape[-2], image.shape[-1])
     result = torch.empty_like(planes)
     continued = Continuation(size, grid, boundary, planes)
@@ -149,7 +150,7 @@ def _filtered(image: Tensor, transfer: Tensor, grid: Size, boundary: Boundary) -
     return laid_out_as(image, result)
 
 
-def _filtered_pairs(image: Tensor, transfer: Tensor, grid: Size, boundary: Boundary) -> Tensor:
+def _filtered_pairs(image: Tensor, whole: Tensor, grid: Size, boundary: Boundary) -> Tensor:
     """What one filter with a real kernel does to two channels, it does to both at once as a complex plane.
 
     A complex transform of two axes is one call of MKL, there and back; back to real numbers it takes several, with
@@ -158,7 +159,6 @@ def _filtered_pairs(image: Tensor, transfer: Tensor, grid: Size, boundary: Bound
     pairs, (height, width) = paired(image), (image.shape[-2], image.shape[-1])
     result = torch.empty(pairs.shape, dtype=image.dtype, device=image.device)
     continued = Continuation((height, width), grid, boundary, image)
-    whole = _whole(transfer, grid[1])
     for part in together(pairs, grid):
         both = filter_field(continued(pairs[part]), _of(whole, part))
         result[part] = torch.view_as_real(both[..., :height, :width])

@@ -134,9 +134,9 @@ def in_parts(
 ) -> Tensor:
     """``function(image, other)`` of (B, C, H, W) and (B, 1 or C, ...), ``step`` channels at a time.
 
-    Unless given, these are all, and of a large picture a few.
+    Unless given, these are all, and of a large picture a few: an even number, which can be `paired`.
     """
-    step = step or max(1, LARGEST // max(1, image[:, :1].numel()))
+    step = step or max(2, LARGEST // max(1, image[:, :1].numel()) // 2 * 2)
     if step >= image.shape[1]:
         return function(image, other)
     result = torch.empty_like(image)
