@@ -3,7 +3,8 @@
     python benchmarks/universal.py ../shared/data [--count 6] [--methods universal universal-small admm]
 
 Four measured PSFs; test photographs placed and mismatched as recipes/mismatched.toml says; 15,000 and 2,000 electrons
-at saturation. Measured as `mwdn evaluate` measures (full, clipped). Prints a table and writes it with all means.
+at saturation. Measured as `mwdn evaluate` measures (full, clipped). Prints a table and writes it with all means;
+methods that are not named keep what the record has of them, if it is of as many captures.
 """
 
 import argparse
@@ -52,6 +53,8 @@ def main():
     arguments = parser.parse_args()
     recipe = read_recipe(Path(__file__).parents[1] / "recipes" / "mismatched.toml")
     photographs, perceptual = Photographs(arguments.data / "photos" / "test"), Perceptual.load()
+    record = json.loads(arguments.out.read_text()) if arguments.out.exists() else {}
+    known = [each["means"] for each in record["rows"]] if record.get("count") == arguments.count else []
     rows = []
     print(f"PSNR in dB / LPIPS, means of {arguments.count}\n")
     print("| PSF | electrons | calibration |", " | ".join(arguments.methods), "|")
@@ -64,7 +67,8 @@ def main():
                 made = captures(calibration.psf, photographs, recipe, full_well, arguments.count, exact=exact)
                 report = evaluate(bound, made, Protocol.parse("full"), perceptual=perceptual)
                 means = {m: {k: report.methods[m].summary(k)[0] for k in ("psnr", "ssim", "lpips")} for m in bound}
-                rows.append({"psf": name, "full_well": full_well, "exact": exact, "means": means})
+                kept = known[len(rows)] if known else {}
+                rows.append({"psf": name, "full_well": full_well, "exact": exact, "means": kept | means})
                 told = " | ".join(f"{each['psnr']:.2f} / {each['lpips']:.3f}" for each in means.values())
                 print(f"| {name} | {full_well:,.0f} | {'exact' if exact else 'mismatched'} | {told} |", flush=True)
     arguments.out.write_text(json.dumps({"count": arguments.count, "rows": rows}, indent=1) + "\n")

@@ -1,12 +1,16 @@
 """The pyramid against scipy's least squares, an independent decimation, and what it is for: a cropped pattern."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
 from scipy.optimize import nnls
+from torch.nn import functional as F
 
 import oracles
 from mwdn import fourier
+from mwdn.calibration.frames import noise_level
 from mwdn.errors import ParameterError
 from mwdn.optics.patterns import contour_psf
 from mwdn.solvers.admm import Penalties
@@ -64,6 +68,21 @@ def test_a_cropped_pattern_is_explained_far_better_than_by_a_wiener_filter(gener
         float((method(measurement, psf) - scene).square().mean()) for method in (Pyramid(), Wiener(regularisation=1e-4))
     ]
     assert errors[0] < errors[1] / 5
+
+
+def test_smoothing_follows_the_noise_of_the_light_not_of_the_dark(generator, monkeypatch):
+    """A pattern on a part of the sensor: by the median noise of the whole frame the scene would hardly be smoothed."""
+    psf = F.pad(contour_psf((48, 64), generator=generator), (32, 32, 24, 24))
+    scene = torch.zeros(1, 3, 96, 128)
+    scene[..., 36:60, 44:84] = torch.tensor([0.8, 0.5, 0.2])[:, None, None]
+    light = fourier.convolve(scene, psf)
+    light = light / light.max()
+    electrons = 2000 * light + (2000 * light + 9).sqrt() * torch.randn(light.shape, generator=generator)
+    truth, found = light.sum() / fourier.convolve(scene, psf).sum() * scene, {}
+    for parts in (16, 1):
+        monkeypatch.setattr("mwdn.solvers.pyramid.noise_level", partial(noise_level, parts=parts))
+        found[parts] = float((Pyramid()(electrons / 2000, psf) - truth).square().mean())
+    assert found[16] < 0.7 * found[1]
 
 
 def test_what_is_explained_and_what_is_left_make_the_measurement(generator):

@@ -63,6 +63,15 @@ def test_channels_are_measured_apart(generator):
     torch.testing.assert_close(found, sigma, rtol=0.02, atol=0)
 
 
+def test_noise_of_light_is_that_of_the_whole_picture_not_of_its_dark_half(generator):
+    sigma = torch.full((200, 300), 0.001)
+    sigma[:, 120:180] = 0.03
+    noise = sigma * torch.randn(1, 1, 200, 300, generator=generator)
+    mean = sigma.square().mean().sqrt().item()
+    assert noise_level(noise).item() == pytest.approx(mean, rel=0.05)
+    assert noise_level(noise, parts=1).item() < 0.1 * mean
+
+
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (5, 1)])
 def test_one_row_tells_nothing(size):
     assert noise_level(torch.rand(2, 3, *size)).tolist() == torch.zeros(2, 3, 1, 1).tolist()

@@ -166,7 +166,7 @@ def _levels(calibration: Calibration, frame: Frame) -> Levels:
     full, _ = saturated(frame, calibration.bit_depth)
     # As deep as the file says: numbers left by binning lie between its steps.
     scale = full_scale(frame, calibration.bit_depth) if integers else 1.0
-    noise = noise_level(image)
+    noise = noise_level(image, parts=1)
     if integers:
         # Rounding alone leaves step / sqrt(12), which the median of an 8-bit frame's differences often misses.
         noise = noise.clamp(min=1 / (12**0.5 * scale * calibration.binning))
