@@ -28,6 +28,8 @@ class Level:
             noise, see `QUIET`, and the gradient's mu with it.
         poor: smooth in poor light alone. With total variation low frequencies need more iterations: only noise makes
             it worth them.
+        least: part of the usual smoothing that remains where there is less noise. In real captures, what the PSF does
+            not say is more than the noise.
     """
 
     shrink: int
@@ -35,10 +37,11 @@ class Level:
     penalties: Penalties
     regularisation: float = 0.0
     poor: bool = False
+    least: float = 0.2
 
     def smoothing(self, caution: Tensor) -> tuple[Penalties, Tensor]:
         """Weights mu and tau by how much of the usual smoothing the noise asks for."""
-        mu = self.penalties
+        mu, caution = self.penalties, caution.clamp(min=self.least)
         if self.poor:
             amount = 1 - 1 / caution.clamp(min=1)
             return mu._replace(gradient=mu.gradient * amount + 1e-4), caution * amount * self.regularisation
@@ -49,7 +52,7 @@ LEVELS = (
     Level(8, 20, Penalties(0.15, 4.0, 0.6), 0.02, poor=True),
     Level(4, 20, Penalties(0.15, 4.0, 0.6), 0.02, poor=True),
     Level(2, 8, Penalties(0.2, 4.0, 0.9), 0.02, poor=True),
-    Level(1, 18, Penalties(0.1, 1.5, 1.5), 0.01),
+    Level(1, 18, Penalties(0.1, 1.5, 1.5), 0.01, least=1.0),
 )
 """What the coarse levels found lets the last one begin where it would be after a hundred iterations."""
 
@@ -78,7 +81,7 @@ class Pyramid:
 
     Args:
         levels: the coarsest first.
-        regularisation: lambda of the last step, for a PSF of unit sum; it grows with the noise as tau does. As it
+        regularisation: lambda of the last step, for a PSF of unit sum; with much noise it grows as tau does. As it
             grows, detail and noise fade.
 
     Raises:
@@ -102,7 +105,7 @@ class Pyramid:
         found = explain(measurement, psf, self.levels)
         tiny = torch.finfo(torch.float32).tiny
         total = psf.float().sum((-2, -1), keepdim=True).clamp(min=tiny)
-        return (found.scene + found.detail(self.regularisation * found.caution)).clamp(min=0) / total
+        return (found.scene + found.detail(self.regularisation * found.caution.clamp(min=1))).clamp(min=0) / total
 
 
 @dataclass(frozen=True)
@@ -182,7 +185,7 @@ class PsfPyramid:
         brightness = brightness.clamp(min=torch.finfo(torch.float32).tiny)
         b = measurement.float() / brightness
         noise = noise_level(b.detach()).square().mean(1, keepdim=True).sqrt()
-        caution = (noise / QUIET).clamp(min=0.3) ** 1.25
+        caution = (noise / QUIET) ** 1.25
         fineness = math.sqrt(size[0] * size[1]) / SIDE
         sizes = {1: b}
         while max(sizes) < self.bands[0].level.shrink:
