@@ -54,7 +54,8 @@ def main():
     recipe = read_recipe(Path(__file__).parents[1] / "recipes" / "mismatched.toml")
     photographs, perceptual = Photographs(arguments.data / "photos" / "test"), Perceptual.load()
     record = json.loads(arguments.out.read_text()) if arguments.out.exists() else {}
-    known = [each["means"] for each in record["rows"]] if record.get("count") == arguments.count else []
+    same = record["rows"] if record.get("count") == arguments.count else []
+    known = {(row["psf"], row["full_well"], row["exact"]): row["means"] for row in same}
     rows = []
     print(f"PSNR in dB / LPIPS, means of {arguments.count}\n")
     print("| PSF | electrons | calibration |", " | ".join(arguments.methods), "|")
@@ -67,7 +68,7 @@ def main():
                 made = captures(calibration.psf, photographs, recipe, full_well, arguments.count, exact=exact)
                 report = evaluate(bound, made, Protocol.parse("full"), perceptual=perceptual)
                 means = {m: {k: report.methods[m].summary(k)[0] for k in ("psnr", "ssim", "lpips")} for m in bound}
-                kept = known[len(rows)] if known else {}
+                kept = known.get((name, full_well, exact), {})
                 rows.append({"psf": name, "full_well": full_well, "exact": exact, "means": kept | means})
                 told = " | ".join(f"{each['psnr']:.2f} / {each['lpips']:.3f}" for each in means.values())
                 print(f"| {name} | {full_well:,.0f} | {'exact' if exact else 'mismatched'} | {told} |", flush=True)

@@ -109,10 +109,10 @@ class _Filter(torch.autograd.Function):
     def forward(ctx: Any, image: Tensor, transfer: Tensor, grid: Size, boundary: Boundary) -> Tensor:  # noqa: ANN401
         ctx.save_for_backward(image, transfer)
         ctx.grid, ctx.boundary = grid, boundary
+        function = _filtered
         if transfer.shape[1] == 1 and image.shape[1] % 2 == 0:
-            whole = _whole(transfer, grid[1])  # once, however many parts there are
-            return in_parts(lambda few, own: _filtered_pairs(few, own, grid, boundary), image, whole)
-        return in_parts(lambda few, own: _filtered(few, own, grid, boundary), image, transfer)
+            function, transfer = _filtered_pairs, _whole(transfer, grid[1])
+        return in_parts(lambda few, own: function(few, own, grid, boundary), image, transfer)
 
     @staticmethod
     @once_differentiable
@@ -150,8 +150,10 @@ def _filtered(image: Tensor, transfer: Tensor, grid: Size, boundary: Boundary) -
     return laid_out_as(image, result)
 
 
-def _filtered_pairs(image: Tensor, whole: Tensor, grid: Size, boundary: Boundary) -> Tensor:
+def _filtered_pairs(image: Tensor, transfer: Tensor, grid: Size, boundary: Boundary) -> Tensor:
     """What one filter with a real kernel does to two channels, it does to both at once as a complex plane.
+
+    Its ``transfer`` is the whole spectrum (`_whole`).
 
     A complex transform of two axes is one call of MKL, there and back; back to real numbers it takes several, with
     copies between them.
@@ -160,7 +162,7 @@ def _filtered_pairs(image: Tensor, whole: Tensor, grid: Size, boundary: Boundary
     result = torch.empty(pairs.shape, dtype=image.dtype, device=image.device)
     continued = Continuation((height, width), grid, boundary, image)
     for part in together(pairs, grid):
-        both = filter_field(continued(pairs[part]), _of(whole, part))
+        both = filter_field(continued(pairs[part]), _of(transfer, part))
         result[part] = torch.view_as_real(both[..., :height, :width])
     return unpaired(result, image)
 

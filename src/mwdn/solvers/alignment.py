@@ -37,7 +37,7 @@ class Pose(NamedTuple):
 _LEVELS = (
     Level(4, 20, Penalties(0.15, 0.0, 0.6)),
     Level(2, 20, Penalties(0.15, 0.0, 0.6)),
-    Level(1, 8, Penalties(0.1, 1.5, 1.5), 0.02),
+    Level(1, 8, Penalties(0.1, 1.5, 1.5), 0.02, least=0.2),
 )
 _COARSE = 0.03  # periods a pixel: below it, ambient light and iterations that have not ended are most of what is left
 _LIKELY = (0.5, 0.01)  # degrees and relative magnification by which a calibration may be wrong

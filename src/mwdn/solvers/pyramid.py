@@ -28,8 +28,8 @@ class Level:
             noise, see `QUIET`, and the gradient's mu with it.
         poor: smooth in poor light alone. With total variation low frequencies need more iterations: only noise makes
             it worth them.
-        least: part of the usual smoothing that remains where there is less noise. In real captures, what the PSF does
-            not say is more than the noise.
+        least: part of the usual smoothing that remains where there is less noise, at least 1 if ``poor``. In real
+            captures, what the PSF does not say is more than the noise.
     """
 
     shrink: int
@@ -37,13 +37,13 @@ class Level:
     penalties: Penalties
     regularisation: float = 0.0
     poor: bool = False
-    least: float = 0.2
+    least: float = 1.0
 
     def smoothing(self, caution: Tensor) -> tuple[Penalties, Tensor]:
         """Weights mu and tau by how much of the usual smoothing the noise asks for."""
         mu, caution = self.penalties, caution.clamp(min=self.least)
         if self.poor:
-            amount = 1 - 1 / caution.clamp(min=1)
+            amount = 1 - 1 / caution
             return mu._replace(gradient=mu.gradient * amount + 1e-4), caution * amount * self.regularisation
         return mu._replace(gradient=mu.gradient * caution), caution * self.regularisation
 
@@ -52,7 +52,7 @@ LEVELS = (
     Level(8, 20, Penalties(0.15, 4.0, 0.6), 0.02, poor=True),
     Level(4, 20, Penalties(0.15, 4.0, 0.6), 0.02, poor=True),
     Level(2, 8, Penalties(0.2, 4.0, 0.9), 0.02, poor=True),
-    Level(1, 18, Penalties(0.1, 1.5, 1.5), 0.01, least=1.0),
+    Level(1, 18, Penalties(0.1, 1.5, 1.5), 0.01),
 )
 """What the coarse levels found lets the last one begin where it would be after a hundred iterations."""
 
