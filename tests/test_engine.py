@@ -44,6 +44,16 @@ def test_exact_is_the_network_and_fast_is_close(name, generator):
     assert psnr(Engine(network, psf)(batch), expected) > 35
 
 
+def test_plug_and_play_too(generator):
+    """The denoiser between the iterations computes in half precision; its level and the picture do not."""
+    psf, batch = psf_and_batch(generator)
+    network = build("wiener-bank", width=8, rounds=3).eval()
+    with torch.no_grad():
+        expected = network(batch, psf)
+    torch.testing.assert_close(Engine(network, psf, precision="exact")(batch), expected, rtol=1e-4, atol=1e-5)
+    assert psnr(Engine(network, psf)(batch), expected) > 50
+
+
 @pytest.mark.parametrize("fused", [True, False])
 @pytest.mark.parametrize("dtype", [None, torch.bfloat16])
 def test_folded_convolution(fused, dtype, generator, monkeypatch):

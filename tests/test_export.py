@@ -184,6 +184,13 @@ def test_every_network(name, tmp_path):
     export(network(name), camera((64, 72)), tmp_path / "camera.onnx", least=100)
 
 
+def test_plug_and_play(tmp_path):
+    """One round behind one iteration: more are the same again."""
+    bank = network("wiener-bank", regularisations=(1e-3,), align=False, rounds=1)
+    bank.levels = tuple(replace(level, iterations=1) for level in bank.levels)
+    export(bank, camera(), tmp_path / "camera.onnx", least=100)
+
+
 @pytest.mark.acceptance
 @pytest.mark.parametrize("name", SOLVERS)
 def test_every_solver(name, tmp_path):

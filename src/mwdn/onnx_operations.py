@@ -199,6 +199,12 @@ def _unshuffle(g: OnnxGraph, node: fx.Node, x: str, block: int) -> str:
     return _reshape(g, node, g("Transpose", split, perm=[0, 1, 3, 5, 2, 4]))
 
 
+def _swapped(g: OnnxGraph, node: fx.Node, x: str, one: int, other: int) -> str:
+    axes = list(range(source(node).ndim))
+    axes[one], axes[other] = axes[other], axes[one]
+    return g("Transpose", x, perm=axes)
+
+
 def _unbind(g: OnnxGraph, node: fx.Node, x: str, axis: int = 0) -> list[str]:
     axes, count = g.integers([axis]), source(node).shape[axis]
     return [g("Squeeze", part, axes) for part in g.several("Split", count, x, axis=axis, num_outputs=count)]
@@ -211,7 +217,8 @@ def _split(g: OnnxGraph, node: fx.Node, x: str, size: int, axis: int = 0) -> lis
 
 REAL: dict[Any, Handler] = {
     **dict.fromkeys((_aten.alias.default, _aten.clone.default, _aten.detach.default), _same),
-    **dict.fromkeys((_aten.view.default, _aten.unsqueeze.default, _aten.reshape.default), _reshape),
+    **dict.fromkeys((_aten.view.default, _aten._unsafe_view.default, _aten.reshape.default), _reshape),
+    _aten.unsqueeze.default: _reshape,
     **dict.fromkeys((_aten.new_zeros.default, _aten.zeros_like.default), _zeros),
     **dict.fromkeys((_aten._to_copy.default, _aten.to.dtype), _cast),
     _aten.abs.default: _plain("Abs"),
@@ -239,6 +246,7 @@ REAL: dict[Any, Handler] = {
     _aten.pixel_unshuffle.default: _unshuffle,
     _aten.pow.Scalar: _plain("Pow"),
     _aten.pow.Tensor_Scalar: _plain("Pow"),
+    _aten.reciprocal.default: _plain("Reciprocal"),
     _aten.relu.default: _plain("Relu"),
     _aten.roll.default: _roll,
     _aten.rsub.Scalar: lambda g, node, a, b: g("Sub", b, a),
@@ -251,6 +259,7 @@ REAL: dict[Any, Handler] = {
     _aten.std.correction: _deviation,
     _aten.sub.Tensor: _plain("Sub"),
     _aten.sum.dim_IntList: _reduce("ReduceSum"),
+    _aten.transpose.int: _swapped,
     _aten.unbind.int: _unbind,
     _aten.upsample_bilinear2d.vec: _enlarge,
     _aten.where.self: lambda g, node, *given: g("Where", *given),

@@ -10,10 +10,11 @@ from torch import nn
 from mwdn import solvers
 from mwdn.calibration import Calibration
 from mwdn.engine import Engine, Precision
-from mwdn.errors import ParameterError, ShapeError, UnknownNameError
+from mwdn.errors import CheckpointError, ParameterError, ShapeError, UnknownNameError
 from mwdn.learning.bundled import BUNDLED, find_weights
 from mwdn.learning.checkpoint import SUFFIXES, load_network, read_metadata
 from mwdn.learning.devices import usable
+from mwdn.networks import DENOISERS
 from mwdn.types import Frame, Measurement, Psf, Scene
 
 Method = Callable[[Measurement, Psf], Scene]
@@ -38,7 +39,13 @@ def find_method(name: str | Path, regularisation: float | None = None) -> Method
         return solvers.build(str(name), **({} if regularisation is None else {"regularisation": regularisation}))
     path = find_weights(str(name)) or Path(name)
     if path.suffix in SUFFIXES or path.is_file():
-        return load_network(path)
+        network = load_network(path)
+        if isinstance(network, tuple(DENOISERS.values())):
+            raise CheckpointError(
+                f"`{name}` holds a denoiser, which reconstructs nothing alone: it is the `denoiser` in [schedule] of a "
+                "recipe such as recipes/universal-plug.toml."
+            )
+        return network
     raise UnknownNameError("method", str(name), [*BUNDLED, *solvers.SOLVERS, "PATH/OF/CHECKPOINT.safetensors"])
 
 

@@ -96,8 +96,9 @@ def test_a_network_that_learns_from_the_first_step_on_is_refused():
         pool(Counted(), size=5)
 
 
-def test_the_bank_is_its_correction_of_its_estimates(generator):
-    network = build("wiener-bank", width=2, align=False).eval()
+@pytest.mark.parametrize("rounds", [0, 1])
+def test_the_bank_is_its_correction_of_its_estimates(rounds, generator):
+    network = build("wiener-bank", width=2, align=False, rounds=rounds).eval()
     psf = torch.rand(1, 3, 32, 32, generator=generator)
     measurement = torch.rand(2, 3, 32, 32, generator=generator)
     estimates = network.estimates(measurement, psf)

@@ -12,6 +12,7 @@ from mwdn.errors import ParameterError, UnknownNameError
 from mwdn.learning.recipe import Recipe, Schedule, read_recipe
 from mwdn.networks import build
 
+DENOISER = '[network]\nname = "drunet"\n'
 NETWORK = '[network]\nname = "wiener-bank"\nwidth = 4\n'
 
 
@@ -113,6 +114,11 @@ def test_mistyped_names_get_the_nearest(read, text, said):
         (NETWORK + "[loss]\nmse = -1", "The weight of `mse` (-1) must be finite and not negative"),
         (NETWORK + '[loss]\nmse = "much"', "The weight of `mse` ('much') must be finite and not negative"),
         ('[network]\nname = "mwdn"\nwidth = "wide"', "cannot be built"),
+        (DENOISER, "[denoising] and a network of drunet go together"),
+        (NETWORK + "[denoising]\nlevels = [0.01, 0.1]", "[denoising] and a network of drunet go together"),
+        (DENOISER + "[denoising]\nlevels = [0.1, 0.01]", "`levels` of [denoising] (0.1, 0.01) must rise from above 0"),
+        (DENOISER + '[denoising]\nlevels = [0.01, 0.1]\n[cameras]\nsizes = ["32x32"]', "[denoising] has no camera"),
+        (DENOISER + '[denoising]\nlevels = [0.01, 0.1]\n[sheet]\ncaptures = ["a.png"]', "[denoising] has no camera"),
     ],
 )  # fmt: skip
 def test_bad_values(read, text, said):

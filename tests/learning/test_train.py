@@ -18,6 +18,7 @@ from safetensors.torch import load_file
 
 from mwdn.calibration import Calibration
 from mwdn.data.cameras import Cameras
+from mwdn.data.noisy import Denoising
 from mwdn.data.pairs import PairFile
 from mwdn.data.photographs import Photographs
 from mwdn.data.simulated import SimulatedPairs
@@ -29,11 +30,13 @@ from mwdn.learning.session import prepare, simulate
 from mwdn.learning.train import Trainer
 from mwdn.learning.validation import Validation
 from mwdn.optics.patterns import contour_psf
+from mwdn.reconstruct import find_method
 
 RECIPE = Recipe(
     {"name": "wiener-bank", "width": 4, "regularisations": (1e-2, 1e-4)},
     Schedule(steps=6, batch=2, learning_rate=2e-3, warmup=2, ema=0.9, validate_every=3, validation=3),
 )
+DRUNET = {"name": "drunet"}  # of the size that wiener-bank has
 
 
 def few(**schedule):
@@ -531,3 +534,26 @@ def test_a_run_with_a_pool_that_is_stopped_ends_as_one_that_was_not(trainer, tmp
     stopped.save(stopped.validate())
     trainer(pooled, "stopped").run()
     assert same(tmp_path / "whole" / "last.safetensors", tmp_path / "stopped" / "last.safetensors")
+
+
+def test_a_denoiser_is_trained_alone_and_then_stays(trainer, tmp_path):
+    """From noisy scenes; then it is part of a network whose U-Net learns, by a pool or without."""
+    learned = trainer(replace(few(steps=40, learning_rate=5e-3), network=DRUNET, denoising=Denoising((0.05, 0.1))), "a")
+    losses = []
+    learned.run(lambda report: losses.append(report.loss))
+    assert sum(losses[-10:]) < 0.7 * sum(losses[:10])
+
+    known = load_network(tmp_path / "a" / "best.safetensors").state_dict()
+    for name, pool in (("kept", 4), ("new", 0)):
+        recipe = few(steps=2, denoiser=str(tmp_path / "a" / "best.safetensors"), pool=pool)
+        second = trainer(replace(recipe, network={**RECIPE.network, "rounds": 2}), name)
+        head = second.network.decoder.head.weight.clone()
+        second.run()
+        assert not torch.equal(second.network.decoder.head.weight, head)
+        for key, value in load_network(tmp_path / name / "last.safetensors").denoiser.state_dict().items():
+            torch.testing.assert_close(value, known[key])
+
+    with pytest.raises(CheckpointError, match=r"`denoiser` \('.*best.safetensors'\) its denoiser, if it has one"):
+        trainer(few(denoiser=str(tmp_path / "a" / "best.safetensors")), "none")
+    with pytest.raises(CheckpointError, match="holds a denoiser, which reconstructs nothing alone"):
+        find_method(tmp_path / "a" / "best.safetensors")

@@ -10,12 +10,13 @@ from typing import Any, TypeVar
 import torch
 
 from mwdn.data.cameras import Cameras
+from mwdn.data.noisy import Denoising
 from mwdn.data.recorded import Division
 from mwdn.data.simulated import Mismatch, Placement
 from mwdn.data.unpaired import SelfSupervised
 from mwdn.errors import MwdnError, ParameterError, UnknownNameError
 from mwdn.learning.losses import checked_weights
-from mwdn.networks import build
+from mwdn.networks import DENOISERS, build
 from mwdn.optics.sensor import Sensor
 
 T = TypeVar("T")
@@ -51,6 +52,7 @@ class Schedule:
         crop: side of the square of a kept sample that is learned from at a time; 0 for all of it.
         start: weights to begin with instead: those that come with the package, "universal", or the path of a
             checkpoint; of the same network.
+        denoiser: path of a checkpoint of the part of the network that is trained alone, see `mwdn.data.noisy`.
     """
 
     steps: int = 2000
@@ -71,6 +73,7 @@ class Schedule:
     pool: int = 0
     crop: int = 0
     start: str = ""
+    denoiser: str = ""
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "learning_rate", "validate_every", "validation"):
@@ -138,6 +141,7 @@ class Recipe:
         sheet: see `Sheet`.
         selfsupervised: learn from captures alone, see `mwdn.data.unpaired.SelfSupervised`.
         cameras: random ones to learn from in place of the one that is given, see `mwdn.data.cameras.Cameras`.
+        denoising: learn to denoise scenes, see `mwdn.data.noisy.Denoising`; of a network of `mwdn.networks.DENOISERS`.
         placement: see `mwdn.data.simulated.Placement`.
         mismatch: see `mwdn.data.simulated.Mismatch`.
         sensor: see `mwdn.optics.sensor.Sensor`.
@@ -152,6 +156,7 @@ class Recipe:
     sheet: Sheet = Sheet()
     selfsupervised: SelfSupervised = SelfSupervised()
     cameras: Cameras = Cameras()
+    denoising: Denoising = Denoising()
     placement: Placement = Placement()
     mismatch: Mismatch = Mismatch()
     sensor: Sensor = Sensor()
@@ -173,6 +178,13 @@ class Recipe:
                 "[selfsupervised] learns from one camera's captures, none of which is ever the same: "
                 "leave `pool` of [schedule] and [cameras] out."
             )
+        learned_alone = self.network.get("name") in DENOISERS
+        if learned_alone != (self.denoising != Denoising()):
+            raise ParameterError(
+                f"[denoising] and a network of {', '.join(DENOISERS)} go together: other networks reconstruct."
+            )
+        if learned_alone and (self.sheet.captures or self.cameras.sizes or self.selfsupervised.consistency):
+            raise ParameterError("[denoising] has no camera: leave [sheet], [cameras] and [selfsupervised] out.")
         if self.later_loss and self.later_loss.keys() != self.loss.keys():
             raise ParameterError(
                 f"[later_loss] ({', '.join(self.later_loss)}) must have the parts of [loss] ({', '.join(self.loss)}). "

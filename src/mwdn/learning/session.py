@@ -8,6 +8,7 @@ from pathlib import Path
 from mwdn.calibration import Calibration
 from mwdn.data.cameras import CameraPairs
 from mwdn.data.captures import find_captures, read_captures
+from mwdn.data.noisy import NoisyScenes
 from mwdn.data.pair_writer import Attribute
 from mwdn.data.photographs import Photographs
 from mwdn.data.recorded import HELD_OUT, record, recorded_pairs
@@ -76,6 +77,8 @@ def prepare(
         validation = replace(source, photographs=held_out)
         across = recipe.cameras.sizes
         training = CameraPairs(source, recipe.cameras, recipe.schedule.batch) if across else source
+        if recipe.denoising.levels[1]:
+            training, validation = (NoisyScenes(each, recipe.denoising) for each in (source, validation))
         count = len(learned)
     trainer = Trainer(
         _in_steps(recipe, count), calibration, training, out, validation=validation, captures=real, device=place

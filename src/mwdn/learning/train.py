@@ -97,8 +97,7 @@ class Trainer:
         torch.manual_seed(self.schedule.seed)
         self.options = {key: value for key, value in recipe.network.items() if key != "name"}
         self.network = build(recipe.network["name"], **self.options).to(self.device)
-        if self.schedule.start:
-            self._begin_with(self.schedule.start)
+        self._begin()
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = build(recipe.network["name"], **self.options).to(self.device).eval()
         self.average.load_state_dict(self.network.state_dict())
@@ -259,13 +258,19 @@ class Trainer:
         s = self.schedule
         return Pool(self.pairs, self.network, self.psf, size=s.pool, batch=s.batch, crop=s.crop, seed=s.seed)
 
-    def _begin_with(self, start: str) -> None:
-        known = load_network(find_weights(start) or start)
+    def _begin(self) -> None:
+        """Take the weights that the schedule names."""
+        known = self.network.state_dict()
+        if start := self.schedule.start:
+            known = load_network(find_weights(start) or start).state_dict()
+        if alone := self.schedule.denoiser:
+            known |= {f"denoiser.{key}": value for key, value in load_network(alone).state_dict().items()}
         try:
-            self.network.load_state_dict(known.state_dict())
+            self.network.load_state_dict(known)
         except RuntimeError as error:
             raise CheckpointError(
-                f"`start` ('{start}') must hold the network of the recipe, {self.recipe.network}: {error}"
+                f"`start` ('{start}') must hold the network of the recipe, {self.recipe.network}, and `denoiser` "
+                f"('{alone}') its denoiser, if it has one: {error}"
             ) from error
 
     def _resume(self) -> None:

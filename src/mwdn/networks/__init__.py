@@ -6,6 +6,7 @@ from typing import Any
 from torch import nn
 
 from mwdn.errors import UnknownNameError
+from mwdn.networks.drunet import Drunet
 from mwdn.networks.flatnet import FlatNet
 from mwdn.networks.ifin import Ifin
 from mwdn.networks.le_admm import LeAdmm
@@ -37,25 +38,29 @@ NETWORKS: dict[str, type[nn.Module]] = {
 }
 """Every network by the name that recipes and the command line use."""
 
+DENOISERS: dict[str, type[nn.Module]] = {"drunet": Drunet}
+"""Parts of networks that are trained alone: a picture and its noise level in, the picture out."""
+
 
 def build(name: str, **options: Any) -> nn.Module:  # noqa: ANN401
     """Make a fresh network.
 
     Args:
-        name: one of `NETWORKS`.
+        name: one of `NETWORKS` or `DENOISERS`.
         **options: keyword arguments of that network, for example ``width=32``.
 
     Raises:
         UnknownNameError: there is no such network, or it has no such option.
     """
-    if name not in NETWORKS:
+    kind = NETWORKS.get(name) or DENOISERS.get(name)
+    if kind is None:
         raise UnknownNameError("network", name, NETWORKS)
-    known = signature(NETWORKS[name]).parameters
+    known = signature(kind).parameters
     for option in options:
         if option not in known:
             raise UnknownNameError(f"option of the network '{name}'", option, known)
     # JSON and TOML, where options come from, have lists alone.
-    return NETWORKS[name](**{key: tuple(v) if isinstance(v, list) else v for key, v in options.items()})
+    return kind(**{key: tuple(v) if isinstance(v, list) else v for key, v in options.items()})
 
 
 __all__ = [

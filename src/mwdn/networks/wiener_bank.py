@@ -10,8 +10,10 @@ from mwdn.deconvolution import deconvolution_grid, wiener_transfer
 from mwdn.errors import ParameterError
 from mwdn.fourier import inverse_spectrum, spectrum
 from mwdn.networks.blocks import Decoder, Encoder, paper_widths, peak_one
+from mwdn.networks.drunet import Drunet
 from mwdn.planes import Boundary, extend
 from mwdn.solvers.alignment import align
+from mwdn.solvers.plug_and_play import plug_and_play
 from mwdn.solvers.pyramid import LEVELS, Band, PsfPyramid
 from mwdn.types import Measurement, Psf, Scene
 
@@ -23,6 +25,10 @@ QUICK = {8: 12, 4: 18, 2: 8}
 """Iterations of each size where detail is left to the bank: three quarters of the time, for a tenth of a decibel."""
 
 
+BOUNDARY: Boundary = "taper"
+"""How a measurement goes on beyond its border, where the bank filters it as it is."""
+
+
 class WienerBank(nn.Module):
     """Several Wiener filters, from strong to weak regularisation, in picture space; a U-Net corrects their estimates.
 
@@ -31,9 +37,9 @@ class WienerBank(nn.Module):
     which decides about shading and colour. So a few iterations that know both (`mwdn.solvers.pyramid`) explain what
     they can, and the bank filters the rest. The U-Net learns what is then still wrong.
 
-    Nothing before the U-Net is learned: `estimates` of a sample can be kept. Everything is measured in units of the
-    smoothest estimate's brightest pixel and scaled back at the end, so exposure and gain cannot matter: the network of
-    a scaled measurement is the scaled scene.
+    Nothing before the U-Net is learned with it: `estimates` of a sample can be kept. Everything is measured in units of
+    the smoothest estimate's brightest pixel and scaled back at the end, so exposure and gain cannot matter: the network
+    of a scaled measurement is the scaled scene.
 
     Args:
         channels: colours of the measurement and the scene.
@@ -42,10 +48,12 @@ class WienerBank(nn.Module):
             a quarter of the time and sees twice as far; the estimates it corrects keep the full resolution.
         regularisations: lambda of each estimate, for a PSF of unit sum, the strongest first.
         finest: pixels of the measurement along each side of those of the finest iterations: 1, 2, 4 or 8. With 4 they
-            take a tenth of the time and leave the detail to the bank. 0 for none: the bank filters the measurement.
+            take a tenth of the time and leave the detail to the bank. 0 for none: the bank filters the measurement,
+            continued by its border.
         align: turn and scale the PSF first until it explains the measurement (`mwdn.solvers.alignment`). In training
             PSFs are taken as they are: let the captures be mismatched by what the alignment leaves.
-        boundary: what stands beyond the measurement if ``finest`` is 0, see `mwdn.planes.Boundary`.
+        rounds: of plug and play (`mwdn.solvers.plug_and_play`) between the iterations and the bank, where ``finest``
+            is 1. Their denoiser is trained alone, by noisy pictures, and has nothing to learn here; 0 for none.
     """
 
     def __init__(
@@ -57,22 +65,27 @@ class WienerBank(nn.Module):
         regularisations: tuple[float, ...] = (1e-3, 1e-4, 2e-5),
         finest: int = 1,
         align: bool = True,
-        boundary: Boundary = "taper",
+        rounds: int = 0,
     ) -> None:
         super().__init__()
         if not regularisations or min(regularisations) <= 0:
             raise ParameterError(f"`regularisations` {tuple(regularisations)} must be one or more positive numbers.")
         if finest not in (0, *(level.shrink for level in LEVELS)):
             raise ParameterError(f"`finest` ({finest}) must be 0 or one of {[level.shrink for level in LEVELS]}.")
+        if rounds and finest != 1:
+            raise ParameterError(f"`rounds` ({rounds}) of plug and play need iterations of the full size: `finest` 1.")
         if fold < 1:
             raise ParameterError(f"`fold` ({fold}) must be at least 1.")
         self.channels, self.fold, self.regularisations = channels, fold, regularisations
-        self.finest, self.align, self.boundary = finest, align, boundary
+        self.finest, self.align = finest, align
         self.levels = tuple(level for level in LEVELS if finest and level.shrink >= finest)
         if finest > 1:  # the bank has what total variation would smooth away
             self.levels = tuple(
                 replace(level, regularisation=0.0, iterations=QUICK[level.shrink]) for level in self.levels
             )
+        self.rounds = rounds
+        if rounds:
+            self.denoiser = Drunet(channels=channels).requires_grad_(False)
         pictures = len(regularisations) + (2 if self.levels else 1)
         self.encoder = Encoder(channels * pictures * fold**2, paper_widths(width))
         self.decoder = Decoder(channels * fold**2, paper_widths(width))
@@ -113,15 +126,17 @@ class WienerBank(nn.Module):
         known = [tensor for band in bands for tensor in (band.transfer, band.norm)]
         if self.finest == 1:  # its last level has the bank's transfer function
             return known
-        grid = deconvolution_grid(size, self.boundary)
+        grid = deconvolution_grid(size, BOUNDARY)
         return [*known, *(wiener_transfer(psf, value, grid) for value in self.regularisations)]
 
     def _estimates(self, measurement: Measurement, known: list[Tensor]) -> Tensor:
         b, count = measurement.float(), 2 * len(self.levels)
         if not self.levels:
-            return torch.cat([*self._filtered(b, known, self.boundary), b], dim=1)
+            return torch.cat([*self._filtered(b, known, BOUNDARY), b], dim=1)
         bands = [Band(*each) for each in zip(self.levels, known[:count:2], known[1:count:2], strict=True)]
         found = PsfPyramid(tuple(bands)).explain(b)
+        if self.rounds:
+            found = plug_and_play(found, self.denoiser, self.rounds)
         if self.finest == 1:
             details = [found.detail(value) for value in self.regularisations]
         else:
@@ -131,7 +146,7 @@ class WienerBank(nn.Module):
     def _filtered(self, picture: Tensor, transfers: list[Tensor], boundary: Boundary) -> list[Tensor]:
         """The bank: one spectrum, several filters."""
         size = picture.shape[-2], picture.shape[-1]
-        grid = deconvolution_grid(size, self.boundary)
+        grid = deconvolution_grid(size, BOUNDARY)
         spread = spectrum(extend(picture, grid, boundary), grid)
         return [inverse_spectrum(spread * transfer, grid, size) for transfer in transfers]
 

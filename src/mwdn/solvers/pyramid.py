@@ -113,16 +113,48 @@ class Explanation:
     """A smooth scene, and what it leaves unexplained of the measurement.
 
     Args:
-        scene: (B, C, H, W), not negative, for a PSF of unit sum.
-        rest: (B, C, H, W), the measurement minus the camera's picture of the whole scene.
-        caution: (B, 1, 1, 1), how much of the usual smoothing the noise asked for, see `QUIET`.
+        measurement: (B, C, H, W).
+        whole: (B, C, rows, columns), the scene of the whole grid of the finest level, not negative, for a PSF of unit
+            sum.
+        noise: (B, 1, 1, 1), over the measurement's brightness.
         psf: what the iterations knew of it.
     """
 
-    scene: Scene
-    rest: Measurement
-    caution: Tensor
+    measurement: Measurement
+    whole: Tensor
+    noise: Tensor
     psf: "PsfPyramid"
+
+    @property
+    def brightness(self) -> Tensor:
+        """Root mean square of the measurement, (B, 1, 1, 1)."""
+        return brightness(self.measurement)
+
+    @property
+    def caution(self) -> Tensor:
+        """How much of the usual smoothing the noise asked for, (B, 1, 1, 1), see `QUIET`."""
+        return caution(self.noise)
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The part (B, C, H, W) that faces the sensor."""
+        return self._on_sensor(self.whole)
+
+    @cached_property
+    def rest(self) -> Measurement:
+        """The measurement minus the camera's picture of the whole scene, (B, C, H, W)."""
+        finest = self.psf.bands[-1]
+        shrink, (height, width) = finest.level.shrink, self.measurement.shape[-2:]
+        sensor = -(-height // shrink), -(-width // shrink)
+        seen = finest.transfer * finest.norm * spectrum(self.whole, finest.grid)
+        return self.measurement - self._on_sensor(inverse_spectrum(seen, finest.grid, sensor))
+
+    def _on_sensor(self, picture: Tensor) -> Tensor:
+        """Of a picture in the finest level's pixels, in the sensor's."""
+        shrink, (height, width) = self.psf.bands[-1].level.shrink, self.measurement.shape[-2:]
+        if shrink > 1:
+            picture = F.interpolate(picture, scale_factor=shrink, mode="bilinear")
+        return picture[..., :height, :width]
 
     @cached_property
     def residual(self) -> Tensor:
@@ -181,23 +213,28 @@ class PsfPyramid:
         """Find a smooth non-negative scene (B, C, H, W), from coarse to fine. Differentiable."""
         size = measurement.shape[-2], measurement.shape[-1]
         # tau is stated for a measurement of unit mean square.
-        brightness = measurement.float().square().mean((1, 2, 3), keepdim=True).sqrt()
-        brightness = brightness.clamp(min=torch.finfo(torch.float32).tiny)
-        b = measurement.float() / brightness
+        unit = brightness(measurement)
+        b = measurement.float() / unit
         noise = noise_level(b.detach()).square().mean(1, keepdim=True).sqrt()
-        caution = (noise / QUIET) ** 1.25
         fineness = math.sqrt(size[0] * size[1]) / SIDE
         sizes = {1: b}
         while max(sizes) < self.bands[0].level.shrink:
             sizes[2 * max(sizes)] = halve(sizes[max(sizes)])
         scene: Tensor = b.new_zeros((1, 1, 1, 1))
         for band in self.bands:
-            scene = _solve(sizes[band.level.shrink], band, scene, caution, fineness)
-        scene, shrink = scene.clamp(min=0) * brightness, band.level.shrink
-        sensor = -(-size[0] // shrink), -(-size[1] // shrink)
-        seen = inverse_spectrum(band.transfer * band.norm * spectrum(scene, band.grid), band.grid, sensor)
-        rest = measurement - _enlarged(seen, shrink, size)
-        return Explanation(_enlarged(scene, shrink, size), rest, caution, self)
+            scene = _solve(sizes[band.level.shrink], band, scene, caution(noise), fineness)
+        return Explanation(measurement, scene.clamp(min=0) * unit, noise, self)
+
+
+def brightness(measurement: Measurement) -> Tensor:
+    """Root mean square of each sample, (B, 1, 1, 1); never 0."""
+    square = measurement.float().square().mean((1, 2, 3), keepdim=True)
+    return square.sqrt().clamp(min=torch.finfo(torch.float32).tiny)
+
+
+def caution(noise: Tensor) -> Tensor:
+    """How much of the usual smoothing this noise, over the measurement's brightness, asks for, see `QUIET`."""
+    return (noise / QUIET) ** 1.25
 
 
 def explain(measurement: Measurement, psf: Psf, levels: tuple[Level, ...] = LEVELS) -> Explanation:
@@ -213,13 +250,6 @@ def explain(measurement: Measurement, psf: Psf, levels: tuple[Level, ...] = LEVE
     """
     check_fit(measurement, psf, "measurement")
     return PsfPyramid.of(psf, (measurement.shape[-2], measurement.shape[-1]), levels).explain(measurement)
-
-
-def _enlarged(picture: Tensor, shrink: int, size: Size) -> Tensor:
-    """The part of ``size`` of a picture whose pixels are ``shrink`` times as long."""
-    if shrink > 1:
-        picture = F.interpolate(picture, scale_factor=shrink, mode="bilinear")
-    return picture[..., : size[0], : size[1]]
 
 
 def halve(picture: Tensor) -> Tensor:

@@ -1,0 +1,95 @@
+"""Plug and play: where it ends against a dense system of equations, and what a good denoiser is worth."""
+
+import numpy as np
+import pytest
+import torch
+
+import oracles
+from mwdn.fourier import convolve
+from mwdn.networks import build
+from mwdn.optics.patterns import contour_psf
+from mwdn.solvers import plug_and_play as module
+from mwdn.solvers.admm import Penalties
+from mwdn.solvers.plug_and_play import TRUST, plug_and_play
+from mwdn.solvers.pyramid import QUIET, Level, explain
+
+SIZE = 24, 32
+
+
+@pytest.fixture
+def found(generator):
+    """A scene in the middle of the frame, whose pattern the sensor crops, and what the pyramid makes of it."""
+    psf = contour_psf(SIZE, cell=6, generator=generator).expand(1, 3, -1, -1)
+    scene = torch.zeros(2, 3, *SIZE)
+    scene[..., 6:18, 8:26] = 0.2 + torch.rand(2, 3, 12, 18, generator=generator)
+    return explain(convolve(scene, psf), psf), scene, psf
+
+
+def test_it_ends_where_sensor_and_denoiser_pull_alike(generator, monkeypatch):
+    """Of 1/2 |crop(h * v) - b|^2 + rho/2 |v - z|^2 with a denoiser that always answers z, the least in the frame."""
+    level, sensor, centre = 0.02, (5, 6), (slice(1, 6), slice(1, 7))
+    monkeypatch.setattr(module, "LEVELS", (level, level))
+    psf = 0.2 + torch.rand(3, 3, generator=generator, dtype=torch.float64)
+    psf = psf / psf.sum()
+    A = oracles.matrix(psf.numpy(), sensor)
+    truth = 1 + torch.rand(7, 8, generator=generator, dtype=torch.float64)
+    b = A @ truth.numpy().ravel()
+    z = truth[centre] + 0.1 * torch.rand(sensor, generator=generator, dtype=torch.float64)
+    found = explain(
+        torch.from_numpy(b).view(1, 1, *sensor).float(),
+        psf.float()[None, None],
+        (Level(1, 50, Penalties(0.5, 0.0, 0.5)),),
+    )
+    brightest, seen = found.scene.max(), []
+
+    def denoise(picture, told):
+        assert told.item() == pytest.approx(level)
+        seen.append(picture)
+        return (z / brightest).float()[None, None]
+
+    ended = plug_and_play(found, denoise, 1500)
+    torch.testing.assert_close(ended.scene, z.float()[None, None])
+    rho = TRUST * float(found.noise.clamp(min=QUIET) * found.brightness / (level * brightest)) ** 2
+    inside = np.zeros((7, 8), bool)
+    inside[centre] = True
+    prior = np.sqrt(rho) * np.eye(56)[inside.ravel()]
+    least = np.linalg.lstsq(np.vstack([A, prior]), np.concatenate([b, np.sqrt(rho) * z.numpy().ravel()]), rcond=None)[0]
+    expected = torch.from_numpy(least.reshape(7, 8)[centre]).float()
+    torch.testing.assert_close((seen[-1] * brightest)[0, 0], expected, rtol=0, atol=2e-3)
+    assert (z - expected).abs().max() > 0.02  # which is not merely z
+
+
+def test_a_denoiser_that_knows_the_scene_explains_the_measurement(found):
+    explained, scene, _ = found
+    unit = explained.scene.amax((1, 2, 3), keepdim=True)
+    ended = plug_and_play(explained, lambda picture, level: scene / unit, 8)
+    torch.testing.assert_close(ended.scene, scene)
+    assert ended.rest.norm() < 0.3 * explained.rest.norm()
+    assert ended.measurement is explained.measurement
+    assert (ended.whole >= 0).all()
+
+
+def test_the_level_falls_and_the_frame_alone_is_denoised(found):
+    explained, _, _ = found
+    told = []
+
+    def denoise(picture, level):
+        told.append((tuple(picture.shape), level.flatten().tolist()))
+        return picture
+
+    plug_and_play(explained, denoise, 3)
+    assert [shape for shape, _ in told] == 3 * [(2, 3, *SIZE)]
+    assert [level for _, levels in told for level in levels] == pytest.approx(
+        [each for each in (0.03, (0.03 * 0.005) ** 0.5, 0.005) for _ in range(2)]
+    )
+
+
+def test_brighter_light_gives_a_brighter_scene(found):
+    explained, _, psf = found
+    torch.manual_seed(0)
+    denoise = build("drunet", widths=(4, 6), blocks=1).requires_grad_(False)
+    once = plug_and_play(explained, denoise, 2).scene
+    bright = plug_and_play(explain(100 * explained.measurement, psf), denoise, 2).scene
+    torch.testing.assert_close(bright, 100 * once, rtol=1e-3, atol=1e-2)
+    alone = plug_and_play(explain(explained.measurement[1:], psf), denoise, 2).scene
+    torch.testing.assert_close(alone, once[1:], rtol=1e-3, atol=1e-4)
