@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from mwdn.solvers.admm import Penalties, Splitting, merge, posed, start
+from mwdn.fourier import inverse_spectrum, spectrum
+from mwdn.solvers.admm import posed
 from mwdn.solvers.pyramid import QUIET, Explanation
 
 Denoiser = Callable[[Tensor, Tensor], Tensor]
@@ -40,21 +41,28 @@ def plug_and_play(found: Explanation, denoise: Denoiser, rounds: int) -> Explana
     """
     band = found.psf.bands[-1]
     problem = posed(found.measurement.float(), band.transfer)
-    height, width = problem.sensor
-    known = (found.whole * band.norm).expand(*found.measurement.shape[:2], *problem.grid)
-    tiny = torch.finfo(torch.float32).tiny
-    brightest = known[..., :height, :width].amax((1, 2, 3), keepdim=True).clamp(min=tiny)
+    grid, (height, width) = problem.grid, problem.sensor
+    known = (found.whole * band.norm).expand(*found.measurement.shape[:2], *grid)
+    brightest = known[..., :height, :width].amax((1, 2, 3), keepdim=True)
+    brightest = brightest.clamp(min=torch.finfo(torch.float32).tiny)
     noise = found.noise.clamp(min=QUIET) * found.brightness
-    state = start(problem, known, smooth=False)
+    V = spectrum(known, grid)
+    Hv = inverse_spectrum(problem.transfer * V, grid, problem.sensor)
+    xi = torch.zeros_like(Hv)  # the crop's multiplier, over its penalty
     first, last = LEVELS
     for step in range(rounds):
         level = torch.full_like(noise, first * (last / first) ** (step / max(1, rounds - 1)))
-        mu = Penalties(DATA, 0.0, TRUST * (noise / (level * brightest)).square())
+        trust = TRUST * (noise / (level * brightest)).square()
+        quotient = 1 / (DATA * problem.power + trust)
+        kept, gain = DATA * problem.power * quotient, DATA * quotient * problem.adjoint
+        prior = spectrum(known, grid).mul_(trust * quotient)
         for _ in range(2):
-            x = (mu.data * (state.xi + state.Hv) + problem.measurement) / (1 + mu.data)
-            state = merge(state._replace(rho=torch.zeros_like(known)), Splitting((), x, known), problem, mu)
-        free = state.v.clamp(min=0)
+            pull = (DATA * (xi + Hv) + problem.measurement) / (1 + DATA) - xi
+            V = spectrum(pull - Hv, grid).mul_(gain).add_(prior).add_(V.mul_(kept))
+            Hv = inverse_spectrum(problem.transfer * V, grid, problem.sensor)
+            xi = Hv - pull
+        free = inverse_spectrum(V, grid, grid).clamp(min=0)
         seen = free[..., :height, :width]
         clean = brightest * denoise(seen / brightest, level).clamp(min=0)
-        known = free + F.pad(clean - seen, (0, problem.grid[1] - width, 0, problem.grid[0] - height))
+        known = free + F.pad(clean - seen, (0, grid[1] - width, 0, grid[0] - height))
     return replace(found, whole=known / band.norm)
