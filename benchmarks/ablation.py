@@ -24,25 +24,28 @@ from universal import FULL_WELLS, captures
 def parts(psf):
     """The whole and what is left of it, as functions of the measurement."""
     network = find_method("universal").eval()
+    known = vars(network) | {"mean_light": wiener_bank.mean_light}
 
-    def with_options(*, aligned=True, free=False):
+    def without(**options):
         def reconstruct(measurement):
-            kept, network.align = wiener_bank.mean_light, aligned
-            if free:
-                wiener_bank.mean_light = torch.zeros_like
-            try:
-                return network(measurement, psf)
-            finally:
-                network.align, wiener_bank.mean_light = True, kept
+            wiener_bank.mean_light = options.get("mean_light", known["mean_light"])
+            network.align, network.rounds = (options.get(name, known[name]) for name in ("align", "rounds"))
+            return network(measurement, psf)
 
         return reconstruct
 
+    def uncorrected(measurement):
+        network.rounds = known["rounds"]
+        return network.estimates(measurement, align(measurement, psf).move(psf))[:, :3]
+
     return {
-        "whole": with_options(),
-        "PSF not aligned": with_options(aligned=False),
-        "U-Net free to change the mean light": with_options(free=True),
-        "no U-Net: pyramid, PSF aligned": lambda b: Pyramid()(b, align(b, psf).move(psf)),
-        "no U-Net: pyramid, PSF not aligned": lambda b: Pyramid()(b, psf),
+        "whole": without(),
+        "PSF not aligned": without(align=False),
+        "no plug and play": without(rounds=0),
+        "U-Net free to change the mean light": without(mean_light=torch.zeros_like),
+        "no U-Net: plug and play, PSF aligned": uncorrected,
+        "neither: pyramid, PSF aligned": lambda b: Pyramid()(b, align(b, psf).move(psf)),
+        "neither: pyramid, PSF not aligned": lambda b: Pyramid()(b, psf),
     }
 
 

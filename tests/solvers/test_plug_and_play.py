@@ -1,5 +1,7 @@
 """Plug and play: where it ends against a dense system of equations, and what a good denoiser is worth."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,7 +13,7 @@ from mwdn.optics.patterns import contour_psf
 from mwdn.solvers import plug_and_play as module
 from mwdn.solvers.admm import Penalties
 from mwdn.solvers.plug_and_play import TRUST, plug_and_play
-from mwdn.solvers.pyramid import QUIET, Level, explain
+from mwdn.solvers.pyramid import QUIET, Level, brightness, explain
 
 SIZE = 24, 32
 
@@ -93,3 +95,14 @@ def test_brighter_light_gives_a_brighter_scene(found):
     torch.testing.assert_close(bright, 100 * once, rtol=1e-3, atol=1e-2)
     alone = plug_and_play(explain(explained.measurement[1:], psf), denoise, 2).scene
     torch.testing.assert_close(alone, once[1:], rtol=1e-3, atol=1e-4)
+
+
+def test_what_the_psf_does_not_explain_counts_as_noise(found):
+    """Through a PSF that is not the camera's."""
+    explained, _, psf = found
+    wrong = explain(explained.measurement, psf.flip(-1))
+    rest = brightness(wrong.rest) / wrong.brightness
+    assert (rest > 1.5 * wrong.noise.clamp(min=QUIET)).all()
+    blur = lambda picture, level: torch.nn.functional.avg_pool2d(picture, 3, 1, 1)  # noqa: E731
+    told = plug_and_play(replace(wrong, noise=rest), blur, 3).scene
+    torch.testing.assert_close(plug_and_play(wrong, blur, 3).scene, told)
