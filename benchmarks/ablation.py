@@ -16,6 +16,7 @@ from mwdn.data.photographs import Photographs
 from mwdn.evaluation import Perceptual, Protocol, evaluate
 from mwdn.learning.recipe import read_recipe
 from mwdn.networks import wiener_bank
+from mwdn.networks.wiener_bank import mean_light
 from mwdn.reconstruct import find_method
 from mwdn.solvers import Pyramid, align
 from universal import FULL_WELLS, captures
@@ -24,7 +25,7 @@ from universal import FULL_WELLS, captures
 def parts(psf):
     """The whole and what is left of it, as functions of the measurement."""
     network = find_method("universal").eval()
-    known = vars(network) | {"mean_light": wiener_bank.mean_light}
+    known = vars(network) | {"mean_light": mean_light}
 
     def without(**options):
         def reconstruct(measurement):
