@@ -8,6 +8,7 @@ Captures as in benchmarks/universal.py, through the paper's PSF: 15,000 and 2,00
 import argparse
 import json
 from pathlib import Path
+from unittest.mock import patch
 
 import torch
 
@@ -16,7 +17,6 @@ from mwdn.data.photographs import Photographs
 from mwdn.evaluation import Perceptual, Protocol, evaluate
 from mwdn.learning.recipe import read_recipe
 from mwdn.networks import wiener_bank
-from mwdn.networks.wiener_bank import mean_light
 from mwdn.reconstruct import find_method
 from mwdn.solvers import Pyramid, align
 from universal import FULL_WELLS, captures
@@ -25,27 +25,24 @@ from universal import FULL_WELLS, captures
 def parts(psf):
     """The whole and what is left of it, as functions of the measurement."""
     network = find_method("universal").eval()
-    known = vars(network) | {"mean_light": mean_light}
 
-    def without(**options):
+    def changed(target, **attributes):
         def reconstruct(measurement):
-            wiener_bank.mean_light = options.get("mean_light", known["mean_light"])
-            network.align, network.rounds = (options.get(name, known[name]) for name in ("align", "rounds"))
-            return network(measurement, psf)
+            with patch.multiple(target, **attributes):
+                return network(measurement, psf)
 
         return reconstruct
 
-    def uncorrected(measurement):
-        network.rounds = known["rounds"]
-        return network.estimates(measurement, align(measurement, psf).move(psf))[:, :3]
+    def aligned(method):
+        return lambda measurement: method(measurement, align(measurement, psf).move(psf))
 
     return {
-        "whole": without(),
-        "PSF not aligned": without(align=False),
-        "no plug and play": without(rounds=0),
-        "U-Net free to change the mean light": without(mean_light=torch.zeros_like),
-        "no U-Net: plug and play, PSF aligned": uncorrected,
-        "neither: pyramid, PSF aligned": lambda b: Pyramid()(b, align(b, psf).move(psf)),
+        "whole": lambda b: network(b, psf),
+        "PSF not aligned": changed(network, align=False),
+        "no plug and play": changed(network, rounds=0),
+        "U-Net free to change the mean light": changed(wiener_bank, mean_light=torch.zeros_like),
+        "no U-Net: plug and play, PSF aligned": aligned(lambda *known: network.estimates(*known)[:, :3]),
+        "neither: pyramid, PSF aligned": aligned(Pyramid()),
         "neither: pyramid, PSF not aligned": lambda b: Pyramid()(b, psf),
     }
 

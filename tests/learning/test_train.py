@@ -557,3 +557,9 @@ def test_a_denoiser_is_trained_alone_and_then_stays(trainer, tmp_path):
         trainer(few(denoiser=str(tmp_path / "a" / "best.safetensors")), "none")
     with pytest.raises(CheckpointError, match="holds a denoiser, which reconstructs nothing alone"):
         find_method(tmp_path / "a" / "best.safetensors")
+
+
+def test_a_denoiser_does_not_learn_from_recorded_pairs(calibration, tmp_path):
+    recipe = replace(few(), network=DRUNET, denoising=Denoising((0.05, 0.1)))
+    with pytest.raises(ParameterError, match="makes its own pairs from photographs: give `--photos`"):
+        prepare(recipe, calibration, None, tmp_path / "run", "cpu", pairs=tmp_path / "none.h5")

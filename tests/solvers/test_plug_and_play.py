@@ -51,7 +51,7 @@ def test_it_ends_where_sensor_and_denoiser_pull_alike(generator, monkeypatch):
 
     ended = plug_and_play(found, denoise, 1500)
     torch.testing.assert_close(ended.scene, z.float()[None, None])
-    rho = TRUST * float(found.noise.clamp(min=QUIET) * found.brightness / (level * brightest)) ** 2
+    rho = TRUST * float(found.noise.clamp(min=QUIET) * brightness(found.measurement) / (level * brightest)) ** 2
     inside = np.zeros((7, 8), bool)
     inside[centre] = True
     prior = np.sqrt(rho) * np.eye(56)[inside.ravel()]
@@ -101,7 +101,7 @@ def test_what_the_psf_does_not_explain_counts_as_noise(found):
     """Through a PSF that is not the camera's."""
     explained, _, psf = found
     wrong = explain(explained.measurement, psf.flip(-1))
-    rest = brightness(wrong.rest) / wrong.brightness
+    rest = brightness(wrong.rest) / brightness(wrong.measurement)
     assert (rest > 1.5 * wrong.noise.clamp(min=QUIET)).all()
     blur = lambda picture, level: torch.nn.functional.avg_pool2d(picture, 3, 1, 1)  # noqa: E731
     told = plug_and_play(replace(wrong, noise=rest), blur, 3).scene

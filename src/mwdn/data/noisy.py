@@ -49,7 +49,7 @@ class NoisyScenes:
             the noisy scene (B, 3, H, W); the scene, its brightest pixel 1; in place of a PSF the noise level
             (B, 1, 1, 1).
         """
-        generators = [torch.Generator().manual_seed((self.pairs.seed * 1_000_003 + n) & (2**63 - 1)) for n in numbers]
+        generators = self.pairs.generators(numbers)
         scene = self.pairs.scenes(generators)
         scene = scene / scene.amax((1, 2, 3), keepdim=True).clamp(min=1e-3)
         lowest, highest = map(math.log, self.denoising.levels)

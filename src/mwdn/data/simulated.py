@@ -192,8 +192,7 @@ class SimulatedPairs:
             measurement (B, 3, H, W), its noise relative to the exposure, in units of the scene; and the scene
             (B, 3, H, W), linear light in [0, 1].
         """
-        # Two neighbouring seeds share no sample before the millionth; torch looks at the lower 32 bits alone.
-        generators = [torch.Generator().manual_seed((self.seed * 1_000_003 + n) & (2**63 - 1)) for n in numbers]
+        generators = self.generators(numbers)
         scene = self.scenes(generators)
         camera = self.camera or Camera(perturb(self.psf.expand(len(scene), -1, -1, -1), self.mismatch, generators))
         light = camera.forward(scene)
@@ -206,6 +205,11 @@ class SimulatedPairs:
         gain = stops.exp()[..., None, None].to(light) / brightest
         exposed = torch.cat([self._expose(one, g) for one, g in zip(light * gain, generators, strict=True)])
         return Pair(exposed / gain, scene)
+
+    def generators(self, numbers: range | list[int]) -> list[torch.Generator]:
+        """One for each sample of these numbers."""
+        # Two neighbouring seeds share no sample before the millionth; torch looks at the lower 32 bits alone.
+        return [torch.Generator().manual_seed((self.seed * 1_000_003 + n) & (2**63 - 1)) for n in numbers]
 
     def scenes(self, generators: list[torch.Generator]) -> Scene:
         """Place one photograph in each scene: chosen, mirrored, scaled, turned, shifted."""

@@ -67,6 +67,8 @@ def prepare(
     elif pairs is not None:
         if recipe.cameras.sizes:
             raise ParameterError("Recorded pairs, `--pairs`, are of one camera: leave [cameras] out of the recipe.")
+        if recipe.denoising.levels[1]:
+            raise ParameterError("[denoising] makes its own pairs from photographs: give `--photos`, not `--pairs`.")
         seed = recipe.schedule.seed
         training, validation = recorded_pairs(pairs, calibration.psf, recipe.pairs, seed=seed, device=place)
         recipe = _within(recipe, len(validation))

@@ -260,10 +260,9 @@ class Trainer:
 
     def _begin(self) -> None:
         """Take the weights that the schedule names."""
-        known = self.network.state_dict()
-        if start := self.schedule.start:
-            known = load_network(find_weights(start) or start).state_dict()
-        if alone := self.schedule.denoiser:
+        start, alone = self.schedule.start, self.schedule.denoiser
+        known = (load_network(find_weights(start) or start) if start else self.network).state_dict()
+        if alone:
             known |= {f"denoiser.{key}": value for key, value in load_network(alone).state_dict().items()}
         try:
             self.network.load_state_dict(known)

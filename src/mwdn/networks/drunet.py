@@ -54,7 +54,7 @@ class Drunet(nn.Module):
         self, *, channels: int = 3, widths: tuple[int, ...] = (32, 64, 96, 128), blocks: int = 2, fold: int = 2
     ) -> None:
         super().__init__()
-        self.channels, self.fold = channels, fold
+        self.fold = fold
         self.head = convolution((channels + 1) * fold**2, widths[0], 3)
         *left, self.centre = (_scale(width, blocks) for width in widths)
         self.encoder = nn.ModuleList(left)

@@ -24,7 +24,6 @@ measure shading and colour better than a U-Net guesses them: 1 dB with an exact 
 QUICK = {8: 12, 4: 18, 2: 8}
 """Iterations of each size where detail is left to the bank: three quarters of the time, for a tenth of a decibel."""
 
-
 BOUNDARY: Boundary = "taper"
 """How a measurement goes on beyond its border, where the bank filters it as it is."""
 

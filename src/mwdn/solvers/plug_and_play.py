@@ -48,9 +48,8 @@ def plug_and_play(found: Explanation, denoise: Denoiser, rounds: int) -> Explana
     known = (found.whole * band.norm).expand(*found.measurement.shape[:2], *grid)
     brightest = known[..., :height, :width].amax((1, 2, 3), keepdim=True)
     brightest = brightest.clamp(min=torch.finfo(torch.float32).tiny)
-    noise = torch.maximum(found.noise.clamp(min=QUIET) * found.brightness, brightness(found.rest))
-    V = spectrum(known, grid)
-    Hv = inverse_spectrum(problem.transfer * V, grid, problem.sensor)
+    noise = torch.maximum(found.noise.clamp(min=QUIET) * brightness(found.measurement), brightness(found.rest))
+    V, Hv = spectrum(known, grid), problem.measurement - found.rest
     xi = torch.zeros_like(Hv)  # the crop's multiplier, over its penalty
     first, last = LEVELS
     for step in range(rounds):

@@ -105,7 +105,8 @@ class Pyramid:
         found = explain(measurement, psf, self.levels)
         tiny = torch.finfo(torch.float32).tiny
         total = psf.float().sum((-2, -1), keepdim=True).clamp(min=tiny)
-        return (found.scene + found.detail(self.regularisation * found.caution.clamp(min=1))).clamp(min=0) / total
+        detail = found.detail(self.regularisation * caution(found.noise).clamp(min=1))
+        return (found.scene + detail).clamp(min=0) / total
 
 
 @dataclass(frozen=True)
@@ -124,16 +125,6 @@ class Explanation:
     whole: Tensor
     noise: Tensor
     psf: "PsfPyramid"
-
-    @property
-    def brightness(self) -> Tensor:
-        """Root mean square of the measurement, (B, 1, 1, 1)."""
-        return brightness(self.measurement)
-
-    @property
-    def caution(self) -> Tensor:
-        """How much of the usual smoothing the noise asked for, (B, 1, 1, 1), see `QUIET`."""
-        return caution(self.noise)
 
     @cached_property
     def scene(self) -> Scene:
