@@ -66,10 +66,13 @@ def test_gain_and_even_light_do_not_matter(known):
 
 
 def test_sentences():
-    assert "mirrored" in Consistency(0.9, 0.95, 0.8, 0.0, 0.0).sentence
-    assert "little" in Consistency(0.2, 0.95, 1.2, 0.0, 0.0).sentence
-    assert Consistency(0.9, 0.95, 1.2, 0.0, 0.0).sentence == (
+    assert "mirrored" in Consistency(0.9, 0.95, 0.8, 0.0, 0.0, 0.0).sentence
+    assert "little" in Consistency(0.2, 0.95, 1.2, 0.0, 0.0, 0.0).sentence
+    assert Consistency(0.9, 0.95, 1.2, 0.0, 0.0, 0.0).sentence == (
         "explains 90.0% of the capture's detail, of 95.0% that is not noise"
+    )
+    assert Consistency(0.9, 0.95, 1.2, 0.5, 0.0, 0.07).sentence.endswith(
+        "; fits best with the PSF turned by 0.50 degrees, under 7% of haze"
     )
 
 

@@ -8,6 +8,7 @@ from scipy.ndimage import affine_transform
 from mwdn.errors import ShapeError
 from mwdn.optics.camera import Camera
 from mwdn.optics.patterns import contour_psf
+from mwdn.optics.warp import hazed
 from mwdn.solvers.alignment import Pose, align
 from mwdn.solvers.pyramid import Pyramid
 
@@ -64,6 +65,23 @@ def test_a_turned_psf_equals_scipys(psf):
     torch.testing.assert_close(moved.sum((-2, -1)), torch.ones(2, moved.shape[1]))
 
 
+def test_haze_is_found_beside_a_turn_and_lifts_the_veil():
+    psf = contour_psf((288, 320), generator=torch.Generator().manual_seed(4))
+    scene = torch.zeros(1, 3, 288, 320)
+    scene[..., 100:180, 120:220] = (
+        torch.rand(3, 10, 10, generator=torch.Generator().manual_seed(5))
+        .repeat_interleave(8, 1)
+        .repeat_interleave(10, 2)
+    )
+    clear, hazy = (turned(psf, 0.5, 1.0), hazed(turned(psf, 0.5, 1.0), 0.1))
+    measurements = torch.cat([captured(each, scene) for each in (clear, hazy)])
+    pose = align(measurements, psf)
+    assert pose.haze[0] == 0
+    assert 0.03 < pose.haze[1] < 0.11
+    found, missed = (Pyramid()(measurements, each.move(psf))[1:] for each in (pose, pose._replace(haze=0.0)))
+    assert (found - scene).square().mean() < 0.75 * (missed - scene).square().mean()
+
+
 def test_each_capture_has_its_own_pose_whatever_its_brightness(psf, scenes):
     measurement = torch.cat([captured(turned(psf, 1.0, 1.0), scenes[:1]), captured(psf, scenes[1:])])
     together = align(measurement * torch.tensor([7.0, 0.1])[:, None, None, None], psf)
@@ -84,6 +102,6 @@ def test_pictures_gain_what_the_calibration_had_lost(psf, scenes):
 
 def test_darkness_and_odd_sizes_leave_the_psf_alone(psf):
     pose = align(torch.zeros(1, 3, 51, 43), psf[..., :37, :39])
-    assert pose.turn_degrees.item() == pose.scale.item() == 0.0
+    assert pose.turn_degrees.item() == pose.scale.item() == pose.haze.item() == 0.0
     with pytest.raises(ShapeError, match="channels"):
         align(torch.zeros(1, 3, 51, 43), psf.expand(1, 2, -1, -1))

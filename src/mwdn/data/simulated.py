@@ -18,6 +18,7 @@ from mwdn.fourier import Size
 from mwdn.optics.camera import Camera
 from mwdn.optics.field import FieldCamera
 from mwdn.optics.sensor import Sensor
+from mwdn.optics.warp import hazed
 from mwdn.types import Measurement, Psf, Scene
 
 Range = tuple[float, float]
@@ -289,8 +290,7 @@ def perturb(psf: Psf, mismatch: Mismatch, generators: list[torch.Generator]) -> 
         noise = torch.stack([torch.randn(blurred.shape[1:], generator=g) for g in generators]).to(blurred)
         blurred = blurred * (1 + mismatch.grain * noise).clamp(min=0)
     blurred = blurred / blurred.sum((-2, -1), keepdim=True).clamp(min=1e-12)
-    haze = mismatch.size(generators, mismatch.background)[..., None, None].to(psf)
-    return (1 - haze) * blurred + haze / (height * width)
+    return hazed(blurred, mismatch.size(generators, mismatch.background)[..., None, None].to(psf))
 
 
 def _blur(planes: Tensor, sigma: Tensor) -> Tensor:

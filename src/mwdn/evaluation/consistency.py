@@ -29,6 +29,7 @@ class Consistency:
         turn_degrees: turn of the PSF with which it explains the most.
         scale: likewise its relative magnification. An object that is nearer than the calibration's point makes it
             positive.
+        haze: part of the light that lies evenly under that PSF, as far as it can be told.
     """
 
     explained: float
@@ -36,6 +37,7 @@ class Consistency:
     contrast: float
     turn_degrees: float
     scale: float
+    haze: float
 
     @property
     def doubtful(self) -> bool:
@@ -49,16 +51,20 @@ class Consistency:
         if self.doubtful:
             why = "the PSF mirrored explains more" if self.contrast < 1 else "that is little"
             return f"{told}; {why}: is it this camera's PSF?"
-        moved = abs(self.turn_degrees) > 0.2 or abs(self.scale) > 0.005
-        pose = f"; fits best with the PSF turned by {self.turn_degrees:.2f} degrees and scaled by {self.scale:+.1%}"
-        return told + (pose if moved else "")
+        changes = [
+            f"turned by {self.turn_degrees:.2f} degrees" * (abs(self.turn_degrees) > 0.2),
+            f"scaled by {self.scale:+.1%}" * (abs(self.scale) > 0.005),
+            f"under {self.haze:.0%} of haze" * (self.haze > 0),
+        ]
+        pose = ", ".join(filter(None, changes))
+        return told + (f"; fits best with the PSF {pose}" if pose else "")
 
 
 @torch.inference_mode()
 def consistency(measurement: Measurement, psf: Psf, scene: Scene, *, pose: Pose | None = None) -> Consistency:
     """Compare a measurement with what the camera would see of its reconstruction.
 
-    The PSF is first turned and scaled as fits best (`mwdn.solvers.alignment`); of each colour a gain and an even
+    The PSF is first turned, scaled and hazed as fits best (`mwdn.solvers.alignment`); of each colour a gain and an even
     light are free.
 
     A PSF that is merely displaced goes unnoticed: it displaces the picture, and explains the capture as well.
@@ -91,4 +97,5 @@ def consistency(measurement: Measurement, psf: Psf, scene: Scene, *, pose: Pose 
         contrast=min(others) / max(left, 1e-30),
         turn_degrees=float(pose.turn_degrees),
         scale=float(pose.scale),
+        haze=float(pose.haze),
     )

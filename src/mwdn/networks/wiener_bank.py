@@ -49,8 +49,8 @@ class WienerBank(nn.Module):
         finest: pixels of the measurement along each side of those of the finest iterations: 1, 2, 4 or 8. With 4 they
             take a tenth of the time and leave the detail to the bank. 0 for none: the bank filters the measurement,
             continued by its border.
-        align: turn and scale the PSF first until it explains the measurement (`mwdn.solvers.alignment`). In training
-            PSFs are taken as they are: let the captures be mismatched by what the alignment leaves.
+        align: turn, scale and haze the PSF first until it explains the measurement (`mwdn.solvers.alignment`). In
+            training PSFs are taken as they are: let the captures be mismatched by what the alignment leaves.
         rounds: of plug and play (`mwdn.solvers.plug_and_play`) between the iterations and the bank, where ``finest``
             is 1. Their denoiser is trained alone, by noisy pictures, and has nothing to learn here; 0 for none.
     """

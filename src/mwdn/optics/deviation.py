@@ -7,7 +7,7 @@ import torch
 
 from mwdn.errors import ParameterError
 from mwdn.optics.field import Aberration, FieldCamera, field_psfs
-from mwdn.optics.warp import warp
+from mwdn.optics.warp import hazed, warp
 from mwdn.types import Psf
 
 OFF_AXIS = Aberration(scale=0.005, stretch=0.02, vignetting=0.3)
@@ -84,6 +84,4 @@ class Deviation:
             psf = psf / psf.sum((-2, -1), keepdim=True).clamp(min=1e-12)
         change = replace(OFF_AXIS * self.off_axis, blur_px=BLUR * self.off_axis * min(size))
         psfs = field_psfs(psf, (GRID, GRID) if self.off_axis else (1, 1), change)
-        even = psfs.sum((-2, -1), keepdim=True) / (size[0] * size[1])
-        psfs = (1 - self.background) * psfs + self.background * even
-        return FieldCamera.from_psfs(psfs, size, rank=RANK)
+        return FieldCamera.from_psfs(hazed(psfs, self.background), size, rank=RANK)

@@ -1,4 +1,4 @@
-"""Turn, scale and shear PSFs about their centre."""
+"""Turn, scale and shear PSFs about their centre; haze."""
 
 import torch
 from torch import Tensor
@@ -27,3 +27,8 @@ def warp(psf: Psf, matrix: Tensor, shift: tuple[float, float] = (0.0, 0.0)) -> T
     grid = torch.stack([(2 * columns + 1) / width - 1, (2 * rows + 1) / height - 1], -1)
     psf = psf.expand(len(grid), -1, -1, -1)
     return F.grid_sample(psf, grid, mode="bicubic", align_corners=False).clamp(min=0)
+
+
+def hazed(psf: Tensor, part: Tensor | float) -> Tensor:
+    """Spread a part of the light of PSFs (..., h, w) evenly over them; ``part`` is a number or broadcasts."""
+    return psf + part * (psf.mean((-2, -1), keepdim=True) - psf)

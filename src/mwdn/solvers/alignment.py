@@ -1,4 +1,4 @@
-"""Turn and scale a PSF until it explains the capture: what has changed in a camera since its calibration."""
+"""Turn, scale and haze a PSF until it explains the capture: what has changed in a camera since its calibration."""
 
 from typing import NamedTuple
 
@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.fourier import Size, check_fit, frequency_grid, inverse_spectrum, spectrum
-from mwdn.optics.warp import warp
+from mwdn.optics.warp import hazed, warp
 from mwdn.solvers.admm import Penalties
 from mwdn.solvers.pyramid import Level, explain, halve
 from mwdn.types import Image, Measurement, Psf
@@ -19,17 +19,21 @@ class Pose(NamedTuple):
     Args:
         turn_degrees: (B,), clockwise.
         scale: (B,), relative magnification, 0 for none.
+        haze: (B,), part of the light that lies evenly under the PSF: scattered by the mask or the sensor's glass, or
+            taken from the PSF as if it had been the sensor's black.
     """
 
     turn_degrees: Tensor
     scale: Tensor
+    haze: Tensor | float = 0.0
 
     def move(self, psf: Psf) -> Tensor:
-        """The PSF (1 or B, C, h, w) turned and scaled for each capture: (B, C, h, w), each colour of unit sum."""
+        """The PSF (1 or B, C, h, w) as each capture met it: (B, C, h, w), each colour of unit sum."""
         angle, size = torch.deg2rad(self.turn_degrees), 1 + self.scale
         c, s = size * angle.cos(), size * angle.sin()
         moved = warp(psf, torch.stack([torch.stack([c, s], -1), torch.stack([-s, c], -1)], 1))
-        return moved / moved.sum((-2, -1), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
+        moved = moved / moved.sum((-2, -1), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
+        return hazed(moved, torch.as_tensor(self.haze, device=moved.device).reshape(-1, 1, 1, 1))
 
 
 # At half the size, where a turn by 0.5 degrees still moves the outer lines of a PSF of 320 pixels by 0.7 of them.
@@ -44,6 +48,10 @@ _LIKELY = (0.5, 0.01)  # degrees and relative magnification by which a calibrati
 _DELTA = (0.1, 0.002)  # for the derivatives
 _SHARED = 20.0  # pixels that tell as much as one: what is left is alike in neighbours
 
+# At a quarter of the size: haze is nothing but low frequencies.
+_HAZES = (0.0, 0.02, 0.04, 0.07, 0.1, 0.14, 0.2)
+_HAZE_LEVELS = (Level(2, 20, Penalties(0.15, 0.0, 0.6)), Level(1, 20, Penalties(0.15, 0.0, 0.6)))
+
 
 @torch.no_grad()
 def align(measurement: Measurement, psf: Psf, *, steps: int = 2) -> Pose:
@@ -54,7 +62,9 @@ def align(measurement: Measurement, psf: Psf, *, steps: int = 2) -> Pose:
     of what is left once the scene has been found anew (variable projection): with a scene that stands still the steps
     would be three times too short. A step that leaves more unexplained is not taken.
 
-    Blur and haze cannot be found in this way: a sharper PSF always explains more.
+    Then the haze. Faint light all over the scene explains a haze that the PSF lacks, but nothing explains one that the
+    camera lacks, for light is not negative: what is left is level up to the true haze and rises steeply behind it. So
+    it is the largest that explains about as well as none. Blur cannot be found: a sharper PSF always explains more.
 
     Args:
         measurement: (B, C, H, W).
@@ -84,12 +94,32 @@ def align(measurement: Measurement, psf: Psf, *, steps: int = 2) -> Pose:
         curvature = A @ A.mT + noise * likely.square().reciprocal().diag()
         pose = pose - torch.linalg.solve(curvature, slope)[..., 0]
     best, _ = _better(pose, _unexplained(small, psf, pose[:, None])[:, 0], best, least)
-    return Pose(best[:, 0], best[:, 1])
+    found = Pose(best[:, 0], best[:, 1])
+    return found._replace(haze=_haze(halve(small), _halved(_halved(found.move(psf)))))
 
 
 def _better(pose: Tensor, left: Tensor, best: Tensor, least: Tensor) -> tuple[Tensor, Tensor]:
     energy = left.square().sum(1)
     return torch.where((energy < least)[:, None], pose, best), torch.minimum(energy, least)
+
+
+def _haze(measurement: Measurement, psf: Psf) -> Tensor:
+    """Haze (B,) under the PSF (B, C, h, w) of each capture: where what is left at low frequencies begins to rise.
+
+    As a parabola that far beyond has the curvature E'' it has then risen by 1.4 % of its least value E. With this part,
+    the best of 0.5 to 3 %, no haze was found in 16 exact captures through two measured PSFs, and 95 % of the decibels
+    gained that the best haze of each of 16 others gains.
+    """
+    hazes = measurement.new_tensor(_HAZES)
+    each = hazed(psf.repeat_interleave(len(hazes), 0), hazes.repeat(len(psf))[:, None, None, None])
+    found = explain(measurement.repeat_interleave(len(hazes), 0), each, _HAZE_LEVELS)
+    grid = found.psf.bands[-1].grid
+    left = inverse_spectrum(found.residual * _low(grid, 4 * _COARSE, measurement.device), grid, grid)
+    left = left.square().sum((1, 2, 3)).reshape(-1, len(hazes))
+    slope = (left.diff() / hazes.diff()).cummax(1).values
+    curvature = 2 * left[:, -1:] / hazes[-1] ** 2
+    level = slope < (2 * 0.014 * left.amin(1, keepdim=True) * curvature).sqrt()
+    return hazes[level.sum(1)]
 
 
 @torch.no_grad()
@@ -108,7 +138,7 @@ def misfit(measurement: Measurement, psf: Psf) -> Tensor:
 def fine_detail(image: Image) -> Image:
     """What is finer than about 30 pixels in a picture, periodically continued."""
     grid = image.shape[-2], image.shape[-1]
-    return inverse_spectrum(spectrum(image, grid) * _fine(grid, image.device), grid, grid)
+    return inverse_spectrum(spectrum(image, grid) * (1 - _low(grid, _COARSE, image.device)), grid, grid)
 
 
 def _unexplained(measurement: Tensor, psf: Psf, poses: Tensor) -> Tensor:
@@ -116,13 +146,17 @@ def _unexplained(measurement: Tensor, psf: Psf, poses: Tensor) -> Tensor:
     count = poses.shape[1]
     each = psf.expand(len(measurement), -1, -1, -1).repeat_interleave(count, 0)
     moved = Pose(*poses.flatten(0, 1).unbind(-1)).move(each)
-    moved = F.avg_pool2d(F.pad(moved, (0, moved.shape[-1] % 2, 0, moved.shape[-2] % 2)), 2)
-    found = explain(measurement.repeat_interleave(count, 0), moved, _LEVELS)
+    found = explain(measurement.repeat_interleave(count, 0), _halved(moved), _LEVELS)
     grid = found.psf.bands[-1].grid
-    left = inverse_spectrum(found.residual * _fine(grid, measurement.device), grid, grid)
+    left = inverse_spectrum(found.residual * (1 - _low(grid, _COARSE, measurement.device)), grid, grid)
     return left.reshape(len(measurement), count, -1)
 
 
-def _fine(grid: Size, device: torch.device) -> Tensor:
+def _halved(psf: Psf) -> Tensor:
+    """Of pixels twice as long; its centre stays the centre."""
+    return F.avg_pool2d(F.pad(psf, (0, psf.shape[-1] % 2, 0, psf.shape[-2] % 2)), 2)
+
+
+def _low(grid: Size, limit: float, device: torch.device) -> Tensor:
     rows, columns = frequency_grid(grid, device=device)
-    return 1 - torch.exp(-(rows.square() + columns.square()) / (2 * _COARSE**2))
+    return torch.exp(-(rows.square() + columns.square()) / (2 * limit**2))
