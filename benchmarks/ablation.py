@@ -39,6 +39,7 @@ def parts(psf):
     return {
         "whole": lambda b: network(b, psf),
         "PSF not aligned": changed(network, align=False),
+        "haze not found": changed(wiener_bank, align=lambda b, p: align(b, p)._replace(haze=0.0)),
         "no plug and play": changed(network, rounds=0),
         "U-Net free to change the mean light": changed(wiener_bank, mean_light=torch.zeros_like),
         "no U-Net: plug and play, PSF aligned": aligned(lambda *known: network.estimates(*known)[:, :3]),
