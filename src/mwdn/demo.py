@@ -69,7 +69,7 @@ below, its point spread function, computed here from a mask of eight levels by d
 records is the scene convolved with it.</p>
 <img src="psf.png" alt="point spread function" width="320">
 <p>None of the reconstructions below needed any training for this camera: <em>universal</em> is a network that comes
-with the package and has learned from 2,000 random cameras; the others are classical.</p>
+with the package and has learned from thousands of random cameras; the others are classical.</p>
 <img src="comparison.png" alt="scene, measurement and reconstructions">
 {table}
 </html>

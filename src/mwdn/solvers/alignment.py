@@ -36,11 +36,13 @@ class Pose(NamedTuple):
         return hazed(moved, torch.as_tensor(self.haze, device=moved.device).reshape(-1, 1, 1, 1))
 
 
+_PLAIN = Penalties(0.15, 0.0, 0.6)  # without total variation
+
 # At half the size, where a turn by 0.5 degrees still moves the outer lines of a PSF of 320 pixels by 0.7 of them.
 # Total variation in the last level keeps a shrunken, so sharper PSF from explaining the noise.
 _LEVELS = (
-    Level(4, 20, Penalties(0.15, 0.0, 0.6)),
-    Level(2, 20, Penalties(0.15, 0.0, 0.6)),
+    Level(4, 20, _PLAIN),
+    Level(2, 20, _PLAIN),
     Level(1, 8, Penalties(0.1, 1.5, 1.5), 0.02, least=0.2),
 )
 _COARSE = 0.03  # periods a pixel: below it, ambient light and iterations that have not ended are most of what is left
@@ -50,12 +52,12 @@ _SHARED = 20.0  # pixels that tell as much as one: what is left is alike in neig
 
 # At a quarter of the size: haze is nothing but low frequencies.
 _HAZES = (0.0, 0.02, 0.04, 0.07, 0.1, 0.14, 0.2)
-_HAZE_LEVELS = (Level(2, 20, Penalties(0.15, 0.0, 0.6)), Level(1, 20, Penalties(0.15, 0.0, 0.6)))
+_HAZE_LEVELS = (Level(2, 20, _PLAIN), Level(1, 20, _PLAIN))
 
 
 @torch.no_grad()
 def align(measurement: Measurement, psf: Psf, *, steps: int = 2) -> Pose:
-    """Find the turn and scale with which the PSF explains each capture best. Nothing but the capture is used.
+    """Find the turn, scale and haze with which the PSF explains each capture best, from nothing but the capture.
 
     A wrong PSF leaves more of the measurement unexplained, whatever the scene: the energy that is left by the best
     scene is smooth in turn and scale, and least at the truth. Gauss-Newton steps go there. Their derivatives are those
