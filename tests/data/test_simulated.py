@@ -10,6 +10,7 @@ import torch
 
 from mwdn.data.photographs import Photographs
 from mwdn.data.simulated import EXACT, Mismatch, Placement, SimulatedPairs, _resample, affine, perturb, uniform
+from mwdn.errors import ParameterError
 from mwdn.optics import Camera, Sensor
 from mwdn.optics.patterns import contour_psf
 
@@ -108,6 +109,25 @@ def test_exact_camera_without_noise_is_the_forward_model(photographs, psf):
     full_scale = expected.amax((1, 2, 3), keepdim=True) / 0.8
     error = ((measurement - expected) / full_scale).abs()
     assert error.max() < 5.5 * math.sqrt(0.8e-9) + 0.5 / 65535 + 1e-6
+
+
+def test_a_part_of_the_cameras_is_exact(photographs, psf):
+    """The scenes are the same; what is drawn for the sensor of an exact camera is not."""
+    spoiled = Mismatch(shift_px=3.0, full=True, vignetting=0.3)
+    pairs = SimulatedPairs(photographs, psf, placement=PLAIN, mismatch=spoiled, sensor=CLEAN)
+    mixed = replace(pairs, mismatch=replace(spoiled, exact=0.25))
+    assert torch.equal(mixed.batch(range(60)).scene, pairs.batch(range(60)).scene)
+    measurement, scene, _ = mixed.batch(range(60))
+    error = (measurement - Camera(psf).forward(scene)).abs().amax((1, 2, 3)) / measurement.amax((1, 2, 3))
+    exact = error < 2e-3
+    assert (error[~exact] > 0.02).all()
+    assert 5 <= int(exact.sum()) <= 25  # 15 of 60, give or take three standard deviations
+    for part, found in ((0.0, 0), (1.0, 60)):
+        measurement, scene, _ = replace(pairs, mismatch=replace(spoiled, exact=part)).batch(range(60))
+        error = (measurement - Camera(psf).forward(scene)).abs().amax((1, 2, 3)) / measurement.amax((1, 2, 3))
+        assert int((error < 2e-3).sum()) == found
+    with pytest.raises(ParameterError, match="exact"):
+        Mismatch(exact=1.5)
 
 
 def test_ambient_is_a_part_of_the_mean(photographs, psf):

@@ -103,3 +103,12 @@ def test_the_bank_is_its_correction_of_its_estimates(rounds, generator):
     measurement = torch.rand(2, 3, 32, 32, generator=generator)
     estimates = network.estimates(measurement, psf)
     torch.testing.assert_close(network.correct(estimates, network.unit(estimates)), network(measurement, psf))
+
+
+@pytest.mark.parametrize("fold", [1, 2])
+def test_a_correction_leaves_the_estimates_as_they_were(fold, generator):
+    network = build("wiener-bank", width=2, fold=fold, align=False).eval()
+    estimates = torch.rand(1, 15, 64, 64, generator=generator).contiguous(memory_format=torch.channels_last)
+    before = estimates.clone()
+    network.correct(estimates, network.unit(estimates))
+    assert torch.equal(estimates, before)

@@ -12,7 +12,7 @@ from mwdn.networks import build
 from mwdn.optics.patterns import contour_psf
 from mwdn.solvers import plug_and_play as module
 from mwdn.solvers.admm import Penalties
-from mwdn.solvers.plug_and_play import TRUST, plug_and_play
+from mwdn.solvers.plug_and_play import certainty, plug_and_play
 from mwdn.solvers.pyramid import QUIET, Level, brightness, explain
 
 SIZE = 24, 32
@@ -28,15 +28,16 @@ def found(generator):
 
 
 def test_it_ends_where_sensor_and_denoiser_pull_alike(generator, monkeypatch):
-    """Of 1/2 |crop(h * v) - b|^2 + rho/2 |v - z|^2 with a denoiser that always answers z, the least in the frame."""
+    """Of W/2 |crop(h * v) - b|^2 + rho/2 |v - z|^2 with a denoiser that always answers z, the least in the frame."""
     level, sensor, centre = 0.02, (5, 6), (slice(1, 6), slice(1, 7))
     monkeypatch.setattr(module, "LEVELS", (level, level))
+    monkeypatch.setattr(module, "TRUST", 5.0)  # where the sensor's pixels must give way, and which do matters
     psf = 0.2 + torch.rand(3, 3, generator=generator, dtype=torch.float64)
     psf = psf / psf.sum()
     A = oracles.matrix(psf.numpy(), sensor)
-    truth = 1 + torch.rand(7, 8, generator=generator, dtype=torch.float64)
+    truth = 1 + torch.rand(7, 8, generator=generator, dtype=torch.float64) + 4 * (torch.arange(8) > 3)
     b = A @ truth.numpy().ravel()
-    z = truth[centre] + 0.1 * torch.rand(sensor, generator=generator, dtype=torch.float64)
+    z = truth[centre] + 0.5 * torch.rand(sensor, generator=generator, dtype=torch.float64)
     found = explain(
         torch.from_numpy(b).view(1, 1, *sensor).float(),
         psf.float()[None, None],
@@ -51,14 +52,22 @@ def test_it_ends_where_sensor_and_denoiser_pull_alike(generator, monkeypatch):
 
     ended = plug_and_play(found, denoise, 1500)
     torch.testing.assert_close(ended.scene, z.float()[None, None])
-    rho = TRUST * float(found.noise.clamp(min=QUIET) * brightness(found.measurement) / (level * brightest)) ** 2
+    rho = module.TRUST * float(found.noise.clamp(min=QUIET) * brightness(found.measurement) / (level * brightest)) ** 2
     inside = np.zeros((7, 8), bool)
     inside[centre] = True
     prior = np.sqrt(rho) * np.eye(56)[inside.ravel()]
-    least = np.linalg.lstsq(np.vstack([A, prior]), np.concatenate([b, np.sqrt(rho) * z.numpy().ravel()]), rcond=None)[0]
-    expected = torch.from_numpy(least.reshape(7, 8)[centre]).float()
+
+    def least(weight):
+        rows = np.sqrt(weight.numpy().ravel())
+        system, wanted = np.vstack([rows[:, None] * A, prior]), [rows * b, np.sqrt(rho) * z.numpy().ravel()]
+        solution = np.linalg.lstsq(system, np.concatenate(wanted), rcond=None)[0]
+        return torch.from_numpy(solution.reshape(7, 8)[centre]).float()
+
+    certain = certainty(found.measurement - found.rest)
+    expected = least(certain)
     torch.testing.assert_close((seen[-1] * brightest)[0, 0], expected, rtol=0, atol=2e-3)
     assert (z - expected).abs().max() > 0.02  # which is not merely z
+    assert (least(torch.ones_like(certain)) - expected).abs().max() > 0.01  # nor that of pixels that weigh the same
 
 
 def test_a_denoiser_that_knows_the_scene_explains_the_measurement(found):
@@ -69,6 +78,18 @@ def test_a_denoiser_that_knows_the_scene_explains_the_measurement(found):
     assert ended.rest.norm() < 0.3 * explained.rest.norm()
     assert ended.measurement is explained.measurement
     assert (ended.whole >= 0).all()
+
+
+def test_a_dark_pixel_says_more():
+    """Light is counted: of k times the light, the noise has k times the variance, but for what all pixels have."""
+    light = torch.tensor([0.0, 1.0, 1.0, 2.0]).view(1, 1, 2, 2)
+    weight = certainty(light)
+    torch.testing.assert_close(weight.mean(), torch.tensor(1.0))
+    torch.testing.assert_close(weight[0, 0, 0, 0] / weight[0, 0, 0, 1], torch.tensor(2.0))
+    torch.testing.assert_close(weight[0, 0, 0, 1] / weight[0, 0, 1, 1], torch.tensor(1.5))
+    both = torch.cat([7 * light, light.flip(-1)])  # each sample by itself, whatever its brightness
+    torch.testing.assert_close(certainty(both), torch.cat([weight, weight.flip(-1)]))
+    assert torch.equal(certainty(torch.zeros_like(light)), torch.ones_like(light))
 
 
 def test_the_level_falls_and_the_frame_alone_is_denoised(found):
@@ -82,7 +103,7 @@ def test_the_level_falls_and_the_frame_alone_is_denoised(found):
     plug_and_play(explained, denoise, 3)
     assert [shape for shape, _ in told] == 3 * [(2, 3, *SIZE)]
     assert [level for _, levels in told for level in levels] == pytest.approx(
-        [each for each in (0.03, (0.03 * 0.005) ** 0.5, 0.005) for _ in range(2)]
+        [each for each in (0.05, (0.05 * 0.005) ** 0.5, 0.005) for _ in range(2)]
     )
 
 

@@ -93,6 +93,15 @@ def test_what_is_explained_and_what_is_left_make_the_measurement(generator):
     assert (found.rest.square().sum((1, 2, 3)) < measurement.square().sum((1, 2, 3))).all()
 
 
+@pytest.mark.parametrize("shrink", [2, 4, 8])
+@pytest.mark.parametrize("size", [(33, 48), (40, 41), (47, 70)])
+def test_a_coarse_scene_is_its_enlargement_where_the_sensor_is(shrink, size, generator):
+    psf, measurement = (torch.rand(1, 1, *size, generator=generator) ** power for power in (6, 1))
+    found = explain(measurement, psf, (Level(shrink, 2, FINE),))
+    large = F.interpolate(found.whole, scale_factor=shrink, mode="bilinear")
+    torch.testing.assert_close(found.scene, large[..., : size[0], : size[1]])
+
+
 def test_impossible_constants_are_refused():
     with pytest.raises(ParameterError, match=r"`regularisation` \(0.0\) must be positive"):
         Pyramid(0.0)

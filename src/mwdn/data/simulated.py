@@ -74,6 +74,7 @@ class Mismatch:
         tilt: relative gain or loss of light at one side of the measurement against its centre, in any direction.
         grain: relative error of the single pixels of the calibrated PSF, as its own noise leaves it.
         full: draw the largest sizes always, with a random sign where there is one.
+        exact: part of the samples whose camera is what its calibration says.
     """
 
     shift_px: float = 0.5
@@ -87,8 +88,11 @@ class Mismatch:
     grain: float = 0.0
     sharpen: float = 0.0
     full: bool = False
+    exact: float = 0.0
 
     def __post_init__(self) -> None:
+        if not self.exact <= 1:
+            raise ParameterError(f"`exact` ({self.exact}) must be in [0, 1]: it is a part of the samples.")
         for part in fields(self):
             if not getattr(self, part.name) >= 0:
                 raise ParameterError(f"`{part.name}` ({getattr(self, part.name)}) must not be negative: it is a size.")
@@ -195,9 +199,13 @@ class SimulatedPairs:
         """
         generators = self.generators(numbers)
         scene = self.scenes(generators)
-        camera = self.camera or Camera(perturb(self.psf.expand(len(scene), -1, -1, -1), self.mismatch, generators))
-        light = camera.forward(scene)
-        light = light * self._shading(generators, (light.shape[-2], light.shape[-1])).to(light)
+        psf = self.psf.expand(len(scene), -1, -1, -1)
+        true = psf if self.camera else perturb(psf, self.mismatch, generators)
+        shading = self._shading(generators, (psf.shape[-2], psf.shape[-1])).to(psf)
+        if self.mismatch.exact:
+            exact = (uniform(generators, 0.0, 1.0)[..., None, None] < self.mismatch.exact).to(psf.device)
+            true, shading = torch.where(exact, psf, true), torch.where(exact, 1.0, shading)
+        light = (self.camera or Camera(true)).forward(scene) * shading
         ambient = uniform(generators, *self.placement.ambient)[..., None, None].to(light)
         light = light + ambient * light.mean((1, 2, 3), keepdim=True)
         brightest = light.amax((1, 2, 3), keepdim=True).clamp(min=1e-6)

@@ -14,15 +14,12 @@ from mwdn.solvers.pyramid import QUIET, Explanation, brightness
 Denoiser = Callable[[Tensor, Tensor], Tensor]
 """A picture (B, C, H, W), whose brightest pixel is about 1, and its noise level (B, 1, 1, 1); the clean picture."""
 
-LEVELS = 0.03, 0.005
+LEVELS = 0.05, 0.005
 """Noise that the denoiser is told of, in the first round and in the last, over the scene's brightest pixel."""
 
 TRUST = 0.1
 """Weight of the denoised scene, over that of a scene whose error is the denoiser's level: the best of 0.03 to 3 on 16
-exact captures through four measured PSFs, where 0.07 and 0.15 cost 0.1 dB, but once 0.9."""
-
-DATA = 0.3
-"""mu of the sensor's crop; it changes the way, not the destination."""
+exact captures through four measured PSFs, where 0.07 and 0.14 cost 0.1 dB, but through one of them 0.5."""
 
 
 def plug_and_play(found: Explanation, denoise: Denoiser, rounds: int) -> Explanation:
@@ -31,8 +28,9 @@ def plug_and_play(found: Explanation, denoise: Denoiser, rounds: int) -> Explana
     How far the measurement is trusted follows what ``found`` leaves unexplained of it: noise, or what the PSF does not
     say, which in real captures is more.
 
-    Half-quadratic splitting: a scene near the denoised one that explains the measurement (two iterations of ADMM,
-    which knows that the sensor crops the pattern), and this one denoised, by and by at a lower level.
+    Half-quadratic splitting: a scene near the denoised one that explains the measurement (an iteration of ADMM, which
+    knows that the sensor crops the pattern), and this one denoised, by and by at a lower level. Light is counted, so
+    the noise of a pixel grows with it, and a dark pixel says more.
 
     Args:
         found: where to begin, of a pyramid that reaches the full size. What lies beyond the frame is not denoised.
@@ -51,20 +49,28 @@ def plug_and_play(found: Explanation, denoise: Denoiser, rounds: int) -> Explana
     noise = torch.maximum(found.noise.clamp(min=QUIET) * brightness(found.measurement), brightness(found.rest))
     V, Hv = spectrum(known, grid), problem.measurement - found.rest
     xi = torch.zeros_like(Hv)  # the crop's multiplier, over its penalty
+    certain = certainty(Hv)
     first, last = LEVELS
     for step in range(rounds):
         level = torch.full_like(noise, first * (last / first) ** (step / max(1, rounds - 1)))
         trust = TRUST * (noise / (level * brightest)).square()
-        quotient = 1 / (DATA * problem.power + trust)
-        kept, gain = DATA * problem.power * quotient, DATA * quotient * problem.adjoint
-        prior = spectrum(known, grid).mul_(trust * quotient)
-        for _ in range(2):
-            pull = (DATA * (xi + Hv) + problem.measurement) / (1 + DATA) - xi
-            V = spectrum(pull - Hv, grid).mul_(gain).add_(prior).add_(V.mul_(kept))
-            Hv = inverse_spectrum(problem.transfer * V, grid, problem.sensor)
-            xi = Hv - pull
+        pull = (xi + Hv + certain * problem.measurement) / (1 + certain) - xi
+        V = V.mul_(problem.power).add_(spectrum(pull - Hv, grid).mul_(problem.adjoint))
+        V = V.add_(spectrum(known, grid).mul_(trust)).mul_(1 / (problem.power + trust))
+        Hv = inverse_spectrum(problem.transfer * V, grid, problem.sensor)
+        xi = Hv - pull
         free = inverse_spectrum(V, grid, grid).clamp(min=0)
         seen = free[..., :height, :width]
         clean = brightest * denoise(seen / brightest, level).clamp(min=0)
         known = free + F.pad(clean - seen, (0, grid[1] - width, 0, grid[0] - height))
     return replace(found, whole=known / band.norm)
+
+
+def certainty(light: Tensor) -> Tensor:
+    """Weight of each pixel of a pattern (B, C, H, W), 1 on the mean of a sample.
+
+    The variance of its noise grows with its light; as much as the mean light's comes from elsewhere.
+    """
+    mean = light.mean((1, 2, 3), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
+    weight = mean / (light.clamp(min=0) + mean)
+    return weight / weight.mean((1, 2, 3), keepdim=True)

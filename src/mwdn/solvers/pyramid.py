@@ -144,7 +144,8 @@ class Explanation:
         """Of a picture in the finest level's pixels, in the sensor's."""
         shrink, (height, width) = self.psf.bands[-1].level.shrink, self.measurement.shape[-2:]
         if shrink > 1:
-            picture = F.interpolate(picture, scale_factor=shrink, mode="bilinear")
+            near = picture[..., : height // shrink + 2, : width // shrink + 2]  # the last pixel's neighbour, too
+            picture = F.interpolate(near, scale_factor=shrink, mode="bilinear")
         return picture[..., :height, :width]
 
     @cached_property
