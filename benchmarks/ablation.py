@@ -41,7 +41,7 @@ def parts(psf):
         "PSF not aligned": changed(network, align=False),
         "haze not found": changed(wiener_bank, align=lambda b, p: align(b, p)._replace(haze=0.0)),
         "no plug and play": changed(network, rounds=0),
-        "U-Net free to change the mean light": changed(wiener_bank, mean_light=torch.zeros_like),
+        "U-Net free to change the mean light": changed(wiener_bank, mean_light=lambda picture, block: 0),
         "no U-Net: plug and play, PSF aligned": aligned(lambda *known: network.estimates(*known)[:, :3]),
         "neither: pyramid, PSF aligned": aligned(Pyramid()),
         "neither: pyramid, PSF not aligned": lambda b: Pyramid()(b, psf),

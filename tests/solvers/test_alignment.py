@@ -92,6 +92,17 @@ def test_each_capture_has_its_own_pose_whatever_its_brightness(psf, scenes):
     assert together.turn_degrees[0] > 0.8 > 0.2 > abs(together.turn_degrees[1])
 
 
+def test_a_psf_stays_where_it_is_unless_another_pose_explains_more(psf, scenes, monkeypatch):
+    measurement = torch.cat([captured(psf, scenes[1:]), captured(turned(psf, 0.3, 1.0), scenes[1:])])
+    pose = align(measurement, psf)
+    assert pose.turn_degrees[0] == pose.scale[0] == 0.0
+    assert pose.turn_degrees[1] > 0.1
+    monkeypatch.setattr("mwdn.solvers.alignment._WORTH", 0.0)
+    assert align(measurement, psf).scale[0] != 0.0  # what noise would have moved
+    monkeypatch.setattr("mwdn.solvers.alignment._WORTH", 0.9)
+    assert (align(measurement, psf).turn_degrees == 0).all()
+
+
 def test_pictures_gain_what_the_calibration_had_lost(psf, scenes):
     measurement = captured(turned(psf, 1.2, 1.015), scenes)
     found = align(measurement, psf, steps=3).move(psf)

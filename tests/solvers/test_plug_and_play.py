@@ -103,7 +103,7 @@ def test_the_level_falls_and_the_frame_alone_is_denoised(found):
     plug_and_play(explained, denoise, 3)
     assert [shape for shape, _ in told] == 3 * [(2, 3, *SIZE)]
     assert [level for _, levels in told for level in levels] == pytest.approx(
-        [each for each in (0.05, (0.05 * 0.005) ** 0.5, 0.005) for _ in range(2)]
+        [each for each in (0.03, (0.03 * 0.005) ** 0.5, 0.005) for _ in range(2)]
     )
 
 

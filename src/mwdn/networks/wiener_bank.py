@@ -17,10 +17,6 @@ from mwdn.solvers.plug_and_play import plug_and_play
 from mwdn.solvers.pyramid import LEVELS, Band, PsfPyramid
 from mwdn.types import Measurement, Psf, Scene
 
-BLOCK = 24
-"""Pixels along each side of the blocks whose mean light stays as the iterations found it. They know the crop, and
-measure shading and colour better than a U-Net guesses them, up to 5 dB."""
-
 QUICK = {8: 12, 4: 18, 2: 8}
 """Iterations of each size where detail is left to the bank: three quarters of the time, for a tenth of a decibel."""
 
@@ -51,11 +47,13 @@ class WienerBank(nn.Module):
             continued by its border.
         align: turn, scale and haze the PSF first until it explains the measurement (`mwdn.solvers.alignment`). In
             training PSFs are taken as they are: let the captures be mismatched by what the alignment leaves.
+        block: pixels along each side of the blocks whose mean light stays as the iterations found it. They know the
+            crop, and measure shading and colour better than a U-Net guesses them, by up to 5 dB.
         rounds: of plug and play (`mwdn.solvers.plug_and_play`) between the iterations and the bank, where ``finest``
             is 1. Their denoiser is trained alone, by noisy pictures, and has nothing to learn here; 0 for none.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         *,
         channels: int = 3,
@@ -64,6 +62,7 @@ class WienerBank(nn.Module):
         regularisations: tuple[float, ...] = (1e-3, 1e-4, 2e-5),
         finest: int = 1,
         align: bool = True,
+        block: int = 32,
         rounds: int = 0,
     ) -> None:
         super().__init__()
@@ -73,10 +72,11 @@ class WienerBank(nn.Module):
             raise ParameterError(f"`finest` ({finest}) must be 0 or one of {[level.shrink for level in LEVELS]}.")
         if rounds and finest != 1:
             raise ParameterError(f"`rounds` ({rounds}) of plug and play need iterations of the full size: `finest` 1.")
-        if fold < 1:
-            raise ParameterError(f"`fold` ({fold}) must be at least 1.")
+        for name, value in (("fold", fold), ("block", block)):
+            if value < 1:
+                raise ParameterError(f"`{name}` ({value}) must be at least 1.")
         self.channels, self.fold, self.regularisations = channels, fold, regularisations
-        self.finest, self.align = finest, align
+        self.finest, self.align, self.block = finest, align, block
         self.levels = tuple(level for level in LEVELS if finest and level.shrink >= finest)
         if finest > 1:  # the bank has what total variation would smooth away
             self.levels = tuple(
@@ -163,11 +163,11 @@ class WienerBank(nn.Module):
         folded = F.pixel_unshuffle(estimates, self.fold).contiguous(memory_format=torch.channels_last).div_(unit)
         correction = F.pixel_shuffle(self.decoder(self.encoder(folded)), self.fold)[..., :height, :width]
         if self.levels:
-            correction = correction - mean_light(correction)
+            correction = correction - mean_light(correction, self.block)
         return first + unit * correction
 
 
-def mean_light(picture: Tensor, block: int = BLOCK) -> Tensor:
+def mean_light(picture: Tensor, block: int) -> Tensor:
     """The smooth picture, (B, C, H, W), through the means of its blocks."""
     height, width = picture.shape[-2:]
     beyond = (0, -width % block, 0, -height % block)

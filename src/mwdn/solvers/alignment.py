@@ -48,6 +48,7 @@ _LEVELS = (
 _COARSE = 0.03  # periods a pixel: below it, ambient light and iterations that have not ended are most of what is left
 _LIKELY = (0.5, 0.01)  # degrees and relative magnification by which a calibration may be wrong
 _DELTA = (0.1, 0.002)  # for the derivatives
+_WORTH = 1e-3  # part of what is left that a pose explains, or the PSF stays as it was calibrated
 _SHARED = 20.0  # pixels that tell as much as one: what is left is alike in neighbours
 
 # At a quarter of the size: haze is nothing but low frequencies.
@@ -62,7 +63,8 @@ def align(measurement: Measurement, psf: Psf, *, steps: int = 2) -> Pose:
     A wrong PSF leaves more of the measurement unexplained, whatever the scene: the energy that is left by the best
     scene is smooth in turn and scale, and least at the truth. Gauss-Newton steps go there. Their derivatives are those
     of what is left once the scene has been found anew (variable projection): with a scene that stands still the steps
-    would be three times too short. A step that leaves more unexplained is not taken.
+    would be three times too short. A step that leaves more unexplained is not taken, and a PSF whose best pose explains
+    hardly more than its own stays where it is: with an exact one that is noise.
 
     Then the haze. Faint light all over the scene explains a haze that the PSF lacks, but nothing explains one that the
     camera lacks, for light is not negative: what is left is level up to the true haze and rises steeply behind it. So
@@ -85,17 +87,20 @@ def align(measurement: Measurement, psf: Psf, *, steps: int = 2) -> Pose:
     delta, likely = small.new_tensor(_DELTA), small.new_tensor(_LIKELY)
     around = torch.cat([delta.new_zeros(1, 2), delta.diag()])
     pose = best = delta.new_zeros(len(small), 2)
-    least = delta.new_full((len(small),), torch.inf)
-    for _ in range(steps):
+    least = calibrated = delta.new_full((len(small),), torch.inf)
+    for step in range(steps):
         left = _unexplained(small, psf, pose[:, None] + around)
         best, least = _better(pose, left[:, 0], best, least)
+        if step == 0:
+            calibrated = least
         # The likeliest pose, given how wrong calibrations are: a damped step.
         A = (left[:, 1:] - left[:, :1]) / delta[:, None]
         noise = _SHARED * left[:, 0].square().mean(1).clamp(min=1e-30)[:, None, None]
         slope = A @ left[:, 0, :, None] + noise * (pose / likely.square())[..., None]
         curvature = A @ A.mT + noise * likely.square().reciprocal().diag()
         pose = pose - torch.linalg.solve(curvature, slope)[..., 0]
-    best, _ = _better(pose, _unexplained(small, psf, pose[:, None])[:, 0], best, least)
+    best, least = _better(pose, _unexplained(small, psf, pose[:, None])[:, 0], best, least)
+    best = torch.where((least < (1 - _WORTH) * calibrated)[:, None], best, 0.0)
     found = Pose(best[:, 0], best[:, 1])
     return found._replace(haze=_haze(halve(small), _halved(_halved(found.move(psf)))))
 
