@@ -15,8 +15,8 @@ Denoiser = Callable[[Tensor, Tensor], Tensor]
 """A picture (B, C, H, W), whose brightest pixel is about 1, and its noise level (B, 1, 1, 1); the clean picture."""
 
 LEVELS = 0.03, 0.005
-"""Noise that the denoiser is told of, in the first round and in the last, over the scene's brightest pixel. From 0.05 on
-exact captures end 0.06 dB higher, but real ones, which their PSF explains less well, come out soft."""
+"""Noise that the denoiser is told of, in the first round and in the last, over the scene's brightest pixel. From 0.05
+on exact captures end 0.06 dB higher, but real ones, which their PSF explains less well, come out soft."""
 
 TRUST = 0.1
 """Weight of the denoised scene, over that of a scene whose error is the denoiser's level: the best of 0.03 to 3 on 16
