@@ -130,6 +130,7 @@ def learned(name, psf, generator):
     """
     psf = F.avg_pool2d(psf, 2)
     psf = psf / psf.sum((-2, -1), keepdim=True)
+    torch.manual_seed(0)  # of the weights, whatever ran before
     network = build(name, width=16).train()
     optimiser = torch.optim.AdamW(network.parameters(), lr=2e-3)
     for _ in range(100):
