@@ -61,7 +61,7 @@ def test_folded_convolution(fused, dtype, generator, monkeypatch):
     if not fused:
         monkeypatch.setattr(engine, "_packed", lambda weight, padding: None)
     layers = nn.Sequential(
-        nn.Conv2d(20, 17, 3, padding=1, bias=False), nn.BatchNorm2d(17), nn.ReLU(), nn.Conv2d(17, 4, 1)
+        nn.Conv2d(20, 17, 3, padding=1, bias=False), nn.BatchNorm2d(17), nn.ReLU(), nn.Conv2d(17, 18, 1)
     )
     layers[1].running_mean.uniform_(-1, 1, generator=generator)
     layers[1].running_var.uniform_(0.5, 2, generator=generator)
@@ -72,6 +72,14 @@ def test_folded_convolution(fused, dtype, generator, monkeypatch):
     assert found.dtype == (dtype or torch.float32)
     tolerance = 1e-5 if dtype is None else 0.03
     torch.testing.assert_close(found.float(), expected, rtol=tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize("channels", [(3, 20), (20, 3)])
+def test_a_convolution_that_sees_the_picture_stays_float32(channels, generator):
+    layer = nn.Conv2d(*channels, 3, padding=1)
+    image = torch.randn(1, channels[0], 9, 11, generator=generator)
+    with torch.no_grad():
+        torch.testing.assert_close(fold(copy.deepcopy(layer), torch.bfloat16)(image), layer(image))
 
 
 def test_other_convolutions_are_left_alone(generator):
@@ -123,38 +131,40 @@ def test_unknown_precision(generator):
         Engine(build("unet", width=2), torch.rand(1, 3, 32, 32), precision="half")
 
 
-def learned(name, psf, generator):
+def learned(name, psf):
     """A hundred steps on blurred blobs: weights, and what BatchNorm makes of them, are no longer random.
 
-    At half the PSF's size: it is the learning that takes the time of a test.
+    At half the PSF's size: it is the learning that takes the time of a test. In float64, or every processor, which
+    rounds in its own way, would learn another network.
     """
-    psf = F.avg_pool2d(psf, 2)
+    psf = F.avg_pool2d(psf, 2).double()
     psf = psf / psf.sum((-2, -1), keepdim=True)
-    torch.manual_seed(0)  # of the weights, whatever ran before
-    network = build(name, width=16).train()
-    optimiser = torch.optim.AdamW(network.parameters(), lr=2e-3)
+    generator = torch.manual_seed(2)
+    network = build(name, width=16).double().train()
+    optimiser = torch.optim.AdamW(network.parameters(), lr=5e-3)
     for _ in range(100):
-        seeds = torch.rand(2, 3, 6, 6, generator=generator)
+        seeds = torch.rand(2, 3, 6, 6, dtype=torch.float64, generator=generator)
         scene = F.pad(F.interpolate(seeds, (20, 20), mode="bicubic").clamp(0, 1), (10,) * 4)
         measurement = Camera(psf).forward(scene)
         measurement = measurement / measurement.amax((1, 2, 3), keepdim=True)
-        measurement = measurement + 0.005 * torch.randn(scene.shape, generator=generator)
+        measurement = measurement + 0.005 * torch.randn(scene.shape, dtype=torch.float64, generator=generator)
         loss = F.mse_loss(network(measurement, psf), scene)
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-    return network
+    return network.float()
 
 
-# Networks trained to the end that were at hand (wiener-bank) reach 72 to 78 dB at full size, these 54 to 61.
-@pytest.mark.parametrize("name", ["wiener-bank", "unet", "mwdn", "mwdn-cpsf"])
-def test_fast_against_exact_on_real_captures(name, data, generator):
+# 55 to 63 dB, and 74 of the one that is trained to the end. Networks that have learned as little as MWDN-CPSF in a
+# hundred steps have between 46 and 61.
+@pytest.mark.parametrize("name", ["universal-small", "unet", "mwdn", "mwdn-cpsf"])
+def test_fast_against_exact_on_real_captures(name, data):
     """PSNR, the brightest pixel of the exact picture taken as 1; captures and PSF binned by 4."""
     camera = data / "mwdn-camera"
     calibration = Calibration.from_file(camera / "psf_320.png")
     psf = F.avg_pool2d(calibration.psf, 4)
     psf = psf / psf.sum((-2, -1), keepdim=True)
-    network = learned(name, psf, generator)
+    network = name if name == "universal-small" else learned(name, psf)
     exact = Reconstructor(network, Calibration(psf), device="cpu", precision="exact")
     fast = Reconstructor(network, Calibration(psf), device="cpu")
     files = sorted((camera / "real-objects").glob("object_*"))

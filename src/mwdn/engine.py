@@ -19,8 +19,8 @@ Precision = Literal["fast", "exact"]
 """How a network computes. Fourier transforms are float32 in both.
 
 - ``fast``: convolutions in half precision where the hardware has it (bfloat16 on a CPU, float16 on a GPU), else as
-  ``exact``. Trained networks differ from it by 50 dB PSNR or more, their brightest pixel taken as 1 (wiener-bank on
-  real captures: 72 to 78 dB); one that amplifies rounding, such as a hardly trained MWDN-CPSF, by as little as 40 dB.
+  ``exact``. Trained networks differ from it by 50 dB PSNR or more, their brightest pixel taken as 1 (``universal`` on
+  real captures: 72 to 80 dB); one that amplifies rounding, such as a hardly trained MWDN-CPSF, by as little as 40 dB.
 - ``exact``: float32, the network's own result but for the order of additions.
 """
 
@@ -108,8 +108,9 @@ def half_precision(device: torch.device) -> torch.dtype | None:
 
 
 FEW = 16
-"""A convolution of fewer channels sees the picture itself and stays float32: it costs little, and in eight bits a
-bright measurement would lose the faint contrast that the Wiener filters amplify (up to 20 dB PSNR)."""
+"""A convolution from or to fewer channels sees the picture itself and stays float32: it costs little. In eight bits a
+bright measurement would lose the faint contrast that the Wiener filters amplify (up to 20 dB PSNR), and the
+reconstruction its finest steps of brightness (1 to 5 dB)."""
 
 
 class Convolution(nn.Module):
@@ -119,7 +120,7 @@ class Convolution(nn.Module):
         convolution: of stride 1, not grouped.
         norm: the BatchNorm after it, if there is one.
         relu: whether a ReLU comes last.
-        dtype: to compute in; ``None`` for float32, which `FEW` channels have always.
+        dtype: to compute in; ``None`` for float32, in which `FEW` channels are always.
     """
 
     def __init__(
@@ -133,7 +134,8 @@ class Convolution(nn.Module):
             mean, variance = norm.state_dict()["running_mean"].double(), norm.state_dict()["running_var"].double()
             scale = norm.weight.double() / (variance + norm.eps).sqrt()
             weight, bias = weight * scale[:, None, None, None], (bias - mean) * scale + norm.bias
-        self.dtype = torch.float32 if dtype is None or convolution.in_channels < FEW else dtype
+        few = min(convolution.in_channels, convolution.out_channels) < FEW
+        self.dtype = torch.float32 if dtype is None or few else dtype
         self.relu, self.padding = relu, [int(p) for p in convolution.padding]
         self.weight = weight.to(self.dtype).contiguous(memory_format=torch.channels_last)
         self.bias = bias.to(self.dtype)
