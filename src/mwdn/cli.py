@@ -54,7 +54,7 @@ def import_(
         kind, path, out, layout=layout, skip_damaged=skip_damaged, track=partial(track, description="Importing")
     )
     for reason in done.skipped.values():
-        errors.print(f"[yellow]skipped:[/] {escape(reason)}", highlight=False)
+        errors.print(f"[yellow]skipped:[/] {escape(reason)}", highlight=False, soft_wrap=True)
     names = f": {', '.join(done.skipped)}" if done.skipped else ""
     summary = f"{done.count:,} pairs written to {out}, {len(done.skipped):,} skipped{names}"
     console.print(summary, markup=False, highlight=False, soft_wrap=True)

@@ -24,8 +24,8 @@ from mwdn.networks import build
 from mwdn.optics.patterns import contour_psf
 
 STEPS = 12
-# 3 samples for two processes: one has one, the other two. At this rate, and without the pyramid's iterations, rounding
-# does not grow into another path.
+# 3 samples for two processes: one has one, the other two. At this rate, with small first steps and without the
+# pyramid's iterations, rounding does not grow into another path: no pool takes its maximum from another pixel.
 RECIPE = f"""
 [network]
 name = "wiener-bank"
@@ -36,7 +36,7 @@ finest = 0
 steps = {STEPS}
 batch = 3
 learning_rate = 1e-4
-warmup = 2
+warmup = 8
 validate_every = 4
 validation = 3
 bfloat16 = false
@@ -118,10 +118,7 @@ def worked(folder):
 
 
 def assert_alike(found, expected):
-    """Learned numbers moved from their start by the same; BatchNorm's moments, too.
-
-    But for rounding, which Adam enlarges and each processor does its own way: less than 1 % on one, 1.8 % on another.
-    """
+    """Learned numbers moved from their start by the same, but for 1 %; BatchNorm's moments to rounding."""
     found, expected = load_file(found / "state.safetensors"), load_file(expected / "state.safetensors")
     assert found.keys() == expected.keys()
     torch.manual_seed(0)
@@ -130,7 +127,7 @@ def assert_alike(found, expected):
     moved = torch.cat([(expected[f"network.{n}"] - start.state_dict()[n]).flatten() for n in names])
     apart = torch.cat([(expected[f"network.{n}"] - found[f"network.{n}"]).flatten() for n in names])
     assert moved.abs().max() > 5e-4
-    assert apart.norm() < 0.05 * moved.norm()
+    assert apart.norm() < 0.01 * moved.norm()
     for key in expected:
         if "running" in key:
             torch.testing.assert_close(found[key], expected[key], rtol=1e-3, atol=1e-4)
