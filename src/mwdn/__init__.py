@@ -13,6 +13,7 @@ from mwdn.data.sheets import for_people
 from mwdn.deconvolution import wiener
 from mwdn.errors import MwdnError
 from mwdn.fourier import convolve, correlate
+from mwdn.memory import keep_memory
 from mwdn.networks import build
 from mwdn.optics import Camera, Sensor
 from mwdn.reconstruct import Reconstructor
@@ -29,6 +30,7 @@ __all__ = [
     "convolve",
     "correlate",
     "for_people",
+    "keep_memory",
     "read_frame",
     "read_picture",
     "wiener",

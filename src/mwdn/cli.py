@@ -21,6 +21,7 @@ from mwdn.cli_train import simulate, train
 from mwdn.data.importers import Layout, import_pairs
 from mwdn.errors import MwdnError
 from mwdn.evaluation import Variant
+from mwdn.memory import keep_memory
 from mwdn.reconstruct import Reconstructor
 
 app = App(
@@ -131,6 +132,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the command line and exit: 0 if all went well, 1 if some captures failed, 2 on a wrong call."""
     arguments = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in arguments
+    keep_memory()
     try:
         result = app([a for a in arguments if a != "--debug"], exit_on_error=False, print_error=True)
     except cyclopts.CycloptsError:
