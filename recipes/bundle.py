@@ -1,6 +1,8 @@
 """Put a trained network's weights into the package, as float16.
 
-python recipes/bundle.py runs/universal/best.safetensors src/mwdn/weights/universal.safetensors
+python recipes/bundle.py runs/universal/best.safetensors src/mwdn/weights/universal.safetensors [DENOISER]
+
+DENOISER: the checkpoint of another denoiser, which takes the place of the network's own.
 """
 
 import sys
@@ -8,4 +10,4 @@ from pathlib import Path
 
 from mwdn.learning.bundled import bundle
 
-bundle(Path(sys.argv[1]), Path(sys.argv[2]))
+bundle(*map(Path, sys.argv[1:]))

@@ -140,6 +140,14 @@ def _roll(g: OnnxGraph, node: fx.Node, x: str, shifts: list[int], axes: list[int
     return x
 
 
+def _flip(g: OnnxGraph, node: fx.Node, x: str, axes: list[int]) -> str:
+    if not axes:
+        return x
+    beyond = torch.iinfo(torch.int64).min
+    start, end, step = (g.integers([each] * len(axes)) for each in (-1, beyond, -1))
+    return g("Slice", x, start, end, g.integers(axes), step)
+
+
 def _reshape(g: OnnxGraph, node: fx.Node, x: str, *_: Any) -> str:  # noqa: ANN401
     return g("Reshape", x, g.integers(_known(value(node).shape)))
 
@@ -232,6 +240,7 @@ REAL: dict[Any, Handler] = {
     _aten.div.Tensor: _plain("Div"),
     _aten.exp.default: _plain("Exp"),
     _aten.expand.default: _expand,
+    _aten.flip.default: _flip,
     _aten.full_like.default: _full,
     _aten.group_norm.default: _group_norm,
     _aten.linalg_vector_norm.default: _norm,

@@ -51,6 +51,28 @@ def test_bundling_rounds_and_remembers(tmp_path):
     assert not (tmp_path / "c.safetensors").exists()
 
 
+def test_bundling_with_another_denoiser(tmp_path):
+    """What a user trains on scenes of his kind."""
+    whole, denoiser, other, out = (tmp_path / f"{name}.safetensors" for name in ("whole", "denoiser", "other", "out"))
+    networks = {}
+    for path, name, options in (
+        (whole, "wiener-bank", {"width": 2, "rounds": 1}),
+        (denoiser, "drunet", {}),
+        (other, "unet", {"width": 2}),
+    ):
+        networks[path] = build(name, **options)
+        save_network(path, networks[path], name, options)
+    for network, part in ((whole, other), (other, denoiser)):
+        with pytest.raises(CheckpointError, match=f"{network.name}` has no denoiser that .*{part.name}` fits"):
+            bundle(network, out, part)
+    assert not out.exists()
+    bundle(whole, out, denoiser)
+    found = load_network(out)
+    for module, expected in ((found.denoiser, networks[denoiser]), (found.encoder, networks[whole].encoder)):
+        for one, another in zip(module.parameters(), expected.parameters(), strict=True):
+            torch.testing.assert_close(one, another, rtol=1e-3, atol=1e-6)
+
+
 def test_other_names_are_no_bundled_networks():
     assert find_weights("admm") is None
     with pytest.raises(CheckpointError, match="must be hub:owner/name"):

@@ -1,5 +1,6 @@
 """Plug and play: where it ends against a dense system of equations, and what a good denoiser is worth."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -27,6 +28,12 @@ def found(generator):
     return explain(convolve(scene, psf), psf), scene, psf
 
 
+def knowing(scene):
+    """A denoiser that answers with this scene, mirrored as each round shows it."""
+    ways = itertools.cycle([scene.flip(axes) for axes in ([], [-1], [-2], [-2, -1])])
+    return lambda picture, level: next(ways)
+
+
 def test_it_ends_where_sensor_and_denoiser_pull_alike(generator, monkeypatch):
     """Of W/2 |crop(h * v) - b|^2 + rho/2 |v - z|^2 with a denoiser that always answers z, the least in the frame."""
     level, sensor, centre = 0.02, (5, 6), (slice(1, 6), slice(1, 7))
@@ -44,13 +51,14 @@ def test_it_ends_where_sensor_and_denoiser_pull_alike(generator, monkeypatch):
         (Level(1, 50, Penalties(0.5, 0.0, 0.5)),),
     )
     brightest, seen = found.scene.max(), []
+    answer = knowing((z / brightest).float()[None, None])
 
     def denoise(picture, told):
         assert told.item() == pytest.approx(level)
         seen.append(picture)
-        return (z / brightest).float()[None, None]
+        return answer(picture, told)
 
-    ended = plug_and_play(found, denoise, 1500)
+    ended = plug_and_play(found, denoise, 1501)
     torch.testing.assert_close(ended.scene, z.float()[None, None])
     rho = module.TRUST * float(found.noise.clamp(min=QUIET) * brightness(found.measurement) / (level * brightest)) ** 2
     inside = np.zeros((7, 8), bool)
@@ -73,7 +81,7 @@ def test_it_ends_where_sensor_and_denoiser_pull_alike(generator, monkeypatch):
 def test_a_denoiser_that_knows_the_scene_explains_the_measurement(found):
     explained, scene, _ = found
     unit = explained.scene.amax((1, 2, 3), keepdim=True)
-    ended = plug_and_play(explained, lambda picture, level: scene / unit, 8)
+    ended = plug_and_play(explained, knowing(scene / unit), 8)
     torch.testing.assert_close(ended.scene, scene)
     assert ended.rest.norm() < 0.3 * explained.rest.norm()
     assert ended.measurement is explained.measurement
@@ -105,6 +113,16 @@ def test_the_level_falls_and_the_frame_alone_is_denoised(found):
     assert [level for _, levels in told for level in levels] == pytest.approx(
         [each for each in (0.03, (0.03 * 0.005) ** 0.5, 0.005) for _ in range(2)]
     )
+
+
+def test_each_round_shows_the_scene_mirrored_another_way(found):
+    """A denoiser that moves everything to the right is as often told the other way round."""
+    explained, _, _ = found
+    right = plug_and_play(explained, lambda picture, level: picture.roll(1, -1), 4).scene
+    left = plug_and_play(explained, lambda picture, level: picture.roll(-1, -1), 4).scene
+    still = plug_and_play(explained, lambda picture, level: picture, 4).scene
+    once = plug_and_play(explained, lambda picture, level: picture.roll(1, -1), 1).scene
+    assert (right - left).norm() < (once - still).norm()
 
 
 def test_brighter_light_gives_a_brighter_scene(found):

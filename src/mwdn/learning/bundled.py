@@ -47,14 +47,25 @@ def _download(name: str) -> Path:
         ) from error
 
 
-def bundle(checkpoint: Path, out: Path) -> None:
+def bundle(checkpoint: Path, out: Path, denoiser: Path | None = None) -> None:
     """Write a checkpoint's weights as float16, with all that it says of itself.
 
+    Args:
+        checkpoint: of a network.
+        out: the file to write.
+        denoiser: checkpoint of the one that takes the place of the network's own.
+
     Raises:
-        CheckpointError: the checkpoint cannot be used, or a weight does not fit float16.
+        CheckpointError: a checkpoint cannot be used, or a weight does not fit float16.
     """
     header = read_metadata(checkpoint)
-    network = load_network(checkpoint).half()
+    network = load_network(checkpoint)
+    if denoiser is not None:
+        try:
+            network.get_submodule("denoiser").load_state_dict(load_network(denoiser).state_dict())
+        except (AttributeError, RuntimeError) as error:
+            raise CheckpointError(f"`{checkpoint}` has no denoiser that `{denoiser}` fits: {error}") from error
+    network = network.half()
     if not all(torch.isfinite(value).all() for value in network.state_dict().values()):
         raise CheckpointError(f"`{checkpoint}` holds weights beyond the range of float16, 65504.")
     save_network(out, network, header.pop("name"), header.pop("options"), **header)

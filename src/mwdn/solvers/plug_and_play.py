@@ -30,8 +30,9 @@ def plug_and_play(found: Explanation, denoise: Denoiser, rounds: int) -> Explana
     say, which in real captures is more.
 
     Half-quadratic splitting: a scene near the denoised one that explains the measurement (an iteration of ADMM, which
-    knows that the sensor crops the pattern), and this one denoised, by and by at a lower level. Light is counted, so
-    the noise of a pixel grows with it, and a dark pixel says more.
+    knows that the sensor crops the pattern), and this one denoised, by and by at a lower level. Each round shows it to
+    the denoiser mirrored another way, so that what it does to one side of everything does not add up. Light is counted,
+    so the noise of a pixel grows with it, and a dark pixel says more.
 
     Args:
         found: where to begin, of a pyramid that reaches the full size. What lies beyond the frame is not denoised.
@@ -62,7 +63,8 @@ def plug_and_play(found: Explanation, denoise: Denoiser, rounds: int) -> Explana
         xi = Hv - pull
         free = inverse_spectrum(V, grid, grid).clamp(min=0)
         seen = free[..., :height, :width]
-        clean = brightest * denoise(seen / brightest, level).clamp(min=0)
+        mirror = [axis for axis, turn in ((-1, 1), (-2, 2)) if step & turn]
+        clean = brightest * denoise((seen / brightest).flip(mirror), level).flip(mirror).clamp(min=0)
         known = free + F.pad(clean - seen, (0, grid[1] - width, 0, grid[0] - height))
     return replace(found, whole=known / band.norm)
 
