@@ -20,7 +20,7 @@ import torch
 import engine
 from mwdn import keep_memory
 
-METHODS = ["mwdn", "universal-small", "solver:pyramid", "solver:admm"]
+METHODS = ["mwdn", "universal-small", "solver:pyramid"]
 
 
 def child(method, height, width, threads, kept):
