@@ -19,9 +19,9 @@ LEVELS = 0.03, 0.005
 on exact captures end 0.06 dB higher, but real ones, which their PSF explains less well, come out soft."""
 
 TRUST = 0.1
-"""Weight of the denoised scene, over that of a scene whose error is the denoiser's level: the best of six from 0.03 to 1
-on 16 exact captures through four measured PSFs. 0.07 and 0.14 cost less than 0.1 dB, but 0.07 through one of them 0.35,
-and 0.03 everywhere 0.4 to 4.7."""
+"""Weight of the denoised scene, over that of a scene whose error is the denoiser's level: the best of six from 0.03 to
+1 on 16 exact captures through four measured PSFs. 0.07 and 0.14 cost less than 0.1 dB, but 0.07 through one of them
+0.35, and 0.03 everywhere 0.4 to 4.7."""
 
 
 def plug_and_play(found: Explanation, denoise: Denoiser, rounds: int) -> Explanation:
