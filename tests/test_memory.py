@@ -17,7 +17,8 @@ def work():
     for size in (2**20, 2**24, 2**22):  # 4 to 64 MB
         torch.ones(size)
 
-work()
+for _ in range(3):  # until each has found its place
+    work()
 before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 work()
 print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
@@ -26,15 +27,14 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 
 @pytest.mark.skipif(sys.platform != "linux", reason="glibc alone can be asked")
 def test_freed_memory_is_used_again():
-    """84 MB have 21,504 pages of 4 kB."""
+    """84 MB have 21,504 pages of 4 kB, or 42 of 2 MB."""
     found = {
         name: int(
             subprocess.run([sys.executable, "-c", FAULTS, name], capture_output=True, check=True, text=True).stdout
         )
         for name in ("usual", "kept")
     }
-    assert found["kept"] < 100
-    assert found["usual"] > 10_000
+    assert found["usual"] > 10 * found["kept"]
 
 
 def test_elsewhere_nothing_happens(monkeypatch):
