@@ -67,7 +67,7 @@ def _other_camera(method: str | Path, calibration: Calibration) -> str | None:
 class Reconstructor:
     """Reconstructs the measurements of one camera.
 
-    Large pictures on a CPU take half the time or less once `mwdn.keep_memory` has been called.
+    Large pictures on a CPU take between a quarter and two thirds of the time once `mwdn.keep_memory` has been called.
 
     Args:
         method: a solver, a network, the name of a solver or of a bundled network, or the path of a checkpoint.
