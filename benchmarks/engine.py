@@ -103,10 +103,16 @@ def seconds(runs, batch, repeats, clock):
 
 def peak_mb(method, size, contender, device):
     """Largest memory of a fresh process that reconstructs, above that of one with the imports alone."""
-    code = "import sys; sys.path.insert(0, 'benchmarks'); import engine; engine.child(*sys.argv[1:])"
-    call = [sys.executable, "-c", code, method, *map(str, size), contender, device]
-    done = subprocess.run(call, capture_output=True, text=True, check=False)
+    done = alone("engine", method, *size, contender, device)
     return float(done.stdout) if done.returncode == 0 else None
+
+
+def alone(benchmark, *arguments):
+    """What `child` of a benchmark does in a process of its own."""
+    code = f"import sys; sys.path.insert(0, 'benchmarks'); import {benchmark}; {benchmark}.child(*sys.argv[1:])"
+    return subprocess.run(
+        [sys.executable, "-c", code, *map(str, arguments)], capture_output=True, text=True, check=False
+    )
 
 
 def child(method, height, width, contender, device):

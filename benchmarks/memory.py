@@ -10,8 +10,6 @@ what an earlier call wrote of other methods and sizes stays in it.
 import argparse
 import json
 import resource
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -48,9 +46,9 @@ def main():
     for method in arguments.methods:
         row = {"method": method, "size": arguments.size, "threads": arguments.threads}
         for kept in ("usual", "kept"):
-            code = "import sys; sys.path.insert(0, 'benchmarks'); import memory; memory.child(*sys.argv[1:])"
-            call = [sys.executable, "-c", code, method, *arguments.size.split("x"), str(arguments.threads), kept]
-            seconds, kernel, mb = json.loads(subprocess.run(call, capture_output=True, text=True, check=True).stdout)
+            done = engine.alone("memory", method, *arguments.size.split("x"), arguments.threads, kept)
+            done.check_returncode()
+            seconds, kernel, mb = json.loads(done.stdout)
             row |= {f"{kept}_s": seconds, f"{kept}_kernel_s": kernel, f"{kept}_mb": mb}
         row["ratio"] = row["usual_s"] / row["kept_s"]
         print(*(f"{value:.4g}" if isinstance(value, float) else value for value in row.values()), flush=True)
