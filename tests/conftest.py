@@ -1,6 +1,7 @@
 """Shape checking of every annotated function, reproducible noise, and the way to the real captures."""
 
 import os
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -31,6 +32,14 @@ def _seed() -> None:
 def generator() -> torch.Generator:
     """Source of all random numbers that a test asks for itself."""
     return torch.Generator().manual_seed(20230731)
+
+
+@pytest.fixture
+def free_port() -> int:
+    """Where nothing listens, for what must be told a port beforehand."""
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return found.getsockname()[1]
 
 
 @pytest.fixture

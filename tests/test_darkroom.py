@@ -4,6 +4,7 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 from functools import partial
@@ -379,6 +380,51 @@ def test_two_processes_share_the_captures(shop, single):
     assert err.count("damaged.npy: ") == 1
     assert out.count(f"{COUNT} of {COUNT + 1} captures reconstructed into two\n") == 1
     assert_finished(shop / "two", single)
+
+
+def machine(folder, out, port, nodes, restarts=0):
+    """One of several, each with a torchrun of its own, which meet at an address."""
+    options = f"--nnodes {nodes} --nproc-per-node 1 --rdzv-backend c10d --rdzv-id {port} --max-restarts {restarts}"
+    options += " --rdzv-conf last_call_timeout=5,keep_alive_interval=1"  # seconds: 30 and 5 otherwise
+    return start(folder, out, "-m", "torch.distributed.run", *options.split(), "--rdzv-endpoint", f"127.0.0.1:{port}")
+
+
+def listened_to(port):
+    with socket.socket() as caller:
+        return caller.connect_ex(("127.0.0.1", port)) == 0
+
+
+def test_two_machines_share_the_captures(shop, single, free_port):
+    machines = [machine(shop, "machines", free_port, 2) for _ in range(2)]
+    said = [each.communicate(timeout=300) for each in machines]
+    assert [each.returncode for each in machines] == [1, 1], said
+    shares = [told(out) for out, _ in said]
+    assert all(shares)
+    assert sorted(name for share in shares for name in share) == [f"{number:02}.npy" for number in range(COUNT)]
+    assert sum(out.count(f"{COUNT} of {COUNT + 1} captures reconstructed into machines\n") for out, _ in said) == 1
+    assert_finished(shop / "machines", single)
+
+
+@linux
+def test_a_machine_goes_on_without_another(shop, single, free_port):
+    """The one where all meet; the other ends at once, with its process."""
+    (shop / "in" / "damaged.npy").rename(shop / "damaged.npy")  # or the status would start all once more
+    first = machine(shop, "left", free_port, "1:2", restarts=1)
+    while not listened_to(free_port):
+        with pytest.raises(subprocess.TimeoutExpired):
+            first.wait(0.02)
+    second = machine(shop, "left", free_port, "1:2", restarts=1)
+    while not list((shop / "left").glob("??.json")):
+        with pytest.raises(subprocess.TimeoutExpired):
+            second.wait(0.02)
+    for pid in (*Path(f"/proc/{second.pid}/task/{second.pid}/children").read_text().split(), second.pid):
+        os.kill(int(pid), signal.SIGKILL)
+    second.communicate(timeout=300)
+    _, err = first.communicate(timeout=300)
+    (shop / "damaged.npy").rename(shop / "in" / "damaged.npy")
+    assert first.returncode == 0, err
+    assert "Process 0 of 2 lost the others" in err
+    assert_finished(shop / "left", single)
 
 
 @linux

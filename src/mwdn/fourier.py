@@ -46,6 +46,8 @@ def gaussian_transfer(grid: Size, sigma: float, *, device: torch.device | str | 
 
 def spectrum(image: Tensor, grid: Size) -> Spectrum:
     """Real Fourier transform of a picture, zero-padded at the bottom and the right to ``grid``."""
+    if image.shape[-2] == grid[0]:
+        return plane_spectrum(image, grid)
     # Rows first, so that the rows which are only padding are never transformed.
     rows = torch.fft.rfft(image.float(), n=grid[1])
     return torch.fft.fft(rows, n=grid[0], dim=-2)
@@ -59,8 +61,8 @@ def plane_spectrum(planes: Tensor, grid: Size) -> Spectrum:
 def inverse_spectrum(spectrum: Tensor, grid: Size, size: Size) -> Image:
     """Top left ``size`` of the picture on ``grid`` that has this spectrum."""
     rows = torch.fft.ifft(spectrum, dim=-2)[..., : size[0], :]
-    # In one piece: MKL takes half as long again for rows that it must gather itself.
-    return torch.fft.irfft(rows.contiguous(), n=grid[1])[..., : size[1]]
+    rows = rows.contiguous()  # MKL takes half as long again for rows that it must gather itself
+    return torch.fft.irfft(rows, n=grid[1])[..., : size[1]]
 
 
 def frequencies(length: int) -> Tensor:

@@ -56,6 +56,16 @@ def _plain(operation: str) -> Handler:
     return handler
 
 
+def _sum(operation: str) -> Handler:
+    """The same of a sum or difference, whose second part torch may weight."""
+    plain = _plain(operation)
+
+    def handler(g: OnnxGraph, node: fx.Node, a: Any, b: Any, *, alpha: float = 1) -> str:  # noqa: ANN401
+        return plain(g, node, a, b if alpha == 1 else g("Mul", b, torch.tensor(float(alpha))))
+
+    return handler
+
+
 def _as(g: OnnxGraph, dtype: torch.dtype, x: Any, given: Any) -> Any:  # noqa: ANN401
     """A number or result in a precision."""
     if not isinstance(given, fx.Node):
@@ -230,7 +240,7 @@ REAL: dict[Any, Handler] = {
     **dict.fromkeys((_aten.new_zeros.default, _aten.zeros_like.default), _zeros),
     **dict.fromkeys((_aten._to_copy.default, _aten.to.dtype), _cast),
     _aten.abs.default: _plain("Abs"),
-    _aten.add.Tensor: _plain("Add"),
+    _aten.add.Tensor: _sum("Add"),
     _aten.amax.default: _reduce("ReduceMax"),
     _aten.avg_pool2d.default: _pool("AveragePool"),
     _aten.cat.default: lambda g, node, parts, axis=0: g("Concat", *parts, axis=axis),
@@ -266,7 +276,7 @@ REAL: dict[Any, Handler] = {
     _aten.square.default: lambda g, node, x: g("Mul", x, x),
     _aten.stack.default: _stack,
     _aten.std.correction: _deviation,
-    _aten.sub.Tensor: _plain("Sub"),
+    _aten.sub.Tensor: _sum("Sub"),
     _aten.sum.dim_IntList: _reduce("ReduceSum"),
     _aten.transpose.int: _swapped,
     _aten.unbind.int: _unbind,

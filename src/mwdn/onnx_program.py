@@ -38,7 +38,7 @@ def to_onnx(program: ExportedProgram) -> "onnx.ModelProto":
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # torch's own, of how it copies a program
-        module = program.run_decompositions({}).module()
+        module = program.run_decompositions({_aten.fft_rfft2.default: _one_by_one}).module()
     found, steps = _divided(module)
     g = OnnxGraph()
     shapes = {}
@@ -54,6 +54,11 @@ def to_onnx(program: ExportedProgram) -> "onnx.ModelProto":
             shapes["scene"] = _axes(value(result))
             return g.model(found[result], shapes)
     raise AssertionError("A program has an output.")
+
+
+def _one_by_one(image: Tensor, grid: list[int], *_: Any) -> Tensor:  # noqa: ANN401
+    """A transform of both axes as `_TRANSFORMS` know it."""
+    return torch.fft.fft(torch.fft.rfft(image, n=grid[1]), n=grid[0], dim=-2)
 
 
 def _divided(module: fx.GraphModule) -> tuple[dict[fx.Node, Any], list[fx.Node]]:

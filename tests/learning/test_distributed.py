@@ -63,17 +63,17 @@ def folder(tmp_path_factory):
     return path
 
 
-def torchrun(folder, *command):
-    """Start a command twice."""
+def torchrun(folder, *command, machines="--standalone --nproc-per-node 2"):
+    """Start a command twice, on one machine unless told otherwise."""
     options = {"cwd": folder, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     here = {"PYTHONFAULTHANDLER": "1"} | ({"GLOO_SOCKET_IFNAME": "lo"} if sys.platform == "linux" else {})
-    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    launch = [sys.executable, "-m", "torch.distributed.run", *machines.split()]
     return subprocess.Popen([*launch, *command], env={**os.environ, **here, "OMP_NUM_THREADS": "1"}, **options)
 
 
-def training(folder, out):
+def training(folder, out, **machines):
     line = "-m mwdn train r.toml --psf psf.npy --background 0 --photos photos --device cpu --out"
-    return torchrun(folder, *line.split(), out)
+    return torchrun(folder, *line.split(), out, **machines)
 
 
 def finish(process):
@@ -145,6 +145,16 @@ def test_two_processes_end_as_one(one, two):
         assert together["psnr"] == pytest.approx(alone["psnr"], abs=1e-2)
     assert logs[1][0]["loss"] == pytest.approx(logs[0][0]["loss"], rel=1e-6)
     assert sorted(path.name for path in two.iterdir()) == sorted(path.name for path in one.iterdir())
+
+
+def test_two_machines_end_as_one_with_two_processes(folder, two, free_port):
+    """Each with a torchrun of its own, the first one's address told to both; the folder is one."""
+    where = f"--nnodes 2 --nproc-per-node 1 --master-addr 127.0.0.1 --master-port {free_port} --node-rank"
+    machines = [training(folder, "machines", machines=f"{where} {rank}") for rank in range(2)]
+    said = [finish(machine) for machine in machines]
+    assert [out.split() for out, _ in said] == [["Weights", "in", "machines/best.safetensors"], []]
+    assert same(folder / "machines" / "last.safetensors", two / "last.safetensors")
+    assert log(folder / "machines") == log(two)
 
 
 def test_two_processes_end_as_one_in_float64(worked):

@@ -164,7 +164,7 @@ def test_objective_is_what_it_says(variation, generator):
     v = torch.rand(2, 3, *problem.grid, generator=generator)
     V = fourier.spectrum(v, problem.grid)
     Hv = fourier.inverse_spectrum(problem.transfer * V, problem.grid, problem.sensor)
-    state = admm.start(problem)._replace(v=v, V=V, slope=proximal.gradient(v), Hv=Hv)
+    state = admm.start(problem)._replace(v=v, V=V, Hv=Hv)
     found = admm.objective(state, problem, 0.3, variation)
     for i in range(2):
         expected, sizes, squares = 0.0, 0.0, []
@@ -209,7 +209,7 @@ def test_admm_without_prior_reaches_the_least_squares_of_scipy(sensor, psf, gene
     problem = admm.pose(b / b.norm(), h / h.norm())
     state, mu = admm.start(problem), Penalties(data=0.1, gradient=1e-3, sign=0.1)
     for _ in range(1000):
-        state = admm.merge(state, admm.split(state, problem, mu, 0.0, "anisotropic"), problem, mu)
+        state = admm.merge(admm.split(state, problem, mu, 0.0, "anisotropic"), problem, mu)
     found = admm.objective(state, problem, 0.0, "anisotropic").item() * b.square().sum().item()
     assert math.isclose(found, least, rel_tol=2e-3)
     Hv = state.Hv[0, 0].double().numpy() * b.norm().item()

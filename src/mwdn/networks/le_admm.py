@@ -79,8 +79,8 @@ class LeAdmm(nn.Module):
         for data, gradient, sign, threshold in zip(*(each.exp() for each in constants), strict=True):
             mu = Penalties(data, gradient, sign)
             state = state if last is None else rescale(state, last, mu)
-            copies = split(state, problem, mu, threshold * gradient, self.variation)
-            state, last = merge(state, copies, problem, mu), mu
+            state = merge(split(state, problem, mu, threshold * gradient, self.variation), problem, mu)
+            last = mu
             scenes.append(state.v[..., :height, :width])
         return scenes
 

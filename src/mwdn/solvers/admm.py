@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mwdn.errors import ParameterError
 from mwdn.fourier import Size, check_fit, fast_length, inverse_spectrum, spectrum, transfer_function
-from mwdn.solvers.proximal import Variation, divergence, gradient, shrink, total_variation
+from mwdn.solvers.proximal import Gradient, Variation, divergence, gradient, shrink, total_variation
 from mwdn.types import Measurement, Psf, Scene, Spectrum
 
 
@@ -48,27 +48,18 @@ class Problem(NamedTuple):
 
 
 class State(NamedTuple):
-    """The scene v, its gradient, what the sensor sees of it, and the multipliers xi, eta, rho.
+    """The scene v, what the sensor sees of it, and what pulls at the scene: each copy minus its multiplier.
 
-    The multipliers are kept divided by their penalties, which saves a multiplication at each of their uses. A
-    problem without total variation has neither slope nor eta: they are empty.
+    A multiplier is how far the scene stays away from its pull, over its penalty: xi = H v - at_sensor, eta = Psi v -
+    slope, rho = v - sign. A problem without total variation has no slope: it is empty.
     """
 
     v: Tensor
     V: Spectrum
-    slope: tuple[Tensor, ...]
     Hv: Measurement
-    xi: Measurement
-    eta: tuple[Tensor, ...]
-    rho: Tensor
-
-
-class Splitting(NamedTuple):
-    """The copies u = Psi v, x = H v and w = v of one iteration."""
-
-    u: tuple[Tensor, ...]
-    x: Measurement
-    w: Tensor
+    at_sensor: Measurement
+    slope: Gradient | tuple[()]
+    sign: Tensor
 
 
 def pose(measurement: Measurement, psf: Psf) -> Problem:
@@ -96,65 +87,73 @@ def posed(measurement: Tensor, transfer: Tensor) -> Problem:
 def start(problem: Problem, scene: Tensor | None = None, *, smooth: bool = True) -> State:
     """Zero multipliers, and a zero scene unless one of the grid's size is given; ``smooth`` for total variation."""
     b = problem.measurement
-    zero = b.new_zeros((*b.shape[:2], *problem.grid))
-    v = zero if scene is None else scene
+    v = b.new_zeros((*b.shape[:2], *problem.grid)) if scene is None else scene
     V = spectrum(v, problem.grid)
     Hv = inverse_spectrum(problem.transfer * V, problem.grid, problem.sensor)
-    slope, eta = (gradient(v), (zero, zero)) if smooth else ((), ())
-    return State(v, V, slope, Hv, torch.zeros_like(b), eta, zero)
+    return State(v, V, Hv, at_sensor=Hv, slope=gradient(v) if smooth else (), sign=v)
 
 
-def split(state: State, problem: Problem, mu: Penalties, tau: float | Tensor, variation: Variation) -> Splitting:
-    """Update the copies: shrink the gradient, fit the sensor, clip the sign.
+def split(state: State, problem: Problem, mu: Penalties, tau: float | Tensor, variation: Variation) -> State:
+    """Update the copies u = Psi v, x = H v and w = v: shrink the gradient, fit the sensor, clip the sign.
 
-    Outside the sensor nothing is measured and the textbook's x obeys ``mu1 x - xi = mu1 H v``, so x and xi are
-    kept on the sensor alone.
+    What a copy is made of, value plus multiplier, is the pull reflected at the value; the new pull is copy minus
+    multiplier, of which the reflection knows enough. Outside the sensor nothing is measured and the textbook's x obeys
+    ``mu1 x - xi = mu1 H v``, so x and xi are kept on the sensor alone.
     """
-    u: tuple[Tensor, ...] = ()
+
+    def reflect(value: Tensor, pull: Tensor) -> Tensor:
+        return (2 * value).sub_(pull)
+
+    def follow(pull: Tensor, reflected: Tensor, copy: Tensor) -> Tensor:  # copy - value + pull
+        return copy.add_(pull, alpha=0.5).sub_(reflected, alpha=0.5)
+
+    slope = state.slope
+    if slope:
+        gy, gx = (reflect(*each) for each in zip(gradient(state.v), slope, strict=True))
+        uy, ux = shrink((gy, gx), tau / mu.gradient, variation)
+        slope = follow(slope[0], gy, uy), follow(slope[1], gx, ux)
+        del gy, gx, uy, ux  # the memory of a large picture
+    Hv, v = reflect(state.Hv, state.at_sensor), reflect(state.v, state.sign)
+    x = (problem.measurement + mu.data * Hv) / (1 + mu.data)
+    w = v.clamp(min=0)
+    return state._replace(at_sensor=follow(state.at_sensor, Hv, x), slope=slope, sign=follow(state.sign, v, w))
+
+
+def merge(state: State, problem: Problem, mu: Penalties) -> State:
+    """Update the scene, on which all pulls must agree, in the Fourier domain."""
+    prior, stiffness = mu.sign * state.sign, mu.sign
     if state.slope:
-        (gy, gx), (ey, ex) = state.slope, state.eta
-        u = shrink((gy + ey, gx + ex), tau / mu.gradient, variation)
-    x = (mu.data * (state.xi + state.Hv) + problem.measurement) / (1 + mu.data)
-    w = (state.rho + state.v).clamp(min=0)
-    return Splitting(u, x, w)
-
-
-def merge(state: State, copies: Splitting, problem: Problem, mu: Penalties) -> State:
-    """Update the scene, which all copies must agree on, in the Fourier domain; then the multipliers."""
-    u, x, w = copies
-    H = problem.transfer
-    # Copy minus multiplier is what the scene is pulled to; the new multiplier is how far it then stays away.
-    pull_sensor, pull_w = x - state.xi, w - state.rho
-    prior, stiffness = mu.sign * pull_w, mu.sign
-    if u:
-        pull_y, pull_x = u[0] - state.eta[0], u[1] - state.eta[1]
-        prior.add_(mu.gradient * divergence((pull_y, pull_x)))
+        prior.add_(mu.gradient * divergence(state.slope))
         stiffness = mu.gradient * problem.laplacian + mu.sign
-    beyond = mu.data * (pull_sensor - state.Hv)  # what the sensor adds to mu1 H v
+    V = spectrum(prior, problem.grid)
+    del prior
     power = mu.data * problem.power
-    V = spectrum(prior, problem.grid).add_(power * state.V).add_(problem.adjoint * spectrum(beyond, problem.grid))
+    beyond = mu.data * (state.at_sensor - state.Hv)  # what the sensor adds to mu1 H v
+    V = V.add_(power * state.V).add_(problem.adjoint * spectrum(beyond, problem.grid))
     V = V * (1 / (power + stiffness))  # a complex quotient takes three times as long
-    v = inverse_spectrum(V, problem.grid, problem.grid)
-    Hv = inverse_spectrum(H * V, problem.grid, problem.sensor)
-    new = State(v, V, (), Hv, xi=Hv - pull_sensor, eta=(), rho=v - pull_w)
-    if not u:
-        return new
-    gy, gx = gradient(v)
-    return new._replace(slope=(gy, gx), eta=(gy - pull_y, gx - pull_x))
+    del power
+    Hv = inverse_spectrum(problem.transfer * V, problem.grid, problem.sensor)
+    return state._replace(v=inverse_spectrum(V, problem.grid, problem.grid), V=V, Hv=Hv)
 
 
 def rescale(state: State, old: Penalties, new: Penalties) -> State:
     """Keep the multipliers what they are when the penalties change."""
-    ratio = old.gradient / new.gradient
-    eta = tuple(each * ratio for each in state.eta)
-    return state._replace(xi=state.xi * (old.data / new.data), eta=eta, rho=state.rho * (old.sign / new.sign))
+    data, steep, sign = (1 - before / after for before, after in zip(old, new, strict=True))
+    slope = state.slope
+    if slope:
+        gy, gx = gradient(state.v)
+        slope = slope[0] + (gy - slope[0]) * steep, slope[1] + (gx - slope[1]) * steep
+    return state._replace(
+        at_sensor=state.at_sensor + (state.Hv - state.at_sensor) * data,
+        slope=slope,
+        sign=state.sign + (state.v - state.sign) * sign,
+    )
 
 
 def objective(state: State, problem: Problem, tau: float, variation: Variation) -> Tensor:
     """Value of the minimised function at the scene v, one number a sample."""
     misfit = (state.Hv - problem.measurement).square().sum((1, 2, 3))
-    gy, gx = state.slope
-    return 0.5 * misfit + tau * total_variation((gy, gx), variation)
+    return 0.5 * misfit + tau * total_variation(gradient(state.v), variation)
 
 
 class Residuals(NamedTuple):
@@ -172,20 +171,23 @@ def _norm(*parts: Tensor) -> Tensor:
     return torch.stack([p.square().sum((1, 2, 3)) for p in parts]).sum(0).sqrt()
 
 
-def residuals(old: State, new: State, copies: Splitting) -> Residuals:
+def residuals(old: State, new: State) -> Residuals:
     """Relative primal and dual residuals of the iteration from ``old`` to ``new``.
 
-    The dual residual is written with the scene in place of its copies, which saves keeping two generations of them.
+    A copy is as far from the scene as its multiplier moved. The dual residual is written with the scene in place of
+    its copies, which saves keeping two generations of them.
     """
     tiny = torch.finfo(torch.float32).tiny
     primal, dual = [], []
-    for copy, value, last, multiplier in (
-        ((copies.x,), (new.Hv,), (old.Hv,), (new.xi,)),
-        (copies.u, new.slope, old.slope, new.eta),
-        ((copies.w,), (new.v,), (old.v,), (new.rho,)),
+    for last, last_pull, value, pull in (
+        ((old.Hv,), (old.at_sensor,), (new.Hv,), (new.at_sensor,)),
+        (gradient(old.v), old.slope, gradient(new.v), new.slope),
+        ((old.v,), (old.sign,), (new.v,), (new.sign,)),
     ):
-        gap = _norm(*(a - b for a, b in zip(copy, value, strict=True)))
-        primal.append(gap / torch.maximum(_norm(*copy), _norm(*value)).clamp(min=tiny))
+        multiplier = [a - b for a, b in zip(value, pull, strict=True)]
+        gap = [a - (b - c) for a, b, c in zip(multiplier, last, last_pull, strict=True)]
+        copy = [a - b for a, b in zip(value, gap, strict=True)]
+        primal.append(_norm(*gap) / torch.maximum(_norm(*copy), _norm(*value)).clamp(min=tiny))
         moved = _norm(*(a - b for a, b in zip(value, last, strict=True)))
         dual.append(moved / _norm(*multiplier).clamp(min=tiny))
     return Residuals((primal[0], primal[1], primal[2]), (dual[0], dual[1], dual[2]))
@@ -298,13 +300,15 @@ class Admm:
         else:
             problem, state, mu = last.problem._replace(measurement=b.float()), last.state, last.penalties
         for iteration in range(1, self.iterations + 1):
-            copies = split(state, problem, mu, tau, self.variation)
-            state, old = merge(state, copies, problem, mu), state
             balancing = self.balance_every and iteration % self.balance_every == 0
             checking = self.tolerance and iteration % 10 == 0
-            if not (balancing or checking or callback):
+            watched = balancing or checking or callback
+            old = state if watched else None  # the last state's memory, unless it is compared
+            state = split(state, problem, mu, tau, self.variation)
+            state = merge(state, problem, mu)
+            if old is None:
                 continue
-            found = residuals(old, state, copies)
+            found = residuals(old, state)
             if callback:
                 value = objective(state, problem, tau, self.variation)
                 primal, dual = (torch.stack(each).amax(0) for each in found)

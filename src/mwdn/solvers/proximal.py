@@ -29,8 +29,9 @@ def divergence(u: Gradient) -> Tensor:
 
 
 def _squared_length(u: Gradient, variation: Variation) -> Tensor:
-    length = u[0].square() + u[1].square()
-    return length.sum(dim=1, keepdim=True) if variation == "colour" else length
+    if variation == "colour":
+        return u[0].square().sum(dim=1, keepdim=True) + u[1].square().sum(dim=1, keepdim=True)
+    return u[0].square() + u[1].square()
 
 
 def total_variation(u: Gradient, variation: Variation) -> Tensor:

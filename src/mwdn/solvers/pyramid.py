@@ -275,5 +275,6 @@ def _solve(measurement: Tensor, band: Band, coarser: Tensor, caution: Tensor, fi
     tau = fineness * tau
     state = start(problem, known.expand(*measurement.shape[:2], *band.grid), smooth=level.regularisation > 0)
     for _ in range(level.iterations):
-        state = merge(state, split(state, problem, mu, tau, "colour"), problem, mu)
+        state = split(state, problem, mu, tau, "colour")
+        state = merge(state, problem, mu)
     return state.v / band.norm
