@@ -9,7 +9,7 @@ from torch.nn import functional as F
 import oracles
 from mwdn.networks import NETWORKS, build
 from mwdn.networks.published import PUBLISHED
-from mwdn.solvers.admm import Admm, Penalties
+from mwdn.solvers import Admm, Penalties
 from mwdn.solvers.proximal import shrink
 
 COUNTS = {"le-admm": 20, "le-admm-u": 11_772_327, "mmcn": 18_863_559, "updn": 2_744_411}

@@ -11,8 +11,8 @@ import oracles
 from mwdn.fourier import convolve
 from mwdn.networks import build
 from mwdn.optics.patterns import contour_psf
+from mwdn.solvers import Penalties
 from mwdn.solvers import plug_and_play as module
-from mwdn.solvers.admm import Penalties
 from mwdn.solvers.plug_and_play import certainty, plug_and_play
 from mwdn.solvers.pyramid import QUIET, Level, brightness, explain
 

@@ -13,7 +13,7 @@ from mwdn import fourier
 from mwdn.calibration.frames import noise_level
 from mwdn.errors import ParameterError
 from mwdn.optics.patterns import contour_psf
-from mwdn.solvers.admm import Penalties
+from mwdn.solvers import Penalties
 from mwdn.solvers.pyramid import LEVELS, Level, Pyramid, explain, halve, low_band
 from mwdn.solvers.wiener import Wiener
 

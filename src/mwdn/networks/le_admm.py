@@ -7,8 +7,8 @@ from torch import Tensor, nn
 
 from mwdn.errors import ParameterError
 from mwdn.networks.blocks import check_size
-from mwdn.solvers.admm import Penalties, merge, pose, rescale, split, start
 from mwdn.solvers.proximal import Variation
+from mwdn.solvers.splitting import Penalties, merge, pose, rescale, split, start
 from mwdn.types import Measurement, Psf, Scene
 
 

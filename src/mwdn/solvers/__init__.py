@@ -4,10 +4,11 @@ from typing import Any
 
 from mwdn.calibration.frames import noise_level
 from mwdn.errors import UnknownNameError
-from mwdn.solvers.admm import TEXTBOOK, Admm, Penalties, Progress
+from mwdn.solvers.admm import Admm, Progress
 from mwdn.solvers.alignment import Pose, align
 from mwdn.solvers.fista import Fista
 from mwdn.solvers.pyramid import Pyramid
+from mwdn.solvers.splitting import TEXTBOOK, Penalties
 from mwdn.solvers.warm import Warm
 from mwdn.solvers.wiener import Wiener
 

@@ -8,8 +8,8 @@ from torch.nn import functional as F
 
 from mwdn.fourier import Size, check_fit, frequency_grid, inverse_spectrum, spectrum
 from mwdn.optics.warp import hazed, warp
-from mwdn.solvers.admm import Penalties
 from mwdn.solvers.pyramid import Level, explain, halve
+from mwdn.solvers.splitting import Penalties
 from mwdn.types import Image, Measurement, Psf
 
 

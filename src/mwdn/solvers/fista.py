@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mwdn.errors import ParameterError
 from mwdn.fourier import inverse_spectrum, spectrum
-from mwdn.solvers.admm import Problem, pose
+from mwdn.solvers.splitting import Problem, pose
 from mwdn.types import Measurement, Psf, Scene
 
 INERTIA = 50.0

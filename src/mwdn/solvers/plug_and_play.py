@@ -8,8 +8,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.fourier import inverse_spectrum, spectrum
-from mwdn.solvers.admm import posed
 from mwdn.solvers.pyramid import QUIET, Explanation, brightness
+from mwdn.solvers.splitting import posed
 
 Denoiser = Callable[[Tensor, Tensor], Tensor]
 """A picture (B, C, H, W), whose brightest pixel is about 1, and its noise level (B, 1, 1, 1); the clean picture."""

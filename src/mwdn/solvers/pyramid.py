@@ -12,7 +12,7 @@ from torch.nn import functional as F
 from mwdn.calibration.frames import noise_level
 from mwdn.errors import ParameterError
 from mwdn.fourier import Size, check_fit, fast_length, inverse_spectrum, spectrum, transfer_function
-from mwdn.solvers.admm import Penalties, merge, posed, split, start
+from mwdn.solvers.splitting import Penalties, merge, posed, split, start
 from mwdn.types import Measurement, Psf, Scene, Spectrum
 
 
