@@ -46,9 +46,11 @@ def gaussian_transfer(grid: Size, sigma: float, *, device: torch.device | str | 
 
 def spectrum(image: Tensor, grid: Size) -> Spectrum:
     """Real Fourier transform of a picture, zero-padded at the bottom and the right to ``grid``."""
-    if image.shape[-2] == grid[0]:
-        return plane_spectrum(image, grid)
-    # Rows first, so that the rows which are only padding are never transformed.
+    return (plane_spectrum if image.shape[-2] == grid[0] else padded_spectrum)(image, grid)
+
+
+def padded_spectrum(image: Tensor, grid: Size) -> Spectrum:
+    """The same rows first, so that those which are only padding are never transformed."""
     rows = torch.fft.rfft(image.float(), n=grid[1])
     return torch.fft.fft(rows, n=grid[0], dim=-2)
 

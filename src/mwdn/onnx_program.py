@@ -14,6 +14,7 @@ from torch.export import ExportedProgram
 
 from mwdn import dft
 from mwdn.errors import ExportError
+from mwdn.fourier import padded_spectrum
 from mwdn.onnx_graph import OnnxGraph, Pair
 from mwdn.onnx_operations import REAL, Handler, filled, source, value
 
@@ -24,7 +25,7 @@ _aten = torch.ops.aten
 _ROWS, _COLUMNS = _aten.fft_rfft.default, _aten.fft_fft.default
 _TO_ROWS, _TO_COLUMNS = _aten.fft_irfft.default, _aten.fft_ifft.default
 _AXIS: dict[Any, int] = {_ROWS: -1, _COLUMNS: -2, _TO_ROWS: -1, _TO_COLUMNS: -2}
-"""The transforms that `mwdn.fourier` uses, and the axis of each."""
+"""The transforms that `mwdn.fourier` uses, and the axis of each; one of both axes is made of two."""
 
 
 def to_onnx(program: ExportedProgram) -> "onnx.ModelProto":
@@ -38,7 +39,7 @@ def to_onnx(program: ExportedProgram) -> "onnx.ModelProto":
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # torch's own, of how it copies a program
-        module = program.run_decompositions({_aten.fft_rfft2.default: _one_by_one}).module()
+        module = program.run_decompositions({_aten.fft_rfft2.default: padded_spectrum}).module()
     found, steps = _divided(module)
     g = OnnxGraph()
     shapes = {}
@@ -54,11 +55,6 @@ def to_onnx(program: ExportedProgram) -> "onnx.ModelProto":
             shapes["scene"] = _axes(value(result))
             return g.model(found[result], shapes)
     raise AssertionError("A program has an output.")
-
-
-def _one_by_one(image: Tensor, grid: list[int], *_: Any) -> Tensor:  # noqa: ANN401
-    """A transform of both axes as `_TRANSFORMS` know it."""
-    return torch.fft.fft(torch.fft.rfft(image, n=grid[1]), n=grid[0], dim=-2)
 
 
 def _divided(module: fx.GraphModule) -> tuple[dict[fx.Node, Any], list[fx.Node]]:
