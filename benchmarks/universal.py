@@ -64,7 +64,10 @@ def scores(task):
     made = captures(calibration.psf, photographs, recipe, full_well, count, exact=exact)
     bound = {method: Reconstructor(method, calibration) for method in methods}
     report = evaluate(bound, made, Protocol.parse("full"), perceptual=Perceptual.load()).methods
-    values = {method: {key: report[method].values[key] for key in ("psnr", "ssim", "lpips")} for method in methods}
+    values = {
+        method: {key: [round(value, 4) for value in report[method].values[key]] for key in ("psnr", "ssim", "lpips")}
+        for method in methods
+    }
     return {"psf": name, "full_well": full_well, "exact": exact, "values": values}
 
 
@@ -106,7 +109,8 @@ def main():
                 row["gain"] = gain(row["values"])
                 told += "{:+.2f} ({:.2f} to {:.2f})".format(*row["gain"])
             print(f"| {name} | {full_well:,.0f} | {'exact' if exact else 'mismatched'} | {told} |", flush=True)
-    arguments.out.write_text(json.dumps({"count": arguments.count, "rows": rows}, indent=1) + "\n")
+    lines = ",\n".join(json.dumps(row) for row in rows)
+    arguments.out.write_text(f'{{"count": {arguments.count}, "rows": [\n{lines}\n]}}\n')
 
 
 if __name__ == "__main__":
