@@ -34,7 +34,8 @@ def test_freed_memory_is_used_again():
         )
         for name in ("usual", "kept")
     }
-    assert found["usual"] > 10 * found["kept"]
+    assert found["kept"] < 100
+    assert found["usual"] > max(20, 10 * found["kept"])
 
 
 def test_elsewhere_nothing_happens(monkeypatch):

@@ -46,11 +46,7 @@ def gaussian_transfer(grid: Size, sigma: float, *, device: torch.device | str | 
 
 def spectrum(image: Tensor, grid: Size) -> Spectrum:
     """Real Fourier transform of a picture, zero-padded at the bottom and the right to ``grid``."""
-    return (plane_spectrum if image.shape[-2] == grid[0] else padded_spectrum)(image, grid)
-
-
-def padded_spectrum(image: Tensor, grid: Size) -> Spectrum:
-    """The same rows first, so that those which are only padding are never transformed."""
+    # Rows first: those which are only padding are never transformed, and every spectrum lies in memory alike.
     rows = torch.fft.rfft(image.float(), n=grid[1])
     return torch.fft.fft(rows, n=grid[0], dim=-2)
 

@@ -14,7 +14,6 @@ from torch.export import ExportedProgram
 
 from mwdn import dft
 from mwdn.errors import ExportError
-from mwdn.fourier import padded_spectrum
 from mwdn.onnx_graph import OnnxGraph, Pair
 from mwdn.onnx_operations import REAL, Handler, filled, source, value
 
@@ -25,7 +24,7 @@ _aten = torch.ops.aten
 _ROWS, _COLUMNS = _aten.fft_rfft.default, _aten.fft_fft.default
 _TO_ROWS, _TO_COLUMNS = _aten.fft_irfft.default, _aten.fft_ifft.default
 _AXIS: dict[Any, int] = {_ROWS: -1, _COLUMNS: -2, _TO_ROWS: -1, _TO_COLUMNS: -2}
-"""The transforms that `mwdn.fourier` uses, and the axis of each; one of both axes is made of two."""
+"""The transforms that `mwdn.fourier` uses, and the axis of each."""
 
 
 def to_onnx(program: ExportedProgram) -> "onnx.ModelProto":
@@ -39,7 +38,7 @@ def to_onnx(program: ExportedProgram) -> "onnx.ModelProto":
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # torch's own, of how it copies a program
-        module = program.run_decompositions({_aten.fft_rfft2.default: padded_spectrum}).module()
+        module = program.run_decompositions({}).module()
     found, steps = _divided(module)
     g = OnnxGraph()
     shapes = {}
