@@ -3,9 +3,10 @@
     python benchmarks/universal.py ../shared/data [--count 32] [--methods universal universal-small admm]
 
 Four measured PSFs; test photographs placed and mismatched as recipes/mismatched.toml says; 15,000 and 2,000 electrons
-at saturation. Measured as `mwdn evaluate` measures (full, clipped). Prints a table and writes it with all means and
-what `universal` gains over ADMM, with its confidence interval; methods that are not named keep what the
-record has of them, if it is of as many captures. A process for each core, of one thread each.
+at saturation. Measured as `mwdn evaluate` measures (full, clipped). Prints a table of means, with the confidence
+interval of what `universal` gains over ADMM, and writes what each picture has, a few at a time: what the record has is
+not measured again, so a run goes on where another stopped. Delete it when a method has changed. A process for each
+core, of one thread each.
 """
 
 import argparse
@@ -39,7 +40,11 @@ FULL_WELLS = (15_000.0, 2_000.0)
 MISMATCHED = Path(__file__).parents[1] / "recipes" / "mismatched.toml"
 
 
-def captures(psf, photographs, recipe, full_well, count, *, exact):
+METRICS = ("psnr", "ssim", "lpips")
+AT_ONCE = 8
+
+
+def captures(psf, photographs, recipe, full_well, numbers, *, exact):
     psf = psf.expand(-1, 3, -1, -1)
     source = SimulatedPairs(
         photographs,
@@ -49,32 +54,41 @@ def captures(psf, photographs, recipe, full_well, count, *, exact):
         sensor=replace(recipe.sensor, full_well=full_well),
         seed=11,
     )
-    batches = [source.batch([number]) for number in range(count)]
+    batches = [source.batch([number]) for number in numbers]
     return [(pair.measurement[0], pair.scene[0]) for pair in batches]
 
 
-def scores(task):
-    """PSNR, SSIM and LPIPS of each picture by each method, through one PSF in one light."""
-    data, count, methods, name, full_well, exact = task
+def scores(data, which, numbers, methods):
+    """Lists of PSNR, SSIM and LPIPS by each method: some captures through one PSF in one light."""
     torch.set_num_threads(1)
     mwdn.keep_memory()
+    name, full_well, exact = which
     path, options = PSFS[name]
     calibration, recipe = Calibration.from_file(data / path, **options), read_recipe(MISMATCHED)
     photographs = Photographs(data / "photos" / "test")
-    made = captures(calibration.psf, photographs, recipe, full_well, count, exact=exact)
+    made = captures(calibration.psf, photographs, recipe, full_well, numbers, exact=exact)
     bound = {method: Reconstructor(method, calibration) for method in methods}
     report = evaluate(bound, made, Protocol.parse("full"), perceptual=Perceptual.load()).methods
-    values = {
-        method: {key: [round(value, 4) for value in report[method].values[key]] for key in ("psnr", "ssim", "lpips")}
+    return {
+        method: {key: [round(value, 4) for value in report[method].values[key]] for key in METRICS}
         for method in methods
     }
-    return {"psf": name, "full_well": full_well, "exact": exact, "values": values}
 
 
-def gain(values):
-    """What `universal` gains over ADMM in PSNR: mean of the pictures and its confidence interval."""
-    both = zip(values["universal"]["psnr"], values["admm"]["psnr"], strict=True)
-    return bootstrap([one - other for one, other in both])
+def table(rows):
+    """Lines of means, and what `universal` gains over ADMM."""
+    methods = sorted({method for values in rows.values() for method in values})
+    yield f"| PSF | electrons | calibration | captures | {' | '.join(methods)} | gain |"
+    yield "| --- " * (5 + len(methods)) + "|"
+    for (name, full_well, exact), found in rows.items():
+        count = min(len(found[method]["psnr"]) for method in methods)
+        values = {method: {key: each[:count] for key, each in found[method].items()} for method in methods}
+        cells = [name, f"{full_well:,.0f}", "exact" if exact else "mismatched", str(count)]
+        cells += [f"{fmean(values[m]['psnr']):.2f} / {fmean(values[m]['lpips']):.3f}" for m in methods]
+        if {"universal", "admm"} <= values.keys():
+            both = zip(values["universal"]["psnr"], values["admm"]["psnr"], strict=True)
+            cells.append("{:+.2f} ({:.2f} to {:.2f})".format(*bootstrap([one - other for one, other in both])))
+        yield f"| {' | '.join(cells)} |"
 
 
 def main():
@@ -84,33 +98,30 @@ def main():
     parser.add_argument("--methods", nargs="+", default=["universal", "universal-small", "admm"])
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/universal.json"))
     arguments = parser.parse_args()
-    record = json.loads(arguments.out.read_text()) if arguments.out.exists() else {}
-    same = record["rows"] if record.get("count") == arguments.count else []
-    known = {(row["psf"], row["full_well"], row["exact"]): row["values"] for row in same}
-    rows = []
-    print(f"PSNR in dB / LPIPS, means of {arguments.count}; what universal gains over ADMM (95 % confidence)\n")
-    methods = sorted({*arguments.methods, *(method for values in known.values() for method in values)})
-    print("| PSF | electrons | calibration |", " | ".join(methods), "| gain |")
-    print("| --- " * (4 + len(methods)) + "|")
-    tasks = [
-        (arguments.data, arguments.count, arguments.methods, *which)
-        for which in itertools.product(PSFS, FULL_WELLS, (True, False))
-    ]
+    rows = {which: {} for which in itertools.product(PSFS, FULL_WELLS, (True, False))}
+    for row in json.loads(arguments.out.read_text()) if arguments.out.exists() else ():
+        rows[row["psf"], row["full_well"], row["exact"]] = row["values"]
+    tasks = []
+    for which, values in rows.items():
+        known = min(len(values.get(method, {}).get("psnr", ())) for method in arguments.methods)
+        tasks += [
+            (which, range(first, min(first + AT_ONCE, arguments.count)))
+            for first in range(known, arguments.count, AT_ONCE)
+        ]
+    tasks.sort(key=lambda task: task[1].start)  # stopped early, all rows have about as many
     with ProcessPoolExecutor(mp_context=get_context("spawn")) as processes:
-        for row in processes.map(scores, tasks):
-            name, full_well, exact = row["psf"], row["full_well"], row["exact"]
-            row["values"] = known.get((name, full_well, exact), {}) | row["values"]
-            rows.append(row)
-            means = {m: {key: fmean(values) for key, values in each.items()} for m, each in row["values"].items()}
-            row["means"] = means
-            told = " | ".join(f"{means[m]['psnr']:.2f} / {means[m]['lpips']:.3f}" for m in methods)
-            told += " | "
-            if {"universal", "admm"} <= means.keys():
-                row["gain"] = gain(row["values"])
-                told += "{:+.2f} ({:.2f} to {:.2f})".format(*row["gain"])
-            print(f"| {name} | {full_well:,.0f} | {'exact' if exact else 'mismatched'} | {told} |", flush=True)
-    lines = ",\n".join(json.dumps(row) for row in rows)
-    arguments.out.write_text(f'{{"count": {arguments.count}, "rows": [\n{lines}\n]}}\n')
+        work = [processes.submit(scores, arguments.data, *task, arguments.methods) for task in tasks]
+        for (which, numbers), done in zip(tasks, work, strict=True):
+            for method, values in done.result().items():
+                before = rows[which].get(method, {})
+                rows[which][method] = {key: before.get(key, [])[: numbers.start] + values[key] for key in METRICS}
+            lines = [
+                json.dumps({"psf": name, "full_well": full_well, "exact": exact, "values": values})
+                for (name, full_well, exact), values in rows.items()
+            ]
+            arguments.out.write_text("[\n" + ",\n".join(lines) + "\n]\n")
+    print("PSNR in dB / LPIPS, means; what universal gains over ADMM (95 % confidence)\n")
+    print("\n".join(table(rows)))
 
 
 if __name__ == "__main__":
