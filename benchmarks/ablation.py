@@ -60,7 +60,7 @@ def main():
     found = {name: [] for name in parts(psf)}
     for full_well in FULL_WELLS:
         for exact in (True, False):
-            made = captures(psf, photographs, recipe, full_well, arguments.count, exact=exact)
+            made = captures(psf, photographs, recipe, full_well, range(arguments.count), exact=exact)
             report = evaluate(parts(psf), made, Protocol.parse("full"), perceptual=perceptual)
             for name, rows in found.items():
                 rows.append([report.methods[name].summary(key)[0] for key in ("psnr", "lpips")])

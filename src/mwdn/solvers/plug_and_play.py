@@ -50,6 +50,7 @@ def plug_and_play(found: Explanation, denoise: Denoiser, rounds: int) -> Explana
     brightest = known[..., :height, :width].amax((1, 2, 3), keepdim=True)
     brightest = brightest.clamp(min=torch.finfo(torch.float32).tiny)
     noise = torch.maximum(found.noise.clamp(min=QUIET) * brightness(found.measurement), brightness(found.rest))
+    adjoint, power = problem.transfer.conj().resolve_conj(), problem.transfer.abs().square()
     V, Hv = spectrum(known, grid), problem.measurement - found.rest
     xi = torch.zeros_like(Hv)  # the crop's multiplier, over its penalty
     certain = certainty(Hv)
@@ -58,8 +59,8 @@ def plug_and_play(found: Explanation, denoise: Denoiser, rounds: int) -> Explana
         level = torch.full_like(noise, first * (last / first) ** (step / max(1, rounds - 1)))
         trust = TRUST * (noise / (level * brightest)).square()
         pull = (xi + Hv + certain * problem.measurement) / (1 + certain) - xi
-        V = V.mul_(problem.power).add_(spectrum(pull - Hv, grid).mul_(problem.adjoint))
-        V = V.add_(spectrum(known, grid).mul_(trust)).mul_(1 / (problem.power + trust))
+        V = V.mul_(power).add_(spectrum(pull - Hv, grid).mul_(adjoint))
+        V = V.add_(spectrum(known, grid).mul_(trust)).mul_(1 / (power + trust))
         Hv = inverse_spectrum(problem.transfer * V, grid, problem.sensor)
         xi = Hv - pull
         free = inverse_spectrum(V, grid, grid).clamp(min=0)

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 from mwdn.calibration.frames import noise_level
 from mwdn.errors import ParameterError
 from mwdn.fourier import Size, check_fit, fast_length, inverse_spectrum, spectrum, transfer_function
-from mwdn.solvers.splitting import Penalties, merge, posed, split, start
+from mwdn.solvers.splitting import Penalties, merge, posed, split, start, weigh
 from mwdn.types import Measurement, Psf, Scene, Spectrum
 
 
@@ -273,8 +273,10 @@ def _solve(measurement: Tensor, band: Band, coarser: Tensor, caution: Tensor, fi
     level = band.level
     mu, tau = level.smoothing(caution)
     tau = fineness * tau
-    state = start(problem, known.expand(*measurement.shape[:2], *band.grid), smooth=level.regularisation > 0)
+    smooth = level.regularisation > 0
+    filters = weigh(problem, mu, smooth=smooth)
+    state = start(problem, known.expand(*measurement.shape[:2], *band.grid), smooth=smooth)
     for _ in range(level.iterations):
         state = split(state, problem, mu, tau, "colour")
-        state = merge(state, problem, mu)
+        state = merge(state, problem, mu, filters)
     return state.v / band.norm

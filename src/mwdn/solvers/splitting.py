@@ -33,8 +33,6 @@ class Problem(NamedTuple):
 
     measurement: Measurement
     transfer: Spectrum
-    adjoint: Spectrum
-    power: Tensor
     laplacian: Tensor
     grid: Size
 
@@ -42,6 +40,14 @@ class Problem(NamedTuple):
     def sensor(self) -> Size:
         """Height and width of the measurement, the top left of the grid."""
         return self.measurement.shape[-2], self.measurement.shape[-1]
+
+
+class Filters(NamedTuple):
+    """What `merge` multiplies each part of the new spectrum with: the same as long as the penalties are."""
+
+    prior: Tensor
+    before: Tensor
+    beyond: Spectrum
 
 
 class State(NamedTuple):
@@ -77,8 +83,15 @@ def posed(measurement: Tensor, transfer: Tensor) -> Problem:
     rows = torch.arange(height, device=transfer.device)[:, None] * (math.pi / height)
     columns = torch.arange(width // 2 + 1, device=transfer.device) * (math.pi / width)
     laplacian = 4 * rows.sin().square() + 4 * columns.sin().square()
-    adjoint = transfer.conj().resolve_conj()  # a lazy conjugate would be copied at each use
-    return Problem(measurement, transfer, adjoint, transfer.abs().square(), laplacian, (height, width))
+    return Problem(measurement, transfer, laplacian, (height, width))
+
+
+def weigh(problem: Problem, mu: Penalties, *, smooth: bool = True) -> Filters:
+    """Filters for these penalties; ``smooth`` for total variation."""
+    power = mu.data * problem.transfer.abs().square()
+    stiffness = mu.gradient * problem.laplacian + mu.sign if smooth else mu.sign
+    prior = 1 / (power + stiffness)
+    return Filters(prior, before=power * prior, beyond=problem.transfer.conj() * (mu.data * prior))
 
 
 def start(problem: Problem, scene: Tensor | None = None, *, smooth: bool = True) -> State:
@@ -118,19 +131,16 @@ def _follow(pull: Tensor, reflected: Tensor, copy: Tensor) -> Tensor:
     return copy.add_(pull, alpha=0.5).sub_(reflected, alpha=0.5)
 
 
-def merge(state: State, problem: Problem, mu: Penalties) -> State:
-    """Update the scene, on which all pulls must agree, in the Fourier domain."""
-    prior, stiffness = mu.sign * state.sign, mu.sign
+def merge(state: State, problem: Problem, mu: Penalties, filters: Filters) -> State:
+    """Update the scene, on which all pulls must agree, in the Fourier domain; ``filters`` of the same penalties."""
+    prior = mu.sign * state.sign
     if state.slope:
         prior.add_(mu.gradient * divergence(state.slope))
-        stiffness = mu.gradient * problem.laplacian + mu.sign
-    V = spectrum(prior, problem.grid)
+    V = spectrum(prior, problem.grid).mul_(filters.prior)
     del prior
-    power = mu.data * problem.power
-    beyond = mu.data * (state.at_sensor - state.Hv)  # what the sensor adds to mu1 H v
-    V = V.add_(power * state.V).add_(problem.adjoint * spectrum(beyond, problem.grid))
-    V = V * (1 / (power + stiffness))  # a complex quotient takes three times as long
-    del power
+    beyond = spectrum(state.at_sensor - state.Hv, problem.grid)  # what the sensor adds to H v
+    V = V.add_(filters.before * state.V).add_(beyond.mul_(filters.beyond))
+    del beyond
     Hv = inverse_spectrum(problem.transfer * V, problem.grid, problem.sensor)
     return state._replace(v=inverse_spectrum(V, problem.grid, problem.grid), V=V, Hv=Hv)
 

@@ -1,0 +1,65 @@
+"""What learning from a camera's own captures alone brings: a mismatched camera whose scenes only the judge knows.
+
+    python benchmarks/selfsupervised.py ../shared/data [--count 24] [--steps 100]
+
+Captures as in benchmarks/universal.py, through the paper's PSF, mismatched, in good light. `universal` reconstructs
+them, learns from them as recipes/selfsupervised.toml says (in --run, which goes on where it was stopped), and
+reconstructs them again. Measured as `mwdn evaluate` measures (full, clipped).
+"""
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+from statistics import fmean
+
+import torch
+
+import mwdn
+from mwdn import Calibration, Reconstructor
+from mwdn.data.photographs import Photographs
+from mwdn.data.unpaired import UnpairedCaptures
+from mwdn.evaluation import Perceptual, Protocol, bootstrap, evaluate
+from mwdn.learning.recipe import read_recipe
+from mwdn.learning.train import Trainer
+from universal import FULL_WELLS, METRICS, MISMATCHED, PSFS, captures
+
+RECIPE = MISMATCHED.with_name("selfsupervised.toml")
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--count", type=int, default=24)
+    parser.add_argument("--steps", type=int, default=100)
+    parser.add_argument("--run", type=Path, default=Path("runs/selfsupervised"))
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/selfsupervised.json"))
+    arguments = parser.parse_args()
+    mwdn.keep_memory()
+    path, options = PSFS["mwdn-camera 320x320"]
+    calibration = Calibration.from_file(arguments.data / path, **options)
+    photographs = Photographs(arguments.data / "photos" / "test")
+    numbers = range(arguments.count)
+    made = captures(calibration.psf, photographs, read_recipe(MISMATCHED), FULL_WELLS[0], numbers, exact=False)
+    recipe = read_recipe(RECIPE)
+    recipe = replace(recipe, schedule=replace(recipe.schedule, steps=arguments.steps))
+    own = UnpairedCaptures(
+        torch.stack([measurement for measurement, _ in made]),
+        calibration.psf,
+        recipe.selfsupervised,
+        recipe.schedule.seed,
+    )
+    Trainer(recipe, calibration, own, arguments.run).run(lambda step: print(step, flush=True))
+    methods = {"before": "universal", "after": str(arguments.run / "best.safetensors")}
+    bound = {name: Reconstructor(method, calibration) for name, method in methods.items()}
+    found = evaluate(bound, made, Protocol.parse("full"), perceptual=Perceptual.load()).methods
+    values = {name: {key: [round(v, 4) for v in found[name].values[key]] for key in METRICS} for name in methods}
+    for name, each in values.items():
+        print(name, {key: round(fmean(each[key]), 3) for key in METRICS})
+    both = zip(values["after"]["psnr"], values["before"]["psnr"], strict=True)
+    print("gain in dB {:+.2f} ({:.2f} to {:.2f})".format(*bootstrap([one - other for one, other in both])))
+    arguments.out.write_text(json.dumps({"steps": arguments.steps, "values": values}) + "\n")
+
+
+if __name__ == "__main__":
+    main()
