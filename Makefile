@@ -26,6 +26,7 @@ acceptance: .venv/.ready  ## real captures (MWDN_DATA, or ../shared/data); pictu
 
 benchmark: .venv/.ready  ## speed against plain baselines in the same run
 	$(BIN)/python benchmarks/admm.py
+	$(BIN)/python benchmarks/memory.py
 	$(BIN)/python benchmarks/train.py
 	$(BIN)/python benchmarks/engine.py --memory
 

@@ -27,6 +27,11 @@ from universal import FULL_WELLS, METRICS, MISMATCHED, PSFS, captures
 RECIPE = MISMATCHED.with_name("selfsupervised.toml")
 
 
+def tell(step):
+    if step.validation is not None:
+        print(f"step {step.step}, loss {step.validation.loss:.4f}", flush=True)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path)
@@ -49,7 +54,7 @@ def main():
         recipe.selfsupervised,
         recipe.schedule.seed,
     )
-    Trainer(recipe, calibration, own, arguments.run).run(lambda step: print(step, flush=True))
+    Trainer(recipe, calibration, own, arguments.run).run(tell)
     methods = {"before": "universal", "after": str(arguments.run / "best.safetensors")}
     bound = {name: Reconstructor(method, calibration) for name, method in methods.items()}
     found = evaluate(bound, made, Protocol.parse("full"), perceptual=Perceptual.load()).methods

@@ -9,7 +9,7 @@ from torch.nn import functional as F
 
 from mwdn.fourier import inverse_spectrum, spectrum
 from mwdn.solvers.pyramid import QUIET, Explanation, brightness
-from mwdn.solvers.splitting import posed
+from mwdn.solvers.splitting import follow, posed, reflect
 
 Denoiser = Callable[[Tensor, Tensor], Tensor]
 """A picture (B, C, H, W), whose brightest pixel is about 1, and its noise level (B, 1, 1, 1); the clean picture."""
@@ -52,17 +52,16 @@ def plug_and_play(found: Explanation, denoise: Denoiser, rounds: int) -> Explana
     noise = torch.maximum(found.noise.clamp(min=QUIET) * brightness(found.measurement), brightness(found.rest))
     adjoint, power = problem.transfer.conj().resolve_conj(), problem.transfer.abs().square()
     V, Hv = spectrum(known, grid), problem.measurement - found.rest
-    xi = torch.zeros_like(Hv)  # the crop's multiplier, over its penalty
-    certain = certainty(Hv)
+    pull, certain = Hv, certainty(Hv)
     first, last = LEVELS
     for step in range(rounds):
         level = torch.full_like(noise, first * (last / first) ** (step / max(1, rounds - 1)))
         trust = TRUST * (noise / (level * brightest)).square()
-        pull = (xi + Hv + certain * problem.measurement) / (1 + certain) - xi
+        light = reflect(Hv, pull)
+        pull = follow(pull, light, (light + certain * problem.measurement) / (1 + certain))
         V = V.mul_(power).add_(spectrum(pull - Hv, grid).mul_(adjoint))
         V = V.add_(spectrum(known, grid).mul_(trust)).mul_(1 / (power + trust))
         Hv = inverse_spectrum(problem.transfer * V, grid, problem.sensor)
-        xi = Hv - pull
         free = inverse_spectrum(V, grid, grid).clamp(min=0)
         seen = free[..., :height, :width]
         mirror = [axis for axis, turn in ((-1, 1), (-2, 2)) if step & turn]

@@ -112,22 +112,23 @@ def split(state: State, problem: Problem, mu: Penalties, tau: float | Tensor, va
     """
     slope = state.slope
     if slope:
-        gy, gx = (_reflect(*each) for each in zip(gradient(state.v), slope, strict=True))
+        gy, gx = (reflect(*each) for each in zip(gradient(state.v), slope, strict=True))
         uy, ux = shrink((gy, gx), tau / mu.gradient, variation)
-        slope = _follow(slope[0], gy, uy), _follow(slope[1], gx, ux)
+        slope = follow(slope[0], gy, uy), follow(slope[1], gx, ux)
         del gy, gx, uy, ux  # the memory of a large picture
-    Hv, v = _reflect(state.Hv, state.at_sensor), _reflect(state.v, state.sign)
+    Hv, v = reflect(state.Hv, state.at_sensor), reflect(state.v, state.sign)
     x = (problem.measurement + mu.data * Hv) / (1 + mu.data)
     w = v.clamp(min=0)
-    return state._replace(at_sensor=_follow(state.at_sensor, Hv, x), slope=slope, sign=_follow(state.sign, v, w))
+    return state._replace(at_sensor=follow(state.at_sensor, Hv, x), slope=slope, sign=follow(state.sign, v, w))
 
 
-def _reflect(value: Tensor, pull: Tensor) -> Tensor:
+def reflect(value: Tensor, pull: Tensor) -> Tensor:
+    """Value plus multiplier: what the copy is made of."""
     return (2 * value).sub_(pull)
 
 
-def _follow(pull: Tensor, reflected: Tensor, copy: Tensor) -> Tensor:
-    """The same as ``copy - value + pull``; in the copy's place."""
+def follow(pull: Tensor, reflected: Tensor, copy: Tensor) -> Tensor:
+    """The new pull, ``copy - value + pull``; in the copy's place."""
     return copy.add_(pull, alpha=0.5).sub_(reflected, alpha=0.5)
 
 
