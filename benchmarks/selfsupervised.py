@@ -1,10 +1,11 @@
-"""What learning from a camera's own captures alone brings: a mismatched camera whose scenes only the judge knows.
+"""What learning from a camera's own captures alone brings: of scenes that only the judge knows.
 
-    python benchmarks/selfsupervised.py ../shared/data [--count 24] [--steps 100]
+    python benchmarks/selfsupervised.py ../shared/data [--exact] [--electrons 15000] [--count 24] [--steps 100]
 
-Captures as in benchmarks/universal.py, through the paper's PSF, mismatched, in good light. `universal` reconstructs
-them, learns from them as recipes/selfsupervised.toml says (in --run, which goes on where it was stopped), and
-reconstructs them again. Measured as `mwdn evaluate` measures (full, clipped).
+Captures as in benchmarks/universal.py, through the paper's PSF, mismatched unless told otherwise. `universal`
+reconstructs them, learns from them as recipes/selfsupervised.toml says (in --run, which goes on where it was stopped),
+and reconstructs them again. Measured as `mwdn evaluate` measures (full, clipped). What an earlier call wrote of another
+camera or light stays in the record.
 """
 
 import argparse
@@ -22,7 +23,7 @@ from mwdn.data.unpaired import UnpairedCaptures
 from mwdn.evaluation import Perceptual, Protocol, bootstrap, evaluate
 from mwdn.learning.recipe import read_recipe
 from mwdn.learning.train import Trainer
-from universal import FULL_WELLS, METRICS, MISMATCHED, PSFS, captures
+from universal import METRICS, MISMATCHED, PSFS, captures
 
 RECIPE = MISMATCHED.with_name("selfsupervised.toml")
 
@@ -35,6 +36,8 @@ def tell(step):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path)
+    parser.add_argument("--exact", action="store_true")
+    parser.add_argument("--electrons", type=float, default=15_000.0)
     parser.add_argument("--count", type=int, default=24)
     parser.add_argument("--steps", type=int, default=100)
     parser.add_argument("--run", type=Path, default=Path("runs/selfsupervised"))
@@ -44,8 +47,14 @@ def main():
     path, options = PSFS["mwdn-camera 320x320"]
     calibration = Calibration.from_file(arguments.data / path, **options)
     photographs = Photographs(arguments.data / "photos" / "test")
-    numbers = range(arguments.count)
-    made = captures(calibration.psf, photographs, read_recipe(MISMATCHED), FULL_WELLS[0], numbers, exact=False)
+    made = captures(
+        calibration.psf,
+        photographs,
+        read_recipe(MISMATCHED),
+        arguments.electrons,
+        range(arguments.count),
+        exact=arguments.exact,
+    )
     recipe = read_recipe(RECIPE)
     recipe = replace(recipe, schedule=replace(recipe.schedule, steps=arguments.steps))
     own = UnpairedCaptures(
@@ -63,7 +72,10 @@ def main():
         print(name, {key: round(fmean(each[key]), 3) for key in METRICS})
     both = zip(values["after"]["psnr"], values["before"]["psnr"], strict=True)
     print("gain in dB {:+.2f} ({:.2f} to {:.2f})".format(*bootstrap([one - other for one, other in both])))
-    arguments.out.write_text(json.dumps({"steps": arguments.steps, "values": values}) + "\n")
+    row = {"full_well": arguments.electrons, "exact": arguments.exact, "steps": arguments.steps, "values": values}
+    rows = json.loads(arguments.out.read_text()) if arguments.out.exists() else []
+    rows = [old for old in rows if any(old[key] != row[key] for key in ("full_well", "exact"))] + [row]
+    arguments.out.write_text("[\n" + ",\n".join(json.dumps(each) for each in rows) + "\n]\n")
 
 
 if __name__ == "__main__":

@@ -191,6 +191,17 @@ def test_the_loss_falls(run):
     assert (trainer.out / "validation.png").is_file()
 
 
+@pytest.mark.parametrize("fixed", [False, True])
+def test_statistics_of_a_few_captures_can_be_left_out(fixed, run):
+    trainer = run(replace(RECIPE, schedule=replace(RECIPE.schedule, fixed_norms=fixed)))
+    norms = [module for module in trainer.network.modules() if isinstance(module, nn.BatchNorm2d)]
+    before = [(norm.running_mean.clone(), norm.weight.detach().clone()) for norm in norms]
+    trainer.advance()
+    pairs = list(zip(norms, before, strict=True))
+    assert {torch.equal(norm.running_mean, mean) for norm, (mean, _) in pairs} == {fixed}
+    assert any(not torch.equal(norm.weight, weight) for norm, (_, weight) in pairs)
+
+
 def test_a_stopped_run_ends_as_one_that_was_not(run, calibration, tmp_path):
     run(folder="whole").run()
     stopped = run(folder="stopped")

@@ -53,6 +53,8 @@ class Schedule:
         start: weights to begin with instead: those that come with the package, "universal", or the path of a
             checkpoint; of the same network.
         denoiser: path of a checkpoint of the part of the network that is trained alone, see `mwdn.data.noisy`.
+        fixed_norms: BatchNorm normalises by the statistics that `start` brings, and they stay: where the samples are
+            too few or too much alike to tell what others will be.
     """
 
     steps: int = 2000
@@ -74,6 +76,7 @@ class Schedule:
     crop: int = 0
     start: str = ""
     denoiser: str = ""
+    fixed_norms: bool = False
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "learning_rate", "validate_every", "validation"):

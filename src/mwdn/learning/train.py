@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError
-from torch import Tensor
+from torch import Tensor, nn
 
 from mwdn.calibration import Calibration
 from mwdn.data.images import write_picture
@@ -34,6 +34,7 @@ from mwdn.networks.recomputed import recompute
 from mwdn.types import Measurement
 
 _MAKE_ROOM = "Make room and give the same command again: it goes on from the last saved state."
+_NORMS = nn.BatchNorm2d, nn.SyncBatchNorm
 
 
 @dataclass(frozen=True)
@@ -166,6 +167,9 @@ class Trainer:
             group["lr"] = self.course.rate(self.step)
         self.loss.weights = self.course.weights
         self.network.train()
+        if self.schedule.fixed_norms:
+            for norm in (module for module in self.network.modules() if isinstance(module, _NORMS)):
+                norm.eval()
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
             loss, parts = self._judge(own)
         weight = len(own) / len(numbers)  # losses are means over samples
