@@ -3,9 +3,9 @@
     python benchmarks/selfsupervised.py ../shared/data [--exact] [--electrons 15000] [--count 24] [--steps 100]
 
 Captures as in benchmarks/universal.py, through the paper's PSF, mismatched unless told otherwise. `universal`
-reconstructs them, learns from them as recipes/selfsupervised.toml says (in --run, which goes on where it was stopped),
-and reconstructs them again. Measured as `mwdn evaluate` measures (full, clipped). What an earlier call wrote of another
-camera or light stays in the record.
+reconstructs them, learns from them as recipes/selfsupervised.toml says (in a folder of runs/, where it goes on if it
+was stopped), and reconstructs them again. Measured as `mwdn evaluate` measures (full, clipped). What an earlier call
+wrote of another camera or light stays in the record.
 """
 
 import argparse
@@ -40,7 +40,6 @@ def main():
     parser.add_argument("--electrons", type=float, default=15_000.0)
     parser.add_argument("--count", type=int, default=24)
     parser.add_argument("--steps", type=int, default=100)
-    parser.add_argument("--run", type=Path, default=Path("runs/selfsupervised"))
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/selfsupervised.json"))
     arguments = parser.parse_args()
     mwdn.keep_memory()
@@ -63,8 +62,9 @@ def main():
         recipe.selfsupervised,
         recipe.schedule.seed,
     )
-    Trainer(recipe, calibration, own, arguments.run).run(tell)
-    methods = {"before": "universal", "after": str(arguments.run / "best.safetensors")}
+    run = Path(f"runs/selfsupervised-{'exact' if arguments.exact else 'mismatched'}-{arguments.electrons:.0f}")
+    Trainer(recipe, calibration, own, run).run(tell)
+    methods = {"before": "universal", "after": str(run / "best.safetensors")}
     bound = {name: Reconstructor(method, calibration) for name, method in methods.items()}
     found = evaluate(bound, made, Protocol.parse("full"), perceptual=Perceptual.load()).methods
     values = {name: {key: [round(v, 4) for v in found[name].values[key]] for key in METRICS} for name in methods}

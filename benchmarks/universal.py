@@ -38,8 +38,6 @@ PSFS = {
 }
 FULL_WELLS = (15_000.0, 2_000.0)
 MISMATCHED = Path(__file__).parents[1] / "recipes" / "mismatched.toml"
-
-
 METRICS = ("psnr", "ssim", "lpips")
 AT_ONCE = 8
 
