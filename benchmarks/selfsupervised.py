@@ -17,13 +17,11 @@ from statistics import fmean
 import torch
 
 import mwdn
-from mwdn import Calibration, Reconstructor
 from mwdn.data.photographs import Photographs
 from mwdn.data.unpaired import UnpairedCaptures
-from mwdn.evaluation import Perceptual, Protocol, bootstrap, evaluate
 from mwdn.learning.recipe import read_recipe
 from mwdn.learning.train import Trainer
-from universal import METRICS, MISMATCHED, PSFS, captures
+from universal import METRICS, MISMATCHED, camera, captures, gain, keep, measured
 
 RECIPE = MISMATCHED.with_name("selfsupervised.toml")
 
@@ -43,8 +41,7 @@ def main():
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/selfsupervised.json"))
     arguments = parser.parse_args()
     mwdn.keep_memory()
-    path, options = PSFS["mwdn-camera 320x320"]
-    calibration = Calibration.from_file(arguments.data / path, **options)
+    calibration = camera(arguments.data, "mwdn-camera 320x320")
     photographs = Photographs(arguments.data / "photos" / "test")
     made = captures(
         calibration.psf,
@@ -65,17 +62,14 @@ def main():
     run = Path(f"runs/selfsupervised-{'exact' if arguments.exact else 'mismatched'}-{arguments.electrons:.0f}")
     Trainer(recipe, calibration, own, run).run(tell)
     methods = {"before": "universal", "after": str(run / "best.safetensors")}
-    bound = {name: Reconstructor(method, calibration) for name, method in methods.items()}
-    found = evaluate(bound, made, Protocol.parse("full"), perceptual=Perceptual.load()).methods
-    values = {name: {key: [round(v, 4) for v in found[name].values[key]] for key in METRICS} for name in methods}
+    values = measured(methods, made, calibration)
     for name, each in values.items():
         print(name, {key: round(fmean(each[key]), 3) for key in METRICS})
-    both = zip(values["after"]["psnr"], values["before"]["psnr"], strict=True)
-    print("gain in dB {:+.2f} ({:.2f} to {:.2f})".format(*bootstrap([one - other for one, other in both])))
+    print("gain in dB", gain(values["after"], values["before"]))
     row = {"full_well": arguments.electrons, "exact": arguments.exact, "steps": arguments.steps, "values": values}
     rows = json.loads(arguments.out.read_text()) if arguments.out.exists() else []
     rows = [old for old in rows if any(old[key] != row[key] for key in ("full_well", "exact"))] + [row]
-    arguments.out.write_text("[\n" + ",\n".join(json.dumps(each) for each in rows) + "\n]\n")
+    keep(rows, arguments.out)
 
 
 if __name__ == "__main__":

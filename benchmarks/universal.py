@@ -38,8 +38,14 @@ PSFS = {
 }
 FULL_WELLS = (15_000.0, 2_000.0)
 MISMATCHED = Path(__file__).parents[1] / "recipes" / "mismatched.toml"
+KEYS = ("psf", "full_well", "exact")
 METRICS = ("psnr", "ssim", "lpips")
 AT_ONCE = 8
+
+
+def camera(data, name):
+    path, options = PSFS[name]
+    return Calibration.from_file(data / path, **options)
 
 
 def captures(psf, photographs, recipe, full_well, numbers, *, exact):
@@ -56,21 +62,33 @@ def captures(psf, photographs, recipe, full_well, numbers, *, exact):
     return [(pair.measurement[0], pair.scene[0]) for pair in batches]
 
 
+def measured(methods, made, calibration):
+    """Lists of PSNR, SSIM and LPIPS of some captures, by methods of these names."""
+    bound = {name: Reconstructor(method, calibration) for name, method in methods.items()}
+    report = evaluate(bound, made, Protocol.parse("full"), perceptual=Perceptual.load()).methods
+    return {name: {key: [round(value, 4) for value in report[name].values[key]] for key in METRICS} for name in methods}
+
+
+def gain(values, other):
+    """What one method gains over another in PSNR, with its confidence interval."""
+    both = zip(values["psnr"], other["psnr"], strict=True)
+    return "{:+.2f} ({:.2f} to {:.2f})".format(*bootstrap([one - two for one, two in both]))
+
+
+def keep(rows, out):
+    """Write a record, a line for each row."""
+    out.write_text("[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n")
+
+
 def scores(data, which, numbers, methods):
-    """Lists of PSNR, SSIM and LPIPS by each method: some captures through one PSF in one light."""
+    """What is `measured` of captures through one PSF in one light."""
     torch.set_num_threads(1)
     mwdn.keep_memory()
     name, full_well, exact = which
-    path, options = PSFS[name]
-    calibration, recipe = Calibration.from_file(data / path, **options), read_recipe(MISMATCHED)
+    calibration, recipe = camera(data, name), read_recipe(MISMATCHED)
     photographs = Photographs(data / "photos" / "test")
     made = captures(calibration.psf, photographs, recipe, full_well, numbers, exact=exact)
-    bound = {method: Reconstructor(method, calibration) for method in methods}
-    report = evaluate(bound, made, Protocol.parse("full"), perceptual=Perceptual.load()).methods
-    return {
-        method: {key: [round(value, 4) for value in report[method].values[key]] for key in METRICS}
-        for method in methods
-    }
+    return measured({method: method for method in methods}, made, calibration)
 
 
 def table(rows):
@@ -84,8 +102,7 @@ def table(rows):
         cells = [name, f"{full_well:,.0f}", "exact" if exact else "mismatched", str(count)]
         cells += [f"{fmean(values[m]['psnr']):.2f} / {fmean(values[m]['lpips']):.3f}" for m in methods]
         if {"universal", "admm"} <= values.keys():
-            both = zip(values["universal"]["psnr"], values["admm"]["psnr"], strict=True)
-            cells.append("{:+.2f} ({:.2f} to {:.2f})".format(*bootstrap([one - other for one, other in both])))
+            cells.append(gain(values["universal"], values["admm"]))
         yield f"| {' | '.join(cells)} |"
 
 
@@ -98,7 +115,7 @@ def main():
     arguments = parser.parse_args()
     rows = {which: {} for which in itertools.product(PSFS, FULL_WELLS, (True, False))}
     for row in json.loads(arguments.out.read_text()) if arguments.out.exists() else ():
-        rows[row["psf"], row["full_well"], row["exact"]] = row["values"]
+        rows[tuple(row[key] for key in KEYS)] = row["values"]
     tasks = []
     for which, values in rows.items():
         known = min(len(values.get(method, {}).get("psnr", ())) for method in arguments.methods)
@@ -113,11 +130,8 @@ def main():
             for method, values in done.result().items():
                 before = rows[which].get(method, {})
                 rows[which][method] = {key: before.get(key, [])[: numbers.start] + values[key] for key in METRICS}
-            lines = [
-                json.dumps({"psf": name, "full_well": full_well, "exact": exact, "values": values})
-                for (name, full_well, exact), values in rows.items()
-            ]
-            arguments.out.write_text("[\n" + ",\n".join(lines) + "\n]\n")
+            record = [dict(zip(KEYS, which, strict=True)) | {"values": values} for which, values in rows.items()]
+            keep(record, arguments.out)
     print("PSNR in dB / LPIPS, means; what universal gains over ADMM (95 % confidence)\n")
     print("\n".join(table(rows)))
 

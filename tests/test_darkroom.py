@@ -4,6 +4,7 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 from functools import partial
@@ -381,18 +382,23 @@ def test_two_processes_share_the_captures(shop, single):
     assert_finished(shop / "two", single)
 
 
-def machines(folder, out, port, nodes, restarts=0):
-    """Two, each with a torchrun of its own, which meet at the first one's address."""
+def machine(folder, out, port, nodes, *, host, restarts=0):
+    """One of several, each with a torchrun of its own, which meet at the host's address."""
     options = f"--nnodes {nodes} --nproc-per-node 1 --rdzv-backend c10d --rdzv-id {port} --max-restarts {restarts}"
     where = ["-m", "torch.distributed.run", *options.split(), "--rdzv-endpoint", f"127.0.0.1:{port}", "--rdzv-conf"]
     brief = "last_call_timeout=10,keep_alive_interval=1"  # seconds: 30 and 5 otherwise
-    return [start(folder, out, *where, f"{brief},is_host={host}") for host in ("true", "false")]
+    return start(folder, out, *where, f"{brief},is_host={str(host).lower()}")
+
+
+def listened_to(port):
+    with socket.socket() as caller:
+        return caller.connect_ex(("127.0.0.1", port)) == 0
 
 
 def test_two_machines_share_the_captures(shop, single, free_port):
-    both = machines(shop, "machines", free_port, nodes=2)
-    said = [machine.communicate(timeout=300) for machine in both]
-    assert [machine.returncode for machine in both] == [1, 1], said
+    machines = [machine(shop, "machines", free_port, 2, host=host) for host in (True, False)]
+    said = [each.communicate(timeout=300) for each in machines]
+    assert [each.returncode for each in machines] == [1, 1], said
     shares = [told(out) for out, _ in said]
     assert all(shares)
     assert sorted(name for share in shares for name in share) == [f"{number:02}.npy" for number in range(COUNT)]
@@ -402,9 +408,13 @@ def test_two_machines_share_the_captures(shop, single, free_port):
 
 @linux
 def test_a_machine_goes_on_without_another(shop, single, free_port):
-    """The one where both meet; the other ends at once, with its process."""
+    """The one where all meet; the other ends at once, with its process."""
     (shop / "in" / "damaged.npy").rename(shop / "damaged.npy")  # or the status would start all once more
-    first, second = machines(shop, "left", free_port, nodes="1:2", restarts=1)
+    first = machine(shop, "left", free_port, "1:2", host=True, restarts=1)
+    while not listened_to(free_port):  # it joins first, and is process 0
+        with pytest.raises(subprocess.TimeoutExpired):
+            first.wait(0.02)
+    second = machine(shop, "left", free_port, "1:2", host=False, restarts=1)
     while not list((shop / "left").glob("??.json")):
         with pytest.raises(subprocess.TimeoutExpired):
             second.wait(0.02)
@@ -414,7 +424,7 @@ def test_a_machine_goes_on_without_another(shop, single, free_port):
     _, err = first.communicate(timeout=300)
     (shop / "damaged.npy").rename(shop / "in" / "damaged.npy")
     assert first.returncode == 0, err
-    assert re.search(r"Process \d of 2 lost the others", err)
+    assert "Process 0 of 2 lost the others" in err
     assert_finished(shop / "left", single)
 
 

@@ -19,6 +19,7 @@ from mwdn.learning.losses import Loss
 from mwdn.learning.recipe import Recipe, Schedule, Sheet
 from mwdn.learning.selfsupervised import judge, unexplained
 from mwdn.learning.session import prepare
+from mwdn.networks.recomputed import norms
 from mwdn.optics.patterns import contour_psf
 from mwdn.solvers.alignment import Pose
 
@@ -194,10 +195,10 @@ def test_the_loss_falls(run):
 @pytest.mark.parametrize("fixed", [False, True])
 def test_statistics_of_a_few_captures_can_be_left_out(fixed, run):
     trainer = run(replace(RECIPE, schedule=replace(RECIPE.schedule, fixed_norms=fixed)))
-    norms = [module for module in trainer.network.modules() if isinstance(module, nn.BatchNorm2d)]
-    before = [(norm.running_mean.clone(), norm.weight.detach().clone()) for norm in norms]
+    found = norms(trainer.network)
+    before = [(norm.running_mean.clone(), norm.weight.detach().clone()) for norm in found]
     trainer.advance()
-    pairs = list(zip(norms, before, strict=True))
+    pairs = list(zip(found, before, strict=True))
     assert {torch.equal(norm.running_mean, mean) for norm, (mean, _) in pairs} == {fixed}
     assert any(not torch.equal(norm.weight, weight) for norm, (_, weight) in pairs)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError
-from torch import Tensor, nn
+from torch import Tensor
 
 from mwdn.calibration import Calibration
 from mwdn.data.images import write_picture
@@ -30,11 +30,10 @@ from mwdn.learning.selfsupervised import BlindValidator, judge
 from mwdn.learning.state import read_state, restore, write_state
 from mwdn.learning.validation import Validation, Validator
 from mwdn.networks import build
-from mwdn.networks.recomputed import recompute
+from mwdn.networks.recomputed import norms, recompute
 from mwdn.types import Measurement
 
 _MAKE_ROOM = "Make room and give the same command again: it goes on from the last saved state."
-_NORMS = nn.BatchNorm2d, nn.SyncBatchNorm
 
 
 @dataclass(frozen=True)
@@ -168,7 +167,7 @@ class Trainer:
         self.loss.weights = self.course.weights
         self.network.train()
         if self.schedule.fixed_norms:
-            for norm in (module for module in self.network.modules() if isinstance(module, _NORMS)):
+            for norm in norms(self.network):
                 norm.eval()
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
             loss, parts = self._judge(own)

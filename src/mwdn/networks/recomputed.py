@@ -44,15 +44,20 @@ def recompute(network: nn.Module) -> None:
         module.recompute = True
 
 
+def norms(network: nn.Module) -> list[nn.modules.batchnorm._BatchNorm]:
+    """Every BatchNorm of a network, of one process or of several."""
+    return [module for module in network.modules() if isinstance(module, nn.modules.batchnorm._BatchNorm)]
+
+
 @contextmanager
 def _seen(network: nn.Module) -> Iterator[None]:
     """BatchNorm has counted this batch already: its running statistics stay as they are."""
-    norms = [module for module in network.modules() if isinstance(module, nn.modules.batchnorm._BatchNorm)]
-    before = [(norm.momentum, norm.num_batches_tracked) for norm in norms]
+    found = norms(network)
+    before = [(norm.momentum, norm.num_batches_tracked) for norm in found]
     try:
-        for norm in norms:
+        for norm in found:
             norm.momentum, norm.num_batches_tracked = 0.0, norm.num_batches_tracked.clone()  # type: ignore[union-attr]
         yield
     finally:
-        for norm, (momentum, count) in zip(norms, before, strict=True):
+        for norm, (momentum, count) in zip(found, before, strict=True):
             norm.momentum, norm.num_batches_tracked = momentum, count

@@ -50,7 +50,8 @@ def plug_and_play(found: Explanation, denoise: Denoiser, rounds: int) -> Explana
     brightest = known[..., :height, :width].amax((1, 2, 3), keepdim=True)
     brightest = brightest.clamp(min=torch.finfo(torch.float32).tiny)
     noise = torch.maximum(found.noise.clamp(min=QUIET) * brightness(found.measurement), brightness(found.rest))
-    adjoint, power = problem.transfer.conj().resolve_conj(), problem.transfer.abs().square()
+    power = problem.transfer.abs().square()
+    adjoint = problem.transfer.conj().resolve_conj()  # a lazy conjugate would be copied in each round
     V, Hv = spectrum(known, grid), problem.measurement - found.rest
     pull, certain = Hv, certainty(Hv)
     first, last = LEVELS
