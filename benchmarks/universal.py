@@ -4,9 +4,11 @@
 
 Four measured PSFs; test photographs placed and mismatched as recipes/mismatched.toml says; 15,000 and 2,000 electrons
 at saturation. Measured as `mwdn evaluate` measures (full, clipped). Prints a table of means, with the confidence
-interval of what `universal` gains over ADMM, and writes what each picture has, a few at a time: what the record has is
-not measured again, so a run goes on where another stopped. Delete it when a method has changed. A process for each
-core, of one thread each.
+interval of what the first method gains over the last, and writes what each picture has, a few at a time: what the
+record has is not measured again, so a run goes on where another stopped. Where a method has changed, `--again` forgets
+what the record has of those that are named. A process for each core, of one thread each.
+
+The method `fine-tuned` is of each PSF the network that recipes/finetune.toml made of `universal`, in `TUNED`.
 """
 
 import argparse
@@ -36,6 +38,7 @@ PSFS = {
     "DiffuserCam tutorial 300x400": ("diffusercam-tutorial/psf_sample.tif", {"binning": 4}),
     "PhlatCam 384x640": ("phlatcam/psf_384x640.npy", {"background": 0.0}),
 }
+TUNED = {name: f"runs/finetune-{path.partition('/')[0]}/best.safetensors" for name, (path, _) in PSFS.items()}
 FULL_WELLS = (15_000.0, 2_000.0)
 MISMATCHED = Path(__file__).parents[1] / "recipes" / "mismatched.toml"
 KEYS = ("psf", "full_well", "exact")
@@ -75,6 +78,15 @@ def gain(values, other):
     return "{:+.2f} ({:.2f} to {:.2f})".format(*bootstrap([one - two for one, two in both]))
 
 
+def remembered(out, forgotten):
+    """What a record has of each row, but for the methods that are forgotten."""
+    rows = {which: {} for which in itertools.product(PSFS, FULL_WELLS, (True, False))}
+    for row in json.loads(out.read_text()) if out.exists() else ():
+        values = {method: values for method, values in row["values"].items() if method not in forgotten}
+        rows[tuple(row[key] for key in KEYS)] = values
+    return rows
+
+
 def keep(rows, out):
     """Write a record, a line for each row."""
     out.write_text("[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n")
@@ -88,21 +100,21 @@ def scores(data, which, numbers, methods):
     calibration, recipe = camera(data, name), read_recipe(MISMATCHED)
     photographs = Photographs(data / "photos" / "test")
     made = captures(calibration.psf, photographs, recipe, full_well, numbers, exact=exact)
-    return measured({method: method for method in methods}, made, calibration)
+    return measured({each: TUNED[name] if each == "fine-tuned" else each for each in methods}, made, calibration)
 
 
-def table(rows):
-    """Lines of means, and what `universal` gains over ADMM."""
-    methods = sorted({method for values in rows.values() for method in values})
-    yield f"| PSF | electrons | calibration | captures | {' | '.join(methods)} | gain |"
-    yield "| --- " * (5 + len(methods)) + "|"
+def table(rows, methods):
+    """Lines of means, and what the first method gains over the last."""
+    columns = ["PSF", "electrons", "calibration", "captures", *methods] + (["gain"] if len(methods) > 1 else [])
+    yield f"| {' | '.join(columns)} |"
+    yield "| --- " * len(columns) + "|"
     for (name, full_well, exact), found in rows.items():
         count = min(len(found[method]["psnr"]) for method in methods)
         values = {method: {key: each[:count] for key, each in found[method].items()} for method in methods}
         cells = [name, f"{full_well:,.0f}", "exact" if exact else "mismatched", str(count)]
         cells += [f"{fmean(values[m]['psnr']):.2f} / {fmean(values[m]['lpips']):.3f}" for m in methods]
-        if {"universal", "admm"} <= values.keys():
-            cells.append(gain(values["universal"], values["admm"]))
+        if len(methods) > 1:
+            cells.append(gain(values[methods[0]], values[methods[-1]]))
         yield f"| {' | '.join(cells)} |"
 
 
@@ -111,11 +123,10 @@ def main():
     parser.add_argument("data", type=Path)
     parser.add_argument("--count", type=int, default=32)
     parser.add_argument("--methods", nargs="+", default=["universal", "universal-small", "admm"])
+    parser.add_argument("--again", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/universal.json"))
     arguments = parser.parse_args()
-    rows = {which: {} for which in itertools.product(PSFS, FULL_WELLS, (True, False))}
-    for row in json.loads(arguments.out.read_text()) if arguments.out.exists() else ():
-        rows[tuple(row[key] for key in KEYS)] = row["values"]
+    rows = remembered(arguments.out, arguments.methods if arguments.again else ())
     tasks = []
     for which, values in rows.items():
         known = min(len(values.get(method, {}).get("psnr", ())) for method in arguments.methods)
@@ -132,8 +143,8 @@ def main():
                 rows[which][method] = {key: before.get(key, [])[: numbers.start] + values[key] for key in METRICS}
             record = [dict(zip(KEYS, which, strict=True)) | {"values": values} for which, values in rows.items()]
             keep(record, arguments.out)
-    print("PSNR in dB / LPIPS, means; what universal gains over ADMM (95 % confidence)\n")
-    print("\n".join(table(rows)))
+    print("PSNR in dB / LPIPS, means; what the first gains over the last (95 % confidence)\n")
+    print("\n".join(table(rows, arguments.methods)))
 
 
 if __name__ == "__main__":

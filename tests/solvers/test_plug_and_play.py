@@ -38,6 +38,7 @@ def test_it_ends_where_sensor_and_denoiser_pull_alike(generator, monkeypatch):
     """Of W/2 |crop(h * v) - b|^2 + rho/2 |v - z|^2 with a denoiser that always answers z, the least in the frame."""
     level, sensor, centre = 0.02, (5, 6), (slice(1, 6), slice(1, 7))
     monkeypatch.setattr(module, "LEVELS", (level, level))
+    monkeypatch.setattr(module, "POOR", 0.0)  # whatever the noise
     monkeypatch.setattr(module, "TRUST", 5.0)  # where the sensor's pixels must give way, and which do matters
     psf = 0.2 + torch.rand(3, 3, generator=generator, dtype=torch.float64)
     psf = psf / psf.sum()
@@ -108,11 +109,24 @@ def test_the_level_falls_and_the_frame_alone_is_denoised(found):
         told.append((tuple(picture.shape), level.flatten().tolist()))
         return picture
 
-    plug_and_play(explained, denoise, 3)
+    plug_and_play(replace(explained, noise=torch.full((2, 1, 1, 1), QUIET)), denoise, 3)  # in good light
     assert [shape for shape, _ in told] == 3 * [(2, 3, *SIZE)]
     assert [level for _, levels in told for level in levels] == pytest.approx(
         [each for each in (0.03, (0.03 * 0.005) ** 0.5, 0.005) for _ in range(2)]
     )
+
+
+def test_poor_light_raises_the_levels_of_its_own_sample(found):
+    explained, _, _ = found
+    noise, told = torch.tensor([0.5 * QUIET, 16 * QUIET]).view(2, 1, 1, 1), []
+
+    def denoise(picture, level):
+        told.append(level.flatten().tolist())
+        return picture
+
+    plug_and_play(replace(explained, noise=noise), denoise, 2)
+    assert told[0] == pytest.approx([0.03, 8 * 0.03])
+    assert told[1] == pytest.approx([0.005, 8 * 0.005])
 
 
 def test_each_round_shows_the_scene_mirrored_another_way(found):
@@ -136,8 +150,9 @@ def test_brighter_light_gives_a_brighter_scene(found):
     torch.testing.assert_close(alone, once[1:], rtol=1e-3, atol=1e-4)
 
 
-def test_what_the_psf_does_not_explain_counts_as_noise(found):
-    """Through a PSF that is not the camera's."""
+def test_what_the_psf_does_not_explain_counts_as_noise(found, monkeypatch):
+    """Through a PSF that is not the camera's; the levels, which follow the sensor's noise alone, kept."""
+    monkeypatch.setattr(module, "POOR", 0.0)
     explained, _, psf = found
     wrong = explain(explained.measurement, psf.flip(-1))
     rest = brightness(wrong.rest) / brightness(wrong.measurement)
