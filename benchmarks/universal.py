@@ -1,6 +1,7 @@
 """The bundled networks against ADMM through PSFs they have never seen: exact and mismatched, in good and poor light.
 
     python benchmarks/universal.py ../shared/data [--count 32] [--methods universal universal-small admm]
+                                                [--psfs "mwdn-camera 320x320" ...]
 
 Four measured PSFs; test photographs placed and mismatched as recipes/mismatched.toml says; 15,000 and 2,000 electrons
 at saturation. Measured as `mwdn evaluate` measures (full, clipped). Prints a table of means, with the confidence
@@ -78,13 +79,22 @@ def gain(values, other):
     return "{:+.2f} ({:.2f} to {:.2f})".format(*bootstrap([one - two for one, two in both]))
 
 
-def remembered(out, forgotten):
-    """What a record has of each row, but for the methods that are forgotten."""
+def remembered(out):
+    """What a record has of each row: values by method."""
     rows = {which: {} for which in itertools.product(PSFS, FULL_WELLS, (True, False))}
     for row in json.loads(out.read_text()) if out.exists() else ():
-        values = {method: values for method, values in row["values"].items() if method not in forgotten}
-        rows[tuple(row[key] for key in KEYS)] = values
+        rows[tuple(row[key] for key in KEYS)] = row["values"]
     return rows
+
+
+def lacking(rows, methods, count):
+    """What is to be measured: (row, numbers of captures, methods), first what all rows begin with."""
+    for first in range(0, count, AT_ONCE):
+        numbers = range(first, min(first + AT_ONCE, count))
+        for which, values in rows.items():
+            left = [each for each in methods if each not in values or len(values[each]["psnr"]) < numbers.stop]
+            if left:
+                yield which, numbers, left
 
 
 def keep(rows, out):
@@ -123,28 +133,28 @@ def main():
     parser.add_argument("data", type=Path)
     parser.add_argument("--count", type=int, default=32)
     parser.add_argument("--methods", nargs="+", default=["universal", "universal-small", "admm"])
+    parser.add_argument("--psfs", nargs="+", choices=PSFS, default=list(PSFS))
     parser.add_argument("--again", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/universal.json"))
     arguments = parser.parse_args()
-    rows = remembered(arguments.out, arguments.methods if arguments.again else ())
-    tasks = []
-    for which, values in rows.items():
-        known = min(len(values.get(method, {}).get("psnr", ())) for method in arguments.methods)
-        tasks += [
-            (which, range(first, min(first + AT_ONCE, arguments.count)))
-            for first in range(known, arguments.count, AT_ONCE)
-        ]
-    tasks.sort(key=lambda task: task[1].start)  # stopped early, all rows have about as many
+    rows = remembered(arguments.out)
+    wanted = {which: values for which, values in rows.items() if which[0] in arguments.psfs}
+    if arguments.again:
+        for values in wanted.values():
+            for method in arguments.methods:
+                values.pop(method, None)
+    tasks = list(lacking(wanted, arguments.methods, arguments.count))
     with ProcessPoolExecutor(mp_context=get_context("spawn")) as processes:
-        work = [processes.submit(scores, arguments.data, *task, arguments.methods) for task in tasks]
-        for (which, numbers), done in zip(tasks, work, strict=True):
+        work = [processes.submit(scores, arguments.data, *task) for task in tasks]
+        for (which, numbers, _), done in zip(tasks, work, strict=True):
             for method, values in done.result().items():
-                before = rows[which].get(method, {})
-                rows[which][method] = {key: before.get(key, [])[: numbers.start] + values[key] for key in METRICS}
+                known = rows[which].setdefault(method, {key: [] for key in METRICS})
+                for key in METRICS:
+                    known[key][numbers.start : numbers.stop] = values[key]
             record = [dict(zip(KEYS, which, strict=True)) | {"values": values} for which, values in rows.items()]
             keep(record, arguments.out)
     print("PSNR in dB / LPIPS, means; what the first gains over the last (95 % confidence)\n")
-    print("\n".join(table(rows, arguments.methods)))
+    print("\n".join(table(wanted, arguments.methods)))
 
 
 if __name__ == "__main__":
