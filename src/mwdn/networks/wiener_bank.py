@@ -163,10 +163,11 @@ class WienerBank(nn.Module):
         # Channels last, before and after: in half the time.
         folded = F.pixel_unshuffle(estimates.contiguous(memory_format=torch.channels_last), self.fold)
         folded = folded.contiguous(memory_format=torch.channels_last).div_(unit)
-        correction = F.pixel_shuffle(self.decoder(self.encoder(folded)), self.fold)[..., :height, :width]
-        if self.levels:
-            correction = correction - mean_light(correction, self.block)
-        return first + unit * correction
+        rows, columns = (-(-size // self.fold) for size in (height, width))
+        correction = self.decoder(self.encoder(folded))[..., :rows, :columns]
+        if self.levels:  # of each place in the folded blocks by itself, or their pattern would be seen in dark areas
+            correction = correction - mean_light(correction, max(1, self.block // self.fold))
+        return first + unit * F.pixel_shuffle(correction, self.fold)[..., :height, :width]
 
 
 def mean_light(picture: Tensor, block: int) -> Tensor:
