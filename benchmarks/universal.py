@@ -27,6 +27,7 @@ import mwdn
 from mwdn import Calibration, Reconstructor
 from mwdn.data.photographs import Photographs
 from mwdn.data.simulated import EXACT, SimulatedPairs
+from mwdn.data.writing import atomic
 from mwdn.evaluation import Perceptual, Protocol, bootstrap, evaluate
 from mwdn.learning.recipe import read_recipe
 
@@ -99,7 +100,8 @@ def lacking(rows, methods, count):
 
 def keep(rows, out):
     """Write a record, a line for each row."""
-    out.write_text("[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n")
+    with atomic(out) as temporary:
+        temporary.write_text("[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n")
 
 
 def scores(data, which, numbers, methods):
