@@ -5,43 +5,94 @@ python examples/onnx_only.py camera.onnx capture.png scene.png [dark.png]
 """
 
 import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
 import onnxruntime
 
 
-def read(path, bit_depth):
-    """A frame as linear light in RGB, (H, W, C); 1 is saturation."""
-    frame = cv2.imread(path, cv2.IMREAD_UNCHANGED)
-    if frame is None:
-        sys.exit(f"{path} cannot be read.")
-    frame = frame[..., :3][..., ::-1] if frame.ndim == 3 else frame[..., None]
-    return frame.astype(np.float32) / (2**bit_depth - 1 if bit_depth else np.iinfo(frame.dtype).max)
+def opened(model):
+    """A session, and what the file says about itself."""
+    try:
+        session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime raises many kinds
+        sys.exit(f"{model} cannot be opened: {str(error).splitlines()[0]}")
+    about = session.get_modelmeta().custom_metadata_map
+    if "psf_hash" not in about:
+        sys.exit(f"{model} must be a file that `mwdn export` wrote.")
+    return session, about
+
+
+def read(path, about):
+    """A frame as linear light in RGB, (H, W, C), its rows as stored; 1 is saturation."""
+    try:
+        frame = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    except (OSError, cv2.error):
+        frame = None
+    if frame is None or not np.isfinite(frame).all():
+        sys.exit(f"{path} cannot be read as PNG, TIFF, JPEG or BMP of finite numbers.")
+    largest = np.iinfo(frame.dtype).max if frame.dtype.kind in "iu" else 1
+    full = 2 ** int(about["bit_depth"]) - 1 if "bit_depth" in about else largest
+    if largest > 1 and not frame.max() <= full <= largest:
+        sys.exit(f"{path} ({frame.dtype}, up to {frame.max()}) must hold numbers of {about['bit_depth']} bits.")
+    frame = frame[..., :3][..., ::-1] if frame.ndim == 3 else frame[..., None]  # OpenCV gives BGR
+    return (frame[..., ::-1] if "colours" in about else frame).astype(np.float32) / full
+
+
+def cropped(frame, height, width):
+    """The middle part; (H // 2, W // 2) stays the centre."""
+    top, left = (max(0, n // 2 - kept // 2) for n, kept in zip(frame.shape, (height, width), strict=False))
+    return frame[top : top + height, left : left + width]
+
+
+def binned(frame, factor):
+    """Means of blocks of pixels; the block of the centre becomes the centre."""
+    for axis in (0, 1):
+        length, blocks = frame.shape[axis], frame.shape[axis] // factor
+        start = min(length // 2 - blocks // 2 * factor, length - blocks * factor)
+        frame = frame.take(range(start, start + blocks * factor), axis)
+    height, width, channels = frame.shape
+    return frame.reshape(height // factor, factor, width // factor, factor, channels).mean((1, 3))
+
+
+def measured(capture, dark, about):
+    """What the file takes: a capture less its dark frame, cropped, binned, row 0 at the top, (1, C, H, W)."""
+    frame = read(capture, about)
+    if dark:
+        level = read(dark, about)
+        if level.shape[:2] != frame.shape[:2] or level.shape[2] not in (1, frame.shape[2]):
+            sys.exit(f"{dark} {level.shape} must have the size of {capture} {frame.shape}.")
+        frame = frame - level
+    elif "dark" in about:
+        sys.exit(f"{capture} needs a dark frame, as this camera's calibration has one: name it last.")
+    if "crop" in about:
+        frame = cropped(frame, *map(int, about["crop"].split(" x ")))
+    frame = binned(frame, int(about["binning"]))
+    frame = frame[::-1] if "rows" in about else frame
+    return np.ascontiguousarray(frame.transpose(2, 0, 1)[None])
 
 
 def for_people(scene):
     """Scale so that all but the brightest 0.3 % fit into [0, 1], then encode as sRGB in 8 bits."""
-    light = np.clip(scene / max(np.quantile(scene, 0.997), 1e-12), 0, 1)
+    brightest = np.sort(scene, axis=None)[-1 - int(0.003 * scene.size)]
+    light = np.clip(scene / max(brightest, 1e-12), 0, 1)
     encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
     return (255 * encoded).round().astype(np.uint8)
 
 
 def main(model, capture, out, dark=None):
-    session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
-    about = session.get_modelmeta().custom_metadata_map
-    bit_depth = int(about.get("bit_depth", 0))
-    frame = read(capture, bit_depth)
-    if dark:
-        frame = frame - read(dark, bit_depth)
-    measurement = np.ascontiguousarray(frame.transpose(2, 0, 1)[None])
+    session, about = opened(model)
+    measurement = measured(capture, dark, about)
     wanted = session.get_inputs()[0].shape[1:]
     if list(measurement.shape[1:]) != wanted:
         sys.exit(f"{capture} is {measurement.shape[1:]} (channels, height, width), but {model} takes {wanted}.")
     (scene,) = session.run(["scene"], {"measurement": measurement})
     picture = for_people(scene[0].transpose(1, 2, 0))
-    if not cv2.imwrite(out, np.ascontiguousarray(picture[..., ::-1])):
-        sys.exit(f"{out} cannot be written.")
+    try:
+        cv2.imencode(Path(out).suffix, np.ascontiguousarray(picture[..., ::-1]))[1].tofile(out)
+    except (OSError, cv2.error):
+        sys.exit(f"{out} cannot be written: it must end in .png, .jpg or .tif, in a folder that exists.")
     print(f"{out}: {about['method']} for PSF {about['psf_hash']}, written by mwdn {about['version']}")
 
 

@@ -9,6 +9,8 @@ import json
 import shutil
 import tempfile
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -146,7 +148,8 @@ def export(
         if precision == "int8":
             from mwdn.quantise import quantise
 
-            quantise(file, simulated(calibration, ("cat", "coffee"), channels))
+            with _explained(file):
+                quantise(file, simulated(calibration, ("cat", "coffee"), channels))
         reached, bar = agreement(run_file(file, measurement), expected), LEAST[precision] if least is None else least
         if not reached >= bar:
             raise ExportError(
@@ -161,16 +164,17 @@ def run_file(file: Path, measurement: Measurement) -> Scene:
     """Reconstruct a batch with an exported file, on the CPU.
 
     Raises:
-        ExportError: onnxruntime is not installed.
+        ExportError: onnxruntime is not installed, or the file cannot be read or run.
     """
     if file.suffix == ".pt2":
-        with torch.no_grad():
+        with _explained(file), torch.no_grad():
             return torch.export.load(file).module()(measurement)
     _need("onnxruntime")
     import onnxruntime
 
-    session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
-    return torch.from_numpy(session.run(["scene"], {"measurement": measurement.numpy()})[0])
+    with _explained(file):
+        session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+        return torch.from_numpy(session.run(["scene"], {"measurement": measurement.numpy()})[0])
 
 
 def read_about(file: Path) -> dict[str, str]:
@@ -228,6 +232,17 @@ def _need(*packages: str) -> None:
         raise ExportError(f"ONNX needs the package {' and '.join(missing)}: `pip install 'mwdn[export]'`.")
 
 
+@contextmanager
+def _explained(file: Path) -> Iterator[None]:
+    """Raise an `ExportError` for what onnxruntime and torch raise, which is of many kinds."""
+    try:
+        yield
+    except Exception as error:
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        again = "Export it again: as .onnx, as .pt2, or with another `--precision`."
+        raise ExportError(f"`{file.name}` cannot be run: {reason.rstrip('.')}. {again}") from error
+
+
 def _about(name: str, calibration: Calibration, channels: int, precision: str) -> dict[str, str]:
     """All that another program must know to use the file."""
     from mwdn import __version__
@@ -251,6 +266,10 @@ def _about(name: str, calibration: Calibration, channels: int, precision: str) -
         about["crop"] = f"{calibration.crop[0]} x {calibration.crop[1]}"
     if calibration.upside_down:
         about["rows"] = "raw frames have their first row at the bottom"
+    if calibration.bgr:
+        about["colours"] = "raw frames have their channels in the order blue, green, red"
+    if calibration.dark is not None:
+        about["dark"] = "a frame taken without light must be subtracted from raw frames"
     return about
 
 

@@ -97,6 +97,11 @@ def _deviation(g: OnnxGraph, node: fx.Node, x: str, axes: list[int], correction:
     return g("Sqrt", g("ReduceMean", g("Mul", away, away), g.integers(axes), keepdims=int(keepdim)))
 
 
+def _concatenation(g: OnnxGraph, node: fx.Node, parts: list[Any], axis: int = 0) -> str:
+    given: Any = node.args[0]
+    return g("Concat", *(_as(g, value(node).dtype, *each) for each in zip(parts, given, strict=True)), axis=axis)
+
+
 def _stack(g: OnnxGraph, node: fx.Node, parts: list[str], axis: int = 0) -> str:
     return g("Concat", *(g("Unsqueeze", part, g.integers([axis])) for part in parts), axis=axis)
 
@@ -196,11 +201,13 @@ def _pool(operation: str) -> Handler:
 
 
 def _group_norm(g: OnnxGraph, node: fx.Node, x: str, groups: int, weight: Any, bias: Any, *rest: Any) -> str:  # noqa: ANN401
-    one, epsilon = torch.ones(groups), (*rest, 1e-5)[0]
-    grouped = g("Reshape", x, g.integers([0, groups, -1]))
+    # In float32, as torch calculates it: squares summed over a picture leave the range of float16.
+    one, epsilon, dtype = torch.ones(groups), (*rest, 1e-5)[0], value(node).dtype
+    grouped = g("Reshape", _as(g, torch.float32, x, node.args[0]), g.integers([0, groups, -1]))
     normal = g("InstanceNormalization", grouped, one, torch.zeros(groups), epsilon=epsilon)
     spread = g("Reshape", normal, g.integers(_known(value(node).shape)))
-    return g("Add", g("Mul", spread, weight[:, None, None]), bias[:, None, None])
+    found = g("Add", g("Mul", spread, weight.float()[:, None, None]), bias.float()[:, None, None])
+    return found if dtype == torch.float32 else g("Cast", found, to=_TYPES[dtype])
 
 
 def _enlarge(g: OnnxGraph, node: fx.Node, x: str, size: Any, corners: bool, *_: Any) -> str:  # noqa: ANN401
@@ -243,7 +250,7 @@ REAL: dict[Any, Handler] = {
     _aten.add.Tensor: _sum("Add"),
     _aten.amax.default: _reduce("ReduceMax"),
     _aten.avg_pool2d.default: _pool("AveragePool"),
-    _aten.cat.default: lambda g, node, parts, axis=0: g("Concat", *parts, axis=axis),
+    _aten.cat.default: _concatenation,
     _aten.clamp.default: _clamp,
     _aten.conv2d.default: _convolution,
     _aten.conv_transpose2d.input: _transposed,
