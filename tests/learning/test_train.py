@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -14,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 
 from mwdn.calibration import Calibration
 from mwdn.data.cameras import Cameras
@@ -27,6 +28,7 @@ from mwdn.learning.checkpoint import load_network, read_metadata
 from mwdn.learning.recipe import Plateau, Recipe, Schedule, Sheet
 from mwdn.learning.schedule import learning_rate
 from mwdn.learning.session import prepare, simulate
+from mwdn.learning.state import read_state
 from mwdn.learning.train import Trainer
 from mwdn.learning.validation import Validation
 from mwdn.optics.patterns import contour_psf
@@ -443,12 +445,35 @@ def test_another_recipe_or_psf_in_the_same_folder(trainer, photos, calibration, 
     assert before == {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
 
 
+def test_weights_of_another_run_are_not_replaced(trainer, tmp_path):
+    """Without its state too, which is large and may have been removed; where no weights are, nothing can be lost."""
+    trainer().run()
+    folder = tmp_path / "run"
+    (folder / "state.safetensors").unlink()
+    best = (folder / "best.safetensors").read_bytes()
+    with pytest.raises(CheckpointError, match="holds a run of another recipe"):
+        trainer(few(learning_rate=1e-4))
+    assert (folder / "best.safetensors").read_bytes() == best
+    assert trainer().step == 0
+    for path in folder.glob("*.safetensors"):
+        path.unlink()
+    assert trainer(few(learning_rate=1e-4)).step == 0
+
+
 def test_damaged_or_foreign_state(trainer, tmp_path):
     trainer().run()
     state = tmp_path / "run" / "state.safetensors"
     whole = state.read_bytes()
     state.write_bytes(whole[:1000])
     with pytest.raises(CheckpointError, match=r"state\.safetensors` is damaged: .* Remove it to begin again"):
+        trainer()
+    state.write_bytes(b"")
+    with pytest.raises(CheckpointError, match=r"state\.safetensors` is damaged"):
+        trainer()
+    tensors, header = read_state(state, whole)
+    del tensors["average.decoder.head.weight"]
+    save_file(tensors, state, metadata=header)
+    with pytest.raises(CheckpointError, match=r"state\.safetensors` is damaged: a part is missing"):
         trainer()
     state.write_bytes((tmp_path / "run" / "last.safetensors").read_bytes())
     with pytest.raises(CheckpointError, match="another recipe or PSF"):
@@ -506,6 +531,29 @@ def test_divergence_leaves_the_state(trainer, tmp_path):
     assert trainer(few(steps=9)).step == 3
 
 
+def test_divergence_names_recorded_rows_and_the_way_out(pairs, calibration, tmp_path):
+    run = prepare(few(seed=1), calibration, None, tmp_path / "run", "cpu", pairs=pairs)
+    rows = [run.pairs.row(number) for number in range(2)]
+    with torch.no_grad():
+        next(run.network.parameters()).fill_(float("nan"))
+    said = rf"samples 0 to 1, rows {re.escape(str(rows))} of the file\) is not finite\. .* another folder, `--out`\.$"
+    with pytest.raises(DivergenceError, match=said):
+        run.advance()
+    run.save(Validation(0.0, 0.0))
+    with pytest.raises(DivergenceError, match=r'are kept: `start = ".*last\.safetensors"`\.$'):
+        run.advance()
+
+
+def test_a_network_that_cannot_learn_from_the_samples(photos, tmp_path):
+    """BatchNorm needs more than one number, and a U-Net more than a few pixels."""
+    tiny = Calibration(torch.eye(16).expand(1, 3, -1, -1) / 16)
+    recipe = replace(few(batch=1), network={"name": "mwdn", "width": 4})
+    with pytest.raises(
+        ParameterError, match=r"\[network\] .* cannot learn from a batch of 1 of these samples: Expected"
+    ):
+        prepare(recipe, tiny, photos, tmp_path / "run", "cpu").advance()
+
+
 # --- Across cameras, and from known weights -----------------------------------------------------------
 
 
@@ -522,8 +570,9 @@ def test_a_run_begins_with_the_weights_it_is_given(trainer, tmp_path):
     known = load_network(start)
     assert all(torch.equal(a, b) for a, b in zip(first.state_dict().values(), known.state_dict().values(), strict=True))
     wider = replace(few(start=start), network={**RECIPE.network, "width": 8})
-    with pytest.raises(CheckpointError, match="must hold the network of the recipe"):
+    with pytest.raises(CheckpointError, match="must hold the network of the recipe") as error:
         trainer(wider, "third")
+    assert len(str(error.value).splitlines()) == 1
 
 
 def test_a_run_with_a_pool_that_is_stopped_ends_as_one_that_was_not(trainer, tmp_path):

@@ -2,7 +2,9 @@
 
 import dataclasses
 import json
+import math
 import tomllib
+import warnings
 from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -85,6 +87,12 @@ class Schedule:
         for name in ("epochs", "warmup", "weight_decay", "clip", "pool", "crop"):
             if not getattr(self, name) >= 0:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) must not be negative.")
+        if not abs(self.seed) < 2**63:
+            raise ParameterError(f"`seed` ({self.seed}) must have 63 bits at most.")
+        if self.learning_rate == math.inf:
+            raise ParameterError("`learning_rate` (inf) must be finite.")
+        if self.crop and not self.pool:
+            raise ParameterError(f"`crop` ({self.crop}) is of kept samples: set `pool`, or leave it out.")
         if not 0 <= self.ema < 1:
             raise ParameterError(f"`ema` ({self.ema}) must be in [0, 1).")
         for kind, name, known in (("course", self.course, COURSES), ("optimiser", self.optimiser, OPTIMISERS)):
@@ -279,9 +287,12 @@ def _as_float(value: Any, example: object) -> Any:  # noqa: ANN401
 def _try(network: dict[str, Any]) -> None:
     """Build it without memory: a mistake is found before a thousand photographs have been read."""
     try:
-        with torch.device("meta"):
-            build(**network)
+        with torch.device("meta"), warnings.catch_warnings(action="ignore"):  # of layers that are empty
+            built = build(**network)
     except (TypeError, ValueError, RuntimeError) as error:
         if isinstance(error, MwdnError):
             raise
         raise ParameterError(f"[network] {network} cannot be built: {error}") from error
+    empty = [name for name, parameter in built.named_parameters() if parameter.numel() == 0]
+    if empty:
+        raise ParameterError(f"[network] {network} has layers without channels, `{empty[0]}` first.")

@@ -45,9 +45,14 @@ def read_state(path: Path, content: bytes) -> tuple[dict[str, Tensor], Header]:
     try:
         state = load(content)
     except SafetensorError as error:
-        raise CheckpointError(f"`{path}` is damaged: {error}. Remove it to begin again.") from error
+        raise damaged(path, error) from error
     length = int.from_bytes(content[:8], "little")  # of a header in JSON, which follows
     return state, json.loads(content[8 : 8 + length]).get("__metadata__", {})
+
+
+def damaged(path: Path, reason: object) -> CheckpointError:
+    """What is raised of a state from which nothing can go on."""
+    return CheckpointError(f"`{path}` is damaged: {reason}. Remove it to begin again.")
 
 
 def restore(

@@ -3,37 +3,34 @@
 import json
 import math
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError
 from torch import Tensor
 
 from mwdn.calibration import Calibration
 from mwdn.data.images import write_picture
+from mwdn.data.recorded import RecordedPairs
 from mwdn.data.simulated import Samples
 from mwdn.data.unpaired import UnpairedCaptures
-from mwdn.data.writing import atomic
-from mwdn.errors import CheckpointError, DivergenceError, ParameterError
+from mwdn.errors import CheckpointError, DivergenceError, MwdnError, ParameterError
 from mwdn.learning import distributed
 from mwdn.learning.bundled import find_weights
-from mwdn.learning.checkpoint import load_network, save_network
+from mwdn.learning.checkpoint import load_network, misfit, save_network
+from mwdn.learning.folder import MAKE_ROOM, RunFolder
 from mwdn.learning.losses import Loss
 from mwdn.learning.pool import Pool
 from mwdn.learning.precision import has_bfloat16
 from mwdn.learning.recipe import Recipe
 from mwdn.learning.schedule import begin, optimiser
 from mwdn.learning.selfsupervised import BlindValidator, judge
-from mwdn.learning.state import read_state, restore, write_state
+from mwdn.learning.state import damaged, restore, write_state
 from mwdn.learning.validation import Validation, Validator
 from mwdn.networks import build
 from mwdn.networks.recomputed import norms, recompute
 from mwdn.types import Measurement
-
-_MAKE_ROOM = "Make room and give the same command again: it goes on from the last saved state."
 
 
 @dataclass(frozen=True)
@@ -120,9 +117,10 @@ class Trainer:
         self.identity = {"recipe": learned, "psf_hash": one, "pairs": pairs.name}
         distributed.check_alike(self.identity)
         distributed.share(range(self.schedule.batch))  # refuses a batch that is too small
+        self.folder = RunFolder(out, self.identity)
         self._resume()
         if distributed.rank() == 0:
-            self._claim()
+            self.folder.claim(self.step)
 
     def run(self, callback: Callable[[Report], None] = lambda report: None) -> float:
         """Train to the end of the schedule; returns the best validation PSNR in dB.
@@ -145,7 +143,9 @@ class Trainer:
             found = self.validate() if due else None
             report = Report(self.step, loss, parts, rate, speed, found)
             if distributed.rank() == 0:
-                self._log(report)  # before the state: a run killed between the two repeats the step, and its line
+                self.folder.log(
+                    report.line()
+                )  # before the state: a run killed between the two repeats the step, and its line
             if found is not None:
                 self.save(found)
                 last = time.perf_counter()
@@ -169,15 +169,20 @@ class Trainer:
         if self.schedule.fixed_norms:
             for norm in norms(self.network):
                 norm.eval()
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
-            loss, parts = self._judge(own)
+        try:
+            with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
+                loss, parts = self._judge(own)
+        except (RuntimeError, ValueError) as error:
+            if self.step or isinstance(error, MwdnError):
+                raise
+            raise ParameterError(
+                f"[network] {self.recipe.network} cannot learn from a batch of {len(own)} of these samples: "
+                f"{str(error).splitlines()[0]}"
+            ) from error
         weight = len(own) / len(numbers)  # losses are means over samples
         total, *totals = distributed.total(weight * torch.stack([loss.detach(), *parts.values()]).double()).tolist()
         if not math.isfinite(total):
-            raise DivergenceError(
-                f"The loss of step {self.step} (samples {numbers.start} to {numbers.stop - 1}) is not finite. "
-                f"Lower the learning rate and go on from `{self.out / 'state.safetensors'}`."
-            )
+            raise self._diverged(numbers)
         self.optimiser.zero_grad(set_to_none=True)
         torch.autograd.backward(weight * loss)
         distributed.add_gradients(self.network)
@@ -187,6 +192,17 @@ class Trainer:
         self.step += 1
         self._average()
         return total, dict(zip(parts, totals, strict=True))
+
+    def _diverged(self, numbers: range) -> DivergenceError:
+        """Names the batch, and what is left."""
+        rows = [self.pairs.row(number) for number in numbers] if isinstance(self.pairs, RecordedPairs) else []
+        which = f"samples {numbers.start} to {numbers.stop - 1}" + (f", rows {rows} of the file" if rows else "")
+        last = self.folder.weights("last")
+        kept = f' The weights of the last validation are kept: `start = "{last}"`.' if last.exists() else ""
+        return DivergenceError(
+            f"The loss of step {self.step} ({which}) is not finite. Lower the learning rate and choose another "
+            f"folder, `--out`.{kept}"
+        )
 
     def _judge(self, numbers: range) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of the samples of these numbers, and its parts."""
@@ -241,21 +257,12 @@ class Trainer:
         metadata = {**self.identity, "step": self.step, "psnr": found.psnr}
         header = {"identity": json.dumps(self.identity), "step": str(self.step), "best": repr(self.best)}
         header["course"] = json.dumps(self.course.state())
-        with self._writing(_MAKE_ROOM):
+        with self.folder.writing(MAKE_ROOM):
             for name in ("last", *(["best"] if found.psnr == self.best else [])):
                 network = self.recipe.network["name"]
-                save_network(self.out / f"{name}.safetensors", self.average, network, self.options, **metadata)
-            path = self.out / "state.safetensors"
+                save_network(self.folder.weights(name), self.average, network, self.options, **metadata)
+            path = self.folder.state
             write_state(path, header, network=self.network, average=self.average, optimiser=self.optimiser)
-
-    @contextmanager
-    def _writing(self, way_out: str) -> Iterator[None]:
-        try:
-            yield
-        except (OSError, SafetensorError) as error:  # safetensors has a type of its own for what the disk refuses
-            reason = getattr(error, "strerror", None) or error
-            message = f"`{self.out}` must be a folder that can be written to: {reason}. {way_out}"
-            raise ParameterError(message) from error
 
     def _pool(self) -> Pool:
         s = self.schedule
@@ -272,35 +279,17 @@ class Trainer:
         except RuntimeError as error:
             raise CheckpointError(
                 f"`start` ('{start}') must hold the network of the recipe, {self.recipe.network}, and `denoiser` "
-                f"('{alone}') its denoiser, if it has one: {error}"
+                f"('{alone}') its denoiser, if it has one: {misfit(error)}."
             ) from error
 
     def _resume(self) -> None:
-        path = self.out / "state.safetensors"
-        content = distributed.from_first(lambda: path.read_bytes() if path.exists() else b"")
-        if not content:
+        saved = self.folder.saved()
+        if saved is None:
             return
-        state, header = read_state(path, content)
-        if json.loads(header.get("identity", "null")) != json.loads(json.dumps(self.identity)):
-            raise CheckpointError(
-                f"`{self.out}` holds a run of another recipe or PSF, or on other pairs. "
-                "Choose another folder, `--out`, or remove it."
-            )
-        restore(state, network=self.network, average=self.average, optimiser=self.optimiser)
+        state, header = saved
+        try:
+            restore(state, network=self.network, average=self.average, optimiser=self.optimiser)
+        except (KeyError, RuntimeError) as error:
+            raise damaged(self.folder.state, "a part is missing") from error
         self.step, self.best = int(header["step"]), float(header["best"])
         self.course = begin(self.recipe, **json.loads(header["course"]))
-
-    def _claim(self) -> None:
-        """Write to the folder once, so that one that refuses is found now and not after an hour."""
-        log = self.out / "log.jsonl"
-        with self._writing("Choose another one: `--out`."):
-            with atomic(self.out / "recipe.json") as temporary:
-                temporary.write_text(json.dumps(self.identity, indent=2), encoding="utf-8")
-            # One line a step; those after the saved step will be written again.
-            lines = log.read_text(encoding="utf-8").splitlines(keepends=True) if log.exists() else []
-            with atomic(log) as temporary:
-                temporary.write_text("".join(lines[: self.step]), encoding="utf-8")
-
-    def _log(self, report: Report) -> None:
-        with self._writing(_MAKE_ROOM), (self.out / "log.jsonl").open("a", encoding="utf-8") as file:
-            file.write(json.dumps(report.line()) + "\n")
