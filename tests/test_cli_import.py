@@ -80,3 +80,17 @@ def test_the_extra_to_install_survives_the_terminals_markup(tmp_path, monkeypatc
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     assert run("parquet", "owner/name", "-o", tmp_path / "pairs.h5") == 2
     assert "pip install 'mwdn[hub]'" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("name", ["captures/[2].png", "captures/new.png", "pairs"])
+def test_no_picture_is_replaced(folders, capsys, name):
+    before = {path: path.read_bytes() for path in folders.rglob("*.png")}
+    assert run("folders", folders, "-o", folders / name) == 2
+    assert "must end in .h5 or .hdf5" in capsys.readouterr().err
+    assert before == {path: path.read_bytes() for path in folders.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("option", ["--bin 0", "--bit-depth 0", "--scene-size -3 5"])
+def test_wrong_numbers_are_one_message(folders, capsys, option):
+    assert run("folders", folders, "-o", folders / "pairs.h5", *option.split()) == 2
+    assert capsys.readouterr().err.count("\n") == 1

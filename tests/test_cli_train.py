@@ -115,15 +115,20 @@ def test_warning_of_a_reconstructor(camera):
         (TRAIN.replace("--device cpu", "--device cuda:99"), "`device` (cuda:99) must be one that torch can use here"),
         ("simulate photos --psf psf.npy --count 0", "`count` (0) must be at least 1"),
         ("simulate photos --psf psf.npy -o photos", "`photos` is a folder"),
+        ("simulate photos --psf psf.npy -o photos/0.png", "`0.png` must end in .h5 or .hdf5"),
+        ("simulate photos --psf psf.npy -o psf.npy", "`psf.npy` would overwrite an input"),
+        (f"simulate photos --psf psf.npy --seed {10**23}", f"`seed` ({10**23}) must have 63 bits at most"),
         ("simulate nothing --psf psf.npy", "The folder `nothing` holds no photograph"),
     ],
 )
 def test_wrong_call_is_one_message_and_exit_2(run, camera, line, said):
+    before = {path: path.read_bytes() for path in camera.rglob("*") if path.is_file()}
     code, _, err = run(line)
     assert code == 2
     assert said in flat(err)
     assert "Traceback" not in err
     assert not list(camera.glob("*.h5"))
+    assert all(path.read_bytes() == content for path, content in before.items())
 
 
 def test_train_on_recorded_pairs(run, camera):

@@ -19,6 +19,7 @@ from mwdn.cli_optics import design
 from mwdn.cli_reconstruct import reconstruct
 from mwdn.cli_train import simulate, train
 from mwdn.data.importers import Layout, import_pairs
+from mwdn.data.writing import check_folder, spare
 from mwdn.errors import MwdnError
 from mwdn.evaluation import Variant
 from mwdn.memory import keep_memory
@@ -47,7 +48,7 @@ def import_(
     Args:
         kind: mwdn (the authors' HDF5), diffusercam, phlatcam, folders (captures/ and scenes/), or parquet.
         path: of the data set; for parquet a shard, a folder of shards, or owner/name on the Hugging Face hub.
-        out: the file of pairs; one that exists is replaced when all has gone well.
+        out: the file of pairs, ending in .h5 or .hdf5; one that exists is replaced when all has gone well.
         skip_damaged: leave out what is damaged or has no partner, and name it.
         layout: what is unusual about this copy of the data set.
     """
@@ -87,12 +88,17 @@ def evaluate(
     """
     from mwdn import evaluation
     from mwdn.data.pairs import PairFile
+    from mwdn.data.recorded import check_pairs, other_camera
 
-    part, calibration = evaluation.Protocol.parse(protocol), camera.load()
+    part, calibration, file = evaluation.Protocol.parse(protocol), camera.load(), PairFile(data)
+    check_pairs(file, calibration.psf)
+    pairs = file if first is None else evaluation.First(file, first)
     reconstructors = {method: Reconstructor(method, calibration, device=device) for method in methods}
     warn(*reconstructors.values())
-    file = PairFile(data)
-    pairs = evaluation.First(file, len(file) if first is None else first)
+    if other := other_camera(file, calibration.psf_hash):
+        errors.print(f"[yellow]Warning:[/] {escape(other)}", highlight=False, soft_wrap=True)
+    spare(out / evaluation.SHEET, camera.psf, camera.dark)
+    check_folder(out)
     with Progress(console=errors, transient=True) as bars:
         bar = bars.add_task("Evaluating", total=len(reconstructors) * len(pairs))
         report = evaluation.evaluate(
@@ -102,8 +108,10 @@ def evaluate(
             variant=variant,
             progress=lambda name, _: bars.update(bar, advance=1, description=name),
         )
+    table = report.table()
+    needed = console.measure(table, options=console.options.update(width=1000)).maximum
+    console.print(report.table(narrow=True) if needed > console.width else table)
     report.write(out)
-    console.print(report.table())
     console.print(f"Look at {out}", highlight=False, markup=False, soft_wrap=True)
 
 

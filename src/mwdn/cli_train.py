@@ -10,6 +10,7 @@ from cyclopts import Parameter
 from rich.progress import Progress, ProgressColumn, track
 
 from mwdn.cli_camera import CameraOptions, console, errors
+from mwdn.data.writing import spare
 from mwdn.learning import distributed, session
 from mwdn.learning.board import Board
 from mwdn.learning.recipe import Recipe, Schedule, Sheet, read_recipe
@@ -93,12 +94,13 @@ def simulate(
     Args:
         photos: folder of photographs.
         camera: calibration of the camera.
-        out: the file of pairs; one that exists is replaced when all has gone well.
+        out: the file of pairs, ending in .h5 or .hdf5; one that exists is replaced when all has gone well.
         count: of pairs.
         recipe: TOML file whose placement, mismatch, sensor and seed are used, see recipes/; defaults unless given.
         seed: instead of the recipe's.
         exact: simulate a camera that is exactly what its calibration says.
     """
+    spare(out, camera.psf, camera.dark, recipe)
     chosen = read_recipe(recipe, seed=seed) if recipe else Recipe(schedule=Schedule(seed=seed or 0))
     progress = partial(track, description="Simulating", console=errors, transient=True)
     session.simulate(chosen, camera.load(), photos, out, count, exact=exact, track=progress)

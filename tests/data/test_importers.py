@@ -11,7 +11,7 @@ from PIL import Image as Pillow
 
 from mwdn.data import PairFile, import_pairs, read_pairs
 from mwdn.data.importers import Layout
-from mwdn.errors import ImageError, UnknownNameError
+from mwdn.errors import ImageError, ParameterError, UnknownNameError
 
 RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
 
@@ -104,7 +104,7 @@ def test_damaged_rows_and_files_of_the_authors_kind(tmp_path):
         import_pairs("mwdn", path, tmp_path / "other.h5", skip_damaged=True)
     with pytest.raises(ImageError, match=r"must have `blur`.* has \['measurement', 'scene'\]"):
         import_pairs("mwdn", tmp_path / "pairs.h5", tmp_path / "other.h5")
-    with pytest.raises(ImageError, match="is the data set itself"):
+    with pytest.raises(ParameterError, match="would overwrite an input"):
         import_pairs("mwdn", path, path)
     with pytest.raises(ImageError, match="is no file"):
         import_pairs("mwdn", tmp_path / "none.h5", tmp_path / "other.h5")
@@ -320,6 +320,15 @@ def test_the_hub_needs_its_package(tmp_path, monkeypatch):
             import_pairs("parquet", name, tmp_path / "pairs.h5")
 
 
+def test_the_hubs_own_words_are_one_line(tmp_path, monkeypatch):
+    def snapshot_download(*_, **__):
+        raise OSError("No such host.\nPlease check your connection and try again.")
+
+    monkeypatch.setitem(sys.modules, "huggingface_hub", types.SimpleNamespace(snapshot_download=snapshot_download))
+    with pytest.raises(ImageError, match=r"from the hub: No such host\. Download it and name its folder\.$"):
+        import_pairs("parquet", "owner/name", tmp_path / "pairs.h5")
+
+
 def test_the_hubs_files_are_read(shards, tmp_path, monkeypatch):
     asked = []
 
@@ -338,3 +347,18 @@ def test_parquet_needs_its_package(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(ImageError, match=r"`pyarrow` must be installed: `pip install 'mwdn\[parquet\]'`"):
         import_pairs("parquet", tmp_path / "a.parquet", tmp_path / "pairs.h5")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"bin": 0}, r"`bin` \(0\)"),
+        ({"bin": -1}, r"`bin` \(-1\)"),
+        ({"bit_depth": 0}, r"`bit_depth` \(0\)"),
+        ({"scene_size": (0, 0)}, r"`scene_size` \(0 x 0\)"),
+        ({"scene_size": (-3, 5)}, r"`scene_size` \(-3 x 5\)"),
+    ],
+)
+def test_wrong_numbers_of_a_layout(wrong, said):
+    with pytest.raises(ParameterError, match=said):
+        Layout(**wrong)

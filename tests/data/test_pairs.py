@@ -252,6 +252,13 @@ def test_wrong_calls(tmp_path, generator, unchecked):
         create(tmp_path / "b.h5", psf=torch.zeros(3, 3))
     with pytest.raises(ImageError, match="is a folder"), create(tmp_path):
         pass
+    (tmp_path / "photo.png").touch()
+    (tmp_path / "link.h5").symlink_to(tmp_path / "photo.png")
+    for name in ("photo.png", "link.h5"):
+        with pytest.raises(ParameterError, match=r"`photo.png` must end in .h5 or .hdf5.*: `photo.h5`"):
+            create(tmp_path / name)
+    for name in ("photo.png", "link.h5"):
+        (tmp_path / name).unlink()
     with pytest.raises(ImageError, match="cannot be written"), create(tmp_path / "a.h5" / "b.h5"):
         pass
     assert [file.name for file in tmp_path.iterdir()] == ["a.h5"]

@@ -111,3 +111,10 @@ def test_bad_files_are_named(tmp_path):
     store(tmp_path / "deep.png", noise(8, 8, 3).astype(np.uint16) * 257)
     with pytest.raises(ImageError, match=r"deep\.png` holds uint16; photographs for training have 8 bits"):
         Photographs(tmp_path)
+
+
+def test_hidden_files_are_no_photographs(tmp_path):
+    """macOS puts a hidden ._a.png beside each a.png on foreign disks; it holds no picture."""
+    store(tmp_path / "a.png", noise(8, 8, 3))
+    (tmp_path / "._a.png").write_bytes(b"Mac OS X")
+    assert Photographs(tmp_path, side=8).names == ["a.png"]

@@ -2,9 +2,11 @@
 
 import io
 import json
-import sys
-import types
+import math
+import re
 
+import h5py
+import numpy as np
 import pytest
 import torch
 from rich.console import Console
@@ -13,8 +15,18 @@ from torch import nn
 from mwdn import cli
 from mwdn.calibration import Calibration
 from mwdn.data.images import read_frame, write_linear
+from mwdn.data.pairs import PairFile
 from mwdn.errors import CheckpointError, ParameterError, ShapeError, UnknownNameError
-from mwdn.evaluation import First, Perceptual, Protocol, evaluate, learnable_numbers, measure
+from mwdn.evaluation import (
+    First,
+    Perceptual,
+    Protocol,
+    Report,
+    Scores,
+    evaluate,
+    learnable_numbers,
+    measure,
+)
 from mwdn.learning import alexnet
 from mwdn.networks import build
 from mwdn.optics import Camera
@@ -43,9 +55,9 @@ def perceptual(data):
     return Perceptual.load(data / "lpips" / "alexnet_features_torchvision.pth")
 
 
-def printed(table):
+def printed(table, width=200):
     file = io.StringIO()
-    Console(file=file, width=200).print(table)
+    Console(file=file, width=width).print(table)
     return file.getvalue()
 
 
@@ -92,8 +104,8 @@ def test_missing_metrics_are_named_and_not_averaged(pairs):
     assert report.variant == "raw"
     text = printed(report.table())
     assert "a[b].pt" in text
-    assert f"LPIPS is missing: {reason}" in text
-    assert f"feature MSE is missing: {reason}" in text
+    assert f"Without LPIPS and feature MSE: {reason}" in text
+    assert text.count(reason) == 1
     content = json.loads(report.json())
     assert content["missing"] == {"lpips": reason, "feature_mse": reason}
     assert content["methods"]["a[b].pt"]["values"]["lpips"] == [None] * 3
@@ -147,11 +159,45 @@ def test_learnable_numbers_are_those_of_the_network_inside(camera):
 @pytest.mark.usefixtures("unchecked")
 def test_wrong_calls_are_refused(pairs):
     same = {"same": lambda b: b}
-    for methods, some in (({}, pairs), (same, [])):
-        with pytest.raises(ParameterError, match="must not be empty"):
+    for methods, some, what in (({}, pairs, "methods"), (same, [], "pairs")):
+        with pytest.raises(ParameterError, match=f"`{what}` must not be empty"):
             evaluate(methods, some, Protocol(), perceptual=Perceptual.none())
     with pytest.raises(ShapeError, match="must have the same shape"):
         evaluate({"small": lambda b: b[:, :1]}, pairs, Protocol(), perceptual=Perceptual.none())
+
+
+@pytest.mark.parametrize(("part", "what"), [(0, "measurement"), (1, "scene")])
+def test_a_pair_that_is_not_finite_is_named_before_any_work(pairs, part, what):
+    pairs[2][part][0, 3, 4] = math.nan
+    with pytest.raises(ParameterError, match=f"The {what} of pair 2, counted from 0, holds NaN or infinity"):
+        evaluate({"method": pytest.fail}, pairs, Protocol(), perceptual=Perceptual.none())
+
+
+def test_a_part_too_small_for_alexnet_is_measured_without_it(pairs, monkeypatch):
+    monkeypatch.setattr("mwdn.evaluation.metrics.load_alexnet", pytest.fail)
+    report = evaluate({"same": lambda b: b}, pairs, Protocol.parse("0:30,0:48"))
+    reason = "the part 0:30,0:48 has less than 31 pixels a side, for AlexNet"
+    assert report.missing == {"lpips": reason, "feature_mse": reason}
+    assert math.isfinite(report.methods["same"].summary("psnr")[0])
+
+
+def test_table_for_80_columns():
+    low = {"psnr": 33.1, "ssim": 0.85, "lpips": 0.0046, "feature_mse": 0.02341, "mse": 0.000487}
+    values = {metric: (mean, 1.1 * mean) for metric, mean in low.items()}
+    name = "runs/mine/best.safetensors"
+    both = {
+        "wiener": Scores(values, (0.01, 0.02), 2**20, "cpu", 0),
+        name: Scores(values, (12.3,), None, "cpu", 17345678),
+    }
+    report = Report("full", "clipped", both, {}, [])
+    text = printed(report.table(narrow=True), 80)
+    assert "…" not in text
+    assert max(map(len, text.splitlines())) <= 80
+    words = set(re.sub(r"[\[\],]", " ", text).split())
+    wanted = report.methods["wiener"].summary("mse")
+    assert {f"{number:.3g}" for number in wanted} | {"33.10", "12300.0", "0.02341", "MiB"} <= words
+    assert "17,345,678" in text
+    assert name in "".join(line.split(" ")[0] for line in text.splitlines())
 
 
 def test_first_reads_only_what_is_asked_for(pairs):
@@ -180,10 +226,13 @@ def run(*arguments):
     return left.value.code
 
 
-def test_command(camera, pairs, tmp_path, monkeypatch, capsys):
-    module = types.ModuleType("mwdn.data.pairs")
-    module.PairFile = lambda path: pairs if path == tmp_path / "pairs.h5" else None
-    monkeypatch.setitem(sys.modules, "mwdn.data.pairs", module)
+@pytest.fixture
+def common(camera, pairs, tmp_path, monkeypatch):
+    """Options of a command, its pairs in pairs.h5; the perceptual networks cannot be had."""
+    shape = (*SIZE, 3)
+    with PairFile.create(tmp_path / "pairs.h5", measurement_shape=shape, scene_shape=shape) as file:
+        for measurement, scene in pairs:
+            file.append(measurement, scene)
     monkeypatch.setattr(alexnet, "cache_folder", lambda: tmp_path / "cache")
     monkeypatch.delenv("MWDN_ALEXNET", raising=False)
 
@@ -192,11 +241,15 @@ def test_command(camera, pairs, tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(alexnet, "urlopen", unroutable)
     write_linear(tmp_path / "psf.npy", camera.psf)
-    common = ["--data", tmp_path / "pairs.h5", "--psf", tmp_path / "psf.npy", "--background", 0, "--device", "cpu"]
+    return ["--data", tmp_path / "pairs.h5", "--psf", tmp_path / "psf.npy", "--background", 0, "--device", "cpu"]
+
+
+def test_command(common, tmp_path, capsys):
     options = ["--first", 2, "--protocol", "2:38,4:40", "--variant", "best-gain", "--out", tmp_path / "out"]
     assert run("evaluate", "wiener", "fista", *common, *options) == 0
     out = capsys.readouterr().out
-    assert "LPIPS is missing" in " ".join(out.split())
+    assert "Without LPIPS and feature MSE" in " ".join(out.split())
+    assert out.count("unreachable") == 1
     content = json.loads((tmp_path / "out" / "report.json").read_text())
     assert list(content["methods"]) == ["wiener", "fista"]
     assert "Network is unreachable" in content["missing"]["lpips"]
@@ -204,3 +257,53 @@ def test_command(camera, pairs, tmp_path, monkeypatch, capsys):
     assert run("evaluate", *common) == 2
     assert run("evaluate", "wiener", *common, "--protocol", "centre") == 2
     assert run("evaluate", "winer", *common) == 2
+
+
+@pytest.mark.parametrize(
+    ("out", "said"), [("file", "must be a folder that can be written to"), ("mine", "would overwrite an input")]
+)
+def test_command_looks_at_its_folder_first(common, tmp_path, monkeypatch, capsys, out, said):
+    monkeypatch.setattr("mwdn.evaluation.evaluate", pytest.fail)
+    (tmp_path / "file").write_text("no folder")
+    (tmp_path / "mine").mkdir()
+    psf = tmp_path / "mine" / "comparison.png"  # its content tells that it is no PNG
+    (tmp_path / "psf.npy").rename(psf)
+    line = [psf if option == tmp_path / "psf.npy" else option for option in common]
+    assert run("evaluate", "wiener", *line, "--out", tmp_path / out) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_command_prints_before_it_writes(common, tmp_path, capsys):
+    (tmp_path / "out" / "report.json").mkdir(parents=True)
+    assert run("evaluate", "wiener", *common, "--out", tmp_path / "out") == 2
+    shown = capsys.readouterr()
+    assert "PSNR" in shown.out
+    assert "report.json` cannot be written" in shown.err
+
+
+@pytest.mark.parametrize(
+    ("count", "value", "scale", "said"),
+    [
+        (3, math.nan, 1, "The measurement of pair 1, counted from 0, holds NaN or infinity"),
+        (0, 0, 1, "`pairs` must not be empty"),
+        (3, 0, 2, "The PSF is 2 times as large: bin it by 2 times as much, `--psf-bin`."),
+    ],
+)
+def test_command_on_pairs_that_it_cannot_use(common, tmp_path, capsys, count, value, scale, said):
+    with h5py.File(tmp_path / "pairs.h5", "a") as file:
+        file["measurement"][1, 5, 6, 0] = value
+        for name in ("measurement", "scene"):
+            file[name].resize(count, axis=0)
+    np.save(tmp_path / "psf.npy", np.kron(np.load(tmp_path / "psf.npy"), np.ones((scale, scale, 1), np.float32)))
+    assert run("evaluate", "wiener", *common, "--out", tmp_path / "out") == 2
+    assert said in capsys.readouterr().err
+
+
+def test_command_warns_of_pairs_of_another_camera(common, tmp_path, capsys):
+    given = Calibration.from_file(tmp_path / "psf.npy", background=0.0).psf_hash
+    for known, count in (("0" * 16, 1), (given, 0)):
+        with h5py.File(tmp_path / "pairs.h5", "a") as file:
+            file.attrs["psf_hash"] = known
+        assert run("evaluate", "wiener", *common, "--out", tmp_path / "out") == 0
+        said = f"holds pairs of the camera of PSF {known}, but the PSF given is {given}."
+        assert capsys.readouterr().err.count(said) == count

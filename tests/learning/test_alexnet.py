@@ -141,7 +141,11 @@ def test_a_damaged_download_is_not_kept(monkeypatch, tmp_path):
 def test_other_weights_and_damaged_files_are_refused(tmp_path):
     torch.save({"features.0.weight": torch.zeros(1)}, tmp_path / "other.pth")
     (tmp_path / "damaged.pth").write_bytes(b"\x80\x02}q\x00.")
+    (tmp_path / "picture.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(50))
     torch.save([1, 2], tmp_path / "list.pth")
-    for file in ("other.pth", "damaged.pth", "list.pth"):
-        with pytest.raises(CheckpointError, match="does not hold the weights of `AlexNet`"):
+    other, damaged = "does not hold the weights of `AlexNet`", "cannot be read as plain weights: it is damaged"
+    for file, said in (("other.pth", other), ("list.pth", other), ("damaged.pth", damaged), ("picture.png", damaged)):
+        with pytest.raises(CheckpointError, match=said) as caught:
             load_alexnet(tmp_path / file)
+        assert "\n" not in str(caught.value)
+        assert "weights_only" not in str(caught.value)

@@ -101,8 +101,25 @@ def test_foreign_and_damaged_metadata(tmp_path, header, message):
 def test_weights_of_another_shape(tmp_path):
     network, options = small("mwdn")
     save_network(tmp_path / "a.safetensors", network, "mwdn", options | {"width": 8})
-    with pytest.raises(CheckpointError, match="does not fit the network 'mwdn'"):
+    with pytest.raises(CheckpointError, match="does not fit the network 'mwdn' it names: size mismatch for ") as caught:
         load_network(tmp_path / "a.safetensors")
+    assert "\n" not in str(caught.value)
+
+
+def test_weights_that_are_no_numbers(tmp_path):
+    network, options = small("mwdn")
+    with torch.no_grad():
+        next(network.parameters())[0] = torch.nan
+    save_network(tmp_path / "a.safetensors", network, "mwdn", options)
+    with pytest.raises(CheckpointError, match=r"holds NaN or infinity, `.*weight` first"):
+        load_network(tmp_path / "a.safetensors")
+
+
+def test_others_may_read_weights_as_any_new_file(tmp_path):
+    network, options = small("mwdn")
+    save_network(tmp_path / "a.safetensors", network, "mwdn", options)
+    (tmp_path / "new").touch()
+    assert (tmp_path / "a.safetensors").stat().st_mode == (tmp_path / "new").stat().st_mode
 
 
 def test_missing_tensor(tmp_path):

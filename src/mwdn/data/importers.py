@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 
 from mwdn.calibration.frames import as_image, bin_pixels, full_scale
-from mwdn.data.pair_writer import PixelType, quantise
+from mwdn.data.pair_writer import PixelType, check_path, quantise
 from mwdn.data.pairs import PairFile
 from mwdn.data.sources import (
     Found,
@@ -19,7 +19,8 @@ from mwdn.data.sources import (
     find_in_parquet,
     find_phlatcam,
 )
-from mwdn.errors import ImageError, MwdnError, UnknownNameError
+from mwdn.data.writing import spare
+from mwdn.errors import ImageError, MwdnError, ParameterError, UnknownNameError
 from mwdn.fourier import Size
 from mwdn.types import Frame
 
@@ -39,6 +40,9 @@ class Layout:
         bgr: the channels of both are blue, green, red.
         upside_down: the first row of both is the picture's last.
         bin: average blocks of so many pixels of a capture along each axis.
+
+    Raises:
+        ParameterError: a number is outside its range.
     """
 
     captures: str | None = None
@@ -48,6 +52,15 @@ class Layout:
     bgr: bool = False
     upside_down: bool = False
     bin: int = 1
+
+    def __post_init__(self) -> None:
+        if self.bit_depth is not None and not 1 <= self.bit_depth <= 16:
+            raise ParameterError(f"`bit_depth` ({self.bit_depth}) must be 1 to 16.")
+        if self.scene_size is not None and min(self.scene_size) < 1:
+            height, width = self.scene_size
+            raise ParameterError(f"`scene_size` ({height} x {width}) must be positive: `--scene-size 384 384`.")
+        if self.bin < 1:
+            raise ParameterError(f"`bin` ({self.bin}) must be at least 1.")
 
     def over(self, usual: "Layout") -> "Layout":
         """Fill what is not said here with what is usual."""
@@ -212,17 +225,18 @@ def import_pairs(
     Args:
         kind: of `KINDS`.
         path: of the data set.
-        output: the new file; one that exists is replaced.
+        output: the new file, ending in .h5 or .hdf5; one that exists is replaced.
         layout: what is unusual about this copy of the data set.
         skip_damaged: leave out what is damaged or has no partner, and name it in the result.
         track: wraps the list of what will be read, for a progress bar.
 
     Raises:
         UnknownNameError: no such kind.
+        ParameterError: ``output`` has another suffix, or is the data set itself.
         ImageError: nothing to import; a pair is damaged and not to be skipped; ``output`` cannot be written.
     """
-    if Path(output).exists() and Path(path).exists() and Path(output).samefile(path):
-        raise ImageError(f"`{output}` is the data set itself. Choose another name for the file of pairs.")
+    check_path(Path(output))
+    spare(Path(output), Path(path))
     done = Imported()
     pairs = read_pairs(kind, path, layout=layout, skipped=done.skipped if skip_damaged else None, track=track)
     first = next(pairs, None)

@@ -28,9 +28,25 @@ VERSION = 1
 
 VERSION_KEY = "mwdn_pairs"
 NAMES = ("measurement", "scene")
+SUFFIXES = ".h5", ".hdf5"
 
 # A number outside this is no noise around [0, 1] but another scale, 0 to 255 for instance.
 _LOWEST, _HIGHEST = -0.5, 1.5
+
+
+def check_path(path: Path) -> None:
+    """See that a file of pairs may have this name: never that of a picture, which it would replace.
+
+    Raises:
+        ImageError: it is a folder.
+        ParameterError: it has another suffix.
+    """
+    if path.is_dir():
+        raise ImageError(f"`{path}` is a folder. Name a file in it: `{path / 'pairs.h5'}`.")
+    real = path.resolve()  # what a link points to is what would be replaced
+    if real.suffix.lower() not in SUFFIXES:
+        name = real.with_suffix(".h5").name
+        raise ParameterError(f"`{real.name}` must end in .h5 or .hdf5, as files of pairs do: `{name}`.")
 
 
 class PairWriter:
@@ -47,6 +63,7 @@ class PairWriter:
         attributes: dict[str, Attribute],
         psf: Tensor | None,
     ) -> None:
+        check_path(path)
         for name, shape in zip(NAMES, shapes, strict=True):
             if len(shape) != 3 or min(shape) < 1:
                 raise ParameterError(f"`{name}_shape` {tuple(shape)} must be (height, width, channels), all positive.")
@@ -67,8 +84,6 @@ class PairWriter:
     def __enter__(self) -> "PairWriter":
         import h5py
 
-        if self.path.is_dir():
-            raise ImageError(f"`{self.path}` is a folder. Name a file in it: `{self.path / 'pairs.h5'}`.")
         with _refusals(self.path), ExitStack() as stack:
             self._file = stack.enter_context(h5py.File(stack.enter_context(atomic(self.path)), "w"))
             self._file.attrs.update({VERSION_KEY: VERSION, **self._attributes})

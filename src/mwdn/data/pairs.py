@@ -65,7 +65,7 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
         """Begin a new file; use it in a ``with`` statement, at whose end the file gets its name.
 
         Args:
-            path: of the file. One that exists is replaced only when all has gone well.
+            path: of the file, ending in .h5 or .hdf5. One that exists is replaced only when all has gone well.
             measurement_shape: (H, W, C) of each measurement.
             scene_shape: (H, W, C) of each scene, which may be larger than the sensor.
             dtype: of both. float32 keeps what noise pushed below 0; integers clip it.
@@ -73,7 +73,8 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
             psf: (C, H, W) or (1, C, H, W), stored as float32.
 
         Raises:
-            ParameterError: a shape, the type or an attribute is none of these.
+            ParameterError: the suffix, a shape, the type or an attribute is none of these.
+            ImageError: the path is a folder.
             ShapeError: the PSF has other axes.
         """
         return PairWriter(Path(path), (measurement_shape, scene_shape), dtype, dict(attributes or {}), psf)

@@ -20,7 +20,7 @@ class Photographs:
     them in a scene.
 
     Args:
-        folder: searched for pictures, also in its folders.
+        folder: searched for pictures, also in its folders; hidden ones are none.
         side: pixels along each side of a square.
         limit: read only the first so many, in the order of their names.
 
@@ -30,7 +30,7 @@ class Photographs:
     """
 
     def __init__(self, folder: str | Path, *, side: int = 208, limit: int | None = None) -> None:
-        paths = sorted(p for p in Path(folder).rglob("*") if p.suffix.lower() in READABLE and p.is_file())[:limit]
+        paths = sorted(p for p in Path(folder).rglob("*") if _is_picture(p))[:limit]
         if not paths:
             raise ParameterError(f"The folder `{folder}` holds no photograph. Readable: {', '.join(sorted(READABLE))}.")
         self.names = [path.name for path in paths]
@@ -62,6 +62,10 @@ class Photographs:
         """Keep the pictures on a device, where they are sampled."""
         self._pixels, self._light = self._pixels.to(device), self._light.to(device)
         return self
+
+
+def _is_picture(path: Path) -> bool:
+    return path.suffix.lower() in READABLE and not path.name.startswith(".") and path.is_file()
 
 
 def _square(path: Path, side: int) -> Frame:

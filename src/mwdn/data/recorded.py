@@ -149,6 +149,18 @@ def check_pairs(file: PairFile, psf: Psf) -> None:
         )
 
 
+def other_camera(file: PairFile, psf_hash: str) -> str | None:
+    """Say so, if a file's pairs are of another PSF than the one of this hash."""
+    known = file.attributes.get("psf_hash")
+    if known in (None, psf_hash):
+        return None
+    return (
+        f"`{file.path}` holds pairs of the camera of PSF {known}, but the PSF given is {psf_hash}. Expect blur, ghosts "
+        "and low numbers, unless both are of one camera; another crop, binning or background of one PSF file counts as "
+        "another PSF."
+    )
+
+
 def record(
     path: Path,
     parts: Iterable[tuple[Samples, range]],
@@ -161,7 +173,7 @@ def record(
     """Write samples to a file of pairs, one part after the other; the file is there only once it is whole.
 
     Args:
-        path: of the file; one that exists is replaced when all has gone well.
+        path: of the file, ending in .h5 or .hdf5; one that exists is replaced when all has gone well.
         parts: sources, and the numbers of their samples.
         psf: of the calibration.
         batch: samples that are made at once.

@@ -199,7 +199,8 @@ def _download(name: Path) -> Path:
     try:
         return Path(snapshot_download(name.as_posix(), repo_type="dataset", allow_patterns="*.parquet"))
     except Exception as error:  # its errors are those of its network library, which changes
-        raise ImageError(f"`{name}` cannot be had from the hub: {error}. Download it and name its folder.") from error
+        reason = str(error).partition("\n")[0].rstrip(".")
+        raise ImageError(f"`{name}` cannot be had from the hub: {reason}. Download it and name its folder.") from error
 
 
 def _missing(package: str, extra: str, before: str = "") -> ImageError:

@@ -2,12 +2,14 @@
 
 import os
 import secrets
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
+from mwdn.errors import ParameterError
 from mwdn.types import FloatFrame, Frame
 
 
@@ -33,12 +35,43 @@ def atomic(path: Path) -> Iterator[Path]:
     # The stem is left out: a long one plus a token could pass the 255 bytes that a file system allows.
     temporary = path.with_name(f".mwdn-{os.getpid()}-{secrets.token_hex(4)}{path.suffix}")
     try:
+        temporary.touch()
+        mode = temporary.stat().st_mode
         yield temporary
+        temporary.chmod(mode)  # that of any new file here: safetensors writes for its owner alone
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def check_folder(folder: Path) -> None:
+    """Create a folder and see that it can be written to, before the work whose result it shall hold.
+
+    Raises:
+        ParameterError: it cannot.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        reason = error.strerror or error
+        raise ParameterError(
+            f"`{folder}` must be a folder that can be written to: {reason}. Choose another one: `--out`."
+        ) from error
+
+
+def spare(output: Path, *inputs: Path | None) -> None:
+    """See that an output replaces none of the inputs.
+
+    Raises:
+        ParameterError: it is one of them.
+    """
+    for path in filter(None, inputs):
+        if output.exists() and path.exists() and output.samefile(path):
+            raise ParameterError(f"`{output}` would overwrite an input. Choose another name: `--out`.")
 
 
 def save_png(path: Path, pixels: Frame) -> None:

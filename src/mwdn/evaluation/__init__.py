@@ -3,9 +3,10 @@
 from mwdn.evaluation.consistency import Consistency, consistency
 from mwdn.evaluation.evaluate import First, evaluate, learnable_numbers
 from mwdn.evaluation.metrics import Perceptual, Protocol, Variant, bootstrap, measure, psnr
-from mwdn.evaluation.report import Report, Scores
+from mwdn.evaluation.report import SHEET, Report, Scores
 
 __all__ = [
+    "SHEET",
     "Consistency",
     "First",
     "Perceptual",

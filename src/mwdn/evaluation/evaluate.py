@@ -12,9 +12,11 @@ from pathlib import Path
 import torch
 from torch import nn
 
+from mwdn.data.pair_writer import NAMES
 from mwdn.errors import ParameterError
 from mwdn.evaluation.metrics import METRICS, Perceptual, Protocol, Variant, measure
 from mwdn.evaluation.report import Report, Scores
+from mwdn.learning.alexnet import SMALLEST
 from mwdn.types import Measurement, Scene
 
 Bound = Callable[[Measurement], Scene]
@@ -74,16 +76,19 @@ def evaluate(
         protocol: the part of each picture that counts.
         variant: what is done to a reconstruction first; that of the protocol unless given.
         perceptual: networks for `lpips` and `feature_mse`; unless given they are found or downloaded, and what
-            cannot be had is reported as missing.
+            cannot be had, or needs larger pictures, is reported as missing.
         shown: number of pictures that the report keeps for its sheet.
         progress: called with the method's name and the position of each picture that is done.
 
     Raises:
-        ParameterError: no method or no pair.
+        ParameterError: no method or no pair, or a pair holds NaN or infinity.
         ShapeError: a reconstruction and its scene differ in shape, or the protocol does not fit.
     """
-    if not methods or not len(pairs):
-        raise ParameterError(f"`methods` ({len(methods)}) and `pairs` ({len(pairs)}) must not be empty.")
+    if not methods:
+        raise ParameterError("`methods` must not be empty. Name one: admm, wiener, universal, or a checkpoint's path.")
+    _check(pairs)
+    if min(protocol.crop(pairs[0][1][None]).shape[-2:]) < SMALLEST:
+        perceptual = Perceptual.none(f"the part {protocol.name} has less than {SMALLEST} pixels a side, for AlexNet")
     perceptual = perceptual or Perceptual.load()
     first = [pairs[i] for i in range(min(shown, len(pairs)))]
     rows = [[scene[None], measurement[None]] for measurement, scene in first]
@@ -106,6 +111,18 @@ def evaluate(
         columns = {metric: tuple(column) for metric, column in values.items()}
         scores[name] = Scores(columns, tuple(seconds), peak, _device(method).type, learnable_numbers(method))
     return Report(protocol.name, variant or protocol.variant, scores, perceptual.missing, rows)
+
+
+def _check(pairs: Pairs) -> None:
+    """Find what no method can be judged by before the first one is."""
+    if not len(pairs):
+        raise ParameterError("`pairs` must not be empty: the file holds none. Make it again, with `mwdn import`.")
+    for i in range(len(pairs)):
+        for name, picture in zip(NAMES, pairs[i], strict=True):
+            if not picture.isfinite().all():
+                raise ParameterError(
+                    f"The {name} of pair {i}, counted from 0, holds NaN or infinity. Make the file again without it."
+                )
 
 
 def learnable_numbers(method: Bound) -> int:

@@ -178,6 +178,9 @@ def measure(
 ) -> dict[str, Tensor]:
     """Compare reconstructions with their scenes.
 
+    Numbers are compared as they are: of scenes in linear light, LPIPS and SSIM are not those of sRGB pictures, in which
+    papers give them.
+
     Args:
         reconstruction: (B, C, H, W), in the numbers of the scene.
         scene: (B, C, H, W), in [0, 1], as the data set stores it.

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from rich import box
 from rich.markup import escape
 from rich.table import Table
 from torch import Tensor
@@ -98,25 +99,36 @@ class Report:
         """How many were compared."""
         return len(next(iter(self.methods.values())).seconds)
 
-    def table(self, more: Mapping[str, Mapping[str, str]] | None = None) -> Table:
+    def table(self, more: Mapping[str, Mapping[str, str]] | None = None, *, narrow: bool = False) -> Table:
         """Means with their 95 % confidence intervals, the best in bold; time, memory, learnable numbers.
 
         Args:
             more: further columns: by their heading, what to say of each method.
+            narrow: each number on a line of its own, for a terminal of 80 columns.
         """
         more = more or {}
         title = f"{self.pictures} pictures, protocol {self.protocol}, {self.variant}: mean [95 % confidence]"
-        caption = "\n".join(f"{_TITLES[name]} is missing: {escape(reason)}" for name, reason in self.missing.items())
-        table = Table("method", title=title, caption=caption or None)
+        style: dict[str, Any] = {"box": box.SIMPLE_HEAD, "padding": 0, "show_edge": False, "leading": 1}
+        caption = self._missing() or None
+        table = Table(title=title, caption=caption, caption_justify="left", **(style if narrow else {}))
+        table.add_column("method", overflow="fold")
         measured = [metric for metric in METRICS if metric not in self.missing]
         for heading in (*(_TITLES[metric] for metric in measured), "ms / picture", "memory", "learnable", *more):
-            table.add_column(heading, justify="right")
+            short = heading.replace(" / ", "\n").replace(" ", "\n")
+            table.add_column(short if narrow else heading, justify="right", no_wrap=narrow)
         best = {metric: self._best(metric) for metric in measured}
         for name, scores in self.methods.items():
             cells = [_cell(metric, scores.summary(metric), name in best[metric]) for metric in measured]
-            said = (escape(column.get(name, "")) for column in more.values())
-            table.add_row(escape(name), *cells, *_costs(scores), *said)
+            cells += [*_costs(scores), *(escape(column.get(name, "")) for column in more.values())]
+            table.add_row(escape(name), *(cell.replace(" ", "\n") if narrow else cell for cell in cells))
         return table
+
+    def _missing(self) -> str:
+        """A line for each reason why metrics are missing."""
+        names: dict[str, list[str]] = {}
+        for metric, reason in self.missing.items():
+            names.setdefault(reason, []).append(_TITLES[metric])
+        return "\n".join(f"Without {' and '.join(titles)}: {escape(reason)}" for reason, titles in names.items())
 
     def json(self) -> str:
         """Everything but the pictures, as JSON.

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from mwdn.data.writing import atomic
 from mwdn.errors import CheckpointError, ShapeError
+from mwdn.learning.checkpoint import misfit, read_plain
 from mwdn.types import Image
 
 SMALLEST = 31
@@ -215,11 +216,12 @@ def _fetch(address: str, path: Path) -> str:
 
 
 def _filled(network: _Network, path: Path, prefix: str) -> _Network:
+    content = read_plain(path)
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-        state = {key: value for key, value in content.items() if key.startswith(prefix)}
-        network.load_state_dict(state)
-    except Exception as error:  # torch raises many kinds for damaged files and for other weights
-        kind = type(network).__name__
-        raise CheckpointError(f"`{path}` does not hold the weights of `{kind}`: {error}. Download it again.") from error
+        network.load_state_dict({key: value for key, value in content.items() if key.startswith(prefix)})
+    except (AttributeError, TypeError, RuntimeError) as error:
+        kind, reason = type(network).__name__, misfit(error)
+        raise CheckpointError(
+            f"`{path}` does not hold the weights of `{kind}`: {reason}. Download it again."
+        ) from error
     return network.requires_grad_(False).eval()

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 from pickle import UnpicklingError
+from textwrap import shorten
 from typing import Any
 
 import torch
@@ -102,19 +103,39 @@ def load_network(path: str | Path) -> nn.Module:
     try:
         network.load_state_dict(state)  # float16 in files that come with the package, float32 here
     except RuntimeError as error:
-        raise CheckpointError(f"`{path}` does not fit the network '{header['name']}' it names: {error}") from error
+        raise CheckpointError(
+            f"`{path}` does not fit the network '{header['name']}' it names: {misfit(error)}. Copy it again."
+        ) from error
+    broken = [key for key, value in network.state_dict().items() if not value.isfinite().all()]
+    if broken:
+        raise CheckpointError(f"`{path}` holds NaN or infinity, `{broken[0]}` first. Take weights from before that.")
     return network.eval()
 
 
-def _read_foreign(path: Path) -> dict[str, Tensor]:
+def read_plain(path: Path) -> Any:  # noqa: ANN401
+    """What `torch.save` wrote, on the CPU, without running code from the file.
+
+    Raises:
+        CheckpointError: damaged, or it holds more than plain values.
+    """
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        return torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many kinds for damaged files
         # Of torch's own words none: they go on for ten lines, and advise to unpickle the file all the same.
-        why = "it holds objects, whose code is not run" if isinstance(error, UnpicklingError) else "it is damaged"
+        objects = isinstance(error, UnpicklingError) and "Unsupported operand" not in str(error)
+        why = "it holds objects, whose code is not run" if objects else "it is damaged, or something else"
         raise CheckpointError(
             f"`{path}` cannot be read as plain weights: {why}. Copy it again, or save its `state_dict()` alone."
         ) from error
+
+
+def misfit(error: Exception) -> str:
+    """What `load_state_dict` complains of first, on one line: it names every key on lines of their own."""
+    return shorten(str(error).partition(":\n")[2] or str(error), 200, placeholder=" ...").rstrip(".")
+
+
+def _read_foreign(path: Path) -> dict[str, Tensor]:
+    content = read_plain(path)
     state = content.get("net_state_dict", content) if isinstance(content, dict) else {}
     state = state if isinstance(state, dict) else {}
     state = {str(key).removeprefix("module."): value for key, value in state.items() if isinstance(value, Tensor)}

@@ -9,7 +9,7 @@ from mwdn.calibration import Calibration
 from mwdn.data.cameras import CameraPairs
 from mwdn.data.captures import find_captures, read_captures
 from mwdn.data.noisy import NoisyScenes
-from mwdn.data.pair_writer import Attribute
+from mwdn.data.pair_writer import Attribute, check_path
 from mwdn.data.photographs import Photographs
 from mwdn.data.recorded import HELD_OUT, record, recorded_pairs
 from mwdn.data.simulated import EXACT, Samples, SimulatedPairs
@@ -105,7 +105,7 @@ def simulate(
         recipe: its placement, mismatch, sensor and seed are used.
         calibration: of the camera.
         photos: folder of photographs.
-        out: the file of pairs; one that exists is replaced when all has gone well.
+        out: the file of pairs, ending in .h5 or .hdf5; one that exists is replaced when all has gone well.
         count: of pairs.
         exact: the camera is what its calibration says, whatever the recipe's mismatch.
         track: shows the progress of an iteration.
@@ -113,6 +113,7 @@ def simulate(
     Raises:
         MwdnError: ``count`` is not positive, a photograph cannot be read, or the file cannot be written.
     """
+    check_path(out)
     if count < 1:
         raise ParameterError(f"`count` ({count}) must be at least 1.")
     pairs = _source(recipe, Photographs(photos), calibration.psf)
