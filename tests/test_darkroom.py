@@ -1,5 +1,6 @@
 """Captures to pictures in files: where they go, what is written, what is left out when it is there."""
 
+import dataclasses
 import json
 import os
 import re
@@ -25,7 +26,7 @@ from mwdn.evaluation.consistency import consistency
 from mwdn.networks import build
 from mwdn.optics.patterns import contour_psf
 from mwdn.reconstruct import Reconstructor
-from mwdn.solvers import Wiener
+from mwdn.solvers import Admm, Wiener
 
 SIZE = 32, 40
 
@@ -193,6 +194,51 @@ def test_nothing_is_written_of_a_bad_capture_and_the_others_go_on(tmp_path, psf,
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["0.json", "0.png", "1.json", "1.png"]
 
 
+@pytest.fixture
+def bright(tmp_path, captures):
+    """Gives the first capture so many times as bright, in a file of its own."""
+
+    def store(factor):
+        np.save(tmp_path / "bright.npy", read_frame(captures[0]) / np.float32(65535) * np.float32(factor))
+        return tmp_path / "bright.npy"
+
+    return store
+
+
+@pytest.mark.parametrize("method", ["fista", "admm", "pyramid"])
+def test_trust_does_not_depend_on_the_brightness(tmp_path, psf, bright, method):
+    """Nor do squares of what a camera of many bits counts overflow."""
+    room = darkroom(psf, tmp_path / "out", method)
+    plain, large = (next(room.develop([bright(factor)])).trust for factor in (1, 1e15))
+    assert dataclasses.astuple(large) == pytest.approx(dataclasses.astuple(plain), rel=0.01, abs=0.01)
+
+
+@pytest.mark.parametrize("judge", [True, False])
+@pytest.mark.parametrize("form", ["png", "npy"])
+def test_result_that_is_not_finite_changes_nothing_and_the_others_go_on(tmp_path, psf, captures, bright, judge, form):
+    room = darkroom(psf, tmp_path / "out", Admm(iterations=2), form=form, judge=judge)
+    list(room.develop([bright(1)]))
+    before = {path: path.read_bytes() for path in room.out.iterdir()}
+    refused, done = room.develop([bright(1e37), captures[1]])
+    assert isinstance(refused.error, ImageError)
+    assert re.search(r"nothing is written\. The capture's brightest pixel is \d\.\d+e\+36", str(refused.error))
+    assert done.error is None
+    assert {path: path.read_bytes() for path in before} == before
+
+
+def test_a_capture_without_light_is_no_picture(tmp_path, psf):
+    np.save(tmp_path / "black.npy", np.zeros((*SIZE, 3), np.uint16))
+    (job,) = darkroom(psf, tmp_path / "out").develop([tmp_path / "black.npy"])
+    assert str(job.error).startswith("The sensor saw no light")
+    assert not (tmp_path / "out").exists()
+
+
+def test_scene_too_large_to_be_judged(tmp_path, psf, captures):
+    (job,) = darkroom(psf, tmp_path / "out", lambda b, h: 1e37 * b).develop(captures[:1])
+    assert "too large numbers" in str(job.error)
+    assert not (tmp_path / "out").exists()
+
+
 def test_disk_that_refuses(tmp_path, psf, captures):
     (tmp_path / "out" / "1.png").mkdir(parents=True)
     jobs = list(darkroom(psf, tmp_path / "out").develop(captures))
@@ -239,6 +285,15 @@ def test_resumed_work_leaves_out_what_is_there(tmp_path, psf, captures):
     assert {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in before} == before
     assert len(list(darkroom(psf, out).develop(captures))) == 3
     assert out.joinpath("0.png").stat().st_mtime_ns > before[out / "0.png"][1]  # not asked to resume
+
+
+def test_resumed_work_judges_what_was_not(tmp_path, psf, captures):
+    out = tmp_path / "out"
+    list(darkroom(psf, out, judge=False).develop(captures[:1]))
+    assert resumed(psf, out, captures[:2]) == ["0.png", "1.png"]
+    assert "explained" in json.loads((out / "0.json").read_text())
+    assert resumed(psf, out, captures[:2]) == []
+    assert resumed(psf, out, captures[:2], judge=False) == []  # more is there than was asked for
 
 
 @pytest.mark.parametrize("lost", ["0.png", "0.json"])

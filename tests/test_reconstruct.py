@@ -85,17 +85,49 @@ def test_unknown_method():
         find_method("no.safetensors")
 
 
-@pytest.mark.parametrize("device", ["gpu", "cpux", "cuda:99"])
+@pytest.mark.parametrize("device", ["gpu", "cpux", "cuda:99", "meta", "vulkan"])
 def test_unusable_device(device, psf):
     with pytest.raises(ParameterError, match=rf"`device` \({device}\) must be one that torch can use here") as caught:
         Reconstructor("wiener", Calibration(psf), device=device)
     assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400
 
 
 def test_measurement_of_another_size(psf):
     message = "`measurement` (1, 3, 16, 40) and `psf` (1, 3, 32, 40) must have the same height and width. Pass raw"
     with pytest.raises(ShapeError, match=re.escape(message)):
         Reconstructor("wiener", Calibration(psf))(torch.rand(1, 3, 16, 40))
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("method", [*SOLVERS, "universal-small"])
+@pytest.mark.parametrize("shape", [(0, 3, *SIZE), (1, 0, *SIZE), (3, *SIZE), SIZE, (1, 1, 3, *SIZE)])
+def test_measurement_that_is_no_batch(method, shape, psf):
+    with pytest.raises(ShapeError, match=re.escape(f"`measurement` {shape} must be a batch (B, C, H, W)")):
+        Reconstructor(method, Calibration(psf), device="cpu")(torch.rand(shape))
+
+
+@pytest.mark.parametrize("method", [*SOLVERS, "universal-small"])
+@pytest.mark.parametrize("channels", [1, 2, 4])
+def test_measurement_of_other_channels_than_the_psf(method, channels, psf):
+    message = f"`psf` (1, 3, 32, 40) must have channels 1 or that of `measurement` (1, {channels}, 32, 40)"
+    with pytest.raises(ShapeError, match=re.escape(message)):
+        Reconstructor(method, Calibration(psf), device="cpu")(torch.rand(1, channels, *SIZE))
+
+
+def test_grey_psf_serves_measurements_of_any_channels(psf):
+    grey = Calibration(psf[:, :1])
+    for channels in (1, 2, 3):
+        measurement = torch.rand(2, channels, *SIZE)
+        assert Reconstructor("wiener", grey, device="cpu")(measurement).shape == measurement.shape
+
+
+@pytest.mark.parametrize("align", [True, False])
+def test_grey_psf_and_a_network_of_colours(align, psf):
+    reconstruct = Reconstructor(build("wiener-bank", width=2, finest=4, align=align), Calibration(psf[:, :1]))
+    assert reconstruct(torch.rand(1, 1, *SIZE)).shape == (1, 1, *SIZE)
+    with pytest.raises(ShapeError, match=r"\(1, 2, 32, 40\) must have 3 channels for this network"):
+        reconstruct(torch.rand(1, 2, *SIZE))
 
 
 @pytest.mark.parametrize(
@@ -185,6 +217,37 @@ def test_stream_goes_on_where_it_was(solver, psf, frames, aligned):
         warm = solvers.Warm(solver)
     assert torch.equal(reconstruct(measurement), solver(measurement, psf))
     assert aligned == []
+
+
+def broken(frame):
+    """With one pixel that is no number."""
+    frame = (frame / 65535).astype(np.float32)
+    frame[3, 4] = np.nan
+    return frame
+
+
+@pytest.mark.parametrize("solver", [Admm(iterations=20), solvers.Fista(iterations=20)], ids=["admm", "fista"])
+def test_stream_forgets_a_frame_that_is_not_finite(solver, psf, frames):
+    stream = Reconstructor(solver, Calibration(psf), device="cpu").stream([frames[0], broken(frames[1]), *frames[2:]])
+    assert [bool(scene.isfinite().all()) for _, scene in stream] == [True, False, True, True, True]
+
+
+def test_stream_finds_the_pose_on_the_first_frame_that_is_finite(bank, psf, frames, aligned):
+    reconstruct = Reconstructor(bank, Calibration(psf), device="cpu", precision="exact")
+    for refresh, at in ((0, [1]), (2, [1, 3, 4])):
+        broken_ones = [broken(frames[n]) if n in (0, 2) else frames[n] for n in range(5)]
+        stream = reconstruct.stream(broken_ones, refresh=refresh)
+        seen = [measurement for measurement, _ in stream]
+        asked = [each for each in aligned if each.isfinite().all()]
+        assert len(asked) == len(at)
+        assert all(torch.equal(each, seen[n]) for each, n in zip(asked, at, strict=True))
+        aligned.clear()
+
+
+def test_stream_checks_the_channels(bank, psf):
+    stream = Reconstructor(bank, Calibration(psf[:, :1])).stream([np.zeros((*SIZE, 2), np.uint8)])
+    with pytest.raises(ShapeError, match="must have 3 channels for this network"):
+        next(stream)
 
 
 def test_stream_of_any_other_method_is_frame_by_frame(psf, frames):

@@ -2,10 +2,11 @@
 
 import hashlib
 import json
+import math
 import os
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, astuple, dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -147,7 +148,7 @@ class Darkroom:
         out: folder of the pictures.
         form: of their files.
         judge: find how far to trust each picture, which may take longer than to make it.
-        resume: leave out each capture whose picture is there, of the same `origin`.
+        resume: leave out each capture whose picture is there, of the same `origin`, and judged if this one is to be.
     """
 
     reconstruct: Reconstructor
@@ -171,7 +172,13 @@ class Darkroom:
         if self.resume and self._is_there(job):
             return replace(job, kept=True)
         measurement = read_capture(job.capture, self.reconstruct.calibration)
-        pose = align(measurement.to(self.reconstruct.device), self.reconstruct.psf) if self.judge else None
+        if measurement.amax() <= 0:
+            raise ImageError("The sensor saw no light: no pixel is brighter than the dark frame, or black.")
+        if not self.judge:
+            return replace(job, measurement=measurement)
+        # As `consistency` does: squares of large numbers would overflow.
+        unit = measurement.abs().amax().clamp(min=torch.finfo(torch.float32).tiny)
+        pose = align((measurement / unit).to(self.reconstruct.device), self.reconstruct.psf)
         return replace(job, measurement=measurement, pose=pose)
 
     @_step
@@ -185,15 +192,13 @@ class Darkroom:
     def _finish(self, job: Job) -> Job:
         if job.measurement is None or job.scene is None:
             return job
-        beside, trust = job.output.with_suffix(".json"), None
+        beside, trust = job.output.with_suffix(".json"), self._judged(job.measurement, job.scene, job.pose)
         content: dict[str, object] = {
             "method": self.method,
             "psf_hash": self.reconstruct.calibration.psf_hash,
             "origin": job.origin,
         }
-        if self.judge:
-            pair = job.measurement.to(self.reconstruct.device), self.reconstruct.psf
-            trust = consistency(*pair, job.scene.to(self.reconstruct.device), pose=job.pose)
+        if trust:
             content |= {**asdict(trust), "doubtful": trust.doubtful}
         _remove(beside)  # or it would vouch for another picture than it was written for
         if self.form in ("tiff", "npy"):
@@ -202,6 +207,20 @@ class Darkroom:
             write_picture(job.output, for_people(job.scene), bits=16 if self.form == "png16" else 8)
         write_json(beside, content)
         return replace(job, measurement=None, pose=None, scene=None, trust=trust)
+
+    def _judged(self, measurement: Measurement, scene: Scene, pose: Pose | None) -> Consistency | None:
+        """How far to trust a scene, if that is asked; an `ImageError` unless the scene and the answer are finite."""
+        trust, finite = None, bool(scene.isfinite().all())
+        if finite and self.judge:
+            pair = measurement.to(self.reconstruct.device), self.reconstruct.psf
+            trust = consistency(*pair, scene.to(self.reconstruct.device), pose=pose)
+            finite = all(map(math.isfinite, astuple(trust)))
+        if not finite:
+            raise ImageError(
+                "The reconstruction holds NaN, infinity or too large numbers: nothing is written. The capture's "
+                f"brightest pixel is {measurement.amax():.3g}, where 1 is saturation. Scale it, or take another method."
+            )
+        return trust
 
     def origin(self, capture: Path) -> str:
         """16 hexadecimal digits that are others if anything is another that a picture depends on.
@@ -230,7 +249,9 @@ class Darkroom:
             content = json.loads(job.output.with_suffix(".json").read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return False
-        return isinstance(content, dict) and content.get("origin") == job.origin != "" and job.output.is_file()
+        if not isinstance(content, dict) or (self.judge and "doubtful" not in content):
+            return False
+        return content.get("origin") == job.origin != "" and job.output.is_file()
 
     def summarise(self, captures: Iterable[str | Path]) -> None:
         """Show the first captures beside their pictures, as they are on the disk; nothing if there is none.

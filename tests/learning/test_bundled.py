@@ -138,3 +138,4 @@ def test_what_the_hub_does_not_have_is_named(hub):
     missing = hub("hub:some/camera/other.safetensors")
     assert missing.returncode != 0
     assert "CheckpointError: `hub:some/camera/other.safetensors` cannot be fetched" in missing.stderr
+    assert "CheckpointError: `hub:some/camera/../a` cannot be fetched" in hub("hub:some/camera/../a").stderr

@@ -17,6 +17,7 @@ from safetensors.torch import load_file
 from test_train import log, same
 
 from mwdn.calibration import Calibration
+from mwdn.errors import ParameterError
 from mwdn.learning import distributed
 from mwdn.learning.recipe import read_recipe
 from mwdn.learning.session import prepare
@@ -86,6 +87,24 @@ def alone(folder, out):
     """The run of one process."""
     calibration = Calibration.from_file(folder / "psf.npy", background=0.0)
     return prepare(read_recipe(folder / "r.toml"), calibration, folder / "photos", folder / out, "cpu")
+
+
+@pytest.mark.parametrize(
+    ("environment", "message"),
+    [
+        ({"WORLD_SIZE": "abc"}, r"`WORLD_SIZE` \(abc\) must be set as torchrun sets it .* `unset WORLD_SIZE`"),
+        ({"WORLD_SIZE": "2"}, r"`RANK` \(not set\) must be set"),
+        ({"WORLD_SIZE": "2", "RANK": "0", "LOCAL_RANK": "x"}, r"`LOCAL_RANK` \(x\) must be set"),
+        ({"WORLD_SIZE": "2", "RANK": "0", "LOCAL_RANK": "0"}, r"`MASTER_ADDR` \(not set\) must be set"),
+    ],
+)
+def test_environment_of_no_torchrun(monkeypatch, environment, message):
+    for name in ("WORLD_SIZE", "RANK", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(ParameterError, match=message), distributed.processes():
+        pass
 
 
 @pytest.fixture(scope="module")

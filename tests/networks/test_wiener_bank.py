@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from mwdn.errors import ParameterError
 from mwdn.networks import build
 
 
@@ -28,3 +29,18 @@ def test_the_mean_light_of_blocks_stays(generator):
         change = network.correct(estimates, network.unit(estimates)) - estimates[:, :3]
     blocks = torch.nn.functional.avg_pool2d(change, 16)
     assert blocks.abs().max() < 0.2 * change.abs().max()
+
+
+@pytest.mark.parametrize("gain", [1e-8, 1e8])
+def test_gain_does_not_matter(generator, gain):
+    network = build("wiener-bank", width=2, block=8).eval()
+    psf, measurement = torch.rand(1, 3, 64, 72, generator=generator) ** 8, torch.rand(1, 3, 64, 72, generator=generator)
+    with torch.no_grad():
+        expected, found = network(measurement, psf), network(gain * measurement, psf) / gain
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-3 * float(expected.max()))
+
+
+@pytest.mark.parametrize("options", [{"rounds": -1}, {"fold": 0}, {"width": 0}])
+def test_numbers_that_are_no_counts(options):
+    with pytest.raises(ParameterError, match=f"`{next(iter(options))}` .* must be a whole number, at least"):
+        build("wiener-bank", **options)

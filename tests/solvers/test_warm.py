@@ -93,6 +93,18 @@ def test_each_first_frame_is_cold(solver, psf, film):
 
 
 @pairs_of(solvers(10))
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+def test_first_frame_after_one_that_is_not_finite_is_cold(solver, bad, psf, film):
+    warm, after = Warm(solver, iterations=2), Warm(solver, iterations=2)
+    warm(film[0], psf)
+    broken = film[1].clone()
+    broken[..., 5, 7] = bad
+    assert not warm(broken, psf).isfinite().all()
+    for frame in film[2:4]:
+        assert torch.equal(warm(frame, psf), after(frame, psf))
+
+
+@pairs_of(solvers(10))
 def test_streams_of_a_batch_are_one_by_one(solver, psf, film):
     together, alone = Warm(solver), Warm(solver)
     for one, two in zip(film[:3], film[3:6], strict=True):

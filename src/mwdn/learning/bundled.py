@@ -39,7 +39,7 @@ def _download(name: str) -> Path:
         raise CheckpointError(f"`{name}` needs the package huggingface-hub: `pip install 'mwdn[hub]'`.") from error
     try:
         return Path(hf_hub_download(f"{owner}/{repository}", file or "model.safetensors"))
-    except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError, OSError) as error:
+    except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError, OSError, ValueError) as error:
         reason = str(error).strip().splitlines()[0]
         raise CheckpointError(
             f"`{name}` cannot be fetched from the hub: {reason} Check the name and the network, or download the file "

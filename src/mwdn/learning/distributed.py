@@ -28,8 +28,23 @@ PSF_ENCODER = "psf_encoder"
 
 
 def started() -> int:
-    """Number of processes that torchrun started, whether they have joined or not."""
-    return int(os.environ.get("WORLD_SIZE", "1"))
+    """Number of processes that torchrun started, whether they have joined or not.
+
+    Raises:
+        ParameterError: the environment holds another thing than a number.
+    """
+    return max(1, int(_of_torchrun("WORLD_SIZE", "1")))
+
+
+def _of_torchrun(name: str, otherwise: str = "") -> str:
+    """What torchrun has set in the environment: numbers, and one address."""
+    value = os.environ.get(name, otherwise)
+    if not (value and (value.isdecimal() or name == "MASTER_ADDR")):
+        raise ParameterError(
+            f"`{name}` ({value or 'not set'}) must be set as torchrun sets it for each of several processes. Start "
+            "them by `torchrun --nproc-per-node 2 -m mwdn ...`, or one alone: `unset WORLD_SIZE`."
+        )
+    return value
 
 
 def _joined() -> bool:
@@ -52,10 +67,13 @@ def processes() -> Iterator[None]:
 
     Raises:
         ProcessError: they cannot be reached.
+        ParameterError: the environment says that there are several, but not how to reach them.
     """
     if started() == 1:
         yield
         return
+    for name in ("RANK", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT"):
+        _of_torchrun(name)
     _end_with_parent()
     # Tensors meet where they are: small messages through the CPU, gradients from GPU to GPU.
     backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"

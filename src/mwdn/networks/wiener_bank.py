@@ -72,9 +72,9 @@ class WienerBank(nn.Module):
             raise ParameterError(f"`finest` ({finest}) must be 0 or one of {[level.shrink for level in LEVELS]}.")
         if rounds and finest != 1:
             raise ParameterError(f"`rounds` ({rounds}) of plug and play need iterations of the full size: `finest` 1.")
-        for name, value in (("fold", fold), ("block", block)):
-            if value < 1:
-                raise ParameterError(f"`{name}` ({value}) must be at least 1.")
+        for name, value, least in (("width", width, 1), ("fold", fold, 1), ("block", block, 1), ("rounds", rounds, 0)):
+            if not isinstance(value, int) or value < least:
+                raise ParameterError(f"`{name}` ({value!r}) must be a whole number, at least {least}.")
         self.channels, self.fold, self.regularisations = channels, fold, regularisations
         self.finest, self.align, self.block = finest, align, block
         self.levels = tuple(level for level in LEVELS if finest and level.shrink >= finest)
@@ -151,7 +151,8 @@ class WienerBank(nn.Module):
 
     def unit(self, estimates: Tensor) -> Tensor:
         """Brightest pixel of the smoothest of `estimates`, (B, 1, 1, 1)."""
-        return estimates[:, : self.channels].detach().amax((1, 2, 3), keepdim=True).clamp(min=1e-6)
+        brightest = estimates[:, : self.channels].detach().amax((1, 2, 3), keepdim=True)
+        return brightest.clamp(min=torch.finfo(torch.float32).tiny)
 
     def correct(self, estimates: Tensor, unit: Tensor) -> Scene:
         """Scene (B, C, H, W) from `estimates`, or a part of them: the learned part, a correction of the smoothest."""

@@ -15,7 +15,8 @@ class Warm:
     """A solver that takes all its iterations for the first frame of a stream, and a few for each that follows.
 
     A scene that moves slowly is then nearer to where the iterations would end than as many come from darkness; another
-    scene takes a few frames to appear. A frame of another shape, or by another PSF, is a first one.
+    scene takes a few frames to appear. A frame of another shape, or by another PSF, is a first one, and so is the next
+    one after a scene that is not finite.
 
     Args:
         solver: whose state is kept from frame to frame: several times the memory of the scene.
@@ -35,6 +36,7 @@ class Warm:
         """Reconstruct the next frame, or batch of frames of as many streams."""
         goes_on = self.last is not None and psf is self.psf and measurement.shape == self.shape
         solver: Any = self.brief if goes_on else self.solver
-        scene, self.last = solver.follow(measurement, psf, self.last if goes_on else None)
+        scene, reached = solver.follow(measurement, psf, self.last if goes_on else None)
+        self.last = reached if scene.isfinite().all() else None
         self.shape, self.psf = measurement.shape, psf
         return scene
