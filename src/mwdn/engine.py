@@ -30,7 +30,8 @@ class Engine:
 
     BatchNorm is folded into the convolutions, these take pixels with their channels side by side, and the transfer
     functions of the network's Wiener filters (with the whole PSF branch of MWDN-CPSF) are kept. On a GPU the
-    calculation of each shape of a batch is recorded when it is met again, and then replayed.
+    calculation of each shape of a batch is recorded when it is met again, and then replayed; not where the PSF is
+    aligned to each measurement.
 
     Memory is bounded: a batch is taken a megapixel at a time (16 on a GPU), and of a larger picture the U-Net's
     convolutions, a strip of rows at a time, see `mwdn.tiles`.
@@ -65,6 +66,13 @@ class Engine:
         if len(measurement) > at_once and len(self.psf) == 1:
             return torch.cat([self(part) for part in measurement.split(at_once)])  # type: ignore[no-untyped-call]
         if measurement.device.type != "cuda":
+            return self._reconstruct(measurement)
+        # Streams are those of the current device; what stays float32 would else have the 10 bits of TF32.
+        with torch.cuda.device(measurement.device), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
+            return self._recorded(measurement)
+
+    def _recorded(self, measurement: Tensor) -> Tensor:
+        if self.aligns:  # its equations wait for the GPU: nothing that could be recorded
             return self._reconstruct(measurement)
         if measurement.shape not in self.recordings:
             if len(self.recordings) >= 4:  # each holds the memory of a whole reconstruction
