@@ -3,8 +3,8 @@
     python benchmarks/trust.py ../shared/data [--method universal] [--count 2]
 
 Wrong PSFs: mirrored, turned by 180, 90 and 3 degrees, displaced, and that of another camera. Prints one line each:
-the part of the capture's detail that is explained, over the part that is not noise; the contrast with mirrored PSFs;
-whether the score calls it doubtful.
+the part of the capture's detail that is explained, over the part that is not noise; the contrast with mirrored and
+turned PSFs; whether the score calls it doubtful. Then the ranges of each kind of PSF.
 """
 
 import argparse
@@ -15,6 +15,7 @@ from pathlib import Path
 import torch
 
 from mwdn import Calibration, Reconstructor, read_frame
+from mwdn.data.writing import atomic
 from mwdn.evaluation.consistency import consistency
 from mwdn.optics import sample_camera
 from mwdn.solvers.alignment import Pose
@@ -35,6 +36,18 @@ def wrong(psf):
     if size[0] == size[1]:
         found["turned by 90 degrees"] = torch.rot90(psf, 1, (-2, -1)).contiguous()
     return found
+
+
+def ranges(rows):
+    """Lines of a table: how many captures of each kind of PSF are called doubtful, and between which numbers."""
+    yield "| PSF | captures | doubtful | explained / possible | contrast |\n| --- | --- | --- | --- | --- |"
+    for name in dict.fromkeys(row["psf"] for row in rows):
+        those = [row for row in rows if row["psf"] == name]
+        shares = [row["explained"] / row["possible"] for row in those]
+        contrasts = [row["contrast"] for row in those]
+        doubtful = sum(row["doubtful"] for row in those)
+        numbers = (f"{min(each):.2f} to {max(each):.2f}" for each in (shares, contrasts))
+        yield f"| {name} | {len(those)} | {doubtful} | {' | '.join(numbers)} |"
 
 
 def main():
@@ -66,7 +79,9 @@ def main():
                 share = found.explained / found.possible
                 told = f"| {capture.stem} | {name} | {share:.2f} | {found.contrast:.2f} |"
                 print(told, "yes |" if found.doubtful else "no |", flush=True)
-    arguments.out.write_text(json.dumps({"method": arguments.method, "rows": rows}, indent=1) + "\n")
+    with atomic(arguments.out) as temporary:
+        temporary.write_text(json.dumps({"method": arguments.method, "rows": rows}, indent=1) + "\n")
+    print("", *ranges(rows), sep="\n")
 
 
 if __name__ == "__main__":

@@ -53,6 +53,33 @@ def test_hand_at_full_size(data: Path) -> None:
     assert explained(scene, calibration.psf, measurement) > 0.99
 
 
+@pytest.mark.parametrize(
+    ("captures", "psf", "options"),
+    [
+        ("mwdn-camera/real-objects/object_*", "mwdn-camera/psf_320.png", ()),
+        ("mwdn-camera/real-objects/scene*", "mwdn-camera/psf_480.tif", ()),
+        ("mwdn-camera/display_capture.tif", "mwdn-camera/psf_480.tif", ()),
+        (
+            "diffusercam/diffuser_images/*",
+            "diffusercam/psf_recovered_270x480.npy",
+            ("--upside-down", "--bgr", "--background", "0"),
+        ),
+        ("diffusercam-tutorial/rawdata_*", "diffusercam-tutorial/psf_sample.tif", ("--bin", "4")),
+    ],
+)
+@pytest.mark.parametrize("method", ["universal", "universal-small"])
+def test_right_psfs_are_trusted(data: Path, tmp_path: Path, captures: str, psf: str, options: tuple, method: str):
+    """By the networks that come with the package."""
+    files = sorted(data.glob(captures))
+    assert files
+    with pytest.raises(SystemExit) as ended:
+        main([*map(str, ("reconstruct", *files, "--psf", data / psf, *options, "--method", method, "--out", tmp_path))])
+    assert ended.value.code == 0
+    told = {path.stem: json.loads(path.read_text()) for path in tmp_path.glob("*.json")}
+    assert len(told) == len(files)
+    assert not [name for name, each in told.items() if each["doubtful"]]
+
+
 def best_psnr(found: np.ndarray, truth: np.ndarray) -> float:
     """PSNR in dB after one gain and one offset by least squares, rows 60:270, columns 60:440."""
     x, y = (picture[60:270, 60:440].ravel().astype(np.float64) for picture in (found, truth))
