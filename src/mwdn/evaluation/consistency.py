@@ -101,8 +101,8 @@ def consistency(measurement: Measurement, psf: Psf, scene: Scene, *, pose: Pose 
     power, of_seen = (each.square().sum((-2, -1)).clamp(min=1e-30) for each in (recorded, seen))
     explained = (seen * recorded).sum((-2, -1)).clamp(min=0).square() / of_seen
     noise = noise_level(measurement)[..., 0, 0].square() * recorded[0, 0].numel()
-    images = torch.cat([_mirrored(fitting), _mirrored(_QUARTER.move(fitting))])
-    left, *others = misfit(measurement.expand(len(images), -1, -1, -1), images).tolist()
+    images = _mirrored(fitting), _mirrored(_QUARTER.move(fitting))
+    left, *others = torch.cat([misfit(measurement.expand(4, -1, -1, -1), four) for four in images]).tolist()
     return Consistency(
         explained=float(explained.sum(1).max() / power.sum()),
         possible=float((1 - noise.sum() / power.sum()).clamp(min=0)),
