@@ -15,8 +15,9 @@ LEAST = 0.25
 """Of real captures the right PSF explains 0.26 and more of what is not noise. One of another camera may explain as much
 of a plain scene, but then so do its own mirror images: `benchmarks/trust.py`."""
 
-CLEAR = 0.02
-"""How far the contrast is above 1, times that part: 0.035 and more with the right PSF, 0.013 and less with others."""
+CLEAR = 0.01
+"""How far the contrast is above 1, times that part: 0.035 and more with the right PSF, 0.013 and less with others, most
+of them below 0."""
 
 
 _QUARTER = Pose(torch.tensor([90.0]), torch.zeros(1))
