@@ -94,9 +94,7 @@ def evaluate(
     check_pairs(file, calibration.psf)
     pairs = file if first is None else evaluation.First(file, first)
     reconstructors = {method: Reconstructor(method, calibration, device=device) for method in methods}
-    warn(*reconstructors.values())
-    if other := other_camera(file, calibration.psf_hash):
-        errors.print(f"[yellow]Warning:[/] {escape(other)}", highlight=False, soft_wrap=True)
+    warn(*(each.warning for each in reconstructors.values()), other_camera(file, calibration.psf_hash))
     spare(out / evaluation.SHEET, camera.psf, camera.dark)
     check_folder(out)
     with Progress(console=errors, transient=True) as bars:

@@ -9,7 +9,6 @@ from rich.markup import escape
 
 from mwdn.calibration import Calibration
 from mwdn.errors import MwdnError
-from mwdn.reconstruct import Reconstructor
 
 console = Console()
 errors = Console(stderr=True)
@@ -55,9 +54,9 @@ class CameraOptions:
         )
 
 
-def warn(*reconstructors: Reconstructor) -> None:
-    """Print why not to trust what they will give."""
-    for warning in filter(None, (reconstructor.warning for reconstructor in reconstructors)):
+def warn(*warnings: str | None) -> None:
+    """Print why not to trust what will come, where there is a reason."""
+    for warning in filter(None, warnings):
         errors.print(f"[yellow]Warning:[/] {escape(warning)}", highlight=False, soft_wrap=True)
 
 

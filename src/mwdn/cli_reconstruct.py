@@ -58,7 +58,7 @@ def reconstruct(  # noqa: PLR0913
         device_here = distributed.device_here(device)
         reconstructor = Reconstructor(method, calibration, regularisation=regularisation, device=device_here)
         if first:
-            warn(reconstructor)
+            warn(reconstructor.warning)
             levels = ", ".join(f"{level:.4f}" for level in calibration.background)
             console.print(f"PSF {calibration.psf_hash}, background {levels} of the full scale subtracted")
         again = distributed.world() > 1 if resume is None else resume

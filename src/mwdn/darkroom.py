@@ -174,11 +174,7 @@ class Darkroom:
         measurement = read_capture(job.capture, self.reconstruct.calibration)
         if measurement.amax() <= 0:
             raise ImageError("The sensor saw no light: no pixel is brighter than the dark frame, or black.")
-        if not self.judge:
-            return replace(job, measurement=measurement)
-        # As `consistency` does: squares of large numbers would overflow.
-        unit = measurement.abs().amax().clamp(min=torch.finfo(torch.float32).tiny)
-        pose = align((measurement / unit).to(self.reconstruct.device), self.reconstruct.psf)
+        pose = align(measurement.to(self.reconstruct.device), self.reconstruct.psf) if self.judge else None
         return replace(job, measurement=measurement, pose=pose)
 
     @_step

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+from safetensors import SafetensorError
 
 from mwdn.errors import ParameterError
 from mwdn.types import FloatFrame, Frame
@@ -46,21 +47,30 @@ def atomic(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+@contextmanager
+def writable(folder: Path, way_out: str = "Choose another one: `--out`.") -> Iterator[None]:
+    """Say of which folder it is that the disk refuses something.
+
+    Raises:
+        ParameterError: the disk is full, or refuses otherwise.
+    """
+    try:
+        yield
+    except (OSError, SafetensorError) as error:  # safetensors has a type of its own for what the disk refuses
+        reason = getattr(error, "strerror", None) or error
+        raise ParameterError(f"`{folder}` must be a folder that can be written to: {reason}. {way_out}") from error
+
+
 def check_folder(folder: Path) -> None:
     """Create a folder and see that it can be written to, before the work whose result it shall hold.
 
     Raises:
         ParameterError: it cannot.
     """
-    try:
+    with writable(folder):
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
-    except OSError as error:
-        reason = error.strerror or error
-        raise ParameterError(
-            f"`{folder}` must be a folder that can be written to: {reason}. Choose another one: `--out`."
-        ) from error
 
 
 def spare(output: Path, *inputs: Path | None) -> None:

@@ -93,9 +93,9 @@ def consistency(measurement: Measurement, psf: Psf, scene: Scene, *, pose: Pose 
         raise ShapeError(
             f"`measurement` {tuple(measurement.shape)} and `scene` {tuple(scene.shape)} must be one and of one shape."
         )
+    pose = pose or align(measurement, psf)
     unit = measurement.abs().amax().clamp(min=torch.finfo(torch.float32).tiny)
     measurement, scene = measurement.float() / unit, scene.float() / unit
-    pose = pose or align(measurement, psf)
     fitting = pose.move(psf)
     recorded = fine_detail(measurement)
     seen = fine_detail(convolve(scene.expand(2, -1, -1, -1), torch.cat([fitting, psf.float()])))

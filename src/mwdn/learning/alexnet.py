@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from mwdn.data.writing import atomic
 from mwdn.errors import CheckpointError, ShapeError
-from mwdn.learning.checkpoint import misfit, read_plain
+from mwdn.learning.checkpoint import first_difference, read_plain
 from mwdn.types import Image
 
 SMALLEST = 31
@@ -220,7 +220,7 @@ def _filled(network: _Network, path: Path, prefix: str) -> _Network:
     try:
         network.load_state_dict({key: value for key, value in content.items() if key.startswith(prefix)})
     except (AttributeError, TypeError, RuntimeError) as error:
-        kind, reason = type(network).__name__, misfit(error)
+        kind, reason = type(network).__name__, first_difference(error)
         raise CheckpointError(
             f"`{path}` does not hold the weights of `{kind}`: {reason}. Download it again."
         ) from error

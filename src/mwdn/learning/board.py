@@ -5,6 +5,7 @@ from types import TracebackType
 from typing import Any
 
 from mwdn.data.images import srgb_encode
+from mwdn.data.writing import writable
 from mwdn.errors import ParameterError
 from mwdn.learning.train import Report
 
@@ -25,13 +26,8 @@ class Board:
             from torch.utils.tensorboard import SummaryWriter
         except ModuleNotFoundError as error:
             raise ParameterError("`tensorboard` must be installed: `pip install 'mwdn[tensorboard]'`.") from error
-        try:
+        with writable(folder):
             self._writer: Any = SummaryWriter(str(folder), purge_step=step + 1)
-        except OSError as error:
-            raise ParameterError(
-                f"`{folder}` must be a folder that can be written to: {error.strerror or error}. "
-                "Choose another one: `--out`."
-            ) from error
 
     def __call__(self, report: Report) -> None:
         """Write a step's numbers, and after a validation its numbers and the contact sheet."""

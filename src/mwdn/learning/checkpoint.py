@@ -104,7 +104,7 @@ def load_network(path: str | Path) -> nn.Module:
         network.load_state_dict(state)  # float16 in files that come with the package, float32 here
     except RuntimeError as error:
         raise CheckpointError(
-            f"`{path}` does not fit the network '{header['name']}' it names: {misfit(error)}. Copy it again."
+            f"`{path}` does not fit the network '{header['name']}' it names: {first_difference(error)}. Copy it again."
         ) from error
     broken = [key for key, value in network.state_dict().items() if not value.isfinite().all()]
     if broken:
@@ -129,7 +129,7 @@ def read_plain(path: Path) -> Any:  # noqa: ANN401
         ) from error
 
 
-def misfit(error: Exception) -> str:
+def first_difference(error: Exception) -> str:
     """What `load_state_dict` complains of first, on one line: it names every key on lines of their own."""
     return shorten(str(error).partition(":\n")[2] or str(error), 200, placeholder=" ...").rstrip(".")
 

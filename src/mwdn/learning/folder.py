@@ -1,16 +1,13 @@
 """The folder of a run: whose it is, what it remembers, what it tells."""
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError
 from torch import Tensor
 
-from mwdn.data.writing import atomic
-from mwdn.errors import CheckpointError, ParameterError
+from mwdn.data.writing import atomic, writable
+from mwdn.errors import CheckpointError
 from mwdn.learning import distributed
 from mwdn.learning.state import Header, read_state
 
@@ -84,7 +81,7 @@ class RunFolder:
             ParameterError: it refuses.
         """
         log = self.path / "log.jsonl"
-        with self.writing("Choose another one: `--out`."):
+        with writable(self.path):
             with atomic(self.path / "recipe.json") as temporary:
                 temporary.write_text(json.dumps(self.identity, indent=2), encoding="utf-8")
             # One line a step; those after the saved step will be written again.
@@ -96,21 +93,7 @@ class RunFolder:
         """Add a line to the log.
 
         Raises:
-            ParameterError: as for `writing`.
-        """
-        with self.writing(MAKE_ROOM), (self.path / "log.jsonl").open("a", encoding="utf-8") as file:
-            file.write(json.dumps(line) + "\n")
-
-    @contextmanager
-    def writing(self, way_out: str) -> Iterator[None]:
-        """Say which folder it is that refuses.
-
-        Raises:
             ParameterError: the disk is full, or refuses otherwise.
         """
-        try:
-            yield
-        except (OSError, SafetensorError) as error:  # safetensors has a type of its own for what the disk refuses
-            reason = getattr(error, "strerror", None) or error
-            message = f"`{self.path}` must be a folder that can be written to: {reason}. {way_out}"
-            raise ParameterError(message) from error
+        with writable(self.path, MAKE_ROOM), (self.path / "log.jsonl").open("a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")

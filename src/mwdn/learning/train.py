@@ -15,10 +15,11 @@ from mwdn.data.images import write_picture
 from mwdn.data.recorded import RecordedPairs
 from mwdn.data.simulated import Samples
 from mwdn.data.unpaired import UnpairedCaptures
+from mwdn.data.writing import writable
 from mwdn.errors import CheckpointError, DivergenceError, MwdnError, ParameterError
 from mwdn.learning import distributed
 from mwdn.learning.bundled import find_weights
-from mwdn.learning.checkpoint import load_network, misfit, save_network
+from mwdn.learning.checkpoint import first_difference, load_network, save_network
 from mwdn.learning.folder import MAKE_ROOM, RunFolder
 from mwdn.learning.losses import Loss
 from mwdn.learning.pool import Pool
@@ -143,9 +144,8 @@ class Trainer:
             found = self.validate() if due else None
             report = Report(self.step, loss, parts, rate, speed, found)
             if distributed.rank() == 0:
-                self.folder.log(
-                    report.line()
-                )  # before the state: a run killed between the two repeats the step, and its line
+                # Before the state: a run killed between the two repeats the step, and its line.
+                self.folder.log(report.line())
             if found is not None:
                 self.save(found)
                 last = time.perf_counter()
@@ -257,7 +257,7 @@ class Trainer:
         metadata = {**self.identity, "step": self.step, "psnr": found.psnr}
         header = {"identity": json.dumps(self.identity), "step": str(self.step), "best": repr(self.best)}
         header["course"] = json.dumps(self.course.state())
-        with self.folder.writing(MAKE_ROOM):
+        with writable(self.out, MAKE_ROOM):
             for name in ("last", *(["best"] if found.psnr == self.best else [])):
                 network = self.recipe.network["name"]
                 save_network(self.folder.weights(name), self.average, network, self.options, **metadata)
@@ -279,7 +279,7 @@ class Trainer:
         except RuntimeError as error:
             raise CheckpointError(
                 f"`start` ('{start}') must hold the network of the recipe, {self.recipe.network}, and `denoiser` "
-                f"('{alone}') its denoiser, if it has one: {misfit(error)}."
+                f"('{alone}') its denoiser, if it has one: {first_difference(error)}."
             ) from error
 
     def _resume(self) -> None:

@@ -84,6 +84,7 @@ def align(measurement: Measurement, psf: Psf, *, steps: int = 2) -> Pose:
     """
     check_fit(measurement, psf, "measurement")
     small = halve(measurement.float())
+    small = small / small.abs().amax((1, 2, 3), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
     delta, likely = small.new_tensor(_DELTA), small.new_tensor(_LIKELY)
     around = torch.cat([delta.new_zeros(1, 2), delta.diag()])
     pose = best = delta.new_zeros(len(small), 2)
