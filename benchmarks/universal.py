@@ -25,8 +25,9 @@ import torch
 
 import mwdn
 from mwdn import Calibration, Reconstructor
+from mwdn.data.mismatch import EXACT
 from mwdn.data.photographs import Photographs
-from mwdn.data.simulated import EXACT, SimulatedPairs
+from mwdn.data.simulated import SimulatedPairs
 from mwdn.data.writing import atomic
 from mwdn.evaluation import Perceptual, Protocol, bootstrap, evaluate
 from mwdn.learning.recipe import read_recipe

@@ -74,6 +74,37 @@ def test_train_then_reconstruct(run, camera):
     assert run(TRAIN)[0] == 0  # nothing left to do
 
 
+def test_any_key_of_the_recipe_by_its_name(run, camera):
+    changes = "--learning-rate 3e-4 --bfloat16=false --seed -2 --mismatch.blur-px 1 --placement.extent [0.3,0.5]"
+    code, _, err = run(f"{TRAIN} {changes} --network.width 6 --schedule.crop 16 --pool 8")
+    assert code == 0, err
+    recipe = json.loads((camera / "runs/x/recipe.json").read_text(encoding="utf-8"))["recipe"]
+    schedule = recipe["schedule"]
+    assert [schedule[key] for key in ("learning_rate", "seed", "crop", "pool")] == [3e-4, -2, 16, 8]
+    assert (recipe["mismatch"]["blur_px"], recipe["placement"]["extent"]) == (1.0, [0.3, 0.5])
+    assert recipe["network"] == {"name": "wiener-bank", "width": 6}
+    for wrong, said in (
+        ("--learnin-rate 1", "No key of [schedule] named 'learnin_rate'. Did you mean 'learning_rate'?"),
+        ("--sensor.iso 100", "No key of [sensor] named 'iso'"),
+        ("--steps many", "`steps` of [schedule] ('many') must be of the same kind as its default, 2000."),
+        ("--seed", "parameter --seed requires an argument"),
+    ):
+        code, _, err = run(f"train r.toml --psf psf.npy --photos photos --out runs/y {wrong}")
+        assert code == 2
+        assert said in flat(err)
+    assert not (camera / "runs/y").exists()
+
+
+def test_simulate_by_the_recipes_keys(run, camera):
+    for name, well in (("good", 15_000), ("poor", 50)):
+        line = f"simulate photos --psf psf.npy --count 2 --exact --seed 3 --sensor.full-well {well} -o {name}.h5"
+        code, _, err = run(line)
+        assert code == 0, err
+    good, poor = (PairFile(camera / f"{name}.h5")[0] for name in ("good", "poor"))
+    assert torch.equal(good[1], poor[1])
+    assert (good[0] - poor[0]).std() > 0.05 * good[0].max()
+
+
 def test_checkpoint_of_another_camera_is_used_with_a_warning(run, camera):
     assert run(TRAIN)[0] == 0
     trained, given = (Calibration.from_file(f"{name}.npy").psf_hash for name in ("psf", "other"))

@@ -4,7 +4,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 from rich.progress import Progress, ProgressColumn, track
@@ -13,8 +13,19 @@ from mwdn.cli_camera import CameraOptions, console, errors
 from mwdn.data.writing import spare
 from mwdn.learning import distributed, session
 from mwdn.learning.board import Board
-from mwdn.learning.recipe import Recipe, Schedule, Sheet, read_recipe
+from mwdn.learning.recipe import Sheet, read_recipe
+from mwdn.learning.tables import value_of
 from mwdn.learning.train import Report
+
+
+def _as_recipe(given: Any) -> Any:  # noqa: ANN401
+    """What a command line says by ``--key value`` and ``--table.key value``, as a recipe has it."""
+    if isinstance(given, dict):
+        return {key.replace("-", "_"): _as_recipe(each) for key, each in given.items()}
+    return value_of(given[-1].value)
+
+
+RecipeKeys = Annotated[Any, Parameter(converter=lambda _, tokens: tokens, show=False)]
 
 
 def train(  # noqa: PLR0913
@@ -25,16 +36,17 @@ def train(  # noqa: PLR0913
     pairs: Path | None = None,
     captures: Annotated[list[Path] | None, Parameter(consume_multiple=True, negative=())] = None,
     out: Path = Path("runs/train"),
-    steps: int | None = None,
-    batch: int | None = None,
-    seed: int | None = None,
     device: str | None = None,
     tensorboard: Annotated[bool, Parameter(negative=())] = False,
+    **changes: RecipeKeys,
 ) -> None:
     """Train a network for one camera: on captures simulated through its PSF, on recorded pairs, or on captures alone.
 
     Give either --photos or --pairs, or --captures alone with a recipe that has [selfsupervised].
     Run again, it goes on where it stopped.
+
+    Any key of the recipe can be given another value: --steps 500 or --learning-rate 1e-4 of [schedule], and of the
+    other tables --mismatch.blur-px 0.5, --network.width 32, --placement.extent "[0.3, 0.7]".
 
     Several GPUs or machines: torchrun --nproc-per-node 4 -m mwdn train ...
 
@@ -47,13 +59,11 @@ def train(  # noqa: PLR0913
             [selfsupervised], to be learned from.
         out: folder of the run: best.safetensors is what `mwdn reconstruct --method` takes, validation.png shows the
             pictures of the latest validation.
-        steps: instead of the recipe's steps or epochs.
-        batch: instead of the recipe's.
-        seed: instead of the recipe's.
         device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
         tensorboard: write progress to the folder tensorboard in --out, for `tensorboard --logdir`.
+        **changes: any key of the recipe.
     """
-    chosen = read_recipe(recipe, steps=steps, batch=batch, seed=seed)
+    chosen = read_recipe(recipe, **_as_recipe(changes))
     if captures:
         chosen = replace(chosen, sheet=Sheet(tuple(map(str, captures))))
     columns: list[str | ProgressColumn] = [*Progress.get_default_columns(), "{task.fields[now]}"]
@@ -86,10 +96,12 @@ def simulate(
     out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("pairs.h5"),
     count: int = 100,
     recipe: Path | None = None,
-    seed: int | None = None,
     exact: bool = False,
+    **changes: RecipeKeys,
 ) -> None:
     """Write a file of pairs: photographs as scenes, and what the camera would capture of them.
+
+    Any key of the recipe can be given another value: --seed 1, --sensor.full-well 2000, --mismatch.blur-px 0.5.
 
     Args:
         photos: folder of photographs.
@@ -97,11 +109,11 @@ def simulate(
         out: the file of pairs, ending in .h5 or .hdf5; one that exists is replaced when all has gone well.
         count: of pairs.
         recipe: TOML file whose placement, mismatch, sensor and seed are used, see recipes/; defaults unless given.
-        seed: instead of the recipe's.
         exact: simulate a camera that is exactly what its calibration says.
+        **changes: any key of the recipe.
     """
     spare(out, camera.psf, camera.dark, recipe)
-    chosen = read_recipe(recipe, seed=seed) if recipe else Recipe(schedule=Schedule(seed=seed or 0))
+    chosen = read_recipe(recipe, **_as_recipe(changes))
     progress = partial(track, description="Simulating", console=errors, transient=True)
     session.simulate(chosen, camera.load(), photos, out, count, exact=exact, track=progress)
     console.print(f"{count:,} pairs written to {out}", markup=False, highlight=False, soft_wrap=True)

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from mwdn.data.cameras import CameraPairs, Cameras
+from mwdn.data.mismatch import EXACT
 from mwdn.data.photographs import Photographs
-from mwdn.data.simulated import EXACT, Placement, SimulatedPairs
+from mwdn.data.simulated import Placement, SimulatedPairs
 from mwdn.errors import ParameterError
 from mwdn.fourier import convolve
 from mwdn.optics import Sensor

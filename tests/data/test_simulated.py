@@ -8,11 +8,16 @@ import numpy as np
 import pytest
 import torch
 
+from mwdn.data.cameras import CameraPairs, Cameras
+from mwdn.data.mismatch import EXACT, Mismatch, perturb, uniform
+from mwdn.data.noisy import Denoising, NoisyScenes
 from mwdn.data.photographs import Photographs
-from mwdn.data.simulated import EXACT, Mismatch, Placement, SimulatedPairs, _resample, affine, perturb, uniform
+from mwdn.data.simulated import Placement, SimulatedPairs, _resample
+from mwdn.data.unpaired import UnpairedCaptures
 from mwdn.errors import ParameterError
 from mwdn.optics import Camera, Sensor
 from mwdn.optics.patterns import contour_psf
+from mwdn.optics.warp import affine
 
 SIZE = 32, 40
 CLEAN = Sensor(full_well=1e9, read_noise=0.0, bit_depth=16, black_level=0.0)
@@ -79,6 +84,24 @@ def test_same_number_same_pair_in_any_batch(photographs, psf):
     torch.testing.assert_close(backwards.scene[1], together.scene[0], rtol=0, atol=1e-5)
 
 
+def test_samples_are_exact_where_a_network_computes_in_half_precision(photographs, psf):
+    simulated = SimulatedPairs(photographs, psf, mismatch=Mismatch(full=True))
+    captures = UnpairedCaptures(simulated.batch(range(2)).measurement, psf[:, :1])
+    scene, light = simulated.scenes(generators(2)), torch.zeros(2, 3, 1, 1)
+    for make in (
+        lambda: simulated.batch(range(2)),
+        lambda: NoisyScenes(simulated, Denoising((0.01, 0.02))).batch(range(2)),
+        lambda: CameraPairs(simulated, Cameras(("32x40",)), 2).batch(range(2)),
+        lambda: replace(captures, poses={}).batch(range(2)),
+        lambda: captures.again(scene, psf.expand(2, -1, -1, -1), light, range(2)),
+    ):
+        alone = make()
+        with torch.autocast("cpu", torch.bfloat16):
+            within = make()
+        for one, other in zip(alone, within, strict=True):
+            assert (one is None and other is None) or torch.equal(one, other)
+
+
 def test_numbers_and_seeds_differ(photographs, psf):
     scenes = [SimulatedPairs(photographs, psf, seed=seed).batch(range(4)).scene for seed in (0, 1)]
     every = torch.cat(scenes)
@@ -91,6 +114,24 @@ def test_all_photographs_are_used(photographs, psf):
     scenes = pairs.scenes(generators(60))
     means = {tuple((scene.mean((1, 2)) * 1000).round().tolist()) for scene in scenes}
     assert len(means) == len(photographs)
+
+
+def test_backdrop_is_even_and_beside_the_photograph(tmp_path, psf):
+    """What shows how bright it is stands around a white square; a recipe without one draws what it always drew."""
+    white = one(tmp_path, np.full((24, 24, 3), 255, np.uint8))
+    placement = replace(PLAIN, backdrop=(0.2, 0.3))
+    scene = SimulatedPairs(white, psf, placement=placement).scenes(generators(4))
+    height, width = SIZE
+    inside = scene[..., height // 2 - 7 : height // 2 + 7, width // 2 - 7 : width // 2 + 7]
+    torch.testing.assert_close(inside, torch.ones_like(inside))
+    beside = scene[..., :4]
+    assert beside.amin() >= 0.2
+    assert beside.amax() <= 0.3
+    assert beside.flatten(2).std(-1).max() < 1e-6
+    assert beside.mean((-2, -1)).unique().numel() == 12  # each colour of each sample its own
+    for backdrop in ((0.3, 0.2), (0.0, 1.1)):
+        with pytest.raises(ParameterError, match="backdrop"):
+            replace(PLAIN, backdrop=backdrop)
 
 
 # --- Light --------------------------------------------------------------------------------------------

@@ -7,10 +7,12 @@ import pytest
 
 from conftest import ROOT
 from mwdn.data.cameras import Cameras
-from mwdn.data.simulated import Mismatch, Placement
+from mwdn.data.mismatch import Mismatch
+from mwdn.data.simulated import Placement
 from mwdn.errors import ParameterError, UnknownNameError
 from mwdn.learning.recipe import Recipe, Schedule, read_recipe
 from mwdn.networks import build
+from mwdn.optics import Sensor
 
 DENOISER = '[network]\nname = "drunet"\n'
 NETWORK = '[network]\nname = "wiener-bank"\nwidth = 4\n'
@@ -55,6 +57,19 @@ def test_overrides(read):
     assert read(NETWORK, steps=7).schedule == Schedule(steps=7)
     with pytest.raises(ParameterError, match=r"`steps` \(0\) must be positive"):
         read(text, steps=0)
+    other = read(text, network={"width": 6}, mismatch={"blur_px": 1}, schedule={"crop": 8}, pool=5, loss={"l1": 2})
+    assert (other.network["width"], other.mismatch, other.loss) == (6, Mismatch(blur_px=1.0), {"l1": 2.0})
+    assert other.schedule == Schedule(steps=10, batch=3, crop=8, pool=5)
+    with pytest.raises(UnknownNameError, match=r"No table of a recipe named 'mismatc'. Did you mean 'mismatch'"):
+        read(text, mismatc={"blur_px": 1})
+    with pytest.raises(UnknownNameError, match=r"No key of \[mismatch\] named 'blur'. Did you mean 'blur_px'"):
+        read(text, mismatch={"blur": 1})
+
+
+def test_without_a_file_all_is_default():
+    assert read_recipe(None, seed=3, sensor={"full_well": 2000}) == Recipe(
+        schedule=Schedule(seed=3), sensor=Sensor(full_well=2000.0)
+    )
 
 
 @pytest.mark.parametrize(

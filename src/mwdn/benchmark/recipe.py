@@ -2,7 +2,6 @@
 
 import json
 import os
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from inspect import signature
@@ -12,7 +11,8 @@ from typing import Any
 from mwdn.benchmark.sets import PRESETS, DataSet
 from mwdn.errors import ParameterError, UnknownNameError
 from mwdn.learning.losses import checked_weights
-from mwdn.learning.recipe import Schedule, fill
+from mwdn.learning.recipe import Schedule
+from mwdn.learning.tables import fill, read_toml
 from mwdn.networks import NETWORKS
 from mwdn.optics import Deviation
 from mwdn.solvers import SOLVERS
@@ -104,10 +104,7 @@ def read_benchmark(path: str | Path) -> Benchmark:
         ParameterError: the file cannot be read, nothing is to be compared, or a value is outside its range.
         UnknownNameError: a name, a table or a key that does not exist.
     """
-    try:
-        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise ParameterError(f"`{path}` cannot be read as a recipe: {error}") from error
+    content = read_toml(path)
     known = {f.name for f in fields(Benchmark)} - {"methods", "path"} | {"networks", "solvers", "shared"}
     for key in content:
         if key not in known:

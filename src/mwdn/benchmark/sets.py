@@ -13,11 +13,12 @@ from torch import Tensor
 from mwdn.calibration import Calibration
 from mwdn.calibration.frames import Background
 from mwdn.data.importers import Layout, import_pairs
+from mwdn.data.mismatch import EXACT
 from mwdn.data.pair_writer import Attribute
 from mwdn.data.pairs import PairFile
 from mwdn.data.photographs import Photographs
 from mwdn.data.recorded import HELD_OUT, Division, RecordedPairs, check_pairs, record
-from mwdn.data.simulated import EXACT, Placement, Samples, SimulatedPairs
+from mwdn.data.simulated import Placement, Samples, SimulatedPairs
 from mwdn.data.splits import split
 from mwdn.data.writing import atomic
 from mwdn.errors import ParameterError

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from mwdn.data.simulated import Pair, SimulatedPairs
+from mwdn.data.simulated import Pair, SimulatedPairs, full_precision
 from mwdn.errors import ParameterError
 from mwdn.fourier import Size
 from mwdn.optics.families import FAMILIES, sample_camera
@@ -59,6 +59,7 @@ class CameraPairs:
         """The same for all photographs."""
         return "simulated across cameras"
 
+    @full_precision
     def batch(self, numbers: range | list[int]) -> Pair:
         """Make the samples of these numbers, which must lie in one batch."""
         size = self.cameras.size(numbers[0] // self.together)

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import torch
 
-from mwdn.data.simulated import Pair, SimulatedPairs, uniform
+from mwdn.data.mismatch import uniform
+from mwdn.data.simulated import Pair, SimulatedPairs, full_precision
 from mwdn.errors import ParameterError
 
 
@@ -42,6 +43,7 @@ class NoisyScenes:
         """The same for all photographs."""
         return "noisy scenes"
 
+    @full_precision
     def batch(self, numbers: range | list[int]) -> Pair:
         """Make the samples of these numbers.
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.calibration.frames import noise_level
-from mwdn.data.simulated import Pair
+from mwdn.data.simulated import Pair, full_precision
 from mwdn.errors import ParameterError
 from mwdn.fourier import convolve
 from mwdn.solvers.alignment import Pose, align
@@ -69,6 +69,7 @@ class UnpairedCaptures:
         content = self.measurements.cpu().contiguous().numpy().tobytes()
         return f"{len(self):,} captures {hashlib.sha256(content).hexdigest()[:16]}"
 
+    @full_precision
     def batch(self, numbers: range | list[int]) -> Pair:
         """Measurements of these numbers, twice, each with independent noise, and their own PSFs.
 
@@ -91,6 +92,7 @@ class UnpairedCaptures:
         epoch, place = divmod(number, len(self))
         return int(torch.randperm(len(self), generator=self._generator(epoch))[place])
 
+    @full_precision
     def again(self, scene: Scene, psf: Psf, light: Tensor, numbers: range | list[int]) -> tuple[Measurement, Scene]:
         """Move scenes elsewhere and capture them once more.
 

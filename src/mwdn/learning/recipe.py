@@ -1,27 +1,25 @@
 """Recipes: one experiment a TOML file, read into frozen dataclasses."""
 
 import dataclasses
-import json
 import math
-import tomllib
 import warnings
 from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 
 from mwdn.data.cameras import Cameras
+from mwdn.data.mismatch import Mismatch
 from mwdn.data.noisy import Denoising
 from mwdn.data.recorded import Division
-from mwdn.data.simulated import Mismatch, Placement
+from mwdn.data.simulated import Placement
 from mwdn.data.unpaired import SelfSupervised
 from mwdn.errors import MwdnError, ParameterError, UnknownNameError
 from mwdn.learning.losses import checked_weights
+from mwdn.learning.tables import fill, read_toml
 from mwdn.networks import DENOISERS, build
 from mwdn.optics.sensor import Sensor
-
-T = TypeVar("T")
 
 COURSES = ("cosine", "plateau")
 OPTIMISERS = ("adam", "adamw")
@@ -207,81 +205,48 @@ class Recipe:
         return dataclasses.asdict(self)
 
 
-def read_recipe(path: str | Path, **schedule: Any) -> Recipe:  # noqa: ANN401
+def read_recipe(path: str | Path | None, **changes: Any) -> Recipe:  # noqa: ANN401
     """Read a recipe.
 
     Args:
-        path: TOML with the tables of `Recipe`.
-        **schedule: values that replace those of the recipe's schedule; ``None`` leaves one as it is.
+        path: TOML with the tables of `Recipe`; ``None`` for all defaults, where nothing is trained.
+        **changes: values in place of the recipe's, ``learning_rate=1e-4`` of [schedule] and
+            ``mismatch={"blur_px": 0.5}`` of any other table; ``None`` leaves one as it is.
 
     Raises:
         ParameterError: the file cannot be read, names no network, or a value is outside its range.
         UnknownNameError: a table, a key, a network or an option of it that does not exist.
     """
-    try:
-        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise ParameterError(f"`{path}` cannot be read as a recipe: {error}") from error
+    content = {} if path is None else read_toml(path)
+    replaced = _by_table(changes)
     fields = {f.name: f for f in dataclasses.fields(Recipe)}
-    for table in content:
+    for table in content | replaced:
         if table not in fields:
             raise UnknownNameError("table of a recipe", table, fields)
-        if not isinstance(content[table], dict):
+        if not isinstance(content.setdefault(table, {}), dict):
             raise ParameterError(f"`{table}` of `{path}` ({content[table]!r}) must be a table: [{table}].")
-    if not isinstance(content.get("network", {}).get("name"), str):
-        raise ParameterError(f'`{path}` must name a network: [network] name = "mwdn".')
-    _try(content["network"])
+        content[table] |= replaced.get(table, {})
+    if path is not None:
+        if not isinstance(content.get("network", {}).get("name"), str):
+            raise ParameterError(f'`{path}` must name a network: [network] name = "mwdn".')
+        _try(content["network"])
     for table in {"loss", "later_loss"} & content.keys():
         content[table] = checked_weights(content[table])
-    changes = {name: value for name, value in schedule.items() if value is not None}
-    if "steps" in changes:  # instead of the recipe's, in whatever unit it counts
-        changes["epochs"] = 0
-    content["schedule"] = content.get("schedule", {}) | changes
     kinds: dict[str, Any] = {name: type(f.default) for name, f in fields.items() if is_dataclass(f.default)}
     tables = {name: fill(kinds[name], name, table) for name, table in content.items() if name in kinds}
     recipe = Recipe(**(content | tables))
-    captures = tuple(str(Path(path).parent / capture) for capture in recipe.sheet.captures)
+    captures = tuple(str(Path(path or "").parent / capture) for capture in recipe.sheet.captures)
     return dataclasses.replace(recipe, sheet=Sheet(captures))
 
 
-def fill(kind: type[T], name: str, table: dict[str, Any]) -> T:
-    """Make a dataclass of a table of TOML.
-
-    Args:
-        kind: of which every field has a default, whose type the table's value must have.
-        name: of the table, for messages.
-        table: values by the fields' names.
-
-    Raises:
-        UnknownNameError: a key that the dataclass has not.
-        ParameterError: a value of another kind than its default, or outside its range.
-    """
-    known = {f.name: f.default for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    for key, value in table.items():
-        if key not in known:
-            raise UnknownNameError(f"key of [{name}]", key, known)
-        if not _alike(_listless(value), known[key]):
-            example = json.dumps(known[key])
-            raise ParameterError(f"`{key}` of [{name}] ({value!r}) must be of the same kind as its default, {example}.")
-    return kind(**{key: _as_float(_listless(value), known[key]) for key, value in table.items()})
-
-
-def _listless(value: Any) -> Any:  # noqa: ANN401
-    return tuple(value) if isinstance(value, list) else value
-
-
-def _alike(value: object, example: object) -> bool:
-    if isinstance(value, tuple) and isinstance(example, tuple):
-        # Where the default is empty, any number of texts.
-        return all(map(_alike, value, example or ("",) * len(value))) and len(value) == len(example or value)
-    return type(value) is type(example) or (type(value) is int and type(example) is float)
-
-
-def _as_float(value: Any, example: object) -> Any:  # noqa: ANN401
-    """TOML's 12 where 12.0 is meant."""
-    if isinstance(value, tuple) and isinstance(example, tuple):
-        return tuple(map(_as_float, value, example or value))
-    return float(value) if isinstance(example, float) else value
+def _by_table(changes: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Changes of a recipe as its tables: those that are in none are of [schedule]."""
+    tables: dict[str, dict[str, Any]] = {name: value for name, value in changes.items() if isinstance(value, dict)}
+    loose = {name: value for name, value in changes.items() if name not in tables and value is not None}
+    schedule = tables.get("schedule", {}) | loose
+    if "steps" in schedule:  # instead of the recipe's, in whatever unit it counts
+        schedule["epochs"] = 0
+    return tables | {"schedule": schedule}
 
 
 def _try(network: dict[str, Any]) -> None:

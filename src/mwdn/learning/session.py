@@ -8,11 +8,12 @@ from pathlib import Path
 from mwdn.calibration import Calibration
 from mwdn.data.cameras import CameraPairs
 from mwdn.data.captures import find_captures, read_captures
+from mwdn.data.mismatch import EXACT
 from mwdn.data.noisy import NoisyScenes
 from mwdn.data.pair_writer import Attribute, check_path
 from mwdn.data.photographs import Photographs
 from mwdn.data.recorded import HELD_OUT, record, recorded_pairs
-from mwdn.data.simulated import EXACT, Samples, SimulatedPairs
+from mwdn.data.simulated import Samples, SimulatedPairs
 from mwdn.data.unpaired import UnpairedCaptures
 from mwdn.errors import ParameterError
 from mwdn.learning import distributed

@@ -32,3 +32,26 @@ def warp(psf: Psf, matrix: Tensor, shift: tuple[float, float] = (0.0, 0.0)) -> T
 def hazed(psf: Tensor, part: Tensor | float) -> Tensor:
     """Spread a part of the light of PSFs (..., h, w) evenly over them; ``part`` is a number or broadcasts."""
     return psf + part * (psf.mean((-2, -1), keepdim=True) - psf)
+
+
+def affine(turn: Tensor, scale_y: Tensor, scale_x: Tensor, shift: Tensor, aspect: float) -> Tensor:
+    """(B, 2, 3) matrices for ``affine_grid`` that scale, then turn (clockwise), then shift a picture's content.
+
+    Args:
+        turn: (B,), radian.
+        scale_y: (B,), height of the content over that of the frame.
+        scale_x: (B,), width of the content over that of the frame.
+        shift: (B, 2), down and right, over half the frame.
+        aspect: width over height of the frame, so that a turned square stays a square.
+    """
+    c, s = turn.cos(), turn.sin()
+    # affine_grid asks where each output pixel comes from: the inverse map, undone from the outside in.
+    inverse = torch.stack(
+        [
+            torch.stack([c / scale_x, s / aspect / scale_x], -1),
+            torch.stack([-s * aspect / scale_y, c / scale_y], -1),
+        ],
+        dim=1,
+    )
+    origin = -(inverse @ shift.flip(-1)[..., None])
+    return torch.cat([inverse, origin], dim=-1)

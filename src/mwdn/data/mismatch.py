@@ -1,0 +1,136 @@
+"""How a camera differs from its calibration: a PSF that is turned, scaled, shifted, blurred, hazed; shaded light."""
+
+import math
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from mwdn.errors import ParameterError
+from mwdn.fourier import Size
+from mwdn.optics.warp import affine, hazed
+from mwdn.types import Psf
+
+
+def uniform(generators: list[torch.Generator], low: float, high: float, count: int = 1) -> Tensor:
+    """(B, count) numbers, each row from its own generator."""
+    return torch.stack([torch.rand(count, generator=g) for g in generators]) * (high - low) + low
+
+
+@dataclass(frozen=True)
+class Mismatch:
+    """How the camera differs from its calibration. Each number is the largest size of a draw.
+
+    Args:
+        shift_px: displacement of the PSF.
+        turn_degrees: rotation of the PSF.
+        scale: relative magnification of the PSF.
+        blur_px: standard deviation of a Gaussian blur of the PSF.
+        sharpen: how much finer than its calibration the PSF is: weight of what a blur by one pixel takes from it.
+        background: even light under the PSF, as a part of its sum.
+        colour_shift_px: displacement of red and blue against green.
+        vignetting: relative loss of light in the corners of the measurement.
+        tilt: relative gain or loss of light at one side of the measurement against its centre, in any direction.
+        grain: relative error of the single pixels of the calibrated PSF, as its own noise leaves it.
+        full: draw the largest sizes always, with a random sign where there is one.
+        exact: part of the samples whose camera is what its calibration says.
+    """
+
+    shift_px: float = 0.5
+    turn_degrees: float = 0.5
+    scale: float = 0.01
+    blur_px: float = 0.7
+    background: float = 0.1
+    colour_shift_px: float = 0.3
+    vignetting: float = 0.1
+    tilt: float = 0.0
+    grain: float = 0.0
+    sharpen: float = 0.0
+    full: bool = False
+    exact: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.exact <= 1:
+            raise ParameterError(f"`exact` ({self.exact}) must be in [0, 1]: it is a part of the samples.")
+        for part in fields(self):
+            if not getattr(self, part.name) >= 0:
+                raise ParameterError(f"`{part.name}` ({getattr(self, part.name)}) must not be negative: it is a size.")
+        for name in ("scale", "background", "vignetting", "tilt"):
+            if not getattr(self, name) < 1:
+                raise ParameterError(f"`{name}` ({getattr(self, name)}) must be below 1.")
+
+    def size(self, generators: list[torch.Generator], largest: float) -> Tensor:
+        """(B, 1) draws from [0, largest]."""
+        drawn = uniform(generators, 0.0, 1.0)
+        return largest * (torch.ones_like(drawn) if self.full else drawn)
+
+    def signed(self, generators: list[torch.Generator], largest: float, count: int = 1) -> Tensor:
+        """(B, count) draws from [-largest, largest]."""
+        drawn = uniform(generators, -1.0, 1.0, count)
+        return largest * (torch.where(drawn < 0, -1.0, 1.0) if self.full else drawn)
+
+
+EXACT = Mismatch(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+"""A camera that is what its calibration says."""
+
+
+def shading(mismatch: Mismatch, generators: list[torch.Generator], size: Size) -> Tensor:
+    """(B, 1, H, W) factors of the light of each pixel: vignetting, and a tilt towards a side of its own."""
+    loss = mismatch.size(generators, mismatch.vignetting)[..., None, None]
+    y, x = torch.linspace(-1, 1, size[0])[:, None], torch.linspace(-1, 1, size[1])
+    factors = 1 - loss * (y.square() + x.square()) / 2
+    if mismatch.tilt:
+        tilt = mismatch.size(generators, mismatch.tilt)[..., None, None]
+        angle = uniform(generators, 0.0, 2 * math.pi)[..., None, None]
+        factors = factors * (1 + tilt * (y * angle.sin() + x * angle.cos()))
+    return factors
+
+
+def perturb(psf: Psf, mismatch: Mismatch, generators: list[torch.Generator]) -> Psf:
+    """Turn, scale, shift, blur and haze each PSF of a batch, each by its own draw; sums stay 1.
+
+    Args:
+        psf: (B, C, H, W) of unit sum.
+        mismatch: largest sizes.
+        generators: one a sample.
+    """
+    if mismatch == EXACT:
+        return psf
+    batch, channels, height, width = psf.shape
+    colours = torch.tensor([-1.0, 0.0, 1.0]) if channels == 3 else torch.zeros(channels)
+    base = mismatch.signed(generators, mismatch.shift_px, 2)
+    spread = mismatch.signed(generators, mismatch.colour_shift_px, 2)
+    shift = base[:, None] + colours[:, None] * spread[:, None]
+    # The PSF's centre is pixel n // 2, half a pixel from the middle of an even frame: turn about it.
+    turn = torch.deg2rad(mismatch.signed(generators, mismatch.turn_degrees)[:, 0]).repeat_interleave(channels)
+    scale = (1 + mismatch.signed(generators, mismatch.scale)[:, 0]).repeat_interleave(channels)
+    half = torch.tensor([height, width]) / 2
+    centre = (torch.tensor([height // 2 + 0.5, width // 2 + 0.5]) - half) / half
+    theta = affine(turn, scale, scale, shift.flatten(0, 1) / half, width / height)
+    centre_xy = centre.flip(0)[:, None]
+    theta[..., 2:] += centre_xy - theta[..., :2] @ centre_xy
+    planes = psf.reshape(batch * channels, 1, height, width)
+    grid = F.affine_grid(theta.to(psf), list(planes.shape), align_corners=False)
+    moved = F.grid_sample(planes, grid, mode="bilinear", align_corners=False)
+    if mismatch.sharpen:
+        amount = mismatch.size(generators, mismatch.sharpen)[:, 0].repeat_interleave(channels)[:, None, None, None]
+        fine = moved - _blur(moved, torch.ones(len(moved), device=moved.device))
+        moved = (moved + amount.to(moved) * fine).clamp(min=0)
+    sigma = mismatch.size(generators, mismatch.blur_px)[:, 0].repeat_interleave(channels)
+    blurred = _blur(moved, sigma.to(psf)).reshape(psf.shape)
+    if mismatch.grain:
+        noise = torch.stack([torch.randn(blurred.shape[1:], generator=g) for g in generators]).to(blurred)
+        blurred = blurred * (1 + mismatch.grain * noise).clamp(min=0)
+    blurred = blurred / blurred.sum((-2, -1), keepdim=True).clamp(min=1e-12)
+    return hazed(blurred, mismatch.size(generators, mismatch.background)[..., None, None].to(psf))
+
+
+def _blur(planes: Tensor, sigma: Tensor) -> Tensor:
+    """Gaussian blur of (N, 1, H, W), each plane by its own sigma (N,) in pixels, over 7 pixels."""
+    distance = torch.arange(-3, 4, device=planes.device)
+    weights = torch.exp(-0.5 * (distance / sigma.clamp(min=1e-3)[:, None]).square())
+    weights = weights / weights.sum(1, keepdim=True)
+    stacked = planes.movedim(0, 1)
+    stacked = F.conv2d(stacked, weights[:, None, :, None], padding=(3, 0), groups=len(planes))
+    return F.conv2d(stacked, weights[:, None, None, :], padding=(0, 3), groups=len(planes)).movedim(0, 1)
