@@ -25,6 +25,7 @@ from mwdn.data.photographs import Photographs
 from mwdn.data.simulated import SimulatedPairs
 from mwdn.errors import CheckpointError, DivergenceError, ParameterError, ShapeError
 from mwdn.learning.checkpoint import load_network, read_metadata
+from mwdn.learning.folder import RunFolder
 from mwdn.learning.recipe import Plateau, Recipe, Schedule, Sheet
 from mwdn.learning.schedule import learning_rate
 from mwdn.learning.session import prepare, simulate
@@ -274,6 +275,32 @@ def test_killed_runs_end_as_one_that_was_not(photos, calibration, tmp_path):
         assert same(tmp_path / "whole" / f"{name}.safetensors", tmp_path / "killed" / f"{name}.safetensors")
     assert [line["step"] for line in log(tmp_path / "killed")] == list(range(1, 61))
     assert log(tmp_path / "killed") == log(tmp_path / "whole")
+
+
+def test_two_runs_do_not_share_a_folder(photos, calibration, tmp_path):
+    """A process of its own is at work; here, a second one may neither begin nor touch what the first writes."""
+    (tmp_path / "r.toml").write_text(TOML, encoding="utf-8")
+    np.save(tmp_path / "psf.npy", calibration.psf[0].movedim(0, -1).numpy() / calibration.psf.max().item())
+    line = [sys.executable, "-m", "mwdn", "train", "r.toml", "--psf", "psf.npy", "--photos", str(photos), "--steps"]
+    folder, options = tmp_path / "run", {"cwd": tmp_path, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+    first = subprocess.Popen([*line, "1000000", "--device", "cpu", "--out", "run"], **options)
+    try:
+        while not (folder / "state.safetensors").exists():
+            with pytest.raises(subprocess.TimeoutExpired):
+                first.wait(0.05)
+        written = (folder / "log.jsonl").read_text(encoding="utf-8")
+        second = subprocess.run([*line, "1000000", "--device", "cpu", "--out", "run"], **options, timeout=60)
+        assert second.returncode == 2
+        assert b"Another run is at work in `run`." in second.stderr
+        assert (folder / "log.jsonl").read_text(encoding="utf-8").startswith(written)
+        first.send_signal(signal.SIGSTOP)  # it holds the folder, whatever it does
+        with pytest.raises(ParameterError, match="Another run is at work"), RunFolder(folder, {}).alone():
+            pytest.fail("came in")
+    finally:
+        first.kill()
+        first.communicate(timeout=60)
+    with RunFolder(folder, {}).alone():  # a killed one holds nothing
+        pass
 
 
 # --- The paper's schedule ------------------------------------------------------------------------------

@@ -1,13 +1,17 @@
 """The folder of a run: whose it is, what it remembers, what it tells."""
 
 import json
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
-from mwdn.data.writing import atomic, writable
-from mwdn.errors import CheckpointError
+from mwdn.data.writing import atomic, check_folder, writable
+from mwdn.errors import CheckpointError, ParameterError
 from mwdn.learning import distributed
 from mwdn.learning.state import Header, read_state
 
@@ -74,14 +78,41 @@ class RunFolder:
                 "Choose another folder, `--out`, or remove it."
             )
 
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Keep other runs out meanwhile; where this process is killed they may come in.
+
+        Raises:
+            ParameterError: another run is here, or the folder refuses.
+        """
+        if distributed.rank() or sys.platform == "win32":
+            yield
+            return
+        import fcntl
+
+        check_folder(self.path)
+        handle = os.open(self.path, os.O_RDONLY)
+        try:
+            with suppress(OSError):  # of file systems that lock nothing
+                try:
+                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError as error:
+                    raise ParameterError(
+                        f"Another run is at work in `{self.path}`. Wait until it has ended, or choose another folder: "
+                        "`--out`."
+                    ) from error
+            yield
+        finally:
+            os.close(handle)
+
     def claim(self, step: int) -> None:
         """Write once, so that a folder that refuses is found now and not after an hour; the log ends at the step.
 
         Raises:
-            ParameterError: it refuses.
+            ParameterError: it refuses, or another run is at work in it.
         """
         log = self.path / "log.jsonl"
-        with writable(self.path):
+        with self.alone(), writable(self.path):
             with atomic(self.path / "recipe.json") as temporary:
                 temporary.write_text(json.dumps(self.identity, indent=2), encoding="utf-8")
             # One line a step; those after the saved step will be written again.

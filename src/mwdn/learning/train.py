@@ -131,9 +131,15 @@ class Trainer:
 
         Raises:
             DivergenceError: as for `advance`.
-            ParameterError: the disk is full, or refuses otherwise; the last saved state stays as it was.
+            ParameterError: another run is at work in the folder, or the disk is full, or refuses otherwise; the last
+                saved state stays as it was.
             ProcessError: another process has ended.
         """
+        with self.folder.alone():
+            self._run(callback)
+        return self.best
+
+    def _run(self, callback: Callable[[Report], None]) -> None:
         last = time.perf_counter()
         while self.step < self.schedule.steps and not self.course.finished:
             rate = self.course.rate(self.step)
@@ -151,7 +157,6 @@ class Trainer:
                 last = time.perf_counter()
             if distributed.rank() == 0:
                 callback(report)
-        return self.best
 
     def advance(self) -> tuple[float, dict[str, float]]:
         """One optimiser step; returns the loss and its parts, over the batches of all processes.
