@@ -56,6 +56,13 @@ def binned(frame, factor):
     return frame.reshape(height // factor, factor, width // factor, factor, channels).mean((1, 3))
 
 
+def demosaiced(frame, mosaic):
+    """Pixels of 2 x 2 cells of a colour filter array, whose greens are averaged."""
+    cells = [frame[row::2, column::2, 0] for row in (0, 1) for column in (0, 1)]
+    colours = [[cell for cell, letter in zip(cells, mosaic, strict=True) if letter == colour] for colour in "rgb"]
+    return np.stack([sum(each) / len(each) for each in colours], axis=-1)
+
+
 def measured(capture, dark, about):
     """What the file takes: a capture less its dark frame, cropped, binned, row 0 at the top, (1, C, H, W)."""
     frame = read(capture, about)
@@ -66,6 +73,10 @@ def measured(capture, dark, about):
         frame = frame - level
     elif "dark" in about:
         sys.exit(f"{capture} needs a dark frame, as this camera's calibration has one: name it last.")
+    if "mosaic" in about:
+        frame = demosaiced(frame, about["mosaic"])
+    if "grey" in about:
+        frame = frame.mean(2, keepdims=True)
     if "crop" in about:
         frame = cropped(frame, *map(int, about["crop"].split(" x ")))
     frame = binned(frame, int(about["binning"]))

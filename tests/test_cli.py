@@ -156,6 +156,7 @@ def test_psf_of_another_size(run, camera):
     [
         ("captures --psf none.png", "`none.png` does not exist"),
         ("captures --psf psf.png --method admn", "No method named 'admn'. Did you mean 'admm'?"),
+        ("captures --psf psf.png --method mwdn", "`mwdn` is a network, which has to be trained first: `mwdn train"),
         ("captures --psf psf.png --method no.safetensors", "No checkpoint at `no.safetensors`"),
         ("captures --psf psf.png --device gpu", "`device` (gpu) must be one that torch can use here"),
         ("captures --psf psf.png --bit-depth 40", "`bit_depth` (40) must be 1 to 16."),
@@ -216,6 +217,50 @@ def test_resume_leaves_out_what_is_there(run, camera):
     assert "a.png explains" not in out
     assert (camera / "out" / "a.png").stat().st_mtime_ns == before
     assert "3 of 3 captures reconstructed into out\n" in run(*line, "--regularisation", "1e-3")[1]
+
+
+def test_json_of_the_user_beside_a_capture(run, camera, monkeypatch):
+    monkeypatch.setattr("mwdn.cli_reconstruct.Darkroom", pytest.fail)
+    np.save("b.npy", read_frame("captures/b.png"))
+    (camera / "b.json").write_text('{"exposure": 8}')
+    code, _, err = reconstruct(run, "captures/a.png", "b.npy", out=".")
+    assert code == 2
+    assert "`b.json` is not of mwdn and would be lost. Choose another folder: `--out`." in err
+    assert (camera / "b.json").read_text() == '{"exposure": 8}'
+
+
+@pytest.mark.parametrize("out", ["raw", "raw/../raw"])
+def test_folder_of_the_captures_is_none_for_the_pictures(run, camera, out):
+    """A second run would take them for captures."""
+    (camera / "raw").mkdir()
+    np.save("raw/a.npy", read_frame("captures/a.png"))
+    code, _, err = reconstruct(run, "raw", out=out)
+    assert code == 2
+    assert f"`{out}` holds the captures: the pictures would be taken for captures the next time" in err
+    assert names(camera / "raw") == ["a.npy"]
+    for _ in range(2):  # a file of it may have its picture beside it
+        assert reconstruct(run, "raw/a.npy", out=out)[0] == 0
+
+
+def test_folder_that_cannot_be_written_to_is_found_first(run, camera, monkeypatch):
+    monkeypatch.setattr("mwdn.cli_reconstruct.Reconstructor", pytest.fail)
+    code, _, err = reconstruct(run, "captures", out="psf.png/out")
+    assert (code, len(err.splitlines())) == (2, 1)
+    assert "`psf.png/out` must be a folder that can be written to: Not a directory." in err
+
+
+def test_line_about_the_psf_is_not_broken(run, camera):
+    _, out, _ = reconstruct(run, "captures/a.png")
+    assert re.search(r"^PSF \w+, background .* of the full scale subtracted$", out, re.MULTILINE)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (5, 5), (32, 14)])
+def test_psf_too_small_to_judge_by(run, camera, size):
+    store("tiny.png", torch.linspace(0.1, 0.9, 3 * size[0] * size[1]).view(1, 3, *size))
+    code, _, err = run("reconstruct", "tiny.png", "--psf", "tiny.png", "--background", "0")
+    assert code == 2
+    assert f"The PSF ({size[0]} x {size[1]}) must have at least 15 pixels along each side" in err
+    assert "`--crop`, `--bin`, `--psf-bin`" in err
 
 
 def test_without_trust(run, camera):

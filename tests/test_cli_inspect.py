@@ -43,6 +43,33 @@ def test_page_json_and_words(run, tmp_path):
         assert " ".join(finding["text"].split()) in words
 
 
+def test_each_finding_is_one_line_where_there_is_no_terminal(run):
+    shown = run("my psf.png", "--json")[1]
+    content = json.loads(shown)
+    lines = run("my psf.png")[1].splitlines()
+    assert lines[:-1] == [content["headline"], *(f"{each['weight']:4} {each['text']}" for each in content["verdict"])]
+    assert max(map(len, lines)) > 80
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_no_input_is_overwritten(run, tmp_path, monkeypatch, dark):
+    monkeypatch.setattr(CameraOptions, "load", pytest.fail)
+    options = ("--dark", "my psf.png") if dark else ()
+    psf = tmp_path / "there" / "my psf.tif" if dark else "my psf.png"
+    before = (tmp_path / "my psf.png").read_bytes()
+    code, _, problem = run(psf, "-o", tmp_path, *options)
+    assert code == 2
+    assert "my psf.png` would overwrite an input" in problem
+    assert (tmp_path / "my psf.png").read_bytes() == before
+
+
+def test_folder_that_cannot_be_written_to_is_found_first(run, tmp_path, monkeypatch):
+    monkeypatch.setattr("mwdn.cli_inspect.inspect_psf", pytest.fail)
+    (tmp_path / "file").write_text("no folder")
+    code, _, problem = run("my psf.png", "-o", "file")
+    assert (code, problem.count("`file` must be a folder that can be written to")) == (2, 1)
+
+
 def test_json_alone_with_the_options_of_the_camera(run):
     code, shown, _ = run("my psf.png", "--json", "--crop", "32", "36", "--bin", "2")
     assert code == 0

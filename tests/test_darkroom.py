@@ -122,6 +122,18 @@ def test_link_to_an_input_that_is_in_the_output_folder(tmp_path):
         check_outputs([tmp_path / "in" / "a.png"], tmp_path / "out", "png")
 
 
+@pytest.mark.parametrize("content", ['{"label": "cat"}', "[1]", "", "mine"])
+def test_json_of_somebody_else_is_not_replaced(tmp_path, content):
+    a, b = touch(tmp_path / "in", "a.png", "b.png")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "b.json").write_text(content)
+    check_outputs([a], tmp_path / "out", "png")
+    with pytest.raises(ParameterError, match=r"out/b\.json` is not of mwdn and would be lost\. Choose another folder"):
+        check_outputs([a, b], tmp_path / "out", "png")
+    (tmp_path / "out" / "b.json").write_text('{"origin": "0123456789abcdef"}')
+    check_outputs([a, b], tmp_path / "out", "png")
+
+
 # --- What is written ----------------------------------------------------------------------------------
 
 

@@ -66,6 +66,32 @@ def test_every_mask_becomes_a_camera(run, tmp_path, line):
     assert read_frame("cam/preview.png").shape[0] == 26 + 246
 
 
+@pytest.mark.parametrize("about", [None, "{}", "[]", "no JSON", '{"made": 1}'])
+@pytest.mark.parametrize("taken", ["psf.tif", "mask.tif", "preview.png", "mask.stl"])
+def test_only_another_design_is_replaced(run, tmp_path, monkeypatch, taken, about):
+    monkeypatch.setattr("mwdn.design.design_camera", pytest.fail)
+    (tmp_path / "cam").mkdir()
+    (tmp_path / "cam" / taken).write_text("measured")
+    if about is not None:
+        (tmp_path / "cam" / "camera.json").write_text(about)
+    code, _, err = run("diffuser", "--size-mm", "0.5", "0.5", *SMALL, "--stl")
+    assert code == 2
+    assert f"`cam/{taken}` would be replaced, and no camera.json says that it is a design's" in err
+    assert (tmp_path / "cam" / taken).read_text() == "measured"
+
+
+def test_another_design_is_replaced(run, tmp_path):
+    line = ("pinholes", "--size-mm", "0.4", "0.4", *SMALL, "--count")
+    hashes = []
+    (tmp_path / "cam").mkdir()
+    (tmp_path / "cam" / "mask.stl").write_text("not asked for")
+    for count in (3, 4):
+        assert run(*line, count)[0] == 0
+        hashes.append(json.loads((tmp_path / "cam/camera.json").read_text())["made"]["psf_hash"])
+    assert len(set(hashes)) == 2
+    assert (tmp_path / "cam" / "mask.stl").read_text() == "not asked for"
+
+
 def test_fabrication_files(run, tmp_path):
     pytest.importorskip("gdstk")
     assert run("contour", "--size-mm", "0.4", "0.4", *SMALL, "--gds", "--stl", "--stl-every", "2")[0] == 0

@@ -210,6 +210,20 @@ def test_the_example_gives_the_picture_of_mwdn_reconstruct(capture, options, raw
     assert np.abs(read_frame("scene.png") - expected).max() <= 1
 
 
+@pytest.mark.parametrize("option", ["--mosaic=gbrg", "--grey"])
+def test_the_example_knows_how_colours_are_stored(option, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    numbers, shape = np.random.default_rng(4), (84, 102, 3 if option == "--grey" else 1)
+    save_png(tmp_path / "psf.png", (numbers.random(shape) ** 40 * 60000).astype(np.uint16))
+    save_png(tmp_path / "capture.png", numbers.integers(2000, 60000, shape, np.uint16))
+    options = ["--psf", "psf.png", "--background", "0", "--regularisation", "1e-3", option]
+    command("export", "wiener", "--out", "camera.onnx", *options)
+    command("reconstruct", "capture.png", "--method", "wiener", "--no-trust", *options)
+    example(monkeypatch, "camera.onnx", "capture.png", "scene.png")
+    expected = read_frame("results/reconstruct/capture.png").astype(int)
+    assert np.abs(read_frame("scene.png") - expected).max() <= 1
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

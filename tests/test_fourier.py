@@ -501,6 +501,25 @@ def test_filtered_and_its_gradients_are_those_of_its_definition(
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5 * one.abs().max().item())
 
 
+@pytest.mark.parametrize(("psf_batch", "psf_channels"), [(1, 1), (1, 4), (3, 1), (3, 4)])
+def test_several_samples_at_once_as_on_a_gpu(psf_batch, psf_channels, generator, monkeypatch):
+    """A GPU takes as many samples together as its gigabyte holds, a CPU one."""
+    grid = deconvolution.deconvolution_grid((21, 25), "taper")
+    image = torch.rand(3, 4, 21, 25, generator=generator)
+    psf = torch.rand(psf_batch, psf_channels, 21, 25, generator=generator)
+    slope = torch.randn(image.shape, generator=generator)
+    found = []
+    for parts in (None, [(slice(0, 2), slice(0, 4)), (slice(2, 4), slice(0, 4))]):
+        if parts:
+            monkeypatch.setattr(deconvolution, "together", lambda *_, parts=parts: parts)
+        x, h = image.clone().requires_grad_(), psf.clone().requires_grad_()
+        y = deconvolution.filtered(x, deconvolution.wiener_transfer(h, 0.1, grid), grid, "taper")
+        y.backward(slope)
+        found.append((y, x.grad, h.grad))
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5 * one.abs().max().item())
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_filtered_keeps_precision_and_memory_format(dtype, generator):
     grid = deconvolution.deconvolution_grid((30, 33), "taper")

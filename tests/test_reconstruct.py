@@ -85,6 +85,20 @@ def test_unknown_method():
         find_method("no.safetensors")
 
 
+@pytest.mark.parametrize("name", NETWORKS)
+def test_network_without_weights(name, tmp_path, monkeypatch):
+    if name in SOLVERS:
+        assert isinstance(find_method(name), SOLVERS[name])
+        return
+    with pytest.raises(ParameterError, match=rf"`{name}` is a network, which has to be trained first: `mwdn train "):
+        find_method(name)
+    save_network(tmp_path / "w.safetensors", build("wiener"), "wiener", {})
+    (tmp_path / "w.safetensors").rename(tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(CheckpointError):  # a file of that name, whatever it holds, goes before
+        find_method(name)
+
+
 @pytest.mark.parametrize("device", ["gpu", "cpux", "cuda:99", "meta", "vulkan"])
 def test_unusable_device(device, psf):
     with pytest.raises(ParameterError, match=rf"`device` \({device}\) must be one that torch can use here") as caught:

@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from mwdn.calibration import Calibration
+from mwdn.calibration.frames import Mosaic
 from mwdn.errors import MwdnError
 
 console = Console()
@@ -39,6 +40,11 @@ class CameraOptions:
     bgr: bool = False
     """The files' channels are blue, green, red (DiffuserCam's .npy)."""
 
+    mosaic: Mosaic | None = None
+    """The files are raw frames of a colour filter array of this order: each 2 x 2 cells become a pixel."""
+    grey: bool = False
+    """Average the colours of PSF and captures."""
+
     def load(self) -> Calibration:
         """Read the calibration."""
         return Calibration.from_file(
@@ -51,6 +57,8 @@ class CameraOptions:
             psf_binning=self.psf_bin,
             upside_down=self.upside_down,
             bgr=self.bgr,
+            mosaic=self.mosaic,
+            grey=self.grey,
         )
 
 

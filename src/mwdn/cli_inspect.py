@@ -8,10 +8,11 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.markup import escape
 
-from mwdn.calibration.report import inspect_psf, write_json
+from mwdn.calibration.report import inspect_psf
 from mwdn.calibration.verdict import headline, verdict
 from mwdn.cli_camera import CameraOptions, console
 from mwdn.data.images import read_frame
+from mwdn.data.writing import check_folder, spare, write_json
 
 _STYLES = {"bad": "bold red", "mind": "yellow", "good": "green"}
 
@@ -32,7 +33,12 @@ def inspect(
     # matplotlib, a second to load, is needed by no other command.
     from mwdn.calibration.report_page import write_page
 
+    page = out / f"{camera.psf.stem}.png"
+    beside = page.with_suffix(".json")
+    for output in (page, beside):
+        spare(output, camera.psf, camera.dark)
     calibration = _own_resolution(camera).load()
+    check_folder(out)
     report = inspect_psf(calibration, read_frame(camera.psf, bgr=camera.bgr))
     found = verdict(report)
     content = {
@@ -41,15 +47,14 @@ def inspect(
         "verdict": [finding._asdict() for finding in found],
         **report.content(),
     }
-    page = out / f"{camera.psf.stem}.png"
     write_page(page, report, calibration.psf, camera.psf.name)
-    write_json(page.with_suffix(".json"), content)
+    write_json(beside, content)
     if json:
         console.print(format_json.dumps(content, indent=2), highlight=False, markup=False, soft_wrap=True)
         return
-    console.print(f"[bold]{escape(headline(report))}[/]", highlight=False)
+    console.print(f"[bold]{escape(headline(report))}[/]", highlight=False, soft_wrap=True)
     for weight, text in found:
-        console.print(f"[{_STYLES[weight]}]{weight:4}[/] {escape(text)}", highlight=False)
+        console.print(f"[{_STYLES[weight]}]{weight:4}[/] {escape(text)}", highlight=False, soft_wrap=True)
     console.print(f"Look at {page}", highlight=False, markup=False, soft_wrap=True)
 
 

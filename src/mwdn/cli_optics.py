@@ -52,8 +52,9 @@ class Output:
 
     def write(self, name: str, mask: MaskDesign, setup: Setup) -> None:
         """Design, write, and say what came out."""
-        from mwdn.design import design_camera, write_fabrication
+        from mwdn.design import check_replaced, design_camera, write_fabrication
 
+        check_replaced(self.out, gds=self.gds, stl=self.stl)
         designed = design_camera(name, mask, setup)
         designed.write(self.out, sensitive=self.sensitivity)
         write_fabrication(designed, self.out, gds=self.gds, stl=self.stl, stl_every=self.stl_every)

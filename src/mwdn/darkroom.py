@@ -15,10 +15,10 @@ import torch
 from torch import Tensor, nn
 
 from mwdn import __version__
-from mwdn.calibration.report import write_json
 from mwdn.data.captures import read_capture
 from mwdn.data.images import read_frame, read_picture, write_linear, write_picture
 from mwdn.data.sheets import contact_sheet, for_people, thumbnail
+from mwdn.data.writing import naming, write_json
 from mwdn.errors import ImageError, MwdnError, ParameterError
 from mwdn.evaluation.consistency import Consistency, consistency
 from mwdn.learning import distributed
@@ -47,7 +47,8 @@ def check_outputs(
     """Check that every capture has a place of its own in ``out``.
 
     Raises:
-        ParameterError: two captures would go to one file, one would overwrite an input, or ``out`` is a file.
+        ParameterError: two captures would go to one file, one would overwrite an input or a ``.json`` of somebody
+            else, or ``out`` is a file.
     """
     if out.exists() and not out.is_dir():
         raise ParameterError(f"`{out}` must be a folder, but is a file. Choose another one: `--out`.")
@@ -58,13 +59,17 @@ def check_outputs(
         if real(output) in inputs:
             raise ParameterError(f"`{output}` would overwrite an input. Choose another folder: `--out`.")
 
+    there = {path.name for path in out.glob("*.json")}
     check(str(out / SUMMARY))
     seen = {SUMMARY: "the summary picture"}
     start = str(out / "x").removesuffix("x")
     for capture in captures:
         name = output_name(capture, form)
+        beside = name.removesuffix(_SUFFIX[form]) + ".json"
         check(start + name)
-        check(start + name.removesuffix(_SUFFIX[form]) + ".json")
+        check(start + beside)
+        if beside in there and not _read_beside(out / beside):
+            raise ParameterError(f"`{start}{beside}` is not of mwdn and would be lost. Choose another folder: `--out`.")
         if name in seen:
             raise ParameterError(
                 f"`{capture}` and {seen[name]} would both be written to `{start}{name}`. Reconstruct them into "
@@ -196,7 +201,8 @@ class Darkroom:
         }
         if trust:
             content |= {**asdict(trust), "doubtful": trust.doubtful}
-        _remove(beside)  # or it would vouch for another picture than it was written for
+        with naming(beside):
+            beside.unlink(missing_ok=True)  # or it would vouch for another picture than it was written for
         if self.form in ("tiff", "npy"):
             write_linear(job.output, job.scene)
         else:
@@ -241,13 +247,9 @@ class Darkroom:
         return _digest(__version__, self.form, camera, *how)
 
     def _is_there(self, job: Job) -> bool:
-        try:
-            content = json.loads(job.output.with_suffix(".json").read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            return False
-        if not isinstance(content, dict) or (self.judge and "doubtful" not in content):
-            return False
-        return content.get("origin") == job.origin != "" and job.output.is_file()
+        content = _read_beside(job.output.with_suffix(".json"))
+        judged = "doubtful" in content or not self.judge
+        return judged and content.get("origin") == job.origin != "" and job.output.is_file()
 
     def summarise(self, captures: Iterable[str | Path]) -> None:
         """Show the first captures beside their pictures, as they are on the disk; nothing if there is none.
@@ -269,11 +271,13 @@ class Darkroom:
             write_picture(self.out / SUMMARY, contact_sheet(rows, titles))
 
 
-def _remove(path: Path) -> None:
+def _read_beside(path: Path) -> dict[str, object]:
+    """What a ``.json`` says of the picture that it lies beside; nothing if it is not there, or of somebody else."""
     try:
-        path.unlink(missing_ok=True)
-    except OSError as error:
-        raise ImageError(f"`{path}` cannot be replaced: {error.strerror}. Choose another folder.") from error
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) and "origin" in content else {}
 
 
 def _read_back(path: Path) -> Tensor:

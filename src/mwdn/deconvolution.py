@@ -128,7 +128,7 @@ class _Filter(torch.autograd.Function):
             if transfer_slope is not None:
                 of_part = _of(transfer_slope, part)
                 product = plane_spectrum(continued(planes[part]), grid).conj().resolve_conj().mul_(G)
-                of_part.add_(product if of_part.shape[1] > 1 else product.sum(1, keepdim=True))
+                of_part.add_(product.sum_to_size(of_part.shape))
             if image_slope is not None:
                 G.mul_(_of(transfer, part).conj())
                 image_slope[part] = continued.adjoint(inverse_spectrum(G, grid, grid))

@@ -10,7 +10,7 @@ from rich.table import Table
 from mwdn.calibration import Calibration
 from mwdn.data.images import write_picture
 from mwdn.data.sheets import contact_sheet, for_people
-from mwdn.data.writing import atomic
+from mwdn.data.writing import save_text
 from mwdn.design import design_camera
 from mwdn.evaluation import psnr
 from mwdn.evaluation.tables import html_table
@@ -51,8 +51,7 @@ def run(out: Path, seed: int, console: Console) -> None:
         rows.append([scene, measurement, *results])
     write_picture(out / "psf.png", for_people(camera.psf))
     write_picture(out / "comparison.png", contact_sheet(rows, ["scene", "measurement", *METHODS]))
-    with atomic(out / "index.html") as temporary:
-        temporary.write_text(_PAGE.format(table=html_table(table)), encoding="utf-8")
+    save_text(out / "index.html", _PAGE.format(table=html_table(table)))
     console.print(table)
     console.print(f"Look at {out / 'index.html'}", highlight=False, markup=False, soft_wrap=True)
 

@@ -1,6 +1,7 @@
 """A designed camera in files: mask, PSF, numbers and a picture."""
 
 import dataclasses
+import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +12,9 @@ from torch import Tensor
 
 from mwdn.calibration import Calibration
 from mwdn.calibration.measures import likeness, ring_means
-from mwdn.calibration.report import write_json
 from mwdn.data.images import write_linear, write_picture
 from mwdn.data.sheets import contact_sheet, thumbnail
+from mwdn.data.writing import write_json
 from mwdn.errors import ParameterError
 from mwdn.fourier import correlate, frequencies, spectrum
 from mwdn.optics.mask_files import write_gds, write_mask, write_stl
@@ -128,6 +129,31 @@ def design_camera(name: str, design: MaskDesign, setup: Setup) -> Designed:
     """
     mask = design.build(setup)
     return Designed(name, design, setup, mask, mask_psf(mask, setup))
+
+
+def check_replaced(out: Path, *, gds: bool = False, stl: bool = False) -> None:
+    """Check that a design written into a folder would replace nothing but another design, no measured PSF above all.
+
+    Args:
+        out: the folder.
+        gds: mask.gds is written, too.
+        stl: mask.stl is written, too.
+
+    Raises:
+        ParameterError: it would.
+    """
+    try:
+        if json.loads((out / "camera.json").read_bytes())["made"]["psf_hash"]:
+            return
+    except (OSError, ValueError, LookupError, TypeError):  # none of ours
+        pass
+    names = ["mask.tif", "psf.tif", "preview.png", *["mask.gds"] * gds, *["mask.stl"] * stl, "camera.json"]
+    for path in (out / name for name in names):
+        if path.exists():
+            raise ParameterError(
+                f"`{path}` would be replaced, and no camera.json says that it is a design's. Choose another folder: "
+                "`--out`."
+            )
 
 
 def write_fabrication(designed: Designed, out: Path, *, gds: bool, stl: bool, stl_every: int = 1) -> None:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mwdn.errors import ParameterError
-from mwdn.learning.precision import has_bfloat16
+from mwdn.learning.precision import has_bfloat16, without_tf32
 from mwdn.networks.blocks import Decoder, Encoder
 from mwdn.solvers.alignment import Pose
 from mwdn.tiles import StripDecoder, StripEncoder
@@ -68,7 +68,7 @@ class Engine:
         if measurement.device.type != "cuda":
             return self._reconstruct(measurement)
         # Streams are those of the current device; what stays float32 would else have the 10 bits of TF32.
-        with torch.cuda.device(measurement.device), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
+        with torch.cuda.device(measurement.device), without_tf32():
             return self._recorded(measurement)
 
     def _recorded(self, measurement: Tensor) -> Tensor:
@@ -246,13 +246,15 @@ class _Recording:
         with torch.cuda.stream(stream):
             for _ in range(3):  # libraries choose their algorithms and plan their transforms
                 calculate(self.measurement)
-        torch.cuda.current_stream().wait_stream(stream)
+        current = torch.cuda.current_stream()
+        current.wait_stream(stream)
         graph = torch.cuda.CUDAGraph()
         try:
-            # Other threads may read or judge other captures meanwhile.
-            with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+            # torch's own stream for this is of whichever GPU recorded first. Other threads may read or judge meanwhile.
+            with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
                 self.result = calculate(self.measurement)
         except RuntimeError:  # something that cannot be recorded: calculate each time
+            torch.cuda.set_stream(current)  # a recording that fails leaves its own
             return
         self.graph = graph
 

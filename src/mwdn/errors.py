@@ -17,7 +17,9 @@ A message states what must hold, what was got, and the way out.
 """
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from inspect import signature
+from typing import Any
 
 
 class MwdnError(Exception):
@@ -46,6 +48,23 @@ class UnknownNameError(ParameterError):
         nearest = difflib.get_close_matches(name, known, n=1)
         hint = f" Did you mean '{nearest[0]}'?" if nearest else ""
         super().__init__(f"No {kind} named '{name}'.{hint} Known: {', '.join(known)}.")
+
+
+def check_options(of: Callable[..., Any], what: str, options: Iterable[str]) -> None:
+    """See that a function or class takes these keyword arguments.
+
+    Args:
+        of: the function or class.
+        what: it is called, for example ``"network 'mwdn'"``.
+        options: names.
+
+    Raises:
+        UnknownNameError: it has none of a name.
+    """
+    known = signature(of).parameters
+    for option in options:
+        if option not in known:
+            raise UnknownNameError(f"option of {what}", option, known)
 
 
 class ImageError(MwdnError, ValueError):

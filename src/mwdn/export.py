@@ -268,6 +268,10 @@ def _about(name: str, calibration: Calibration, channels: int, precision: str) -
         about["rows"] = "raw frames have their first row at the bottom"
     if calibration.bgr:
         about["colours"] = "raw frames have their channels in the order blue, green, red"
+    if calibration.mosaic:
+        about["mosaic"] = calibration.mosaic
+    if calibration.grey:
+        about["grey"] = "the colours of raw frames must be averaged"
     if calibration.dark is not None:
         about["dark"] = "a frame taken without light must be subtracted from raw frames"
     return about

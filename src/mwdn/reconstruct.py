@@ -15,7 +15,7 @@ from mwdn.fourier import check_fit
 from mwdn.learning.bundled import BUNDLED, find_weights
 from mwdn.learning.checkpoint import SUFFIXES, load_network, read_metadata
 from mwdn.learning.devices import usable
-from mwdn.networks import DENOISERS
+from mwdn.networks import DENOISERS, NETWORKS
 from mwdn.networks.blocks import check_channels
 from mwdn.types import Frame, Measurement, Psf, Scene
 
@@ -33,7 +33,7 @@ def find_method(name: str | Path, regularisation: float | None = None) -> Method
     Raises:
         UnknownNameError: neither a solver nor a file.
         CheckpointError: the file holds no usable weights.
-        ParameterError: the method has no regularisation to set.
+        ParameterError: the method has no regularisation to set, or is a network without weights.
     """
     if regularisation is not None and str(name) not in ("admm", "wiener"):
         raise ParameterError(f"`regularisation` belongs to admm and wiener, not to '{name}': `--method admm`.")
@@ -48,6 +48,12 @@ def find_method(name: str | Path, regularisation: float | None = None) -> Method
                 "recipe such as recipes/universal-plug.toml."
             )
         return network
+    if str(name) in NETWORKS:
+        raise ParameterError(
+            f"`{name}` is a network, which has to be trained first: `mwdn train RECIPE.toml --psf psf.png --photos "
+            f'photos/ --out runs/{name}`, with `name = "{name}"` in [network] of the recipe. Its method is then '
+            f"`runs/{name}/best.safetensors`. `universal` needs no training."
+        )
     raise UnknownNameError("method", str(name), [*BUNDLED, *solvers.SOLVERS, "PATH/OF/CHECKPOINT.safetensors"])
 
 
@@ -85,7 +91,7 @@ class Reconstructor:
     Raises:
         UnknownNameError: no such method.
         CheckpointError: the checkpoint cannot be used.
-        ParameterError: no such device or precision, or the method has no regularisation to set.
+        ParameterError: no such device or precision, or the method has no regularisation to set or no weights.
     """
 
     def __init__(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from mwdn.calibration.frames import as_image, bin_pixels, crop_centre, estimate_background, full_scale
+from mwdn.calibration.frames import as_image, bin_pixels, crop_centre, demosaiced, estimate_background, full_scale
 from mwdn.errors import ParameterError, ShapeError
 
 
@@ -94,3 +94,21 @@ def test_background_is_the_5th_percentile_of_each_channel(generator):
     image = torch.stack([ramp[torch.randperm(400, generator=generator)], 3 + ramp]).reshape(1, 2, 20, 20)
     torch.testing.assert_close(estimate_background(image).flatten(), torch.tensor([ramp[20], 3 + ramp[20]]))
     assert estimate_background(image).shape == (1, 2, 1, 1)
+
+
+@pytest.mark.parametrize("mosaic", ["rggb", "bggr", "grbg", "gbrg"])
+def test_cells_of_a_mosaic_become_pixels(mosaic):
+    """Against a picture of known colours, sampled by the filters."""
+    colours = torch.rand(2, 3, 4, 6)
+    image = torch.zeros(2, 1, 8, 12)
+    for place, letter in enumerate(mosaic):
+        row, column = divmod(place, 2)
+        image[:, 0, row::2, column::2] = colours[:, "rgb".index(letter)] + (0.1 * row if letter == "g" else 0)
+    colours[:, 1] += 0.05  # the two greens differ by their row
+    torch.testing.assert_close(demosaiced(image, mosaic), colours)
+
+
+def test_what_is_no_mosaic():
+    for shape, said in (((1, 3, 8, 8), "3 x 8 x 8"), ((1, 1, 7, 8), "1 x 7 x 8")):
+        with pytest.raises(ShapeError, match=rf"A raw mosaic \({said}\) must have one channel and even sides"):
+            demosaiced(torch.zeros(shape), "rggb")

@@ -176,6 +176,51 @@ def test_colour_capture_of_a_grey_psf_keeps_its_colours():
 # --- Hash ---------------------------------------------------------------------------------------------
 
 
+def mosaicked(image, mosaic):
+    """What a sensor under a colour filter array stores of (1, 3, H, W): (H, W) numbers."""
+    raw = np.zeros(image.shape[-2:], np.float32)
+    for place, letter in enumerate(mosaic):
+        row, column = divmod(place, 2)
+        raw[row::2, column::2] = image[0, "rgb".index(letter), row::2, column::2]
+    return raw
+
+
+@pytest.mark.parametrize("mosaic", ["rggb", "gbrg"])
+def test_raw_mosaics_become_a_psf_and_measurements_in_colour(tmp_path, generator, mosaic):
+    """A bright point in another place of the scene casts the PSF there, whatever cells it falls on."""
+    light = contour_psf((64, 64), cell=16, generator=generator) * torch.tensor([0.9, 0.6, 0.3])[:, None, None]
+    light = torch.nn.functional.pad(light / light.max(), (8, 8, 8, 8))
+    dark = np.full((80, 80), 0.1, np.float32)
+    np.save(tmp_path / "psf.npy", mosaicked(light, mosaic) + dark)
+    np.save(tmp_path / "dark.npy", dark)
+    options = {"dark": tmp_path / "dark.npy", "background": 0.0, "mosaic": mosaic}
+    calibration = Calibration.from_file(tmp_path / "psf.npy", **options)
+    assert calibration.psf.shape == (1, 3, 40, 40)
+    measurement = calibration.correct((mosaicked(light.roll((4, -6), (-2, -1)), mosaic) + dark)[..., None])
+    expected = calibration.psf.roll((2, -3), (-2, -1))
+    torch.testing.assert_close(measurement / measurement.sum((-2, -1), keepdim=True), expected, atol=1e-7, rtol=1e-4)
+    with pytest.raises(ShapeError, match=r"--grey`; or say how .* `--mosaic rggb`"):
+        calibration.__class__(calibration.psf).correct(np.ones((40, 40, 1), np.float32))
+    with pytest.raises(ShapeError, match="must have one channel"):
+        Calibration(calibration.psf, mosaic=mosaic).correct(np.ones((80, 80, 3), np.float32))
+
+
+def test_grey_averages_psf_and_captures(tmp_path, caustic):
+    np.save(tmp_path / "psf.npy", coloured(caustic))
+    calibration = Calibration.from_file(tmp_path / "psf.npy", background=0.0, grey=True)
+    mean = coloured(caustic).mean(-1)
+    np.testing.assert_allclose(calibration.psf[0, 0], mean / mean.sum(), rtol=1e-5)
+    frame = np.random.default_rng(0).random((*SIZE, 3), np.float32)
+    for seen in (frame, frame.mean(-1, keepdims=True)):
+        np.testing.assert_allclose(calibration.correct(seen)[0, 0], frame.mean(-1), rtol=1e-5)
+
+
+def test_psf_that_was_subtracted_before_gets_no_light_added(tmp_path, caustic):
+    noise = np.random.default_rng(0).normal(0, 0.01, caustic.shape)
+    np.save(tmp_path / "psf.npy", (caustic + noise).astype(np.float32))
+    assert Calibration.from_file(tmp_path / "psf.npy").background == (0.0,)
+
+
 def test_hash_is_that_of_the_content(tmp_path, caustic):
     frame = (caustic * 65535).astype(np.uint16)[..., None]
     one = Calibration.from_file(store(tmp_path / "a.png", frame)).psf_hash
@@ -234,6 +279,16 @@ def test_empty_psf(tmp_path, background):
     frame[..., 1] = 0
     with pytest.raises(PsfError, match=r"PSF `.*psf.png` is empty: .* no light is left in a channel\. Expose longer"):
         Calibration.from_file(store(tmp_path / "psf.png", frame), background=background)
+
+
+def test_empty_psf_says_which_colour_and_why(tmp_path):
+    frame = np.zeros((8, 8, 3), np.uint8)
+    frame[2, 2] = 100, 100, 0
+    store(tmp_path / "psf.png", frame)
+    with pytest.raises(PsfError, match=r"nothing of blue\) no light .* Expose longer\.$"):
+        Calibration.from_file(tmp_path / "psf.png")
+    with pytest.raises(PsfError, match=r"Expose longer, or take the dark frame `.*psf\.png` without light\.$"):
+        Calibration.from_file(tmp_path / "psf.png", dark=tmp_path / "psf.png")
 
 
 def test_nan_in_the_file(tmp_path, caustic):

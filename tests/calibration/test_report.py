@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from mwdn.calibration import Calibration, measures
-from mwdn.calibration.report import inspect_psf, write_json
+from mwdn.calibration.report import inspect_psf
 from mwdn.calibration.verdict import headline, verdict
 from mwdn.data.images import read_frame
+from mwdn.data.writing import write_json
 from mwdn.errors import ImageError
 from mwdn.optics import sample_camera
 from mwdn.optics.families import Variety

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from mwdn.data.cameras import CameraPairs, Cameras
-from mwdn.data.mismatch import EXACT, Mismatch, perturb, uniform
+from mwdn.data.draws import uniform
+from mwdn.data.mismatch import EXACT, Mismatch, perturb
 from mwdn.data.noisy import Denoising, NoisyScenes
 from mwdn.data.photographs import Photographs
 from mwdn.data.simulated import Placement, SimulatedPairs, _resample

@@ -558,6 +558,21 @@ def test_divergence_leaves_the_state(trainer, tmp_path):
     assert trainer(few(steps=9)).step == 3
 
 
+def test_divergence_that_the_validation_meets(trainer, tmp_path):
+    """Before it writes a picture or weights."""
+    run = trainer(few(steps=1, validate_every=1, warmup=0, learning_rate=1e30, clip=0.0, bfloat16=False))
+    with pytest.raises(DivergenceError, match="The loss of the validation after step 1 is not finite"):
+        run.run()
+    assert {path.name for path in (tmp_path / "run").iterdir()} <= {"recipe.json", "log.jsonl"}
+
+
+@pytest.mark.parametrize("seed", [-(2**62), 2**63 - 1])
+def test_any_seed(trainer, seed):
+    recipe = few(steps=1, seed=seed, pool=2)
+    trainer(recipe).run()
+    trainer(replace(recipe, schedule=replace(recipe.schedule, crop=16), cameras=Cameras(("32x32",))), "many").run()
+
+
 def test_divergence_names_recorded_rows_and_the_way_out(pairs, calibration, tmp_path):
     run = prepare(few(seed=1), calibration, None, tmp_path / "run", "cpu", pairs=pairs)
     rows = [run.pairs.row(number) for number in range(2)]

@@ -10,8 +10,8 @@ from skimage.restoration import denoise_tv_chambolle
 
 import oracles
 from mwdn import fourier
-from mwdn.errors import ParameterError, ShapeError
-from mwdn.solvers import TEXTBOOK, Admm, Penalties, admm, proximal, splitting
+from mwdn.errors import ParameterError, ShapeError, UnknownNameError
+from mwdn.solvers import TEXTBOOK, Admm, Penalties, admm, build, proximal, splitting
 from mwdn.solvers.fista import Fista
 from mwdn.solvers.pyramid import Pyramid
 
@@ -443,3 +443,8 @@ def test_impossible_constants_are_refused(options):
 def test_fista_needs_an_iteration():
     with pytest.raises(ParameterError, match=r"`iterations` \(0\) must be at least 1"):
         Fista(iterations=0)
+
+
+def test_option_that_a_solver_has_not():
+    with pytest.raises(UnknownNameError, match=r"No option of the solver 'admm' named 'itterations'\. Did you mean"):
+        build("admm", itterations=3)

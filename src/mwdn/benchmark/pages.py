@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.table import Table
 
-from mwdn.data.writing import atomic
+from mwdn.data.writing import save_text, written
 from mwdn.evaluation.tables import html_table, markdown_table
 
 
@@ -70,9 +70,7 @@ def write_html(path: Path, title: str, sections: list[Section]) -> None:
         f'<h2 id="s{i}">{html.escape(section.title)}</h2>\n' + "\n".join(map(_as_html, section.blocks))
         for i, section in enumerate(sections)
     )
-    with atomic(path) as temporary:
-        page = _HTML.format(title=html.escape(title), links=links, body=body)
-        temporary.write_text(page, encoding="utf-8")
+    save_text(path, _HTML.format(title=html.escape(title), links=links, body=body))
 
 
 def write_markdown(path: Path, title: str, sections: list[Section]) -> None:
@@ -82,11 +80,10 @@ def write_markdown(path: Path, title: str, sections: list[Section]) -> None:
         parts.append(f"## {section.title}")
         for block in section.blocks:
             if isinstance(block, Picture):
-                with atomic(path.parent / "pictures" / block.name) as temporary:
+                with written(path.parent / "pictures" / block.name) as temporary:
                     temporary.write_bytes(block.content)
             parts.append(_as_markdown(block))
-    with atomic(path) as temporary:
-        temporary.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
+    save_text(path, "\n\n".join(parts) + "\n")
 
 
 def _as_html(block: Block) -> str:

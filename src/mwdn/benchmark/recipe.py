@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mwdn.benchmark.sets import PRESETS, DataSet
-from mwdn.errors import ParameterError, UnknownNameError
+from mwdn.errors import ParameterError, UnknownNameError, check_options
 from mwdn.learning.losses import checked_weights
 from mwdn.learning.recipe import Schedule
 from mwdn.learning.tables import fill, read_toml
@@ -155,9 +155,7 @@ def _methods(table: str, content: dict[str, Any], registry: Mapping[str, Any], s
             raise UnknownNameError(table.removesuffix("s"), name, registry)
         has = signature(registry[name]).parameters
         own = {key: value for key, value in options.items() if key != "name"}
-        for option in own:
-            if option not in has:
-                raise UnknownNameError(f"option of '{name}'", option, has)
+        check_options(registry[name], f"'{name}'", own)
         common = {key: value for key, value in shared.items() if key in has}
         found.append(Method(label, name, {**common, **own}, table == "networks"))
     return found

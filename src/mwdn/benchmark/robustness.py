@@ -13,7 +13,7 @@ from mwdn.benchmark.recipe import AXES, Robustness
 from mwdn.benchmark.scoring import read_kept
 from mwdn.benchmark.sets import Opened, simulated
 from mwdn.data.photographs import Photographs
-from mwdn.data.writing import atomic
+from mwdn.data.writing import save_text
 from mwdn.evaluation import measure
 from mwdn.learning.session import FILE_START
 from mwdn.optics import Sensor
@@ -84,8 +84,7 @@ def sweep(
             measurements, scenes = pairs(axis, size)
             found = torch.cat([bound(one[None]) for one in measurements])
             known.setdefault(place, {})[key] = measure(found, scenes, opened.data.part())["psnr"].tolist()
-            with atomic(path) as temporary:
-                temporary.write_text(json.dumps({"identity": asked, "psnr": known}, indent=1), encoding="utf-8")
+            save_text(path, json.dumps({"identity": asked, "psnr": known}, indent=1))
     places = {axis: {size: _place(axis, size) for size in sizes} for axis, sizes in wanted.sizes.items()}
     return {axis: {size: known[at][key] for size, (at, key) in found.items()} for axis, found in places.items()}
 

@@ -20,8 +20,7 @@ from mwdn.benchmark.sets import Opened, open_set
 from mwdn.benchmark.sharing import held, shared
 from mwdn.benchmark.training import train
 from mwdn.data.photographs import Photographs
-from mwdn.data.writing import atomic
-from mwdn.errors import ParameterError
+from mwdn.data.writing import save_text
 from mwdn.evaluation import Perceptual
 from mwdn.learning.alexnet import SMALLEST
 from mwdn.learning.distributed import device_here
@@ -86,19 +85,14 @@ def write(found: Found, out: Path) -> None:
     """Write the page in its four forms.
 
     Raises:
-        ParameterError: the disk refuses.
+        ImageError: the disk refuses.
     """
     title = found.benchmark.title
-    try:
-        parts = sections(found)
-        write_html(out / PAGE, title, parts)
-        write_markdown(out / "benchmark.md", title, parts)
-        texts = {"benchmark.json": json.dumps(json_content(found), indent=1) + "\n", "benchmark.csv": csv_text(found)}
-        for name, text in texts.items():
-            with atomic(out / name) as temporary:
-                temporary.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise ParameterError(f"`{out}` must be a folder that can be written to: {error.strerror}.") from error
+    parts = sections(found)
+    write_html(out / PAGE, title, parts)
+    write_markdown(out / "benchmark.md", title, parts)
+    save_text(out / "benchmark.json", json.dumps(json_content(found), indent=1) + "\n")
+    save_text(out / "benchmark.csv", csv_text(found))
 
 
 def _train_all(benchmark: Benchmark, opened: dict[str, Opened], out: Path, place: torch.device, watch: Watch) -> None:

@@ -14,7 +14,7 @@ from mwdn import __version__, solvers
 from mwdn.benchmark.recipe import Method
 from mwdn.benchmark.sets import Opened, file_hash
 from mwdn.data.captures import find_captures, read_captures
-from mwdn.data.writing import atomic
+from mwdn.data.writing import save_text, written
 from mwdn.evaluation import First, Perceptual, Scores, evaluate
 from mwdn.reconstruct import Reconstructor
 
@@ -96,8 +96,7 @@ def score(
     kept = read_kept(path, wanted)
     if kept is None:
         kept = _measure(bind(method, checkpoint, opened, device), opened, path, perceptual(), shown)
-        with atomic(path) as temporary:  # last: what it says is there, is
-            temporary.write_text(json.dumps({"identity": wanted, **kept}, indent=1), encoding="utf-8")
+        save_text(path, json.dumps({"identity": wanted, **kept}, indent=1))  # last: what it says is there, is
     cpu = Scores.read(kept["cpu"]) if kept["cpu"] else None
     pictures = {name: torch.from_numpy(np.load(_pictures(path, name))) for name in ("pictures", "captures")}
     return Scored(Scores.read(kept["scores"]), cpu, kept["missing"], **pictures)
@@ -123,7 +122,7 @@ def _measure(bound: Reconstructor, opened: Opened, path: Path, perceptual: Perce
     captures = _captures(opened)
     found = [bound(one[None]) for one in captures] if captures is not None else [torch.zeros(0, 3, *size)]
     for name, pictures in (("pictures", [row[2] for row in report.rows]), ("captures", found)):
-        with atomic(_pictures(path, name)) as temporary:
+        with written(_pictures(path, name)) as temporary:
             np.save(temporary, torch.cat(pictures).numpy())
     return {"scores": report.methods["it"].content(), "cpu": cpu, "missing": report.missing}
 

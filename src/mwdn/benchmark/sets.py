@@ -20,7 +20,7 @@ from mwdn.data.photographs import Photographs
 from mwdn.data.recorded import HELD_OUT, Division, RecordedPairs, check_pairs, record
 from mwdn.data.simulated import Placement, Samples, SimulatedPairs
 from mwdn.data.splits import split
-from mwdn.data.writing import atomic
+from mwdn.data.writing import save_text
 from mwdn.errors import ParameterError
 from mwdn.evaluation import Protocol
 from mwdn.learning.session import FILE_START
@@ -184,24 +184,24 @@ def open_set(name: str, data: DataSet, folder: Path, device: torch.device, track
     calibration = data.calibration()
     data.part().crop(calibration.psf)  # refuses a part that does not fit before anything is trained
     simulates = not data.pairs
-    path = folder / f"{name}.h5" if simulates or data.kind else Path(data.pairs)
     shown = {"psf", "captures", "protocol"}
     identity = {key: value for key, value in asdict(data).items() if key not in shown}
     identity = json.loads(json.dumps({**identity, "psf_hash": calibration.psf_hash}))
     note = folder / f"{name}.json"
-    made = json.loads(note.read_text(encoding="utf-8")) if note.is_file() and path.is_file() else None
+    own = simulates or data.kind  # else the user's file, of which nothing is made
+    path = folder / f"{name}.h5" if own else Path(data.pairs)
+    made = json.loads(note.read_text(encoding="utf-8")) if own and note.is_file() and path.is_file() else None
     if made not in (None, identity):
         raise ParameterError(
             f"`{path}` holds pairs that another recipe made. Choose another folder, `--out`, or remove it."
         )
-    if made is None:
+    if own and made is None:
         if simulates:
             _simulate(data, calibration, path, device, lambda rows: track(f"{name}: simulating", rows))
-        elif data.kind:
+        else:
             size = calibration.size if data.bin > 1 else None
             import_pairs(data.kind, data.pairs, path, layout=Layout(bin=data.bin, scene_size=size))
-        with atomic(note) as temporary:
-            temporary.write_text(json.dumps(identity, indent=2), encoding="utf-8")
+        save_text(note, json.dumps(identity, indent=2))
     file = PairFile(path)
     check_pairs(file, calibration.psf)
     rows = _rows(data, len(file), simulates)

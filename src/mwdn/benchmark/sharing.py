@@ -10,7 +10,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from mwdn.errors import ParameterError
+from mwdn.data.writing import writable
 
 
 def held(folder: Path, part: str) -> FileLock:
@@ -20,10 +20,8 @@ def held(folder: Path, part: str) -> FileLock:
         ParameterError: the folder cannot be written to.
     """
     path = folder / "locks" / f"{part}.lock"
-    try:
+    with writable(folder):
         path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ParameterError(f"`{folder}` must be a folder that can be written to: {error.strerror}.") from error
     return FileLock(path)
 
 

@@ -12,7 +12,7 @@ import torch
 
 from mwdn.benchmark.recipe import Benchmark, Method
 from mwdn.benchmark.sets import Opened
-from mwdn.data.writing import atomic
+from mwdn.data.writing import save_text
 from mwdn.errors import ParameterError
 from mwdn.fourier import Size
 from mwdn.learning.recipe import OPTIMISERS, Recipe, Schedule
@@ -103,9 +103,8 @@ def train(
 
     def told(report: Report) -> None:
         if report.validation is not None:  # its state has just been saved
-            with atomic(folder / CLOCK) as temporary:
-                passed = before + time.perf_counter() - start
-                temporary.write_text(json.dumps({"step": report.step, "seconds": passed}), encoding="utf-8")
+            passed = before + time.perf_counter() - start
+            save_text(folder / CLOCK, json.dumps({"step": report.step, "seconds": passed}))
         show(report)
 
     trainer.run(told)

@@ -1,14 +1,17 @@
 """What happens to every frame of a sensor, a PSF's or a capture's: levels, crop, binning."""
 
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from mwdn.errors import ParameterError, ShapeError
+from mwdn.errors import ParameterError, ShapeError, UnknownNameError
 from mwdn.fourier import Size
 from mwdn.types import Frame, Image
+
+Mosaic = Literal["rggb", "bggr", "grbg", "gbrg"]
+"""Colour filter arrays: the colours of 2 x 2 cells, row by row."""
 
 Background = float | Literal["estimate"]
 """A level as a part of the full scale, or ``"estimate"``."""
@@ -42,6 +45,32 @@ def full_scale(frame: Frame, bit_depth: int | None) -> float:
 def as_image(frame: Frame, scale: float) -> Image:
     """(H, W, C) numbers to (1, C, H, W) parts of the full scale."""
     return torch.from_numpy(frame.astype(np.float32)).movedim(-1, 0)[None].contiguous() / scale
+
+
+def demosaiced(image: Tensor, mosaic: Mosaic) -> Tensor:
+    """Turn each 2 x 2 cells of a colour filter array into one pixel; its two greens are averaged.
+
+    Each colour keeps its own place in the cell, in a PSF as in a capture, so that scenes come out without fringes.
+
+    Args:
+        image: (B, 1, H, W), of even sides.
+        mosaic: colours of the first two cells of the first row, then of the second.
+
+    Returns:
+        (B, 3, H / 2, W / 2), red, green, blue.
+
+    Raises:
+        ShapeError: it has colours already, or odd sides.
+        UnknownNameError: no such mosaic.
+    """
+    if mosaic not in get_args(Mosaic):
+        raise UnknownNameError("mosaic", mosaic, get_args(Mosaic))
+    channels, height, width = image.shape[1:]
+    if channels != 1 or height % 2 or width % 2:
+        raise ShapeError(f"A raw mosaic ({channels} x {height} x {width}) must have one channel and even sides.")
+    cells = [image[..., row::2, column::2] for row in (0, 1) for column in (0, 1)]
+    planes = [[cell for cell, letter in zip(cells, mosaic, strict=True) if letter == colour] for colour in "rgb"]
+    return torch.cat([sum(plane[1:], plane[0]) / len(plane) for plane in planes], dim=1)
 
 
 def crop_centre(image: Tensor, size: Size) -> Tensor:

@@ -10,9 +10,11 @@ from torch import Tensor
 
 from mwdn.calibration.frames import (
     Background,
+    Mosaic,
     as_image,
     bin_pixels,
     crop_centre,
+    demosaiced,
     estimate_background,
     full_scale,
 )
@@ -33,13 +35,15 @@ class Calibration:
         psf: (1, C, H, W), not negative, each channel of unit sum, centred at ``(H // 2, W // 2)``.
         bit_depth: of raw frames; ``None`` if their numbers fill the file's type, or are floats up to 1.
         dark: frame (1, C or 1, h, w) taken without light, as a part of the full scale, before crop and binning.
-        crop: middle part of raw frames that is used, in raw pixels.
-        binning: raw pixels that were averaged to one, along each axis.
+        crop: middle part of raw frames that is used, in raw pixels; of a mosaic in pixels of 2 x 2 cells.
+        binning: pixels that were averaged to one after that, along each axis.
         background: level that was subtracted from each channel of the PSF, as a part of the full scale.
         upside_down: raw frames have their first row at the bottom.
         bgr: raw frames have their channels in the order blue, green, red.
         pitch_um: distance of the pixels after binning.
         distance_mm: from the point source to the camera.
+        mosaic: raw frames are a colour filter array, see `mwdn.calibration.frames.demosaiced`.
+        grey: colours of raw frames are averaged.
     """
 
     psf: Psf
@@ -52,6 +56,8 @@ class Calibration:
     bgr: bool = False
     pitch_um: float | None = None
     distance_mm: float | None = None
+    mosaic: Mosaic | None = None
+    grey: bool = False
 
     @classmethod
     def from_file(  # noqa: PLR0913
@@ -66,6 +72,8 @@ class Calibration:
         psf_binning: int | None = None,
         upside_down: bool = False,
         bgr: bool = False,
+        mosaic: Mosaic | None = None,
+        grey: bool = False,
     ) -> "Calibration":
         """Read the picture of a point source.
 
@@ -75,17 +83,19 @@ class Calibration:
             background: even light under the PSF besides the dark frame: a part of the full scale, or
                 ``"estimate"`` (see `mwdn.calibration.frames.estimate_background`). 0 for a PSF already clean.
             bit_depth: of the sensor, where its numbers do not fill the file's type.
-            crop: height and width of the middle part to use, in raw pixels.
-            binning: average blocks of so many raw pixels along each axis, after the crop.
+            crop: height and width of the middle part to use, in raw pixels; of a mosaic in pixels of 2 x 2 cells.
+            binning: average blocks of so many pixels along each axis, after the crop.
             psf_binning: that of the PSF, where it was taken at another resolution than the captures, whose crop then
                 covers the same part of it, and whose dark frame is left out of it.
             upside_down: the file's first row is the picture's last.
             bgr: the file's channels are blue, green, red.
+            mosaic: PSF, dark frame and captures are raw frames of a colour filter array, of which this is the order.
+            grey: average the colours of all of them.
 
         Raises:
             ImageError: the file cannot be read.
             PsfError: the PSF is saturated, empty, or of the wrong channel count.
-            ShapeError: the dark frame does not fit.
+            ShapeError: the dark frame does not fit, or a mosaic has colours or odd sides.
             ParameterError: a number is outside its range.
         """
         frame = read_frame(path, bgr=bgr)
@@ -100,15 +110,12 @@ class Calibration:
         if psf_binning is not None and psf_binning != binning:
             own, its_dark = psf_binning, None
             part = crop and (crop[0] * own // binning, crop[1] * own // binning)
-        psf = cls(torch.ones(1, 1, 1, 1), bit_depth, its_dark, part, own).prepare(frame)
+        psf = cls(torch.ones(1, 1, 1, 1), bit_depth, its_dark, part, own, mosaic=mosaic, grey=grey).prepare(frame)
         level = _level(psf, background)
         psf = (psf - level).clamp(min=0)
         total = psf.sum((-2, -1), keepdim=True)
         if not (total > 0).all():
-            raise PsfError(
-                f"PSF `{path}` is empty: after the background ({', '.join(f'{v:.3g}' for v in level.flatten())} "
-                "of the full scale) no light is left in a channel. Expose longer, or give `--background 0`."
-            )
+            raise PsfError(_empty(path, total.flatten() > 0, level.flatten(), dark))
         return cls(
             _turn(psf / total) if upside_down else psf / total,
             bit_depth,
@@ -118,6 +125,8 @@ class Calibration:
             tuple(round(float(value), 6) for value in level.flatten()),
             upside_down,
             bgr,
+            mosaic=mosaic,
+            grey=grey,
         )
 
     def __post_init__(self) -> None:
@@ -144,7 +153,7 @@ class Calibration:
         return self.psf.shape[-2], self.psf.shape[-1]
 
     def prepare(self, frame: Frame) -> Measurement:
-        """Subtract the dark frame, crop and bin; rows stay in the file's order."""
+        """Subtract the dark frame, make pixels of a mosaic's cells, crop and bin; rows stay in the file's order."""
         image = as_image(frame, full_scale(frame, self.bit_depth))
         if self.dark is not None:
             if self.dark.shape[-2:] != image.shape[-2:] or self.dark.shape[1] not in (1, image.shape[1]):
@@ -153,6 +162,8 @@ class Calibration:
                     "Take it with the same camera settings."
                 )
             image = image - self.dark
+        image = demosaiced(image, self.mosaic) if self.mosaic else image
+        image = image.mean(1, keepdim=True) if self.grey else image
         return bin_pixels(crop_centre(image, self.crop) if self.crop else image, self.binning)
 
     def correct(self, frame: Frame) -> Measurement:
@@ -177,9 +188,24 @@ class Calibration:
             )
         channels = measurement.shape[1]
         if channels == 1 and self.psf.shape[1] == 3:
-            raise ShapeError("The capture is grey, but `psf` has colours. Calibrate with the camera's grey mode.")
+            raise ShapeError(
+                "The capture is grey, but `psf` has colours. Take both as grey, `--grey`; or say how the cells of raw "
+                "frames are coloured, `--mosaic rggb`."
+            )
         # No `_turn`: a capture has no centre to keep, and a rolled row would be one of the opposite border.
         return measurement.flip(-2) if self.upside_down else measurement
+
+
+def _empty(path: str | Path, lit: Tensor, level: Tensor, dark: str | Path | None) -> str:
+    names = ["grey"] if len(lit) == 1 else ["red", "green", "blue"]
+    without = [name for name, light in zip(names, lit.tolist(), strict=True) if not light]
+    ways = ["Expose longer"]
+    ways += [f"take the dark frame `{dark}` without light"] if dark else []
+    ways += ["give `--background 0`"] if level.max() > 0 else []
+    return (
+        f"PSF `{path}` is empty: after the background ({', '.join(f'{v:.3g}' for v in level)} of the full scale; "
+        f"nothing of {', '.join(without)}) no light is left in a channel. {', or '.join(ways)}."
+    )
 
 
 def _turn(image: Tensor) -> Tensor:
@@ -212,7 +238,7 @@ def _refuse_saturated(frame: Frame, bit_depth: int | None) -> None:
 
 def _level(psf: Tensor, background: Background) -> Tensor:
     if background == "estimate":
-        return estimate_background(psf)
+        return estimate_background(psf).clamp(min=0)  # below 0 where somebody has subtracted it before
     if not 0 <= background < 1:
         raise ParameterError(f"`background` ({background}) must be in [0, 1), a part of the full scale.")
     return torch.full((1, psf.shape[1], 1, 1), float(background))

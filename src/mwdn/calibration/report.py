@@ -1,8 +1,6 @@
 """What can be said about a PSF: its measures, gathered."""
 
-import json
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -10,8 +8,6 @@ import torch
 from mwdn.calibration import measures
 from mwdn.calibration.frames import estimate_background, full_scale, noise_level
 from mwdn.calibration.psf import Calibration, saturated
-from mwdn.data.writing import atomic
-from mwdn.errors import ImageError
 from mwdn.fourier import Size
 from mwdn.types import Frame, Psf
 
@@ -186,16 +182,3 @@ def _levels(calibration: Calibration, frame: Frame) -> Levels:
         noise=float(noise.max()),
         noise_floor=float((pixels * (noise / light).square()).max()),
     )
-
-
-def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write a report as JSON, atomically.
-
-    Raises:
-        ImageError: the disk refuses.
-    """
-    try:
-        with atomic(path) as temporary:
-            temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise ImageError(f"`{path}` cannot be written: {error.strerror}. Choose another folder.") from error

@@ -10,8 +10,7 @@ from mwdn.calibration import measures
 from mwdn.calibration.report import PsfReport
 from mwdn.calibration.verdict import headline, verdict
 from mwdn.data.images import srgb_encode
-from mwdn.data.writing import atomic
-from mwdn.errors import ImageError
+from mwdn.data.writing import written
 from mwdn.types import Psf
 
 if TYPE_CHECKING:
@@ -48,11 +47,8 @@ def write_page(path: Path, report: PsfReport, psf: Psf, title: str) -> None:
         ImageError: the disk refuses.
     """
     figure = draw_page(report, psf, title)
-    try:
-        with atomic(path) as temporary:
-            figure.savefig(temporary)
-    except OSError as error:
-        raise ImageError(f"`{path}` cannot be written: {error.strerror}. Choose another folder.") from error
+    with written(path) as temporary:
+        figure.savefig(temporary)
 
 
 def _draw_psf(axes: "Axes", psf: Psf) -> None:

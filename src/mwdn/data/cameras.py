@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from mwdn.data.draws import seeded
 from mwdn.data.simulated import Pair, SimulatedPairs, full_precision
 from mwdn.errors import ParameterError
 from mwdn.fourier import Size
@@ -66,7 +67,7 @@ class CameraPairs:
         device = self.pairs.psf.device
         psfs = []
         for number in numbers:
-            generator = torch.Generator().manual_seed((self.pairs.seed * 1_000_003 + number) ^ (CAMERA_SEED << 24))
+            generator = seeded((self.pairs.seed * 1_000_003 + number) ^ (CAMERA_SEED << 24))
             names = self.cameras.families or tuple(FAMILIES)
             family = names[int(torch.randint(len(names), (), generator=generator))]
             psfs.append(sample_camera(generator, size, family=family, device=device))

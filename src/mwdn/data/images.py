@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mwdn.data.formats import decode, kind_of, read
-from mwdn.data.writing import save_linear, save_png
+from mwdn.data.writing import naming, save_linear, save_png
 from mwdn.errors import ImageError, ParameterError
 from mwdn.types import FloatFrame, Frame, Image
 
@@ -143,8 +143,5 @@ def _writable(path: Path, image: Tensor, *suffixes: str) -> FloatFrame:
 
 
 def _write(save: Callable[[Path, Frame], None], path: Path, pixels: Frame) -> None:
-    try:
+    with naming(path):
         save(path, pixels)
-    except OSError as error:
-        why = error.strerror or error
-        raise ImageError(f"`{path}` cannot be written: {why}. Choose another folder.") from error

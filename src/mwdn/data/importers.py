@@ -8,7 +8,7 @@ from typing import cast
 
 import numpy as np
 
-from mwdn.calibration.frames import as_image, bin_pixels, full_scale
+from mwdn.calibration.frames import as_image, bin_pixels, demosaiced, full_scale
 from mwdn.data.pair_writer import PixelType, check_path, quantise
 from mwdn.data.pairs import PairFile
 from mwdn.data.sources import (
@@ -159,16 +159,17 @@ def read_pairs(
 def _prepare(source: Source, layout: Layout, mosaic_bits: int) -> tuple[Frame, Frame]:
     """Load a pair and turn it upright, into RGB, and into one type that loses nothing of either."""
     capture, scene = raw = source.load()
-    bit_depth = layout.bit_depth
+    bit_depth, mosaic = layout.bit_depth, False
     if mosaic_bits and capture.shape[2] == 1:
-        capture, bit_depth = _from_mosaic(capture, source.name), bit_depth or mosaic_bits
+        bit_depth, mosaic = bit_depth or mosaic_bits, True
     if mosaic_bits and scene.shape[2] == 1:
         scene = scene.repeat(3, axis=2)  # a few of ImageNet's photographs are grey
     if bit_depth or layout.bin > 1:
         if bit_depth and bit_depth > 8 * raw[0].dtype.itemsize:
             raise ImageError(f"The capture of `{source.name}` has {raw[0].dtype}, fewer than {bit_depth} bits.")
-        scale = full_scale(raw[0], bit_depth)
-        capture = bin_pixels(as_image(capture, scale), layout.bin)[0].movedim(0, -1).numpy()
+        image = as_image(capture, full_scale(capture, bit_depth))
+        image = demosaiced(image, "rggb") if mosaic else image
+        capture = bin_pixels(image, layout.bin)[0].movedim(0, -1).numpy()
     if layout.scene_size:
         scene = _resized(scene, layout.scene_size)
     shallow = capture.dtype == scene.dtype == np.uint8
@@ -178,15 +179,6 @@ def _prepare(source: Source, layout: Layout, mosaic_bits: int) -> tuple[Frame, F
     named = {"capture": capture, "scene": scene}
     capture, scene = (quantise(f[rows, :, channels], dtype, f"{n} of {source.name}") for n, f in named.items())
     return capture, scene
-
-
-def _from_mosaic(capture: Frame, name: str) -> Frame:
-    """Turn red, green / green, blue cells into pixels; the two greens are averaged."""
-    if capture.shape[0] % 2 or capture.shape[1] % 2:
-        raise ImageError(f"The raw capture of `{name}` ({capture.shape[0]} x {capture.shape[1]}) must have even sides.")
-    cells = capture[..., 0].astype(np.float32)
-    green = (cells[0::2, 1::2] + cells[1::2, 0::2]) / 2
-    return np.stack([cells[0::2, 0::2], green, cells[1::2, 1::2]], axis=-1)
 
 
 def _resized(scene: Frame, size: Size) -> Frame:

@@ -7,15 +7,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from mwdn.data.draws import uniform
 from mwdn.errors import ParameterError
 from mwdn.fourier import Size
 from mwdn.optics.warp import affine, hazed
 from mwdn.types import Psf
-
-
-def uniform(generators: list[torch.Generator], low: float, high: float, count: int = 1) -> Tensor:
-    """(B, count) numbers, each row from its own generator."""
-    return torch.stack([torch.rand(count, generator=g) for g in generators]) * (high - low) + low
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,6 @@
 """Writing files of pairs, which `mwdn.data.pairs` reads."""
 
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
@@ -10,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mwdn.data.writing import atomic
+from mwdn.data.writing import atomic, naming
 from mwdn.errors import ImageError, ParameterError, ShapeError
 from mwdn.types import Frame
 
@@ -84,7 +83,7 @@ class PairWriter:
     def __enter__(self) -> "PairWriter":
         import h5py
 
-        with _refusals(self.path), ExitStack() as stack:
+        with naming(self.path), ExitStack() as stack:
             self._file = stack.enter_context(h5py.File(stack.enter_context(atomic(self.path)), "w"))
             self._file.attrs.update({VERSION_KEY: VERSION, **self._attributes})
             for name, shape in self._shapes.items():
@@ -100,7 +99,7 @@ class PairWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         # An exception of the ``with`` statement's own body passes through unchanged: the stack only cleans up.
-        with _refusals(self.path):
+        with naming(self.path):
             self._stack.__exit__(kind, error, trace)
         self._file = None
 
@@ -125,7 +124,7 @@ class PairWriter:
                 f"`measurement` ({len(rows[0])}) and `scene` ({len(rows[1])}) must be as many. Append whole pairs."
             )
         end = self._length + len(rows[0])
-        with _refusals(self.path):
+        with naming(self.path):
             for name, batch in zip(NAMES, rows, strict=True):
                 self._file[name].resize(end, axis=0)
                 self._file[name][self._length : end] = batch
@@ -179,12 +178,3 @@ def _stored(psf: Tensor | None) -> Frame | None:
     if picture.ndim != 3:
         raise ShapeError(f"`psf` {tuple(psf.shape)} must be (C, H, W) or (1, C, H, W).")
     return picture.detach().to("cpu", torch.float32).numpy()
-
-
-@contextmanager
-def _refusals(path: Path) -> Iterator[None]:
-    """Name the file in what the disk refuses."""
-    try:
-        yield
-    except OSError as error:
-        raise ImageError(f"`{path}` cannot be written: {error.strerror or error}. Choose another folder.") from error

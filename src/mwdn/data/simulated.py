@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from mwdn.data.mismatch import Mismatch, perturb, shading, uniform
+from mwdn.data.draws import seeded, uniform
+from mwdn.data.mismatch import Mismatch, perturb, shading
 from mwdn.data.photographs import Photographs
 from mwdn.errors import ParameterError
 from mwdn.fourier import Size
@@ -157,8 +158,8 @@ class SimulatedPairs:
 
     def generators(self, numbers: range | list[int]) -> list[torch.Generator]:
         """One for each sample of these numbers."""
-        # Two neighbouring seeds share no sample before the millionth; torch looks at the lower 32 bits alone.
-        return [torch.Generator().manual_seed((self.seed * 1_000_003 + n) & (2**63 - 1)) for n in numbers]
+        # Two neighbouring seeds share no sample before the millionth.
+        return [seeded(self.seed * 1_000_003 + n) for n in numbers]
 
     def scenes(self, generators: list[torch.Generator]) -> Scene:
         """Place one photograph in each scene: chosen, mirrored, scaled, turned, shifted, before its backdrop."""

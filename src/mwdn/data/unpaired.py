@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.calibration.frames import noise_level
+from mwdn.data.draws import seeded
 from mwdn.data.simulated import Pair, full_precision
 from mwdn.errors import ParameterError
 from mwdn.fourier import convolve
@@ -135,5 +136,5 @@ class UnpairedCaptures:
         return torch.stack(drawn).to(self.measurements)
 
     def _generator(self, number: int, purpose: int = 3) -> torch.Generator:
-        """Of its own for each sample and purpose; torch looks at the lower 32 bits alone."""
-        return torch.Generator().manual_seed((4 * (self.seed * 1_000_003 + number) + purpose) & (2**63 - 1))
+        """Of its own for each sample and purpose."""
+        return seeded(4 * (self.seed * 1_000_003 + number) + purpose)

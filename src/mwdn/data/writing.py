@@ -1,16 +1,18 @@
 """Files that are either wholly new or wholly old. What the disk refuses is raised as its `OSError`."""
 
+import json
 import os
 import secrets
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError
 
-from mwdn.errors import ParameterError
+from mwdn.errors import ImageError, ParameterError
 from mwdn.types import FloatFrame, Frame
 
 
@@ -45,6 +47,49 @@ def atomic(path: Path) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def written(path: str | Path) -> Iterator[Path]:
+    """`atomic`, which names the file in what the disk refuses.
+
+    Raises:
+        ImageError: the disk refuses.
+    """
+    with naming(path), atomic(Path(path)) as temporary:
+        yield temporary
+
+
+@contextmanager
+def naming(path: str | Path) -> Iterator[None]:
+    """Name a file in what the disk refuses.
+
+    Raises:
+        ImageError: it does.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise ImageError(f"`{path}` cannot be written: {error.strerror or error}. Choose another folder.") from error
+
+
+def save_text(path: Path, text: str) -> None:
+    """Write a text file, atomically.
+
+    Raises:
+        ImageError: the disk refuses.
+    """
+    with written(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write a report as JSON, atomically.
+
+    Raises:
+        ImageError: the disk refuses.
+    """
+    save_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
 @contextmanager

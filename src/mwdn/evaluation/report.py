@@ -15,9 +15,9 @@ from rich.markup import escape
 from rich.table import Table
 from torch import Tensor
 
-from mwdn.calibration.report import write_json
 from mwdn.data.images import write_picture
 from mwdn.data.sheets import contact_sheet
+from mwdn.data.writing import write_json
 from mwdn.errors import UnknownNameError
 from mwdn.evaluation.metrics import LARGER_IS_BETTER, METRICS, bootstrap
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from torch import Tensor
 
-from mwdn.data.writing import atomic, check_folder, writable
+from mwdn.data.writing import check_folder, save_text, writable
 from mwdn.errors import CheckpointError, ParameterError
 from mwdn.learning import distributed
 from mwdn.learning.state import Header, read_state
@@ -91,6 +91,7 @@ class RunFolder:
         import fcntl
 
         check_folder(self.path)
+        # The folder itself: a file to be locked would stay behind.
         handle = os.open(self.path, os.O_RDONLY)
         try:
             with suppress(OSError):  # of file systems that lock nothing
@@ -109,16 +110,15 @@ class RunFolder:
         """Write once, so that a folder that refuses is found now and not after an hour; the log ends at the step.
 
         Raises:
-            ParameterError: it refuses, or another run is at work in it.
+            ParameterError: another run is at work in it.
+            MwdnError: it refuses.
         """
         log = self.path / "log.jsonl"
-        with self.alone(), writable(self.path):
-            with atomic(self.path / "recipe.json") as temporary:
-                temporary.write_text(json.dumps(self.identity, indent=2), encoding="utf-8")
+        with self.alone():
+            save_text(self.path / "recipe.json", json.dumps(self.identity, indent=2))
             # One line a step; those after the saved step will be written again.
             lines = log.read_text(encoding="utf-8").splitlines(keepends=True) if log.exists() else []
-            with atomic(log) as temporary:
-                temporary.write_text("".join(lines[:step]), encoding="utf-8")
+            save_text(log, "".join(lines[:step]))
 
     def log(self, line: dict[str, Any]) -> None:
         """Add a line to the log.

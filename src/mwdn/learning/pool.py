@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor, nn
 
+from mwdn.data.draws import seeded
 from mwdn.data.simulated import Samples
 from mwdn.errors import ParameterError
 from mwdn.types import Psf
@@ -52,9 +53,9 @@ class Pool:
     def _turned(self, number: int) -> tuple[Tensor, Tensor, Tensor]:
         epoch, place = divmod(number, self.size)
         step, slot = divmod(place, self.together)
-        generator = torch.Generator().manual_seed((self.seed * 1_000_003 + epoch) * self.together + slot)
+        generator = seeded((self.seed * 1_000_003 + epoch) * self.together + slot)
         order = torch.randperm(self.size // self.together, generator=generator)
-        generator.manual_seed(self.seed * 1_000_003 + number + 1)  # now for this sample alone
+        generator = seeded(self.seed * 1_000_003 + number + 1)  # now for this sample alone
         estimates, unit, scene = self._sample(int(order[step]) * self.together + slot)
         # The mirror images of a square; a frame of two lengths is not turned on its side.
         way = epoch + place

@@ -185,11 +185,11 @@ class Trainer:
                 f"{str(error).splitlines()[0]}"
             ) from error
         weight = len(own) / len(numbers)  # losses are means over samples
+        self.optimiser.zero_grad(set_to_none=True)
+        torch.autograd.backward(weight * loss)  # before the loss is read, for which a GPU would have to wait
         total, *totals = distributed.total(weight * torch.stack([loss.detach(), *parts.values()]).double()).tolist()
         if not math.isfinite(total):
-            raise self._diverged(numbers)
-        self.optimiser.zero_grad(set_to_none=True)
-        torch.autograd.backward(weight * loss)
+            raise self._diverged(f"step {self.step} ({self._names(numbers)})")
         distributed.add_gradients(self.network)
         if self.schedule.clip > 0:
             torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.schedule.clip)
@@ -198,15 +198,15 @@ class Trainer:
         self._average()
         return total, dict(zip(parts, totals, strict=True))
 
-    def _diverged(self, numbers: range) -> DivergenceError:
-        """Names the batch, and what is left."""
+    def _names(self, numbers: range) -> str:
         rows = [self.pairs.row(number) for number in numbers] if isinstance(self.pairs, RecordedPairs) else []
-        which = f"samples {numbers.start} to {numbers.stop - 1}" + (f", rows {rows} of the file" if rows else "")
+        return f"samples {numbers.start} to {numbers.stop - 1}" + (f", rows {rows} of the file" if rows else "")
+
+    def _diverged(self, where: str) -> DivergenceError:
         last = self.folder.weights("last")
         kept = f' The weights of the last validation are kept: `start = "{last}"`.' if last.exists() else ""
         return DivergenceError(
-            f"The loss of step {self.step} ({which}) is not finite. Lower the learning rate and choose another "
-            f"folder, `--out`.{kept}"
+            f"The loss of {where} is not finite. Lower the learning rate and choose another folder, `--out`.{kept}"
         )
 
     def _judge(self, numbers: range) -> tuple[Tensor, dict[str, Tensor]]:
@@ -240,13 +240,18 @@ class Trainer:
         """Measure the averaged weights, write the contact sheet, and let the course see the loss.
 
         The first process does it, and all go on with its numbers.
+
+        Raises:
+            DivergenceError: the loss is not finite; the last saved state stays as it was.
         """
         found = Validation(math.nan, math.nan)
         if distributed.rank() == 0:
             found = self.validator(self.average, self.loss, f"step {self.step}")
+        psnr, loss = distributed.numbers_of_first([found.psnr, found.loss])
+        if not math.isfinite(loss):
+            raise self._diverged(f"the validation after step {self.step}")
         if found.sheet is not None:
             write_picture(self.out / "validation.png", found.sheet)
-        psnr, loss = distributed.numbers_of_first([found.psnr, found.loss])
         self.course = self.course.after(loss)
         return Validation(psnr, loss, found.sheet)
 

@@ -1,11 +1,10 @@
 """Learned reconstruction, one file a method. Each is called as ``network(measurement, psf)``."""
 
-from inspect import signature
 from typing import Any
 
 from torch import nn
 
-from mwdn.errors import UnknownNameError
+from mwdn.errors import UnknownNameError, check_options
 from mwdn.networks.drunet import Drunet
 from mwdn.networks.flatnet import FlatNet
 from mwdn.networks.ifin import Ifin
@@ -55,16 +54,15 @@ def build(name: str, **options: Any) -> nn.Module:  # noqa: ANN401
     kind = NETWORKS.get(name) or DENOISERS.get(name)
     if kind is None:
         raise UnknownNameError("network", name, NETWORKS)
-    known = signature(kind).parameters
-    for option in options:
-        if option not in known:
-            raise UnknownNameError(f"option of the network '{name}'", option, known)
+    check_options(kind, f"the network '{name}'", options)
     # JSON and TOML, where options come from, have lists alone.
     return kind(**{key: tuple(v) if isinstance(v, list) else v for key, v in options.items()})
 
 
 __all__ = [
+    "DENOISERS",
     "NETWORKS",
+    "Drunet",
     "FlatNet",
     "Ifin",
     "LeAdmm",

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from mwdn.data.writing import atomic
+from mwdn.data.writing import written
 from mwdn.errors import ImageError, MwdnError, ParameterError
 from mwdn.optics.masks import Mask
 
@@ -52,20 +52,17 @@ def write_mask(path: str | Path, mask: Mask) -> None:
     about |= {"pitch_um": mask.pitch_um, "index": mask.index, "step_um": mask.step_um}
     numbers = np.rint(values / scale).astype(np.uint16)
     per_cm = 1e4 / mask.pitch_um
-    try:
-        with atomic(Path(path)) as temporary:
-            tifffile.imwrite(
-                temporary,
-                numbers,
-                photometric="minisblack",
-                compression="zlib",
-                description=json.dumps(about),
-                metadata=None,
-                resolution=(per_cm, per_cm),
-                resolutionunit="CENTIMETER",
-            )
-    except OSError as error:
-        raise ImageError(f"`{path}` cannot be written: {error.strerror or error}. Choose another folder.") from error
+    with written(path) as temporary:
+        tifffile.imwrite(
+            temporary,
+            numbers,
+            photometric="minisblack",
+            compression="zlib",
+            description=json.dumps(about),
+            metadata=None,
+            resolution=(per_cm, per_cm),
+            resolutionunit="CENTIMETER",
+        )
 
 
 def read_mask(path: str | Path) -> Mask:
@@ -121,11 +118,8 @@ def write_gds(path: str | Path, mask: Mask) -> None:
             corner = ((left - columns // 2 - 0.5) * mask.pitch_um, -(top - rows // 2 - 0.5) * mask.pitch_um)
             other = ((right - columns // 2 - 0.5) * mask.pitch_um, -(bottom - rows // 2 - 0.5) * mask.pitch_um)
             cell.add(gdstk.rectangle(corner, other, layer=layer))
-    try:
-        with atomic(Path(path)) as temporary:
-            library.write_gds(temporary)
-    except OSError as error:
-        raise ImageError(f"`{path}` cannot be written: {error.strerror or error}. Choose another folder.") from error
+    with written(path) as temporary:
+        library.write_gds(temporary)
 
 
 def write_stl(path: str | Path, mask: Mask, *, base_um: float = 100.0, every: int = 1) -> None:
@@ -158,13 +152,10 @@ def write_stl(path: str | Path, mask: Mask, *, base_um: float = 100.0, every: in
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     facets = np.zeros(len(triangles), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("_", "<u2")])
     facets["normal"], facets["corners"] = normals, triangles
-    try:
-        with atomic(Path(path)) as temporary, temporary.open("wb") as file:
-            file.write(b"mwdn mask, unit um".ljust(80))
-            file.write(np.uint32(len(facets)).tobytes())
-            facets.tofile(file)
-    except OSError as error:
-        raise ImageError(f"`{path}` cannot be written: {error.strerror or error}. Choose another folder.") from error
+    with written(path) as temporary, temporary.open("wb") as file:
+        file.write(b"mwdn mask, unit um".ljust(80))
+        file.write(np.uint32(len(facets)).tobytes())
+        facets.tofile(file)
 
 
 def _levels(mask: Mask) -> npt.NDArray[np.int64]:

@@ -3,7 +3,7 @@
 from typing import Any
 
 from mwdn.calibration.frames import noise_level
-from mwdn.errors import UnknownNameError
+from mwdn.errors import UnknownNameError, check_options
 from mwdn.solvers.admm import Admm, Progress
 from mwdn.solvers.alignment import Pose, align
 from mwdn.solvers.fista import Fista
@@ -26,10 +26,11 @@ def build(name: str, **options: Any) -> Solver:  # noqa: ANN401
         **options: keyword arguments of that solver, for example ``iterations=50``.
 
     Raises:
-        UnknownNameError: there is no such solver.
+        UnknownNameError: there is no such solver, or it has no such option.
     """
     if name not in SOLVERS:
         raise UnknownNameError("solver", name, SOLVERS)
+    check_options(SOLVERS[name], f"the solver '{name}'", options)
     return SOLVERS[name](**options)
 
 

@@ -161,7 +161,7 @@ def _unexplained(measurement: Tensor, psf: Psf, poses: Tensor) -> Tensor:
 
 
 def _halved(psf: Psf) -> Tensor:
-    """Of pixels twice as long; its centre stays the centre."""
+    """Of pixels twice as long. The centre may move by one of them, and with it the scene, which nobody sees."""
     return F.avg_pool2d(F.pad(psf, (0, psf.shape[-1] % 2, 0, psf.shape[-2] % 2)), 2)
 
 
