@@ -263,6 +263,23 @@ def test_psf_too_small_to_judge_by(run, camera, size):
     assert "`--crop`, `--bin`, `--psf-bin`" in err
 
 
+def test_overexposed_capture_is_named_before_its_psf_is_doubted(run, camera):
+    frame = read_frame("captures/a.png")
+    top = np.iinfo(frame.dtype).max
+    bright = (frame * (top / np.quantile(frame.max(-1), 0.8))).clip(0, top).astype(frame.dtype)
+    part = (bright.max(-1) == top).mean()
+    assert 0.15 < part < 0.25
+    cv2.imwrite("captures/bright.png", bright[..., ::-1])
+    code, out, err = reconstruct(run, "captures/bright.png")
+    assert code == 0
+    told = f"Warning: bright.png is overexposed: {part:.1%} of its pixels are saturated"
+    assert told in err
+    assert (out + err).index("explains") > 0
+    beside = json.loads((camera / "out" / "bright.json").read_text(encoding="utf-8"))
+    assert beside["saturated"] == pytest.approx(part)
+    assert "overexposed" not in reconstruct(run, "captures/a.png")[2]
+
+
 def test_without_trust(run, camera):
     line = ("reconstruct", "captures/a.png", "--psf", "psf.png", "--out", "out", "--method", "wiener", "--no-trust")
     code, out, err = run(*line)

@@ -122,6 +122,11 @@ def _told(job: Job) -> str:
     if job.error:
         complain(f"[red]{escape(str(job.capture))}:[/]", job.error)
         return "failed"
+    if job.overexposed:
+        warn(
+            f"{job.capture.name} is overexposed: {job.saturated:.1%} of its pixels are saturated, and no PSF explains "
+            "them. Lower the exposure."
+        )
     if job.trust:
         told = f"{job.capture.name} {job.trust.sentence}"
         (errors if job.trust.doubtful else console).print(told, highlight=False, markup=False, soft_wrap=True)

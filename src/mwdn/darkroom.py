@@ -3,7 +3,6 @@
 import hashlib
 import json
 import math
-import os
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, astuple, dataclass, fields, replace
@@ -15,10 +14,11 @@ import torch
 from torch import Tensor, nn
 
 from mwdn import __version__
+from mwdn.calibration.psf import SATURATED_PART
 from mwdn.data.captures import read_capture
 from mwdn.data.images import read_frame, read_picture, write_linear, write_picture
 from mwdn.data.sheets import contact_sheet, for_people, thumbnail
-from mwdn.data.writing import naming, write_json
+from mwdn.data.writing import naming, resolver, write_json
 from mwdn.errors import ImageError, MwdnError, ParameterError
 from mwdn.evaluation.consistency import Consistency, consistency
 from mwdn.learning import distributed
@@ -52,7 +52,7 @@ def check_outputs(
     """
     if out.exists() and not out.is_dir():
         raise ParameterError(f"`{out}` must be a folder, but is a file. Choose another one: `--out`.")
-    real = _resolver()
+    real = resolver()
     inputs = {real(str(path)) for path in (*captures, *protected) if path is not None}
 
     def check(output: str) -> None:
@@ -78,27 +78,6 @@ def check_outputs(
         seen[name] = f"`{capture}`"
 
 
-def _resolver() -> Callable[[str], str]:
-    """The same as `Path.resolve`, but each folder is looked at once: a million files take seconds, not minutes."""
-    folders: dict[str, tuple[str, dict[str, str]]] = {}
-
-    def look(folder: Path) -> tuple[str, dict[str, str]]:
-        links: dict[str, str] = {}
-        if folder.is_dir():
-            with os.scandir(folder) as entries:
-                links = {each.name: str(Path(each.path).resolve()) for each in entries if each.is_symlink()}
-        return str(folder.resolve() / "x").removesuffix("x"), links
-
-    def real(path: str) -> str:
-        folder, name = os.path.split(path)
-        if folder not in folders:
-            folders[folder] = look(Path(folder))
-        start, links = folders[folder]
-        return links.get(name) or start + name
-
-    return real
-
-
 @dataclass(frozen=True)
 class Job:
     """One capture on its way to a picture.
@@ -112,6 +91,7 @@ class Job:
         pose: of the PSF, if the picture is judged.
         scene: (1, C, H, W).
         kept: the picture was there before.
+        saturated: part of the capture's pixels, see `Calibration.saturated_part`.
         trust: how far to trust the picture, if it is judged.
         error: why there is no picture.
     """
@@ -124,8 +104,14 @@ class Job:
     pose: Pose | None = None
     scene: Scene | None = None
     kept: bool = False
+    saturated: float = 0.0
     trust: Consistency | None = None
     error: MwdnError | None = None
+
+    @property
+    def overexposed(self) -> bool:
+        """Whether so much is cut off that even the right PSF may be doubted."""
+        return self.saturated > SATURATED_PART
 
 
 def _step(work: Callable[["Darkroom", Job], Job]) -> Callable[["Darkroom", Job], Job]:
@@ -176,11 +162,13 @@ class Darkroom:
         job = replace(job, origin=self.origin(job.capture))
         if self.resume and self._is_there(job):
             return replace(job, kept=True)
-        measurement = read_capture(job.capture, self.reconstruct.calibration)
+        calibration = self.reconstruct.calibration
+        frame = read_frame(job.capture, bgr=calibration.bgr)
+        measurement = calibration.correct(frame)
         if measurement.amax() <= 0:
             raise ImageError("The sensor saw no light: no pixel is brighter than the dark frame, or black.")
         pose = align(measurement.to(self.reconstruct.device), self.reconstruct.psf) if self.judge else None
-        return replace(job, measurement=measurement, pose=pose)
+        return replace(job, measurement=measurement, pose=pose, saturated=calibration.saturated_part(frame))
 
     @_step
     def _reconstruct(self, job: Job) -> Job:
@@ -199,6 +187,8 @@ class Darkroom:
             "psf_hash": self.reconstruct.calibration.psf_hash,
             "origin": job.origin,
         }
+        if job.overexposed:
+            content["saturated"] = job.saturated
         if trust:
             content |= {**asdict(trust), "doubtful": trust.doubtful}
         with naming(beside):

@@ -152,6 +152,10 @@ class Calibration:
         """Height and width of the PSF and of a measurement."""
         return self.psf.shape[-2], self.psf.shape[-1]
 
+    def saturated_part(self, frame: Frame) -> float:
+        """Part of a raw frame's pixels that are at the sensor's maximum; 0 of floats, which tell of none."""
+        return saturated(frame, self.bit_depth)[0] / (frame.shape[0] * frame.shape[1])
+
     def prepare(self, frame: Frame) -> Measurement:
         """Subtract the dark frame, make pixels of a mosaic's cells, crop and bin; rows stay in the file's order."""
         image = as_image(frame, full_scale(frame, self.bit_depth))

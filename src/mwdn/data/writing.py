@@ -4,7 +4,7 @@ import json
 import os
 import secrets
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -127,6 +127,27 @@ def spare(output: Path, *inputs: Path | None) -> None:
     for path in filter(None, inputs):
         if output.exists() and path.exists() and output.samefile(path):
             raise ParameterError(f"`{output}` would overwrite an input. Choose another name: `--out`.")
+
+
+def resolver() -> Callable[[str], str]:
+    """The same as `Path.resolve`, but each folder is looked at once: a million files take seconds, not minutes."""
+    folders: dict[str, tuple[str, dict[str, str]]] = {}
+
+    def look(folder: Path) -> tuple[str, dict[str, str]]:
+        links: dict[str, str] = {}
+        if folder.is_dir():
+            with os.scandir(folder) as entries:
+                links = {each.name: str(Path(each.path).resolve()) for each in entries if each.is_symlink()}
+        return str(folder.resolve() / "x").removesuffix("x"), links
+
+    def real(path: str) -> str:
+        folder, name = os.path.split(path)
+        if folder not in folders:
+            folders[folder] = look(Path(folder))
+        start, links = folders[folder]
+        return links.get(name) or start + name
+
+    return real
 
 
 def save_png(path: Path, pixels: Frame) -> None:
