@@ -44,7 +44,7 @@ def main(data: Path, out: Path = Path("docs/universal.jpg")) -> None:
         ),
     ]
     third = -(-len(found) // 3)
-    found += [[torch.zeros_like(p) for p in found[0]]] * (3 * third - len(found))
+    found += [[torch.ones_like(p) for p in found[0]]] * (3 * third - len(found))
     lines = [a + b + c for a, b, c in zip(found[:third], found[third : 2 * third], found[2 * third :], strict=True)]
     sheet = srgb_encode(contact_sheet(lines, 3 * ["ADMM", "universal"], height=180))
     cv2.imwrite(str(out), (sheet[0].flip(0).permute(1, 2, 0) * 255).round().byte().numpy())
