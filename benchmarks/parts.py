@@ -27,13 +27,13 @@ from mwdn.networks import wiener_bank
 RECIPE = Path(__file__).parents[1] / "recipes" / "universal.toml"
 BANK = {"name": "wiener-bank", "width": 24, "finest": 0, "regularisations": [3e-2, 3e-3, 3e-4, 5e-5, 1e-5]}
 PARTS = {
-    "bank in image space, tapered": BANK,
-    "not continued: circular": BANK,
-    "one estimate, lambda 3e-4": BANK | {"regularisations": [3e-4]},
-    "feature space: MWDN": {"name": "mwdn", "width": 20},
-    "bank behind iterations": BANK | {"finest": 1, "regularisations": [1e-3, 1e-4, 2e-5]},
+    "bank in image space, tapered": (BANK, "taper"),
+    "not continued: circular": (BANK, "circular"),
+    "one estimate, lambda 3e-4": (BANK | {"regularisations": [3e-4]}, "taper"),
+    "feature space: MWDN": ({"name": "mwdn", "width": 20}, "taper"),
+    "bank behind iterations": (BANK | {"finest": 1, "regularisations": [1e-3, 1e-4, 2e-5]}, "taper"),
 }
-"""Networks by what they are made of."""
+"""Networks by what they are made of, and how the bank continues the measurement; MWDN tapers by itself."""
 
 
 def learned(part, data, steps):
@@ -41,8 +41,8 @@ def learned(part, data, steps):
     torch.set_num_threads(1)
     changes = {"steps": steps, "validate_every": steps // 4, "warmup": 20, "pool": 0, "crop": 0}
     recipe = read_recipe(RECIPE, **changes, cameras={"sizes": ["320x320"]}, placement={"exposure": [0.4, 0.95]})
-    recipe = replace(recipe, network=PARTS[part])
-    boundary = "circular" if "circular" in part else wiener_bank.BOUNDARY
+    network, boundary = PARTS[part]
+    recipe = replace(recipe, network=network)
     calibration, found = Calibration.from_file(data / "mwdn-camera" / "psf_320.png"), {}
 
     def note(report):

@@ -159,9 +159,8 @@ def read_pairs(
 def _prepare(source: Source, layout: Layout, mosaic_bits: int) -> tuple[Frame, Frame]:
     """Load a pair and turn it upright, into RGB, and into one type that loses nothing of either."""
     capture, scene = raw = source.load()
-    bit_depth, mosaic = layout.bit_depth, False
-    if mosaic_bits and capture.shape[2] == 1:
-        bit_depth, mosaic = bit_depth or mosaic_bits, True
+    mosaic = mosaic_bits > 0 and capture.shape[2] == 1
+    bit_depth = layout.bit_depth or (mosaic_bits if mosaic else None)
     if mosaic_bits and scene.shape[2] == 1:
         scene = scene.repeat(3, axis=2)  # a few of ImageNet's photographs are grey
     if bit_depth or layout.bin > 1:

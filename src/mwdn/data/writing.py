@@ -1,4 +1,8 @@
-"""Files that are either wholly new or wholly old. What the disk refuses is raised as its `OSError`."""
+"""Files that are either wholly new or wholly old.
+
+What the disk refuses is raised as its `OSError` by `atomic`, `save_png` and `save_linear`, and is told in the words of
+this package by the others.
+"""
 
 import json
 import os
