@@ -13,7 +13,7 @@ from mwdn.errors import CheckpointError, ParameterError, ShapeError, UnknownName
 from mwdn.learning import save_network
 from mwdn.networks import NETWORKS, build
 from mwdn.optics.patterns import contour_psf
-from mwdn.reconstruct import Reconstructor, find_method
+from mwdn.reconstruct import AT_ONCE, Reconstructor, find_method
 from mwdn.solvers import SOLVERS, Admm, Wiener
 
 SIZE = 32, 40
@@ -284,3 +284,36 @@ def test_stream_refuses(psf):
         reconstruct.stream([], refresh=-1)
     with pytest.raises(ShapeError, match=r"must have the same height and width"):
         next(reconstruct.stream([np.zeros((4, 4, 3), np.uint8)]))
+
+
+@pytest.mark.parametrize("method", [build("wiener"), Wiener(1e-3)])
+def test_a_batch_is_taken_a_few_at_a_time(method, generator, monkeypatch):
+    """A batch of 3 pictures of 256 x 256 is 2 and 1."""
+    psf = torch.rand(1, 3, 256, 256, generator=generator)
+    reconstruct = Reconstructor(method, Calibration(psf / psf.sum()), device="cpu", precision="exact")
+    seen, whole = [], Reconstructor._reconstruct
+    monkeypatch.setattr(
+        Reconstructor, "_reconstruct", lambda self, batch: seen.append(len(batch)) or whole(self, batch)
+    )
+    batch = torch.rand(3, 3, 256, 256, generator=generator)
+    found = reconstruct(batch)
+    assert seen == [2, 1]
+    torch.testing.assert_close(found[2:], reconstruct(batch[2:]))
+
+
+@torch.no_grad()
+def test_what_belongs_to_each_sample_keeps_a_batch_together(generator, monkeypatch):
+    """Where the iterations for the last frame ended, and the pose of the PSF."""
+    monkeypatch.setitem(AT_ONCE, "cpu", 1)
+    psf = torch.rand(1, 3, 24, 32, generator=generator)
+    calibration, batch = Calibration(psf / psf.sum()), torch.rand(3, 3, 24, 32, generator=generator)
+    warm, whole = solvers.Warm(solvers.Admm(iterations=5)), solvers.Warm(solvers.Admm(iterations=5))
+    stream = Reconstructor(warm, calibration, device="cpu")
+    for _ in range(2):
+        torch.testing.assert_close(stream(batch), whole(batch, stream.psf))
+    network = Reconstructor(build("wiener-bank", width=4).eval(), calibration, device="cpu", precision="exact")
+    pose = solvers.Pose(torch.tensor([0.0, 2.0, -3.0]), torch.tensor([0.0, 0.01, 0.02]))
+    found = network.at(pose)(batch)
+    for i in range(3):
+        one = solvers.Pose(pose.turn_degrees[i : i + 1], pose.scale[i : i + 1])
+        torch.testing.assert_close(found[i : i + 1], network.at(one)(batch[i : i + 1]), rtol=1e-3, atol=1e-4)

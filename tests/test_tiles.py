@@ -88,16 +88,3 @@ def test_normalisation_over_the_picture_is_not_cut(generator):
     """GroupNorm sees the whole picture."""
     for unet in (Encoder(3, (8, 8), norm="group"), Decoder(3, (8, 8), norm="group")):
         assert type(fold(unet.eval(), None)) is type(unet)
-
-
-def test_a_batch_is_taken_a_few_at_a_time(generator):
-    """A batch of 3 pictures of half a megapixel is 2 and 1."""
-    psf = torch.rand(1, 3, 512, 1024, generator=generator)
-    engine = Engine(build("wiener"), psf, precision="exact")
-    seen = []
-    reconstruct = engine._reconstruct
-    engine._reconstruct = lambda batch: seen.append(len(batch)) or reconstruct(batch)
-    batch = torch.rand(3, 3, 512, 1024, generator=generator)
-    found = engine(batch)
-    assert seen == [2, 1]
-    torch.testing.assert_close(found[2:], engine(batch[2:]))

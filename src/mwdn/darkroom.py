@@ -25,6 +25,7 @@ from mwdn.learning import distributed
 from mwdn.reconstruct import Reconstructor
 from mwdn.solvers import Pose, align
 from mwdn.streams import ahead
+from mwdn.transfers import sent
 from mwdn.types import Measurement, Scene
 
 Format = Literal["png", "png16", "tiff", "npy"]
@@ -167,7 +168,8 @@ class Darkroom:
         measurement = calibration.correct(frame)
         if measurement.amax() <= 0:
             raise ImageError("The sensor saw no light: no pixel is brighter than the dark frame, or black.")
-        pose = align(measurement.to(self.reconstruct.device), self.reconstruct.psf) if self.judge else None
+        measurement = sent(measurement, self.reconstruct.device)
+        pose = align(measurement, self.reconstruct.psf) if self.judge else None
         return replace(job, measurement=measurement, pose=pose, saturated=calibration.saturated_part(frame))
 
     @_step
@@ -175,7 +177,7 @@ class Darkroom:
         if job.measurement is None:
             return job
         reconstruct = self.reconstruct.at(job.pose) if job.pose else self.reconstruct
-        return replace(job, scene=reconstruct(job.measurement))
+        return replace(job, scene=reconstruct.on_device(job.measurement))
 
     @_step
     def _finish(self, job: Job) -> Job:
@@ -204,8 +206,7 @@ class Darkroom:
         """How far to trust a scene, if that is asked; an `ImageError` unless the scene and the answer are finite."""
         trust, finite = None, bool(scene.isfinite().all())
         if finite and self.judge:
-            pair = measurement.to(self.reconstruct.device), self.reconstruct.psf
-            trust = consistency(*pair, scene.to(self.reconstruct.device), pose=pose)
+            trust = consistency(measurement, self.reconstruct.psf, scene, pose=pose)
             finite = all(map(math.isfinite, astuple(trust)))
         if not finite:
             raise ImageError(

@@ -33,8 +33,8 @@ class Engine:
     calculation of each shape of a batch is recorded when it is met again, and then replayed; not where the PSF is
     aligned to each measurement.
 
-    Memory is bounded: a batch is taken a megapixel at a time (16 on a GPU), and of a larger picture the U-Net's
-    convolutions, a strip of rows at a time, see `mwdn.tiles`.
+    Memory is bounded: of a large picture the U-Net's convolutions are taken a strip of rows at a time, see
+    `mwdn.tiles`; of a large batch `mwdn.Reconstructor` takes a few pictures at a time.
 
     Args:
         network: as trained; a copy is taken.
@@ -61,10 +61,6 @@ class Engine:
     @torch.inference_mode()
     def __call__(self, measurement: Measurement) -> Scene:
         """Reconstruct a batch, (B, C, H, W), on the device of the PSF."""
-        pixels = 2**24 if measurement.device.type == "cuda" else 2**20
-        at_once = max(1, pixels // (measurement.shape[-2] * measurement.shape[-1]))
-        if len(measurement) > at_once and len(self.psf) == 1:
-            return torch.cat([self(part) for part in measurement.split(at_once)])  # type: ignore[no-untyped-call]
         if measurement.device.type != "cuda":
             return self._reconstruct(measurement)
         # Streams are those of the current device; what stays float32 would else have the 10 bits of TF32.

@@ -2,12 +2,13 @@
 
 import itertools
 import re
+import threading
 
 import pytest
 import torch
 
 from mwdn.data.pairs import PairFile
-from mwdn.data.recorded import Division, RecordedPairs, recorded_pairs
+from mwdn.data.recorded import Division, ReadAhead, RecordedPairs, recorded_pairs
 from mwdn.data.simulated import Samples
 from mwdn.errors import ImageError, ParameterError, ShapeError, UnknownNameError
 
@@ -47,6 +48,41 @@ def test_parts_are_the_papers(pairs):
     assert sorted(drawn(train, range(24))) == list(range(6, 30))
     assert sorted(drawn(validation, range(10**12, 10**12 + 3))) == [3, 4, 5]
     assert drawn(validation, range(10**12, 10**12 + 3)) == drawn(validation, range(10**12 + 3, 10**12 + 6))
+
+
+def test_a_batch_ahead(pairs):
+    """The same batches, in any order; the next one has been read before it is asked for, in another thread."""
+    train, _ = recorded_pairs(pairs(), psf(), Division(), seed=4)
+    readers = []
+
+    class Watched(RecordedPairs):
+        def batch(self, numbers):
+            readers.append((numbers, threading.current_thread()))
+            return super().batch(numbers)
+
+    watched = Watched(train.file, train.rows, train.seed)
+    following = ReadAhead(watched, 4)
+    for start in (0, 4, 8, 24, 28, 8):
+        assert drawn(following, range(start, start + 2)) == drawn(train, range(start, start + 2))
+    here = [numbers.start for numbers, thread in readers if thread is threading.main_thread()]
+    assert here == [0, 24, 8]  # where the last one does not tell the next
+
+
+def test_a_damaged_pair_ahead_is_of_the_batch_that_takes_it(pairs, monkeypatch):
+    train, _ = recorded_pairs(pairs(), psf(), Division())
+    read = PairFile.__getitem__
+
+    def refuse(file, number):
+        if number == train.row(5):
+            raise ImageError("damaged")
+        return read(file, number)
+
+    monkeypatch.setattr(PairFile, "__getitem__", refuse)
+    following = ReadAhead(train, 4)
+    assert drawn(following, range(4)) == drawn(train, range(4))
+    for _ in range(2):
+        with pytest.raises(ImageError, match="damaged"):
+            following.batch(range(4, 8))
 
 
 def test_each_epoch_has_each_pair_once_in_an_order_of_its_own(pairs):

@@ -1,6 +1,7 @@
 """Recorded pairs as a source of numbered samples, like the simulated ones."""
 
 from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -14,6 +15,7 @@ from mwdn.data.pairs import PairFile
 from mwdn.data.simulated import Pair, Samples
 from mwdn.data.splits import split
 from mwdn.errors import ParameterError, ShapeError
+from mwdn.transfers import sent
 from mwdn.types import Psf
 
 HELD_OUT = 20
@@ -90,13 +92,35 @@ class RecordedPairs:
             ImageError: a pair cannot be read.
         """
         pairs = [self.file[self.row(number)] for number in numbers]
-        measurement, scene = (torch.stack(part).to(self.device) for part in zip(*pairs, strict=True))
+        measurement, scene = (sent(torch.stack(part), self.device) for part in zip(*pairs, strict=True))
         return Pair(measurement, scene)
 
     def row(self, number: int) -> int:
         """Position in the file of a sample."""
         epoch, place = divmod(number, len(self.rows))
         return self.rows[int(_order(len(self.rows), self.seed, epoch)[place]) if self.shuffled else place]
+
+
+class ReadAhead:
+    """Recorded pairs, of which the next batch is read while whoever took the last one works.
+
+    Args:
+        pairs: to be read.
+        stride: from a batch's numbers to those of the next.
+    """
+
+    def __init__(self, pairs: RecordedPairs, stride: int) -> None:
+        self.pairs, self.stride = pairs, stride
+        self._thread = ThreadPoolExecutor(1)
+        self._expected: range | None = None
+        self._next = Future[Pair]()
+
+    def batch(self, numbers: range) -> Pair:
+        """Samples of these numbers, as `RecordedPairs.batch` reads them; its errors are raised where they are taken."""
+        found = self._next.result() if numbers == self._expected else self.pairs.batch(numbers)
+        self._expected = range(numbers.start + self.stride, numbers.stop + self.stride)
+        self._next = self._thread.submit(self.pairs.batch, self._expected)
+        return found
 
 
 def recorded_pairs(

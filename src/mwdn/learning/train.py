@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mwdn.calibration import Calibration
 from mwdn.data.images import write_picture
-from mwdn.data.recorded import RecordedPairs
+from mwdn.data.recorded import ReadAhead, RecordedPairs
 from mwdn.data.simulated import Samples
 from mwdn.data.unpaired import UnpairedCaptures
 from mwdn.data.writing import writable
@@ -104,6 +104,7 @@ class Trainer:
         if self.schedule.checkpointing:
             recompute(self.network)
         self.pool = self._pool() if self.schedule.pool else None
+        self.samples = ReadAhead(pairs, self.schedule.batch) if isinstance(pairs, RecordedPairs) else pairs
         self.loss = Loss(recipe.loss, alexnet=alexnet).to(self.device)
         self.optimiser = optimiser(self.network, self.schedule)
         self.course = begin(recipe)
@@ -222,7 +223,7 @@ class Trainer:
         if self.pool is not None:
             estimates, unit, scene = self.pool.batch(numbers)
             return self.network.correct(estimates, unit), scene  # type: ignore[operator]
-        measurement, scene, psf = self.pairs.batch(numbers)
+        measurement, scene, psf = self.samples.batch(numbers)
         seen = measurement.contiguous(memory_format=torch.channels_last)
         return self.network(seen, self.psf if psf is None else psf), scene
 

@@ -52,7 +52,8 @@ def shrink(u: Gradient, threshold: float | Tensor, variation: Variation) -> Grad
     A root is taken of the larger of length and threshold only, so that a zero gradient, which every first
     iteration has, does not give an infinite derivative.
     """
-    t = torch.as_tensor(threshold, dtype=u[0].dtype, device=u[0].device)
+    # A number is filled in on a GPU, and would else be copied there, for which all before it has to end.
+    t = threshold if isinstance(threshold, Tensor) else u[0].new_full((), threshold)
     if variation == "anisotropic":
         return u[0] - u[0].clamp(-t, t), u[1] - u[1].clamp(-t, t)
     smallest = t.square().clamp(min=torch.finfo(t.dtype).tiny)
