@@ -15,7 +15,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 # Data flows downward through this list and imports only point upward. A dotted name is one file of a folder
 # that stands elsewhere: files are read and written from calibration on.
 TIERS = [
-    ("errors", "types", "streams", "memory"),
+    ("errors", "types", "streams", "memory", "transfers"),
     ("planes",),
     ("fourier", "dft"),
     ("deconvolution",),

@@ -104,7 +104,7 @@ class Trainer:
         if self.schedule.checkpointing:
             recompute(self.network)
         self.pool = self._pool() if self.schedule.pool else None
-        self.samples = ReadAhead(pairs, self.schedule.batch) if isinstance(pairs, RecordedPairs) else pairs
+        self.ahead = ReadAhead(pairs, self.schedule.batch) if isinstance(pairs, RecordedPairs) else None
         self.loss = Loss(recipe.loss, alexnet=alexnet).to(self.device)
         self.optimiser = optimiser(self.network, self.schedule)
         self.course = begin(recipe)
@@ -223,7 +223,7 @@ class Trainer:
         if self.pool is not None:
             estimates, unit, scene = self.pool.batch(numbers)
             return self.network.correct(estimates, unit), scene  # type: ignore[operator]
-        measurement, scene, psf = self.samples.batch(numbers)
+        measurement, scene, psf = (self.ahead or self.pairs).batch(numbers)
         seen = measurement.contiguous(memory_format=torch.channels_last)
         return self.network(seen, self.psf if psf is None else psf), scene
 
