@@ -53,7 +53,7 @@ def shrink(u: Gradient, threshold: float | Tensor, variation: Variation) -> Grad
     iteration has, does not give an infinite derivative.
     """
     # A number is filled in on a GPU, and would else be copied there, for which all before it has to end.
-    t = threshold if isinstance(threshold, Tensor) else u[0].new_full((), threshold)
+    t = threshold if isinstance(threshold, Tensor) else torch.full_like(u[0][:1, :1, :1, :1], threshold)
     if variation == "anisotropic":
         return u[0] - u[0].clamp(-t, t), u[1] - u[1].clamp(-t, t)
     smallest = t.square().clamp(min=torch.finfo(t.dtype).tiny)
