@@ -25,7 +25,7 @@ from mwdn.learning import distributed
 from mwdn.reconstruct import Reconstructor
 from mwdn.solvers import Pose, align
 from mwdn.streams import ahead
-from mwdn.transfers import sent
+from mwdn.transfers import fetched, sent
 from mwdn.types import Measurement, Scene
 
 Format = Literal["png", "png16", "tiff", "npy"]
@@ -193,12 +193,13 @@ class Darkroom:
             content["saturated"] = job.saturated
         if trust:
             content |= {**asdict(trust), "doubtful": trust.doubtful}
+        scene = fetched(job.scene)
         with naming(beside):
             beside.unlink(missing_ok=True)  # or it would vouch for another picture than it was written for
         if self.form in ("tiff", "npy"):
-            write_linear(job.output, job.scene)
+            write_linear(job.output, scene)
         else:
-            write_picture(job.output, for_people(job.scene), bits=16 if self.form == "png16" else 8)
+            write_picture(job.output, for_people(scene), bits=16 if self.form == "png16" else 8)
         write_json(beside, content)
         return replace(job, measurement=None, pose=None, scene=None, trust=trust)
 

@@ -167,7 +167,7 @@ class Reconstructor:
         """Pictures of a batch that are reconstructed together."""
         if isinstance(self.method, solvers.Warm) or (self.engine and len(self.engine.psf) > 1):
             return len(measurement)  # each has a past, or a pose, of its own
-        return max(1, AT_ONCE.get(self.device.type, 2**17) // (measurement.shape[-2] * measurement.shape[-1]))
+        return max(1, AT_ONCE.get(self.device.type, AT_ONCE["cpu"]) // (measurement.shape[-2] * measurement.shape[-1]))
 
     def _check(self, measurement: Measurement) -> None:
         shape = tuple(measurement.shape)
