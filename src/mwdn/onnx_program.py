@@ -163,11 +163,16 @@ def _multiplied(g: OnnxGraph, node: fx.Node, a: Any, b: Any) -> Pair:  # noqa: A
     return Pair(real, g("Add", g("Mul", a.real, b.imaginary), g("Mul", a.imaginary, b.real)))
 
 
+def _added(g: OnnxGraph, node: fx.Node, a: Pair, b: Pair) -> Pair:
+    return Pair(*(g("Add", *each) for each in zip(a, b, strict=True)))
+
+
 _ON_PAIRS: dict[Any, Handler] = {
     **{each: _on_each(each) for each in (_aten.alias.default, _aten.clone.default, _aten.slice.Tensor)},
     _aten._conj.default: lambda g, node, a: Pair(a.real, g("Neg", a.imaginary)),
     _aten.abs.default: lambda g, node, a: g("Sqrt", g("Add", g("Mul", a[0], a[0]), g("Mul", a[1], a[1]))),
-    _aten.add.Tensor: lambda g, node, a, b: Pair(*(g("Add", *each) for each in zip(a, b, strict=True))),
+    _aten.add.Tensor: _added,
+    _aten.addcmul.default: lambda g, node, a, b, c: _added(g, node, a, _multiplied(g, node, b, c)),
     _aten.div.Tensor: lambda g, node, a, b: Pair(*(g("Div", part, b) for part in a)),
     _aten.mul.Tensor: _multiplied,
 }

@@ -10,7 +10,7 @@ import oracles
 from mwdn.networks import NETWORKS, build
 from mwdn.networks.published import PUBLISHED
 from mwdn.solvers import Admm, Penalties
-from mwdn.solvers.proximal import shrink
+from mwdn.solvers.proximal import bounded
 
 COUNTS = {"le-admm": 20, "le-admm-u": 11_772_327, "mmcn": 18_863_559, "updn": 2_744_411}
 
@@ -168,7 +168,10 @@ def test_the_original_shrinkage_does_not():
         kept = (length - threshold).clamp(min=0)
         return u[0] * kept / (kept + threshold), u[1] * kept / (kept + threshold)
 
-    for shrinkage, finite in ((textbook, False), (shrink, True)):
+    def ours(u, threshold, variation):
+        return [given - part for given, part in zip(u, bounded(u, threshold, variation), strict=True)]
+
+    for shrinkage, finite in ((textbook, False), (ours, True)):
         mu = torch.tensor(1e-4, requires_grad=True)
         zero = torch.zeros(1, 1, 4, 4) / mu
         sum(part.sum() for part in shrinkage((zero, zero), 2e-4, "isotropic")).backward()

@@ -9,7 +9,7 @@ from torch.nn import functional as F
 
 from mwdn.fourier import inverse_spectrum, spectrum
 from mwdn.solvers.pyramid import QUIET, Explanation, brightness, caution
-from mwdn.solvers.splitting import follow, posed, reflect
+from mwdn.solvers.splitting import opposed, posed
 
 Denoiser = Callable[[Tensor, Tensor], Tensor]
 """A picture (B, C, H, W), whose brightest pixel is about 1, and its noise level (B, 1, 1, 1); the clean picture."""
@@ -64,8 +64,7 @@ def plug_and_play(found: Explanation, denoise: Denoiser, rounds: int) -> Explana
     for step in range(rounds):
         level = poor * first * (last / first) ** (step / max(1, rounds - 1))
         trust = TRUST * (noise / (level * brightest)).square()
-        light = reflect(Hv, pull)
-        pull = follow(pull, light, (light + certain * problem.measurement) / (1 + certain))
+        pull = opposed(Hv, pull).add_(problem.measurement).mul_(certain / (1 + certain)).add_(Hv)
         V = V.mul_(power).add_(spectrum(pull - Hv, grid).mul_(adjoint))
         V = V.add_(spectrum(known, grid).mul_(trust)).mul_(1 / (power + trust))
         Hv = inverse_spectrum(problem.transfer * V, grid, problem.sensor)

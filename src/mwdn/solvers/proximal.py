@@ -1,4 +1,4 @@
-"""Gradient of a picture, its adjoint, and the proximal map of total variation."""
+"""Gradient of a picture, its adjoint, and total variation."""
 
 from typing import Literal
 
@@ -46,16 +46,16 @@ def total_variation(u: Gradient, variation: Variation) -> Tensor:
     return _squared_length(u, variation).sqrt().sum((1, 2, 3))
 
 
-def shrink(u: Gradient, threshold: float | Tensor, variation: Variation) -> Gradient:
-    """Proximal map of ``threshold * total_variation``: each size or length moves towards zero by ``threshold``.
+def bounded(u: Gradient, bound: float | Tensor, variation: Variation) -> Gradient:
+    """What the proximal map of ``bound * total_variation`` takes away: each size or length, at most ``bound`` of it.
 
-    A root is taken of the larger of length and threshold only, so that a zero gradient, which every first
-    iteration has, does not give an infinite derivative.
+    A root is taken of the larger of length and bound only, so that a zero gradient, which every first iteration has,
+    does not give an infinite derivative.
     """
     # A number is filled in on a GPU, and would else be copied there, for which all before it has to end.
-    t = threshold if isinstance(threshold, Tensor) else torch.full_like(u[0][:1, :1, :1, :1], threshold)
+    t = bound if isinstance(bound, Tensor) else torch.full_like(u[0][:1, :1, :1, :1], bound)
     if variation == "anisotropic":
-        return u[0] - u[0].clamp(-t, t), u[1] - u[1].clamp(-t, t)
+        return u[0].clamp(-t, t), u[1].clamp(-t, t)
     smallest = t.square().clamp(min=torch.finfo(t.dtype).tiny)
-    keep = 1 - t / torch.maximum(_squared_length(u, variation), smallest).sqrt()
-    return u[0] * keep, u[1] * keep
+    part = t / torch.maximum(_squared_length(u, variation), smallest).sqrt_()
+    return u[0] * part, u[1] * part

@@ -117,14 +117,17 @@ class Explanation:
         measurement: (B, C, H, W).
         whole: (B, C, rows, columns), the scene of the whole grid of the finest level, not negative, for a PSF of unit
             sum.
-        noise: (B, 1, 1, 1), over the measurement's brightness.
         psf: what the iterations knew of it.
     """
 
     measurement: Measurement
     whole: Tensor
-    noise: Tensor
     psf: "PsfPyramid"
+
+    @cached_property
+    def noise(self) -> Tensor:
+        """Noise of the measurement over its brightness, (B, 1, 1, 1)."""
+        return relative_noise(self.measurement)
 
     @cached_property
     def scene(self) -> Scene:
@@ -207,21 +210,28 @@ class PsfPyramid:
         # tau is stated for a measurement of unit mean square.
         unit = brightness(measurement)
         b = measurement.float() / unit
-        noise = noise_level(b.detach()).square().mean(1, keepdim=True).sqrt()
+        smooth = any(band.level.regularisation for band in self.bands)
+        wary = caution(relative_noise(measurement)) if smooth else unit  # nobody asks
         fineness = math.sqrt(size[0] * size[1]) / SIDE
         sizes = {1: b}
         while max(sizes) < self.bands[0].level.shrink:
             sizes[2 * max(sizes)] = halve(sizes[max(sizes)])
         scene: Tensor = b.new_zeros((1, 1, 1, 1))
         for band in self.bands:
-            scene = _solve(sizes[band.level.shrink], band, scene, caution(noise), fineness)
-        return Explanation(measurement, scene.clamp(min=0) * unit, noise, self)
+            scene = _solve(sizes[band.level.shrink], band, scene, wary, fineness)
+        return Explanation(measurement, scene.clamp(min=0) * unit, self)
 
 
 def brightness(measurement: Measurement) -> Tensor:
     """Root mean square of each sample, (B, 1, 1, 1); never 0."""
     square = measurement.float().square().mean((1, 2, 3), keepdim=True)
     return square.sqrt().clamp(min=torch.finfo(torch.float32).tiny)
+
+
+def relative_noise(measurement: Measurement) -> Tensor:
+    """Noise of each sample over its `brightness`, (B, 1, 1, 1)."""
+    b = measurement.detach().float()
+    return noise_level(b / brightness(b)).square().mean(1, keepdim=True).sqrt()
 
 
 def caution(noise: Tensor) -> Tensor:
@@ -262,7 +272,7 @@ def low_band(transfer: Spectrum, grid: Size, shrink: int) -> Tensor:
     """Transfer function of the camera whose pixels are ``shrink`` times as long: the low frequencies."""
     rows, columns = grid[0] // shrink, grid[1] // shrink
     kept = torch.cat([transfer[..., : rows // 2, :], transfer[..., grid[0] - rows + rows // 2 :, :]], dim=-2)
-    return kept[..., : columns // 2 + 1].contiguous()
+    return kept[..., : columns // 2 + 1].mT.contiguous().mT  # in memory as `spectrum` leaves its own
 
 
 def _solve(measurement: Tensor, band: Band, coarser: Tensor, caution: Tensor, fineness: float) -> Tensor:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from mwdn.fourier import Size, check_fit, fast_length, inverse_spectrum, spectrum, transfer_function
-from mwdn.solvers.proximal import Gradient, Variation, divergence, gradient, shrink, total_variation
+from mwdn.solvers.proximal import Gradient, Variation, bounded, divergence, gradient, total_variation
 from mwdn.types import Measurement, Psf, Spectrum
 
 
@@ -43,11 +43,15 @@ class Problem(NamedTuple):
 
 
 class Filters(NamedTuple):
-    """What `merge` multiplies each part of the new spectrum with: the same as long as the penalties are."""
+    """What `merge` multiplies each part of the new spectrum with: the same as long as the penalties are.
+
+    The gradient's pull counts ``steep`` times as much as the sign's.
+    """
 
     prior: Tensor
     before: Tensor
-    beyond: Spectrum
+    correlate: Spectrum
+    steep: float | Tensor
 
 
 class State(NamedTuple):
@@ -90,8 +94,9 @@ def weigh(problem: Problem, mu: Penalties, *, smooth: bool = True) -> Filters:
     """Filters for these penalties; ``smooth`` for total variation."""
     power = mu.data * problem.transfer.abs().square()
     stiffness = mu.gradient * problem.laplacian + mu.sign if smooth else mu.sign
-    prior = 1 / (power + stiffness)
-    return Filters(prior, before=power * prior, beyond=problem.transfer.conj() * (mu.data * prior))
+    all_in_all = 1 / (power + stiffness)
+    correlate = problem.transfer.conj() * (mu.data * all_in_all)
+    return Filters(mu.sign * all_in_all, power * all_in_all, correlate, mu.gradient / mu.sign)
 
 
 def start(problem: Problem, scene: Tensor | None = None, *, smooth: bool = True) -> State:
@@ -106,42 +111,34 @@ def start(problem: Problem, scene: Tensor | None = None, *, smooth: bool = True)
 def split(state: State, problem: Problem, mu: Penalties, tau: float | Tensor, variation: Variation) -> State:
     """Update the copies u = Psi v, x = H v and w = v: shrink the gradient, fit the sensor, clip the sign.
 
-    What a copy is made of, value plus multiplier, is the pull reflected at the value; the new pull is copy minus
-    multiplier, of which the reflection knows enough. Outside the sensor nothing is measured and the textbook's x obeys
-    ``mu1 x - xi = mu1 H v``, so x and xi are kept on the sensor alone.
+    A copy is the proximal map of value plus multiplier, and the new pull, copy minus multiplier, is the value less what
+    that map takes away: each of them takes the negative of its argument, `opposed`, and adds. Outside the sensor
+    nothing is measured and the textbook's x obeys ``mu1 x - xi = mu1 H v``, so x and xi are kept on the sensor alone.
     """
     slope = state.slope
     if slope:
-        gy, gx = (reflect(*each) for each in zip(gradient(state.v), slope, strict=True))
-        uy, ux = shrink((gy, gx), tau / mu.gradient, variation)
-        slope = follow(slope[0], gy, uy), follow(slope[1], gx, ux)
-        del gy, gx, uy, ux  # the memory of a large picture
-    Hv, v = reflect(state.Hv, state.at_sensor), reflect(state.v, state.sign)
-    x = (problem.measurement + mu.data * Hv) / (1 + mu.data)
-    w = v.clamp(min=0)
-    return state._replace(at_sensor=follow(state.at_sensor, Hv, x), slope=slope, sign=follow(state.sign, v, w))
+        gy, gx = gradient(state.v)
+        by, bx = bounded((opposed(gy, slope[0]), opposed(gx, slope[1])), tau / mu.gradient, variation)
+        slope = gy.add_(by), gx.add_(bx)
+        del by, bx  # the memory of a large picture
+    at_sensor = opposed(state.Hv, state.at_sensor).add_(problem.measurement).div_(1 + mu.data).add_(state.Hv)
+    sign = state.v + opposed(state.v, state.sign).relu_()
+    return state._replace(at_sensor=at_sensor, slope=slope, sign=sign)
 
 
-def reflect(value: Tensor, pull: Tensor) -> Tensor:
-    """Value plus multiplier: what the copy is made of."""
-    return (2 * value).sub_(pull)
-
-
-def follow(pull: Tensor, reflected: Tensor, copy: Tensor) -> Tensor:
-    """The new pull, ``copy - value + pull``; in the copy's place."""
-    return copy.add_(pull, alpha=0.5).sub_(reflected, alpha=0.5)
+def opposed(value: Tensor, pull: Tensor) -> Tensor:
+    """``pull - 2 value``: the negative of value plus multiplier."""
+    return torch.sub(pull, value, alpha=2)
 
 
 def merge(state: State, problem: Problem, mu: Penalties, filters: Filters) -> State:
     """Update the scene, on which all pulls must agree, in the Fourier domain; ``filters`` of the same penalties."""
-    prior = mu.sign * state.sign
+    prior = state.sign
     if state.slope:
-        prior.add_(mu.gradient * divergence(state.slope))
-    V = spectrum(prior, problem.grid).mul_(filters.prior)
+        prior = divergence(state.slope).mul_(filters.steep).add_(prior)
+    V = spectrum(prior, problem.grid).mul_(filters.prior).addcmul_(filters.before, state.V)
     del prior
-    beyond = spectrum(state.at_sensor - state.Hv, problem.grid)  # what the sensor adds to H v
-    V = V.add_(filters.before * state.V).add_(beyond.mul_(filters.beyond))
-    del beyond
+    V.addcmul_(filters.correlate, spectrum(state.at_sensor - state.Hv, problem.grid))  # what the sensor adds to H v
     Hv = inverse_spectrum(problem.transfer * V, problem.grid, problem.sensor)
     return state._replace(v=inverse_spectrum(V, problem.grid, problem.grid), V=V, Hv=Hv)
 
