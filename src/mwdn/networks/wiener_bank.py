@@ -146,7 +146,8 @@ class WienerBank(nn.Module):
         """The bank: one spectrum, several filters."""
         size = picture.shape[-2], picture.shape[-1]
         grid = deconvolution_grid(size, BOUNDARY)
-        spread = spectrum(extend(picture, grid, boundary), grid)
+        # Transforms continue with zeros by themselves, and then skip the rows that hold nothing else.
+        spread = spectrum(picture if boundary == "zero" else extend(picture, grid, boundary), grid)
         return [inverse_spectrum(spread * transfer, grid, size) for transfer in transfers]
 
     def unit(self, estimates: Tensor) -> Tensor:
@@ -172,6 +173,7 @@ class WienerBank(nn.Module):
 def mean_light(picture: Tensor, block: int) -> Tensor:
     """The smooth picture, (B, C, H, W), through the means of its blocks."""
     height, width = picture.shape[-2:]
-    beyond = (0, -width % block, 0, -height % block)
-    means = F.avg_pool2d(F.pad(picture, beyond, mode="replicate"), block)
+    below, right = -height % block, -width % block
+    whole = F.pad(picture, (0, right, 0, below), mode="replicate") if below or right else picture
+    means = F.avg_pool2d(whole, block)
     return F.interpolate(means, scale_factor=block, mode="bilinear")[..., :height, :width]
