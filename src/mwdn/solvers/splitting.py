@@ -138,7 +138,9 @@ def merge(state: State, problem: Problem, mu: Penalties, filters: Filters) -> St
         prior = divergence(state.slope).mul_(filters.steep).add_(prior)
     V = spectrum(prior, problem.grid).mul_(filters.prior).addcmul_(filters.before, state.V)
     del prior
-    V.addcmul_(filters.correlate, spectrum(state.at_sensor - state.Hv, problem.grid))  # what the sensor adds to H v
+    added = spectrum(state.at_sensor - state.Hv, problem.grid)  # by the sensor to H v
+    V.add_(added.mul_(filters.correlate))
+    del added
     Hv = inverse_spectrum(problem.transfer * V, problem.grid, problem.sensor)
     return state._replace(v=inverse_spectrum(V, problem.grid, problem.grid), V=V, Hv=Hv)
 
