@@ -19,6 +19,7 @@ from test_train import log, same
 from mwdn.calibration import Calibration
 from mwdn.errors import ParameterError
 from mwdn.learning import distributed
+from mwdn.learning.batch_norm import freeze_cancelled
 from mwdn.learning.recipe import read_recipe
 from mwdn.learning.session import prepare
 from mwdn.networks import build
@@ -203,7 +204,7 @@ def test_bias_before_batch_norm_is_not_learned(one):
     """Its gradient is rounding noise, of which Adam would make steps as large as any."""
     torch.manual_seed(0)
     network = build("wiener-bank", width=4, fold=1, finest=0)
-    distributed.freeze_cancelled(network)
+    freeze_cancelled(network)
     frozen = [name for name, parameter in network.named_parameters() if not parameter.requires_grad]
     assert len(frozen) == 18  # two in each of five and four scales
     assert all(name.endswith((".0.bias", ".3.bias")) for name in frozen)
@@ -215,7 +216,7 @@ def test_bias_before_batch_norm_is_not_learned(one):
 def test_gradient_of_a_bias_before_batch_norm_is_zero(generator):
     """In float64 nothing is left of it."""
     network = build("mwdn", width=2).double()
-    distributed.freeze_cancelled(network)
+    freeze_cancelled(network)
     frozen = {name for name, parameter in network.named_parameters() if not parameter.requires_grad}
     network.requires_grad_(True)
     picture = torch.rand(1, 3, 32, 32, generator=generator).double()

@@ -14,6 +14,7 @@ from mwdn.calibration import Calibration
 from mwdn.data.simulated import SimulatedPairs
 from mwdn.errors import MwdnError
 from mwdn.learning import distributed
+from mwdn.learning.batch_norm import synchronise
 from mwdn.learning.recipe import read_recipe
 from mwdn.learning.session import prepare
 
@@ -30,7 +31,7 @@ def batch_norm():
         weights = torch.randn(2, 3, generator=drawn, dtype=torch.float64).to(dtype)
         for one in (whole, layer[0]):
             one.load_state_dict(one.state_dict() | {"weight": weights[0], "bias": weights[1]})
-        distributed.synchronise(layer, torch.device("cpu"))
+        synchronise(layer, torch.device("cpu"))
         found = {}
         for name, one, mine in (("one", whole, range(5)), ("two", layer, distributed.share(range(5)))):
             mine = slice(mine.start, mine.stop)

@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from mwdn.errors import ParameterError
-from mwdn.learning.distributed import GlobalBatchNorm2d
+from mwdn.learning.batch_norm import GlobalBatchNorm2d
 from mwdn.networks import build
 from mwdn.networks.recomputed import Stages, recompute
 

@@ -18,6 +18,7 @@ from mwdn.data.unpaired import UnpairedCaptures
 from mwdn.data.writing import writable
 from mwdn.errors import CheckpointError, DivergenceError, MwdnError, ParameterError
 from mwdn.learning import distributed
+from mwdn.learning.batch_norm import freeze_cancelled, synchronise
 from mwdn.learning.bundled import find_weights
 from mwdn.learning.checkpoint import first_difference, load_network, save_network
 from mwdn.learning.folder import MAKE_ROOM, RunFolder
@@ -99,8 +100,8 @@ class Trainer:
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = build(recipe.network["name"], **self.options).to(self.device).eval()
         self.average.load_state_dict(self.network.state_dict())
-        distributed.freeze_cancelled(self.network)
-        distributed.synchronise(self.network, self.device)
+        freeze_cancelled(self.network)
+        synchronise(self.network, self.device)
         if self.schedule.checkpointing:
             recompute(self.network)
         self.pool = self._pool() if self.schedule.pool else None
