@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from mwdn import fourier
 from mwdn.engine import Engine
-from mwdn.errors import MwdnError, UnknownNameError
+from mwdn.errors import MwdnError, ShapeError, UnknownNameError
 from mwdn.networks import NETWORKS, build
 
 FEW = ("wiener", "le-admm")
@@ -149,6 +149,15 @@ def test_grey_psf_is_that_of_each_colour(name, ready, generator, request):
 def test_grey(name, ready, generator):
     b, h, _ = pair(generator, channels=1)
     assert ready(small(name, channels=1))(b, h).shape == b.shape
+
+
+def test_measurement_of_other_channels_is_named(name, generator):
+    """Its channels and the network's, not those of what has been made of it, nor of a weight."""
+    if name in FEW:
+        pytest.skip("takes as many as there are")
+    b, h, _ = pair(generator, channels=2)
+    with pytest.raises(ShapeError, match=r"2, \d+, \d+\) must have 3 channels"):
+        small(name).eval()(b, h[:, :1])
 
 
 @pytest.mark.parametrize("name", BOTTOMED)

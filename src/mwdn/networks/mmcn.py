@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from mwdn.networks.blocks import at_least, convolutions
+from mwdn.networks.blocks import at_least, check_channels, convolutions
 from mwdn.networks.denoiser import SMALLEST, WIDTHS, Denoiser, scaled_widths
 from mwdn.networks.le_admm import LeAdmm, brightest_one
 from mwdn.types import Measurement, Psf, Scene
@@ -49,6 +49,7 @@ class Mmcn(nn.Module):
 
     def __init__(self, *, channels: int = 3, width: int = WIDTHS[0]) -> None:
         super().__init__()
+        self.channels = channels
         widths = scaled_widths(width)
         self.admm = LeAdmm(iterations=len(widths))
         inputs = (channels, *(own + channels for own in widths[:-1]))
@@ -59,7 +60,12 @@ class Mmcn(nn.Module):
         self.denoiser = Denoiser(channels, width=width, joining=widths[-1])
 
     def forward(self, measurement: Measurement, psf: Psf) -> Scene:
-        """Scene (B, C, H, W)."""
+        """Scene (B, C, H, W).
+
+        Raises:
+            ShapeError: the measurement has other channels than the network.
+        """
+        check_channels(measurement, self.channels)
         height, width = measurement.shape[-2:]
         scenes = [at_least(brightest_one(each), SMALLEST) for each in self.admm.iterates(measurement, psf)]
         features = F.max_pool2d(self.branch[0](at_least(measurement, SMALLEST)), 2)

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from mwdn.deconvolution import deconvolution_grid
 from mwdn.errors import ParameterError
 from mwdn.fourier import inverse_spectrum, spectrum, transfer_function
-from mwdn.networks.blocks import one_each_colour, stretched
+from mwdn.networks.blocks import check_channels, one_each_colour, stretched
 from mwdn.networks.generator import Generator
 from mwdn.planes import Boundary, Size, extend
 from mwdn.types import Measurement, Psf, Scene
@@ -71,13 +71,18 @@ class SvDeconv(nn.Module):
         super().__init__()
         if field < 1 or not regularisation > 0:
             raise ParameterError(f"`field` ({field}) must be at least 1, `regularisation` ({regularisation}) positive.")
-        self.field, self.boundary = field, boundary
+        self.channels, self.field, self.boundary = channels, field, boundary
         self.correction = nn.Parameter(torch.zeros(1, field**2 + 1, *size))
         self.log_regularisation = nn.Parameter(torch.full((field**2 + 1,), math.log(regularisation)))
         self.generator = Generator(2 * channels, outputs or channels, width=width)
 
     def deconvolve(self, measurement: Measurement, psf: Psf) -> tuple[Tensor, Tensor]:
-        """Estimates (B, C, H, W) of the PSF for all of the field, and of the field of PSFs."""
+        """Estimates (B, C, H, W) of the PSF for all of the field, and of the field of PSFs.
+
+        Raises:
+            ShapeError: the measurement has other channels than the network.
+        """
+        check_channels(measurement, self.channels)
         psf = one_each_colour(psf, measurement)
         total = psf.sum((-2, -1), keepdim=True)
         size = measurement.shape[-2], measurement.shape[-1]

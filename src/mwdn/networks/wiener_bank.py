@@ -9,7 +9,7 @@ from torch.nn import functional as F
 from mwdn.deconvolution import deconvolution_grid, wiener_transfer
 from mwdn.errors import ParameterError
 from mwdn.fourier import inverse_spectrum, spectrum
-from mwdn.networks.blocks import Decoder, Encoder, paper_widths, peak_one
+from mwdn.networks.blocks import Decoder, Encoder, check_channels, paper_widths, peak_one
 from mwdn.networks.drunet import Drunet
 from mwdn.planes import Boundary, extend, folded
 from mwdn.solvers.alignment import align
@@ -92,11 +92,17 @@ class WienerBank(nn.Module):
             self.decoder.head.weight.mul_(0.1)  # begin near the estimate
 
     def forward(self, measurement: Measurement, psf: Psf) -> Scene:
-        """Scene (B, C, H, W), each colour deconvolved with its own PSF."""
+        """Scene (B, C, H, W), each colour deconvolved with its own PSF.
+
+        Raises:
+            ShapeError: the measurement is neither grey nor of the network's channels.
+        """
         return self.reconstruct(measurement, self.bind(psf, measurement))
 
     def bind(self, psf: Psf, measurement: Measurement) -> list[Tensor]:
         """The PSF where it is aligned to each measurement, else all that the estimates need of it."""
+        if measurement.shape[1] > 1:  # a grey one stands for all colours
+            check_channels(measurement, self.channels)
         return [psf] if self.align else self._known(psf, measurement.expand(-1, self.channels, -1, -1))
 
     def reconstruct(self, measurement: Measurement, bound: list[Tensor]) -> Scene:
