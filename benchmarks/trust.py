@@ -1,4 +1,4 @@
-"""What the consistency score says of right and wrong PSFs, on real captures of three cameras.
+"""What the consistency score says of right and wrong PSFs, on real captures of two cameras.
 
     python benchmarks/trust.py ../shared/data [--method universal] [--count 2]
 

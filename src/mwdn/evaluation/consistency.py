@@ -12,7 +12,7 @@ from mwdn.solvers.alignment import Pose, align, fine_detail, misfit
 from mwdn.types import Measurement, Psf, Scene
 
 LEAST = 0.25
-"""Of real captures the right PSF explains 0.26 and more of what is not noise. One of another camera may explain as much
+"""Of real captures the right PSF explains 0.32 and more of what is not noise. One of another camera may explain as much
 of a plain scene, but then so do its own mirror images: `benchmarks/trust.py`."""
 
 CLEAR = 0.01
