@@ -15,10 +15,10 @@ import torch
 from mwdn import Calibration
 from mwdn.data.photographs import Photographs
 from mwdn.evaluation import Perceptual, Protocol, evaluate
-from mwdn.learning.recipe import read_recipe
+from mwdn.inference.reconstructor import find_method
 from mwdn.networks import wiener_bank
-from mwdn.reconstruct import find_method
 from mwdn.solvers import Pyramid, align
+from mwdn.training.recipe import read_recipe
 from universal import FULL_WELLS, captures
 
 

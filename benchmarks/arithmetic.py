@@ -7,7 +7,7 @@ import torch
 from torch.profiler import ProfilerActivity, profile
 from torch.utils.flop_counter import FlopCounterMode
 
-from mwdn.engine import Engine, half_precision
+from mwdn.inference.engine import Engine, half_precision
 from mwdn.networks import build
 
 METHODS = ("mwdn", "mwdn-cpsf", "unet", "wiener-unet")

@@ -32,13 +32,13 @@ import torch
 
 import arithmetic
 from mwdn import Calibration, Reconstructor
-from mwdn.fourier import inverse_spectrum, spectrum
-from mwdn.learning.bundled import BUNDLED
+from mwdn.fourier.padding import extend
+from mwdn.fourier.transforms import inverse_spectrum, spectrum
+from mwdn.inference.reconstructor import find_method
 from mwdn.networks import NETWORKS, blocks, build
 from mwdn.optics.patterns import contour_psf
-from mwdn.planes import extend
-from mwdn.reconstruct import find_method
 from mwdn.solvers import SOLVERS
+from mwdn.weights.bundled import BUNDLED
 
 SOLVER_PREFIX = "solver:"
 METHODS = [*NETWORKS, *BUNDLED, *(SOLVER_PREFIX + name for name in SOLVERS)]

@@ -21,11 +21,11 @@ import torch
 
 from mwdn import Calibration, Reconstructor
 from mwdn.data.captures import find_captures, read_captures
-from mwdn.deconvolution import deconvolution_grid
-from mwdn.export import agreement, export
-from mwdn.fourier import inverse_spectrum, spectrum
-from mwdn.onnx_graph import OnnxGraph
-from mwdn.onnx_program import to_onnx
+from mwdn.export.exporter import agreement, export
+from mwdn.export.onnx_graph import OnnxGraph
+from mwdn.export.onnx_program import to_onnx
+from mwdn.fourier.transforms import inverse_spectrum, spectrum
+from mwdn.fourier.wiener import deconvolution_grid
 
 KINDS = [(".onnx", "float32"), (".onnx", "float16"), (".onnx", "int8"), (".pt2", "float32"), (".pt2", "float16")]
 

@@ -15,11 +15,11 @@ from pathlib import Path
 import torch
 from torch.nn import functional as F
 
-from mwdn.calibration.measures import likeness
-from mwdn.data.images import read_picture
 from mwdn.evaluation.metrics import best_gain, psnr
+from mwdn.io.images import read_picture
 from mwdn.optics import Aberration, FieldCamera, field_psfs
 from mwdn.optics.patterns import contour_psf
+from mwdn.optics.psf_measures import likeness
 from mwdn.solvers import build
 
 CORNER = Aberration(scale=0.01, stretch=0.01, blur_px=0.5)
@@ -31,7 +31,7 @@ EXTENT = 0.7
 def scenes(size):
     """The bundled pictures in the middle of a dark field."""
     names = ("astronaut", "coffee", "cat")
-    pictures = [read_picture(str(files("mwdn") / "pictures" / f"{name}.jpg")) for name in names]
+    pictures = [read_picture(str(files("mwdn") / "io" / "pictures" / f"{name}.jpg")) for name in names]
     margin = round((1 - EXTENT) / 2 * size)
     inner = (size - 2 * margin,) * 2
     return torch.cat([F.pad(F.interpolate(picture, inner, mode="area"), (margin,) * 4) for picture in pictures])

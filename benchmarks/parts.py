@@ -19,10 +19,10 @@ from unittest.mock import patch
 import torch
 
 from mwdn import Calibration
-from mwdn.data.writing import write_json
-from mwdn.learning.recipe import read_recipe
-from mwdn.learning.session import prepare
+from mwdn.io.files import write_json
 from mwdn.networks import wiener_bank
+from mwdn.training.experiment import prepare
+from mwdn.training.recipe import read_recipe
 
 RECIPE = Path(__file__).parents[1] / "recipes" / "universal.toml"
 BANK = {"name": "wiener-bank", "width": 24, "finest": 0, "regularisations": [3e-2, 3e-3, 3e-4, 5e-5, 1e-5]}

@@ -19,8 +19,8 @@ import torch
 import mwdn
 from mwdn.data.photographs import Photographs
 from mwdn.data.unpaired import UnpairedCaptures
-from mwdn.learning.recipe import read_recipe
-from mwdn.learning.train import Trainer
+from mwdn.training.recipe import read_recipe
+from mwdn.training.trainer import Trainer
 from universal import METRICS, MISMATCHED, camera, captures, gain, keep, measured
 
 RECIPE = MISMATCHED.with_name("selfsupervised.toml")

@@ -15,8 +15,8 @@ from pathlib import Path
 import torch
 
 from mwdn import Calibration, Reconstructor, read_frame
-from mwdn.data.writing import atomic
 from mwdn.evaluation.consistency import consistency
+from mwdn.io.files import atomic
 from mwdn.optics import sample_camera
 from mwdn.solvers.alignment import Pose
 

@@ -28,9 +28,9 @@ from mwdn import Calibration, Reconstructor
 from mwdn.data.mismatch import EXACT
 from mwdn.data.photographs import Photographs
 from mwdn.data.simulated import SimulatedPairs
-from mwdn.data.writing import atomic
 from mwdn.evaluation import Perceptual, Protocol, bootstrap, evaluate
-from mwdn.learning.recipe import read_recipe
+from mwdn.io.files import atomic
+from mwdn.training.recipe import read_recipe
 
 PSFS = {
     "mwdn-camera 320x320": ("mwdn-camera/psf_320.png", {}),

@@ -17,12 +17,12 @@ import torch
 from torch.nn import functional as F
 
 from mwdn import Calibration, Camera, Reconstructor, read_picture, write_picture
-from mwdn.data.images import srgb_encode
-from mwdn.data.sheets import contact_sheet, for_people
-from mwdn.data.writing import atomic
-from mwdn.design import Designed, design_camera, radial_autocorrelation, radial_spectrum, sharpness
 from mwdn.evaluation import psnr
+from mwdn.io.contact_sheets import contact_sheet, for_people
+from mwdn.io.files import atomic
+from mwdn.io.images import srgb_encode
 from mwdn.optics import CodedAperture, Contour, Diffuser, Lenslets, Mask, Pinholes, Setup, ZoneAperture, mask_psf
+from mwdn.optics.design import Designed, design_camera, radial_autocorrelation, radial_spectrum, sharpness
 from mwdn.types import Psf, Scene
 
 DOCS = Path(__file__).resolve().parent
@@ -74,7 +74,7 @@ away. Errors of etching and reflections are likely sources of the haze.
 
 def scene() -> Scene:
     """The cup of coffee in the middle of a dark field."""
-    picture = read_picture(str(files("mwdn") / "pictures" / "coffee.jpg"))
+    picture = read_picture(str(files("mwdn") / "io" / "pictures" / "coffee.jpg"))
     return F.pad(picture, ((PAPER.size[0] - picture.shape[-1]) // 2,) * 4)
 
 

@@ -12,8 +12,8 @@ import cv2
 import torch
 
 from mwdn import Calibration, Reconstructor, for_people, read_frame
-from mwdn.data.images import srgb_encode
-from mwdn.data.sheets import contact_sheet
+from mwdn.io.contact_sheets import contact_sheet
+from mwdn.io.images import srgb_encode
 
 
 def main(camera: Path, weights: str, out: Path = Path("docs/objects.jpg")) -> None:

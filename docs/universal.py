@@ -10,8 +10,8 @@ import cv2
 import torch
 
 from mwdn import Calibration, Reconstructor, for_people, read_frame
-from mwdn.data.images import srgb_encode
-from mwdn.data.sheets import contact_sheet
+from mwdn.io.contact_sheets import contact_sheet
+from mwdn.io.images import srgb_encode
 
 DIFFUSERCAM = {"background": 0.0, "upside_down": True, "bgr": True}
 

@@ -8,6 +8,6 @@ DENOISER: the checkpoint of another denoiser, which takes the place of the netwo
 import sys
 from pathlib import Path
 
-from mwdn.learning.bundled import bundle
+from mwdn.weights.bundled import bundle
 
 bundle(*map(Path, sys.argv[1:]))

@@ -12,49 +12,32 @@ SOURCE = Path(__file__).resolve().parents[1] / "src"
 PACKAGE = SOURCE / "mwdn"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
-# Data flows downward through this list and imports only point upward. A dotted name is one file of a folder
-# that stands elsewhere: files are read and written from calibration on.
-TIERS = [
-    ("errors", "types", "streams", "memory", "transfers"),
-    ("planes",),
-    ("fourier", "dft"),
-    ("deconvolution",),
-    ("data.formats", "data.writing", "data.images"),
-    ("optics",),
-    ("calibration",),
-    ("solvers",),
-    ("networks",),
-    ("data",),
-    ("pictures",),
-    ("learning",),
-    ("evaluation",),
-    ("tiles",),
-    ("engine",),
-    ("reconstruct",),
-    ("darkroom",),
-    ("onnx_graph", "onnx_operations", "onnx_program", "quantise"),
-    ("export",),
-    ("capture",),
-    ("preview",),
-    ("design", "doctor"),
-    ("benchmark",),
-    (
-        "demo",
-        "cli_camera",
-        "cli_optics",
-        "cli_export",
-        "cli_inspect",
-        "cli_benchmark",
-        "cli_train",
-        "cli_reconstruct",
-        "cli",
-        "__main__",
-    ),
-    ("",),  # mwdn/__init__.py: the public names
+# From the ground up: a folder imports from itself and from the folders above it in this list, nothing else.
+FLOORS = [
+    "errors",
+    "types",
+    "version",
+    "fourier",
+    "runtime",
+    "io",
+    "optics",
+    "calibration",
+    "solvers",
+    "data",
+    "networks",
+    "weights",
+    "evaluation",
+    "inference",
+    "training",
+    "export",
+    "benchmark",
+    "cli",
+    "__main__",
+    "",  # mwdn/__init__.py: the public names
 ]
-RANK = {name: rank for rank, names in enumerate(TIERS) for name in names}
+FLOOR = {name: number for number, name in enumerate(FLOORS)}
 
-NETWORKS_MAY_IMPORT = {"errors", "types", "planes", "fourier", "deconvolution", "solvers", "networks"}
+NETWORKS_MAY_IMPORT = {"errors", "types", "fourier", "solvers", "networks"}
 HEAVY = ["cv2", "h5py", "starlette", "matplotlib", "tifffile", "cyclopts", "skimage", "scipy"]
 
 
@@ -79,7 +62,7 @@ def imports(path: Path) -> list[tuple[int, str]]:
             if node.level:
                 base = ".".join([*folder[: len(folder) - node.level + 1], *([base] if base else [])])
             for alias in node.names:
-                # `from mwdn import fourier` is a module, `from mwdn.fourier import wiener` a name of one.
+                # `from mwdn import fourier` is a module, `from mwdn.fourier.convolution import wiener` a name of one.
                 full = f"{base}.{alias.name}"
                 if full == "mwdn.__version__":  # a string, not a module
                     continue
@@ -87,10 +70,9 @@ def imports(path: Path) -> list[tuple[int, str]]:
     return found
 
 
-def tier(module: str) -> str:
-    """Name in `TIERS` that a module of mwdn belongs to."""
-    inside = module.removeprefix("mwdn").removeprefix(".")
-    return inside if inside in RANK else inside.split(".")[0]
+def folder(module: str) -> str:
+    """Name in `FLOORS` that a module of mwdn belongs to."""
+    return module.removeprefix("mwdn").removeprefix(".").split(".")[0]
 
 
 def each(paths):
@@ -98,15 +80,15 @@ def each(paths):
 
 
 @each(MODULES)
-def test_imports_only_point_upward(path):
-    own = tier(dotted(path))
-    assert own in RANK, f"{path} is in no tier: give it a place in TIERS"
+def test_imports_point_down(path):
+    own = folder(dotted(path))
+    assert own in FLOOR, f"{path} is on no floor: give its folder a place in FLOORS"
     for line, name in imports(path):
         if name.split(".")[0] != "mwdn":
             continue
-        other = tier(name)
-        assert other in RANK, f"{path}:{line} imports {name}, which is in no tier"
-        assert RANK[other] <= RANK[own], f"{path}:{line}: {own} must not import {name}, which is below it"
+        other = folder(name)
+        assert other in FLOOR, f"{path}:{line} imports {name}, which is on no floor"
+        assert FLOOR[other] <= FLOOR[own], f"{path}:{line}: {own} must not import {name}, which is above it"
 
 
 @each([path for path in MODULES if dotted(path).startswith("mwdn.networks")])
@@ -114,7 +96,7 @@ def test_networks_can_be_read_beside_the_paper(path):
     for line, name in imports(path):
         top = name.split(".")[0]
         if top == "mwdn":
-            assert tier(name) in NETWORKS_MAY_IMPORT, f"{path}:{line} imports {name}"
+            assert folder(name) in NETWORKS_MAY_IMPORT, f"{path}:{line} imports {name}"
         else:
             assert top in {"torch", "numpy"} | sys.stdlib_module_names, f"{path}:{line} imports {name}"
 
@@ -129,7 +111,7 @@ def test_only_fourier_mentions_torch_fft():
     """Elsewhere nobody would think of float32 and of where a PSF's centre is."""
     pattern = re.compile(r"torch\.fft|from\s+torch\s+import\s[^\n]*\bfft\b|\bfft\.i?r?fftn?2?\(")
     found = [dotted(path) for path in MODULES if pattern.search(path.read_text(encoding="utf-8"))]
-    assert found == ["mwdn.fourier"]
+    assert found == ["mwdn.fourier.transforms"]
 
 
 def test_import_is_light():

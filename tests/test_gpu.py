@@ -11,16 +11,16 @@ import pytest
 import torch
 
 from mwdn import Calibration, Camera, Reconstructor, solvers
-from mwdn.darkroom import Darkroom
 from mwdn.data.pairs import PairFile
 from mwdn.data.photographs import Photographs
 from mwdn.data.recorded import RecordedPairs, record
 from mwdn.data.simulated import SimulatedPairs
-from mwdn.learning.recipe import Recipe, Schedule
-from mwdn.learning.train import Trainer
+from mwdn.inference.batch import Darkroom
 from mwdn.networks import build
 from mwdn.optics.patterns import contour_psf
-from mwdn.transfers import fetched, sent
+from mwdn.runtime.transfers import fetched, sent
+from mwdn.training.recipe import Recipe, Schedule
+from mwdn.training.trainer import Trainer
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU here")
 

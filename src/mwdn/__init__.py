@@ -8,17 +8,16 @@
 """
 
 from mwdn.calibration import Calibration
-from mwdn.data import read_frame, read_picture, write_linear, write_picture
-from mwdn.data.sheets import for_people
-from mwdn.deconvolution import wiener
 from mwdn.errors import MwdnError
-from mwdn.fourier import convolve, correlate
-from mwdn.memory import keep_memory
+from mwdn.fourier.convolution import convolve, correlate
+from mwdn.fourier.wiener import wiener
+from mwdn.inference.reconstructor import Reconstructor
+from mwdn.io.contact_sheets import for_people
+from mwdn.io.images import read_frame, read_picture, write_linear, write_picture
 from mwdn.networks import build
 from mwdn.optics import Camera, Sensor
-from mwdn.reconstruct import Reconstructor
-
-__version__ = "0.1.0"
+from mwdn.runtime.memory import keep_memory
+from mwdn.version import __version__ as __version__
 
 __all__ = [
     "Calibration",

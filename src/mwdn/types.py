@@ -15,6 +15,9 @@ import numpy.typing as npt
 from jaxtyping import Complex, Float
 from torch import Tensor
 
+Size = tuple[int, int]
+"""(height, width) in pixels."""
+
 Image = Float[Tensor, "batch channel height width"]
 """Any picture whose relation to the other arguments is free."""
 

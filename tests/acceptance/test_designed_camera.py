@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from mwdn import Calibration, write_picture
-from mwdn.data.sheets import contact_sheet
-from mwdn.design import design_camera, radial_autocorrelation, radial_spectrum
+from mwdn.io.contact_sheets import contact_sheet
 from mwdn.optics import Contour, Setup
+from mwdn.optics.design import design_camera, radial_autocorrelation, radial_spectrum
 
 pytestmark = pytest.mark.acceptance
 OUT = Path("results/acceptance")

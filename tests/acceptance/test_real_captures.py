@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from mwdn import Calibration, convolve, read_frame
-from mwdn.cli import main
+from mwdn.cli.app import main
 
 pytestmark = pytest.mark.acceptance
 OUT = Path("results/acceptance")

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from mwdn.benchmark import read_benchmark, run
-from mwdn.cli import main
+from mwdn.cli.app import main
 from mwdn.data.pairs import PairFile
 from mwdn.errors import CheckpointError, ParameterError, UnknownNameError
 from mwdn.evaluation import bootstrap

@@ -11,7 +11,7 @@ import torch
 from mwdn.calibration import Calibration
 from mwdn.calibration.psf import _turn
 from mwdn.errors import ImageError, ParameterError, PsfError, ShapeError
-from mwdn.fourier import convolve
+from mwdn.fourier.convolution import convolve
 from mwdn.optics.patterns import contour_psf
 
 SIZE = 48, 40

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from mwdn.calibration import Calibration, measures
+from mwdn.calibration import Calibration
 from mwdn.calibration.report import inspect_psf
 from mwdn.calibration.verdict import headline, verdict
-from mwdn.data.images import read_frame
-from mwdn.data.writing import write_json
 from mwdn.errors import ImageError
-from mwdn.optics import sample_camera
-from mwdn.optics.families import Variety
+from mwdn.io.files import write_json
+from mwdn.io.images import read_frame
+from mwdn.optics import psf_measures, sample_camera
 from mwdn.optics.patterns import contour_psf
+from mwdn.optics.random_psf import Variety
 
 SIZE = 96, 80
 CLEAN = Variety(support=(0.6, 0.6), offset=0.0, halo=(0.0, 0.0), glow=(0.0, 0.0), background=(0.0, 0.0))
@@ -181,18 +181,18 @@ def test_distance_and_angle(psf):
     others = {10.0: psf, 20.0: psf.flip(-1)}
     report = inspect_psf(Calibration(psf), depth=others, angle={5.0: psf})
     assert report.depth[10.0] == pytest.approx(1, abs=1e-4)
-    assert report.depth[20.0] == measures.likeness(psf.flip(-1), psf)
+    assert report.depth[20.0] == psf_measures.likeness(psf.flip(-1), psf)
     assert said(report, "distance", "at 20 the camera needs another PSF")
     assert said(report, "every angle asked for", "1.00")
 
 
 def test_numbers_are_those_of_the_measures(psf):
     report = inspect_psf(Calibration(psf))
-    assert report.noise_gain[1e-3] == max(measures.noise_gain(psf, 1e-3))
+    assert report.noise_gain[1e-3] == max(psf_measures.noise_gain(psf, 1e-3))
     gains, kept = list(report.noise_gain.values()), list(report.detail_kept.values())
     assert gains == sorted(gains, reverse=True)
     assert kept == sorted(kept, reverse=True)
-    worst = min(measures.resolved_frequency(psf[:, [c]], 0.003) for c in range(3))
+    worst = min(psf_measures.resolved_frequency(psf[:, [c]], 0.003) for c in range(3))
     assert report.resolution_px[0.003] == 0.5 / worst
 
 

@@ -10,7 +10,7 @@ from mwdn.data.mismatch import EXACT
 from mwdn.data.photographs import Photographs
 from mwdn.data.simulated import Placement, SimulatedPairs
 from mwdn.errors import ParameterError
-from mwdn.fourier import convolve
+from mwdn.fourier.convolution import convolve
 from mwdn.optics import Sensor
 
 CLEAN = Sensor(full_well=1e9, read_noise=0.0, bit_depth=16, black_level=0.0)

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from mwdn.data.images import srgb_decode
 from mwdn.data.photographs import Photographs
 from mwdn.errors import ImageError, ParameterError
+from mwdn.io.images import srgb_decode
 
 
 def store(path, pixels):

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from mwdn.data.cameras import CameraPairs, Cameras
-from mwdn.data.draws import uniform
 from mwdn.data.mismatch import EXACT, Mismatch, perturb
 from mwdn.data.noisy import Denoising, NoisyScenes
 from mwdn.data.photographs import Photographs
+from mwdn.data.random import uniform
 from mwdn.data.simulated import Placement, SimulatedPairs, _resample
 from mwdn.data.unpaired import UnpairedCaptures
 from mwdn.errors import ParameterError

@@ -12,26 +12,16 @@ import torch
 from rich.console import Console
 from torch import nn
 
-from mwdn import cli
 from mwdn.calibration import Calibration
-from mwdn.data.images import read_frame, write_linear
+from mwdn.cli import app
 from mwdn.data.pairs import PairFile
 from mwdn.errors import CheckpointError, ParameterError, ShapeError, UnknownNameError
-from mwdn.evaluation import (
-    First,
-    Perceptual,
-    Protocol,
-    Report,
-    Scores,
-    evaluate,
-    learnable_numbers,
-    measure,
-)
-from mwdn.learning import alexnet
+from mwdn.evaluation import First, Perceptual, Protocol, Report, Scores, alexnet, evaluate, learnable_numbers, measure
+from mwdn.inference.reconstructor import Reconstructor
+from mwdn.io.images import read_frame, write_linear
 from mwdn.networks import build
 from mwdn.optics import Camera
 from mwdn.optics.patterns import contour_psf
-from mwdn.reconstruct import Reconstructor
 from mwdn.solvers import Admm
 
 SIZE = 40, 48
@@ -222,7 +212,7 @@ def test_first_reads_only_what_is_asked_for(pairs):
 
 def run(*arguments):
     with pytest.raises(SystemExit) as left:
-        cli.main([str(argument) for argument in arguments])
+        app.main([str(argument) for argument in arguments])
     return left.value.code
 
 

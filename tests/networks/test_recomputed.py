@@ -7,9 +7,9 @@ import torch
 from torch import nn
 
 from mwdn.errors import ParameterError
-from mwdn.learning.batch_norm import GlobalBatchNorm2d
 from mwdn.networks import build
 from mwdn.networks.recomputed import Stages, recompute
+from mwdn.training.batch_norm import GlobalBatchNorm2d
 
 
 def learned_once(network, measurement, psf):

@@ -7,8 +7,8 @@ from torch import nn
 from torch.nn import functional as F
 
 import oracles
+from mwdn.benchmark.published import PUBLISHED
 from mwdn.networks import NETWORKS, build
-from mwdn.networks.published import PUBLISHED
 from mwdn.solvers import Admm, Penalties
 from mwdn.solvers.proximal import bounded
 

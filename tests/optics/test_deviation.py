@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from mwdn.errors import ParameterError
-from mwdn.fourier import convolve
+from mwdn.fourier.convolution import convolve
 from mwdn.optics import Camera, Deviation
 from mwdn.optics.patterns import contour_psf
 

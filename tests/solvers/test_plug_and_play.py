@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import oracles
-from mwdn.fourier import convolve
+from mwdn.fourier.convolution import convolve
 from mwdn.networks import build
 from mwdn.optics.patterns import contour_psf
 from mwdn.solvers import Penalties

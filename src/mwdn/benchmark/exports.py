@@ -7,7 +7,7 @@ import math
 from dataclasses import asdict
 from typing import Any
 
-from mwdn.benchmark.found import Found, environment
+from mwdn.benchmark.results import Found, environment
 from mwdn.evaluation.metrics import METRICS
 
 

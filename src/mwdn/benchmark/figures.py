@@ -14,8 +14,8 @@ from torch.nn import functional as F
 from mwdn.benchmark.pages import Picture
 from mwdn.benchmark.recipe import AXES
 from mwdn.benchmark.robustness import Sweep
-from mwdn.data.images import srgb_encode
-from mwdn.data.sheets import contact_sheet
+from mwdn.io.contact_sheets import contact_sheet
+from mwdn.io.images import srgb_encode
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from rich.table import Table
 
-from mwdn.data.writing import save_text, written
 from mwdn.evaluation.tables import html_table, markdown_table
+from mwdn.io.files import save_text, written
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,12 @@ from typing import Any
 
 from mwdn.benchmark.sets import PRESETS, DataSet
 from mwdn.errors import ParameterError, UnknownNameError, check_options
-from mwdn.learning.losses import checked_weights
-from mwdn.learning.recipe import Schedule
-from mwdn.learning.tables import fill, read_toml
+from mwdn.io.toml import fill, read_toml
 from mwdn.networks import NETWORKS
 from mwdn.optics import Deviation
 from mwdn.solvers import SOLVERS
+from mwdn.training.losses import checked_weights
+from mwdn.training.recipe import Schedule
 
 AXES = {"noise": 1.0, **{part.name: 0.0 for part in fields(Deviation)}}
 """What a robustness sweep varies, and its value in the camera that networks were trained for: noise as a multiple."""

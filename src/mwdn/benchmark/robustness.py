@@ -13,11 +13,11 @@ from mwdn.benchmark.recipe import AXES, Robustness
 from mwdn.benchmark.scoring import read_kept
 from mwdn.benchmark.sets import Opened, simulated
 from mwdn.data.photographs import Photographs
-from mwdn.data.writing import save_text
 from mwdn.evaluation import measure
-from mwdn.learning.session import FILE_START
+from mwdn.inference.reconstructor import Reconstructor
+from mwdn.io.files import save_text
 from mwdn.optics import Sensor
-from mwdn.reconstruct import Reconstructor
+from mwdn.training.experiment import FILE_START
 
 Sweep = dict[str, dict[float, list[float]]]
 """PSNR of each picture by the size, by the axis."""

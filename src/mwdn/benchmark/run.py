@@ -9,22 +9,22 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from mwdn.benchmark.compose import sections
 from mwdn.benchmark.exports import csv_text, json_content
-from mwdn.benchmark.found import Found
+from mwdn.benchmark.locks import held, shared
 from mwdn.benchmark.pages import write_html, write_markdown
 from mwdn.benchmark.recipe import Benchmark, Method
+from mwdn.benchmark.results import Found
 from mwdn.benchmark.robustness import Sweep, pairs_at, sweep
 from mwdn.benchmark.scoring import Scored, bind, identity, score
+from mwdn.benchmark.sections import sections
 from mwdn.benchmark.sets import Opened, open_set
-from mwdn.benchmark.sharing import held, shared
 from mwdn.benchmark.training import train
 from mwdn.data.photographs import Photographs
-from mwdn.data.writing import save_text
 from mwdn.evaluation import Perceptual
-from mwdn.learning.alexnet import SMALLEST
-from mwdn.learning.distributed import device_here
-from mwdn.learning.train import Report
+from mwdn.evaluation.alexnet import SMALLEST
+from mwdn.io.files import save_text
+from mwdn.runtime.distributed import device_here
+from mwdn.training.trainer import Report
 
 PAGE = "index.html"
 
@@ -55,7 +55,7 @@ def run(
     """Make data, train, score, sweep, and write the page.
 
     What is finished stays: files of pairs, trained networks, scores. A network whose training was interrupted goes on
-    from its last saved state. Several processes with one ``out`` share the networks, see `mwdn.benchmark.sharing`.
+    from its last saved state. Several processes with one ``out`` share the networks, see `mwdn.benchmark.locks`.
 
     Args:
         benchmark: the recipe.

@@ -10,13 +10,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mwdn import __version__, solvers
+from mwdn import solvers
 from mwdn.benchmark.recipe import Method
 from mwdn.benchmark.sets import Opened, file_hash
 from mwdn.data.captures import find_captures, read_captures
-from mwdn.data.writing import save_text, written
 from mwdn.evaluation import First, Perceptual, Scores, evaluate
-from mwdn.reconstruct import Reconstructor
+from mwdn.inference.reconstructor import Reconstructor
+from mwdn.io.files import save_text, written
+from mwdn.version import __version__
 
 TIMED = 3
 """Pictures for the time on the CPU, where the scores come from a GPU."""

@@ -20,12 +20,12 @@ from mwdn.data.photographs import Photographs
 from mwdn.data.recorded import HELD_OUT, Division, RecordedPairs, check_pairs, record
 from mwdn.data.simulated import Placement, Samples, SimulatedPairs
 from mwdn.data.splits import split
-from mwdn.data.writing import save_text
 from mwdn.errors import ParameterError
 from mwdn.evaluation import Protocol
-from mwdn.learning.session import FILE_START
-from mwdn.learning.validation import START
+from mwdn.io.files import save_text
 from mwdn.optics import Deviation, Sensor
+from mwdn.training.experiment import FILE_START
+from mwdn.training.validation import START
 
 Track = Callable[[str, list[range]], Iterable[range]]
 """Shows the progress of an iteration under a title."""

@@ -10,15 +10,15 @@ from typing import Any
 
 import torch
 
+from mwdn.benchmark.published import PUBLISHED
 from mwdn.benchmark.recipe import Benchmark, Method
 from mwdn.benchmark.sets import Opened
-from mwdn.data.writing import save_text
 from mwdn.errors import ParameterError
-from mwdn.fourier import Size
-from mwdn.learning.recipe import OPTIMISERS, Recipe, Schedule
-from mwdn.learning.train import Report, Trainer
+from mwdn.io.files import save_text
 from mwdn.networks import NETWORKS
-from mwdn.networks.published import PUBLISHED
+from mwdn.training.recipe import OPTIMISERS, Recipe, Schedule
+from mwdn.training.trainer import Report, Trainer
+from mwdn.types import Size
 
 CLOCK = "clock.json"
 """Seconds that a run has trained, up to its last saved state."""
@@ -83,7 +83,7 @@ def train(
         The checkpoint: the weights of the best validation.
 
     Raises:
-        MwdnError: as for `mwdn.learning.train.Trainer`; or the data set is for tests alone.
+        MwdnError: as for `mwdn.training.trainer.Trainer`; or the data set is for tests alone.
     """
     if opened.training is None:
         raise ParameterError(f"Nothing is trained on `{opened.name}`: its networks are those of `trained_on`.")

@@ -1,6 +1,5 @@
 """The calibration of a camera: its PSF, and how its raw frames become measurements."""
 
-import hashlib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,10 +17,10 @@ from mwdn.calibration.frames import (
     estimate_background,
     full_scale,
 )
-from mwdn.data.images import read_frame
 from mwdn.errors import ParameterError, PsfError, ShapeError
-from mwdn.fourier import Size
-from mwdn.types import Frame, Measurement, Psf
+from mwdn.io.images import read_frame
+from mwdn.optics.psf import psf_hash
+from mwdn.types import Frame, Measurement, Psf, Size
 
 SATURATED_PART = 1e-3
 """A PSF whose lines saturate is a wrong PSF; a few hot pixels are not. 1e-3 of 320 x 320 are 102 pixels."""
@@ -143,9 +142,7 @@ class Calibration:
     @cached_property
     def psf_hash(self) -> str:
         """First 16 hexadecimal digits of the SHA-256 of the PSF's shape and float32 numbers."""
-        digest = hashlib.sha256(repr(tuple(self.psf.shape)).encode())
-        digest.update(self.psf.float().cpu().contiguous().numpy().tobytes())
-        return digest.hexdigest()[:16]
+        return psf_hash(self.psf)
 
     @property
     def size(self) -> Size:
@@ -174,7 +171,7 @@ class Calibration:
         """Turn a raw frame into a measurement: levels, crop, binning, orientation.
 
         Args:
-            frame: (H, W, C) numbers of the sensor, RGB, as `mwdn.data.read_frame` gives them.
+            frame: (H, W, C) numbers of the sensor, RGB, as `mwdn.io.images.read_frame` gives them.
 
         Returns:
             (1, C, *size), linear light; 1 is saturation.

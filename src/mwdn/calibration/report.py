@@ -5,11 +5,11 @@ from typing import Any
 
 import torch
 
-from mwdn.calibration import measures
-from mwdn.calibration.frames import estimate_background, full_scale, noise_level
+from mwdn.calibration.frames import estimate_background, full_scale
 from mwdn.calibration.psf import Calibration, saturated
-from mwdn.fourier import Size
-from mwdn.types import Frame, Psf
+from mwdn.optics import psf_measures
+from mwdn.optics.noise import noise_level
+from mwdn.types import Frame, Psf, Size
 
 LAMBDAS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
 """Regularisations that the noise gain is told for."""
@@ -74,7 +74,7 @@ class PsfReport:
     psf_hash: str
     size: Size
     levels: Levels | None
-    support: measures.Support
+    support: psf_measures.Support
     peak_width_px: float
     side_lobe: tuple[float, tuple[int, int]]
     weak_part: float
@@ -110,26 +110,26 @@ def inspect_psf(
         calibration: that holds it.
         frame: the file's numbers, as `mwdn.read_frame` gives them; without them nothing is said about levels.
         depth: the PSFs of points at other distances than the calibration's, by the distance.
-        angle: likewise, by the angle. `mwdn.calibration.measures.sensitivity` does the same for a function.
+        angle: likewise, by the angle. `mwdn.optics.psf_measures.sensitivity` does the same for a function.
     """
     psf = calibration.psf.float().cpu()
     colours = [psf[:, [c]] for c in range(psf.shape[1])]
     pairs = [(a, b) for i, a in enumerate(colours) for b in colours[:i]]
-    peak, weak = measures.autocorrelation(psf), measures.zeros(psf)
+    peak, weak = psf_measures.autocorrelation(psf), psf_measures.zeros(psf)
     levels = _levels(calibration, frame) if frame is not None else None
     return PsfReport(
         psf_hash=calibration.psf_hash,
         size=calibration.size,
         levels=levels,
-        support=measures.support(psf),
+        support=psf_measures.support(psf),
         peak_width_px=peak.width,
         side_lobe=(peak.lobe, peak.lobe_at),
         weak_part=weak[0],
         dark_rings=weak[1],
-        effective_rank=measures.effective_rank(psf),
-        colour_likeness=min((measures.likeness(a, b) for a, b in pairs), default=1.0),
-        noise_gain={value: max(measures.noise_gain(psf, value)) for value in LAMBDAS},
-        detail_kept={value: min(measures.detail_kept(psf, value)) for value in LAMBDAS},
+        effective_rank=psf_measures.effective_rank(psf),
+        colour_likeness=min((psf_measures.likeness(a, b) for a, b in pairs), default=1.0),
+        noise_gain={value: max(psf_measures.noise_gain(psf, value)) for value in LAMBDAS},
+        detail_kept={value: min(psf_measures.detail_kept(psf, value)) for value in LAMBDAS},
         resolution_px={noise: _resolution(colours, noise) for noise in NOISES},
         known_frequency=_known(psf, levels.noise_floor if levels else 0.0),
         depth=_likenesses(psf, depth),
@@ -138,18 +138,18 @@ def inspect_psf(
 
 
 def _likenesses(psf: Psf, others: dict[float, Psf] | None) -> dict[float, float]:
-    return {place: measures.likeness(other, psf) for place, other in (others or {}).items()}
+    return {place: psf_measures.likeness(other, psf) for place, other in (others or {}).items()}
 
 
 def _resolution(colours: list[Psf], noise: float) -> float:
     """Half the shortest visible period, of the colour that sees least."""
-    frequency = min(measures.resolved_frequency(colour, noise) for colour in colours)
+    frequency = min(psf_measures.resolved_frequency(colour, noise) for colour in colours)
     return 0.5 / frequency if frequency > 0 else float("inf")
 
 
 def _known(psf: Psf, floor: float) -> float:
     """Lowest frequency from which on the PSF's power is not even twice that of its noise."""
-    ring = measures.rings(psf)
+    ring = psf_measures.rings(psf)
     lost = (ring.power < 2 * floor).flip(0).long().cumprod(0).flip(0).nonzero()
     return float(ring.frequency[lost[0, 0]]) if len(lost) else 0.5
 
@@ -178,7 +178,7 @@ def _levels(calibration: Calibration, frame: Frame) -> Levels:
         background=tuple(background.flatten().tolist()),
         subtracted=calibration.background,
         pedestal=float(share.max()),
-        between=measures.between_lines(upright.mean((0, 1))[measures.lit_box(calibration.psf)]),
+        between=psf_measures.between_lines(upright.mean((0, 1))[psf_measures.lit_box(calibration.psf)]),
         noise=float(noise.max()),
         noise_floor=float((pixels * (noise / light).square()).max()),
     )

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mwdn.calibration import measures
 from mwdn.calibration.report import PsfReport
 from mwdn.calibration.verdict import headline, verdict
-from mwdn.data.images import srgb_encode
-from mwdn.data.writing import written
+from mwdn.io.files import written
+from mwdn.io.images import srgb_encode
+from mwdn.optics import psf_measures
 from mwdn.types import Psf
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def _draw_psf(axes: "Axes", psf: Psf) -> None:
 
 
 def _draw_autocorrelation(axes: "Axes", psf: Psf) -> None:
-    image = measures.autocorrelation(psf).image.numpy()
+    image = psf_measures.autocorrelation(psf).image.numpy()
     height, width = image.shape
     extent = (-(width // 2) - 0.5, width - width // 2 - 0.5, height - height // 2 - 0.5, -(height // 2) - 0.5)
     shown = axes.imshow(image, cmap="RdBu_r", vmin=-0.3, vmax=0.3, extent=extent)
@@ -68,7 +68,7 @@ def _draw_autocorrelation(axes: "Axes", psf: Psf) -> None:
 
 
 def _draw_profile(axes: "Axes", psf: Psf) -> None:
-    image = measures.autocorrelation(psf).image.numpy()
+    image = psf_measures.autocorrelation(psf).image.numpy()
     row, column = image.shape[0] // 2, image.shape[1] // 2
     reach = min(row, column, 40)
     steps = np.arange(-reach, reach + 1)
@@ -82,7 +82,7 @@ def _draw_profile(axes: "Axes", psf: Psf) -> None:
 
 def _draw_spectrum(axes: "Axes", psf: Psf, report: PsfReport) -> None:
     for channel, colour in zip(range(psf.shape[1]), ("C3", "C2", "C0") if psf.shape[1] == 3 else ("k",), strict=True):
-        frequency, power = measures.rings(psf[:, [channel]])
+        frequency, power = psf_measures.rings(psf[:, [channel]])
         axes.plot(frequency[1:], 10 * power[1:].clamp(min=1e-12).log10(), colour, lw=1)
     for ring in report.dark_rings:
         axes.axvline(ring, color=_COLOURS["mind"], lw=0.7)
@@ -106,7 +106,7 @@ def _draw_gain(axes: "Axes", report: PsfReport) -> None:
 def _draw_resolution(axes: "Axes", psf: Psf, report: PsfReport) -> None:
     noises = np.logspace(-4, -1.5, 16)
     frequency = [
-        min(measures.resolved_frequency(psf[:, [c]], float(noise)) for c in range(psf.shape[1])) for noise in noises
+        min(psf_measures.resolved_frequency(psf[:, [c]], float(noise)) for c in range(psf.shape[1])) for noise in noises
     ]
     pairs = [(100 * noise, 0.5 / f) for noise, f in zip(noises, frequency, strict=True) if f > 0]
     if pairs:

@@ -4,11 +4,11 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from mwdn.data.draws import seeded
+from mwdn.data.random import seeded
 from mwdn.data.simulated import Pair, SimulatedPairs, full_precision
 from mwdn.errors import ParameterError
-from mwdn.fourier import Size
-from mwdn.optics.families import FAMILIES, sample_camera
+from mwdn.optics.random_psf import FAMILIES, sample_camera
+from mwdn.types import Size
 
 CAMERA_SEED = 7
 """Apart from the generators of the samples themselves."""

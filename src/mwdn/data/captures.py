@@ -7,8 +7,8 @@ from pathlib import Path
 import torch
 
 from mwdn.calibration import Calibration
-from mwdn.data.images import READABLE, read_frame
 from mwdn.errors import ParameterError, ShapeError
+from mwdn.io.images import READABLE, read_frame
 from mwdn.types import Measurement
 
 

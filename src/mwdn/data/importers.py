@@ -11,18 +11,10 @@ import numpy as np
 from mwdn.calibration.frames import as_image, bin_pixels, demosaiced, full_scale
 from mwdn.data.pair_writer import PixelType, check_path, quantise
 from mwdn.data.pairs import PairFile
-from mwdn.data.sources import (
-    Found,
-    Source,
-    find_in_folders,
-    find_in_hdf5,
-    find_in_parquet,
-    find_phlatcam,
-)
-from mwdn.data.writing import spare
+from mwdn.data.sources import Found, Source, find_in_folders, find_in_hdf5, find_in_parquet, find_phlatcam
 from mwdn.errors import ImageError, MwdnError, ParameterError, UnknownNameError
-from mwdn.fourier import Size
-from mwdn.types import Frame
+from mwdn.io.files import spare
+from mwdn.types import Frame, Size
 
 Pair = tuple[str, Frame, Frame]
 """A name, a measurement and a scene, both (H, W, C), RGB, row 0 at the top, integers or floats in [0, 1]."""

@@ -7,11 +7,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from mwdn.data.draws import uniform
+from mwdn.data.random import uniform
 from mwdn.errors import ParameterError
-from mwdn.fourier import Size
 from mwdn.optics.warp import affine, hazed
-from mwdn.types import Psf
+from mwdn.types import Psf, Size
 
 
 @dataclass(frozen=True)

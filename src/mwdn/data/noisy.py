@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import torch
 
-from mwdn.data.draws import uniform
+from mwdn.data.random import uniform
 from mwdn.data.simulated import Pair, SimulatedPairs, full_precision
 from mwdn.errors import ParameterError
 

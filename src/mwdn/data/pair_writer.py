@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mwdn.data.writing import atomic, naming
 from mwdn.errors import ImageError, ParameterError, ShapeError
+from mwdn.io.files import atomic, naming
 from mwdn.types import Frame
 
 Attribute = str | int | float

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mwdn.data.images import READABLE, read_frame, srgb_decode
 from mwdn.errors import ImageError, ParameterError
+from mwdn.io.images import READABLE, read_frame, srgb_decode
 from mwdn.types import Frame
 
 

@@ -15,7 +15,7 @@ from mwdn.data.pairs import PairFile
 from mwdn.data.simulated import Pair, Samples
 from mwdn.data.splits import split
 from mwdn.errors import ParameterError, ShapeError
-from mwdn.transfers import sent
+from mwdn.runtime.transfers import sent
 from mwdn.types import Psf
 
 HELD_OUT = 20

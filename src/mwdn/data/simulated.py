@@ -14,16 +14,15 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from mwdn.data.draws import seeded, uniform
 from mwdn.data.mismatch import Mismatch, perturb, shading
 from mwdn.data.photographs import Photographs
+from mwdn.data.random import seeded, uniform
 from mwdn.errors import ParameterError
-from mwdn.fourier import Size
 from mwdn.optics.camera import Camera
 from mwdn.optics.field import FieldCamera
 from mwdn.optics.sensor import Sensor
 from mwdn.optics.warp import affine
-from mwdn.types import Measurement, Psf, Scene
+from mwdn.types import Measurement, Psf, Scene, Size
 
 P = ParamSpec("P")
 R = TypeVar("R")

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from mwdn.data.images import READABLE, decode_frame, read_frame
 from mwdn.errors import ImageError
+from mwdn.io.images import READABLE, decode_frame, read_frame
 from mwdn.types import Frame
 
 AGAIN = "Copy it from its source again."

@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from mwdn.calibration.frames import noise_level
-from mwdn.data.draws import seeded
+from mwdn.data.random import seeded
 from mwdn.data.simulated import Pair, full_precision
 from mwdn.errors import ParameterError
-from mwdn.fourier import convolve
+from mwdn.fourier.convolution import convolve
+from mwdn.optics.noise import noise_level
 from mwdn.solvers.alignment import Pose, align
 from mwdn.types import Image, Measurement, Psf, Scene
 

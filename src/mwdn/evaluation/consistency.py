@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mwdn.calibration.frames import noise_level
 from mwdn.errors import ShapeError
-from mwdn.fourier import convolve
+from mwdn.fourier.convolution import convolve
+from mwdn.optics.noise import noise_level
 from mwdn.solvers.alignment import Pose, align, fine_detail, misfit
 from mwdn.types import Measurement, Psf, Scene
 

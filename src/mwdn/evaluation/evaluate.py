@@ -14,9 +14,9 @@ from torch import nn
 
 from mwdn.data.pair_writer import NAMES
 from mwdn.errors import ParameterError
+from mwdn.evaluation.alexnet import SMALLEST
 from mwdn.evaluation.metrics import METRICS, Perceptual, Protocol, Variant, measure
 from mwdn.evaluation.report import Report, Scores
-from mwdn.learning.alexnet import SMALLEST
 from mwdn.types import Measurement, Scene
 
 Bound = Callable[[Measurement], Scene]

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from mwdn.errors import CheckpointError, ParameterError, ShapeError
-from mwdn.learning import losses
-from mwdn.learning.alexnet import AlexNet, Heads, load_alexnet, load_heads
+from mwdn.evaluation import distances
+from mwdn.evaluation.alexnet import AlexNet, Heads, load_alexnet, load_heads
 from mwdn.types import Image
 
 Variant = Literal["raw", "clipped", "best-gain"]
@@ -116,8 +116,8 @@ class Perceptual:
         """Find or download the weights; what cannot be had goes to ``missing`` with its reason.
 
         Args:
-            alexnet: file of AlexNet's weights; see `mwdn.learning.alexnet.load_alexnet`.
-            heads: file of LPIPS's heads; see `mwdn.learning.alexnet.load_heads`.
+            alexnet: file of AlexNet's weights; see `mwdn.evaluation.alexnet.load_alexnet`.
+            heads: file of LPIPS's heads; see `mwdn.evaluation.alexnet.load_heads`.
         """
         try:
             features = load_alexnet(alexnet)
@@ -147,7 +147,7 @@ def psnr(image: Image, reference: Image) -> Tensor:
     Raises:
         ShapeError: the shapes differ.
     """
-    return -10 * torch.log10(losses.mse(image, reference))
+    return -10 * torch.log10(distances.mse(image, reference))
 
 
 def best_gain(image: Image, reference: Image) -> Image:
@@ -214,10 +214,10 @@ def measure(
     alexnet, heads = networks.alexnet, networks.heads
     return {
         "psnr": psnr(image, reference),
-        "ssim": losses.ssim(image, reference),
-        "lpips": losses.lpips(image, reference, alexnet, heads) if alexnet and heads else missing,
-        "feature_mse": losses.feature_mse(image, reference, alexnet) if alexnet else missing,
-        "mse": losses.mse(image, reference),
+        "ssim": distances.ssim(image, reference),
+        "lpips": distances.lpips(image, reference, alexnet, heads) if alexnet and heads else missing,
+        "feature_mse": distances.feature_mse(image, reference, alexnet) if alexnet else missing,
+        "mse": distances.mse(image, reference),
     }
 
 

@@ -15,11 +15,11 @@ from rich.markup import escape
 from rich.table import Table
 from torch import Tensor
 
-from mwdn.data.images import write_picture
-from mwdn.data.sheets import contact_sheet
-from mwdn.data.writing import write_json
 from mwdn.errors import UnknownNameError
 from mwdn.evaluation.metrics import LARGER_IS_BETTER, METRICS, bootstrap
+from mwdn.io.contact_sheets import contact_sheet
+from mwdn.io.files import write_json
+from mwdn.io.images import write_picture
 
 JSON = "report.json"
 SHEET = "comparison.png"

@@ -8,12 +8,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from mwdn.deconvolution import deconvolution_grid, filtered, wiener_transfer
 from mwdn.errors import ParameterError, ShapeError
-from mwdn.fourier import Size
+from mwdn.fourier.filtering import filtered
+from mwdn.fourier.memory_format import in_parts
+from mwdn.fourier.padding import Boundary
+from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
 from mwdn.networks.recomputed import Stages
-from mwdn.planes import Boundary, in_parts
-from mwdn.types import Image, Measurement, Psf
+from mwdn.types import Image, Measurement, Psf, Size
 
 Pooling = Literal["max", "average"]
 
@@ -146,7 +147,7 @@ class Wiener(nn.Module):
     Args:
         weight: start value of w; ``None`` leaves w out (MWDN-CPSF, whose PSF is learned).
         regularisation: start value of lambda.
-        boundary: see `mwdn.planes.Boundary`.
+        boundary: see `mwdn.fourier.padding.Boundary`.
     """
 
     def __init__(

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from mwdn.planes import folded
+from mwdn.fourier.memory_format import folded
 from mwdn.types import Image
 
 

@@ -5,13 +5,13 @@ import math
 import torch
 from torch import Tensor, nn
 
-from mwdn.deconvolution import deconvolution_grid
 from mwdn.errors import ParameterError
-from mwdn.fourier import inverse_spectrum, spectrum, transfer_function
+from mwdn.fourier.padding import Boundary, extend
+from mwdn.fourier.transforms import inverse_spectrum, spectrum, transfer_function
+from mwdn.fourier.wiener import deconvolution_grid
 from mwdn.networks.blocks import one_each_colour, stretched
 from mwdn.networks.generator import Generator
-from mwdn.planes import Boundary, Size, extend
-from mwdn.types import Measurement, Psf, Scene
+from mwdn.types import Measurement, Psf, Scene, Size
 
 
 class FlatNet(nn.Module):
@@ -34,7 +34,7 @@ class FlatNet(nn.Module):
         width: feature channels at the U-Net's finest scale.
         size: height and width of the sensor whose filter is learned; ``None`` keeps the Wiener filter.
         regularisation: lambda of the Wiener filter that it begins as, for a PSF of unit sum.
-        boundary: what stands beyond the measurement, see `mwdn.planes.Boundary`.
+        boundary: what stands beyond the measurement, see `mwdn.fourier.padding.Boundary`.
 
     References:
         S. S. Khan et al., FlatNet: towards photorealistic scene reconstruction from lensless measurements, IEEE Trans.

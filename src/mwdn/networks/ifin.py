@@ -6,10 +6,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from mwdn.deconvolution import wiener
-from mwdn.fourier import convolve
+from mwdn.fourier.convolution import convolve
+from mwdn.fourier.padding import Boundary
+from mwdn.fourier.wiener import wiener
 from mwdn.networks.blocks import Decoder, Encoder, Wiener, check_channels, convolutions, one_each_colour, paper_widths
-from mwdn.planes import Boundary
 from mwdn.types import Measurement, Psf, Scene
 
 
@@ -20,7 +20,7 @@ class Exchange(nn.Module):
         inputs: channels of each stream at the scale before.
         width: channels at this scale.
         regularisation: start value of the Wiener filter's lambda, one a channel.
-        boundary: see `mwdn.planes.Boundary`.
+        boundary: see `mwdn.fourier.padding.Boundary`.
     """
 
     def __init__(self, inputs: int, width: int, *, regularisation: float, boundary: Boundary) -> None:
@@ -62,7 +62,7 @@ class Ifin(nn.Module):
         outputs: colours of the scene; as many unless given.
         width: feature channels at full resolution.
         regularisation: start value of every lambda.
-        boundary: what stands beyond the measurement in Wiener filters, see `mwdn.planes.Boundary`.
+        boundary: what stands beyond the measurement in Wiener filters, see `mwdn.fourier.padding.Boundary`.
 
     References:
         Integrated forward-inverse network, openreview.net/forum?id=q1TpQ6guwX (ECCV 2026).

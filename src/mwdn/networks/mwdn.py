@@ -2,8 +2,8 @@
 
 from torch import Tensor, nn
 
+from mwdn.fourier.padding import Boundary
 from mwdn.networks.blocks import Decoder, Encoder, Pooling, Wiener, halve, one_each_colour, paper_widths
-from mwdn.planes import Boundary
 from mwdn.types import Measurement, Psf, Scene
 
 
@@ -22,7 +22,7 @@ class Mwdn(nn.Module):
         psf_pooling: between the PSF's scales; the paper takes the maximum, the authors' code averages.
         weight: start value of w, for a PSF whose peak is 1 (the value of the authors' code).
         regularisation: start value of lambda (the value of the authors' code).
-        boundary: see `mwdn.planes.Boundary`. The paper writes linear convolutions; its code is circular.
+        boundary: see `mwdn.fourier.padding.Boundary`. The paper writes linear convolutions; its code is circular.
     """
 
     def __init__(  # noqa: PLR0913

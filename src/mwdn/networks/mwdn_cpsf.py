@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor, nn
 
+from mwdn.fourier.padding import Boundary
 from mwdn.networks.blocks import Decoder, Encoder, Pooling, Wiener, one_each_colour, paper_widths
-from mwdn.planes import Boundary
 from mwdn.types import Measurement, Psf, Scene
 
 
@@ -20,7 +20,7 @@ class MwdnCpsf(nn.Module):
         width: feature channels at full resolution.
         pooling: between the scales of both encoders; the authors' code averages.
         regularisation: start value of lambda (the value of the authors' code).
-        boundary: see `mwdn.planes.Boundary`. The paper writes linear convolutions; its code is circular.
+        boundary: see `mwdn.fourier.padding.Boundary`. The paper writes linear convolutions; its code is circular.
         authors_scalars: also keep what the authors' code has and the paper has not: a learned weight of the PSF
             before its encoder, and a fifth lambda that nothing uses. 21,956,745 learnable numbers.
     """

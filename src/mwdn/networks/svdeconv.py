@@ -5,13 +5,13 @@ import math
 import torch
 from torch import Tensor, nn
 
-from mwdn.deconvolution import deconvolution_grid
 from mwdn.errors import ParameterError
-from mwdn.fourier import inverse_spectrum, spectrum, transfer_function
+from mwdn.fourier.padding import Boundary, extend
+from mwdn.fourier.transforms import inverse_spectrum, spectrum, transfer_function
+from mwdn.fourier.wiener import deconvolution_grid
 from mwdn.networks.blocks import check_channels, one_each_colour, stretched
 from mwdn.networks.generator import Generator
-from mwdn.planes import Boundary, Size, extend
-from mwdn.types import Measurement, Psf, Scene
+from mwdn.types import Measurement, Psf, Scene, Size
 
 
 def field_weights(side: int, size: Size, device: torch.device) -> Tensor:
@@ -50,7 +50,7 @@ class SvDeconv(nn.Module):
         field: K, places along each side of the field.
         size: height and width of the sensor whose PSFs are learned.
         regularisation: start value of each lambda.
-        boundary: what stands beyond the measurement, see `mwdn.planes.Boundary`.
+        boundary: what stands beyond the measurement, see `mwdn.fourier.padding.Boundary`.
 
     References:
         X. Cai et al., PhoCoLens: photorealistic and consistent reconstruction in lensless imaging, NeurIPS (2024);

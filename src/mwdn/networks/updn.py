@@ -6,9 +6,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from mwdn.fourier import Convolution, Size, convolution
+from mwdn.fourier.convolution import Convolution, convolution
 from mwdn.networks.blocks import check_channels, one_each_colour, stretched
-from mwdn.types import Measurement, Psf, Scene
+from mwdn.types import Measurement, Psf, Scene, Size
 
 
 def _rectified(*widths: int) -> nn.Sequential:

@@ -2,8 +2,8 @@
 
 from torch import Tensor, nn
 
+from mwdn.fourier.padding import Boundary
 from mwdn.networks.blocks import Wiener, peak_one
-from mwdn.planes import Boundary
 from mwdn.types import Measurement, Psf, Scene
 
 
@@ -13,7 +13,7 @@ class WienerNetwork(nn.Module):
     Args:
         weight: start value of w, for a PSF whose peak is 1.
         regularisation: start value of lambda.
-        boundary: see `mwdn.planes.Boundary`.
+        boundary: see `mwdn.fourier.padding.Boundary`.
     """
 
     def __init__(self, *, weight: float = 1e-3, regularisation: float = 1e-2, boundary: Boundary = "taper") -> None:

@@ -6,12 +6,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from mwdn.deconvolution import deconvolution_grid, wiener_transfer
 from mwdn.errors import ParameterError
-from mwdn.fourier import inverse_spectrum, spectrum
+from mwdn.fourier.memory_format import folded
+from mwdn.fourier.padding import Boundary, extend
+from mwdn.fourier.transforms import inverse_spectrum, spectrum
+from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
 from mwdn.networks.blocks import Decoder, Encoder, check_channels, paper_widths, peak_one
 from mwdn.networks.drunet import Drunet
-from mwdn.planes import Boundary, extend, folded
 from mwdn.solvers.alignment import align
 from mwdn.solvers.plug_and_play import plug_and_play
 from mwdn.solvers.pyramid import LEVELS, Band, PsfPyramid

@@ -2,10 +2,10 @@
 
 from torch import Tensor, nn
 
+from mwdn.fourier.padding import Boundary
 from mwdn.networks.blocks import Pooling
 from mwdn.networks.unet import UNet
 from mwdn.networks.wiener import WienerNetwork
-from mwdn.planes import Boundary
 from mwdn.types import Measurement, Psf, Scene
 
 
@@ -19,7 +19,7 @@ class WienerUNet(nn.Module):
         pooling: between the encoder's scales; the authors' code averages.
         weight: start value of w.
         regularisation: start value of lambda.
-        boundary: see `mwdn.planes.Boundary`.
+        boundary: see `mwdn.fourier.padding.Boundary`.
     """
 
     def __init__(

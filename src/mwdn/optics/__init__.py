@@ -3,10 +3,10 @@
 from mwdn.optics.amplitude_masks import CodedAperture, Pinholes, ZoneAperture
 from mwdn.optics.camera import Camera
 from mwdn.optics.deviation import Deviation
-from mwdn.optics.families import FAMILIES, Variety, sample_camera
 from mwdn.optics.field import Aberration, FieldCamera, field_psfs
 from mwdn.optics.masks import Mask, mask_psf
 from mwdn.optics.phase_masks import Contour, Diffuser, Lenslets
+from mwdn.optics.random_psf import FAMILIES, Variety, sample_camera
 from mwdn.optics.sensor import Sensor
 from mwdn.optics.setup import Setup
 

@@ -8,11 +8,10 @@ import torch
 from torch import Tensor
 
 from mwdn.errors import ParameterError
-from mwdn.fourier import Size
 from mwdn.optics.masks import Mask, samples
 from mwdn.optics.propagation import UM_PER_MM, coordinates, positive
 from mwdn.optics.setup import Setup
-from mwdn.types import Plane
+from mwdn.types import Plane, Size
 
 Pattern = Literal["mls", "mura"]
 

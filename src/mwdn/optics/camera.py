@@ -4,9 +4,9 @@ from dataclasses import dataclass, field
 
 import torch
 
-from mwdn.fourier import Size, convolve, correlate
+from mwdn.fourier.convolution import convolve, correlate
 from mwdn.optics.sensor import Sensor
-from mwdn.types import Image, Measurement, Psf, Scene
+from mwdn.types import Image, Measurement, Psf, Scene, Size
 
 
 @dataclass(frozen=True, eq=False)

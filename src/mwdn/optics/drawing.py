@@ -3,7 +3,8 @@
 import torch
 from torch import Tensor
 
-from mwdn.fourier import Size, frequency_grid, inverse_spectrum, spectrum
+from mwdn.fourier.transforms import frequency_grid, inverse_spectrum, spectrum
+from mwdn.types import Size
 
 
 def contour_lines(field: Tensor, line: float, flattest: float = 1e-3) -> Tensor:

@@ -9,10 +9,11 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.errors import ParameterError, ShapeError
-from mwdn.fourier import Size, convolve, correlate, fast_length, gaussian_transfer, inverse_spectrum, spectrum
+from mwdn.fourier.convolution import convolve, correlate
+from mwdn.fourier.transforms import fast_length, gaussian_transfer, inverse_spectrum, spectrum
 from mwdn.optics.sensor import Sensor
 from mwdn.optics.warp import warp
-from mwdn.types import Image, Measurement, Psf, Scene
+from mwdn.types import Image, Measurement, Psf, Scene, Size
 
 FieldPsfs = Float[Tensor, "rows columns psf_channel psf_height psf_width"]
 """PSFs of points on a grid that spans the scene from corner to corner, each centred as that of a point on the axis."""

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from mwdn.data.writing import written
 from mwdn.errors import ImageError, MwdnError, ParameterError
+from mwdn.io.files import written
 from mwdn.optics.masks import Mask
 
 _FORMAT = "mwdn mask 1"

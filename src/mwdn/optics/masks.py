@@ -7,10 +7,9 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import torch
 
 from mwdn.errors import ParameterError
-from mwdn.fourier import Size
 from mwdn.optics.propagation import UM_PER_MM, UM_PER_NM, integrate, overlap, point_source, positive, propagate
 from mwdn.optics.setup import Setup
-from mwdn.types import Field, Plane, Psf
+from mwdn.types import Field, Plane, Psf, Size
 
 Kind = Literal["phase", "amplitude"]
 

@@ -6,9 +6,9 @@ import torch
 from torch.nn import functional as F
 
 from mwdn.errors import ParameterError
-from mwdn.fourier import Size, filter_field, frequencies
+from mwdn.fourier.transforms import filter_field, frequencies
 from mwdn.optics.drawing import contour_lines
-from mwdn.types import Plane, Psf
+from mwdn.types import Plane, Psf, Size
 
 
 def contour_psf(size: Size, *, line: float = 1.2, cell: int = 24, generator: torch.Generator | None = None) -> Psf:

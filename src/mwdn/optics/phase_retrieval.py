@@ -3,7 +3,7 @@
 import torch
 
 from mwdn.errors import ParameterError
-from mwdn.fourier import fast_length, filter_field
+from mwdn.fourier.transforms import fast_length, filter_field
 from mwdn.optics.propagation import angular_spectrum, needed_samples, positive
 from mwdn.types import Field, Plane
 

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from mwdn.errors import ParameterError
-from mwdn.fourier import Size, fast_length, filter_field, frequencies
-from mwdn.types import Field, Plane
+from mwdn.fourier.transforms import fast_length, filter_field, frequencies
+from mwdn.types import Field, Plane, Size
 
 UM_PER_MM = 1e3
 UM_PER_NM = 1e-3

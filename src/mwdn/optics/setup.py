@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from mwdn.errors import ParameterError
-from mwdn.fourier import Size
 from mwdn.optics.propagation import positive
+from mwdn.types import Size
 
 # Means and standard deviations in nm. A white LED is a blue chip and the broad light of its phosphor; the filters
 # are those of a usual Bayer mosaic. The widths are typical ones, not those of a certain part.

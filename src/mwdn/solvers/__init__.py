@@ -2,14 +2,14 @@
 
 from typing import Any
 
-from mwdn.calibration.frames import noise_level
 from mwdn.errors import UnknownNameError, check_options
+from mwdn.optics.noise import noise_level
 from mwdn.solvers.admm import Admm, Progress
 from mwdn.solvers.alignment import Pose, align
 from mwdn.solvers.fista import Fista
 from mwdn.solvers.pyramid import Pyramid
 from mwdn.solvers.splitting import TEXTBOOK, Penalties
-from mwdn.solvers.warm import Warm
+from mwdn.solvers.warm_start import Warm
 from mwdn.solvers.wiener import Wiener
 
 Solver = Admm | Fista | Pyramid | Wiener

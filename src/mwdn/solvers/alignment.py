@@ -6,11 +6,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from mwdn.fourier import Size, check_fit, frequency_grid, inverse_spectrum, spectrum
+from mwdn.fourier.convolution import check_fit
+from mwdn.fourier.transforms import frequency_grid, inverse_spectrum, spectrum
 from mwdn.optics.warp import hazed, warp
 from mwdn.solvers.pyramid import Level, explain, halve
 from mwdn.solvers.splitting import Penalties
-from mwdn.types import Image, Measurement, Psf
+from mwdn.types import Image, Measurement, Psf, Size
 
 
 class Pose(NamedTuple):

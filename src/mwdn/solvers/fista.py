@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mwdn.errors import ParameterError
-from mwdn.fourier import inverse_spectrum, spectrum
+from mwdn.fourier.transforms import inverse_spectrum, spectrum
 from mwdn.solvers.splitting import Problem, pose
 from mwdn.types import Measurement, Psf, Scene
 

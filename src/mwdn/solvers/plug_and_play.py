@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from mwdn.fourier import inverse_spectrum, spectrum
+from mwdn.fourier.transforms import inverse_spectrum, spectrum
 from mwdn.solvers.pyramid import QUIET, Explanation, brightness, caution
 from mwdn.solvers.splitting import opposed, posed
 

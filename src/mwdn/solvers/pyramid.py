@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from mwdn.calibration.frames import noise_level
 from mwdn.errors import ParameterError
-from mwdn.fourier import Size, check_fit, fast_length, inverse_spectrum, spectrum, transfer_function
+from mwdn.fourier.convolution import check_fit
+from mwdn.fourier.transforms import fast_length, inverse_spectrum, spectrum, transfer_function
+from mwdn.optics.noise import noise_level
 from mwdn.solvers.splitting import Penalties, merge, posed, split, start, weigh
-from mwdn.types import Measurement, Psf, Scene, Spectrum
+from mwdn.types import Measurement, Psf, Scene, Size, Spectrum
 
 
 @dataclass(frozen=True)
@@ -157,7 +158,7 @@ class Explanation:
         return spectrum(self.rest, self.psf.bands[-1].grid)
 
     def detail(self, regularisation: float | Tensor) -> Scene:
-        """Wiener estimate of the rest of the scene; ``regularisation`` as for `mwdn.deconvolution.wiener`.
+        """Wiener estimate of the rest of the scene; ``regularisation`` as for `mwdn.fourier.wiener.wiener`.
 
         Of a pyramid that reaches the full size.
         """

@@ -6,9 +6,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from mwdn.fourier import Size, check_fit, fast_length, inverse_spectrum, spectrum, transfer_function
+from mwdn.fourier.convolution import check_fit
+from mwdn.fourier.transforms import fast_length, inverse_spectrum, spectrum, transfer_function
 from mwdn.solvers.proximal import Gradient, Variation, bounded, divergence, gradient, total_variation
-from mwdn.types import Measurement, Psf, Spectrum
+from mwdn.types import Measurement, Psf, Size, Spectrum
 
 
 class Penalties(NamedTuple):

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mwdn.calibration.frames import noise_level
-from mwdn.deconvolution import deconvolution_grid
 from mwdn.errors import ParameterError
-from mwdn.fourier import check_fit, inverse_spectrum, spectrum, transfer_function
-from mwdn.planes import Boundary, extend
+from mwdn.fourier.convolution import check_fit
+from mwdn.fourier.padding import Boundary, extend
+from mwdn.fourier.transforms import inverse_spectrum, spectrum, transfer_function
+from mwdn.fourier.wiener import deconvolution_grid
+from mwdn.optics.noise import noise_level
 from mwdn.types import Measurement, Psf, Scene
 
 
@@ -25,7 +26,7 @@ class Wiener:
             measurement to within ``tolerance``.
         tolerance: part of the measurement's contrast that may stay unexplained besides its noise: what a crop,
             a PSF that was measured, and a field that is not quite shift-invariant cost.
-        boundary: see `mwdn.planes.Boundary`.
+        boundary: see `mwdn.fourier.padding.Boundary`.
 
     Raises:
         ParameterError: a constant is not positive.

@@ -1,0 +1,67 @@
+"""`mwdn inspect`: what a PSF is worth, before anything is reconstructed with it."""
+
+import json as format_json
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+from rich.markup import escape
+
+from mwdn.calibration.report import inspect_psf
+from mwdn.calibration.verdict import headline, verdict
+from mwdn.cli.camera import CameraOptions, console
+from mwdn.io.files import check_folder, spare, write_json
+from mwdn.io.images import read_frame
+
+_STYLES = {"bad": "bold red", "mind": "yellow", "good": "green"}
+
+
+def inspect(
+    camera: CameraOptions,
+    *,
+    json: Annotated[bool, Parameter(negative=())] = False,
+    out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("results/inspect"),
+) -> None:
+    """Report what a PSF is worth: exposure, background, sharpness, spectrum, noise gain, resolution.
+
+    Args:
+        camera: the PSF, and how its frame is stored.
+        json: print the report as JSON instead of words.
+        out: folder for the page and the JSON, named after the PSF's file.
+    """
+    # matplotlib, a second to load, is needed by no other command.
+    from mwdn.calibration.report_page import write_page
+
+    page = out / f"{camera.psf.stem}.png"
+    beside = page.with_suffix(".json")
+    for output in (page, beside):
+        spare(output, camera.psf, camera.dark)
+    calibration = _own_resolution(camera).load()
+    check_folder(out)
+    report = inspect_psf(calibration, read_frame(camera.psf, bgr=camera.bgr))
+    found = verdict(report)
+    content = {
+        "file": str(camera.psf),
+        "headline": headline(report),
+        "verdict": [finding._asdict() for finding in found],
+        **report.content(),
+    }
+    write_page(page, report, calibration.psf, camera.psf.name)
+    write_json(beside, content)
+    if json:
+        console.print(format_json.dumps(content, indent=2), highlight=False, markup=False, soft_wrap=True)
+        return
+    console.print(f"[bold]{escape(headline(report))}[/]", highlight=False, soft_wrap=True)
+    for weight, text in found:
+        console.print(f"[{_STYLES[weight]}]{weight:4}[/] {escape(text)}", highlight=False, soft_wrap=True)
+    console.print(f"Look at {page}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _own_resolution(camera: CameraOptions) -> CameraOptions:
+    """The options at the PSF's own resolution, where it differs from the captures'; the dark frame is the captures'."""
+    if camera.psf_bin is None or camera.psf_bin == camera.bin:
+        return camera
+    own = camera.psf_bin
+    crop = camera.crop and (camera.crop[0] * own // camera.bin, camera.crop[1] * own // camera.bin)
+    return replace(camera, bin=own, psf_bin=None, crop=crop, dark=None)

@@ -1,0 +1,227 @@
+"""AlexNet's features and the heads of LPIPS: two small networks with public, frozen weights."""
+
+import hashlib
+import logging
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from http.client import HTTPException
+from pathlib import Path
+from typing import TypeVar
+from urllib.request import urlopen
+
+import torch
+from torch import Tensor, nn
+
+from mwdn.errors import CheckpointError, ShapeError
+from mwdn.io.files import atomic
+from mwdn.types import Image
+from mwdn.weights.checkpoint import first_difference, read_plain
+
+SMALLEST = 31
+"""Pixels along each axis below which relu3 to relu5 would be empty: 31 -> 7 (stride 4) -> 3 -> 1 (pooled)."""
+
+CHANNELS = 64, 192, 384, 256, 256
+"""Of relu1 to relu5."""
+
+_Network = TypeVar("_Network", bound=nn.Module)
+
+
+class AlexNet(nn.Module):
+    """The convolutions of AlexNet; their keys in a state dict are torchvision's, ``features.N.weight``.
+
+    References:
+        A. Krizhevsky, "One weird trick for parallelizing convolutional neural networks", arXiv:1404.5997 (2014).
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.features = nn.Sequential(
+            nn.Conv2d(3, 64, 11, stride=4, padding=2),
+            nn.ReLU(),
+            nn.MaxPool2d(3, stride=2),
+            nn.Conv2d(64, 192, 5, padding=2),
+            nn.ReLU(),
+            nn.MaxPool2d(3, stride=2),
+            nn.Conv2d(192, 384, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(384, 256, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(256, 256, 3, padding=1),
+            nn.ReLU(),
+        )
+
+    def forward(self, image: Image, last: int = 5) -> list[Tensor]:
+        """Compute the outputs of the ReLUs.
+
+        Args:
+            image: (B, 3, H, W), or (B, 1, H, W), which is repeated; scaled by the caller.
+            last: where to stop; relu5 unless given.
+
+        Returns:
+            relu1 to relu``last``, (B, `CHANNELS`, h, w), h and w about H and W over 4, 8, 16, 16, 16.
+
+        Raises:
+            ShapeError: neither 1 nor 3 channels, or a side shorter than `SMALLEST`.
+        """
+        if image.shape[1] not in (1, 3) or min(image.shape[-2:]) < SMALLEST:
+            raise ShapeError(
+                f"`image` {tuple(image.shape)} must have 1 or 3 channels and at least {SMALLEST} x {SMALLEST} pixels "
+                "for AlexNet. Take a larger part, or leave out `feature_mse` and `lpips`."
+            )
+        value, found = image.expand(-1, 3, -1, -1), []
+        for layer in self.features:
+            value = layer(value)
+            if isinstance(layer, nn.ReLU):
+                found.append(value)
+            if len(found) == last:
+                break
+        return found
+
+
+class Heads(nn.Module):
+    """The five learned 1x1 convolutions of LPIPS 0.1, which weigh the channels of AlexNet's features.
+
+    Their keys in a state dict are those of the public file, ``linN.model.1.weight``.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        for i, channels in enumerate(CHANNELS):
+            # The public file counts a dropout as layer 0.
+            layer = nn.ModuleDict({"model": nn.ModuleDict({"1": nn.Conv2d(channels, 1, 1, bias=False)})})
+            self.add_module(f"lin{i}", layer)
+
+    def forward(self, differences: Sequence[Tensor]) -> Tensor:
+        """Weigh squared differences (B, `CHANNELS`, h, w), average each over its pixels and add them: (B,)."""
+        convolutions = [module for module in self.modules() if isinstance(module, nn.Conv2d)]
+        maps = [weigh(difference) for weigh, difference in zip(convolutions, differences, strict=True)]
+        return torch.stack([each.mean((1, 2, 3)) for each in maps]).sum(0)
+
+
+@dataclass(frozen=True)
+class _Public:
+    """Weights that somebody else publishes."""
+
+    what: str
+    file: str
+    variable: str
+    address: str
+    sha256: str
+    """Its first digits."""
+    mebibytes: int
+
+
+_ALEXNET = _Public(
+    "AlexNet",
+    "alexnet-owt-7be5be79.pth",
+    "MWDN_ALEXNET",
+    "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth",
+    "7be5be79",
+    233,
+)
+# The publisher names no checksum; this is of the file that torchmetrics ships and of the project's own copy.
+_HEADS = _Public(
+    "the heads of LPIPS",
+    "lin_v0.1_alex.pth",
+    "MWDN_LPIPS",
+    "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/lpips/weights/v0.1/alex.pth",
+    "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0",
+    1,
+)
+
+
+def cache_folder() -> Path:
+    """Where public weights are kept between runs: ``~/.cache/mwdn``."""
+    return Path.home() / ".cache" / "mwdn"
+
+
+def load_alexnet(path: str | Path | None = None) -> AlexNet:
+    """Load AlexNet with its ImageNet weights, frozen, in evaluation mode, on the CPU.
+
+    Args:
+        path: a state dict with torchvision's keys; a whole AlexNet or its convolutions. Unless given, the file
+            that the environment names in ``MWDN_ALEXNET``, else ``~/.cache/mwdn/alexnet-owt-7be5be79.pth``, which
+            is downloaded once (233 MiB) and checked.
+
+    Raises:
+        CheckpointError: no file, and no way to download it; or not these weights.
+    """
+    return _filled(AlexNet(), _locate(_ALEXNET, path), "features.")
+
+
+def load_heads(path: str | Path | None = None, *, alexnet: str | Path | None = None) -> Heads:
+    """Load the calibrated heads of LPIPS 0.1 for AlexNet, frozen, in evaluation mode, on the CPU.
+
+    Args:
+        path: the public ``lin_v0.1_alex.pth``. Unless given, the file that the environment names in
+            ``MWDN_LPIPS``, else one of that name beside AlexNet's, else in ``~/.cache/mwdn``, to where it is
+            downloaded once (6 kB) and checked.
+        alexnet: the path given to `load_alexnet`, if any.
+
+    Raises:
+        CheckpointError: no file, and no way to download it; or not these weights.
+    """
+    neighbour = alexnet or os.environ.get(_ALEXNET.variable)
+    beside = Path(neighbour).with_name(_HEADS.file) if neighbour else None
+    if path is None and _HEADS.variable not in os.environ and beside and beside.is_file():
+        path = beside
+    return _filled(Heads(), _locate(_HEADS, path), "lin")
+
+
+def _locate(public: _Public, path: str | Path | None) -> Path:
+    named = path or os.environ.get(public.variable)
+    if named:
+        if not Path(named).is_file():
+            origin = f" (from {public.variable})" if path is None else ""
+            raise CheckpointError(
+                f"No weights of {public.what} at `{named}`{origin}. Correct the path or leave it out."
+            )
+        return Path(named)
+    cached = cache_folder() / public.file
+    if not cached.is_file():
+        _download(public, cached)
+    return cached
+
+
+def _download(public: _Public, path: Path) -> None:
+    # Shown on the error stream even where nobody has set up logging: 233 MiB take a while.
+    logging.getLogger(__name__).warning(
+        "Downloading %s (%d MiB, once) from %s", public.what, public.mebibytes, public.address
+    )
+    try:
+        with atomic(path) as temporary:
+            digest = _fetch(public.address, temporary)
+            if not digest.startswith(public.sha256):
+                raise CheckpointError(
+                    f"{public.address} gave a file whose SHA-256 starts with {digest[:8]} instead of "
+                    f"{public.sha256[:8]}: damaged or replaced on its way. Try again, or from another network."
+                )
+    except (OSError, HTTPException) as error:
+        raise CheckpointError(
+            f"The weights of {public.what} are not at `{path}` and cannot be downloaded ({error}). Where there is a "
+            f"network: `curl -fL -o {public.file} {public.address}`; then copy the file here and "
+            f"`export {public.variable}=/PATH/TO/{public.file}`."
+        ) from error
+
+
+def _fetch(address: str, path: Path) -> str:
+    """Write what is at an address to a file and return its SHA-256."""
+    digest = hashlib.sha256()
+    with urlopen(address, timeout=30) as reply, path.open("wb") as file:
+        while block := reply.read(2**20):
+            digest.update(block)
+            file.write(block)
+    return digest.hexdigest()
+
+
+def _filled(network: _Network, path: Path, prefix: str) -> _Network:
+    content = read_plain(path)
+    try:
+        network.load_state_dict({key: value for key, value in content.items() if key.startswith(prefix)})
+    except (AttributeError, TypeError, RuntimeError) as error:
+        kind, reason = type(network).__name__, first_difference(error)
+        raise CheckpointError(
+            f"`{path}` does not hold the weights of `{kind}`: {reason}. Download it again."
+        ) from error
+    return network.requires_grad_(False).eval()

@@ -1,0 +1,203 @@
+"""Distances between pictures, one number a sample.
+
+All of them are computed in float32, also inside autocast, on the device of the pictures, and are differentiable:
+their gradients are finite, also between identical pictures. (AlexNet's convolutions on a GPU follow torch's setting
+for TF32, which costs the third digit.)
+"""
+
+import math
+from collections.abc import Callable
+from functools import wraps
+from typing import TypeVar, cast
+
+import torch
+from torch import Tensor, nn
+
+from mwdn.errors import ShapeError
+from mwdn.evaluation.alexnet import AlexNet, Heads
+from mwdn.types import Image
+
+_Distance = TypeVar("_Distance", bound=Callable[..., Tensor])
+
+
+def _comparing(distance: _Distance) -> _Distance:
+    """Refuse pictures of different shapes, and compute in float32 outside autocast."""
+
+    @wraps(distance)
+    def wrapped(image: Tensor, reference: Tensor, *networks: nn.Module, **named: nn.Module) -> Tensor:
+        if image.ndim != 4 or image.shape != reference.shape:
+            raise ShapeError(
+                f"`image` {tuple(image.shape)} and `reference` {tuple(reference.shape)} must have the same shape "
+                "(B, C, H, W). Crop or resize the larger one."
+            )
+        with torch.autocast(image.device.type, enabled=False):
+            return distance(image.float(), reference.float(), *networks, **named)
+
+    return cast(_Distance, wrapped)
+
+
+@_comparing
+def mse(image: Image, reference: Image) -> Tensor:
+    """Mean squared error of each sample.
+
+    Args:
+        image: (B, C, H, W), any range.
+        reference: of the same shape.
+
+    Returns:
+        (B,), 0 for identical pictures.
+
+    Raises:
+        ShapeError: the shapes differ.
+    """
+    return (image - reference).square().mean((1, 2, 3))
+
+
+@_comparing
+def l1(image: Image, reference: Image) -> Tensor:
+    """Mean absolute error of each sample.
+
+    Args:
+        image: (B, C, H, W), any range.
+        reference: of the same shape.
+
+    Returns:
+        (B,), 0 for identical pictures.
+
+    Raises:
+        ShapeError: the shapes differ.
+    """
+    return (image - reference).abs().mean((1, 2, 3))
+
+
+@_comparing
+def log_mse(image: Image, reference: Image) -> Tensor:
+    """Logarithm to base 10 of each sample's mean squared error: minus a tenth of its PSNR in dB.
+
+    `mse` is decided by the samples that are spoiled most; here a decibel counts the same in each.
+
+    Args:
+        image: (B, C, H, W), any range.
+        reference: of the same shape.
+
+    Returns:
+        (B,), -8 for identical pictures.
+
+    Raises:
+        ShapeError: the shapes differ.
+
+    References:
+        L. Chen et al., "Simple baselines for image restoration", ECCV (2022), whose networks learn from PSNR.
+    """
+    return mse(image, reference).clamp(min=1e-8).log10()
+
+
+WINDOW = 11
+"""Pixels along each side of the window of `ssim`."""
+
+
+@_comparing
+def ssim(image: Image, reference: Image) -> Tensor:
+    """Structural similarity of each sample, in a Gaussian window of 11 x 11 pixels, sigma 1.5, for a range of 1.
+
+    Averaged over colours and over all windows that lie wholly inside the picture. It equals scikit-image's
+    ``structural_similarity(gaussian_weights=True, use_sample_covariance=False, data_range=1)``. torchmetrics also
+    counts windows that reach into a reflected border, which changes the second decimal place of small pictures.
+
+    Args:
+        image: (B, C, H, W), nominally in [0, 1].
+        reference: of the same shape.
+
+    Returns:
+        (B,), at most 1, for identical pictures; larger is more similar. As a loss, `Loss` takes 1 - SSIM.
+
+    Raises:
+        ShapeError: the shapes differ, or a side is shorter than 11 pixels.
+
+    References:
+        Z. Wang et al., "Image quality assessment", IEEE Trans. Image Process. 13, 600 (2004), eq. (13).
+    """
+    if min(image.shape[-2:]) < WINDOW:
+        raise ShapeError(f"`image` {tuple(image.shape)} must have at least {WINDOW} x {WINDOW} pixels for SSIM.")
+    x, y = image, reference
+    mean_x, mean_y, square_x, square_y, product = _blurred(torch.stack([x, y, x * x, y * y, x * y]))
+    variances = square_x - mean_x.square() + square_y - mean_y.square()
+    covariance = product - mean_x * mean_y
+    c1, c2 = 0.01**2, 0.03**2  # (K1 L)^2 and (K2 L)^2 for the range L = 1
+    luminance = (2 * mean_x * mean_y + c1) / (mean_x.square() + mean_y.square() + c1)
+    structure = (2 * covariance + c2) / (variances + c2)
+    return (luminance * structure).mean((1, 2, 3))
+
+
+def _blurred(planes: Tensor) -> Tensor:
+    """Average (..., H, W) in each Gaussian window that fits: (..., H - 10, W - 10)."""
+    weights = [math.exp(-0.5 * ((i - WINDOW // 2) / 1.5) ** 2) for i in range(WINDOW)]
+    # Shifted sums, four times as fast as `conv2d` on a CPU. On a GPU, where convolutions round to TF32, variances
+    # as differences of squares would lose all their digits.
+    for axis in (-2, -1):
+        fitting = planes.shape[axis] - WINDOW + 1
+        blurred = planes.narrow(axis, 0, fitting) * (weights[0] / sum(weights))
+        for i in range(1, WINDOW):
+            blurred.add_(planes.narrow(axis, i, fitting), alpha=weights[i] / sum(weights))
+        planes = blurred
+    return planes
+
+
+@_comparing
+def feature_mse(image: Image, reference: Image, alexnet: AlexNet) -> Tensor:
+    """Mean squared error of AlexNet's features relu2 plus that of relu4, of each sample.
+
+    This is what the MWDN paper and its public code call LPIPS, in training and in tables; `lpips` is another
+    number. Pictures enter as they are, without the normalisation of ImageNet. (The authors' files are BGR, and so
+    are the pictures behind their published numbers.)
+
+    Args:
+        image: (B, 1 or 3, H, W), nominally in [0, 1], at least 31 x 31 pixels; grey is repeated.
+        reference: of the same shape.
+        alexnet: from `mwdn.evaluation.alexnet.load_alexnet`, on the device of the pictures.
+
+    Returns:
+        (B,), 0 for identical pictures.
+
+    Raises:
+        ShapeError: the shapes differ or do not suit AlexNet.
+
+    References:
+        Eq. (3) of the MWDN paper.
+    """
+    pairs = zip(alexnet(image, 4), alexnet(reference, 4), strict=True)
+    relu = [(found - wanted).square().mean((1, 2, 3)) for found, wanted in pairs]
+    return relu[1] + relu[3]
+
+
+@_comparing
+def lpips(image: Image, reference: Image, alexnet: AlexNet, heads: Heads) -> Tensor:
+    """LPIPS 0.1 of each sample: calibrated distance of AlexNet's features.
+
+    Args:
+        image: (B, 1 or 3, H, W) in [0, 1], at least 31 x 31 pixels; grey is repeated. LPIPS was calibrated on the
+            numbers of sRGB files, not on linear light.
+        reference: of the same shape.
+        alexnet: from `mwdn.evaluation.alexnet.load_alexnet`, on the device of the pictures.
+        heads: from `mwdn.evaluation.alexnet.load_heads`, on the same device.
+
+    Returns:
+        (B,), 0 for identical pictures, about 0.1 for slight and 0.7 for strong distortions.
+
+    Raises:
+        ShapeError: the shapes differ or do not suit AlexNet.
+
+    References:
+        R. Zhang et al., "The unreasonable effectiveness of deep features as a perceptual metric", CVPR (2018),
+        eq. (1).
+    """
+    # LPIPS wants [-1, 1]; this shift and scale are ImageNet's mean and deviation, carried over to that range.
+    shift = image.new_tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1)
+    scale = image.new_tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1)
+    found, wanted = (alexnet((2 * picture - 1 - shift) / scale) for picture in (image, reference))
+    return heads([(_unit(a) - _unit(b)).square() for a, b in zip(found, wanted, strict=True)])
+
+
+def _unit(features: Tensor) -> Tensor:
+    # `vector_norm` has the gradient 0 where all channels are 0, where a square root would give NaN.
+    return features / (torch.linalg.vector_norm(features, dim=1, keepdim=True) + 1e-10)

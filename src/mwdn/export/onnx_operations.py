@@ -1,0 +1,293 @@
+"""What torch calls an operation, in the words of ONNX: those that networks and solvers of this package use.
+
+Each function is given the graph to add to, the operation of torch, and its arguments: names of what is calculated,
+tensors and numbers of what is known.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, fx
+
+from mwdn.errors import ExportError
+from mwdn.export.onnx_graph import OnnxGraph
+
+_aten = torch.ops.aten
+_TYPES = {torch.float32: 1, torch.float16: 10}  # numbers of onnx.TensorProto
+Handler = Callable[..., Any]
+
+
+def value(node: fx.Node) -> Any:  # noqa: ANN401
+    """What an operation gives, without its numbers: shape and type."""
+    return node.meta["val"]
+
+
+def source(node: fx.Node) -> Tensor:
+    """The same of the first argument."""
+    return value(node.args[0])  # type: ignore[arg-type]
+
+
+def filled(given: Sequence[Any], *defaults: Any) -> tuple[Any, ...]:  # noqa: ANN401
+    """Arguments by their places; the last ones are left out where they have their defaults."""
+    return (*given, *defaults[len(given) :])
+
+
+def _known(shape: Sequence[Any]) -> list[int]:
+    """A shape whose batch, where it is open, is -1: what a Reshape finds out by itself."""
+    return [length if isinstance(length, int) else -1 for length in shape]
+
+
+def _shape(g: OnnxGraph, shape: Sequence[Any]) -> str:
+    """The name of a shape whose first axis may be that of the measurement."""
+    if all(isinstance(length, int) for length in shape):
+        return g.integers(shape)
+    times = int(shape[0].node.expr.as_coeff_Mul()[0])  # colours that have moved into the batch
+    batch = g("Mul", g("Shape", "measurement", start=0, end=1), g.integers([times]))
+    return g("Concat", batch, g.integers(_known(shape)[1:]), axis=0)
+
+
+def _plain(operation: str) -> Handler:
+    """An operation that ONNX has as well; of two precisions torch takes the higher one."""
+
+    def handler(g: OnnxGraph, node: fx.Node, *arguments: Any) -> str:  # noqa: ANN401
+        return g(operation, *(_as(g, value(node).dtype, *each) for each in zip(arguments, node.args, strict=True)))
+
+    return handler
+
+
+def _sum(operation: str) -> Handler:
+    """The same of a sum or difference, whose second part torch may weight."""
+    plain = _plain(operation)
+
+    def handler(g: OnnxGraph, node: fx.Node, a: Any, b: Any, *, alpha: float = 1) -> str:  # noqa: ANN401
+        return plain(g, node, a, b if alpha == 1 else g("Mul", b, torch.tensor(float(alpha))))
+
+    return handler
+
+
+def _as(g: OnnxGraph, dtype: torch.dtype, x: Any, given: Any) -> Any:  # noqa: ANN401
+    """A number or result in a precision."""
+    if not isinstance(given, fx.Node):
+        return torch.tensor(x, dtype=dtype)
+    return x if value(given).dtype == dtype else g("Cast", x, to=_TYPES[dtype])
+
+
+def _same(g: OnnxGraph, node: fx.Node, x: Any, **_: Any) -> Any:  # noqa: ANN401
+    return x
+
+
+def _reduce(operation: str) -> Handler:
+    def handler(g: OnnxGraph, node: fx.Node, x: str, axes: Sequence[int] = (), keep: bool = False) -> str:
+        return g(operation, x, g.integers(axes), keepdims=int(keep))
+
+    return handler
+
+
+def _norm(g: OnnxGraph, node: fx.Node, x: str, order: float = 2, axes: Sequence[int] = (), keep: bool = False) -> str:
+    if order != 2:
+        raise ExportError(f"`{node.target}` of order {order} cannot be written as ONNX. Export to .pt2 instead.")
+    return g("ReduceL2", x, g.integers(axes), keepdims=int(keep))
+
+
+def _deviation(g: OnnxGraph, node: fx.Node, x: str, axes: list[int], correction: int = 1, keepdim: bool = False) -> str:
+    if correction:
+        raise ExportError("A standard deviation with a correction cannot be written as ONNX. Export to .pt2 instead.")
+    away = g("Sub", x, g("ReduceMean", x, g.integers(axes)))
+    return g("Sqrt", g("ReduceMean", g("Mul", away, away), g.integers(axes), keepdims=int(keepdim)))
+
+
+def _concatenation(g: OnnxGraph, node: fx.Node, parts: list[Any], axis: int = 0) -> str:
+    given: Any = node.args[0]
+    return g("Concat", *(_as(g, value(node).dtype, *each) for each in zip(parts, given, strict=True)), axis=axis)
+
+
+def _stack(g: OnnxGraph, node: fx.Node, parts: list[str], axis: int = 0) -> str:
+    return g("Concat", *(g("Unsqueeze", part, g.integers([axis])) for part in parts), axis=axis)
+
+
+def _full(g: OnnxGraph, node: fx.Node, x: str, fill: float, **_: Any) -> str:  # noqa: ANN401
+    return g("Expand", fill, _shape(g, value(node).shape))
+
+
+def _median(g: OnnxGraph, node: fx.Node, x: str, axis: int, keep: bool = False) -> tuple[str, str]:
+    """The lower of two middle values, as torch takes it: the largest of the smaller half."""
+    smaller = g.integers([(source(node).shape[axis] + 1) // 2])
+    values, places = g.several("TopK", 2, x, smaller, axis=axis, largest=0)
+    last, axes = (g.integers([-1]), g.integers([torch.iinfo(torch.int64).max])), g.integers([axis])
+    found = [g("Slice", each, *last, axes) for each in (values, places)]
+    return tuple(each if keep else g("Squeeze", each, axes) for each in found)  # type: ignore[return-value]
+
+
+def _clamp(g: OnnxGraph, node: fx.Node, x: str, min: float | None = None, max: float | None = None) -> str:
+    return g("Clip", x, min, max)
+
+
+def _slice(g: OnnxGraph, node: fx.Node, x: str, *limits: Any) -> str:  # noqa: ANN401
+    axis, start, end, step = filled(limits, 0, None, None, 1)
+    whole = source(node).shape[axis]
+    if not start and step == 1 and (end is None or (isinstance(whole, int) and end >= whole)):
+        return x
+    largest = torch.iinfo(torch.int64).max
+    limits = [start or 0], [largest if end is None else end], [axis], [step]
+    return g("Slice", x, *map(g.integers, limits))
+
+
+def _pad(g: OnnxGraph, node: fx.Node, x: str, widths: list[int], mode: str = "constant", fill: float = 0.0) -> str:
+    before, after = widths[-2::-2], widths[::-2]
+    others = [0] * (source(node).ndim - len(before))
+    return g(
+        "Pad",
+        x,
+        g.integers([*others, *before, *others, *after]),
+        float(fill or 0.0) if mode == "constant" else None,
+        mode={"replicate": "edge"}.get(mode, mode),
+    )
+
+
+def _roll(g: OnnxGraph, node: fx.Node, x: str, shifts: list[int], axes: list[int]) -> str:
+    for shift, axis in zip(shifts, axes, strict=True):
+        first, second = (
+            g("Slice", x, g.integers([start]), g.integers([end]), g.integers([axis]))
+            for start, end in ((-shift, torch.iinfo(torch.int64).max), (0, -shift))
+        )
+        x = g("Concat", first, second, axis=axis)
+    return x
+
+
+def _flip(g: OnnxGraph, node: fx.Node, x: str, axes: list[int]) -> str:
+    if not axes:
+        return x
+    beyond = torch.iinfo(torch.int64).min
+    start, end, step = (g.integers([each] * len(axes)) for each in (-1, beyond, -1))
+    return g("Slice", x, start, end, g.integers(axes), step)
+
+
+def _reshape(g: OnnxGraph, node: fx.Node, x: str, *_: Any) -> str:  # noqa: ANN401
+    return g("Reshape", x, g.integers(_known(value(node).shape)))
+
+
+def _expand(g: OnnxGraph, node: fx.Node, x: str, *_: Any, **__: Any) -> str:  # noqa: ANN401
+    return g("Expand", x, _shape(g, value(node).shape))
+
+
+def _zeros(g: OnnxGraph, node: fx.Node, *_: Any, **__: Any) -> str:  # noqa: ANN401
+    return g("Expand", 0.0, _shape(g, value(node).shape))
+
+
+def _cast(g: OnnxGraph, node: fx.Node, x: str, *_: Any, **__: Any) -> str:  # noqa: ANN401
+    return _as(g, value(node).dtype, x, node.args[0])
+
+
+def _convolution(g: OnnxGraph, node: fx.Node, x: str, *rest: Any) -> str:  # noqa: ANN401
+    weight, bias, stride, padding, dilation, groups = filled(rest, None, None, (1, 1), (0, 0), (1, 1), 1)
+    return g("Conv", x, weight, bias, strides=stride, pads=[*padding, *padding], dilations=dilation, group=groups)
+
+
+def _transposed(g: OnnxGraph, node: fx.Node, x: str, *rest: Any) -> str:  # noqa: ANN401
+    defaults = None, None, (1, 1), (0, 0), (0, 0), 1, (1, 1)
+    weight, bias, stride, padding, more, groups, dilation = filled(rest, *defaults)
+    shape = {"strides": stride, "pads": [*padding, *padding], "output_padding": more, "dilations": dilation}
+    return g("ConvTranspose", x, weight, bias, group=groups, **shape)
+
+
+def _pool(operation: str) -> Handler:
+    def handler(g: OnnxGraph, node: fx.Node, x: str, size: list[int], stride: Any = (), *rest: Any) -> str:  # noqa: ANN401
+        if any(each not in ([0, 0], [1, 1], False) for each in rest):
+            raise ExportError(f"`{node.target}` with padding cannot be written as ONNX. Export to .pt2 instead.")
+        return g(operation, x, kernel_shape=size, strides=stride or size)
+
+    return handler
+
+
+def _group_norm(g: OnnxGraph, node: fx.Node, x: str, groups: int, weight: Any, bias: Any, *rest: Any) -> str:  # noqa: ANN401
+    # In float32, as torch calculates it: squares summed over a picture leave the range of float16.
+    one, epsilon, dtype = torch.ones(groups), (*rest, 1e-5)[0], value(node).dtype
+    grouped = g("Reshape", _as(g, torch.float32, x, node.args[0]), g.integers([0, groups, -1]))
+    normal = g("InstanceNormalization", grouped, one, torch.zeros(groups), epsilon=epsilon)
+    spread = g("Reshape", normal, g.integers(_known(value(node).shape)))
+    found = g("Add", g("Mul", spread, weight.float()[:, None, None]), bias.float()[:, None, None])
+    return found if dtype == torch.float32 else g("Cast", found, to=_TYPES[dtype])
+
+
+def _enlarge(g: OnnxGraph, node: fx.Node, x: str, size: Any, corners: bool, *_: Any) -> str:  # noqa: ANN401
+    # All four lengths: onnxruntime 1.31 forgets which axes are meant where it moves a Resize (to NHWC, for int8).
+    mode = "align_corners" if corners else "half_pixel"
+    wanted = _shape(g, value(node).shape)
+    return g("Resize", x, None, None, wanted, mode="linear", coordinate_transformation_mode=mode)
+
+
+def _unshuffle(g: OnnxGraph, node: fx.Node, x: str, block: int) -> str:
+    # SpaceToDepth orders channels otherwise.
+    _, channels, height, width = source(node).shape
+    split = g("Reshape", x, g.integers([-1, channels, height // block, block, width // block, block]))
+    return _reshape(g, node, g("Transpose", split, perm=[0, 1, 3, 5, 2, 4]))
+
+
+def _swapped(g: OnnxGraph, node: fx.Node, x: str, one: int, other: int) -> str:
+    axes = list(range(source(node).ndim))
+    axes[one], axes[other] = axes[other], axes[one]
+    return g("Transpose", x, perm=axes)
+
+
+def _unbind(g: OnnxGraph, node: fx.Node, x: str, axis: int = 0) -> list[str]:
+    axes, count = g.integers([axis]), source(node).shape[axis]
+    return [g("Squeeze", part, axes) for part in g.several("Split", count, x, axis=axis, num_outputs=count)]
+
+
+def _split(g: OnnxGraph, node: fx.Node, x: str, size: int, axis: int = 0) -> list[str]:
+    lengths = [part.shape[axis] for part in value(node)]
+    return g.several("Split", len(lengths), x, g.integers(lengths), axis=axis)
+
+
+REAL: dict[Any, Handler] = {
+    **dict.fromkeys((_aten.alias.default, _aten.clone.default, _aten.detach.default), _same),
+    **dict.fromkeys((_aten.view.default, _aten._unsafe_view.default, _aten.reshape.default), _reshape),
+    _aten.unsqueeze.default: _reshape,
+    **dict.fromkeys((_aten.new_zeros.default, _aten.zeros_like.default), _zeros),
+    **dict.fromkeys((_aten._to_copy.default, _aten.to.dtype), _cast),
+    _aten.abs.default: _plain("Abs"),
+    _aten.add.Tensor: _sum("Add"),
+    _aten.amax.default: _reduce("ReduceMax"),
+    _aten.avg_pool2d.default: _pool("AveragePool"),
+    _aten.cat.default: _concatenation,
+    _aten.clamp.default: _clamp,
+    _aten.conv2d.default: _convolution,
+    _aten.conv_transpose2d.input: _transposed,
+    _aten.div.Tensor: _plain("Div"),
+    _aten.exp.default: _plain("Exp"),
+    _aten.expand.default: _expand,
+    _aten.flip.default: _flip,
+    _aten.full_like.default: _full,
+    _aten.group_norm.default: _group_norm,
+    _aten.linalg_vector_norm.default: _norm,
+    _aten.lt.Tensor: lambda g, node, a, b: g("Less", a, b),
+    _aten.max_pool2d.default: _pool("MaxPool"),
+    _aten.maximum.default: _plain("Max"),
+    _aten.mean.dim: _reduce("ReduceMean"),
+    _aten.median.dim: _median,
+    _aten.mul.Tensor: _plain("Mul"),
+    _aten.pad.default: _pad,
+    _aten.pixel_shuffle.default: lambda g, node, x, block: g("DepthToSpace", x, blocksize=block, mode="CRD"),
+    _aten.pixel_unshuffle.default: _unshuffle,
+    _aten.pow.Scalar: _plain("Pow"),
+    _aten.pow.Tensor_Scalar: _plain("Pow"),
+    _aten.reciprocal.default: _plain("Reciprocal"),
+    _aten.relu.default: _plain("Relu"),
+    _aten.roll.default: _roll,
+    _aten.rsub.Scalar: lambda g, node, a, b: g("Sub", b, a),
+    _aten.sigmoid.default: _plain("Sigmoid"),
+    _aten.slice.Tensor: _slice,
+    _aten.split.Tensor: _split,
+    _aten.sqrt.default: _plain("Sqrt"),
+    _aten.square.default: lambda g, node, x: g("Mul", x, x),
+    _aten.stack.default: _stack,
+    _aten.std.correction: _deviation,
+    _aten.sub.Tensor: _sum("Sub"),
+    _aten.sum.dim_IntList: _reduce("ReduceSum"),
+    _aten.transpose.int: _swapped,
+    _aten.unbind.int: _unbind,
+    _aten.upsample_bilinear2d.vec: _enlarge,
+    _aten.where.self: lambda g, node, *given: g("Where", *given),
+}
+"""Operations of real numbers."""

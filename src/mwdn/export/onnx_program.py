@@ -1,0 +1,179 @@
+"""From an exported program of torch to ONNX: without complex numbers, and with products for Fourier transforms.
+
+What depends on no input is computed here, once. torch's own exporter is not used: of complex numbers it knows little,
+it leaves transforms to the runtime, and for the thousand operations of an iterative method it takes minutes.
+"""
+
+import operator
+import warnings
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, fx
+from torch.export import ExportedProgram
+
+from mwdn.errors import ExportError
+from mwdn.export import dft
+from mwdn.export.onnx_graph import OnnxGraph, Pair
+from mwdn.export.onnx_operations import REAL, Handler, filled, source, value
+
+if TYPE_CHECKING:
+    import onnx
+
+_aten = torch.ops.aten
+_ROWS, _COLUMNS = _aten.fft_rfft.default, _aten.fft_fft.default
+_TO_ROWS, _TO_COLUMNS = _aten.fft_irfft.default, _aten.fft_ifft.default
+_AXIS: dict[Any, int] = {_ROWS: -1, _COLUMNS: -2, _TO_ROWS: -1, _TO_COLUMNS: -2}
+"""The transforms that `mwdn.fourier.convolution` uses, and the axis of each."""
+
+
+def to_onnx(program: ExportedProgram) -> "onnx.ModelProto":
+    """The same function as an exported program, of the input ``measurement`` and the output ``scene``.
+
+    Args:
+        program: of one picture to one picture, as `torch.export.export` gives it; its batch may be open.
+
+    Raises:
+        ExportError: it does something that has no form here.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # torch's own, of how it copies a program
+        module = program.run_decompositions({}).module()
+    found, steps = _divided(module)
+    g = OnnxGraph()
+    shapes = {}
+    for step in steps:
+        if step.op == "placeholder":
+            found[step] = "measurement"
+            shapes["measurement"] = _axes(value(step))
+        elif step.op == "call_function":
+            arguments, options = fx.map_arg((step.args, step.kwargs), found.get)
+            found[step] = _written(g, step, arguments, options)
+        elif step.op == "output":
+            result = step.all_input_nodes[0]
+            shapes["scene"] = _axes(value(result))
+            return g.model(found[result], shapes)
+    raise AssertionError("A program has an output.")
+
+
+def _divided(module: fx.GraphModule) -> tuple[dict[fx.Node, Any], list[fx.Node]]:
+    """Values of what depends on no input, complex ones as pairs; and the other operations."""
+    values: dict[fx.Node, Any] = {}
+    steps = []
+    for node in module.graph.nodes:
+        if node.op == "get_attr":
+            values[node] = operator.attrgetter(str(node.target))(module)
+        elif node.op == "call_function" and all(given in values for given in node.all_input_nodes):
+            arguments, options = fx.map_arg((node.args, node.kwargs), values.__getitem__)
+            values[node] = node.target(*arguments, **options)
+        elif node.op != "call_module" and node.target is not _aten._assert_tensor_metadata.default:  # only checks
+            steps.append(node)
+    pairs = {node: Pair(v.real, v.imag) for node, v in values.items() if isinstance(v, Tensor) and v.is_complex()}
+    return values | pairs, steps
+
+
+def _axes(image: Tensor) -> list[int | str]:
+    return [length if isinstance(length, int) else "batch" for length in image.shape]
+
+
+def _written(g: OnnxGraph, step: fx.Node, arguments: Any, options: Any) -> Any:  # noqa: ANN401
+    """Add an operation to the graph; what it gives."""
+    if not isinstance(value(step), Tensor | tuple | list):
+        return None  # the length of the batch: shapes say it
+    if step.target is operator.getitem:
+        return arguments[0][arguments[1]]
+    handlers = _TRANSFORMS if step.target in _AXIS else REAL
+    if step.target not in _AXIS and any(_is_complex(given) for given in step.all_input_nodes):
+        handlers = _ON_PAIRS
+    if step.target not in handlers:
+        kind = "of complex numbers " if handlers is _ON_PAIRS else ""
+        raise ExportError(f"`{step.target}` {kind}cannot be written as ONNX. Export to .pt2 instead.")
+    return handlers[step.target](g, step, *arguments, **options)
+
+
+def _is_complex(node: fx.Node) -> bool:
+    return isinstance(value(node), Tensor) and value(node).is_complex()
+
+
+def _length(node: fx.Node) -> int:
+    """Of a transform; checked to be along the axis that is expected."""
+    axis, dimensions = _AXIS[node.target], source(node).ndim
+    _, n, along, norm = filled(node.args, None, None, -1, None)
+    if along % dimensions != axis % dimensions or norm or node.kwargs:
+        raise ExportError(f"`{node.target}` along another axis cannot be written as ONNX. Export to .pt2 instead.")
+    return n or source(node).shape[axis]
+
+
+def _kept(node: fx.Node) -> int:
+    """How many numbers along its axis are used, where all next operations cut the rest off."""
+    axis, ends = _AXIS[node.target], []
+    whole = value(node).shape[axis]
+    for user in node.users:
+        ends.append(whole)
+        if user.target is _aten.slice.Tensor:
+            _, along, start, end, step = filled(user.args, None, 0, None, None, 1)
+            if along % value(node).ndim == axis % value(node).ndim and not start and step == 1 and end is not None:
+                ends[-1] = end
+    return min(whole, max(ends, default=whole))
+
+
+def _rows(g: OnnxGraph, node: fx.Node, image: str, *_: Any) -> Pair:  # noqa: ANN401
+    both = g("MatMul", image, dft.row_matrix(source(node).shape[-1], _length(node)))
+    return Pair(*g.several("Split", 2, both, axis=-1, num_outputs=2))
+
+
+def _to_rows(g: OnnxGraph, node: fx.Node, rows: Pair, *_: Any) -> str:  # noqa: ANN401
+    return g("MatMul", g("Concat", *rows, axis=-1), dft.inverse_row_matrix(_length(node), _kept(node)))
+
+
+def _columns(g: OnnxGraph, node: fx.Node, columns: Pair, *_: Any) -> Pair:  # noqa: ANN401
+    given, width = source(node).shape[-2:]
+    kept = _kept(node)
+    matrices = dft.column_matrices(_length(node), given, kept, inverse=node.target is _TO_COLUMNS)
+    parts, points, below = matrices.parts, matrices.points, matrices.rows * matrices.points - given
+    if below:
+        columns = Pair(*(g("Pad", part, g.integers([0] * 6 + [below, 0])) for part in columns))
+    stacked = g("Concat", *columns, axis=2)
+    stacked = g("Reshape", stacked, g.integers([0, 0, 2 * matrices.rows, points * width]))
+    sums = g("MatMul", matrices.first, stacked)
+    sums = g("MatMul", matrices.second, g("Reshape", sums, g.integers([0, 0, parts, 2 * points, width])))
+    sums = g("Reshape", sums, g.integers([0, 0, parts, 2, -1, width]))
+    both = g("Reshape", g("Transpose", sums, perm=[0, 1, 3, 4, 2, 5]), g.integers([0, 0, -1, width]))
+    found = matrices.second.shape[1] // 2 * parts
+    if found == kept:
+        return Pair(*g.several("Split", 2, both, axis=2, num_outputs=2))
+    parts_of = [g("Slice", both, g.integers([s]), g.integers([s + kept]), g.integers([2])) for s in (0, found)]
+    return Pair(*parts_of)
+
+
+_TRANSFORMS: dict[Any, Handler] = {_ROWS: _rows, _TO_ROWS: _to_rows, _COLUMNS: _columns, _TO_COLUMNS: _columns}
+
+
+def _on_each(target: Any) -> Handler:  # noqa: ANN401
+    return lambda g, node, pair, *arguments, **options: Pair(
+        *(REAL[target](g, node, part, *arguments, **options) for part in pair)
+    )
+
+
+def _multiplied(g: OnnxGraph, node: fx.Node, a: Any, b: Any) -> Pair:  # noqa: ANN401
+    if not (isinstance(a, Pair) and isinstance(b, Pair)):
+        pair, factor = (a, b) if isinstance(a, Pair) else (b, a)
+        return Pair(g("Mul", pair.real, factor), g("Mul", pair.imaginary, factor))
+    real = g("Sub", g("Mul", a.real, b.real), g("Mul", a.imaginary, b.imaginary))
+    return Pair(real, g("Add", g("Mul", a.real, b.imaginary), g("Mul", a.imaginary, b.real)))
+
+
+def _added(g: OnnxGraph, node: fx.Node, a: Pair, b: Pair) -> Pair:
+    return Pair(*(g("Add", *each) for each in zip(a, b, strict=True)))
+
+
+_ON_PAIRS: dict[Any, Handler] = {
+    **{each: _on_each(each) for each in (_aten.alias.default, _aten.clone.default, _aten.slice.Tensor)},
+    _aten._conj.default: lambda g, node, a: Pair(a.real, g("Neg", a.imaginary)),
+    _aten.abs.default: lambda g, node, a: g("Sqrt", g("Add", g("Mul", a[0], a[0]), g("Mul", a[1], a[1]))),
+    _aten.add.Tensor: _added,
+    _aten.addcmul.default: lambda g, node, a, b, c: _added(g, node, a, _multiplied(g, node, b, c)),
+    _aten.div.Tensor: lambda g, node, a, b: Pair(*(g("Div", part, b) for part in a)),
+    _aten.mul.Tensor: _multiplied,
+}
+"""Operations of complex numbers."""

@@ -1,0 +1,98 @@
+"""Linear and circular convolution of a scene with a PSF, and its adjoint."""
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+from mwdn.errors import ShapeError
+from mwdn.fourier.transforms import fast_length, inverse_spectrum, spectrum, transfer_function
+from mwdn.types import Image, Measurement, Psf, Scene, Size, Spectrum
+
+
+def _operator(psf: Tensor, scene: Size, sensor: Size, *, circular: bool) -> tuple[Spectrum, Size]:
+    """Transfer function that takes a scene at (0, 0) to a sensor at (0, 0), their centres aligned; and its grid.
+
+    The grid must be so long that no wrapped end of the full convolution lands on the sensor. Counted from the
+    centres, the sensor is [-(o//2), o-o//2-1] and the full convolution [-(s//2+p//2), (s-s//2-1)+(p-p//2-1)], so
+    the grid needs 1 + the larger of the two overhangs: 1.5 n for equal sizes n, where 2 n is the usual choice.
+    """
+    grid, origin = [], []
+    for s, o, p in zip(scene, sensor, psf.shape[-2:], strict=True):
+        before = s // 2 + p // 2 + (o - o // 2 - 1)
+        after = (s - s // 2 - 1) + (p - p // 2 - 1) + o // 2
+        grid.append(max(s, o) if circular else fast_length(max(1 + before, 1 + after, s, o, p)))
+        origin.append(p // 2 + s // 2 - o // 2)
+    size = (grid[0], grid[1])
+    return transfer_function(psf, size, (origin[0], origin[1])), size
+
+
+def check_fit(image: Tensor, psf: Tensor, name: str) -> None:
+    """Raise a `ShapeError` unless the PSF's batch and channels are 1 or those of the picture called ``name``."""
+    for axis, of in ((0, "batch"), (1, "channels")):
+        if psf.shape[axis] not in (1, image.shape[axis]):
+            raise ShapeError(f"`psf` {tuple(psf.shape)} must have {of} 1 or that of `{name}` {tuple(image.shape)}.")
+
+
+def convolve(scene: Scene, psf: Psf, *, size: Size | None = None, circular: bool = False) -> Image:
+    """Convolution of a scene with a PSF, as seen by a sensor of ``size`` whose centre faces the scene's centre.
+
+    Args:
+        scene: (B, C, H, W).
+        psf: (1 or B, 1 or C, h, w), centred at ``(h // 2, w // 2)``.
+        size: height and width of the result; the scene's unless given. A smaller one crops, as a sensor does.
+        circular: let what leaves the scene at one border enter at the other, instead of leaving for good.
+
+    Returns:
+        (B, C, *size), float32.
+
+    Raises:
+        ShapeError: batch, channels or (circular only) sizes do not fit.
+
+    References:
+        Eq. (1) of the MWDN paper, without the noise.
+    """
+    check_fit(scene, psf, "scene")
+    size = size or (scene.shape[-2], scene.shape[-1])
+    transfer, grid = _operator(psf, (scene.shape[-2], scene.shape[-1]), size, circular=circular)
+    return inverse_spectrum(spectrum(scene, grid) * transfer, grid, size)
+
+
+def correlate(measurement: Measurement, psf: Psf, *, size: Size | None = None, circular: bool = False) -> Scene:
+    """Exact adjoint of `convolve`: ``<convolve(v, psf), b> == <v, correlate(b, psf)>``.
+
+    Args:
+        measurement: (B, C, H, W).
+        psf: as for `convolve`.
+        size: height and width of the scene; the measurement's unless given.
+        circular: as for `convolve`.
+
+    Returns:
+        (B, C, *size), float32.
+    """
+    check_fit(measurement, psf, "measurement")
+    size = size or (measurement.shape[-2], measurement.shape[-1])
+    transfer, grid = _operator(psf, size, (measurement.shape[-2], measurement.shape[-1]), circular=circular)
+    return inverse_spectrum(spectrum(measurement, grid) * transfer.conj(), grid, size)
+
+
+class Convolution(NamedTuple):
+    """`convolve` and `correlate` between fixed sizes, for a method that needs both many times: see `convolution`."""
+
+    transfer: Spectrum
+    grid: Size
+    scene: Size
+    sensor: Size
+
+    def forward(self, scene: Scene) -> Image:
+        """What the sensor sees of a scene."""
+        return inverse_spectrum(spectrum(scene, self.grid) * self.transfer, self.grid, self.sensor)
+
+    def adjoint(self, measurement: Measurement) -> Scene:
+        """Exact adjoint of `forward`."""
+        return inverse_spectrum(spectrum(measurement, self.grid) * self.transfer.conj(), self.grid, self.scene)
+
+
+def convolution(psf: Psf, scene: Size, sensor: Size) -> Convolution:
+    """Linear convolution of scenes with a PSF that is transformed once, here."""
+    transfer, grid = _operator(psf, scene, sensor, circular=False)
+    return Convolution(transfer, grid, scene, sensor)

@@ -1,0 +1,62 @@
+"""Wiener deconvolution, of one picture or of hundreds of features at once."""
+
+from torch import Tensor
+
+from mwdn.errors import ParameterError
+from mwdn.fourier.convolution import check_fit
+from mwdn.fourier.filtering import filtered
+from mwdn.fourier.padding import Boundary
+from mwdn.fourier.transforms import fast_length, transfer_function
+from mwdn.types import Image, Measurement, Psf, Size, Spectrum
+
+
+def deconvolution_grid(size: Size, boundary: Boundary) -> Size:
+    """Grid on which a measurement of ``size`` is deconvolved: 1.5 times as long, or itself if circular."""
+    if boundary == "circular":
+        return size
+    return fast_length(size[0] + size[0] // 2), fast_length(size[1] + size[1] // 2)
+
+
+def wiener(
+    measurement: Measurement, psf: Psf, regularisation: float | Tensor, *, boundary: Boundary = "taper"
+) -> Image:
+    """Wiener estimate of the scene, eq. (2) of the paper: ``V = conj(H) B / (|H|^2 + lambda)``.
+
+    Args:
+        measurement: (B, C, H, W).
+        psf: (1 or B, 1 or C, h, w), centred; the paper's weight w is already multiplied into it.
+        regularisation: lambda, positive; a number, or a tensor that broadcasts against (B, C, 1, 1). It is the
+            noise-to-signal power ratio: as it grows, noise and detail fade and the estimate dims. For a PSF of
+            unit sum, |H|^2 is 1 at frequency zero and useful values lie between 1e-5 and 1e-1.
+        boundary: what stands beyond the measurement's border, see `Boundary`.
+
+    Returns:
+        (B, C, H, W), float32; its range is that of ``measurement`` over the sum of ``psf``.
+
+    Raises:
+        ShapeError: batch or channels do not fit.
+        ParameterError: ``regularisation`` is a number that is not positive, or ``boundary`` is unknown.
+
+    References:
+        N. Wiener, Extrapolation, Interpolation, and Smoothing of Stationary Time Series (1949).
+    """
+    check_fit(measurement, psf, "measurement")
+    grid = deconvolution_grid((measurement.shape[-2], measurement.shape[-1]), boundary)
+    return filtered(measurement.float(), wiener_transfer(psf, regularisation, grid), grid, boundary)
+
+
+def wiener_transfer(psf: Psf, regularisation: float | Tensor, grid: Size) -> Spectrum:
+    """Transfer function of the Wiener filter, ``conj(H) / (|H|^2 + lambda)``; what it needs of a camera.
+
+    Args:
+        psf: (B, C, h, w), centred, at most as large as ``grid``.
+        regularisation: lambda, as for `wiener`.
+        grid: see `deconvolution_grid`.
+
+    Raises:
+        ParameterError: ``regularisation`` is a number that is not positive.
+    """
+    if not isinstance(regularisation, Tensor) and not regularisation > 0:
+        raise ParameterError(f"`regularisation` ({regularisation}) must be positive; try 1e-3.")
+    H = transfer_function(psf, grid)
+    return H.conj() / (H.abs().square() + regularisation)

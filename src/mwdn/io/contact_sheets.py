@@ -1,0 +1,68 @@
+"""Contact sheets: pictures side by side under their titles."""
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from mwdn.io.images import srgb_decode
+from mwdn.types import Image
+
+
+def for_people(image: Image) -> Image:
+    """Scale each picture of a batch so that all but its brightest 0.3 % fit into [0, 1].
+
+    A reconstruction's absolute brightness depends on the exposure and on the PSF's; people want to see a picture.
+    """
+    pixels = image.float().flatten(1)
+    brightest = pixels.kthvalue(pixels.shape[1] - int(0.003 * pixels.shape[1])).values
+    return (image / brightest.clamp(min=1e-12)[:, None, None, None]).clamp(0, 1)
+
+
+def contact_sheet(rows: list[list[Tensor]], titles: list[str], *, height: int = 240) -> Tensor:
+    """Arrange pictures in rows, each scaled by `for_people` and resized to one height.
+
+    Args:
+        rows: lists of (1, 1 or 3, H, W) in linear light, as many a row as there are titles.
+        titles: of the columns.
+        height: of each picture.
+
+    Returns:
+        (1, 3, H, W) in linear light.
+    """
+    gap, head = 6, 26
+    cells = [[_cell(picture, height, gap) for picture in row] for row in rows]
+    lines = [torch.cat(row, dim=-1) for row in cells]
+    widest = max(line.shape[-1] for line in lines)
+    lines = [F.pad(line, (0, widest - line.shape[-1], 0, 0), value=1.0) for line in lines]
+    widths = [cell.shape[-1] for cell in cells[0]]
+    return torch.cat([_heading(titles, widths, head, widest), *lines], dim=-2)
+
+
+def thumbnail(picture: Image, height: int = 240) -> Tensor:
+    """Shrink a picture to a sheet's height, if it is taller: what a sheet of large pictures needs of each."""
+    if picture.shape[-2] <= height:
+        return picture
+    return F.interpolate(picture, (height, _width(picture, height)), mode="area")
+
+
+def _cell(picture: Tensor, height: int, gap: int) -> Tensor:
+    picture = thumbnail(for_people(picture), height)
+    if picture.shape[-2] < height:
+        picture = F.interpolate(picture, (height, _width(picture, height)), mode="bicubic").clamp(0, 1)
+    return F.pad(picture.expand(-1, 3, -1, -1), (0, gap, 0, gap), value=1.0)
+
+
+def _width(picture: Tensor, height: int) -> int:
+    return max(1, round(picture.shape[-1] * height / picture.shape[-2]))
+
+
+def _heading(titles: list[str], widths: list[int], height: int, total: int) -> Tensor:
+    import cv2
+
+    canvas = np.full((height, total), 255, np.uint8)
+    left = 0
+    for title, width in zip(titles, widths, strict=True):
+        cv2.putText(canvas, title, (left + 2, height - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.5, 0, 1, cv2.LINE_AA)
+        left += width
+    return srgb_decode(torch.from_numpy(canvas / np.float32(255)))[None, None].expand(1, 3, -1, -1)

@@ -1,0 +1,147 @@
+"""Pictures and frames in and out of files: what their numbers mean, and which way is up."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mwdn.errors import ImageError, ParameterError
+from mwdn.io.files import naming, save_linear, save_png
+from mwdn.io.formats import decode, kind_of, read
+from mwdn.types import FloatFrame, Frame, Image
+
+READABLE = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".npy"})
+"""Suffixes, in lower case, by which a folder is searched for pictures and frames."""
+
+
+def read_frame(path: str | Path, *, bgr: bool = False, upside_down: bool = False, upright: bool = False) -> Frame:
+    """Read a frame, its numbers exactly as stored: no gamma, no scaling.
+
+    Args:
+        path: PNG, JPEG, BMP, TIFF (its first picture) or NPY.
+        bgr: the file's channels are blue, green, red, against its format's custom.
+        upside_down: the file's first row is the picture's last. DiffuserCam's ``.npy`` files need both.
+        upright: turn a photograph as its EXIF says; a sensor's frame stays as it lies.
+
+    Returns:
+        (H, W, 1) or (H, W, 3), RGB, row 0 at the top, uint8 or uint16 as stored, any float as float32.
+        Grey has one channel, alpha is dropped, leading axes of length 1 are removed.
+
+    Raises:
+        ImageError: no such file; damaged, cut off, or of an unknown format; other numbers or axes than these;
+            more than `mwdn.io.formats.MAX_PIXELS` pixels; NaN or infinity.
+    """
+    frame = read(Path(path), photograph=upright)
+    return np.ascontiguousarray(frame[:: -1 if upside_down else 1, :, :: -1 if bgr else 1])
+
+
+def decode_frame(data: bytes, name: str) -> Frame:
+    """Read a frame from the bytes of a file, its numbers exactly as stored.
+
+    Args:
+        data: whole content of a PNG, JPEG or BMP.
+        name: of where the bytes come from, for the message.
+
+    Returns:
+        (H, W, 1) or (H, W, 3), as for `read_frame`.
+
+    Raises:
+        ImageError: damaged, cut off, or of another format.
+    """
+    try:
+        if (kind := kind_of(data)) not in ("PNG", "JPEG", "BMP"):
+            raise ImageError(f"must be PNG, JPEG or BMP, but starts with {data[:8]!r}. Export it as PNG.")
+        return np.ascontiguousarray(decode(kind, data, photograph=False))
+    except ImageError as problem:
+        raise ImageError(f"{name} {problem}") from problem
+
+
+def read_picture(path: str | Path) -> Image:
+    """Read a photograph as linear light: turned upright as its EXIF says, decoded from sRGB.
+
+    Args:
+        path: PNG, JPEG, BMP, TIFF (its first picture) or NPY, of 8 or 16 bits.
+
+    Returns:
+        (1, 3, H, W), in [0, 1]; 1 is the largest number of 8 or 16 bits. Grey is repeated, alpha dropped.
+
+    Raises:
+        ImageError: as for `read_frame`, or the file holds floats, for which no gamma is customary.
+    """
+    pixels = read(Path(path), photograph=True)
+    if pixels.dtype.kind == "f":
+        raise ImageError(f"`{path}` holds floats; a photograph has 8 or 16 bits. Read it with `read_frame`.")
+    peak = np.iinfo(pixels.dtype).max
+    light = srgb_decode(torch.arange(peak + 1) / peak).numpy()[pixels]  # one power a level, not a pixel
+    return torch.from_numpy(light).movedim(-1, 0)[None].expand(-1, 3, -1, -1).contiguous()
+
+
+def write_picture(path: str | Path, image: Tensor, *, bits: int = 8) -> None:
+    """Write a picture for people: clipped to [0, 1], encoded as sRGB, rounded, as PNG, atomically.
+
+    Args:
+        path: ends in ``.png``; missing folders are created.
+        image: (1, C, H, W) or (C, H, W) of 1 or 3 channels, linear light.
+        bits: 8, or 16 for a picture that will be edited.
+
+    Raises:
+        ParameterError: ``bits`` is neither.
+        ImageError: another suffix or shape, integers, NaN or infinity, or the disk refuses.
+    """
+    if bits not in (8, 16):
+        raise ParameterError(f"`bits` ({bits}) must be 8 or 16, the depths of a PNG in colour.")
+    frame = _writable(Path(path), image, ".png")
+    encoded = srgb_encode(torch.from_numpy(frame)).mul(2**bits - 1).round().numpy()
+    _write(save_png, Path(path), encoded.astype(f"uint{bits}"))
+
+
+def write_linear(path: str | Path, image: Tensor) -> None:
+    """Write a picture for measuring: its exact float32 numbers, which `read_frame` gives back, atomically.
+
+    Args:
+        path: ends in ``.tif``, ``.tiff`` or ``.npy``; missing folders are created.
+        image: (1, C, H, W) or (C, H, W) of 1 or 3 channels, any range; stored as (H, W, C).
+
+    Raises:
+        ImageError: another suffix or shape, integers, NaN or infinity, or the disk refuses.
+    """
+    _write(save_linear, Path(path), _writable(Path(path), image, ".npy", ".tif", ".tiff"))
+
+
+def srgb_encode(linear: Tensor) -> Tensor:
+    """From linear light to the numbers of an sRGB file, of any shape; clipped to [0, 1].
+
+    References:
+        IEC 61966-2-1:1999, section 5.2: a line in the dark, then a power of 1 / 2.4. 0.2140 becomes 0.5.
+    """
+    linear = linear.clamp(0, 1)
+    power = linear ** (1 / 2.4)
+    # 1.055 power - 0.055, in a form that makes white exactly 1 in float32 too.
+    return torch.where(linear <= 0.0031308, 12.92 * linear, power + 0.055 * (power - 1))
+
+
+def srgb_decode(encoded: Tensor) -> Tensor:
+    """From the numbers of an sRGB file, of any shape and in [0, 1], to linear light; undoes `srgb_encode`."""
+    return torch.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+def _writable(path: Path, image: Tensor, *suffixes: str) -> FloatFrame:
+    if path.suffix.lower() not in suffixes:
+        raise ImageError(f"`{path}` must end in {' or '.join(suffixes)}, not '{path.suffix}'. Rename it.")
+    picture = image[0] if image.ndim == 4 and len(image) == 1 else image
+    fits = picture.ndim == 3 and len(picture) in (1, 3) and picture.numel() > 0
+    if not (fits and picture.is_floating_point()):
+        got = f"{' x '.join(map(str, image.shape))}, {image.dtype}"
+        wanted = "(C, H, W) or (1, C, H, W), floats of 1 or 3 channels"
+        raise ImageError(f"`image` ({got}) must be {wanted} for `{path}`. Pick one of the batch.")
+    picture = picture.detach().to("cpu", torch.float32)
+    if not torch.isfinite(picture).all():
+        raise ImageError(f"`image` holds NaN or infinity: `{path}` is not written. Use `torch.nan_to_num`.")
+    return picture.movedim(0, -1).contiguous().numpy()
+
+
+def _write(save: Callable[[Path, Frame], None], path: Path, pixels: Frame) -> None:
+    with naming(path):
+        save(path, pixels)

@@ -1,0 +1,23 @@
+"""The pictures that come with the package."""
+
+from importlib.resources import files
+
+from torch.nn import functional as F
+
+from mwdn.io.images import read_picture
+from mwdn.types import Scene, Size
+
+__all__ = ["dark_scene"]
+
+
+def dark_scene(name: str, size: Size, side: int) -> Scene:
+    """A picture in the middle of a dark scene, (1, 3, *size), linear light.
+
+    Args:
+        name: of a file in this folder, without ``.jpg``.
+        size: height and width of the scene.
+        side: height and width of the picture in it.
+    """
+    picture = F.interpolate(read_picture(str(files("mwdn.io.pictures") / f"{name}.jpg")), (side, side), mode="area")
+    (height, width), above, left = size, (size[0] - side) // 2, (size[1] - side) // 2
+    return F.pad(picture, (left, width - side - left, above, height - side - above))

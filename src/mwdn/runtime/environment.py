@@ -1,0 +1,48 @@
+"""What this machine offers."""
+
+import os
+import platform
+from importlib.metadata import PackageNotFoundError, version
+
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from mwdn.runtime.devices import has_bfloat16
+
+_PACKAGES = ("mwdn", "torch", "numpy", "opencv-python-headless", "tifffile", "h5py", "safetensors", "cyclopts", "rich")
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def findings() -> dict[str, str]:
+    """Everything worth knowing before one reports a problem, by its name."""
+    found = {"python": f"{platform.python_version()} on {platform.platform()}"}
+    found |= {package: _version(package) for package in _PACKAGES}
+    found["CPU"] = (
+        f"{platform.machine()}, {os.cpu_count()} cores, instructions {torch.backends.cpu.get_cpu_capability()}"
+    )
+    found["threads"] = f"{torch.get_num_threads()} (set OMP_NUM_THREADS to change)"
+    found["bfloat16 on the CPU"] = (
+        "yes, in hardware" if has_bfloat16(torch.device("cpu")) else "emulated: float32 is faster"
+    )
+    if not torch.cuda.is_available():
+        found["GPU"] = "none that torch can use"
+    for index in range(torch.cuda.device_count()):
+        card = torch.cuda.get_device_properties(index)
+        bfloat = "with" if has_bfloat16(torch.device("cuda", index)) else "without"
+        found[f"cuda:{index}"] = f"{card.name}, {card.total_memory / 2**30:.0f} GiB, {bfloat} bfloat16"
+    return found
+
+
+def report(console: Console) -> None:
+    """Print the findings as a table."""
+    table = Table(show_header=False)
+    for name, value in findings().items():
+        table.add_row(name, value)
+    console.print(table)

@@ -1,0 +1,121 @@
+"""BatchNorm of a batch whose parts several processes hold, and the biases that it cancels."""
+
+import itertools
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from mwdn.runtime import distributed
+
+PSF_ENCODER = "psf_encoder"
+"""Child of a network that sees the PSF alone, which all processes have whole."""
+
+
+def freeze_cancelled(network: nn.Module) -> None:
+    """Stop learning each bias that stands before a BatchNorm, which subtracts it again.
+
+    Its gradient is 0, but for rounding. Adam, which divides a gradient by its size, would make steps of that noise,
+    others on each machine and for each number of processes.
+    """
+    for module in network.modules():
+        if isinstance(module, nn.Sequential):
+            for layer, following in itertools.pairwise(module):
+                if isinstance(layer, nn.Conv2d) and layer.bias is not None and isinstance(following, nn.BatchNorm2d):
+                    layer.bias.requires_grad_(False)
+
+
+def synchronise(network: nn.Module, device: torch.device) -> None:
+    """Let every BatchNorm of the network normalise by the whole batch instead of this process's part.
+
+    The encoder of the PSF stays as it is: its batch is one PSF, which no process shares with another.
+
+    Args:
+        network: its layers are replaced; their parameters, and so the checkpoint, stay.
+        device: where it computes. On GPUs torch's own layer is taken, which the CPU does not have.
+    """
+    if distributed.world() == 1:
+        return
+    for name, child in network.named_children():
+        if name == PSF_ENCODER:
+            continue
+        if not isinstance(child, nn.BatchNorm2d):
+            synchronise(child, device)
+        elif device.type == "cuda":
+            setattr(network, name, nn.SyncBatchNorm.convert_sync_batchnorm(child))  # type: ignore[no-untyped-call]
+        else:
+            child.__class__ = GlobalBatchNorm2d
+
+
+class GlobalBatchNorm2d(nn.BatchNorm2d):
+    """BatchNorm over the parts of a batch that all processes hold, which may be of different sizes."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        """Normalise (B, C, H, W); while training by the mean and variance over every process's B, H and W."""
+        if not self.training:
+            return super().forward(input)
+        mean, variance, count = _moments(input)
+        with torch.no_grad():
+            self.num_batches_tracked.add_(1)  # type: ignore[union-attr]
+            for running, new in ((self.running_mean, mean), (self.running_var, variance * count / (count - 1))):
+                running.lerp_(new.to(running), self.momentum)  # type: ignore[union-attr, arg-type]
+        numbers = (mean, variance, count, self.eps)
+        return _Normalise.apply(input, self.weight, self.bias, *numbers)  # type: ignore[no-untyped-call]
+
+
+AXES = (0, 2, 3)
+"""All but the channels."""
+
+
+@torch.no_grad()
+def _moments(features: Tensor) -> tuple[Tensor, Tensor, float]:
+    """Mean and variance (C,) over all processes, float64, and of how many numbers."""
+    own_variance, own_mean = torch.var_mean(_precise(features), AXES, correction=0)
+    own_count = torch.full_like(own_mean, features.numel() // features.shape[1])
+    # Every process's row of one table, as a sum with the zeros of all others. Moments of parts, unlike sums of
+    # squares, lose no digits where the mean is large.
+    table = own_mean.new_zeros(distributed.world(), 3, len(own_mean), dtype=torch.float64)
+    table[distributed.rank()] = torch.stack([own_count, own_mean, own_variance])
+    counts, means, variances = distributed.total(table).unbind(1)
+    part = counts / counts.sum(0)
+    mean = (part * means).sum(0)
+    variance = (part * (variances + (means - mean).square())).sum(0)
+    return mean, variance, counts[:, 0].sum().item()
+
+
+def _precise(features: Tensor) -> Tensor:
+    return features.float() if features.dtype == torch.bfloat16 else features
+
+
+class _Normalise(torch.autograd.Function):
+    """y = w (x - m) s + b with s = 1 / sqrt(v + eps), where m and v depend on the x of every process.
+
+    For the gradient g of y, that of x is w s (g - mean(g) - z mean(g z)), z = (x - m) s, means over all processes.
+    """
+
+    @staticmethod
+    def forward(  # noqa: PLR0913
+        ctx: Any,  # noqa: ANN401
+        x: Tensor,
+        w: Tensor,
+        b: Tensor,
+        m: Tensor,
+        v: Tensor,
+        count: float,
+        eps: float,
+    ) -> Tensor:
+        ctx.save_for_backward(x, w, m, (v + eps).rsqrt())
+        ctx.count = count
+        return F.batch_norm(x, m.to(w), v.to(w), w, b, training=False, eps=eps)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
+        x, w, m, s = ctx.saved_tensors
+        g = _precise(gradient)
+        w_s, m, s = (value.to(g)[:, None, None] for value in (w * s, m, s))
+        z = (_precise(x) - m) * s
+        own = torch.stack([g.sum(AXES), (g * z).sum(AXES)])
+        mean_g, mean_gz = (distributed.total(own.to(torch.float64, copy=True)) / ctx.count).to(g)[..., None, None]
+        # The parameters' gradients are of this process's part: `distributed.add_gradients` sums them with all others.
+        return (w_s * (g - mean_g - z * mean_gz)).to(x.dtype), own[1].to(w), own[0].to(w), None, None, None, None

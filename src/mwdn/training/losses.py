@@ -1,0 +1,86 @@
+"""The training loss: a weighted sum of distances between pictures."""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from mwdn.errors import ParameterError, UnknownNameError
+from mwdn.evaluation.alexnet import load_alexnet, load_heads
+from mwdn.evaluation.distances import feature_mse, l1, log_mse, lpips, mse, ssim
+from mwdn.types import Image
+
+NAMES = ("feature_mse", "l1", "log_mse", "lpips", "mse", "ssim")
+"""What a `Loss` can be made of."""
+
+
+class Loss(nn.Module):
+    """A weighted sum of distances, averaged over the batch.
+
+    AlexNet and the heads of LPIPS are loaded only if a part needs them; move them with ``.to(device)``.
+
+    Args:
+        weights: of each part by its name in `NAMES`; ``{"mse": 1.0, "feature_mse": 0.05}`` ends the training of
+            the MWDN paper. Similarity enters as 1 - SSIM. A part of weight 0 is reported, not trained on.
+        alexnet: file of AlexNet's weights; see `mwdn.evaluation.alexnet.load_alexnet`.
+        heads: file of LPIPS's heads; see `mwdn.evaluation.alexnet.load_heads`.
+
+    Raises:
+        UnknownNameError: no such part.
+        ParameterError: no part, or a weight that is negative or not finite.
+        CheckpointError: a network is needed and cannot be had.
+    """
+
+    def __init__(
+        self, weights: Mapping[str, float], *, alexnet: str | Path | None = None, heads: str | Path | None = None
+    ) -> None:
+        super().__init__()
+        self.weights = checked_weights(weights)
+        """May be changed while training: a weight, not a name."""
+        self.alexnet = load_alexnet(alexnet) if {"feature_mse", "lpips"} & set(weights) else None
+        self.heads = load_heads(heads, alexnet=alexnet) if "lpips" in weights else None
+
+    def forward(self, reconstruction: Image, scene: Image) -> tuple[Tensor, dict[str, Tensor]]:
+        """Compare a batch.
+
+        Args:
+            reconstruction: (B, C, H, W), nominally in [0, 1].
+            scene: of the same shape.
+
+        Returns:
+            The weighted sum, a scalar to be minimised, and each part before its weight, a scalar without gradient.
+
+        Raises:
+            ShapeError: the shapes differ or do not suit a part.
+        """
+        total, parts = reconstruction.new_zeros((), dtype=torch.float32), {}
+        for name, weight in self.weights.items():
+            with torch.set_grad_enabled(weight > 0 and torch.is_grad_enabled()):
+                part = self._part(name, reconstruction, scene).mean()
+            total = total + weight * part if weight > 0 else total
+            parts[name] = part.detach()
+        return total, parts
+
+    def _part(self, name: str, image: Tensor, reference: Tensor) -> Tensor:
+        if name == "ssim":
+            return 1 - ssim(image, reference)
+        if name == "feature_mse" and self.alexnet is not None:
+            return feature_mse(image, reference, self.alexnet)
+        if name == "lpips" and self.alexnet is not None and self.heads is not None:
+            return lpips(image, reference, self.alexnet, self.heads)
+        return {"mse": mse, "l1": l1, "log_mse": log_mse}[name](image, reference)
+
+
+def checked_weights(weights: Mapping[str, Any]) -> dict[str, float]:
+    """Copy of the weights of a `Loss`, for which its errors are raised."""
+    if not weights:
+        raise ParameterError(f'`weights` must name at least one of {", ".join(NAMES)}, for example {{"mse": 1.0}}.')
+    for name, weight in weights.items():
+        if name not in NAMES:
+            raise UnknownNameError("loss", name, NAMES)
+        if not (isinstance(weight, int | float) and math.isfinite(weight) and weight >= 0):
+            raise ParameterError(f"The weight of `{name}` ({weight!r}) must be finite and not negative.")
+    return {name: float(weight) for name, weight in weights.items()}

@@ -1,0 +1,49 @@
+"""A run's progress for TensorBoard, which is an extra."""
+
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from mwdn.errors import ParameterError
+from mwdn.io.files import writable
+from mwdn.io.images import srgb_encode
+from mwdn.training.trainer import Report
+
+
+class Board:
+    """Writes event files; use it in a ``with`` statement, and call it with each report.
+
+    Args:
+        folder: of the event files, which ``tensorboard --logdir`` shows; missing folders are created.
+        step: what is already written of later steps will be hidden: a resumed run repeats them.
+
+    Raises:
+        ParameterError: TensorBoard is not installed, or the folder cannot be written to.
+    """
+
+    def __init__(self, folder: Path, step: int = 0) -> None:
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ModuleNotFoundError as error:
+            raise ParameterError("`tensorboard` must be installed: `pip install 'mwdn[tensorboard]'`.") from error
+        with writable(folder):
+            self._writer: Any = SummaryWriter(str(folder), purge_step=step + 1)
+
+    def __call__(self, report: Report) -> None:
+        """Write a step's numbers, and after a validation its numbers and the contact sheet."""
+        scalars = {f"loss/{name}": value for name, value in {"total": report.loss, **report.parts}.items()}
+        scalars |= {"learning_rate": report.learning_rate, "pictures_per_s": report.pictures_per_s}
+        if report.validation is not None:
+            scalars |= {"validation/psnr": report.validation.psnr, "validation/loss": report.validation.loss}
+            if report.validation.sheet is not None:
+                self._writer.add_image("validation", srgb_encode(report.validation.sheet[0]), report.step)
+        for name, value in scalars.items():
+            self._writer.add_scalar(name, value, report.step)
+
+    def __enter__(self) -> "Board":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._writer.close()

@@ -1,0 +1,71 @@
+"""Trained networks by name: those that come with the package, and those on the Hugging Face hub."""
+
+from importlib.resources import files
+from pathlib import Path
+
+import torch
+
+from mwdn.errors import CheckpointError
+from mwdn.weights.checkpoint import load_network, read_metadata, save_network
+
+BUNDLED = ("universal", "universal-small")
+"""Networks for any camera. Their model card is `mwdn/weights/README.md`."""
+
+HUB = "hub:"
+"""``hub:owner/name`` is the file model.safetensors of that repository, ``hub:owner/name/file`` another one."""
+
+_FOLDER = Path(str(files("mwdn") / "weights"))
+
+
+def find_weights(name: str) -> Path | None:
+    """The file of a bundled network, or of one on the hub, which is downloaded once; ``None`` for any other name.
+
+    Raises:
+        CheckpointError: the hub does not have it, or cannot be reached.
+    """
+    if name in BUNDLED:
+        return _FOLDER / f"{name}.safetensors"
+    return _download(name) if name.startswith(HUB) else None
+
+
+def _download(name: str) -> Path:
+    owner, repository, file = (*name.removeprefix(HUB).split("/", 2), "", "")[:3]
+    if not (owner and repository):
+        raise CheckpointError(f"`{name}` must be hub:owner/name or hub:owner/name/file.safetensors.")
+    try:
+        from huggingface_hub import hf_hub_download
+        from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
+    except ImportError as error:
+        raise CheckpointError(f"`{name}` needs the package huggingface-hub: `pip install 'mwdn[hub]'`.") from error
+    try:
+        return Path(hf_hub_download(f"{owner}/{repository}", file or "model.safetensors"))
+    except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError, OSError, ValueError) as error:
+        reason = str(error).strip().splitlines()[0]
+        raise CheckpointError(
+            f"`{name}` cannot be fetched from the hub: {reason} Check the name and the network, or download the file "
+            "and give its path."
+        ) from error
+
+
+def bundle(checkpoint: Path, out: Path, denoiser: Path | None = None) -> None:
+    """Write a checkpoint's weights as float16, with all that it says of itself.
+
+    Args:
+        checkpoint: of a network.
+        out: the file to write.
+        denoiser: checkpoint of the one that takes the place of the network's own.
+
+    Raises:
+        CheckpointError: a checkpoint cannot be used, or a weight does not fit float16.
+    """
+    header = read_metadata(checkpoint)
+    network = load_network(checkpoint)
+    if denoiser is not None:
+        try:
+            network.get_submodule("denoiser").load_state_dict(load_network(denoiser).state_dict())
+        except (AttributeError, RuntimeError) as error:
+            raise CheckpointError(f"`{checkpoint}` has no denoiser that `{denoiser}` fits: {error}") from error
+    network = network.half()
+    if not all(torch.isfinite(value).all() for value in network.state_dict().values()):
+        raise CheckpointError(f"`{checkpoint}` holds weights beyond the range of float16, 65504.")
+    save_network(out, network, header.pop("name"), header.pop("options"), **header)

@@ -1,0 +1,345 @@
+"""The commands as a user types them: exit codes, messages, files."""
+
+import importlib.metadata
+import json
+import re
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import mwdn
+from mwdn import Camera, read_frame
+from mwdn.cli.app import main
+from mwdn.cli.demo import METHODS
+from mwdn.optics.patterns import contour_psf
+
+SIZE = 32, 40
+
+
+@pytest.fixture
+def camera(tmp_path, monkeypatch, generator):
+    """Current folder with psf.png, captures a.png, b.png, c.png in `captures`, all 16-bit colour."""
+    monkeypatch.chdir(tmp_path)
+    psf = contour_psf(SIZE, cell=10, generator=generator)
+    (tmp_path / "captures").mkdir()
+    store("psf.png", 0.9 * psf / psf.max())
+    for i, name in enumerate("abc"):
+        scene = torch.zeros(1, 3, *SIZE)
+        scene[:, i, 10:20, 12:22] = 0.9
+        store(f"captures/{name}.png", Camera(psf).simulate(scene, generator=generator))
+    return tmp_path
+
+
+def store(path, image):
+    frame = (image.expand(-1, 3, -1, -1)[0].movedim(0, -1).clamp(0, 1) * 65535).numpy().astype(np.uint16)
+    assert cv2.imwrite(str(path), frame[..., ::-1])
+
+
+@pytest.fixture
+def run(capsys):
+    """``run("demo", ...)`` gives exit code, standard output, standard error."""
+
+    def call(*arguments):
+        with pytest.raises(SystemExit) as caught:
+            main([str(argument) for argument in arguments])
+        code = caught.value.code
+        return (0 if code is None else code, *capsys.readouterr())
+
+    return call
+
+
+def reconstruct(run, *captures, psf="psf.png", out="out", method="wiener"):
+    return run("reconstruct", *captures, "--psf", psf, "--out", out, "--method", method)
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+# --- reconstruct --------------------------------------------------------------------------------------
+
+
+def test_one_file(run, camera):
+    code, out, err = reconstruct(run, "captures/a.png", method="admm")
+    assert (code, err) == (0, "")
+    assert re.search(r"PSF [0-9a-f]{16}, background 0\.\d{4}, 0\.\d{4}, 0\.\d{4} of the full scale", out)
+    assert "1 of 1 captures reconstructed into out" in out
+    assert names(camera / "out") == ["a.json", "a.png", "summary.png"]
+    assert "a.png explains" in out
+    trust = json.loads((camera / "out" / "a.json").read_text())
+    assert trust["explained"] > 0.8 * trust["possible"]
+    assert not trust["doubtful"]
+    picture = read_frame("out/a.png")
+    assert picture.shape == (*SIZE, 3)
+    inside, outside = picture[12:18, 14:20].mean((0, 1)), picture[24:, 28:].mean((0, 1))
+    assert inside[0] > 180
+    assert max(inside[1], inside[2], *outside) < 60
+
+
+def test_many_files_and_a_folder(run, camera):
+    code, out, _ = reconstruct(run, "captures/c.png", "captures/a.png", out="some")
+    assert (code, names(camera / "some")) == (0, ["a.json", "a.png", "c.json", "c.png", "summary.png"])
+    assert "2 of 2" in out
+    code, _, _ = reconstruct(run, "captures", out="all")
+    assert (code, names(camera / "all")) == (
+        0,
+        [*(f"{name}.{kind}" for name in "abc" for kind in ("json", "png")), "summary.png"],
+    )
+    for name in ("a.png", "c.png"):
+        assert (camera / "some" / name).read_bytes() == (camera / "all" / name).read_bytes()
+
+
+def test_formats_and_checkpoint(run, camera):
+    options = {"width": 2}
+    mwdn.weights.checkpoint.save_network("net.safetensors", mwdn.build("mwdn", **options), "mwdn", options)
+    line = ("reconstruct", "captures/a.png", "--psf", "psf.png", "--out", "out", "--method", "net.safetensors")
+    assert run(*line, "--format", "npy", "--device", "cpu")[0] == 0
+    assert read_frame("out/a.npy").dtype == np.float32
+    assert names(camera / "out") == ["a.json", "a.npy", "summary.png"]
+
+
+def test_options_of_the_camera(run, camera):
+    line = ("reconstruct", "captures/a.png", "--psf", "psf.png", "--method", "wiener", "--background", "0.01")
+    code, out, err = run(
+        *line, "--crop", "30", "32", "--bin", "2", "--bgr", "--upside-down", "--dark", "captures/c.png"
+    )
+    assert (code, err) == (0, "")
+    assert "background 0.0100" in out
+    assert read_frame("results/reconstruct/a.png").shape == (15, 16, 3)
+
+
+def test_one_bad_file_among_many(run, camera):
+    (camera / "captures" / "b[red].png").write_bytes((camera / "captures" / "b.png").read_bytes()[:500])
+    code, out, err = reconstruct(run, "captures", "captures/none.png")
+    assert code == 1
+    assert "3 of 5 captures reconstructed into out" in out
+    assert [name for name in names(camera / "out") if name.endswith("png")] == [
+        "a.png",
+        "b.png",
+        "c.png",
+        "summary.png",
+    ]
+    first, second = err.splitlines()  # each message on one line, brackets and all
+    assert first.startswith("captures/b[red].png: `captures/b[red].png` is cut off")
+    assert second.startswith("captures/none.png: `captures/none.png` does not exist")
+
+
+def test_only_bad_files(run, camera):
+    code, out, _ = reconstruct(run, "captures/none.png")
+    assert code == 1
+    assert "0 of 1" in out
+    assert not (camera / "out").exists()
+
+
+def test_psf_of_another_size(run, camera):
+    store("large.png", torch.from_numpy(read_frame("psf.png") / 65535).movedim(-1, 0)[None].repeat(1, 1, 2, 2))
+    code, _, err = reconstruct(run, "captures/a.png", psf="large.png")
+    assert code == 1
+    assert "`psf` (64 x 80) and the capture (32 x 40) must have the same height and width" in err
+    assert "The PSF is 2 times as large: bin it by 2, `--psf-bin 2`." in err
+    line = ("reconstruct", "captures/a.png", "--method", "wiener")
+    assert run(*line, "--psf", "large.png", "--psf-bin", "2")[0] == 0
+    assert run(*line, "--psf", "psf.png", "--psf-bin", "2")[0] == 1
+    (camera / "halves").mkdir()
+    store("halves/a.png", torch.rand(1, 3, 2 * SIZE[0], 2 * SIZE[1]))
+    code, _, err = run("reconstruct", "halves", "--method", "wiener", "--psf", "psf.png")
+    assert "`--bin 2 --psf-bin 1`" in err
+    assert run("reconstruct", "halves", "--psf", "psf.png", "--bin", "2", "--psf-bin", "1")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("captures --psf none.png", "`none.png` does not exist"),
+        ("captures --psf psf.png --method admn", "No method named 'admn'. Did you mean 'admm'?"),
+        ("captures --psf psf.png --method mwdn", "`mwdn` is a network, which has to be trained first: `mwdn train"),
+        ("captures --psf psf.png --method no.safetensors", "No checkpoint at `no.safetensors`"),
+        ("captures --psf psf.png --device gpu", "`device` (gpu) must be one that torch can use here"),
+        ("captures --psf psf.png --bit-depth 40", "`bit_depth` (40) must be 1 to 16."),
+        ("captures --psf psf.png --crop 99 99", "`crop` (99 x 99) must be within the frame (32 x 40)."),
+        ("captures --psf psf.png --out captures", "a.png` would overwrite an input"),
+        ("captures/a.png --psf psf.png --out psf.png", "`psf.png` must be a folder, but is a file"),
+        ("--psf psf.png", "Name at least one capture"),
+        ("captures", "--psf requires an argument"),
+        ("captures --psf psf.png --methud admm", "Unknown option: --methud. Did you mean --method?"),
+        ("captures --psf psf.png --format jpeg", "jpeg"),
+        ("captures --psf psf.png --bin two", "--bin"),
+    ],
+)
+def test_wrong_call_is_one_message_and_exit_2(run, camera, line, message):
+    before = {path: path.read_bytes() for path in camera.rglob("*.png")}
+    code, out, err = run("reconstruct", *line.split())
+    assert code == 2
+    flat = re.sub(r"[\s│]+", " ", err)  # cyclopts draws a box of the terminal's width
+    assert message in flat
+    assert "Traceback" not in out + err
+    assert before == {path: path.read_bytes() for path in camera.rglob("*.png")}
+
+
+def test_unknown_command(run):
+    code, _, err = run("recunstruct")
+    assert code == 2
+    assert 'Did you mean "reconstruct"?' in re.sub(r"[\s│]+", " ", err)
+
+
+@pytest.mark.parametrize("place", [0, -1])
+def test_debug_shows_where_it_comes_from(run, camera, place):
+    line = ["reconstruct", "captures", "--psf", "none.png"]
+    line.insert(place if place == 0 else len(line), "--debug")
+    code, _, err = run(*line)
+    assert code == 2
+    assert "Traceback" in err
+    assert "read_frame" in err
+    assert "Error: `none.png` does not exist" in err
+
+
+def test_existing_output_is_replaced(run, camera):
+    (camera / "out").mkdir()
+    (camera / "out" / "a.png").write_text("old")
+    (camera / "out" / "keep.txt").write_text("mine")
+    assert reconstruct(run, "captures/a.png")[0] == 0
+    assert read_frame("out/a.png").shape == (*SIZE, 3)
+    assert (camera / "out" / "keep.txt").read_text() == "mine"
+    assert names(camera / "out") == ["a.json", "a.png", "keep.txt", "summary.png"]
+
+
+def test_resume_leaves_out_what_is_there(run, camera):
+    assert reconstruct(run, "captures/a.png")[0] == 0
+    line = ("reconstruct", "captures", "--psf", "psf.png", "--out", "out", "--method", "wiener", "--resume")
+    before = (camera / "out" / "a.png").stat().st_mtime_ns
+    code, out, _ = run(*line)
+    assert code == 0
+    assert "3 of 3 captures reconstructed into out, 1 of them before" in out
+    assert "a.png explains" not in out
+    assert (camera / "out" / "a.png").stat().st_mtime_ns == before
+    assert "3 of 3 captures reconstructed into out\n" in run(*line, "--regularisation", "1e-3")[1]
+
+
+def test_json_of_the_user_beside_a_capture(run, camera, monkeypatch):
+    monkeypatch.setattr("mwdn.cli.reconstruct.Darkroom", pytest.fail)
+    np.save("b.npy", read_frame("captures/b.png"))
+    (camera / "b.json").write_text('{"exposure": 8}')
+    code, _, err = reconstruct(run, "captures/a.png", "b.npy", out=".")
+    assert code == 2
+    assert "`b.json` is not of mwdn and would be lost. Choose another folder: `--out`." in err
+    assert (camera / "b.json").read_text() == '{"exposure": 8}'
+
+
+@pytest.mark.parametrize("out", ["raw", "raw/../raw"])
+def test_folder_of_the_captures_is_none_for_the_pictures(run, camera, out):
+    """A second run would take them for captures."""
+    (camera / "raw").mkdir()
+    np.save("raw/a.npy", read_frame("captures/a.png"))
+    code, _, err = reconstruct(run, "raw", out=out)
+    assert code == 2
+    assert f"`{out}` holds the captures: the pictures would be taken for captures the next time" in err
+    assert names(camera / "raw") == ["a.npy"]
+    for _ in range(2):  # a file of it may have its picture beside it
+        assert reconstruct(run, "raw/a.npy", out=out)[0] == 0
+
+
+def test_folder_that_cannot_be_written_to_is_found_first(run, camera, monkeypatch):
+    monkeypatch.setattr("mwdn.cli.reconstruct.Reconstructor", pytest.fail)
+    code, _, err = reconstruct(run, "captures", out="psf.png/out")
+    assert (code, len(err.splitlines())) == (2, 1)
+    assert "`psf.png/out` must be a folder that can be written to: Not a directory." in err
+
+
+def test_line_about_the_psf_is_not_broken(run, camera):
+    _, out, _ = reconstruct(run, "captures/a.png")
+    assert re.search(r"^PSF \w+, background .* of the full scale subtracted$", out, re.MULTILINE)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (5, 5), (32, 14)])
+def test_psf_too_small_to_judge_by(run, camera, size):
+    store("tiny.png", torch.linspace(0.1, 0.9, 3 * size[0] * size[1]).view(1, 3, *size))
+    code, _, err = run("reconstruct", "tiny.png", "--psf", "tiny.png", "--background", "0")
+    assert code == 2
+    assert f"The PSF ({size[0]} x {size[1]}) must have at least 15 pixels along each side" in err
+    assert "`--crop`, `--bin`, `--psf-bin`" in err
+
+
+def test_overexposed_capture_is_named_before_its_psf_is_doubted(run, camera):
+    frame = read_frame("captures/a.png")
+    top = np.iinfo(frame.dtype).max
+    bright = (frame * (top / np.quantile(frame.max(-1), 0.8))).clip(0, top).astype(frame.dtype)
+    part = (bright.max(-1) == top).mean()
+    assert 0.15 < part < 0.25
+    cv2.imwrite("captures/bright.png", bright[..., ::-1])
+    code, out, err = reconstruct(run, "captures/bright.png")
+    assert code == 0
+    told = f"Warning: bright.png is overexposed: {part:.1%} of its pixels are saturated"
+    assert told in err
+    assert (out + err).index("explains") > 0
+    beside = json.loads((camera / "out" / "bright.json").read_text(encoding="utf-8"))
+    assert beside["saturated"] == pytest.approx(part)
+    assert "overexposed" not in reconstruct(run, "captures/a.png")[2]
+
+
+def test_without_trust(run, camera):
+    line = ("reconstruct", "captures/a.png", "--psf", "psf.png", "--out", "out", "--method", "wiener", "--no-trust")
+    code, out, err = run(*line)
+    assert (code, err) == (0, "")
+    assert "explains" not in out
+    assert names(camera / "out") == ["a.json", "a.png", "summary.png"]
+    assert set(json.loads((camera / "out" / "a.json").read_text())) == {"method", "psf_hash", "origin"}
+
+
+# --- The others ---------------------------------------------------------------------------------------
+
+
+def test_demo(run, tmp_path):
+    code, out, err = run("demo", "--out", tmp_path / "demo")
+    assert (code, err) == (0, "")
+    assert names(tmp_path / "demo") == ["comparison.png", "index.html", "psf.png"]
+    rows = {
+        words[0]: dict(zip(METHODS, map(float, words[1:]), strict=True))
+        for words in (re.findall(r"[\w.]+", line) for line in out.splitlines() if line.startswith("│"))
+    }
+    assert set(rows) == {"astronaut", "coffee", "cat"}
+    assert all(row["universal"] > 24.5 for row in rows.values()), rows
+    assert all(row["admm"] > 24 for row in rows.values()), rows
+    assert all(row["admm"] > row["fista"] > row["wiener"] > 15 for row in rows.values()), rows
+    page = (tmp_path / "demo" / "index.html").read_text(encoding="utf-8")
+    assert all(f"<th>{name}</th>" in page for name in rows)
+    assert all(f"<td>{value:.2f}</td>" in page for row in rows.values() for value in row.values())
+    assert 'src="psf.png"' in page
+    assert 'src="comparison.png"' in page
+    assert str(tmp_path / "demo" / "index.html") in out  # on one line, to be clicked or copied
+    assert read_frame(tmp_path / "demo" / "comparison.png").shape == (26 + 3 * 246, 7 * 246, 3)
+
+
+def test_doctor(run):
+    code, out, _ = run("doctor")
+    assert code == 0
+    for package in ("torch", "numpy", "cyclopts"):
+        assert re.search(rf"{package}\s+│\s+{re.escape(importlib.metadata.version(package))}", out)
+    assert sys.version.split()[0] in out
+    assert "threads" in out
+
+
+def test_version_and_help(run):
+    assert run("--version") == (0, f"{mwdn.__version__}\n", "")
+    for line in ((), ("--help",)):
+        code, out, _ = run(*line)
+        assert code == 0
+        assert all(command in out for command in ("reconstruct", "demo", "doctor", "--debug"))
+    code, out, _ = run("reconstruct", "--help")
+    assert code == 0
+    assert all(option in out for option in ("--psf", "--dark", "--crop", "--bin", "--method", "--out", "--format"))
+
+
+def test_as_a_process(camera):
+    line = [sys.executable, "-W", "error", "-m", "mwdn", "reconstruct", "--psf", "psf.png", "--method", "wiener"]
+    options = {"capture_output": True, "text": True, "check": False, "timeout": 120}
+    done = subprocess.run([*line, "captures/b.png"], **options)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert read_frame("results/reconstruct/b.png").shape == (*SIZE, 3)
+    wrong = subprocess.run([*line[:-1], "wienr", "captures/b.png"], **options)
+    assert wrong.returncode == 2
+    assert wrong.stderr.startswith("Error: No method named 'wienr'. Did you mean 'wiener'?")
+    assert len(wrong.stderr.splitlines()) == 1

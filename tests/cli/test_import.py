@@ -1,0 +1,97 @@
+import sys
+
+import numpy as np
+import pytest
+
+from mwdn.cli.app import main
+from mwdn.data import PairFile
+from mwdn.io.images import write_linear, write_picture
+
+
+def run(*arguments):
+    with pytest.raises(SystemExit) as stopped:
+        main(["import", *map(str, arguments)])
+    return stopped.value.code
+
+
+@pytest.fixture
+def folders(tmp_path, generator):
+    import torch
+
+    for i in range(3):
+        for folder in ("captures", "scenes"):
+            write_picture(tmp_path / folder / f"[{i}].png", torch.rand(1, 3, 6, 7, generator=generator))
+    return tmp_path
+
+
+def test_import_writes_pairs_and_says_so(folders, capsys):
+    out = folders / "new" / "pairs.h5"
+    assert run("folders", folders, "-o", out) == 0
+    assert len(PairFile(out)) == 3
+    shown = capsys.readouterr().out
+    assert shown.splitlines()[-1] == f"3 pairs written to {out}, 0 skipped"
+
+
+def test_what_is_skipped_is_named(folders, capsys):
+    (folders / "scenes" / "[1].png").write_bytes(b"no picture")
+    (folders / "captures" / "[2].png").unlink()
+    out = folders / "pairs.h5"
+    assert run("folders", folders, "-o", out) == 2
+    problem = " ".join(capsys.readouterr().err.split())
+    assert "has no partner" in problem
+    assert "--skip-damaged" in problem
+    assert not out.exists()
+    assert run("folders", folders, "-o", out, "--skip-damaged") == 0
+    shown = capsys.readouterr()
+    assert shown.out.splitlines()[-1] == f"1 pairs written to {out}, 2 skipped: [2], [1]"
+    assert shown.err.count("skipped:") == 2
+    assert "[1].png" in shown.err
+
+
+def test_an_existing_file_stays_when_the_import_fails(folders, capsys):
+    out = folders / "pairs.h5"
+    assert run("folders", folders, "-o", out) == 0
+    before = out.read_bytes()
+    (folders / "scenes" / "[2].png").write_bytes(b"no picture")
+    assert run("folders", folders, "-o", out) == 2
+    assert out.read_bytes() == before
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_the_layout_is_given_by_options(tmp_path):
+    import torch
+
+    picture = torch.from_numpy(np.arange(6 * 4 * 3, dtype=np.float32).reshape(3, 6, 4) / 72)
+    write_linear(tmp_path / "a" / "x.npy", picture)
+    write_linear(tmp_path / "b" / "x.npy", picture)
+    options = ["--captures", "a", "--scenes", "b", "--bgr", "--upside-down", "--scene-size", "3", "2", "--bin", "2"]
+    assert run("folders", tmp_path, "-o", tmp_path / "pairs.h5", *options) == 0
+    measurement, scene = PairFile(tmp_path / "pairs.h5")[0]
+    expected = torch.nn.functional.avg_pool2d(picture.flip(0, 1), 2)
+    assert torch.allclose(measurement, expected, atol=1e-6)
+    assert torch.allclose(scene, expected, atol=1e-6)
+
+
+def test_unknown_kind(tmp_path, capsys):
+    assert run("diffusecam", tmp_path) == 2
+    assert "Did you mean 'diffusercam'?" in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_extra_to_install_survives_the_terminals_markup(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    assert run("parquet", "owner/name", "-o", tmp_path / "pairs.h5") == 2
+    assert "pip install 'mwdn[hub]'" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("name", ["captures/[2].png", "captures/new.png", "pairs"])
+def test_no_picture_is_replaced(folders, capsys, name):
+    before = {path: path.read_bytes() for path in folders.rglob("*.png")}
+    assert run("folders", folders, "-o", folders / name) == 2
+    assert "must end in .h5 or .hdf5" in capsys.readouterr().err
+    assert before == {path: path.read_bytes() for path in folders.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("option", ["--bin 0", "--bit-depth 0", "--scene-size -3 5"])
+def test_wrong_numbers_are_one_message(folders, capsys, option):
+    assert run("folders", folders, "-o", folders / "pairs.h5", *option.split()) == 2
+    assert capsys.readouterr().err.count("\n") == 1

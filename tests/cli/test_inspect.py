@@ -1,0 +1,99 @@
+"""`mwdn inspect` as a user types it."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from mwdn.cli.app import CameraOptions, main
+from mwdn.cli.inspect import _own_resolution
+from mwdn.optics import sample_camera
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    psf = sample_camera(1, (64, 72), family="caustics")
+    frame = (0.8 * psf / psf.max() * 65535)[0].movedim(0, -1).numpy().astype(np.uint16)
+    assert cv2.imwrite("my psf.png", frame[..., ::-1])
+
+    def call(*arguments):
+        with pytest.raises(SystemExit) as caught:
+            main(["inspect", *map(str, arguments)])
+        return (caught.value.code, *capsys.readouterr())
+
+    return call
+
+
+def test_page_json_and_words(run, tmp_path):
+    code, shown, problem = run("my psf.png", "-o", "out")
+    assert (code, problem) == (0, "")
+    page = cv2.imread(str(tmp_path / "out" / "my psf.png"))
+    assert page is not None
+    assert min(page.shape[:2]) > 800
+    assert page.std() > 10
+    content = json.loads((tmp_path / "out" / "my psf.json").read_text())
+    assert content["size"] == [64, 72]
+    assert shown.startswith(content["headline"])
+    words = " ".join(shown.split())
+    for finding in content["verdict"]:
+        assert " ".join(finding["text"].split()) in words
+
+
+def test_each_finding_is_one_line_where_there_is_no_terminal(run):
+    shown = run("my psf.png", "--json")[1]
+    content = json.loads(shown)
+    lines = run("my psf.png")[1].splitlines()
+    assert lines[:-1] == [content["headline"], *(f"{each['weight']:4} {each['text']}" for each in content["verdict"])]
+    assert max(map(len, lines)) > 80
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_no_input_is_overwritten(run, tmp_path, monkeypatch, dark):
+    monkeypatch.setattr(CameraOptions, "load", pytest.fail)
+    options = ("--dark", "my psf.png") if dark else ()
+    psf = tmp_path / "there" / "my psf.tif" if dark else "my psf.png"
+    before = (tmp_path / "my psf.png").read_bytes()
+    code, _, problem = run(psf, "-o", tmp_path, *options)
+    assert code == 2
+    assert "my psf.png` would overwrite an input" in problem
+    assert (tmp_path / "my psf.png").read_bytes() == before
+
+
+def test_folder_that_cannot_be_written_to_is_found_first(run, tmp_path, monkeypatch):
+    monkeypatch.setattr("mwdn.cli.inspect.inspect_psf", pytest.fail)
+    (tmp_path / "file").write_text("no folder")
+    code, _, problem = run("my psf.png", "-o", "file")
+    assert (code, problem.count("`file` must be a folder that can be written to")) == (2, 1)
+
+
+def test_json_alone_with_the_options_of_the_camera(run):
+    code, shown, _ = run("my psf.png", "--json", "--crop", "32", "36", "--bin", "2")
+    assert code == 0
+    content = json.loads(shown)
+    assert content["file"] == "my psf.png"
+    assert len(content["noise_gain"]) == 6
+    assert content["size"] == [16, 18]
+
+
+def test_psf_at_its_own_resolution():
+    """Captures of 32 x 36 raw pixels; the PSF was taken at twice the resolution."""
+    own = _own_resolution(CameraOptions(Path("psf.png"), dark=Path("dark.png"), crop=(32, 36), psf_bin=2))
+    assert (own.bin, own.crop, own.psf_bin, own.dark) == (2, (64, 72), None, None)
+    same = CameraOptions(Path("psf.png"), bin=2, psf_bin=2)
+    assert _own_resolution(same) is same
+
+
+def test_saturated_psf_is_refused(run):
+    frame = torch.full((32, 32), 255, dtype=torch.uint8).numpy()
+    assert cv2.imwrite("white.png", frame)
+    code, _, problem = run("white.png")
+    assert code == 2
+    assert "PSF is saturated: 1,024 of 1,024 pixels" in problem
+
+
+def test_one_psf_at_a_time(run):
+    assert run("my psf.png", "other.png")[0] == 2

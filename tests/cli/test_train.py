@@ -1,0 +1,276 @@
+"""`mwdn train` and `mwdn simulate` as a user types them, and what becomes of their files."""
+
+import json
+import re
+import sys
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from mwdn import read_frame
+from mwdn.calibration import Calibration
+from mwdn.cli.app import main
+from mwdn.data.pairs import PairFile
+from mwdn.fourier.convolution import convolve
+from mwdn.inference.reconstructor import Reconstructor
+from mwdn.networks import build
+from mwdn.optics.patterns import contour_psf
+from mwdn.weights.checkpoint import save_network
+
+RECIPE = """
+network = { name = "wiener-bank", width = 4 }
+schedule = { steps = 9, batch = 2, validate_every = 2, validation = 2, bfloat16 = false }
+placement = { extent = [0.4, 0.4] }
+"""
+
+
+@pytest.fixture
+def camera(tmp_path, monkeypatch, generator):
+    """Current folder with psf.npy, other.npy, photos, a capture and r.toml."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("psf", "other"):
+        psf = contour_psf((32, 40), cell=10, generator=generator).expand(1, 3, -1, -1)
+        np.save(f"{name}.npy", (0.9 * psf / psf.max())[0].movedim(0, -1).numpy())
+    np.save("capture.npy", np.full((32, 40, 3), 0.3, np.float32))
+    (tmp_path / "photos").mkdir()
+    for number in range(3):
+        small = np.random.default_rng(number).integers(0, 256, (4, 4, 3), np.uint8)
+        cv2.imwrite(f"photos/{number}.png", cv2.resize(small, (24, 24), interpolation=cv2.INTER_CUBIC))
+    (tmp_path / "r.toml").write_text(RECIPE, encoding="utf-8")
+    return tmp_path
+
+
+@pytest.fixture
+def run(capsys):
+    """``run("train r.toml ...")`` gives exit code, standard output, standard error."""
+
+    def call(line):
+        with pytest.raises(SystemExit) as caught:
+            main(line.split())
+        return (caught.value.code or 0, *capsys.readouterr())
+
+    return call
+
+
+def flat(text):
+    return re.sub(r"[\s│]+", " ", text)
+
+
+TRAIN = "train r.toml --psf psf.npy --photos photos --steps 4 --device cpu --out runs/x"
+RECONSTRUCT = "reconstruct capture.npy --method runs/x/best.safetensors --device cpu --psf"
+
+
+def test_train_then_reconstruct(run, camera):
+    code, out, err = run(TRAIN)
+    assert code == 0, err
+    assert "Weights in runs/x/best.safetensors" in out
+    assert re.search(r"step 4: validation \d+\.\d\d dB, best \d+\.\d\d dB", flat(err))
+    code, out, err = run(f"{RECONSTRUCT} psf.npy")
+    assert code == 0
+    assert "capture.npy explains" in out + err
+    assert read_frame("results/reconstruct/capture.png").shape == (32, 40, 3)
+    assert run(TRAIN)[0] == 0  # nothing left to do
+
+
+def test_any_key_of_the_recipe_by_its_name(run, camera):
+    changes = "--learning-rate 3e-4 --bfloat16=false --seed -2 --mismatch.blur-px 1 --placement.extent [0.3,0.5]"
+    code, _, err = run(f"{TRAIN} {changes} --network.width 6 --schedule.crop 16 --pool 8")
+    assert code == 0, err
+    recipe = json.loads((camera / "runs/x/recipe.json").read_text(encoding="utf-8"))["recipe"]
+    schedule = recipe["schedule"]
+    assert [schedule[key] for key in ("learning_rate", "seed", "crop", "pool")] == [3e-4, -2, 16, 8]
+    assert (recipe["mismatch"]["blur_px"], recipe["placement"]["extent"]) == (1.0, [0.3, 0.5])
+    assert recipe["network"] == {"name": "wiener-bank", "width": 6}
+    for wrong, said in (
+        ("--learnin-rate 1", "No key of [schedule] named 'learnin_rate'. Did you mean 'learning_rate'?"),
+        ("--sensor.iso 100", "No key of [sensor] named 'iso'"),
+        ("--steps many", "`steps` of [schedule] ('many') must be of the same kind as its default, 2000."),
+        ("--seed", "parameter --seed requires an argument"),
+    ):
+        code, _, err = run(f"train r.toml --psf psf.npy --photos photos --out runs/y {wrong}")
+        assert code == 2
+        assert said in flat(err)
+    assert not (camera / "runs/y").exists()
+
+
+def test_simulate_by_the_recipes_keys(run, camera):
+    for name, well in (("good", 15_000), ("poor", 50)):
+        line = f"simulate photos --psf psf.npy --count 2 --exact --seed 3 --sensor.full-well {well} -o {name}.h5"
+        code, _, err = run(line)
+        assert code == 0, err
+    good, poor = (PairFile(camera / f"{name}.h5")[0] for name in ("good", "poor"))
+    assert torch.equal(good[1], poor[1])
+    assert (good[0] - poor[0]).std() > 0.05 * good[0].max()
+
+
+def test_checkpoint_of_another_camera_is_used_with_a_warning(run, camera):
+    assert run(TRAIN)[0] == 0
+    trained, given = (Calibration.from_file(f"{name}.npy").psf_hash for name in ("psf", "other"))
+    code, _, err = run(f"{RECONSTRUCT} other.npy")
+    assert code == 0
+    assert err.count("Warning:") == 1
+    said = f"`runs/x/best.safetensors` was trained for the camera of PSF {trained}, but the PSF given is {given}."
+    assert said in err
+    assert "Expect blur, ghosts and invented detail" in err
+    assert read_frame("results/reconstruct/capture.png").shape == (32, 40, 3)
+
+
+def test_warning_of_a_reconstructor(camera):
+    calibration = Calibration.from_file("psf.npy")
+    network = build("wiener-bank", width=2)
+    for name, told in (("any", {}), ("own", {"psf_hash": calibration.psf_hash}), ("other", {"psf_hash": "0" * 16})):
+        save_network(f"{name}.safetensors", network, "wiener-bank", {"width": 2}, **told)
+        warning = Reconstructor(f"{name}.safetensors", calibration, device="cpu").warning
+        assert (warning is not None) == (name == "other")
+    assert Reconstructor("wiener", calibration).warning is None
+    assert Reconstructor(network, calibration).warning is None
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        (TRAIN.replace("runs/x", "r.toml"), "`r.toml` must be a folder that can be written to"),
+        (TRAIN.replace("--photos photos", "--photos runs"), "The folder `runs` holds no photograph"),
+        (TRAIN.replace("--photos photos", ""), "Name what to learn from: photographs, `--photos FOLDER`, or pairs,"),
+        (
+            TRAIN + " --pairs p.h5",
+            "`--photos` (photos) and `--pairs` (p.h5) exclude each other. Leave one of them out.",
+        ),
+        (TRAIN.replace("--photos photos", "--pairs p.h5"), "`p.h5` is no file"),
+        (TRAIN + " --captures runs", "`runs`"),
+        (TRAIN.replace("train r.toml", "train r.tml"), "`r.tml` cannot be read as a recipe"),
+        (TRAIN.replace("--steps 4", "--steps 0"), "`steps` (0) must be positive"),
+        (TRAIN.replace("--device cpu", "--device gpu"), "`device` (gpu) must be one that torch can use here"),
+        (TRAIN.replace("--device cpu", "--device cuda:99"), "`device` (cuda:99) must be one that torch can use here"),
+        ("simulate photos --psf psf.npy --count 0", "`count` (0) must be at least 1"),
+        ("simulate photos --psf psf.npy -o photos", "`photos` is a folder"),
+        ("simulate photos --psf psf.npy -o photos/0.png", "`0.png` must end in .h5 or .hdf5"),
+        ("simulate photos --psf psf.npy -o psf.npy", "`psf.npy` would overwrite an input"),
+        (f"simulate photos --psf psf.npy --seed {10**23}", f"`seed` ({10**23}) must have 63 bits at most"),
+        ("simulate nothing --psf psf.npy", "The folder `nothing` holds no photograph"),
+    ],
+)
+def test_wrong_call_is_one_message_and_exit_2(run, camera, line, said):
+    before = {path: path.read_bytes() for path in camera.rglob("*") if path.is_file()}
+    code, _, err = run(line)
+    assert code == 2
+    assert said in flat(err)
+    assert "Traceback" not in err
+    assert not list(camera.glob("*.h5"))
+    assert all(path.read_bytes() == content for path, content in before.items())
+
+
+def test_train_on_recorded_pairs(run, camera):
+    assert run("simulate photos --psf psf.npy -o pairs.h5 --count 20 --recipe r.toml")[0] == 0
+    line = TRAIN.replace("--photos photos", "--pairs pairs.h5")
+    code, out, err = run(line)
+    assert code == 0, err
+    assert "Weights in runs/x/best.safetensors" in out
+    assert run(f"{RECONSTRUCT} psf.npy")[0] == 0
+    np.save("large.npy", np.kron(np.load("psf.npy"), np.ones((2, 2, 1), np.float32)))
+    code, _, err = run(line.replace("psf.npy", "large.npy"))
+    assert code == 2
+    assert "The PSF is 2 times as large" in flat(err)
+    assert run(line.replace("psf.npy", "large.npy --psf-bin 2").replace("runs/x", "runs/y"))[0] == 0
+
+
+def test_tensorboard_and_captures(run, camera):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    np.save("second.npy", np.full((32, 40, 3), 0.1, np.float32))
+    (camera / "r.toml").write_text(RECIPE + 'sheet = { captures = ["none.npy"] }', encoding="utf-8")  # not looked for
+    code, _, err = run(f"{TRAIN} --tensorboard --captures capture.npy second.npy")
+    assert code == 0, err
+    events = EventAccumulator("runs/x/tensorboard").Reload()
+    lines = [json.loads(line) for line in (camera / "runs" / "x" / "log.jsonl").read_text().splitlines()]
+    for tag, key in (("loss/total", "loss"), ("loss/mse", "mse"), ("learning_rate", "learning_rate")):
+        assert [e.value for e in events.Scalars(tag)] == pytest.approx([line[key] for line in lines])
+    assert [e.step for e in events.Scalars("pictures_per_s")] == [1, 2, 3, 4]
+    for tag, key in (("validation/psnr", "psnr"), ("validation/loss", "validation_loss")):
+        measured = {line["step"]: pytest.approx(line[key]) for line in lines if line[key] is not None}
+        assert {e.step: e.value for e in events.Scalars(tag)} == measured
+        assert measured.keys() == {2, 4}
+    image = events.Images("validation")[-1]
+    sheet = read_frame("runs/x/validation.png")
+    assert (image.step, image.height, image.width) == (4, *sheet.shape[:2])
+    assert sheet.shape[1] == 5 * (300 + 6)  # measurement, reconstruction, scene; capture, reconstruction
+
+
+def test_captures_of_the_recipe_leave_the_psf_out(run, camera):
+    (camera / "frames").mkdir()
+    for name in ("psf.npy", "capture.npy"):
+        (camera / name).rename(camera / "frames" / name)
+    (camera / "r.toml").write_text(RECIPE + 'sheet = { captures = ["frames"] }', encoding="utf-8")
+    code, _, err = run(TRAIN.replace("psf.npy", "frames/psf.npy"))
+    assert code == 0, err
+    sheet = read_frame("runs/x/validation.png")
+    assert (sheet[26 + 240 + 6 :, 3 * 306 :] == 255).all()  # one capture, two pairs
+    assert not (sheet[26 : 26 + 240, 3 * 306 :] == 255).all()
+
+
+def test_tensorboard_that_is_not_installed(run, camera, monkeypatch):
+    for name in ["tensorboard", *(name for name in sys.modules if name.startswith("torch.utils.tensorboard"))]:
+        monkeypatch.setitem(sys.modules, name, None)
+    code, _, err = run(f"{TRAIN} --tensorboard")
+    assert code == 2
+    assert "`tensorboard` must be installed: `pip install 'mwdn[tensorboard]'`." in flat(err)
+    assert not (camera / "runs" / "x" / "log.jsonl").read_text()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit on the size of a file")
+def test_disk_that_refuses_is_one_message_and_leaves_the_last_state(run, camera):
+    """A file may not become as large as a state, as if the disk were full: the kernel refuses to write more."""
+    import resource
+
+    line = TRAIN.replace("--steps 4", "--steps 2")
+    assert run(line)[0] == 0
+    files = sorted(path.name for path in (camera / "runs/x").iterdir())
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, ((camera / "runs/x/state.safetensors").stat().st_size - 1, limits[1]))
+    try:
+        code, _, err = run(line.replace("runs/x", "runs/y"))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert code == 2
+    assert "Traceback" not in err
+    assert re.search(r"`runs/y` must be a folder that can be written to: .*File too large.* Make room and", flat(err))
+    files.remove("state.safetensors")
+    assert sorted(path.name for path in (camera / "runs/y").iterdir()) == files
+    assert run(line.replace("runs/x", "runs/y"))[0] == 0  # with room
+
+
+def test_simulate_then_evaluate(run, camera):
+    code, out, err = run("simulate photos --psf psf.npy -o pairs.h5 --count 5 --recipe r.toml --seed 3")
+    assert code == 0, err
+    assert "5 pairs written to pairs.h5" in out
+    calibration = Calibration.from_file("psf.npy")
+    with PairFile("pairs.h5") as file:
+        assert len(file) == 5
+        assert file.attributes == {"psf_hash": calibration.psf_hash, "seed": 3}
+        assert torch.equal(file.psf, calibration.psf)
+        measurement, scene = file[4]
+        assert measurement.shape == scene.shape == (3, 32, 40)
+        assert measurement.dtype == torch.float32
+        assert 0 < scene.count_nonzero() < 1.6 * 3 * (0.4 * 32 + 4) ** 2  # the recipe's extent
+    code, out, err = run("evaluate wiener --data pairs.h5 --psf psf.npy --device cpu")
+    assert code == 0, err
+    assert "wiener" in out
+
+
+def test_simulate_is_reproducible_and_exact(run, camera):
+    for name, options in (("a", "--seed 1"), ("b", "--seed 1"), ("c", ""), ("exact", "--seed 1 --exact")):
+        assert run(f"simulate photos --psf psf.npy -o {name}.h5 --count 3 {options}")[0] == 0
+    a, b, c, exact = (PairFile(f"{name}.h5") for name in ("a", "b", "c", "exact"))
+    for one, other, another in zip(a, b, c, strict=True):
+        assert all(map(torch.equal, one, other))
+        assert not torch.equal(one[1], another[1])
+    # Apart from ambient light, which is even, only noise distinguishes it from the calibrated camera.
+    errors = []
+    for file in (exact, a):
+        measurement, scene = (torch.stack(part) for part in zip(*(file[i] for i in range(3)), strict=True))
+        difference = measurement - convolve(scene, file.psf)
+        difference = difference - difference.mean((1, 2, 3), keepdim=True)
+        errors.append(float(difference.std() / measurement.std()))
+    assert errors[0] < 0.05 < errors[1]

@@ -1,0 +1,434 @@
+"""What is exported is the same function, in onnxruntime and without torch."""
+
+import runpy
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import jaxtyping
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from mwdn import Calibration, Reconstructor, for_people, read_frame
+from mwdn.cli.app import main
+from mwdn.errors import ExportError, ParameterError
+from mwdn.export import exporter as exporting
+from mwdn.export.dft import column_matrices, inverse_row_matrix, row_matrix
+from mwdn.export.exporter import LEAST, agreement, export, read_about, run_file, simulated
+from mwdn.export.onnx_operations import REAL
+from mwdn.fourier.filtering import filtered
+from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
+from mwdn.io.files import save_linear, save_png
+from mwdn.io.images import srgb_encode
+from mwdn.networks import NETWORKS, build
+from mwdn.optics.patterns import contour_psf
+from mwdn.solvers import SOLVERS
+from mwdn.solvers import build as build_solver
+
+pytest.importorskip("onnx", reason="The extra is missing: pip install 'mwdn[export]'")
+pytest.importorskip("onnxruntime", reason="The extra is missing: pip install 'mwdn[export]'")
+pytestmark = pytest.mark.usefixtures("unchecked")  # an open batch is no number: its checks do not know that
+
+SIZE = 38, 48
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLE = ROOT / "examples" / "onnx_only.py"
+
+
+def camera(size=SIZE, channels=3):
+    psf = contour_psf(size, cell=12, generator=torch.Generator().manual_seed(1)).expand(1, channels, *size).contiguous()
+    return Calibration(psf / psf.sum((-2, -1), keepdim=True), bit_depth=12)
+
+
+def network(name, **options):
+    """Narrow, with statistics as after some training."""
+    generator = torch.Generator().manual_seed(2)
+    torch.manual_seed(3)
+    made = build(name, **({} if name in ("wiener", "le-admm") else {"width": 4} | options))
+    for module in made.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            module.running_mean.copy_(0.1 * torch.randn(module.num_features, generator=generator))
+            module.running_var.copy_(0.5 + torch.rand(module.num_features, generator=generator))
+    return made.eval()
+
+
+class Unchanged(nn.Module):
+    """The quickest to export."""
+
+    def forward(self, measurement, psf):
+        return measurement * 1.0
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """A narrow MWDN-CPSF as a file, and the network."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    mwdn = network("mwdn-cpsf")
+    done = export(mwdn, camera(), tmp_path_factory.mktemp("export") / "camera.onnx")
+    jaxtyping.config.update("jaxtyping_disable", False)
+    return done, mwdn
+
+
+def random_batch(generator, count=2, channels=3):
+    return torch.rand(count, channels, *SIZE, generator=generator)
+
+
+@pytest.mark.parametrize(("given", "length"), [(8, 8), (5, 9), (7, 7), (320, 480), (270, 420), (1, 1), (13, 31)])
+def test_matrices_are_those_of_the_transform(given, length, generator):
+    rows = torch.randn(3, given, generator=generator)
+    half = length // 2 + 1
+    found = (rows @ row_matrix(given, length)).numpy()
+    expected = np.fft.rfft(rows.double().numpy(), n=length)
+    np.testing.assert_allclose(found[:, :half] + 1j * found[:, half:], expected, atol=1e-5 * length**0.5)
+    parts = np.concatenate([expected.real, expected.imag], axis=1).astype(np.float32)
+    again = torch.from_numpy(parts) @ inverse_row_matrix(length, given)
+    np.testing.assert_allclose(again, rows, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("length", "given", "kept"), [(8, 8, 8), (480, 320, 480), (480, 480, 320), (31, 13, 31), (45, 45, 20), (1, 1, 1)]
+)
+@pytest.mark.parametrize("inverse", [False, True])
+def test_columns_in_two_factors(length, given, kept, inverse, generator):
+    """The products of the docstring, written out with sums over n1 and n2."""
+    column = torch.complex(*torch.randn(2, given, generator=generator))
+    matrices = column_matrices(length, given, kept, inverse=inverse)
+    points = matrices.points
+    padded = torch.cat([column, column.new_zeros(matrices.rows * points - given)]).reshape(-1, points)
+    sums = matrices.first @ torch.cat([padded.real, padded.imag])
+    sums = matrices.second @ sums.reshape(matrices.parts, 2 * points, 1)
+    real, imaginary = sums.reshape(matrices.parts, 2, -1).unbind(1)
+    found = torch.complex(real, imaginary).T.flatten()[:kept]
+    transform = np.fft.ifft if inverse else np.fft.fft
+    expected = transform(column.to(torch.complex128).numpy(), n=length)[:kept]
+    np.testing.assert_allclose(found, expected, atol=1e-5 * (1 if inverse else length**0.5))
+
+
+class Filter(nn.Module):
+    """One filter on a grid of its own: what a network does at each of its scales."""
+
+    def __init__(self, boundary):
+        super().__init__()
+        self.boundary = boundary
+
+    def forward(self, measurement, psf):
+        grid = deconvolution_grid(measurement.shape[-2:], self.boundary)
+        return filtered(measurement, wiener_transfer(psf, 1e-2, grid), grid, self.boundary)
+
+
+@pytest.mark.parametrize(("size", "boundary"), [((17, 23), "circular"), ((16, 30), "taper"), ((19, 29), "zero")])
+def test_a_filter_of_any_size(size, boundary, tmp_path):
+    done = export(Filter(boundary), camera(size), tmp_path / "filter.onnx", least=120)
+    assert done.agreement >= 120
+
+
+def test_bound_network_is_the_same_function_for_any_batch(exported, generator):
+    done, mwdn = exported
+    assert done.agreement >= 100
+    exact = Reconstructor(mwdn, camera(), device="cpu", precision="exact")
+    for count in (1, 3):
+        batch = random_batch(generator, count)
+        assert agreement(run_file(done.path, batch), exact(batch)) >= 100
+
+
+def test_the_file_says_what_it_is(exported):
+    import onnx
+
+    done, _ = exported
+    about = read_about(done.path)
+    assert about == done.about
+    assert about["method"] == "MwdnCpsf"
+    assert about["psf_hash"] == camera().psf_hash
+    assert (about["size"], about["channels"], about["bit_depth"]) == ("38 x 48", "RGB", "12")
+    graph = onnx.load(done.path).graph
+    assert [each.name for each in (*graph.input, *graph.output)] == ["measurement", "scene"]
+    assert "DFT" not in {node.op_type for node in graph.node}
+
+
+def test_it_runs_without_torch(exported, tmp_path):
+    """The example, where neither torch nor mwdn can be imported; its picture is the reconstructor's."""
+    import cv2
+
+    done, mwdn = exported
+    measurement = simulated(camera(), ("cat",), 3)[:1]
+    dark = np.full((*SIZE, 3), 100, np.uint16)
+    counts = (measurement[0].movedim(0, -1).numpy() * 3800).round().clip(0) + 100
+    cv2.imwrite(str(tmp_path / "capture.png"), counts.astype(np.uint16)[..., ::-1])
+    cv2.imwrite(str(tmp_path / "dark.png"), dark)
+    blocked = "import runpy, sys; sys.modules['torch'] = sys.modules['mwdn'] = None; "
+    blocked += "sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__')"
+    names = [str(tmp_path / name) for name in ("capture.png", "scene.png", "dark.png")]
+    call = [sys.executable, "-c", blocked, str(EXAMPLE), str(done.path), *names]
+    told = subprocess.run(call, capture_output=True, text=True, check=False, timeout=120)
+    assert told.returncode == 0, told.stderr
+    assert camera().psf_hash in told.stdout
+    taken = Calibration(camera().psf, bit_depth=12, dark=torch.full((1, 3, *SIZE), 100 / 4095))
+    scene = Reconstructor(mwdn, taken, device="cpu", precision="exact")(taken.correct(read_frame(names[0])))
+    expected = srgb_encode(for_people(scene))[0].movedim(0, -1).numpy() * 255
+    assert np.abs(read_frame(names[1]) - expected).max() <= 1
+
+
+def command(*arguments):
+    with pytest.raises(SystemExit) as ended:
+        main([str(argument) for argument in arguments])
+    assert ended.value.code == 0
+
+
+def example(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", [str(EXAMPLE), *map(str, arguments)])
+    runpy.run_path(str(EXAMPLE), run_name="__main__")
+
+
+@pytest.fixture
+def raw(tmp_path):
+    """A folder with PSF, capture and dark frame of a colour camera, 83 x 101, neither symmetrical nor grey."""
+    numbers = np.random.default_rng(4)
+    save_png(tmp_path / "psf.png", (numbers.random((83, 101, 3)) ** 40 * 60000).astype(np.uint16))
+    save_png(tmp_path / "capture.png", numbers.integers(2000, 60000, (83, 101, 3), np.uint16))
+    save_png(tmp_path / "dark.png", numbers.integers(0, 2000, (83, 101, 3), np.uint16))
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("capture", "options"),
+    [
+        ("capture.png", ["--upside-down"]),
+        ("capture.png", ["--bgr"]),
+        ("capture.tif", []),
+        ("capture.png", ["--dark", "dark.png", "--crop", "78", "99", "--bin", "2", "--upside-down", "--bgr"]),
+    ],
+)
+def test_the_example_gives_the_picture_of_mwdn_reconstruct(capture, options, raw, monkeypatch):
+    monkeypatch.chdir(raw)
+    save_linear(raw / "capture.tif", read_frame("capture.png") / np.float32(65535))
+    camera_options = ["--psf", "psf.png", "--background", "0", *options]
+    command("export", "wiener", "--regularisation", "1e-3", "--out", "camera.onnx", *camera_options)
+    command("reconstruct", capture, "--method", "wiener", "--regularisation", "1e-3", "--no-trust", *camera_options)
+    example(monkeypatch, "camera.onnx", capture, "scene.png", *(["dark.png"] if "--dark" in options else []))
+    expected = read_frame("results/reconstruct/capture.png").astype(int)
+    assert np.abs(read_frame("scene.png") - expected).max() <= 1
+
+
+@pytest.mark.parametrize("option", ["--mosaic=gbrg", "--grey"])
+def test_the_example_knows_how_colours_are_stored(option, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    numbers, shape = np.random.default_rng(4), (84, 102, 3 if option == "--grey" else 1)
+    save_png(tmp_path / "psf.png", (numbers.random(shape) ** 40 * 60000).astype(np.uint16))
+    save_png(tmp_path / "capture.png", numbers.integers(2000, 60000, shape, np.uint16))
+    options = ["--psf", "psf.png", "--background", "0", "--regularisation", "1e-3", option]
+    command("export", "wiener", "--out", "camera.onnx", *options)
+    command("reconstruct", "capture.png", "--method", "wiener", "--no-trust", *options)
+    example(monkeypatch, "camera.onnx", "capture.png", "scene.png")
+    expected = read_frame("results/reconstruct/capture.png").astype(int)
+    assert np.abs(read_frame("scene.png") - expected).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["none.onnx", "capture.png", "scene.png"], r"none.onnx cannot be opened: .* File doesn't exist"),
+        (["capture.png", "capture.png", "scene.png"], r"capture.png cannot be opened: .*Protobuf parsing failed"),
+        (["foreign.onnx", "capture.png", "scene.png"], r"foreign.onnx must be a file that `mwdn export` wrote"),
+        (["camera.onnx", "none.png", "scene.png", "dark.png"], r"none.png cannot be read as PNG"),
+        (["camera.onnx", "nan.tif", "scene.png", "dark.png"], r"nan.tif cannot be read as PNG.* of finite numbers"),
+        (["camera.onnx", "16.png", "scene.png", "dark.png"], r"16.png \(uint16, up to \d+\) must hold .* of 12 bits"),
+        (["camera.onnx", "capture.png", "scene.png"], r"capture.png needs a dark frame"),
+        (["camera.onnx", "capture.png", "scene.png", "small.png"], r"small.png \(40, 48, 3\) must have the size of"),
+        (["camera.onnx", "small.png", "scene.png", "small.png"], r"small.png is \(3, 40, 48\).*takes \[3, 38, 48\]"),
+        (["camera.onnx", "capture.png", "scene.xyz", "dark.png"], r"scene.xyz cannot be written: it must end in .png"),
+        (["camera.onnx", "capture.png", "no/scene.png", "dark.png"], r"no/scene.png cannot be written"),
+    ],
+)
+def test_the_example_says_in_one_line_what_is_wrong(arguments, message, tmp_path, monkeypatch):
+    import onnx
+
+    monkeypatch.chdir(tmp_path)
+    export(Unchanged(), replace(camera(), dark=torch.zeros(1, 3, *SIZE)), Path("camera.onnx"))
+    model = onnx.load("camera.onnx")
+    del model.metadata_props[:]
+    onnx.save(model, "foreign.onnx")
+    for name, size in (("capture.png", SIZE), ("dark.png", SIZE), ("small.png", (40, 48))):
+        save_png(Path(name), np.full((*size, 3), 9, np.uint16))
+    save_png(Path("16.png"), np.full((*SIZE, 3), 5000, np.uint16))
+    save_linear(Path("nan.tif"), np.full((*SIZE, 3), np.nan, np.float32))
+    with pytest.raises(SystemExit, match=message) as ended:
+        example(monkeypatch, *arguments)
+    assert "\n" not in str(ended.value)
+    assert not list(tmp_path.glob("scene.*"))
+
+
+def test_alignment_is_off_in_the_file_alone(tmp_path):
+    """With one level of one iteration: more are the same again, see `test_every_network`."""
+    bank = network("wiener-bank", finest=8, regularisations=(1e-3,), align=True)
+    bank.levels = tuple(replace(level, iterations=1) for level in bank.levels)
+    done = export(bank, camera(), tmp_path / "camera.onnx", least=100)
+    assert read_about(done.path)["alignment"].startswith("off")
+    assert bank.align
+    bank.align = False
+    seen = simulated(camera(), ("coffee",), 3)
+    expected = Reconstructor(bank, camera(), device="cpu", precision="exact")(seen)
+    assert agreement(run_file(done.path, seen), expected) >= 100
+
+
+@pytest.mark.acceptance
+@pytest.mark.parametrize("name", NETWORKS)
+def test_every_network(name, tmp_path):
+    export(network(name), camera((64, 72)), tmp_path / "camera.onnx", least=100)
+
+
+def test_plug_and_play(tmp_path):
+    """Behind one iteration, each way that the denoiser sees the scene: more are the same again."""
+    bank = network("wiener-bank", regularisations=(1e-3,), align=False, rounds=3)
+    bank.levels = tuple(replace(level, iterations=1) for level in bank.levels)
+    export(bank, camera(), tmp_path / "camera.onnx", least=100)
+
+
+@pytest.mark.acceptance
+@pytest.mark.parametrize("name", SOLVERS)
+def test_every_solver(name, tmp_path):
+    options = {"iterations": 5} if name in ("admm", "fista") else {}
+    export(build_solver(name, **options), camera(), tmp_path / "camera.onnx", least=100)
+
+
+@pytest.mark.parametrize(("precision", "share"), [("float16", 2), ("int8", 4)])
+def test_lower_precisions(precision, share, tmp_path):
+    """The first convolution and, with int8, the last one stay float32: a few thousand bytes of 350,000 numbers."""
+    import onnx
+
+    unet = network("unet", width=16)
+    done = export(unet, camera(), tmp_path / "camera.onnx", precision=precision)
+    assert LEAST[precision] <= done.agreement < 100
+    numbers = sum(parameter.numel() for parameter in unet.parameters())
+    assert done.path.stat().st_size < 1.1 * 4 * numbers / share
+    graph = onnx.load(done.path).graph
+    assert {"float16": "Cast", "int8": "QuantizeLinear"}[precision] in {node.op_type for node in graph.node}
+    assert read_about(done.path)["precision"] == precision
+
+
+@pytest.mark.parametrize("name", ["flatnet", "ifin", pytest.param("svdeconv", marks=pytest.mark.acceptance)])
+def test_float16_of_group_norm_and_mixed_precisions(name, tmp_path):
+    """From 16 features on convolutions are float16; what stands between them stays float32."""
+    options = {"size": SIZE} if name == "svdeconv" else {}
+    unet = network(name, width=16, **options)
+    done = export(unet, camera(), tmp_path / "camera.onnx", precision="float16")
+    assert LEAST["float16"] <= done.agreement < 100
+
+
+def test_torchs_own_format(tmp_path, generator):
+    unet = network("unet")
+    done = export(unet, camera(), tmp_path / "camera.pt2")
+    assert read_about(done.path) == done.about
+    batch = random_batch(generator, 3)
+    exact = Reconstructor(unet, camera(), device="cpu", precision="exact")(batch)
+    assert agreement(run_file(done.path, batch), exact) >= 100
+
+
+def test_grey_captures(tmp_path):
+    done = export(network("wiener"), camera(channels=1), tmp_path / "camera.onnx")
+    assert run_file(done.path, torch.rand(1, 1, *SIZE)).shape == (1, 1, *SIZE)
+    assert done.about["channels"] == "1"
+
+
+class Cumulative(nn.Module):
+    def forward(self, measurement, psf):
+        return measurement.cumsum(-1)
+
+
+class Careless(nn.Module):
+    """It remembers its first call: what is exported is another function."""
+
+    def __init__(self):
+        super().__init__()
+        self.calls = 0
+
+    def __deepcopy__(self, memo):
+        copy = Careless()
+        copy.calls = self.calls + 1
+        return copy
+
+    def forward(self, measurement, psf):
+        return measurement * self.calls
+
+
+@pytest.mark.parametrize(
+    ("method", "message"),
+    [
+        (Cumulative(), r"`aten.cumsum.default` cannot be written as ONNX. Export to .pt2 instead."),
+        (Careless(), r"must agree with `Careless` to 80.0 dB, but does to [-\d.]+ dB; it is not written"),
+    ],
+)
+def test_a_file_that_is_not_the_same_function_is_not_written(method, message, tmp_path):
+    out = tmp_path / "camera.onnx"
+    with pytest.raises(ExportError, match=message):
+        export(method, camera(), tmp_path / "new" / "camera.onnx")
+    assert not any(tmp_path.iterdir())
+    out.write_bytes(b"an older one")
+    with pytest.raises(ExportError, match=message):
+        export(method, camera(), out)
+    assert [path.name for path in tmp_path.iterdir()] == ["camera.onnx"]
+    assert out.read_bytes() == b"an older one"
+
+
+@pytest.mark.parametrize("precision", ["float32", "int8"])
+def test_a_file_that_onnxruntime_refuses_is_not_written(precision, tmp_path, monkeypatch):
+    """Two types in one sum: the checker of onnx lets it pass."""
+    half = {torch.ops.aten.relu.default: lambda g, node, x: g("Add", x, torch.ones(1, dtype=torch.float16))}
+    monkeypatch.setattr("mwdn.export.onnx_program.REAL", REAL | half)
+    with pytest.raises(ExportError, match=r"`camera.onnx` cannot be run: .*Add.* Export it again: as .onnx, as .pt2"):
+        export(network("unet"), camera(), tmp_path / "camera.onnx", precision=precision)
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("suffix", [".onnx", ".pt2"])
+def test_a_foreign_file_is_not_run(suffix, tmp_path):
+    file = tmp_path / f"camera{suffix}"
+    file.write_bytes(b"something else")
+    with pytest.raises(ExportError, match=rf"`camera{suffix}` cannot be run: "):
+        run_file(file, torch.rand(1, 3, *SIZE))
+
+
+@pytest.mark.parametrize(
+    ("out", "options", "message"),
+    [
+        ("camera.pt", {}, r"must end in .onnx or .pt2, not '.pt'"),
+        ("camera.pt2", {"precision": "int8"}, r"`precision` int8 exists in ONNX alone"),
+        ("camera.onnx", {"precision": "half"}, r"`precision` must be float32, float16 or int8, not 'half'"),
+        ("camera.onnx", {"channels": 2}, r"`channels` \(2\) must be 1 or 3"),
+    ],
+)
+def test_wrong_calls(out, options, message, tmp_path):
+    with pytest.raises(ParameterError, match=message):
+        export(network("wiener"), camera(), tmp_path / out, **options)
+
+
+def test_the_file_says_how_raw_frames_become_measurements(tmp_path):
+    taken = replace(
+        camera(), upside_down=True, bgr=True, dark=torch.zeros(1, 3, 2 * 40, 2 * 50), crop=(76, 96), binning=2
+    )
+    about = export(Unchanged(), taken, tmp_path / "camera.onnx").about
+    assert (about["crop"], about["binning"], about["bit_depth"]) == ("76 x 96", "2", "12")
+    assert "at the bottom" in about["rows"]
+    assert "blue, green, red" in about["colours"]
+    assert "subtracted" in about["dark"]
+    assert not {"rows", "colours", "dark"} & set(export(Unchanged(), camera(), tmp_path / "b.onnx").about)
+
+
+def test_the_extra_is_named(monkeypatch, tmp_path):
+    monkeypatch.setattr(exporting, "find_spec", lambda name: None)
+    with pytest.raises(ExportError, match=r"needs the package onnx and onnxruntime: `pip install 'mwdn\[export\]'`"):
+        export(network("wiener"), camera(), tmp_path / "camera.onnx")
+
+
+def test_command(tmp_path, capsys):
+    np.save(tmp_path / "psf.npy", camera().psf[0].movedim(0, -1).numpy())
+    out = tmp_path / "camera.onnx"
+    with pytest.raises(SystemExit) as ended:
+        main(["export", "fista", "--psf", str(tmp_path / "psf.npy"), "--out", str(tmp_path / "camera.zip")])
+    assert ended.value.code == 2
+    with pytest.raises(SystemExit) as ended:
+        main(["export", "wiener", "--regularisation", "1e-3", "--psf", str(tmp_path / "psf.npy"), "--out", str(out)])
+    assert ended.value.code == 0
+    assert "agrees to" in capsys.readouterr().out
+    assert read_about(out)["method"] == "wiener"

@@ -1,0 +1,546 @@
+"""Captures to pictures in files: where they go, what is written, what is left out when it is there."""
+
+import dataclasses
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from mwdn import Camera, read_frame
+from mwdn.calibration import Calibration
+from mwdn.errors import ImageError, ParameterError
+from mwdn.evaluation.consistency import consistency
+from mwdn.inference.batch import Darkroom, check_outputs, output_name
+from mwdn.inference.reconstructor import Reconstructor
+from mwdn.io.contact_sheets import for_people
+from mwdn.io.images import srgb_decode
+from mwdn.networks import build
+from mwdn.optics.patterns import contour_psf
+from mwdn.solvers import Admm, Wiener
+
+SIZE = 32, 40
+
+
+@pytest.fixture
+def psf(generator):
+    return contour_psf(SIZE, cell=10, generator=generator).expand(1, 3, -1, -1).contiguous()
+
+
+@pytest.fixture
+def captures(tmp_path, psf, generator):
+    """Three of them, 16-bit PNG."""
+    (tmp_path / "in").mkdir()
+    for number in range(3):
+        scene = torch.zeros(1, 3, *SIZE)
+        scene[..., 10:20, 12 + 4 * number : 22 + 4 * number] = torch.tensor([0.9, 0.5, 0.2])[:, None, None]
+        seen = Camera(psf).simulate(scene, generator=generator)[0].movedim(0, -1)
+        frame = (seen.clamp(0, 1) * 65535).round().numpy().astype(np.uint16)
+        cv2.imwrite(str(tmp_path / f"in/{number}.png"), frame[..., ::-1])
+    return [tmp_path / f"in/{number}.png" for number in range(3)]
+
+
+def darkroom(psf, out, method="wiener", **options):
+    calibration = psf if isinstance(psf, Calibration) else Calibration(psf)
+    return Darkroom(Reconstructor(method, calibration, device="cpu"), "name", out, **options)
+
+
+def touch(folder, *names):
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        (folder / name).write_bytes(b"")
+    return [folder / name for name in names]
+
+
+# --- Files --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("form", "suffix"), [("png", ".png"), ("png16", ".png"), ("tiff", ".tif"), ("npy", ".npy")])
+def test_outputs_have_the_captures_names(tmp_path, form, suffix):
+    captures = touch(tmp_path / "in", "a.tif", "b.c.npy")
+    out = tmp_path / "out"
+    check_outputs(captures, out, form)
+    assert [out / output_name(capture, form) for capture in captures] == [out / f"a{suffix}", out / f"b.c{suffix}"]
+    assert not out.exists()
+
+
+def test_two_captures_of_one_name(tmp_path):
+    one, two = touch(tmp_path, "a.tif", "a.png")
+    message = f"`{two}` and `{one}` would both be written to `{tmp_path / 'out' / 'a.png'}`"
+    with pytest.raises(ParameterError, match=re.escape(message)):
+        check_outputs([one, two], tmp_path / "out", "png")
+
+
+def test_capture_called_summary(tmp_path):
+    captures = touch(tmp_path, "summary.tif")
+    with pytest.raises(ParameterError, match=r"summary\.tif` and the summary picture would both be written"):
+        check_outputs(captures, tmp_path / "out", "png")
+    check_outputs(captures, tmp_path / "out", "tiff")
+
+
+@pytest.mark.parametrize("taken", ["a.png", "psf.png", "summary.png"])
+def test_no_input_is_overwritten(tmp_path, taken):
+    captures = touch(tmp_path, "a.png")
+    captures += touch(tmp_path / "other", "psf.tif") if taken == "psf.png" else []
+    psf = touch(tmp_path, taken)[0]
+    out = tmp_path / "other" / ".."  # another spelling of the same folder
+    (tmp_path / "other").mkdir(exist_ok=True)
+    captures = captures if taken == "a.png" else [tmp_path / "other" / "x.png", *captures[1:]]
+    with pytest.raises(ParameterError, match=rf"{taken}` would overwrite an input\. Choose another folder: `--out`"):
+        check_outputs(captures, out, "png", protected=(psf, None))
+
+
+def test_out_is_a_file(tmp_path):
+    file, capture = touch(tmp_path, "out", "a.png")
+    with pytest.raises(ParameterError, match=r"`.*out` must be a folder, but is a file"):
+        check_outputs([capture], file, "png")
+
+
+def test_link_in_the_output_folder_to_an_input(tmp_path):
+    """It would be followed."""
+    captures = touch(tmp_path / "in", "a.png")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "a.png").symlink_to(captures[0])
+    with pytest.raises(ParameterError, match=r"out/a\.png` would overwrite an input"):
+        check_outputs(captures, tmp_path / "out", "png")
+
+
+def test_link_to_an_input_that_is_in_the_output_folder(tmp_path):
+    touch(tmp_path / "out", "a.png")
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "a.png").symlink_to(tmp_path / "out" / "a.png")
+    with pytest.raises(ParameterError, match=r"out/a\.png` would overwrite an input"):
+        check_outputs([tmp_path / "in" / "a.png"], tmp_path / "out", "png")
+
+
+@pytest.mark.parametrize("content", ['{"label": "cat"}', "[1]", "", "mine"])
+def test_json_of_somebody_else_is_not_replaced(tmp_path, content):
+    a, b = touch(tmp_path / "in", "a.png", "b.png")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "b.json").write_text(content)
+    check_outputs([a], tmp_path / "out", "png")
+    with pytest.raises(ParameterError, match=r"out/b\.json` is not of mwdn and would be lost\. Choose another folder"):
+        check_outputs([a, b], tmp_path / "out", "png")
+    (tmp_path / "out" / "b.json").write_text('{"origin": "0123456789abcdef"}')
+    check_outputs([a, b], tmp_path / "out", "png")
+
+
+# --- What is written ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("form", "suffix"), [("tiff", ".tif"), ("npy", ".npy")])
+def test_linear_formats_hold_what_the_reconstructor_returns(tmp_path, form, suffix, captures, psf):
+    room = darkroom(psf, tmp_path / "out", form=form)
+    jobs = list(room.develop(captures))
+    assert [job.number for job in jobs] == [0, 1, 2]
+    for job, capture in zip(jobs, captures, strict=True):
+        assert (job.capture, job.output) == (capture, tmp_path / "out" / (capture.stem + suffix))
+        measurement = room.reconstruct.calibration.correct(read_frame(capture))
+        scene = room.reconstruct(measurement)
+        found = read_frame(job.output)
+        assert found.dtype == np.float32
+        assert np.array_equal(found, scene[0].movedim(0, -1).numpy())
+        assert job.trust == consistency(measurement, psf, scene)
+        assert job.measurement is job.pose is job.scene is job.error is None  # a million jobs may be kept
+        beside = json.loads(job.output.with_suffix(".json").read_text())
+        assert beside["method"] == "name"
+        assert beside["psf_hash"] == room.reconstruct.calibration.psf_hash
+        assert beside["explained"] == job.trust.explained
+        assert beside["doubtful"] == job.trust.doubtful
+
+
+@pytest.mark.parametrize(("form", "steps"), [("png", 255), ("png16", 65535)])
+def test_png_is_the_same_picture_in_srgb(tmp_path, form, steps, captures, psf):
+    room = darkroom(psf, tmp_path, form=form, judge=False)
+    (job,) = room.develop(captures[:1])
+    scene = room.reconstruct(room.reconstruct.calibration.correct(read_frame(captures[0])))
+    stored = read_frame(job.output)
+    assert np.iinfo(stored.dtype).max == steps
+    light = srgb_decode(torch.from_numpy(stored.astype(np.float32) / steps))
+    # Half a step of the code is at most 2.275 / 1.055 ... of it in light: the steepest part is at white.
+    torch.testing.assert_close(light, for_people(scene)[0].movedim(0, -1), rtol=0, atol=0.5 * 2.3 / steps + 1e-6)
+    assert job.trust is None
+    assert set(json.loads((tmp_path / "0.json").read_text())) == {"method", "psf_hash", "origin"}
+
+
+def test_network_is_given_the_pose_that_the_picture_is_judged_by(tmp_path, captures, psf):
+    """It would find the same, at the same price."""
+    network = build("wiener-bank", width=2, finest=4)
+    pictures = []
+    for judge in (True, False):
+        room = darkroom(psf, tmp_path / str(judge), network, form="npy", judge=judge)
+        (job,) = room.develop(captures[:1])
+        pictures.append(torch.from_numpy(read_frame(job.output)))
+    torch.testing.assert_close(*pictures, rtol=1e-4, atol=1e-5)
+
+
+def test_captures_are_read_as_the_calibration_says(tmp_path, psf, captures):
+    """Blue first and the last row first in the file: the same picture as from a plain file."""
+    frame = read_frame(captures[0])
+    np.save(tmp_path / "plain.npy", frame)
+    np.save(tmp_path / "twisted.npy", frame[::-1, :, ::-1])
+    for name, calibration in (("plain", Calibration(psf)), ("twisted", Calibration(psf, bgr=True, upside_down=True))):
+        list(darkroom(calibration, tmp_path / "out", form="tiff").develop([tmp_path / f"{name}.npy"]))
+    assert np.array_equal(read_frame(tmp_path / "out/plain.tif"), read_frame(tmp_path / "out/twisted.tif"))
+
+
+def test_nothing_is_written_of_a_bad_capture_and_the_others_go_on(tmp_path, psf, captures):
+    (tmp_path / "bad.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    np.save(tmp_path / "small.npy", np.zeros((4, 4, 3), np.uint8))
+    files = [captures[0], tmp_path / "bad.png", tmp_path / "small.npy", tmp_path / "none.png", captures[1]]
+    jobs = list(darkroom(psf, tmp_path / "out").develop(files))
+    assert [job.capture for job in jobs] == files
+    assert [job.error is None for job in jobs] == [True, False, False, False, True]
+    assert isinstance(jobs[1].error, ImageError)
+    assert "`psf` (32 x 40) and the capture (4 x 4)" in str(jobs[2].error)
+    assert "does not exist" in str(jobs[3].error)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["0.json", "0.png", "1.json", "1.png"]
+
+
+@pytest.fixture
+def bright(tmp_path, captures):
+    """Gives the first capture so many times as bright, in a file of its own."""
+
+    def store(factor):
+        np.save(tmp_path / "bright.npy", read_frame(captures[0]) / np.float32(65535) * np.float32(factor))
+        return tmp_path / "bright.npy"
+
+    return store
+
+
+@pytest.mark.parametrize("method", ["fista", "admm", "pyramid"])
+def test_trust_does_not_depend_on_the_brightness(tmp_path, psf, bright, method):
+    """Nor do squares of what a camera of many bits counts overflow."""
+    room = darkroom(psf, tmp_path / "out", method)
+    plain, large = (next(room.develop([bright(factor)])).trust for factor in (1, 1e15))
+    assert dataclasses.astuple(large) == pytest.approx(dataclasses.astuple(plain), rel=0.01, abs=0.01)
+
+
+@pytest.mark.parametrize("judge", [True, False])
+@pytest.mark.parametrize("form", ["png", "npy"])
+def test_result_that_is_not_finite_changes_nothing_and_the_others_go_on(tmp_path, psf, captures, bright, judge, form):
+    room = darkroom(psf, tmp_path / "out", Admm(iterations=2), form=form, judge=judge)
+    list(room.develop([bright(1)]))
+    before = {path: path.read_bytes() for path in room.out.iterdir()}
+    refused, done = room.develop([bright(1e37), captures[1]])
+    assert isinstance(refused.error, ImageError)
+    assert re.search(r"nothing is written\. The capture's brightest pixel is \d\.\d+e\+36", str(refused.error))
+    assert done.error is None
+    assert {path: path.read_bytes() for path in before} == before
+
+
+def test_a_capture_without_light_is_no_picture(tmp_path, psf):
+    np.save(tmp_path / "black.npy", np.zeros((*SIZE, 3), np.uint16))
+    (job,) = darkroom(psf, tmp_path / "out").develop([tmp_path / "black.npy"])
+    assert str(job.error).startswith("The sensor saw no light")
+    assert not (tmp_path / "out").exists()
+
+
+def test_scene_too_large_to_be_judged(tmp_path, psf, captures):
+    (job,) = darkroom(psf, tmp_path / "out", lambda b, h: 1e37 * b).develop(captures[:1])
+    assert "too large numbers" in str(job.error)
+    assert not (tmp_path / "out").exists()
+
+
+def test_disk_that_refuses(tmp_path, psf, captures):
+    (tmp_path / "out" / "1.png").mkdir(parents=True)
+    jobs = list(darkroom(psf, tmp_path / "out").develop(captures))
+    assert [job.error is None for job in jobs] == [True, False, True]
+    assert "1.png` cannot be written" in str(jobs[1].error)
+    assert not (tmp_path / "out" / "1.json").exists()
+
+
+def test_work_stops_with_its_user(tmp_path, psf, captures):
+    """And leaves whole files behind."""
+    jobs = darkroom(psf, tmp_path / "out").develop(captures)
+    next(jobs)
+    jobs.close()
+    left = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert left in (["0.json", "0.png"], ["0.json", "0.png", "1.json", "1.png"])
+
+
+def test_summary_shows_the_first_twelve_that_are_there(tmp_path, psf, captures):
+    room = darkroom(psf, tmp_path / "out")
+    room.summarise(captures)
+    assert not (tmp_path / "out").exists()
+    list(room.develop([captures[0], captures[2]]))
+    room.summarise([captures[0], captures[1], captures[2]])
+    assert read_frame(tmp_path / "out" / "summary.png").shape[0] == 26 + 2 * 246
+    room.summarise(captures[:1] * 20)
+    assert read_frame(tmp_path / "out" / "summary.png").shape[0] == 26 + 12 * 246
+
+
+# --- What is there already ----------------------------------------------------------------------------
+
+
+def resumed(room_psf, out, captures, *arguments, **options):
+    """Names of the captures that were done again."""
+    jobs = list(darkroom(room_psf, out, *arguments, resume=True, **options).develop(captures))
+    assert all(job.error is None for job in jobs)
+    return [job.capture.name for job in jobs if not job.kept]
+
+
+def test_resumed_work_leaves_out_what_is_there(tmp_path, psf, captures):
+    out = tmp_path / "out"
+    list(darkroom(psf, out).develop(captures[:2]))
+    before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in out.iterdir()}
+    assert resumed(psf, out, captures) == ["2.png"]
+    assert {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in before} == before
+    assert len(list(darkroom(psf, out).develop(captures))) == 3
+    assert out.joinpath("0.png").stat().st_mtime_ns > before[out / "0.png"][1]  # not asked to resume
+
+
+def test_resumed_work_judges_what_was_not(tmp_path, psf, captures):
+    out = tmp_path / "out"
+    list(darkroom(psf, out, judge=False).develop(captures[:1]))
+    assert resumed(psf, out, captures[:2]) == ["0.png", "1.png"]
+    assert "explained" in json.loads((out / "0.json").read_text())
+    assert resumed(psf, out, captures[:2]) == []
+    assert resumed(psf, out, captures[:2], judge=False) == []  # more is there than was asked for
+
+
+@pytest.mark.parametrize("lost", ["0.png", "0.json"])
+@pytest.mark.parametrize("how", ["gone", "empty"])
+def test_half_a_result_is_none(tmp_path, lost, how, psf, captures):
+    out = tmp_path / "out"
+    list(darkroom(psf, out).develop(captures))
+    (out / lost).unlink()
+    if how == "empty":
+        (out / lost.replace("png", "json")).write_text("[]")
+    assert resumed(psf, out, captures) == ["0.png"]
+
+
+@pytest.mark.parametrize("what", ["capture", "regularisation", "network", "weights", "psf", "bits", "dark", "form"])
+def test_result_of_anything_else_is_none(tmp_path, what, psf, captures):
+    out, method, camera, form = tmp_path / "out", Wiener(), Calibration(psf), "png"
+    if what == "weights":
+        torch.manual_seed(1)
+        method = build("wiener-bank", width=2, finest=8)
+    list(darkroom(camera, out, method, judge=False).develop(captures[:1]))
+    assert resumed(camera, out, captures[:1], method, judge=False) == []
+    if what == "capture":
+        os.utime(captures[0], ns=(0, 0))
+    elif what == "regularisation":
+        method = Wiener(regularisation=1e-3)
+    elif what == "network":
+        method = build("wiener")
+    elif what == "weights":
+        method.decoder.head.weight.data[0, 0] += 1e-3
+    elif what == "psf":
+        camera = Calibration(psf.flip(-1))
+    elif what == "bits":
+        camera = Calibration(psf, bit_depth=16)
+    elif what == "dark":
+        camera = Calibration(psf, dark=torch.zeros(1, 3, *SIZE))
+    else:
+        form = "png16"
+    assert resumed(camera, out, captures[:1], method, judge=False, form=form) == ["0.png"]
+
+
+def test_old_judgement_never_stands_beside_a_new_picture(tmp_path, psf, captures, monkeypatch):
+    """Even if the work stops between the two."""
+    out = tmp_path / "out"
+    list(darkroom(psf, out).develop(captures[:1]))
+
+    def refuse(path, content):
+        raise ImageError("full")
+
+    monkeypatch.setattr("mwdn.inference.batch.write_json", refuse)
+    (job,) = darkroom(psf, out, Wiener(regularisation=1.0)).develop(captures[:1])
+    assert str(job.error) == "full"
+    assert [path.name for path in out.iterdir()] == ["0.png"]
+
+
+# --- Several processes --------------------------------------------------------------------------------
+
+COUNT = 16
+
+
+@pytest.fixture(scope="module")
+def shop(tmp_path_factory):
+    """Folder with psf.npy and `in`, where there are `COUNT` captures and one that is damaged."""
+    folder = tmp_path_factory.mktemp("shop")
+    (folder / "in").mkdir()
+    generator = torch.Generator().manual_seed(3)
+    psf = contour_psf(SIZE, cell=10, generator=generator).expand(1, 3, -1, -1)
+    np.save(folder / "psf.npy", (0.9 * psf / psf.max())[0].movedim(0, -1).numpy())
+    for number in range(COUNT):
+        scene = torch.zeros(1, 3, *SIZE)
+        scene[..., 10:20, 5 + number : 15 + number] = 0.9
+        seen = Camera(psf).simulate(scene, generator=generator)
+        np.save(folder / f"in/{number:02}.npy", seen[0].movedim(0, -1).numpy())
+    (folder / "in" / "damaged.npy").write_bytes(b"\x93NUMPY")
+    return folder
+
+
+def start(folder, out, *launch):
+    """``python`` with the command, or with torchrun and the command."""
+    line = f"-m mwdn reconstruct in --psf psf.npy --method admm --format npy --device cpu --out {out}"
+    here = {"PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"}
+    here |= {"GLOO_SOCKET_IFNAME": "lo"} if sys.platform == "linux" else {}
+    options = {"cwd": folder, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    # A shell lets what it starts in the background ignore the interrupt, and so would this process.
+    options["preexec_fn"] = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    return subprocess.Popen([sys.executable, *launch, *line.split()], env={**os.environ, **here}, **options)
+
+
+def two(folder, out, restarts=0):
+    options = f"-m torch.distributed.run --standalone --nproc-per-node 2 --max-restarts {restarts}"
+    return start(folder, out, *options.split())
+
+
+def told(output):
+    """Captures of which the output says that they were done."""
+    return re.findall(r"^(\d\d\.npy) explains", output, re.MULTILINE)
+
+
+def whole(out):
+    """Time of writing of each picture that is done, and of what says so."""
+    done = [path.with_suffix(".npy") for path in out.glob("??.json")]
+    return {path: path.stat().st_mtime_ns for one in done for path in (one, one.with_suffix(".json"))}
+
+
+@pytest.fixture(scope="module")
+def single(shop):
+    """What one process writes."""
+    process = start(shop, "single")
+    out, err = process.communicate(timeout=300)
+    assert process.returncode == 1, err  # for the damaged one
+    assert told(out) == [f"{number:02}.npy" for number in range(COUNT)]
+    assert f"{COUNT} of {COUNT + 1} captures reconstructed into single\n" in out
+    return {path.name: path.read_bytes() for path in (shop / "single").iterdir()}
+
+
+def kill_one(process, out, goal):
+    """Kill a worker when so many captures are done; returns its number."""
+    while len(list(out.glob("??.json"))) < goal:
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(0.02)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    assert len(children) == 2
+    os.kill(int(children[1]), signal.SIGKILL)
+
+
+def assert_finished(out, single):
+    """All is there, the same as from one process, and nothing else but what the killed one was writing."""
+    found = {path.name: path.read_bytes() for path in out.iterdir() if not path.name.startswith(".mwdn-")}
+    assert found == single
+
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells the children of a process in /proc")
+
+
+def test_two_processes_share_the_captures(shop, single):
+    process = two(shop, "two")
+    out, err = process.communicate(timeout=300)
+    assert process.returncode == 1, err
+    assert sorted(told(out)) == [f"{number:02}.npy" for number in range(COUNT)]
+    assert err.count("damaged.npy: ") == 1
+    assert out.count(f"{COUNT} of {COUNT + 1} captures reconstructed into two\n") == 1
+    assert_finished(shop / "two", single)
+
+
+def machine(folder, out, port, nodes, *, host, restarts=0):
+    """One of several, each with a torchrun of its own, which meet at the host's address."""
+    options = f"--nnodes {nodes} --nproc-per-node 1 --rdzv-backend c10d --rdzv-id {port} --max-restarts {restarts}"
+    where = ["-m", "torch.distributed.run", *options.split(), "--rdzv-endpoint", f"127.0.0.1:{port}", "--rdzv-conf"]
+    brief = "last_call_timeout=10,keep_alive_interval=1"  # seconds: 30 and 5 otherwise
+    return start(folder, out, *where, f"{brief},is_host={str(host).lower()}")
+
+
+def listened_to(port):
+    with socket.socket() as caller:
+        return caller.connect_ex(("127.0.0.1", port)) == 0
+
+
+def test_two_machines_share_the_captures(shop, single, free_port):
+    machines = [machine(shop, "machines", free_port, 2, host=host) for host in (True, False)]
+    said = [each.communicate(timeout=300) for each in machines]
+    assert [each.returncode for each in machines] == [1, 1], said
+    shares = [told(out) for out, _ in said]
+    assert all(shares)
+    assert sorted(name for share in shares for name in share) == [f"{number:02}.npy" for number in range(COUNT)]
+    assert sum(out.count(f"{COUNT} of {COUNT + 1} captures reconstructed into machines\n") for out, _ in said) == 1
+    assert_finished(shop / "machines", single)
+
+
+@linux
+def test_a_machine_goes_on_without_another(shop, single, free_port):
+    """The one where all meet; the other ends at once, with its process."""
+    (shop / "in" / "damaged.npy").rename(shop / "damaged.npy")  # or the status would start all once more
+    first = machine(shop, "left", free_port, "1:2", host=True, restarts=1)
+    while not listened_to(free_port):  # it joins first, and is process 0
+        with pytest.raises(subprocess.TimeoutExpired):
+            first.wait(0.02)
+    second = machine(shop, "left", free_port, "1:2", host=False, restarts=1)
+    while not list((shop / "left").glob("??.json")):
+        with pytest.raises(subprocess.TimeoutExpired):
+            second.wait(0.02)
+    for pid in (*Path(f"/proc/{second.pid}/task/{second.pid}/children").read_text().split(), second.pid):
+        os.kill(int(pid), signal.SIGKILL)
+    second.communicate(timeout=300)
+    _, err = first.communicate(timeout=300)
+    (shop / "damaged.npy").rename(shop / "in" / "damaged.npy")
+    assert first.returncode == 0, err
+    assert "Process 0 of 2 lost the others" in err
+    assert_finished(shop / "left", single)
+
+
+@linux
+def test_killed_work_goes_on_where_it_was(shop, single):
+    process = two(shop, "killed")
+    kill_one(process, shop / "killed", goal=4)
+    first, _ = process.communicate(timeout=300)
+    assert process.returncode == 1
+    before = whole(shop / "killed")
+    process = two(shop, "killed")
+    second, err = process.communicate(timeout=300)
+    assert f"{COUNT} of {COUNT + 1} captures reconstructed into killed, {len(before) // 2} of them before" in second, (
+        err
+    )
+    # Nothing was done twice: what was there is still as it was, and the rest was done.
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    there = {path.name for path in before}
+    assert 4 <= len(there) // 2 < COUNT
+    assert set(told(first)) <= there
+    assert sorted(told(second)) == [
+        name for name in sorted(single) if re.match(r"\d\d\.npy", name) and name not in there
+    ]
+    assert_finished(shop / "killed", single)
+
+
+@linux
+def test_interrupted_work_ends_quietly_and_leaves_whole_files(shop, single):
+    process, out = start(shop, "interrupted"), shop / "interrupted"
+    while len(list(out.glob("??.json"))) < 2:
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(0.02)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=300)
+    assert process.returncode == 130
+    assert "Traceback" not in err
+    found = {path.name: path.read_bytes() for path in out.iterdir()}
+    assert 4 <= len(found) < len(single)
+    assert found == {name: single[name] for name in found}
+
+
+@linux
+def test_torchrun_starts_killed_workers_again(shop, single):
+    (shop / "in" / "damaged.npy").rename(shop / "damaged.npy")  # or the status would start them once more
+    process = two(shop, "again", restarts=1)
+    kill_one(process, shop / "again", goal=4)
+    out, err = process.communicate(timeout=300)
+    (shop / "damaged.npy").rename(shop / "in" / "damaged.npy")
+    assert process.returncode == 0, err
+    assert re.search(rf"{COUNT} of {COUNT} captures reconstructed into again, \d+ of them before", out)
+    assert len(set(told(out))) == len(told(out)) <= COUNT
+    assert_finished(shop / "again", single)

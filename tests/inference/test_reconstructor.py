@@ -1,0 +1,319 @@
+"""A method bound to one camera, for single captures and for streams."""
+
+import inspect
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from mwdn import Camera, solvers
+from mwdn.calibration import Calibration
+from mwdn.errors import CheckpointError, ParameterError, ShapeError, UnknownNameError
+from mwdn.inference.reconstructor import AT_ONCE, Reconstructor, find_method
+from mwdn.networks import NETWORKS, build
+from mwdn.optics.patterns import contour_psf
+from mwdn.solvers import SOLVERS, Admm, Wiener
+from mwdn.weights.checkpoint import save_network
+
+SIZE = 32, 40
+
+
+@pytest.fixture
+def psf(generator):
+    return contour_psf(SIZE, cell=10, generator=generator).expand(1, 3, -1, -1).contiguous()
+
+
+@pytest.fixture
+def measurement(psf, generator):
+    scene = torch.zeros(1, 3, *SIZE)
+    scene[..., 10:20, 12:22] = torch.tensor([0.9, 0.5, 0.2])[:, None, None]
+    return Camera(psf).simulate(scene, generator=generator)
+
+
+def touch(folder, *names):
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        (folder / name).write_bytes(b"")
+    return [folder / name for name in names]
+
+
+# --- Method -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_each_solver_by_its_name(name, psf, measurement):
+    result = Reconstructor(name, Calibration(psf), device="cpu")(measurement)
+    assert result.shape == measurement.shape
+    assert result.device.type == "cpu"
+    torch.testing.assert_close(result, SOLVERS[name]()(measurement, psf))
+
+
+def test_solver_object_and_function(psf, measurement):
+    calibration = Calibration(psf)
+    fixed = Wiener(regularisation=1e-3)
+    assert torch.equal(Reconstructor(fixed, calibration)(measurement), fixed(measurement, psf))
+    assert torch.equal(Reconstructor(lambda b, h: b - h, calibration)(measurement), measurement - psf)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_each_network_from_its_checkpoint(tmp_path, name, psf, measurement):
+    options = {"width": 2} if "width" in inspect.signature(NETWORKS[name]).parameters else {}
+    network = build(name, **options)
+    path = tmp_path / "net.safetensors"
+    save_network(path, network, name, options)
+    batch = torch.cat([measurement, measurement / 2])
+    expected = network.eval()(batch, psf).detach()
+    for method in (path, str(path), network.train()):
+        result = Reconstructor(method, Calibration(psf), device="cpu")(batch)
+        assert (result - expected).norm() < 0.05 * expected.norm()
+        exact = Reconstructor(method, Calibration(psf), device="cpu", precision="exact")(batch)
+        torch.testing.assert_close(exact, expected, rtol=1e-4, atol=1e-4)
+        assert not result.requires_grad
+
+
+def test_file_called_like_a_solver_does_not_hide_it(tmp_path, monkeypatch):
+    touch(tmp_path, "admm")
+    monkeypatch.chdir(tmp_path)
+    assert isinstance(find_method("admm"), Admm)
+
+
+def test_unknown_method():
+    with pytest.raises(UnknownNameError, match=r"No method named 'admn'\. Did you mean 'admm'\? Known: .*wiener"):
+        find_method("admn")
+    with pytest.raises(CheckpointError, match=r"No checkpoint at `no\.safetensors`"):
+        find_method("no.safetensors")
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_network_without_weights(name, tmp_path, monkeypatch):
+    if name in SOLVERS:
+        assert isinstance(find_method(name), SOLVERS[name])
+        return
+    with pytest.raises(ParameterError, match=rf"`{name}` is a network, which has to be trained first: `mwdn train "):
+        find_method(name)
+    save_network(tmp_path / "w.safetensors", build("wiener"), "wiener", {})
+    (tmp_path / "w.safetensors").rename(tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(CheckpointError):  # a file of that name, whatever it holds, goes before
+        find_method(name)
+
+
+@pytest.mark.parametrize("device", ["gpu", "cpux", "cuda:99", "meta", "vulkan"])
+def test_unusable_device(device, psf):
+    with pytest.raises(ParameterError, match=rf"`device` \({device}\) must be one that torch can use here") as caught:
+        Reconstructor("wiener", Calibration(psf), device=device)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400
+
+
+def test_measurement_of_another_size(psf):
+    message = "`measurement` (1, 3, 16, 40) and `psf` (1, 3, 32, 40) must have the same height and width. Pass raw"
+    with pytest.raises(ShapeError, match=re.escape(message)):
+        Reconstructor("wiener", Calibration(psf))(torch.rand(1, 3, 16, 40))
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("method", [*SOLVERS, "universal-small"])
+@pytest.mark.parametrize("shape", [(0, 3, *SIZE), (1, 0, *SIZE), (3, *SIZE), SIZE, (1, 1, 3, *SIZE)])
+def test_measurement_that_is_no_batch(method, shape, psf):
+    with pytest.raises(ShapeError, match=re.escape(f"`measurement` {shape} must be a batch (B, C, H, W)")):
+        Reconstructor(method, Calibration(psf), device="cpu")(torch.rand(shape))
+
+
+@pytest.mark.parametrize("method", [*SOLVERS, "universal-small"])
+@pytest.mark.parametrize("channels", [1, 2, 4])
+def test_measurement_of_other_channels_than_the_psf(method, channels, psf):
+    message = f"`psf` (1, 3, 32, 40) must have channels 1 or that of `measurement` (1, {channels}, 32, 40)"
+    with pytest.raises(ShapeError, match=re.escape(message)):
+        Reconstructor(method, Calibration(psf), device="cpu")(torch.rand(1, channels, *SIZE))
+
+
+def test_grey_psf_serves_measurements_of_any_channels(psf):
+    grey = Calibration(psf[:, :1])
+    for channels in (1, 2, 3):
+        measurement = torch.rand(2, channels, *SIZE)
+        assert Reconstructor("wiener", grey, device="cpu")(measurement).shape == measurement.shape
+
+
+@pytest.mark.parametrize("align", [True, False])
+def test_grey_psf_and_a_network_of_colours(align, psf):
+    reconstruct = Reconstructor(build("wiener-bank", width=2, finest=4, align=align), Calibration(psf[:, :1]))
+    assert reconstruct(torch.rand(1, 1, *SIZE)).shape == (1, 1, *SIZE)
+    with pytest.raises(ShapeError, match=r"\(1, 2, 32, 40\) must have 3 channels for this network"):
+        reconstruct(torch.rand(1, 2, *SIZE))
+
+
+@pytest.mark.parametrize(
+    "error", [torch.OutOfMemoryError("CUDA out of memory"), RuntimeError("DefaultCPUAllocator: can't allocate memory")]
+)
+def test_too_large_for_the_memory(psf, measurement, error):
+    def greedy(measurement, psf):
+        raise error
+
+    with pytest.raises(ParameterError, match=r"needs more memory than cpu has free\. Bin or crop it: `--bin 2`"):
+        Reconstructor(greedy, Calibration(psf), device="cpu")(measurement)
+
+
+@pytest.mark.parametrize("name", ["unet", "mwdn", "mwdn-cpsf"])
+def test_network_of_other_colours(name, psf):
+    with pytest.raises(ShapeError, match=r"must have 3 channels for this network"):
+        Reconstructor(build(name, width=2), Calibration(psf[:, :1]))(torch.rand(1, 1, *SIZE))
+
+
+# --- Poses and streams --------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def bank():
+    return build("wiener-bank", width=2, finest=4).eval()
+
+
+@pytest.fixture
+def frames(psf, generator):
+    """Raw 16-bit frames of a square that goes to the right."""
+    found = []
+    for number in range(5):
+        scene = torch.zeros(1, 3, *SIZE)
+        scene[..., 10:20, 12 + number : 22 + number] = torch.tensor([0.9, 0.5, 0.2])[:, None, None]
+        seen = Camera(psf).simulate(scene, generator=generator)[0].movedim(0, -1)
+        found.append((seen.clamp(0, 1) * 65535).round().numpy().astype(np.uint16))
+    return found
+
+
+@pytest.fixture
+def aligned(monkeypatch):
+    """Measurements whose poses were asked for."""
+    asked, align = [], solvers.align
+    monkeypatch.setattr(solvers, "align", lambda b, h: asked.append(b) or align(b, h))
+    return asked
+
+
+@pytest.mark.parametrize("precision", ["exact", "fast"])
+def test_pose_given_is_the_pose_found(precision, bank, psf, measurement):
+    reconstruct = Reconstructor(bank, Calibration(psf), device="cpu", precision=precision)
+    both = torch.cat([measurement, measurement.roll(3, -1)])
+    found = reconstruct.at(solvers.align(both, psf))(both)
+    torch.testing.assert_close(found, reconstruct(both), rtol=1e-4, atol=1e-5)
+    turned = reconstruct.at(solvers.Pose(torch.tensor([5.0]), torch.tensor([0.0])))
+    assert (turned(measurement) - found[:1]).norm() > 0.02 * found[:1].norm()
+    assert torch.equal(reconstruct(both), Reconstructor(bank, Calibration(psf), precision=precision)(both))
+
+
+def test_pose_does_not_matter_to_others(psf, measurement):
+    pose = solvers.Pose(torch.tensor([5.0]), torch.tensor([0.01]))
+    for method in ("wiener", build("wiener-bank", width=2, align=False)):
+        reconstruct = Reconstructor(method, Calibration(psf), device="cpu")
+        assert torch.equal(reconstruct.at(pose)(measurement), reconstruct(measurement))
+
+
+@pytest.mark.parametrize(("refresh", "asked"), [(0, [0]), (2, [0, 2, 4]), (100, [0])])
+def test_stream_keeps_the_pose(refresh, asked, bank, psf, frames, aligned):
+    calibration = Calibration(psf)
+    reconstruct = Reconstructor(bank, calibration, device="cpu", precision="exact")
+    seen = list(reconstruct.stream(frames, refresh=refresh))
+    poses = aligned.copy()
+    assert len(poses) == len(asked)
+    for number, (measurement, scene) in enumerate(seen):
+        assert torch.equal(measurement, calibration.correct(frames[number]))
+        last = max(n for n in asked if n <= number)
+        assert torch.equal(poses[asked.index(last)], seen[last][0])
+        torch.testing.assert_close(scene, reconstruct.at(solvers.align(seen[last][0], psf))(measurement))
+
+
+@pytest.mark.parametrize("solver", [Admm(iterations=30), solvers.Fista(iterations=30)], ids=["admm", "fista"])
+def test_stream_goes_on_where_it_was(solver, psf, frames, aligned):
+    warm = solvers.Warm(solver)
+    reconstruct = Reconstructor(solver, Calibration(psf), device="cpu")
+    for _ in range(2):  # each stream begins anew
+        for measurement, scene in reconstruct.stream(frames):
+            assert torch.equal(scene, warm(measurement, psf))
+        warm = solvers.Warm(solver)
+    assert torch.equal(reconstruct(measurement), solver(measurement, psf))
+    assert aligned == []
+
+
+def broken(frame):
+    """With one pixel that is no number."""
+    frame = (frame / 65535).astype(np.float32)
+    frame[3, 4] = np.nan
+    return frame
+
+
+@pytest.mark.parametrize("solver", [Admm(iterations=20), solvers.Fista(iterations=20)], ids=["admm", "fista"])
+def test_stream_forgets_a_frame_that_is_not_finite(solver, psf, frames):
+    stream = Reconstructor(solver, Calibration(psf), device="cpu").stream([frames[0], broken(frames[1]), *frames[2:]])
+    assert [bool(scene.isfinite().all()) for _, scene in stream] == [True, False, True, True, True]
+
+
+def test_stream_finds_the_pose_on_the_first_frame_that_is_finite(bank, psf, frames, aligned):
+    reconstruct = Reconstructor(bank, Calibration(psf), device="cpu", precision="exact")
+    for refresh, at in ((0, [1]), (2, [1, 3, 4])):
+        broken_ones = [broken(frames[n]) if n in (0, 2) else frames[n] for n in range(5)]
+        stream = reconstruct.stream(broken_ones, refresh=refresh)
+        seen = [measurement for measurement, _ in stream]
+        asked = [each for each in aligned if each.isfinite().all()]
+        assert len(asked) == len(at)
+        assert all(torch.equal(each, seen[n]) for each, n in zip(asked, at, strict=True))
+        aligned.clear()
+
+
+def test_stream_checks_the_channels(bank, psf):
+    stream = Reconstructor(bank, Calibration(psf[:, :1])).stream([np.zeros((*SIZE, 2), np.uint8)])
+    with pytest.raises(ShapeError, match="must have 3 channels for this network"):
+        next(stream)
+
+
+def test_stream_of_any_other_method_is_frame_by_frame(psf, frames):
+    reconstruct = Reconstructor("wiener", Calibration(psf), device="cpu")
+    for frame, (measurement, scene) in zip(frames, reconstruct.stream(frames), strict=True):
+        assert torch.equal(scene, reconstruct(measurement))
+        assert torch.equal(measurement, reconstruct.calibration.correct(frame))
+
+
+def test_stream_takes_frames_as_they_are_asked_for(psf, frames):
+    left = iter(frames)
+    stream = Reconstructor("wiener", Calibration(psf)).stream(left)
+    assert len(list(left)) == 5
+    assert list(stream) == []
+
+
+def test_stream_refuses(psf):
+    reconstruct = Reconstructor("wiener", Calibration(psf))
+    with pytest.raises(ParameterError, match=r"`refresh` \(-1\) must be a number of frames, or 0"):
+        reconstruct.stream([], refresh=-1)
+    with pytest.raises(ShapeError, match=r"must have the same height and width"):
+        next(reconstruct.stream([np.zeros((4, 4, 3), np.uint8)]))
+
+
+@pytest.mark.parametrize("method", [build("wiener"), Wiener(1e-3)])
+def test_a_batch_is_taken_a_few_at_a_time(method, generator, monkeypatch):
+    """A batch of 3 pictures of 256 x 256 is 2 and 1."""
+    psf = torch.rand(1, 3, 256, 256, generator=generator)
+    reconstruct = Reconstructor(method, Calibration(psf / psf.sum()), device="cpu", precision="exact")
+    seen, whole = [], Reconstructor._reconstruct
+    monkeypatch.setattr(
+        Reconstructor, "_reconstruct", lambda self, batch: seen.append(len(batch)) or whole(self, batch)
+    )
+    batch = torch.rand(3, 3, 256, 256, generator=generator)
+    found = reconstruct(batch)
+    assert seen == [2, 1]
+    torch.testing.assert_close(found[2:], reconstruct(batch[2:]))
+
+
+@torch.no_grad()
+def test_what_belongs_to_each_sample_keeps_a_batch_together(generator, monkeypatch):
+    """Where the iterations for the last frame ended, and the pose of the PSF."""
+    monkeypatch.setitem(AT_ONCE, "cpu", 1)
+    psf = torch.rand(1, 3, 24, 32, generator=generator)
+    calibration, batch = Calibration(psf / psf.sum()), torch.rand(3, 3, 24, 32, generator=generator)
+    warm, whole = solvers.Warm(solvers.Admm(iterations=5)), solvers.Warm(solvers.Admm(iterations=5))
+    stream = Reconstructor(warm, calibration, device="cpu")
+    for _ in range(2):
+        torch.testing.assert_close(stream(batch), whole(batch, stream.psf))
+    network = Reconstructor(build("wiener-bank", width=4).eval(), calibration, device="cpu", precision="exact")
+    pose = solvers.Pose(torch.tensor([0.0, 2.0, -3.0]), torch.tensor([0.0, 0.01, 0.02]))
+    found = network.at(pose)(batch)
+    for i in range(3):
+        one = solvers.Pose(pose.turn_degrees[i : i + 1], pose.scale[i : i + 1])
+        torch.testing.assert_close(found[i : i + 1], network.at(one)(batch[i : i + 1]), rtol=1e-3, atol=1e-4)

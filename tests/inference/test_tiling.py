@@ -1,0 +1,92 @@
+"""A U-Net in strips of rows is the U-Net of the whole picture."""
+
+import copy
+
+import pytest
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from mwdn.fourier import memory_format
+from mwdn.inference import tiling
+from mwdn.inference.engine import Engine
+from mwdn.inference.fusion import fold
+from mwdn.inference.tiling import StripDecoder, StripEncoder, enlarged
+from mwdn.networks import blocks, build
+from mwdn.networks.blocks import Decoder, Encoder
+
+
+def lively(network, generator):
+    """Statistics of BatchNorm as after some training, in evaluation mode."""
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            module.running_mean.copy_(0.1 * torch.randn(module.num_features, generator=generator))
+            module.running_var.copy_(0.5 + torch.rand(module.num_features, generator=generator))
+    return network.eval()
+
+
+@pytest.fixture
+def strips(monkeypatch):
+    """Counts the strips; they are of few rows."""
+    taken = []
+    whole = tiling.in_strips
+
+    def counted(layers, size, rows):
+        def noted(first, last):
+            taken.append((first, last, size[0]))
+            return rows(first, last)
+
+        return whole(layers, size, noted)
+
+    monkeypatch.setattr(tiling, "in_strips", counted)
+    monkeypatch.setattr(tiling, "LARGEST", 7 * 45 * 32)
+    return taken
+
+
+@pytest.mark.parametrize("pooling", ["max", "average"])
+@pytest.mark.parametrize("size", [(64, 45), (67, 45), (33, 90)])
+@torch.no_grad()
+def test_strips_are_the_whole_picture(size, pooling, strips, generator):
+    """Of 7 rows and of fewer at one scale and of more at another, of which the last is cut off."""
+    unet = lively(build("unet", width=16, pooling=pooling), generator)
+    picture = torch.rand(2, 3, *size, generator=generator)
+    expected = unet(picture, picture[:1])
+    folded = fold(copy.deepcopy(unet), None)
+    assert isinstance(folded.encoder, StripEncoder)
+    assert isinstance(folded.decoder, StripDecoder)
+    found = folded(picture, picture[:1])
+    assert len(strips) > 20
+    assert any(last - first < height for first, last, height in strips)
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["mwdn", "mwdn-cpsf"])
+@torch.no_grad()
+def test_large_pictures_in_parts_everywhere(name, strips, monkeypatch, generator):
+    """Strips, channels filtered a few at a time, transfer functions made when they are needed."""
+    network = lively(build(name, width=16), generator)
+    psf, measurement = torch.rand(1, 3, 64, 45, generator=generator), torch.rand(2, 3, 64, 45, generator=generator)
+    expected = network(measurement, psf)
+    monkeypatch.setattr(memory_format, "LARGEST", 3 * 2 * 64 * 45)
+    monkeypatch.setattr(blocks, "LARGEST", 8 * 96 * 70)
+    engine = Engine(network, psf, precision="exact")
+    found = engine(measurement)
+    kept = [tensor.is_complex() for tensor in engine.bound[3]]
+    assert kept == ([True] * 4 if name == "mwdn" else [False] * 2 + [True] * 2)
+    assert strips
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("size", [(23, 31), (22, 9), (40, 16)])
+def test_enlarged_rows(size, generator):
+    picture = torch.rand(2, 3, 11, 16, generator=generator)
+    expected = F.interpolate(picture, size=size, mode="bilinear", align_corners=True)
+    for first, last in ((0, 5), (5, 6), (6, size[0]), (0, size[0])):
+        found = enlarged(picture, size, first, last)
+        torch.testing.assert_close(found, expected[..., first:last, :], rtol=1e-6, atol=1e-6)
+
+
+def test_normalisation_over_the_picture_is_not_cut(generator):
+    """GroupNorm sees the whole picture."""
+    for unet in (Encoder(3, (8, 8), norm="group"), Decoder(3, (8, 8), norm="group")):
+        assert type(fold(unet.eval(), None)) is type(unet)

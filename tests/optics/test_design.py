@@ -1,0 +1,195 @@
+"""`mwdn design` as a user types it; what a PSF's curves say."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mwdn import Calibration, read_frame
+from mwdn.cli.app import main
+from mwdn.optics import Contour, Diffuser, Setup, mask_psf
+from mwdn.optics.design import decades, design_camera, radial_autocorrelation, radial_spectrum, sharpness
+from mwdn.optics.mask_files import read_mask
+from mwdn.optics.patterns import contour_psf
+
+RECIPES = Path(__file__).resolve().parents[1] / "recipes"
+SMALL = ["--aperture-mm", "0.4", "0.4", "--pixels", "200", "240", "--wavelengths", "2", "-o", "cam"]
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        with pytest.raises(SystemExit) as caught:
+            main(["design", *map(str, arguments)])
+        return (caught.value.code or 0, *capsys.readouterr())
+
+    return call
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "contour --size-mm 0.5 0.5 --iterations 3",
+        "diffuser --size-mm 0.5 0.5",
+        "lenslets --size-mm 0.5 0.5 --levels 16",
+        "zone --size-mm 0.5 0.5 --zone-um 100",
+        "coded --order 4 --distance-mm 0.5",
+        "coded --pattern mura --order 13 --distance-mm 0.5",
+        "pinholes --size-mm 0.4 0.4 --count 3",
+    ],
+)
+def test_every_mask_becomes_a_camera(run, tmp_path, line):
+    code, out, err = run(*line.split(), *SMALL)
+    assert (code, err) == (0, "")
+    assert sorted(path.name for path in (tmp_path / "cam").iterdir()) == [
+        "camera.json",
+        "mask.tif",
+        "preview.png",
+        "psf.tif",
+    ]
+    about = json.loads((tmp_path / "cam/camera.json").read_text())
+    calibration = Calibration.from_file("cam/psf.tif", background=0.0)
+    assert calibration.size == (50, 60)
+    assert about["made"]["psf_hash"] == calibration.psf_hash
+    assert calibration.psf_hash in out
+    assert about["mask"]["name"] == line.split()[0]
+    # The files are enough to compute the PSF again.
+    setup = {name: tuple(value) if isinstance(value, list) else value for name, value in about["setup"].items()}
+    again = mask_psf(read_mask("cam/mask.tif"), Setup(**setup))
+    again = again / again.sum((-2, -1), keepdim=True)
+    torch.testing.assert_close(again, calibration.psf, rtol=0.01, atol=2e-3 * float(again.max()))
+    assert read_frame("cam/preview.png").shape[0] == 26 + 246
+
+
+@pytest.mark.parametrize("about", [None, "{}", "[]", "no JSON", '{"made": 1}'])
+@pytest.mark.parametrize("taken", ["psf.tif", "mask.tif", "preview.png", "mask.stl"])
+def test_only_another_design_is_replaced(run, tmp_path, monkeypatch, taken, about):
+    monkeypatch.setattr("mwdn.optics.design.design_camera", pytest.fail)
+    (tmp_path / "cam").mkdir()
+    (tmp_path / "cam" / taken).write_text("measured")
+    if about is not None:
+        (tmp_path / "cam" / "camera.json").write_text(about)
+    code, _, err = run("diffuser", "--size-mm", "0.5", "0.5", *SMALL, "--stl")
+    assert code == 2
+    assert f"`cam/{taken}` would be replaced, and no camera.json says that it is a design's" in err
+    assert (tmp_path / "cam" / taken).read_text() == "measured"
+
+
+def test_another_design_is_replaced(run, tmp_path):
+    line = ("pinholes", "--size-mm", "0.4", "0.4", *SMALL, "--count")
+    hashes = []
+    (tmp_path / "cam").mkdir()
+    (tmp_path / "cam" / "mask.stl").write_text("not asked for")
+    for count in (3, 4):
+        assert run(*line, count)[0] == 0
+        hashes.append(json.loads((tmp_path / "cam/camera.json").read_text())["made"]["psf_hash"])
+    assert len(set(hashes)) == 2
+    assert (tmp_path / "cam" / "mask.stl").read_text() == "not asked for"
+
+
+def test_fabrication_files(run, tmp_path):
+    pytest.importorskip("gdstk")
+    assert run("contour", "--size-mm", "0.4", "0.4", *SMALL, "--gds", "--stl", "--stl-every", "2")[0] == 0
+    assert (tmp_path / "cam/mask.gds").stat().st_size > 1000
+    assert (tmp_path / "cam/mask.stl").stat().st_size == 84 + 50 * (2 * 99 * 99 + 3 * 4 * 99)
+
+
+def test_recipe_stands_behind_the_command_line(run, tmp_path):
+    (tmp_path / "mine.toml").write_text('size-mm = [0.4, 0.4]\nfeature-um = 40.0\nseed = 7\nsource-mm = "inf"\n')
+    assert run("diffuser", "--recipe", "mine.toml", "--seed", "8", *SMALL)[0] == 0
+    about = json.loads((tmp_path / "cam/camera.json").read_text())
+    assert about["mask"]["feature_um"] == 40.0
+    assert about["mask"]["seed"] == 8
+    assert about["setup"]["source_mm"] is None
+
+
+@pytest.mark.parametrize(("recipe", "mask"), [("mwdn", "contour"), ("diffuser", "diffuser"), ("coded", "coded")])
+def test_recipes_of_the_project_are_understood(run, recipe, mask):
+    """One wrong number is named, after all the others have been read."""
+    code, _, err = run(mask, "--recipe", RECIPES / f"camera-{recipe}.toml", "--pitch-um", "-1")
+    assert (code, err) == (2, "Error: `pitch_um` (-1) must be positive.\n")
+
+
+def test_recipe_of_the_paper_is_the_default(run, monkeypatch):
+    found = []
+    monkeypatch.setattr("mwdn.cli.design.Output.write", lambda self, *arguments: found.append(arguments))
+    assert run("contour", "--recipe", RECIPES / "camera-mwdn.toml")[0] == 0
+    assert found == [("contour", Contour(), Setup())]
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("contour --levels 0", "Error: `levels` (0) must be 2 to 65,536."),
+        ("contour --distance-mm -2", "Error: `distance_mm` (-2) must be positive."),
+        ("diffuser --pitch-um 9", "Error: `pitch_um` (9) cannot sample a surface that turns light"),
+        ("contour --recipe none.toml", "Error: `recipe` (none.toml) must be a TOML file"),
+        ("contour --levls 3", "Did you mean --levels?"),
+        ("kontour", 'Did you mean "contour"?'),
+        ("pinholes --stl --size-mm 0.4 0.4 --count 2", "has no heights for an STL"),
+    ],
+)
+def test_wrong_call_is_one_message_and_exit_2(run, line, said):
+    code, out, err = run(*line.split(), *SMALL)
+    assert code == 2
+    assert said in " ".join(err.split())
+    assert "Traceback" not in out + err
+
+
+# --- Curves ---------------------------------------------------------------------------------------------
+
+
+def test_sharpness_of_a_known_spot():
+    """The autocorrelation of a Gaussian of width s is one of sqrt(2) s; less the mean, and in rings, 4 % narrower."""
+    y, x = torch.arange(81.0)[:, None] - 40, torch.arange(91.0) - 45
+    spot = torch.exp(-(y**2 + x**2) / (2 * 3.0**2))[None, None]
+    assert sharpness(spot / spot.sum()) == pytest.approx(2.355 * 2**0.5 * 3.0, rel=0.05)
+
+
+def test_radial_spectrum_of_a_known_spot():
+    y, x = torch.arange(80.0)[:, None] - 40, torch.arange(80.0) - 40
+    spot = torch.exp(-(y**2 + x**2) / (2 * 1.5**2))[None, None]
+    found = radial_spectrum(spot / spot.sum(), bins=40)
+    expected = torch.exp(-2 * (torch.pi * 1.5 * torch.arange(40) / 80) ** 2)
+    torch.testing.assert_close(found[:20], expected[:20].double(), rtol=0.05, atol=1e-3)
+
+
+def test_radial_autocorrelation_sees_the_lines(generator):
+    assert radial_autocorrelation(contour_psf((90, 100), cell=20, generator=generator))[0] == 1.0
+
+
+@pytest.mark.parametrize("size", [(9, 12), (8, 9), (10, 10)])
+def test_spectrum_picture_is_the_shifted_modulus(size, generator):
+    psf = torch.rand(1, 1, *size, generator=generator)
+    modulus = abs(np.fft.fft2(psf[0, 0].double().numpy()))
+    rolled = np.roll(modulus / modulus.max(), (size[0] // 2, (size[1] - 1) // 2), (0, 1))
+    expected = (1 + np.log10(rolled.clip(1e-3)) / 3) ** 2.2
+    np.testing.assert_allclose(decades(psf)[0, 0].numpy(), expected, atol=1e-4)
+
+
+def test_designed_camera_keeps_its_light():
+    setup = Setup(aperture_mm=(0.4, 0.4), pixels=(200, 200), wavelengths=2)
+    designed = design_camera("diffuser", Diffuser(size_mm=(0.5, 0.5)), setup)
+    torch.testing.assert_close(designed.psf.sum((-2, -1)), torch.ones(1, 3))
+    assert designed.stored.max() == 1
+    assert 0.9 < designed.light.sum((-2, -1)).min() <= designed.light.sum((-2, -1)).max() < 1.02
+    other = design_camera("diffuser", replace(Diffuser(size_mm=(0.5, 0.5)), seed=1), setup)
+    assert other.report()["made"]["psf_hash"] != designed.report()["made"]["psf_hash"]
+
+
+def test_sensitivity_falls_with_the_distance_from_where_the_psf_was_taken(run, tmp_path):
+    status, _, said = run("diffuser", "--size-mm", "0.5", "0.5", *SMALL, "--sensitivity")
+    assert status == 0, said
+    likeness = json.loads((tmp_path / "cam" / "camera.json").read_text())["likeness"]
+    angles = likeness["angle_degrees"]
+    # So small an aperture moves its pattern and hardly changes it.
+    assert all(0.8 < value < 1 for value in angles.values())
+    assert "10" not in angles  # the pitch of 2 um cannot sample it
+    near, half, far = (likeness["source_mm"][key] for key in ("50", "100", "800"))
+    assert 0.8 < near < half < 1
+    assert near < far < 1  # the wave from far away is nearly flat already

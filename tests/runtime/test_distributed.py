@@ -1,0 +1,294 @@
+"""Training by two processes: the same as by one, to rounding, and exact after any interruption."""
+
+import json
+import os
+import random
+import select
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from test_train import log, same
+
+from mwdn.calibration import Calibration
+from mwdn.errors import ParameterError
+from mwdn.networks import build
+from mwdn.optics.patterns import contour_psf
+from mwdn.runtime import distributed
+from mwdn.training.batch_norm import freeze_cancelled
+from mwdn.training.experiment import prepare
+from mwdn.training.recipe import read_recipe
+
+STEPS = 12
+# 3 samples for two processes: one has one, the other two. At this rate, with small first steps and without the
+# pyramid's iterations, rounding does not grow into another path: no pool takes its maximum from another pixel.
+RECIPE = f"""
+[network]
+name = "wiener-bank"
+width = 4
+fold = 1
+finest = 0
+[schedule]
+steps = {STEPS}
+batch = 3
+learning_rate = 1e-4
+warmup = 8
+validate_every = 4
+validation = 3
+bfloat16 = false
+"""
+CPSF = """
+network = { name = "mwdn-cpsf", width = 4 }
+schedule = { steps = 4, batch = 5, course = "plateau", validate_every = 2, validation = 3, bfloat16 = false }
+loss = { l1 = 0.5, mse = 1.0 }
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two recipes, psf.npy and photos."""
+    path = tmp_path_factory.mktemp("distributed")
+    psf = contour_psf((32, 40), cell=10, generator=torch.Generator().manual_seed(3)).expand(1, 3, -1, -1)
+    np.save(path / "psf.npy", (0.9 * psf / psf.max())[0].movedim(0, -1).numpy())
+    (path / "photos").mkdir()
+    for number in range(3):
+        small = np.random.default_rng(number).integers(0, 256, (4, 4, 3), np.uint8)
+        cv2.imwrite(str(path / f"photos/{number}.png"), cv2.resize(small, (24, 24), interpolation=cv2.INTER_CUBIC))
+    (path / "r.toml").write_text(RECIPE, encoding="utf-8")
+    (path / "cpsf.toml").write_text(CPSF, encoding="utf-8")
+    return path
+
+
+def torchrun(folder, *command, machines="--standalone --nproc-per-node 2"):
+    """Start a command twice, on one machine unless told otherwise."""
+    options = {"cwd": folder, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    here = {"PYTHONFAULTHANDLER": "1"} | ({"GLOO_SOCKET_IFNAME": "lo"} if sys.platform == "linux" else {})
+    launch = [sys.executable, "-m", "torch.distributed.run", *machines.split()]
+    return subprocess.Popen([*launch, *command], env={**os.environ, **here, "OMP_NUM_THREADS": "1"}, **options)
+
+
+def training(folder, out, **machines):
+    line = "-m mwdn train r.toml --psf psf.npy --background 0 --photos photos --device cpu --out"
+    return torchrun(folder, *line.split(), out, **machines)
+
+
+def finish(process):
+    out, err = process.communicate(timeout=300)
+    assert process.returncode == 0, err
+    return out, err
+
+
+def alone(folder, out):
+    """The run of one process."""
+    calibration = Calibration.from_file(folder / "psf.npy", background=0.0)
+    return prepare(read_recipe(folder / "r.toml"), calibration, folder / "photos", folder / out, "cpu")
+
+
+@pytest.mark.parametrize(
+    ("environment", "message"),
+    [
+        ({"WORLD_SIZE": "abc"}, r"`WORLD_SIZE` \(abc\) must be set as torchrun sets it .* `unset WORLD_SIZE`"),
+        ({"WORLD_SIZE": "2"}, r"`RANK` \(not set\) must be set"),
+        ({"WORLD_SIZE": "2", "RANK": "0", "LOCAL_RANK": "x"}, r"`LOCAL_RANK` \(x\) must be set"),
+        ({"WORLD_SIZE": "2", "RANK": "0", "LOCAL_RANK": "0"}, r"`MASTER_ADDR` \(not set\) must be set"),
+    ],
+)
+def test_environment_of_no_torchrun(monkeypatch, environment, message):
+    for name in ("WORLD_SIZE", "RANK", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(ParameterError, match=message), distributed.processes():
+        pass
+
+
+@pytest.fixture(scope="module")
+def one(folder):
+    alone(folder, "one").run()
+    return folder / "one"
+
+
+@pytest.fixture(scope="module")
+def two(folder):
+    out, err = finish(training(folder, "two"))
+    assert out.split() == ["Weights", "in", "two/best.safetensors"]  # said once
+    assert err.count(f"step {STEPS}: validation") == 1
+    return folder / "two"
+
+
+@pytest.fixture(scope="module")
+def worked(folder):
+    """What `two_processes.py` has left."""
+    stop = InterruptedError
+
+    def after_four(report):
+        if report.step == 5:
+            raise stop
+
+    with pytest.raises(stop):
+        alone(folder, "mixed").run(after_four)
+    finish(torchrun(folder, str(Path(__file__).with_name("two_processes.py"))))
+    return folder
+
+
+def assert_alike(found, expected):
+    """Learned numbers moved from their start by the same, but for 1 %; BatchNorm's moments to rounding."""
+    found, expected = load_file(found / "state.safetensors"), load_file(expected / "state.safetensors")
+    assert found.keys() == expected.keys()
+    torch.manual_seed(0)
+    start = build("wiener-bank", width=4, fold=1, finest=0)
+    names = [name for name, _ in start.named_parameters()]
+    moved = torch.cat([(expected[f"network.{n}"] - start.state_dict()[n]).flatten() for n in names])
+    apart = torch.cat([(expected[f"network.{n}"] - found[f"network.{n}"]).flatten() for n in names])
+    assert moved.abs().max() > 5e-4
+    assert apart.norm() < 0.01 * moved.norm()
+    for key in expected:
+        if "running" in key:
+            torch.testing.assert_close(found[key], expected[key], rtol=1e-3, atol=1e-4)
+
+
+# --- One result -----------------------------------------------------------------------------------------
+
+
+def test_two_processes_end_as_one(one, two):
+    assert_alike(two, one)
+    logs = log(one), log(two)
+    assert [line["step"] for line in logs[1]] == list(range(1, STEPS + 1))
+    for alone, together in zip(*logs, strict=True):
+        assert together["loss"] == pytest.approx(alone["loss"], rel=1e-3)
+        assert together["psnr"] == pytest.approx(alone["psnr"], abs=1e-2)
+    assert logs[1][0]["loss"] == pytest.approx(logs[0][0]["loss"], rel=1e-6)
+    assert sorted(path.name for path in two.iterdir()) == sorted(path.name for path in one.iterdir())
+
+
+def test_two_machines_end_as_one_with_two_processes(folder, two, free_port):
+    """Each with a torchrun of its own, the first one's address told to both; the folder is one."""
+    where = f"--nnodes 2 --nproc-per-node 1 --master-addr 127.0.0.1 --master-port {free_port} --node-rank"
+    machines = [training(folder, "machines", machines=f"{where} {rank}") for rank in range(2)]
+    said = [finish(machine) for machine in machines]
+    assert [out.split() for out, _ in said] == [["Weights", "in", "machines/best.safetensors"], []]
+    assert same(folder / "machines" / "last.safetensors", two / "last.safetensors")
+    assert log(folder / "machines") == log(two)
+
+
+def test_two_processes_end_as_one_in_float64(worked):
+    """Nothing is left of the difference; `mwdn-cpsf` also encodes the PSF, of which each process has a whole batch."""
+    states = [load_file(worked / "double" / name / "state.safetensors") for name in ("one-0", "two")]
+    assert states[0].keys() == states[1].keys()
+    assert states[0]["network.decoder.head.weight"].dtype == torch.float64
+    for key, value in states[0].items():
+        torch.testing.assert_close(states[1][key], value, rtol=1e-5, atol=1e-8, msg=lambda m, k=key: f"{k}: {m}")
+
+
+def test_both_processes_have_the_course_of_the_first(worked):
+    """Only the first validates."""
+    courses = [json.loads((worked / f"course-{rank}.json").read_text()) for rank in (0, 1)]
+    assert courses[0] == courses[1]
+    losses = [line["validation_loss"] for line in log(worked / "double" / "two")]
+    assert courses[0]["best"] == min(loss for loss in losses if loss is not None)
+
+
+def test_run_begun_by_one_process_goes_on_with_two(one, worked):
+    assert_alike(worked / "mixed", one)
+    assert [line["step"] for line in log(worked / "mixed")] == list(range(1, STEPS + 1))
+    assert log(worked / "mixed")[:4] == log(one)[:4]  # not begun again
+
+
+def test_bias_before_batch_norm_is_not_learned(one):
+    """Its gradient is rounding noise, of which Adam would make steps as large as any."""
+    torch.manual_seed(0)
+    network = build("wiener-bank", width=4, fold=1, finest=0)
+    freeze_cancelled(network)
+    frozen = [name for name, parameter in network.named_parameters() if not parameter.requires_grad]
+    assert len(frozen) == 18  # two in each of five and four scales
+    assert all(name.endswith((".0.bias", ".3.bias")) for name in frozen)
+    state = load_file(one / "state.safetensors")
+    for name, parameter in network.named_parameters():
+        assert torch.equal(state[f"network.{name}"], parameter) == (name in frozen)
+
+
+def test_gradient_of_a_bias_before_batch_norm_is_zero(generator):
+    """In float64 nothing is left of it."""
+    network = build("mwdn", width=2).double()
+    freeze_cancelled(network)
+    frozen = {name for name, parameter in network.named_parameters() if not parameter.requires_grad}
+    network.requires_grad_(True)
+    picture = torch.rand(1, 3, 32, 32, generator=generator).double()
+    network.encoder(picture)[-1].square().sum().backward()
+    gradients = {name: p.grad.abs().max() for name, p in network.encoder.named_parameters()}
+    for name, value in gradients.items():
+        assert (value < 1e-9) == (f"encoder.{name}" in frozen)
+
+
+# --- BatchNorm over all processes -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-10), ("float32", 2e-4)])
+@pytest.mark.parametrize("rank", [0, 1])
+def test_batch_norm_over_two_processes(worked, rank, dtype, tolerance):
+    """Output, gradients, running moments after two steps: those of torch's own layer for the whole batch."""
+    found = load_file(worked / f"{dtype}-{rank}.safetensors")
+    for key in ("y", "x.grad", "w.grad", "b.grad", "mean", "var", "count", "eval"):
+        torch.testing.assert_close(found[f"two.{key}"], found[f"one.{key}"], rtol=tolerance, atol=tolerance)
+    assert found["two.count"] == 2
+
+
+# --- Interruptions --------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends a process with its parent")
+def test_killed_and_resumed_run_ends_as_one_that_was_not(folder, two):
+    """SIGKILL of torchrun alone, after some steps: its processes end with it, and the next run finds a whole state."""
+    process, path = training(folder, "killed"), folder / "killed" / "log.jsonl"
+    goal = random.randint(2, STEPS - 2)
+    while process.poll() is None and not (path.exists() and path.read_bytes().count(b"\n") >= goal):
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(0.02)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    handles = [os.pidfd_open(int(child)) for child in children]
+    process.send_signal(signal.SIGKILL)
+    process.communicate(timeout=60)  # the pipes close when the last of them has ended
+    assert process.returncode == -signal.SIGKILL
+    assert len(handles) == 2
+    for handle in handles:
+        assert select.select([handle], [], [], 60)[0] == [handle]
+        os.close(handle)
+    assert len(log(folder / "killed")) < STEPS
+    finish(training(folder, "killed"))
+    for name in ("best", "last", "state"):
+        assert same(folder / "killed" / f"{name}.safetensors", two / f"{name}.safetensors")
+    assert log(folder / "killed") == log(two)
+
+
+# --- What is refused ------------------------------------------------------------------------------------
+
+
+def test_refusals_of_two_processes(worked):
+    first, second = ((worked / f"said-{rank}.txt").read_text().splitlines() for rank in (0, 1))
+    assert first[0] == second[0]
+    assert first[0].startswith("ParameterError: `batch` (1) must be at least the number of processes (2)")
+    assert first[1] == second[1]
+    assert first[1].startswith("ParameterError: `device` (cuda:0) must be `cuda`: each of 2 processes takes a GPU")
+    assert first[2] == second[2]
+    assert first[2].startswith("DivergenceError: The loss of step 0 (samples 0 to 2) is not finite.")
+    assert second[3].startswith("ParameterError: Process 1 must be given the recipe and PSF that process 0 was given.")
+    assert first[3].startswith("ProcessError: Process 0 of 2 lost the others: ")
+    assert first[3].endswith("The same command given again goes on from the last saved state.")
+    assert len(first) == len(second) == 4
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 7])
+def test_shares_are_the_batch(monkeypatch, count):
+    monkeypatch.setattr(distributed, "world", lambda: count)
+    parts = []
+    for rank in range(count):
+        monkeypatch.setattr(distributed, "rank", lambda rank=rank: rank)
+        parts.append(distributed.share(range(100, 107)))
+    assert [number for part in parts for number in part] == list(range(100, 107))
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1

@@ -1,0 +1,212 @@
+"""Work ahead in a thread, the newest frame of a source, and the memory of both."""
+
+import threading
+import weakref
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mwdn import Calibration, Reconstructor
+from mwdn.runtime.streams import ahead, latest
+from mwdn.solvers import Wiener
+
+WAIT = 30  # seconds, where something that should happen at once does not
+
+# --- Ahead --------------------------------------------------------------------------------------------
+
+
+def test_results_come_in_order_from_another_thread():
+    with ahead(lambda n: (n * n, threading.get_ident()), range(20)) as results:
+        squares, threads = zip(*results, strict=True)
+    assert squares == tuple(n * n for n in range(20))
+    assert len(set(threads)) == 1
+    assert threads[0] != threading.get_ident()
+
+
+@pytest.mark.parametrize("depth", [1, 3])
+def test_no_more_than_a_few_are_ahead(depth):
+    taken = []
+    with ahead(lambda n: n, (taken.append(n) or n for n in range(20)), depth=depth) as results:
+        for number, result in enumerate(results):
+            assert result == number
+            assert len(taken) == min(number + depth + 1, 20)
+
+
+def test_stages_overlap():
+    """The second item is worked on while the first result is in use: else neither would go on."""
+    begun, used = threading.Event(), threading.Event()
+
+    def work(n):
+        if n == 1:
+            begun.set()
+            assert used.wait(WAIT)
+        return n
+
+    with ahead(work, range(3)) as results:
+        assert next(results) == 0
+        assert begun.wait(WAIT)
+        used.set()
+        assert list(results) == [1, 2]
+
+
+def test_error_is_raised_where_its_result_is_taken():
+    with ahead(lambda n: 6 // (3 - n), range(6)) as results:
+        assert [next(results) for _ in range(3)] == [2, 3, 6]
+        with pytest.raises(ZeroDivisionError):
+            next(results)
+
+
+def test_thread_ends_with_the_block():
+    """After the item it is at, whatever has ended the block."""
+    before, done = threading.active_count(), []
+
+    def interrupted():
+        with ahead(done.append, range(100)) as results:
+            next(results)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert threading.active_count() == before
+    assert len(done) <= 3
+
+
+# --- Latest -------------------------------------------------------------------------------------------
+
+
+class Source:
+    """Frames 0, 1 ... of a camera that waits to be told how many it may have taken."""
+
+    def __init__(self, count):
+        self.count, self.allowed, self.taken = count, threading.Semaphore(0), 0
+
+    def take(self, count):
+        """Let it take some, and wait until it asks for one more."""
+        goal = self.taken + count
+        for _ in range(count):
+            self.allowed.release()
+        with self.asked:
+            assert self.asked.wait_for(lambda: self.waiting == goal, WAIT)
+
+    asked, waiting = threading.Condition(), -1
+
+    def __iter__(self):
+        for number in range(self.count):
+            with self.asked:
+                self.waiting = number
+                self.asked.notify()
+            assert self.allowed.acquire(timeout=WAIT)
+            self.taken += 1
+            yield number
+        with self.asked:
+            self.waiting = self.count
+            self.asked.notify()
+
+
+def test_newest_frame_wins():
+    source = Source(10)
+    with closing(latest(source)) as frames:
+        source.allowed.release()
+        assert next(frames) == 0
+        source.take(4)  # frames 1 to 4, and the consumer was busy
+        assert next(frames) == 4
+        source.take(5)
+        assert list(frames) == [9]  # the last one is given, although the source has ended
+
+
+def test_frames_of_a_slow_source_all_come():
+    source = Source(5)
+    with closing(latest(source)) as frames:
+        for number in range(5):
+            source.allowed.release()
+            assert next(frames) == number
+        assert list(frames) == []
+
+
+def test_source_without_frames():
+    assert list(latest([])) == []
+
+
+def test_error_of_the_source_comes_after_its_last_frame():
+    def broken():
+        yield 1
+        raise OSError("unplugged")
+
+    frames = latest(broken())
+    assert next(frames) == 1
+    with pytest.raises(OSError, match="unplugged"):
+        next(frames)
+
+
+def test_source_stops_when_nobody_looks():
+    ended = threading.Event()
+
+    def endless():
+        try:
+            while True:
+                yield 0
+        finally:
+            ended.set()
+
+    with closing(latest(endless())) as frames:
+        assert next(frames) == 0
+    assert ended.wait(WAIT)
+    assert not any(thread.name.endswith("(run)") for thread in threading.enumerate())
+
+
+# --- Memory -------------------------------------------------------------------------------------------
+
+
+def resident():
+    """Bytes of memory in use by this process."""
+    path = Path("/proc/self/statm")
+    if not path.exists():
+        pytest.skip("Only Linux tells the memory of a process in /proc.")
+    return 4096 * int(path.read_text().split()[1])
+
+
+def test_frames_are_not_kept():
+    alive = weakref.WeakSet()
+
+    class Frame:
+        pass
+
+    def camera():
+        for _ in range(1000):
+            frame = Frame()
+            alive.add(frame)
+            yield frame
+            del frame
+
+    most = 0
+    for frame in latest(camera()):
+        most = max(most, len(alive))
+        del frame
+    assert 0 < most <= 3  # one in use, one that waits, one that is being taken
+    assert len(alive) == 0
+
+
+@pytest.fixture
+def one_thread():
+    """Such small frames have no work for two."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("unchecked", "one_thread")
+def test_memory_is_steady_over_ten_thousand_frames(generator):
+    calibration = Calibration(torch.rand(1, 3, 32, 32, generator=generator) / 1024)
+    frame = np.random.default_rng(0).integers(0, 256, (32, 32, 3), np.uint8)
+    reconstruct = Reconstructor(Wiener(regularisation=1e-3), calibration, device="cpu")
+    used = []
+    for number, _ in enumerate(reconstruct.stream(frame.copy() for _ in range(10_000))):
+        if number % 1000 == 999:
+            used.append(resident())
+    assert len(used) == 10
+    # A picture of each frame kept would be 10,000 x 12 kB = 120 MB.
+    assert max(used[2:]) - used[1] < 4e6

@@ -1,0 +1,110 @@
+"""What one of two processes does; `test_distributed.py` starts them by torchrun and judges the files they leave."""
+
+import json
+import os
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from safetensors.torch import save_file
+from torch import nn
+
+from mwdn.calibration import Calibration
+from mwdn.data.simulated import SimulatedPairs
+from mwdn.errors import MwdnError
+from mwdn.runtime import distributed
+from mwdn.training.batch_norm import synchronise
+from mwdn.training.experiment import prepare
+from mwdn.training.recipe import read_recipe
+
+
+def batch_norm():
+    """Features (5, 3, 4, 6) with means of 0, 10 and 1000, normalised as parts of 2 and 3."""
+    for dtype in (torch.float64, torch.float32):
+        whole = nn.BatchNorm2d(3).to(dtype)
+        layer = nn.Sequential(nn.BatchNorm2d(3)).to(dtype)
+        drawn = torch.Generator().manual_seed(0)
+        x = torch.randn(5, 3, 4, 6, generator=drawn, dtype=torch.float64)
+        x = (x + torch.tensor([0.0, 10.0, 1000.0])[:, None, None]).to(dtype)
+        gradient = torch.randn(5, 3, 4, 6, generator=drawn, dtype=torch.float64).to(dtype)
+        weights = torch.randn(2, 3, generator=drawn, dtype=torch.float64).to(dtype)
+        for one in (whole, layer[0]):
+            one.load_state_dict(one.state_dict() | {"weight": weights[0], "bias": weights[1]})
+        synchronise(layer, torch.device("cpu"))
+        found = {}
+        for name, one, mine in (("one", whole, range(5)), ("two", layer, distributed.share(range(5)))):
+            mine = slice(mine.start, mine.stop)
+            part = x[mine].clone().requires_grad_()
+            for _ in range(2):
+                y = one(part)
+            y.backward(gradient[mine])
+            outputs, inputs = torch.zeros(2, *x.shape, dtype=dtype)
+            outputs[mine], inputs[mine] = y.detach(), part.grad
+            if name == "two":
+                distributed.add_gradients(layer)
+                outputs, inputs = distributed.total(outputs), distributed.total(inputs)
+            norm = layer[0] if name == "two" else whole
+            parts = {"y": outputs, "x.grad": inputs, "w.grad": norm.weight.grad, "b.grad": norm.bias.grad}
+            parts |= {"mean": norm.running_mean, "var": norm.running_var, "count": norm.num_batches_tracked}
+            parts |= {"eval": norm.eval()(x).detach()}
+            found |= {f"{name}.{key}": value for key, value in parts.items()}
+        save_file(found, f"{dtype}-{distributed.rank()}.safetensors".removeprefix("torch."))
+
+
+class Lame(SimulatedPairs):
+    """Scenes of the second process are not finite."""
+
+    def batch(self, numbers):
+        pair = super().batch(numbers)
+        return pair._replace(scene=pair.scene / (1 - distributed.rank()))
+
+
+@contextmanager
+def double_precision():
+    """Everything in float64, also what asks for float32 by name."""
+    single = torch.Tensor.float
+    torch.Tensor.float = torch.Tensor.double
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(torch.float32)
+    torch.Tensor.float = single
+
+
+def main():
+    calibration = Calibration.from_file("psf.npy", background=0.0)
+    precise, recipe = Calibration(calibration.psf.double()), read_recipe("r.toml")
+    number = os.environ["RANK"]
+
+    def start(folder, recipe=recipe, calibration=calibration):
+        return prepare(recipe, calibration, Path("photos"), Path(folder), "cpu")
+
+    def attempt(action):
+        with Path(f"said-{number}.txt").open("a") as file:
+            try:
+                action()
+            except MwdnError as error:
+                file.write(f"{type(error).__name__}: {error}\n")
+
+    with double_precision():  # before the two meet, each is one
+        start(f"double/one-{number}", read_recipe("cpsf.toml"), precise).run()
+    with distributed.processes():
+        batch_norm()
+        with double_precision():
+            run = start("double/two", read_recipe("cpsf.toml"), precise)
+            run.run()
+        Path(f"course-{number}.json").write_text(json.dumps(run.course.state()))
+        start("mixed").run()  # begun by one process
+        attempt(lambda: start("small", replace(recipe, schedule=replace(recipe.schedule, batch=1))))
+        attempt(lambda: distributed.device_here("cuda:0"))
+        lame = start("lame")
+        lame.pairs = Lame(**vars(lame.pairs))
+        attempt(lame.run)
+        # The second is given another recipe and ends; the first finds itself alone.
+        odd = replace(recipe, schedule=replace(recipe.schedule, seed=int(number)))
+        attempt(lambda: start("odd", odd).run())
+        os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

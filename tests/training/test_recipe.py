@@ -1,0 +1,188 @@
+"""Recipes: what they hold, and what is said about mistakes in them."""
+
+import json
+import re
+
+import pytest
+
+from conftest import ROOT
+from mwdn.data.cameras import Cameras
+from mwdn.data.mismatch import Mismatch
+from mwdn.data.simulated import Placement
+from mwdn.errors import ParameterError, UnknownNameError
+from mwdn.networks import build
+from mwdn.optics import Sensor
+from mwdn.training.recipe import Recipe, Schedule, read_recipe
+
+DENOISER = '[network]\nname = "drunet"\n'
+NETWORK = '[network]\nname = "wiener-bank"\nwidth = 4\n'
+
+
+@pytest.fixture
+def read(tmp_path):
+    def call(text, **schedule):
+        (tmp_path / "r.toml").write_text(text, encoding="utf-8")
+        return read_recipe(tmp_path / "r.toml", **schedule)
+
+    return call
+
+
+OTHERS = ("camera-", "benchmark-")
+TRAININGS = [path for path in sorted((ROOT / "recipes").glob("*.toml")) if not path.stem.startswith(OTHERS)]
+
+
+@pytest.mark.parametrize("path", TRAININGS, ids=lambda path: path.stem)
+def test_each_recipe_of_the_repository(path):
+    recipe = read_recipe(path)
+    assert build(**recipe.network)
+    assert json.loads(json.dumps(recipe.as_dict()))["network"]["name"] == recipe.network["name"]
+
+
+def test_network_alone_takes_defaults(read):
+    assert read(NETWORK) == Recipe({"name": "wiener-bank", "width": 4})
+
+
+def test_values_and_their_kinds(read):
+    recipe = read(NETWORK + "[placement]\nextent = [0.2, 1]\nturn_degrees = 3\n[mismatch]\nshift_px = 0\n")
+    assert recipe.placement == Placement(extent=(0.2, 1.0), turn_degrees=3.0)
+    assert type(recipe.placement.turn_degrees) is float
+    assert recipe.mismatch == Mismatch(shift_px=0.0)
+    many = read('[network]\nname = "wiener-bank"\nwidth = 2\nregularisations = [1e-2, 1e-4]\n')
+    assert build(**many.network).regularisations == (1e-2, 1e-4)
+
+
+def test_overrides(read):
+    text = NETWORK + "[schedule]\nsteps = 10\nbatch = 3\n"
+    assert read(text, steps=7, batch=None, seed=5).schedule == Schedule(steps=7, batch=3, seed=5)
+    assert read(NETWORK, steps=7).schedule == Schedule(steps=7)
+    with pytest.raises(ParameterError, match=r"`steps` \(0\) must be positive"):
+        read(text, steps=0)
+    other = read(text, network={"width": 6}, mismatch={"blur_px": 1}, schedule={"crop": 8}, pool=5, loss={"l1": 2})
+    assert (other.network["width"], other.mismatch, other.loss) == (6, Mismatch(blur_px=1.0), {"l1": 2.0})
+    assert other.schedule == Schedule(steps=10, batch=3, crop=8, pool=5)
+    with pytest.raises(UnknownNameError, match=r"No table of a recipe named 'mismatc'. Did you mean 'mismatch'"):
+        read(text, mismatc={"blur_px": 1})
+    with pytest.raises(UnknownNameError, match=r"No key of \[mismatch\] named 'blur'. Did you mean 'blur_px'"):
+        read(text, mismatch={"blur": 1})
+
+
+def test_without_a_file_all_is_default():
+    assert read_recipe(None, seed=3, sensor={"full_well": 2000}) == Recipe(
+        schedule=Schedule(seed=3), sensor=Sensor(full_well=2000.0)
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (NETWORK + "[shedule]\nsteps = 3\n", "No table of a recipe named 'shedule'. Did you mean 'schedule'?"),
+        (NETWORK + "[schedule]\nstep = 3\n", "No key of [schedule] named 'step'. Did you mean 'steps'?"),
+        (NETWORK + "[mismatch]\nblur = 1\n", "No key of [mismatch] named 'blur'. Did you mean 'blur_px'?"),
+        ('[network]\nname = "mwdm"\n', "No network named 'mwdm'. Did you mean 'mwdn'?"),
+        (NETWORK + "widht = 3\n", "No option of the network 'wiener-bank' named 'widht'. Did you mean 'width'?"),
+        (NETWORK + "[loss]\nmsee = 1\n", "No loss named 'msee'. Did you mean 'mse'?"),
+        (NETWORK + "[later_loss]\nmsee = 1\n", "No loss named 'msee'. Did you mean 'mse'?"),
+        (NETWORK + '[schedule]\ncourse = "plato"\n', "No course named 'plato'. Did you mean 'plateau'?"),
+        (NETWORK + '[schedule]\noptimiser = "adamv"\n', "No optimiser named 'adamv'. Did you mean 'adam'?"),
+        (NETWORK + "[pairs]\nsplitt = 3\n", "No key of [pairs] named 'splitt'. Did you mean 'split'?"),
+    ],
+)
+def test_mistyped_names_get_the_nearest(read, text, said):
+    with pytest.raises(UnknownNameError, match=re.escape(said)):
+        read(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "must name a network"),
+        ("network = 3", "`network` of `"),
+        ("[network]\nname = 3", "must name a network"),
+        ("[network", "cannot be read as a recipe"),
+        (NETWORK + "[schedule]\nsteps = -1", "`steps` (-1) must be positive."),
+        (NETWORK + "[schedule]\nsteps = 1.5", "`steps` of [schedule] (1.5) must be of the same kind"),
+        (NETWORK + '[schedule]\nbatch = "4"', "`batch` of [schedule] ('4') must be of the same kind"),
+        (NETWORK + "[schedule]\nbfloat16 = 1", "`bfloat16` of [schedule] (1) must be of the same kind"),
+        (NETWORK + "[schedule]\nema = 1", "`ema` (1.0) must be in [0, 1)."),
+        (NETWORK + "[schedule]\nlearning_rate = nan", "`learning_rate` (nan) must be positive."),
+        (NETWORK + "[schedule]\nlearning_rate = inf", "`learning_rate` (inf) must be finite."),
+        (NETWORK + "[schedule]\ncrop = 8", "`crop` (8) is of kept samples: set `pool`, or leave it out."),
+        (NETWORK + f"[schedule]\nseed = {2**63 - 1}0", "must have 63 bits at most."),
+        ('[network]\nname = "mwdn"\nwidth = 0', "has layers without channels"),
+        (NETWORK + "[schedule]\nwarmup = -1", "`warmup` (-1) must not be negative."),
+        (NETWORK + "[schedule]\nepochs = -1", "`epochs` (-1) must not be negative."),
+        (NETWORK + "[plateau]\nfactor = 1", "`factor` (1.0) must be in (0, 1)"),
+        (NETWORK + "[plateau]\npatience = -1", "`patience` (-1) must not be negative"),
+        (NETWORK + "[plateau]\npatience = 3", "[plateau] belongs to another course than 'cosine'. Leave it out"),
+        (NETWORK + "[later_loss]\nmse = 1", "[later_loss] belongs to another course than 'cosine'"),
+        (
+            NETWORK + '[schedule]\ncourse = "plateau"\n[later_loss]\nl1 = 1',
+            "[later_loss] (l1) must have the parts of [loss] (mse). Give a part that shall not count the weight 0.",
+        ),
+        (NETWORK + "[sheet]\ncaptures = [3]", "`captures` of [sheet] ([3]) must be of the same kind"),
+        (NETWORK + '[sheet]\ncaptures = "a.png"', "`captures` of [sheet] ('a.png') must be of the same kind"),
+        (NETWORK + "[pairs]\nfractions = [1, 0]", "`fractions` of [pairs] ([1, 0]) must be of the same kind"),
+        (NETWORK + "[placement]\nextent = 0.3", "`extent` of [placement] (0.3) must be of the same"),
+        (NETWORK + "[placement]\nextent = [0.7, 0.3]", "`extent` (0.7, 0.3) must be a range"),
+        (NETWORK + "[placement]\nextent = [0, 0.3]", "`extent` (0.0, 0.3) must be positive"),
+        (NETWORK + "[placement]\naspect = 0.5", "`aspect` (0.5) must be at least 1"),
+        (NETWORK + "[placement]\noffset = 1.5", "`offset` (1.5) must be in [0, 1]"),
+        (NETWORK + "[mismatch]\nshift_px = -1", "`shift_px` (-1.0) must not be negative"),
+        (NETWORK + "[mismatch]\nbackground = 1", "`background` (1.0) must be below 1"),
+        (NETWORK + "[sensor]\nbit_depth = 99", "`bit_depth` (99) must be 1 to 16."),
+        (NETWORK + "[loss]\nmse = -1", "The weight of `mse` (-1) must be finite and not negative"),
+        (NETWORK + '[loss]\nmse = "much"', "The weight of `mse` ('much') must be finite and not negative"),
+        ('[network]\nname = "mwdn"\nwidth = "wide"', "cannot be built"),
+        (DENOISER, "[denoising] and a network of drunet go together"),
+        (NETWORK + "[denoising]\nlevels = [0.01, 0.1]", "[denoising] and a network of drunet go together"),
+        (DENOISER + "[denoising]\nlevels = [0.1, 0.01]", "`levels` of [denoising] (0.1, 0.01) must rise from above 0"),
+        (DENOISER + '[denoising]\nlevels = [0.01, 0.1]\n[cameras]\nsizes = ["32x32"]', "[denoising] has no camera"),
+        (DENOISER + '[denoising]\nlevels = [0.01, 0.1]\n[sheet]\ncaptures = ["a.png"]', "[denoising] has no camera"),
+    ],
+)  # fmt: skip
+def test_bad_values(read, text, said):
+    with pytest.raises(ParameterError, match=re.escape(said)):
+        read(text)
+
+
+def test_captures_are_beside_the_recipe(read, tmp_path):
+    recipe = read(NETWORK + f'[sheet]\ncaptures = ["a.png", "../b", "{tmp_path}/c"]')
+    assert recipe.sheet.captures == (f"{tmp_path}/a.png", f"{tmp_path}/../b", f"{tmp_path}/c")
+    assert read(NETWORK + "[sheet]\ncaptures = []").sheet.captures == ()
+
+
+def test_steps_replace_epochs(read):
+    text = NETWORK + "[schedule]\nepochs = 3\n"
+    assert read(text).schedule.epochs == 3
+    assert read(text, batch=2).schedule.epochs == 3
+    assert (read(text, steps=5).schedule.epochs, read(text, steps=5).schedule.steps) == (0, 5)
+
+
+def test_recipe_of_the_paper():
+    """Training in section 4 of the paper and in its public code; its camera in section 4."""
+    recipe = read_recipe(ROOT / "recipes" / "paper.toml")
+    schedule, plateau = recipe.schedule, recipe.plateau
+    assert sum(p.numel() for p in build(**recipe.network).parameters()) == 17_267_531
+    assert (schedule.optimiser, schedule.learning_rate, schedule.weight_decay) == ("adam", 1e-4, 1e-4)
+    assert (schedule.course, schedule.batch, schedule.epochs, schedule.validation) == ("plateau", 16, 300, 2500)
+    assert (schedule.clip, schedule.ema, schedule.bfloat16) == (0, 0, False)
+    assert (plateau.factor, plateau.patience, plateau.later, plateau.stop) == (0.1, 5, 1e-6, 2e-8)
+    assert recipe.loss == {"mse": 1, "feature_mse": 1}
+    assert recipe.later_loss == {"mse": 1, "feature_mse": 0.05}
+    assert recipe.pairs.split == "paper"
+    # A scene of 137 x 137, padded by 94 at the top and 89 on the left to 320 x 320.
+    extent, room = 137 / 320, 1 - 137 / 320
+    assert recipe.placement.extent == pytest.approx((extent, extent), abs=1e-3)
+    assert recipe.placement.offset * room * 160 == pytest.approx(94 - (320 - 137) / 2, abs=0.3)
+
+
+def test_no_such_file(tmp_path):
+    with pytest.raises(ParameterError, match=r"`.*none\.toml` cannot be read as a recipe"):
+        read_recipe(tmp_path / "none.toml")
+
+
+def test_kept_samples_of_several_sizes_need_a_crop():
+    several = Cameras(("32x32", "48x32"))
+    with pytest.raises(ParameterError, match="Set `crop`"):
+        Recipe(schedule=Schedule(pool=4), cameras=several)
+    assert Recipe(schedule=Schedule(pool=4, crop=32), cameras=several).cameras == several

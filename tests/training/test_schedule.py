@@ -1,0 +1,134 @@
+"""When to learn how fast: our course by its formula, the paper's against torch's own scheduler."""
+
+import itertools
+import json
+import math
+import random
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import nn
+
+from mwdn.networks import build
+from mwdn.training.recipe import Plateau, Recipe, Schedule
+from mwdn.training.schedule import Cosine, Descent, begin, learning_rate, optimiser
+
+FIRST, LATER = {"mse": 1.0, "feature_mse": 1.0}, {"mse": 1.0, "feature_mse": 0.05}
+PAPER = Recipe({"name": "mwdn"}, Schedule(course="plateau", learning_rate=1e-4), FIRST, later_loss=LATER)
+
+
+# --- Ours ---------------------------------------------------------------------------------------------
+
+
+def test_learning_rate_rises_then_falls_as_half_a_cosine():
+    schedule = Schedule(steps=110, warmup=10, learning_rate=2.0)
+    rates = [learning_rate(step, schedule) for step in range(111)]
+    assert rates[:10] == pytest.approx([0.2 * (step + 1) for step in range(10)])
+    assert rates[10] == pytest.approx(2.0)
+    assert rates[35] == pytest.approx(2.0 * (0.01 + 0.99 * (1 + 0.5**0.5) / 2))  # an eighth of a period
+    assert rates[60] == pytest.approx(2.0 * (0.01 + 0.99 / 2))
+    assert rates[110] == pytest.approx(0.02)
+    assert all(a > b for a, b in itertools.pairwise(rates[10:]))
+    assert learning_rate(0, Schedule(warmup=0, learning_rate=2.0)) == 2.0
+
+
+def test_cosine_does_not_look_at_the_validation():
+    course = begin(replace(PAPER, schedule=Schedule(), later_loss={}))
+    assert isinstance(course, Cosine)
+    assert course.after(1.0) == course
+    assert (course.finished, course.weights, course.state()) == (False, FIRST, {})
+    assert course.rate(7) == learning_rate(7, Schedule())
+
+
+# --- The paper's --------------------------------------------------------------------------------------
+
+
+def losses(seed):
+    """Falls, stays, jitters about torch's threshold of 1e-4, is sometimes NaN."""
+    drawn = random.Random(seed)
+    loss = 1.0
+    while True:
+        loss *= drawn.choice([1, 1, 1, 1 - 0.5e-4, 1 - 1.5e-4, 0.9, 1.2])
+        yield math.nan if drawn.random() < 0.05 else loss
+
+
+@pytest.mark.parametrize("plateau", [Plateau(), Plateau(factor=0.5, patience=2), Plateau(patience=0)])
+@pytest.mark.parametrize("seed", range(5))
+def test_learning_rate_falls_when_torchs_does(seed, plateau):
+    parameter = nn.Parameter(torch.zeros(1))
+    optim = torch.optim.Adam([parameter], lr=1e-4)
+    oracle = torch.optim.lr_scheduler.ReduceLROnPlateau(optim, factor=plateau.factor, patience=plateau.patience)
+    course, rates = begin(replace(PAPER, plateau=plateau)), []
+    for loss in losses(seed):
+        course = course.after(loss)
+        oracle.step(loss)
+        rates.append(course.rate(len(rates)))
+        assert rates[-1] == optim.param_groups[0]["lr"]
+        assert course.weights == (FIRST if rates[-1] > 1.0001e-6 else LATER)
+        assert course.finished == (rates[-1] < 2e-8)
+        if course.finished:
+            break
+    assert len(set(rates)) > 4
+
+
+def test_phases_of_the_paper():
+    """A loss that never falls: the first validation is the lowest, then each sixth lowers the rate."""
+    course, phases = begin(PAPER), []
+    for validation in range(1, 40):
+        course = course.after(1.0)
+        phases.append((validation, round(math.log10(course.rate(0))), course.weights["feature_mse"]))
+        if course.finished:
+            break
+    changes = [after for before, after in itertools.pairwise(phases) if before[1:] != after[1:]]
+    assert phases[0] == (1, -4, 1.0)
+    assert changes == [(7, -5, 1.0), (13, -6, 0.05), (19, -7, 0.05), (25, -8, 0.05)]
+    assert phases[-1][0] == 25
+
+
+def test_one_weighting_throughout():
+    course = replace(begin(replace(PAPER, later_loss={})), current=1e-7)
+    assert course.weights == FIRST
+
+
+def test_the_watched_rate_is_at_the_limit():
+    """Rounding must not decide: 1e-4 x 0.1 x 0.1 is a little more than 1e-6."""
+    assert 1e-4 * 0.1 * 0.1 > 1e-6
+    assert Descent(PAPER, 1e-4 * 0.1 * 0.1).weights == LATER
+    assert not Descent(PAPER, 2e-8 * (1 - 1e-15)).finished
+
+
+def test_state_goes_through_json_to_the_last_bit():
+    course = begin(PAPER)
+    assert begin(PAPER, **json.loads(json.dumps(course.state()))) == course
+    stream = losses(7)
+    for _ in range(20):
+        course = course.after(next(stream))
+    assert course.bad or course.current < 1e-4
+    assert begin(PAPER, **json.loads(json.dumps(course.state()))) == course
+
+
+# --- Optimiser ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "physical"), [("mwdn", 8), ("mwdn-cpsf", 4), ("wiener-unet", 2), ("unet", 0)])
+def test_adam_decays_all_but_w_and_lambda(name, physical):
+    """With gradients of 0 Adam moves what is decayed, by its learning rate, towards 0; and nothing else."""
+    network = build(name, width=4)
+    before = {key: value.detach().clone() for key, value in network.named_parameters()}
+    optim = optimiser(network, Schedule(optimiser="adam", learning_rate=1e-6, weight_decay=1e-2))
+    assert type(optim) is torch.optim.Adam
+    for parameter in network.parameters():
+        parameter.grad = torch.zeros_like(parameter)
+    optim.step()
+    still = [key for key, value in network.named_parameters() if torch.equal(value, before[key]) and value.any()]
+    assert len(still) == physical
+    assert all(key.endswith(("log_weight", "log_regularisation")) for key in still)
+
+
+def test_adamw_decays_convolutions_alone():
+    network = build("mwdn", width=4)
+    optim = optimiser(network, Schedule(weight_decay=0.3))
+    assert type(optim) is torch.optim.AdamW
+    decay = {id(p): group["weight_decay"] for group in optim.param_groups for p in group["params"]}
+    assert all(decay[id(p)] == (0.3 if p.ndim == 4 else 0) for p in network.parameters())

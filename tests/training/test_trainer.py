@@ -1,0 +1,657 @@
+"""The training loop: it learns, and a run that is stopped anywhere ends as one that was not."""
+
+import errno
+import json
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from mwdn.calibration import Calibration
+from mwdn.data.cameras import Cameras
+from mwdn.data.noisy import Denoising
+from mwdn.data.pairs import PairFile
+from mwdn.data.photographs import Photographs
+from mwdn.data.simulated import SimulatedPairs
+from mwdn.errors import CheckpointError, DivergenceError, ParameterError, ShapeError
+from mwdn.inference.reconstructor import find_method
+from mwdn.optics.patterns import contour_psf
+from mwdn.training.experiment import prepare, simulate
+from mwdn.training.recipe import Plateau, Recipe, Schedule, Sheet
+from mwdn.training.run_folder import RunFolder
+from mwdn.training.schedule import learning_rate
+from mwdn.training.trainer import Trainer
+from mwdn.training.training_state import read_state
+from mwdn.training.validation import Validation
+from mwdn.weights.checkpoint import load_network, read_metadata
+
+RECIPE = Recipe(
+    {"name": "wiener-bank", "width": 4, "regularisations": (1e-2, 1e-4)},
+    Schedule(steps=6, batch=2, learning_rate=2e-3, warmup=2, ema=0.9, validate_every=3, validation=3),
+)
+DRUNET = {"name": "drunet"}  # of the size that wiener-bank has
+
+
+def few(**schedule):
+    return replace(RECIPE, schedule=replace(RECIPE.schedule, **schedule))
+
+
+@pytest.fixture
+def photos(tmp_path):
+    """A few smooth pictures in a folder."""
+    (tmp_path / "photos").mkdir()
+    drawn = np.random.default_rng(2)
+    for number in range(3):
+        smooth = cv2.resize(drawn.integers(0, 256, (4, 4, 3), np.uint8), (24, 24), interpolation=cv2.INTER_CUBIC)
+        cv2.imwrite(str(tmp_path / "photos" / f"{number}.png"), smooth)
+    return tmp_path / "photos"
+
+
+@pytest.fixture
+def calibration(generator):
+    return Calibration(contour_psf((32, 32), cell=10, generator=generator).expand(1, 3, -1, -1).contiguous())
+
+
+@pytest.fixture
+def trainer(photos, calibration, tmp_path):
+    """``trainer(recipe, folder)``"""
+
+    def make(recipe=RECIPE, folder="run"):
+        return prepare(recipe, calibration, photos, tmp_path / folder, "cpu")
+
+    return make
+
+
+def same(one, other):
+    one, other = load_file(one), load_file(other)
+    assert one.keys() == other.keys()
+    return all(torch.equal(value, other[key]) for key, value in one.items())
+
+
+def log(folder):
+    return [json.loads(line) for line in (folder / "log.jsonl").read_text(encoding="utf-8").splitlines()]
+
+
+# --- Learning -----------------------------------------------------------------------------------------
+
+
+class FourPairs(SimulatedPairs):
+    """Always the first four."""
+
+    def batch(self, numbers):
+        return super().batch(range(4)[: len(numbers)])
+
+
+def test_overfits_four_pairs(photos, calibration, tmp_path):
+    recipe = few(steps=40, batch=4, warmup=5, learning_rate=5e-3, validate_every=40, validation=4, bfloat16=False)
+    recipe = replace(recipe, network={**RECIPE.network, "finest": 0})  # may change all, the mean light too
+    pairs = FourPairs(Photographs(photos, side=24), calibration.psf)
+    losses = []
+    best = Trainer(recipe, calibration, pairs, tmp_path / "run").run(lambda report: losses.append(report.loss))
+    assert sum(losses[-5:]) < 0.3 * sum(losses[:5])
+    scenes = pairs.batch(range(4)).scene
+    assert best > -10 * torch.log10(scenes.square().mean())  # better than black
+
+
+def test_checkpointing_is_the_same_run(trainer, tmp_path):
+    """It may begin without and go on with it, where memory turns out too short."""
+    trainer(few(bfloat16=False), "kept").run()
+    first = trainer(few(bfloat16=False), "changed")
+    for _ in range(3):
+        first.advance()
+    first.save(first.validate())
+    second = trainer(few(bfloat16=False, checkpointing=True), "changed")
+    assert second.step == 3
+    second.run()
+    assert second.network.encoder.recompute
+    kept, changed = (load_file(tmp_path / name / "last.safetensors") for name in ("kept", "changed"))
+    for key, value in kept.items():
+        torch.testing.assert_close(changed[key], value, rtol=1e-3, atol=1e-5)
+
+
+def test_each_step_has_its_learning_rate(trainer):
+    run = trainer()
+    for step in range(4):
+        run.advance()
+        assert {group["lr"] for group in run.optimiser.param_groups} == {learning_rate(step, run.schedule)}
+
+
+def test_running_mean_of_the_weights(trainer):
+    """Decay min(ema, n / (n + 10)) after step n, from the initial weights on; counters are copied."""
+    run = trainer(few(ema=0.15))
+    mean = {key: value.clone() for key, value in run.network.state_dict().items()}
+    for step in range(1, 4):
+        run.advance()
+        decay = min(0.15, step / (step + 10))
+        for key, value in run.network.state_dict().items():
+            mean[key] = decay * mean[key] + (1 - decay) * value if value.is_floating_point() else value.clone()
+    for key, value in run.average.state_dict().items():
+        torch.testing.assert_close(value, mean[key], rtol=1e-5, atol=1e-7)
+
+
+def test_without_ema_the_last_weights_count(trainer):
+    run = trainer(few(ema=0.0))
+    run.advance()
+    for mean, value in zip(run.average.state_dict().values(), run.network.state_dict().values(), strict=True):
+        assert torch.equal(mean, value)
+
+
+# --- What is written ----------------------------------------------------------------------------------
+
+
+def test_files_of_a_run(trainer, calibration, tmp_path):
+    reports = []
+    best = trainer().run(reports.append)
+    out = tmp_path / "run"
+    assert sorted(path.name for path in out.iterdir()) == [
+        *("best.safetensors", "last.safetensors", "log.jsonl", "recipe.json", "state.safetensors", "validation.png")
+    ]
+    lines = log(out)
+    assert [line["step"] for line in lines] == [1, 2, 3, 4, 5, 6]
+    assert [line["step"] for line in lines if line["psnr"] is not None] == [3, 6]
+    assert best == max(line["psnr"] for line in lines if line["psnr"] is not None)
+    assert [line["learning_rate"] for line in lines] == [learning_rate(step, RECIPE.schedule) for step in range(6)]
+    assert [report.loss for report in reports] == [line["loss"] for line in lines]
+    header = read_metadata(out / "best.safetensors")
+    assert (header["name"], header["psf_hash"], header["psnr"]) == ("wiener-bank", calibration.psf_hash, best)
+    assert header["recipe"]["schedule"]["steps"] == 6
+    assert read_metadata(out / "last.safetensors")["step"] == 6
+    assert load_network(out / "best.safetensors")(torch.rand(1, 3, 32, 32), calibration.psf).shape == (1, 3, 32, 32)
+
+
+def test_network_with_an_unused_number_is_resumed(trainer, tmp_path):
+    """The authors' fifth lambda, which never has a gradient."""
+    network = {"name": "mwdn-cpsf", "width": 2, "authors_scalars": True}
+    recipe = replace(few(steps=2, validate_every=1), network=network)
+    trainer(recipe, "whole").run()
+
+    def stop(report):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        trainer(recipe, "halves").run(stop)
+    assert trainer(recipe, "halves").step == 1
+    trainer(recipe, "halves").run()
+    assert same(tmp_path / "whole" / "state.safetensors", tmp_path / "halves" / "state.safetensors")
+
+
+@pytest.mark.parametrize("recipe", [RECIPE, few(bfloat16=False)], ids=["bfloat16", "float32"])
+def test_resumed_run_ends_bit_identical(trainer, recipe, tmp_path):
+    trainer(recipe, "whole").run()
+    first = trainer(recipe, "halves")
+    for _ in range(3):
+        first.advance()
+    first.save(first.validate())
+    second = trainer(recipe, "halves")
+    assert (second.step, second.best) == (3, first.best)
+    second.run()
+    for name in ("last", "best", "state"):
+        assert same(tmp_path / "whole" / f"{name}.safetensors", tmp_path / "halves" / f"{name}.safetensors")
+
+
+def test_log_has_one_line_a_step_after_a_resume(trainer, tmp_path):
+    """Stopped after step 5, in the middle of a line, resumed from step 3."""
+    first = trainer()
+
+    def stop(report):
+        if report.step == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        first.run(stop)
+    path = tmp_path / "run" / "log.jsonl"
+    before = log(tmp_path / "run")
+    path.write_text(path.read_text() + '{"step": 6, "lo')
+    trainer().run()
+    after = log(tmp_path / "run")
+    assert [line["step"] for line in after] == [1, 2, 3, 4, 5, 6]
+    assert after[:5] == before
+    assert trainer().run() == max(line["psnr"] for line in after if line["psnr"] is not None)  # nothing left to do
+    assert log(tmp_path / "run") == after
+
+
+def test_log_of_a_run_that_never_saved_begins_again(trainer, tmp_path):
+    run = trainer()
+    with pytest.raises(KeyboardInterrupt):
+        run.run(lambda report: (_ for _ in ()).throw(KeyboardInterrupt))
+    trainer()
+    assert log(tmp_path / "run") == []
+
+
+def test_killed_between_log_and_state_repeats_the_step(trainer, tmp_path, monkeypatch):
+    run = trainer()
+    with monkeypatch.context() as patched:
+        patched.setattr(Trainer, "save", lambda self, psnr: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            run.run()
+    trainer().run()
+    assert [line["step"] for line in log(tmp_path / "run")] == [1, 2, 3, 4, 5, 6]
+
+
+TOML = """
+network = { name = "wiener-bank", width = 4, regularisations = [1e-2, 1e-4] }
+schedule = { steps = 60, batch = 1, warmup = 2, ema = 0.9, validate_every = 7, validation = 2 }
+"""
+
+
+def test_killed_runs_end_as_one_that_was_not(photos, calibration, tmp_path):
+    """SIGKILL twice, after some number of further steps, wherever the process then is; then left alone."""
+    (tmp_path / "r.toml").write_text(TOML, encoding="utf-8")
+    np.save(tmp_path / "psf.npy", calibration.psf[0].movedim(0, -1).numpy() / calibration.psf.max().item())
+    line = [sys.executable, "-m", "mwdn", "train", "r.toml", "--psf", "psf.npy", "--photos", str(photos)]
+    options = {"cwd": tmp_path, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "env": os.environ}
+
+    def start(folder):
+        return subprocess.Popen([*line, "--device", "cpu", "--out", folder], **options)
+
+    def lines():
+        path = tmp_path / "killed" / "log.jsonl"
+        return path.read_bytes().count(b"\n") if path.exists() else 0
+
+    whole = start("whole")
+    for _ in range(2):
+        process, goal = start("killed"), lines() + random.randint(3, 20)
+        while process.poll() is None and lines() < goal:
+            with pytest.raises(subprocess.TimeoutExpired):
+                process.wait(0.02)
+        process.send_signal(signal.SIGKILL)
+        process.communicate(timeout=60)
+        assert process.returncode == -signal.SIGKILL
+    last = start("killed")
+    for process in (whole, last):
+        _, err = process.communicate(timeout=300)
+        assert process.returncode == 0, err
+    for name in ("best", "last", "state"):
+        assert same(tmp_path / "whole" / f"{name}.safetensors", tmp_path / "killed" / f"{name}.safetensors")
+    assert [line["step"] for line in log(tmp_path / "killed")] == list(range(1, 61))
+    assert log(tmp_path / "killed") == log(tmp_path / "whole")
+
+
+def test_two_runs_do_not_share_a_folder(photos, calibration, tmp_path):
+    """A process of its own is at work; here, a second one may neither begin nor touch what the first writes."""
+    (tmp_path / "r.toml").write_text(TOML, encoding="utf-8")
+    np.save(tmp_path / "psf.npy", calibration.psf[0].movedim(0, -1).numpy() / calibration.psf.max().item())
+    line = [sys.executable, "-m", "mwdn", "train", "r.toml", "--psf", "psf.npy", "--photos", str(photos), "--steps"]
+    folder, options = tmp_path / "run", {"cwd": tmp_path, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+    first = subprocess.Popen([*line, "1000000", "--device", "cpu", "--out", "run"], **options)
+    try:
+        while not (folder / "state.safetensors").exists():
+            with pytest.raises(subprocess.TimeoutExpired):
+                first.wait(0.05)
+        written = (folder / "log.jsonl").read_text(encoding="utf-8")
+        second = subprocess.run([*line, "1000000", "--device", "cpu", "--out", "run"], **options, timeout=60)
+        assert second.returncode == 2
+        assert b"Another run is at work in `run`." in second.stderr
+        assert (folder / "log.jsonl").read_text(encoding="utf-8").startswith(written)
+        first.send_signal(signal.SIGSTOP)  # it holds the folder, whatever it does
+        with pytest.raises(ParameterError, match="Another run is at work"), RunFolder(folder, {}).alone():
+            pytest.fail("came in")
+    finally:
+        first.kill()
+        first.communicate(timeout=60)
+    with RunFolder(folder, {}).alone():  # a killed one holds nothing
+        pass
+
+
+# --- The paper's schedule ------------------------------------------------------------------------------
+
+# It learns too fast to go on falling, so that each phase is reached soon.
+PAPER = Recipe(
+    {"name": "wiener"},
+    Schedule(
+        steps=400,
+        batch=2,
+        course="plateau",
+        learning_rate=1.0,
+        optimiser="adam",
+        clip=0.0,
+        ema=0.0,
+        bfloat16=False,
+        validate_every=2,
+        validation=3,
+    ),
+    {"mse": 1.0, "l1": 1.0},
+    plateau=Plateau(patience=1, later=1e-2, stop=2e-4),
+    later_loss={"mse": 1.0, "l1": 0.05},
+)
+
+
+def test_plateau_switches_phase_and_stops_when_torchs_scheduler_does(trainer, tmp_path):
+    trainer(PAPER).run()
+    optim = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
+    oracle = torch.optim.lr_scheduler.ReduceLROnPlateau(optim, factor=0.1, patience=1)
+    lines, phases = log(tmp_path / "run"), []
+    for line in lines:
+        rate = optim.param_groups[0]["lr"]
+        assert rate >= 2e-4  # else there should be no such step
+        assert line["learning_rate"] == rate
+        weight = 1.0 if rate > 1.0001e-2 else 0.05
+        assert line["loss"] == pytest.approx(line["mse"] + weight * line["l1"])
+        phases.append(weight)
+        assert (line["psnr"] is not None) == (line["validation_loss"] is not None) == (line["step"] % 2 == 0)
+        if line["validation_loss"] is not None:
+            oracle.step(line["validation_loss"])
+    assert set(phases) == {1.0, 0.05}
+    assert optim.param_groups[0]["lr"] < 2e-4  # stopped by it, not by the number of steps
+    assert len(lines) < 400
+    assert read_metadata(tmp_path / "run" / "last.safetensors")["step"] == len(lines)
+
+
+@pytest.mark.parametrize("stop", [2, 8, 15, 20])
+def test_plateau_goes_on_where_it_was(trainer, tmp_path, stop):
+    trainer(PAPER, "whole").run()
+
+    def interrupt(report):
+        if report.step == stop:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        trainer(PAPER, "halves").run(interrupt)
+    second = trainer(PAPER, "halves")
+    assert second.step == stop - stop % 2
+    second.run()
+    assert log(tmp_path / "whole") == log(tmp_path / "halves")
+    for name in ("last", "best", "state"):
+        assert same(tmp_path / "whole" / f"{name}.safetensors", tmp_path / "halves" / f"{name}.safetensors")
+    steps = second.step
+    third = trainer(PAPER, "halves")
+    assert third.course == second.course
+    assert third.course.finished
+    third.run()
+    assert third.step == steps  # it has ended, though not by the number of steps
+
+
+@pytest.mark.parametrize("clip", [0.0, 1e-3])
+def test_gradients_are_clipped_or_left(trainer, clip):
+    run = trainer(few(clip=clip))
+    run.advance()
+    norm = torch.stack([p.grad.norm() for p in run.network.parameters() if p.grad is not None]).norm()
+    assert norm > 0.01 if clip == 0 else norm == pytest.approx(1e-3, rel=1e-3)
+
+
+# --- Recorded pairs -----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def pairs(photos, calibration, tmp_path):
+    path = tmp_path / "pairs.h5"
+    simulate(RECIPE, calibration, photos, path, 23)
+    return path
+
+
+def test_epochs_of_recorded_pairs(pairs, calibration, tmp_path):
+    """23 pairs: 2 for test, 2 for validation, 19 for training, which are 5 steps of 4."""
+    run = prepare(few(epochs=2, batch=4), calibration, None, tmp_path / "run", "cpu", pairs=pairs)
+    assert (run.schedule.steps, run.schedule.validate_every, run.schedule.validation) == (10, 5, 2)
+    seen = []
+    read = PairFile.__getitem__
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(PairFile, "__getitem__", lambda self, row: (seen.append(row), read(self, row))[1])
+        run.run()
+    training = [row for row in seen if row >= 4]
+    assert sorted(training[:19]) == sorted(training[19:38]) == list(range(4, 23))
+    assert [row for row in seen if row < 4] in ([2, 3] * 2, [3, 2] * 2)
+    assert [line["step"] for line in log(tmp_path / "run") if line["psnr"] is not None] == [5, 10]
+
+
+def test_run_on_photographs_does_not_go_on_with_pairs(trainer, pairs, calibration, tmp_path):
+    trainer().run()
+    with pytest.raises(CheckpointError, match="or on other pairs"):
+        prepare(few(validation=3), calibration, None, tmp_path / "run", "cpu", pairs=pairs)
+
+
+def test_epochs_of_photographs(trainer):
+    assert trainer(few(epochs=4, batch=2)).schedule.steps == 8  # of 3, which are fewer than 20, none is held out
+
+
+def test_resumed_run_on_recorded_pairs_ends_bit_identical(pairs, calibration, tmp_path):
+    def make(folder):
+        return prepare(few(steps=14), calibration, None, tmp_path / folder, "cpu", pairs=pairs)
+
+    make("whole").run()
+
+    def interrupt(report):
+        if report.step == 10:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make("halves").run(interrupt)
+    assert make("halves").step == 9
+    make("halves").run()
+    assert same(tmp_path / "whole" / "state.safetensors", tmp_path / "halves" / "state.safetensors")
+    assert log(tmp_path / "whole") == log(tmp_path / "halves")
+
+
+def test_captures_on_the_sheet_change_nothing_else(trainer, photos, calibration, tmp_path):
+    trainer(folder="without").run()
+    np.save(tmp_path / "capture.npy", np.random.default_rng(0).random((32, 32, 3), np.float32))
+    (tmp_path / "folder").mkdir()
+    np.save(tmp_path / "folder" / "a.npy", np.full((32, 32, 3), 0.5, np.float32))
+    for name, capture in (("one", "capture.npy"), ("other", "folder")):
+        recipe, out = replace(RECIPE, sheet=Sheet((str(tmp_path / capture),))), tmp_path / name
+        prepare(recipe, calibration, photos, out, "cpu").run()
+        assert same(tmp_path / "without" / "state.safetensors", out / "state.safetensors")
+        assert read_metadata(out / "best.safetensors") == read_metadata(tmp_path / "without" / "best.safetensors")
+    sheets = [cv2.imread(str(tmp_path / name / "validation.png")) for name in ("without", "one", "other")]
+    assert sheets[1].shape == sheets[2].shape != sheets[0].shape
+    assert (sheets[1] != sheets[2]).any()
+
+
+def test_capture_that_does_not_fit_is_found_before_training(calibration, photos, tmp_path):
+    np.save(tmp_path / "small.npy", np.ones((30, 32, 3), np.float32))
+    recipe = replace(RECIPE, sheet=Sheet((str(tmp_path / "small.npy"),)))
+    with pytest.raises(ShapeError, match="same height and width"):
+        prepare(recipe, calibration, photos, tmp_path / "run", "cpu")
+
+
+# --- What is refused ----------------------------------------------------------------------------------
+
+
+def test_another_recipe_or_psf_in_the_same_folder(trainer, photos, calibration, tmp_path):
+    trainer().run()
+    before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
+    other = Calibration(calibration.psf.flip(-1))
+    for again in (
+        lambda: trainer(few(learning_rate=1e-4)),
+        lambda: prepare(RECIPE, other, photos, tmp_path / "run", "cpu"),
+    ):
+        with pytest.raises(
+            CheckpointError, match=r"holds a run of another recipe or PSF, or on other pairs\. Choose another folder"
+        ):
+            again()
+    assert before == {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
+
+
+def test_weights_of_another_run_are_not_replaced(trainer, tmp_path):
+    """Without its state too, which is large and may have been removed; where no weights are, nothing can be lost."""
+    trainer().run()
+    folder = tmp_path / "run"
+    (folder / "state.safetensors").unlink()
+    best = (folder / "best.safetensors").read_bytes()
+    with pytest.raises(CheckpointError, match="holds a run of another recipe"):
+        trainer(few(learning_rate=1e-4))
+    assert (folder / "best.safetensors").read_bytes() == best
+    assert trainer().step == 0
+    for path in folder.glob("*.safetensors"):
+        path.unlink()
+    assert trainer(few(learning_rate=1e-4)).step == 0
+
+
+def test_damaged_or_foreign_state(trainer, tmp_path):
+    trainer().run()
+    state = tmp_path / "run" / "state.safetensors"
+    whole = state.read_bytes()
+    state.write_bytes(whole[:1000])
+    with pytest.raises(CheckpointError, match=r"state\.safetensors` is damaged: .* Remove it to begin again"):
+        trainer()
+    state.write_bytes(b"")
+    with pytest.raises(CheckpointError, match=r"state\.safetensors` is damaged"):
+        trainer()
+    tensors, header = read_state(state, whole)
+    del tensors["average.decoder.head.weight"]
+    save_file(tensors, state, metadata=header)
+    with pytest.raises(CheckpointError, match=r"state\.safetensors` is damaged: a part is missing"):
+        trainer()
+    state.write_bytes((tmp_path / "run" / "last.safetensors").read_bytes())
+    with pytest.raises(CheckpointError, match="another recipe or PSF"):
+        trainer()
+
+
+def test_folder_that_cannot_be_written_is_found_before_training(trainer, tmp_path):
+    (tmp_path / "run").write_text("a file")
+    with pytest.raises(ParameterError, match=r"`.*run` must be a folder that can be written to: .*`--out`"):
+        trainer()
+    with pytest.raises(ParameterError, match="must be a folder that can be written to"):
+        trainer(folder="run/deeper")
+    assert (tmp_path / "run").read_text() == "a file"
+
+
+@pytest.mark.parametrize("refused", ["last.safetensors", "best.safetensors", "state.safetensors"])
+def test_full_disk_leaves_the_state(trainer, tmp_path, monkeypatch, refused):
+    """As soon as one of the three files of a checkpoint cannot be finished."""
+    run, folder = trainer(), tmp_path / "run"
+    for _ in range(3):
+        run.advance()
+    run.save(Validation(-100.0, 1.0))
+    before = (folder / "state.safetensors").read_bytes()
+    rename = Path.replace
+
+    def full(path, target):
+        if target.name == refused:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "replace", full)
+    with pytest.raises(ParameterError, match=r"`.*run` must be .*: No space left on device\. Make room and give the"):
+        run.run()
+    monkeypatch.undo()
+    assert (folder / "state.safetensors").read_bytes() == before
+    assert not list(folder.glob(".*"))
+    for name in ("last", "best"):
+        load_network(folder / f"{name}.safetensors")
+    trainer().run()
+    trainer(folder="whole").run()
+    assert same(folder / "state.safetensors", tmp_path / "whole" / "state.safetensors")
+
+
+def test_divergence_leaves_the_state(trainer, tmp_path):
+    run = trainer(few(steps=9))
+    for _ in range(3):
+        run.advance()
+    run.save(run.validate())
+    before = (tmp_path / "run" / "state.safetensors").read_bytes()
+    with torch.no_grad():
+        next(run.network.parameters()).fill_(float("nan"))
+    with pytest.raises(DivergenceError, match=r"The loss of step 3 \(samples 6 to 7\) is not finite\. Lower the"):
+        run.run()
+    assert (tmp_path / "run" / "state.safetensors").read_bytes() == before
+    assert trainer(few(steps=9)).step == 3
+
+
+def test_divergence_that_the_validation_meets(trainer, tmp_path):
+    """Before it writes a picture or weights."""
+    run = trainer(few(steps=1, validate_every=1, warmup=0, learning_rate=1e30, clip=0.0, bfloat16=False))
+    with pytest.raises(DivergenceError, match="The loss of the validation after step 1 is not finite"):
+        run.run()
+    assert {path.name for path in (tmp_path / "run").iterdir()} <= {"recipe.json", "log.jsonl"}
+
+
+@pytest.mark.parametrize("seed", [-(2**62), 2**63 - 1])
+def test_any_seed(trainer, seed):
+    recipe = few(steps=1, seed=seed, pool=2)
+    trainer(recipe).run()
+    trainer(replace(recipe, schedule=replace(recipe.schedule, crop=16), cameras=Cameras(("32x32",))), "many").run()
+
+
+def test_divergence_names_recorded_rows_and_the_way_out(pairs, calibration, tmp_path):
+    run = prepare(few(seed=1), calibration, None, tmp_path / "run", "cpu", pairs=pairs)
+    rows = [run.pairs.row(number) for number in range(2)]
+    with torch.no_grad():
+        next(run.network.parameters()).fill_(float("nan"))
+    said = rf"samples 0 to 1, rows {re.escape(str(rows))} of the file\) is not finite\. .* another folder, `--out`\.$"
+    with pytest.raises(DivergenceError, match=said):
+        run.advance()
+    run.save(Validation(0.0, 0.0))
+    with pytest.raises(DivergenceError, match=r'are kept: `start = ".*last\.safetensors"`\.$'):
+        run.advance()
+
+
+def test_a_network_that_cannot_learn_from_the_samples(photos, tmp_path):
+    """BatchNorm needs more than one number, and a U-Net more than a few pixels."""
+    tiny = Calibration(torch.eye(16).expand(1, 3, -1, -1) / 16)
+    recipe = replace(few(batch=1), network={"name": "mwdn", "width": 4})
+    with pytest.raises(
+        ParameterError, match=r"\[network\] .* cannot learn from a batch of 1 of these samples: Expected"
+    ):
+        prepare(recipe, tiny, photos, tmp_path / "run", "cpu").advance()
+
+
+# --- Across cameras, and from known weights -----------------------------------------------------------
+
+
+def test_a_network_of_all_cameras_belongs_to_none(trainer, tmp_path):
+    recipe = replace(few(steps=3), cameras=Cameras(("32x32", "32x48")))
+    trainer(recipe).run()
+    assert read_metadata(tmp_path / "run" / "last.safetensors")["psf_hash"] is None
+
+
+def test_a_run_begins_with_the_weights_it_is_given(trainer, tmp_path):
+    trainer(few(steps=3)).run()
+    start = str(tmp_path / "run" / "last.safetensors")
+    first = trainer(few(start=start), "second").network
+    known = load_network(start)
+    assert all(torch.equal(a, b) for a, b in zip(first.state_dict().values(), known.state_dict().values(), strict=True))
+    wider = replace(few(start=start), network={**RECIPE.network, "width": 8})
+    with pytest.raises(CheckpointError, match="must hold the network of the recipe") as error:
+        trainer(wider, "third")
+    assert len(str(error.value).splitlines()) == 1
+
+
+def test_a_run_with_a_pool_that_is_stopped_ends_as_one_that_was_not(trainer, tmp_path):
+    pooled = few(pool=4)
+    trainer(pooled, "whole").run()
+    stopped = trainer(pooled, "stopped")
+    while stopped.step < 3:
+        stopped.advance()
+    stopped.save(stopped.validate())
+    trainer(pooled, "stopped").run()
+    assert same(tmp_path / "whole" / "last.safetensors", tmp_path / "stopped" / "last.safetensors")
+
+
+def test_a_denoiser_is_trained_alone_and_then_stays(trainer, tmp_path):
+    """From noisy scenes; then it is part of a network whose U-Net learns, by a pool or without."""
+    learned = trainer(replace(few(steps=40, learning_rate=5e-3), network=DRUNET, denoising=Denoising((0.05, 0.1))), "a")
+    losses = []
+    learned.run(lambda report: losses.append(report.loss))
+    assert sum(losses[-10:]) < 0.7 * sum(losses[:10])
+
+    known = load_network(tmp_path / "a" / "best.safetensors").state_dict()
+    for name, pool in (("kept", 4), ("new", 0)):
+        recipe = few(steps=2, denoiser=str(tmp_path / "a" / "best.safetensors"), pool=pool)
+        second = trainer(replace(recipe, network={**RECIPE.network, "rounds": 2}), name)
+        head = second.network.decoder.head.weight.clone()
+        second.run()
+        assert not torch.equal(second.network.decoder.head.weight, head)
+        for key, value in load_network(tmp_path / name / "last.safetensors").denoiser.state_dict().items():
+            torch.testing.assert_close(value, known[key])
+
+    with pytest.raises(CheckpointError, match=r"`denoiser` \('.*best.safetensors'\) its denoiser, if it has one"):
+        trainer(few(denoiser=str(tmp_path / "a" / "best.safetensors")), "none")
+    with pytest.raises(CheckpointError, match="holds a denoiser, which reconstructs nothing alone"):
+        find_method(tmp_path / "a" / "best.safetensors")
+
+
+def test_a_denoiser_does_not_learn_from_recorded_pairs(calibration, tmp_path):
+    recipe = replace(few(), network=DRUNET, denoising=Denoising((0.05, 0.1)))
+    with pytest.raises(ParameterError, match="makes its own pairs from photographs: give `--photos`"):
+        prepare(recipe, calibration, None, tmp_path / "run", "cpu", pairs=tmp_path / "none.h5")

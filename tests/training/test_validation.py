@@ -1,0 +1,78 @@
+"""Validation: its numbers by their definition, and what its sheet shows."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import nn
+
+from mwdn.data.simulated import Pair
+from mwdn.io.contact_sheets import contact_sheet
+from mwdn.training.losses import Loss
+from mwdn.training.recipe import Recipe, Schedule
+from mwdn.training.validation import START, Validator
+
+SIZE = 12, 16
+RECIPE = Recipe({"name": "unet"}, Schedule(batch=2, validation=5), {"mse": 1.0, "l1": 0.5})
+
+
+class Numbered:
+    """Pair n is drawn from a generator seeded by n; remembers what was asked for."""
+
+    name = "numbered"
+
+    def __init__(self):
+        self.asked = []
+
+    def batch(self, numbers):
+        self.asked += numbers
+        pictures = [torch.rand(2, 3, *SIZE, generator=torch.Generator().manual_seed(n % 1000)) for n in numbers]
+        return Pair(*torch.stack(pictures, dim=1))
+
+
+class Darker(nn.Module):
+    """Leaves [0, 1]: it must be clipped for the PSNR and not for the loss."""
+
+    def forward(self, measurement, psf):
+        return 1.5 * measurement - 0.2
+
+
+PSF = torch.ones(1, 3, *SIZE) / (SIZE[0] * SIZE[1])
+
+
+@pytest.mark.parametrize("batch", [1, 2, 5, 9])
+def test_means_over_the_samples_whatever_the_batch(batch):
+    pairs = Numbered()
+    recipe = replace(RECIPE, schedule=replace(RECIPE.schedule, batch=batch))
+    loss = Loss({"mse": 1.0, "l1": 0.0})  # the training is at another weighting
+    found = Validator(recipe, pairs, PSF)(Darker(), loss, "step 3")
+    assert pairs.asked == list(range(START, START + 5))
+    measurement, scene, _ = Numbered().batch(pairs.asked)
+    error = 1.5 * measurement - 0.2 - scene
+    clipped = (1.5 * measurement - 0.2).clamp(0, 1) - scene
+    assert found.loss == pytest.approx(float(error.square().mean() + 0.5 * error.abs().mean()), rel=1e-5)
+    assert found.psnr == pytest.approx(float((-10 * clipped.square().mean((1, 2, 3)).log10()).mean()), rel=1e-5)
+    assert loss.weights == {"mse": 1.0, "l1": 0.0}
+
+
+@pytest.mark.parametrize("shown", [1, 3, 6, 8])
+def test_captures_stand_beside_the_pairs(shown):
+    """Five pairs, and six captures at most; white where one has more than the other."""
+    captures = torch.rand(shown, 3, *SIZE)
+    network = Darker()
+    sheet = Validator(RECIPE, Numbered(), PSF, captures)(network, Loss(RECIPE.loss), "step 3").sheet
+    measurement, scene, _ = Numbered().batch(range(START, START + 5))
+    white = torch.ones(1, 1, *SIZE)
+    rows = [[m[None], network(m[None], PSF), s[None]] for m, s in zip(measurement, scene, strict=True)]
+    rows += [[white] * 3] * (min(shown, 6) - 5)
+    for number, row in enumerate(rows):
+        real = captures[number : number + 1]
+        row += [real, network(real, PSF)] if number < shown else [white] * 2
+    torch.testing.assert_close(sheet, contact_sheet(rows, ["measurement", "step 3", "scene", "capture", "step 3"]))
+
+
+def test_sheet_without_captures():
+    sheet = Validator(RECIPE, Numbered(), PSF)(Darker(), Loss(RECIPE.loss), "step 3").sheet
+    measurement, scene, _ = Numbered().batch(range(START, START + 5))
+    rows = [[m[None], 1.5 * m[None] - 0.2, s[None]] for m, s in zip(measurement, scene, strict=True)]
+    torch.testing.assert_close(sheet, contact_sheet(rows, ["measurement", "step 3", "scene"]))

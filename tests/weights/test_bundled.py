@@ -1,0 +1,141 @@
+"""The networks in the package, and those of a hub: a server of files on this machine."""
+
+import hashlib
+import json
+import subprocess
+import sys
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+import torch
+
+from mwdn.errors import CheckpointError
+from mwdn.networks import build
+from mwdn.weights.bundled import BUNDLED, bundle, find_weights
+from mwdn.weights.checkpoint import load_network, read_metadata, save_network
+
+CARD = files("mwdn") / "weights" / "README.md"
+
+
+@pytest.mark.parametrize(("name", "most"), list(zip(BUNDLED, (5e6, 2e6), strict=True)))
+def test_bundled_networks_are_whole_and_for_any_camera(name, most):
+    path = find_weights(name)
+    assert hashlib.sha256(path.read_bytes()).hexdigest() in CARD.read_text(encoding="utf-8")
+    network, header = load_network(path), read_metadata(path)
+    assert header["psf_hash"] is None
+    assert header["recipe"]["cameras"]["sizes"]
+    assert sum(parameter.numel() for parameter in network.parameters()) < most
+    assert {parameter.dtype for parameter in network.parameters()} == {torch.float32}
+
+
+def test_bundled_networks_are_small():
+    assert sum(find_weights(name).stat().st_size for name in BUNDLED) < 14e6
+
+
+def test_bundling_rounds_and_remembers(tmp_path):
+    network = build("wiener-bank", width=2)
+    save_network(tmp_path / "a.safetensors", network, "wiener-bank", {"width": 2}, recipe={"steps": 5})
+    bundle(tmp_path / "a.safetensors", tmp_path / "b.safetensors")
+    assert (tmp_path / "b.safetensors").stat().st_size < 0.7 * (tmp_path / "a.safetensors").stat().st_size
+    assert read_metadata(tmp_path / "b.safetensors") == read_metadata(tmp_path / "a.safetensors")
+    for one, other in zip(network.parameters(), load_network(tmp_path / "b.safetensors").parameters(), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-6)
+    with torch.no_grad():
+        next(network.parameters()).fill_(1e6)
+    save_network(tmp_path / "a.safetensors", network, "wiener-bank", {"width": 2})
+    with pytest.raises(CheckpointError, match="range of float16"):
+        bundle(tmp_path / "a.safetensors", tmp_path / "c.safetensors")
+    assert not (tmp_path / "c.safetensors").exists()
+
+
+def test_bundling_with_another_denoiser(tmp_path):
+    """What a user trains on scenes of his kind."""
+    whole, denoiser, other, out = (tmp_path / f"{name}.safetensors" for name in ("whole", "denoiser", "other", "out"))
+    networks = {}
+    for path, name, options in (
+        (whole, "wiener-bank", {"width": 2, "rounds": 1}),
+        (denoiser, "drunet", {}),
+        (other, "unet", {"width": 2}),
+    ):
+        networks[path] = build(name, **options)
+        save_network(path, networks[path], name, options)
+    for network, part in ((whole, other), (other, denoiser)):
+        with pytest.raises(CheckpointError, match=f"{network.name}` has no denoiser that .*{part.name}` fits"):
+            bundle(network, out, part)
+    assert not out.exists()
+    bundle(whole, out, denoiser)
+    found = load_network(out)
+    for module, expected in ((found.denoiser, networks[denoiser]), (found.encoder, networks[whole].encoder)):
+        for one, another in zip(module.parameters(), expected.parameters(), strict=True):
+            torch.testing.assert_close(one, another, rtol=1e-3, atol=1e-6)
+
+
+def test_other_names_are_no_bundled_networks():
+    assert find_weights("admm") is None
+    with pytest.raises(CheckpointError, match="must be hub:owner/name"):
+        find_weights("hub:alone")
+
+
+FETCH = "import sys; from mwdn.weights.bundled import find_weights; print(find_weights(sys.argv[1]))"
+
+
+@pytest.fixture
+def hub(tmp_path):
+    """``hub(name)`` fetches from a server that has one file, in the way of `huggingface_hub`."""
+    pytest.importorskip("huggingface_hub", reason="needs `pip install 'mwdn[hub]'`")
+    content = find_weights("universal-small").read_bytes()
+
+    class Files(BaseHTTPRequestHandler):
+        def do_HEAD(self):
+            found = self.path == "/some/camera/resolve/main/model.safetensors"
+            self.send_response(200 if found else 404)
+            self.send_header("Content-Length", str(len(content) if found else 0))
+            self.send_header("ETag", '"1234"')
+            self.send_header("X-Repo-Commit", "0" * 40)
+            if not found:
+                self.send_header("X-Error-Code", "EntryNotFound")
+            self.end_headers()
+
+        def do_GET(self):
+            self.do_HEAD()
+            self.wfile.write(content)
+
+        def log_message(self, *_):
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Files)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+
+    def fetch(name):
+        environment = {
+            "HF_ENDPOINT": f"http://127.0.0.1:{server.server_port}",
+            "HF_HOME": str(tmp_path / "cache"),
+            "HF_HUB_DISABLE_TELEMETRY": "1",
+            "HF_HUB_DISABLE_XET": "1",
+            "PATH": "/usr/bin:/bin",
+            "PYTHONPATH": json.dumps(sys.path)[1:-1].replace('", "', ":").strip('"'),
+        }
+        line = [sys.executable, "-c", FETCH, name]
+        return subprocess.run(line, env=environment, capture_output=True, text=True, check=False)
+
+    yield fetch
+    server.shutdown()
+    server.server_close()
+
+
+def test_a_network_of_the_hub_is_fetched_once(hub):
+    first = hub("hub:some/camera")
+    assert first.returncode == 0, first.stderr
+    path = Path(first.stdout.strip())
+    assert path.read_bytes() == find_weights("universal-small").read_bytes()
+    assert hub("hub:some/camera").stdout == first.stdout
+
+
+def test_what_the_hub_does_not_have_is_named(hub):
+    missing = hub("hub:some/camera/other.safetensors")
+    assert missing.returncode != 0
+    assert "CheckpointError: `hub:some/camera/other.safetensors` cannot be fetched" in missing.stderr
+    assert "CheckpointError: `hub:some/camera/../a` cannot be fetched" in hub("hub:some/camera/../a").stderr

@@ -1,0 +1,321 @@
+"""Networks in files of this package and of the paper's authors; files that are neither."""
+
+import inspect
+import json
+import pickle
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from torch.nn import functional as F
+
+from mwdn.errors import CheckpointError
+from mwdn.networks import NETWORKS, build
+from mwdn.weights.authors import load_authors
+from mwdn.weights.checkpoint import load_network, read_metadata, save_network
+
+
+def small(name):
+    wanted = {"width": 4, "pooling": "average", "size": (9, 9), **({"weight": 0.02} if name == "wiener" else {})}
+    options = {key: wanted[key] for key in wanted.keys() & inspect.signature(NETWORKS[name]).parameters.keys()}
+    return build(name, **options), options
+
+
+def pair(generator, size=(32, 48)):
+    return torch.rand(1, 3, *size, generator=generator), torch.rand(1, 3, *size, generator=generator) ** 4
+
+
+# --- This package's own -------------------------------------------------------------------------------
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", NETWORKS)
+def test_what_is_saved_is_what_is_loaded(tmp_path, name, generator):
+    network, options = small(name)
+    b, h = pair(generator)
+    network.train()(b, h)  # moves the running means
+    path = tmp_path / "folder" / "net.safetensors"
+    save_network(path, network, name, options)
+    loaded = load_network(path)
+    assert type(loaded) is type(network)
+    assert not loaded.training
+    assert torch.equal(loaded(b, h), network.eval()(b, h))
+    assert {p.device.type for p in loaded.state_dict().values()} == {"cpu"}
+    assert [file.name for file in path.parent.iterdir()] == ["net.safetensors"]
+
+
+def test_metadata(tmp_path):
+    network, options = small("mwdn")
+    save_network(tmp_path / "a.safetensors", network, "mwdn", options, psf_hash="00ff", recipe={"lr": 1e-4})
+    found = read_metadata(tmp_path / "a.safetensors")
+    assert found.pop("version").count(".") == 2
+    assert found == {"name": "mwdn", "options": options, "psf_hash": "00ff", "recipe": {"lr": 1e-4}}
+
+
+def test_saving_replaces_and_a_failed_save_does_not(tmp_path):
+    path = tmp_path / "a.safetensors"
+    network, options = small("unet")
+    save_network(path, network, "unet", options, epoch=1)
+    save_network(path, network, "unet", options, epoch=2)
+    with pytest.raises(TypeError):
+        save_network(path, network, "unet", options, epoch=object())
+    assert read_metadata(path)["epoch"] == 2
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("name", ["net.pt", "net"])
+def test_saved_under_a_name_that_would_not_load(tmp_path, name):
+    network, options = small("unet")
+    with pytest.raises(CheckpointError, match=rf"`.*{name}` must end in \.safetensors"):
+        save_network(tmp_path / name, network, "unet", options)
+
+
+def stored(path, header, tensors=None):
+    save_file(tensors or {"a": torch.zeros(1)}, path, metadata={"mwdn": header} if header is not None else None)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        (None, "was not written by mwdn"),
+        ("{", "metadata of .* is damaged"),
+        ("[]", "must hold a name and options"),
+        ('{"name": "mwdn"}', "must hold a name and options"),
+        ('{"name": "mwdm", "options": {}, "version": "9.1"}', "of mwdn 9.1, .* Did you mean 'mwdn'"),
+        ('{"name": "mwdn", "options": {"depth": 3}}', "cannot be built: .*depth"),
+        ('{"name": "mwdn", "options": {"pooling": "median"}}', "cannot be built: `pooling`"),
+        ('{"name": "wiener", "options": {}}', "does not fit the network 'wiener'"),
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_foreign_and_damaged_metadata(tmp_path, header, message):
+    path = stored(tmp_path / "a.safetensors", header)
+    with pytest.raises(CheckpointError, match=message) as caught:
+        load_network(path)
+    assert str(path) in str(caught.value)
+
+
+def test_weights_of_another_shape(tmp_path):
+    network, options = small("mwdn")
+    save_network(tmp_path / "a.safetensors", network, "mwdn", options | {"width": 8})
+    with pytest.raises(CheckpointError, match="does not fit the network 'mwdn' it names: size mismatch for ") as caught:
+        load_network(tmp_path / "a.safetensors")
+    assert "\n" not in str(caught.value)
+
+
+def test_weights_that_are_no_numbers(tmp_path):
+    network, options = small("mwdn")
+    with torch.no_grad():
+        next(network.parameters())[0] = torch.nan
+    save_network(tmp_path / "a.safetensors", network, "mwdn", options)
+    with pytest.raises(CheckpointError, match=r"holds NaN or infinity, `.*weight` first"):
+        load_network(tmp_path / "a.safetensors")
+
+
+def test_others_may_read_weights_as_any_new_file(tmp_path):
+    network, options = small("mwdn")
+    save_network(tmp_path / "a.safetensors", network, "mwdn", options)
+    (tmp_path / "new").touch()
+    assert (tmp_path / "a.safetensors").stat().st_mode == (tmp_path / "new").stat().st_mode
+
+
+def test_missing_tensor(tmp_path):
+    network, options = small("mwdn")
+    save_network(tmp_path / "a.safetensors", network, "mwdn", options)
+    tensors = load_file(tmp_path / "a.safetensors")
+    del tensors["filters.2.log_weight"]
+    stored(tmp_path / "a.safetensors", json.dumps({"name": "mwdn", "options": options}), tensors)
+    with pytest.raises(CheckpointError, match=r"filters\.2\.log_weight"):
+        load_network(tmp_path / "a.safetensors")
+
+
+@pytest.mark.parametrize("kept", [0, 5, 100, -1])
+def test_truncated_file(tmp_path, kept):
+    network, options = small("unet")
+    path = tmp_path / "a.safetensors"
+    save_network(path, network, "unet", options)
+    path.write_bytes(path.read_bytes()[:kept])
+    with pytest.raises(CheckpointError, match=r"`.*a\.safetensors` cannot be read as safetensors"):
+        load_network(path)
+
+
+@pytest.mark.parametrize("name", ["no.safetensors", "no.tar", "."])
+def test_missing_file(tmp_path, name):
+    with pytest.raises(CheckpointError, match=r"No checkpoint at .*the current folder is"):
+        load_network(tmp_path / name)
+
+
+# --- The authors' -------------------------------------------------------------------------------------
+
+
+def double(state, name, inputs, outputs, inner, generator):
+    """(3x3 convolution, BatchNorm, ReLU) twice, by the authors' names 0 to 5."""
+    for index, (a, b) in ((0, (inputs, inner)), (3, (inner, outputs))):
+        state[f"{name}.double_conv.{index}.weight"] = torch.randn(b, a, 3, 3, generator=generator) / (3 * a**0.5)
+        state[f"{name}.double_conv.{index}.bias"] = 0.1 * torch.randn(b, generator=generator)
+        norm = f"{name}.double_conv.{index + 1}"
+        state[f"{norm}.weight"] = 1 + 0.1 * torch.randn(b, generator=generator)
+        state[f"{norm}.bias"] = 0.1 * torch.randn(b, generator=generator)
+        state[f"{norm}.running_mean"] = 0.1 * torch.randn(b, generator=generator)
+        state[f"{norm}.running_var"] = 0.5 + torch.rand(b, generator=generator)
+        state[f"{norm}.num_batches_tracked"] = torch.tensor(7)
+
+
+def authors(generator, *, cpsf, width=4):
+    """State of the authors' network at any width, all its numbers random."""
+    state = {"w": 1e-3 * (1 + torch.rand(1 if cpsf else 4, generator=generator))}
+    state["delta"] = 1e-2 * (0.5 + torch.rand(5 if cpsf else 4, generator=generator))
+    widths = (3, width, 2 * width, 4 * width, 8 * width, 8 * width)
+    names = ["inc", *(f"down{i}.avgpool_conv.1" for i in (1, 2, 3, 4))]
+    for name, a, b in zip(names, widths[:-1], widths[1:], strict=True):
+        double(state, name, a, b, b, generator)
+    ups = [(16 * width, 4 * width), (8 * width, 2 * width), (4 * width, width), (2 * width, width)]
+    for i, (a, b) in enumerate(ups, 1):
+        double(state, f"up{i}.conv", a, b, a // 2, generator)
+    state["outc.conv.weight"] = torch.randn(3, width, 1, 1, generator=generator)
+    state["outc.conv.bias"] = torch.randn(3, generator=generator)
+    if cpsf:
+        names = ["inc0", *(f"down{i}.avgpool_conv.1" for i in (11, 22, 33))]
+        for name, a, b in zip(names, widths[:-2], widths[1:-1], strict=True):
+            double(state, name, a, b, b, generator)
+    return state
+
+
+def blocks(state, name, x):
+    for index in (0, 3):
+        x = F.conv2d(
+            x, state[f"{name}.double_conv.{index}.weight"], state[f"{name}.double_conv.{index}.bias"], padding=1
+        )
+        norm = {
+            key: state[f"{name}.double_conv.{index + 1}.{key}"]
+            for key in ("running_mean", "running_var", "weight", "bias")
+        }
+        x = F.batch_norm(x, **norm).relu()
+    return x
+
+
+def features(state, names, x):
+    found = [blocks(state, names[0], x)]
+    for name in names[1:]:
+        found.append(blocks(state, f"{name}.avgpool_conv.1", F.avg_pool2d(found[-1], 2)))
+    return found
+
+
+def circular_wiener(b, h, constant):
+    """Eq. (2) on a circle with the PSF's centre where it is; the result is moved by half of the picture."""
+    H = torch.fft.rfft2(h)
+    v = torch.fft.irfft2(H.conj() / (H.abs() ** 2 + constant) * torch.fft.rfft2(b), s=b.shape[-2:])
+    return v.roll((b.shape[-2] // 2, b.shape[-1] // 2), (-2, -1))
+
+
+def as_authors_would(state, b, h, *, cpsf):
+    """Their networks' output, as methods.md describes them, for a PSF whose peak is 1."""
+    *skips, x = features(state, ["inc", "down1", "down2", "down3", "down4"], b)
+    if cpsf:
+        psfs = features(state, ["inc0", "down11", "down22", "down33"], state["w"] * h)
+    else:
+        psfs = [w * F.avg_pool2d(h.sum(1, keepdim=True), 2**i) for i, w in enumerate(state["w"])]
+    for i in (3, 2, 1, 0):
+        x = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=True)
+        x = torch.cat([circular_wiener(skips[i], psfs[i], state["delta"][i]), x], 1)
+        x = blocks(state, f"up{4 - i}.conv", x)
+    return F.conv2d(x, state["outc.conv.weight"], state["outc.conv.bias"])
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("prefix", ["", "module."])
+@pytest.mark.parametrize("cpsf", [False, True], ids=["mwdn", "mwdn-cpsf"])
+def test_authors_checkpoint_computes_what_theirs_does(tmp_path, cpsf, prefix, generator):
+    state = authors(generator, cpsf=cpsf)
+    wrapped = {"net_state_dict": {prefix + key: value for key, value in state.items()}, "epoch": 299}
+    torch.save(wrapped, tmp_path / "best.tar")
+    network = load_network(tmp_path / "best.tar")
+    b, h = pair(generator, (32, 48))
+    h = h / h.max()
+    expected = as_authors_would(state, b, h, cpsf=cpsf)
+    assert expected.std() > 0.01
+    torch.testing.assert_close(network(b, h), expected, rtol=1e-3, atol=1e-3 * expected.abs().max().item())
+
+
+@pytest.mark.parametrize(("cpsf", "count"), [(False, 17_267_531), (True, 21_956_745)])
+def test_full_width_has_the_papers_count(cpsf, count, generator):
+    network = load_authors(authors(generator, cpsf=cpsf, width=64))
+    assert sum(parameter.numel() for parameter in network.parameters()) == count
+
+
+@pytest.mark.parametrize(("key", "index"), [("w", 0), ("w", 3), ("delta", 2)])
+def test_negative_constants_are_refused(tmp_path, key, index, generator):
+    state = authors(generator, cpsf=False)
+    state[key][index] *= -1
+    torch.save(state, tmp_path / "a.pt")
+    with pytest.raises(CheckpointError, match=rf"`{key}` \(\[.*-0\.0.*\]\) must be positive"):
+        load_network(tmp_path / "a.pt")
+
+
+def test_lambda_that_nothing_uses_may_be_anything(generator):
+    state = authors(generator, cpsf=True)
+    state["delta"][4] = -1
+    assert load_authors(state).unused_regularisation.item() == -1
+
+
+@pytest.mark.parametrize("cpsf", [False, True])
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("delta", torch.ones(3), "`delta` must have the shape"),
+        ("w", torch.ones(2), "`w` must have the shape"),
+        ("inc.double_conv.0.weight", torch.ones(4), "must have the shape"),
+        ("down3.avgpool_conv.1.double_conv.3.bias", None, "Missing key.*encoder.scales.3.3.bias"),
+        ("up2.conv.double_conv.3.bias", torch.ones(99), "size mismatch for decoder.scales.1.3.bias"),
+        ("attention.weight", torch.ones(2), "Unexpected key.*attention.weight"),
+        ("outc.conv.weight", None, "is neither a checkpoint of mwdn"),
+        ("w", None, "is neither a checkpoint of mwdn"),
+    ],
+)
+def test_authors_names_with_other_tensors(tmp_path, cpsf, key, value, message, generator):
+    state = authors(generator, cpsf=cpsf)
+    if value is None:
+        del state[key]
+    else:
+        state[key] = value
+    torch.save({"net_state_dict": state}, tmp_path / "a.tar")
+    with pytest.raises(CheckpointError, match=f"(?s){message}"):
+        load_network(tmp_path / "a.tar")
+
+
+# --- Neither ------------------------------------------------------------------------------------------
+
+
+class Bomb:
+    def __init__(self, target):
+        self.target = target
+
+    def __reduce__(self):
+        return Path.touch, (self.target,)
+
+
+@pytest.mark.parametrize("save", [torch.save, lambda what, path: path.write_bytes(pickle.dumps(what))])
+def test_code_in_a_file_is_not_run(tmp_path, save):
+    target = tmp_path / "exploded"
+    save({"net_state_dict": Bomb(target)}, tmp_path / "a.pt")
+    with pytest.raises(CheckpointError, match=r"`.*a\.pt` cannot be read as plain weights") as caught:
+        load_network(tmp_path / "a.pt")
+    assert not target.exists()
+    assert "weights_only" not in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [[1, 2], torch.zeros(3), {"net_state_dict": 5}, {3: torch.zeros(1)}, {}])
+def test_other_content(tmp_path, content):
+    torch.save(content, tmp_path / "a.pth")
+    with pytest.raises(CheckpointError, match="is neither a checkpoint of mwdn"):
+        load_network(tmp_path / "a.pth")
+
+
+@pytest.mark.parametrize("data", [b"", b"hello", b"PK\x03\x04" + bytes(50)])
+def test_no_weights_at_all(tmp_path, data):
+    (tmp_path / "a.ckpt").write_bytes(data)
+    with pytest.raises(CheckpointError, match="cannot be read as plain weights"):
+        load_network(tmp_path / "a.ckpt")
