@@ -77,7 +77,7 @@ from pathlib import Path
 import torch
 torch.set_num_threads(2)
 from mwdn.benchmark import read_benchmark, run, scoring
-from mwdn.learning import train
+from mwdn.training import trainer
 
 calls = {"save": 0, "measure": 0}
 def counted(name, then, last):
@@ -91,7 +91,7 @@ def counted(name, then, last):
 
 where = sys.argv[1]
 if where == "save":     # the second network has saved once: 1 x 3 + 1
-    train.Trainer.save = counted("save", train.Trainer.save, 4)
+    trainer.Trainer.save = counted("save", trainer.Trainer.save, 4)
 else:                   # the second method's scores are known, and not yet written
     scoring._measure = counted("measure", scoring._measure, 2)
 run(read_benchmark("r.toml"), Path("out"), device="cpu")

@@ -13,7 +13,7 @@ from mwdn.errors import ParameterError
 AT_WORK = """
 import sys, time
 from pathlib import Path
-from mwdn.benchmark.sharing import shared
+from mwdn.benchmark.locks import shared
 
 folder = Path(sys.argv[1])
 for part in shared(folder, ["a", "b", "c", "d"]):

@@ -33,7 +33,7 @@ pytest.importorskip("onnxruntime", reason="The extra is missing: pip install 'mw
 pytestmark = pytest.mark.usefixtures("unchecked")  # an open batch is no number: its checks do not know that
 
 SIZE = 38, 48
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "onnx_only.py"
 
 

@@ -10,10 +10,10 @@ from scipy.signal import convolve2d, fftconvolve
 from skimage import restoration
 
 import oracles
+from mwdn import fourier
 from mwdn.errors import MwdnError, ParameterError, ShapeError
-from mwdn.fourier import convolution, filtering, memory_format, wiener
 
-BOUNDARIES = get_args(memory_format.Boundary)
+BOUNDARIES = get_args(fourier.Boundary)
 
 # (scene, PSF, sensor): one pixel, odd, even, prime, not square; PSF and sensor smaller and larger than scene.
 SIZES = [
@@ -71,22 +71,22 @@ def dot(a, b):
 
 def test_fast_length_is_the_next_even_smooth_number():
     for length in range(1, 700):
-        assert convolution.fast_length(length) == oracles.smooth_even(length)
+        assert fourier.fast_length(length) == oracles.smooth_even(length)
 
 
 @pytest.mark.parametrize("grid", [(1, 2), (6, 10), (7, 9), (12, 5)])
 def test_spectrum_is_numpys(grid, generator):
     picture = noise((2, 3, min(5, grid[0]), min(4, grid[1])), generator)
     expected = np.fft.rfft2(picture.double().numpy(), s=grid)
-    found = convolution.spectrum(picture, grid)
+    found = fourier.spectrum(picture, grid)
     assert found.dtype == torch.complex64
     assert abs(found.numpy() - expected).max() < 1e-5
-    close(convolution.inverse_spectrum(found, grid, picture.shape[-2:]), picture)
+    close(fourier.inverse_spectrum(found, grid, picture.shape[-2:]), picture)
 
 
 @pytest.mark.parametrize("grid", [(40, 46), (41, 45)])
 def test_gaussian_transfer_blurs_a_point_to_a_gaussian(grid):
-    found = convolution.inverse_spectrum(convolution.gaussian_transfer(grid, 2.5)[None, None], grid, grid)[0, 0]
+    found = fourier.inverse_spectrum(fourier.gaussian_transfer(grid, 2.5)[None, None], grid, grid)[0, 0]
     y, x = (torch.minimum(torch.arange(n), n - torch.arange(n)) for n in grid)
     expected = torch.exp(-(y[:, None].square() + x.square()) / (2 * 2.5**2)) / (2 * torch.pi * 2.5**2)
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-7)
@@ -95,7 +95,7 @@ def test_gaussian_transfer_blurs_a_point_to_a_gaussian(grid):
 @pytest.mark.parametrize(("scene", "psf", "size"), SIZES)
 def test_convolve_is_the_sum_over_points(scene, psf, size, generator):
     v, h = noise((1, 1, *scene), generator), noise((1, 1, *psf), generator)
-    found = convolution.convolve(v, h, size=size)
+    found = fourier.convolve(v, h, size=size)
     close(found[0, 0], oracles.convolve(v[0, 0], h[0, 0], size))
 
 
@@ -104,14 +104,14 @@ def test_grid_is_long_enough_for_every_small_combination(generator):
     for scene, psf, sensor in itertools.product(range(1, 8), repeat=3):
         v, h = noise((1, 1, 1, scene), generator), noise((1, 1, 1, psf), generator)
         expected = oracles.convolve(v[0, 0], h[0, 0], (1, sensor))
-        found = convolution.convolve(v, h, size=(1, sensor))[0, 0].double().numpy()
+        found = fourier.convolve(v, h, size=(1, sensor))[0, 0].double().numpy()
         assert abs(found - expected).max() < 1e-5, (scene, psf, sensor)
 
 
 @pytest.mark.parametrize(("scene", "psf", "size"), FITS)
 def test_circular_convolve_wraps_what_leaves(scene, psf, size, generator):
     v, h = noise((1, 1, *scene), generator), noise((1, 1, *psf), generator)
-    found = convolution.convolve(v, h, size=size, circular=True)
+    found = fourier.convolve(v, h, size=size, circular=True)
     close(found[0, 0], oracles.convolve(v[0, 0], h[0, 0], size, circular=True))
 
 
@@ -120,15 +120,15 @@ def test_odd_psfs_agree_with_scipys_same_mode(size, generator):
     """The one case in which scipy's own centre crop has no ambiguity."""
     v, h = noise((1, 1, *size), generator), noise((1, 1, 3, 5), generator)
     expected = convolve2d(v[0, 0].double(), h[0, 0].double(), mode="same")
-    close(convolution.convolve(v, h)[0, 0], expected)
+    close(fourier.convolve(v, h)[0, 0], expected)
     wrapped = convolve2d(v[0, 0].double(), h[0, 0].double(), mode="same", boundary="wrap")
-    close(convolution.convolve(v, h, circular=True)[0, 0], wrapped)
+    close(fourier.convolve(v, h, circular=True)[0, 0], wrapped)
 
 
 def test_convolve_at_the_papers_size_agrees_with_fftconvolve(generator):
     v, h = torch.rand(1, 1, 320, 320, generator=generator), torch.rand(1, 1, 320, 320, generator=generator)
     full = fftconvolve(v[0, 0].double(), h[0, 0].double())
-    close(convolution.convolve(v, h)[0, 0], full[160:480, 160:480])
+    close(fourier.convolve(v, h)[0, 0], full[160:480, 160:480])
 
 
 @pytest.mark.parametrize("circular", [False, True])
@@ -137,19 +137,19 @@ def test_convolve_at_the_papers_size_agrees_with_fftconvolve(generator):
 def test_delta_at_the_centre_is_the_identity(scene, psf, circular, generator):
     v = noise((2, 3, *scene), generator)
     delta = point(psf, psf[0] // 2, psf[1] // 2)
-    close(convolution.convolve(v, delta, circular=circular), v)
-    close(convolution.correlate(v, delta, circular=circular), v)
+    close(fourier.convolve(v, delta, circular=circular), v)
+    close(fourier.correlate(v, delta, circular=circular), v)
 
 
 @pytest.mark.parametrize("psf", [(9, 9), (10, 12), (11, 14)])
 def test_delta_below_and_right_moves_the_scene_down_and_right(psf, generator):
     v = noise((1, 1, 11, 14), generator)
     delta = point(psf, psf[0] // 2 + 2, psf[1] // 2 + 3)
-    moved = convolution.convolve(v, delta)
+    moved = fourier.convolve(v, delta)
     close(moved[..., 2:, 3:], v[..., :-2, :-3])
     assert moved[..., :2, :].abs().max() < 1e-5
     assert moved[..., :, :3].abs().max() < 1e-5
-    close(convolution.convolve(v, delta, circular=True), v.roll((2, 3), (-2, -1)))
+    close(fourier.convolve(v, delta, circular=True), v.roll((2, 3), (-2, -1)))
 
 
 @pytest.mark.parametrize("sensor", [(4, 4), (5, 6), (12, 3), (1, 1), (20, 21)])
@@ -157,7 +157,7 @@ def test_delta_below_and_right_moves_the_scene_down_and_right(psf, generator):
 def test_sensor_faces_the_centre_of_the_scene(scene, sensor):
     """A point at the scene's centre lands on the sensor's centre, whatever the two sizes are."""
     v = point(scene, scene[0] // 2, scene[1] // 2)
-    found = convolution.convolve(v, point((3, 4), 1, 2), size=sensor)
+    found = fourier.convolve(v, point((3, 4), 1, 2), size=sensor)
     close(found, point(sensor, sensor[0] // 2, sensor[1] // 2), 1e-5)
 
 
@@ -166,8 +166,8 @@ def test_sensor_faces_the_centre_of_the_scene(scene, sensor):
 def test_correlate_is_the_adjoint(scene, psf, size, circular, generator):
     v, h = noise((2, 3, *scene), generator), noise((1, 3, *psf), generator)
     y = noise((2, 3, *(size or scene)), generator)
-    Av = convolution.convolve(v, h, size=size, circular=circular)
-    Ay = convolution.correlate(y, h, size=scene, circular=circular)
+    Av = fourier.convolve(v, h, size=size, circular=circular)
+    Ay = fourier.correlate(y, h, size=scene, circular=circular)
     assert Ay.shape == v.shape
     assert abs(dot(Av, y) - dot(v, Ay)) <= 1e-5 * (Av.norm() * y.norm()).item()
 
@@ -176,7 +176,7 @@ def test_correlate_is_the_adjoint(scene, psf, size, circular, generator):
 def test_correlate_is_the_adjoint_of_psfs_larger_than_the_scene(scene, psf, size, generator):
     v, h = noise((2, 3, *scene), generator), noise((1, 3, *psf), generator)
     y = noise((2, 3, *(size or scene)), generator)
-    Av, Ay = convolution.convolve(v, h, size=size), convolution.correlate(y, h, size=scene)
+    Av, Ay = fourier.convolve(v, h, size=size), fourier.correlate(y, h, size=scene)
     assert abs(dot(Av, y) - dot(v, Ay)) <= 1e-5 * (Av.norm() * y.norm()).item()
 
 
@@ -185,16 +185,16 @@ def test_energy_of_a_scene_away_from_the_border_is_conserved(psf, generator):
     v = torch.zeros(1, 2, 25, 26)
     v[..., 8:17, 8:17] = torch.rand(1, 2, 9, 9, generator=generator)
     h = torch.rand(1, 1, *psf, generator=generator)
-    b = convolution.convolve(v, h / h.sum())
+    b = fourier.convolve(v, h / h.sum())
     torch.testing.assert_close(b.sum((-2, -1)), v.sum((-2, -1)), rtol=1e-5, atol=0)
-    everything = convolution.convolve(torch.rand(1, 1, 9, 9, generator=generator), h / h.sum(), circular=True)
+    everything = fourier.convolve(torch.rand(1, 1, 9, 9, generator=generator), h / h.sum(), circular=True)
     assert everything.min() > 0
 
 
 def test_linear_convolution_loses_at_the_border_what_circular_keeps():
     v, h = torch.ones(1, 1, 12, 15), torch.ones(1, 1, 5, 5) / 25
-    close(convolution.convolve(v, h, circular=True), v)
-    corner, edge = convolution.convolve(v, h)[0, 0, 0, :1], convolution.convolve(v, h)[0, 0, 0, 7:8]
+    close(fourier.convolve(v, h, circular=True), v)
+    corner, edge = fourier.convolve(v, h)[0, 0, 0, :1], fourier.convolve(v, h)[0, 0, 0, 7:8]
     close(corner, [9 / 25], 1e-5)
     close(edge, [15 / 25], 1e-5)
 
@@ -202,12 +202,12 @@ def test_linear_convolution_loses_at_the_border_what_circular_keeps():
 def test_convolve_is_linear_in_scene_and_psf(generator):
     v, w = noise((2, 1, 2, 9, 10), generator)
     h, g = noise((2, 1, 2, 7, 7), generator)
-    A = convolution.convolve
+    A = fourier.convolve
     close(A(2 * v - 3 * w, h), 2 * A(v, h) - 3 * A(w, h), 1e-5)
     close(A(v, 2 * h - 3 * g), 2 * A(v, h) - 3 * A(v, g), 1e-5)
 
 
-@pytest.mark.parametrize("operation", [convolution.convolve, convolution.correlate])
+@pytest.mark.parametrize("operation", [fourier.convolve, fourier.correlate])
 @pytest.mark.parametrize("batch", [1, 2])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_psf_broadcasts_over_batch_and_channels(operation, batch, channels, generator):
@@ -224,7 +224,7 @@ def test_psf_broadcasts_over_batch_and_channels(operation, batch, channels, gene
 def test_wiener_broadcasts_over_batch_and_channels(batch, channels, generator):
     b, h = noise((2, 3, 8, 9), generator), noise((batch, channels, 5, 6), generator)
     k = torch.rand(2, 3, 1, 1, generator=generator) + 0.1
-    found = wiener.wiener(b, h, k)
+    found = fourier.wiener(b, h, k)
     for i in range(2):
         for c in range(3):
             own = h[i % batch, c % channels].double()
@@ -232,9 +232,9 @@ def test_wiener_broadcasts_over_batch_and_channels(batch, channels, generator):
 
 
 OPERATIONS = {
-    "convolve": convolution.convolve,
-    "correlate": convolution.correlate,
-    "wiener": lambda b, h: wiener.wiener(b, h, 0.1),
+    "convolve": fourier.convolve,
+    "correlate": fourier.correlate,
+    "wiener": lambda b, h: fourier.wiener(b, h, 0.1),
 }
 
 
@@ -263,7 +263,7 @@ def test_gradients_of_convolve_are_those_of_the_bilinear_map(circular, generator
     v = noise((1, 1, 4, 5), generator).requires_grad_()
     h = noise((1, 1, 3, 4), generator).requires_grad_()
     y = noise((1, 1, 6, 7), generator)
-    (convolution.convolve(v, h, size=(6, 7), circular=circular) * y).sum().backward()
+    (fourier.convolve(v, h, size=(6, 7), circular=circular) * y).sum().backward()
     for variable in (v, h):
         expected = np.zeros(variable.shape[-2:])
         for index in np.ndindex(*expected.shape):
@@ -281,7 +281,7 @@ def test_gradients_of_wiener_are_finite_differences(boundary, generator):
     h = torch.rand(1, 1, 3, 4, generator=generator).requires_grad_()
     k = torch.tensor(0.3, requires_grad=True)
     y = noise((1, 1, 4, 5), generator)
-    (wiener.wiener(b, h, k, boundary=boundary) * y).sum().backward()
+    (fourier.wiener(b, h, k, boundary=boundary) * y).sum().backward()
     values = [t.detach().double().reshape(t.shape[-2:]).numpy() for t in (b, h, k)]
     for which, variable in enumerate((b, h, k)):
         expected = np.zeros(variable.shape[-2:])
@@ -301,8 +301,8 @@ def test_noise_free_wiener_inverts(size, generator):
     h = torch.rand(1, 3, *size, generator=generator)
     h = 0.25 * h / h.sum((-2, -1), keepdim=True)
     h[..., size[0] // 2, size[1] // 2] += 0.75
-    b = convolution.convolve(v, h, circular=True)
-    close(wiener.wiener(b, h, 1e-6, boundary="circular"), v, 2e-5)
+    b = fourier.convolve(v, h, circular=True)
+    close(fourier.wiener(b, h, 1e-6, boundary="circular"), v, 2e-5)
 
 
 @pytest.mark.parametrize("boundary", BOUNDARIES)
@@ -319,7 +319,7 @@ def test_noise_free_wiener_inverts(size, generator):
 )
 def test_wiener_is_equation_2(size, psf, boundary, generator):
     b, h = noise((1, 1, *size), generator), noise((1, 1, *psf), generator)
-    found = wiener.wiener(b, h, 0.05, boundary=boundary)
+    found = fourier.wiener(b, h, 0.05, boundary=boundary)
     close(found[0, 0], oracles.wiener(b[0, 0], h[0, 0], 0.05, boundary), 2e-5)
 
 
@@ -331,26 +331,26 @@ def test_wiener_is_scikit_images_with_a_flat_prior(size, psf, generator):
     theirs = restoration.wiener(
         b[0, 0].double().numpy(), h[0, 0].double().numpy(), 0.02, reg=np.ones((1, 1)), clip=False
     )
-    close(wiener.wiener(b, h, 0.02, boundary="circular")[0, 0], theirs, 1e-5)
+    close(fourier.wiener(b, h, 0.02, boundary="circular")[0, 0], theirs, 1e-5)
 
 
 def test_more_regularisation_dims_the_estimate(generator):
     b, h = torch.rand(1, 1, 16, 16, generator=generator), torch.rand(1, 1, 16, 16, generator=generator)
-    energies = [wiener.wiener(b, h / h.sum(), k).norm().item() for k in (1e-4, 1e-3, 1e-2, 1e-1, 1.0)]
+    energies = [fourier.wiener(b, h / h.sum(), k).norm().item() for k in (1e-4, 1e-3, 1e-2, 1e-1, 1.0)]
     assert energies == sorted(energies, reverse=True)
 
 
 def test_weight_in_the_psf_is_the_papers_w(generator):
     """w conj(H) B / (|w H|^2 + lambda), with w = 3, is 1/3 of the filter without w at lambda / 9."""
     b, h = noise((1, 1, 9, 8), generator), noise((1, 1, 9, 8), generator)
-    close(wiener.wiener(b, 3 * h, 0.9), wiener.wiener(b, h, 0.1) / 3, 1e-5)
+    close(fourier.wiener(b, 3 * h, 0.9), fourier.wiener(b, h, 0.1) / 3, 1e-5)
 
 
 @pytest.mark.parametrize("boundary", BOUNDARIES)
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (2, 2), (17, 6), (33, 47)])
 def test_every_boundary_keeps_the_size(size, boundary, generator):
     b, h = torch.rand(2, 3, *size, generator=generator), torch.rand(1, 1, *size, generator=generator)
-    found = wiener.wiener(b, h, 1e-3, boundary=boundary)
+    found = fourier.wiener(b, h, 1e-3, boundary=boundary)
     assert found.shape == b.shape
     assert found.isfinite().all()
 
@@ -361,7 +361,7 @@ def test_constant_measurement_gives_a_constant_over_the_sum_of_the_psf(size, psf
     """Only frequency zero is there, so V = S B / (S^2 + lambda) exactly."""
     h = torch.rand(1, 1, *psf, generator=generator)
     S = h.sum().item()
-    found = wiener.wiener(torch.full((1, 1, *size), 0.7), h, 1e-4, boundary=boundary)
+    found = fourier.wiener(torch.full((1, 1, *size), 0.7), h, 1e-4, boundary=boundary)
     close(found, np.full((1, 1, *size), 0.7 * S / (S**2 + 1e-4)), 2e-5)
 
 
@@ -372,7 +372,7 @@ def test_constant_measurement_gives_a_constant_over_the_sum_of_the_psf(size, psf
 )
 def test_extend_is_numpys_edge_padding(size, grid, boundary, generator):
     picture = noise((2, 3, *size), generator)
-    found = memory_format.extend(picture, grid, boundary)
+    found = fourier.extend(picture, grid, boundary)
     assert torch.equal(found[..., : size[0], : size[1]], picture)
     for b in range(2):
         for c in range(3):
@@ -385,8 +385,8 @@ def test_extended_picture_is_continuous_at_both_borders(size, boundary):
     """Of a smooth picture, no step on the periodic grid may be much larger than the steps inside it."""
     rows, columns = torch.linspace(0, 1, size[0])[:, None], torch.linspace(0, 1, size[1])
     picture = (0.2 + 0.5 * rows + 0.3 * columns)[None, None]
-    grid = wiener.deconvolution_grid(size, boundary)
-    wide = memory_format.extend(picture, grid, boundary)[0, 0]
+    grid = fourier.deconvolution_grid(size, boundary)
+    wide = fourier.extend(picture, grid, boundary)[0, 0]
     height, width = size
     # The taper falls by at most pi/2 / (padding / 2) a pixel, and by the square of that next to the border.
     near = {"replicate": 0.0, "taper": 0.05}[boundary]
@@ -421,8 +421,8 @@ def test_letter_is_found_again_upright_and_in_place(boundary, generator):
     """Correlated with all eight turned and mirrored letters at all shifts, the upright one unmoved wins."""
     scene = letter_f()
     h = torch.rand(1, 1, 32, 32, generator=generator) ** 8
-    b = convolution.convolve(scene, h / h.sum(), circular=boundary == "circular")
-    found = wiener.wiener(b, h / h.sum(), 1e-3, boundary=boundary)[0, 0].double().numpy()
+    b = fourier.convolve(scene, h / h.sum(), circular=boundary == "circular")
+    found = fourier.wiener(b, h / h.sum(), 1e-3, boundary=boundary)[0, 0].double().numpy()
     found = found - found.mean()
     best = {}
     for turn in TURNS:
@@ -454,21 +454,21 @@ def test_psf_that_does_not_fit_is_refused(operation, psf, said):
 def test_psf_larger_than_the_grid_is_refused():
     message = r"`psf` \(9 x 4\) must not be larger than the grid \(8 x 8\)"
     with pytest.raises(ShapeError, match=message):
-        convolution.convolve(torch.ones(1, 1, 8, 8), torch.ones(1, 1, 9, 4), circular=True)
+        fourier.convolve(torch.ones(1, 1, 8, 8), torch.ones(1, 1, 9, 4), circular=True)
     with pytest.raises(ShapeError, match=message):
-        wiener.wiener(torch.ones(1, 1, 8, 8), torch.ones(1, 1, 9, 4), 0.1, boundary="circular")
+        fourier.wiener(torch.ones(1, 1, 8, 8), torch.ones(1, 1, 9, 4), 0.1, boundary="circular")
 
 
 @pytest.mark.parametrize("value", [0.0, -1e-3, float("nan")])
 def test_regularisation_must_be_positive(value):
     with pytest.raises(ParameterError, match=r"`regularisation` \(.*\) must be positive"):
-        wiener.wiener(torch.ones(1, 1, 8, 8), torch.ones(1, 1, 8, 8), value)
+        fourier.wiener(torch.ones(1, 1, 8, 8), torch.ones(1, 1, 8, 8), value)
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_unknown_boundary_is_refused():
     with pytest.raises(ParameterError, match="`boundary` must be circular, zero, replicate or taper, not 'mirror'"):
-        wiener.wiener(torch.ones(1, 1, 8, 8), torch.ones(1, 1, 8, 8), 0.1, boundary="mirror")
+        fourier.wiener(torch.ones(1, 1, 8, 8), torch.ones(1, 1, 8, 8), 0.1, boundary="mirror")
 
 
 @pytest.mark.parametrize("boundary", ["circular", "zero", "replicate", "taper"])
@@ -482,19 +482,19 @@ def test_filtered_and_its_gradients_are_those_of_its_definition(
 ):
     """Its passes are written by hand, of an even number of channels two at a time; torch derives those of
     transform, product, transform."""
-    grid = wiener.deconvolution_grid((21, width), boundary)
+    grid = fourier.deconvolution_grid((21, width), boundary)
     image = torch.rand(2, channels, 21, width, generator=generator)
     psf = torch.rand(psf_batch, psf_channels, 21, width, generator=generator)
     slope = torch.randn(image.shape, generator=generator)
     found = []
     for defined in (True, False):
         x, h = image.clone().requires_grad_(), psf.clone().requires_grad_()
-        transfer = wiener.wiener_transfer(h, 0.1, grid)
+        transfer = fourier.wiener_transfer(h, 0.1, grid)
         if defined:
-            spread = convolution.spectrum(memory_format.extend(x, grid, boundary), grid)
-            y = convolution.inverse_spectrum(transfer * spread, grid, (21, width))
+            spread = fourier.spectrum(fourier.extend(x, grid, boundary), grid)
+            y = fourier.inverse_spectrum(transfer * spread, grid, (21, width))
         else:
-            y = filtering.filtered(x, transfer, grid, boundary)
+            y = fourier.filtered(x, transfer, grid, boundary)
         y.backward(slope)
         found.append((y, x.grad, h.grad))
     for one, other in zip(*found, strict=True):
@@ -504,16 +504,16 @@ def test_filtered_and_its_gradients_are_those_of_its_definition(
 @pytest.mark.parametrize(("psf_batch", "psf_channels"), [(1, 1), (1, 4), (3, 1), (3, 4)])
 def test_several_samples_at_once_as_on_a_gpu(psf_batch, psf_channels, generator, monkeypatch):
     """A GPU takes as many samples together as its gigabyte holds, a CPU one."""
-    grid = wiener.deconvolution_grid((21, 25), "taper")
+    grid = fourier.deconvolution_grid((21, 25), "taper")
     image = torch.rand(3, 4, 21, 25, generator=generator)
     psf = torch.rand(psf_batch, psf_channels, 21, 25, generator=generator)
     slope = torch.randn(image.shape, generator=generator)
     found = []
     for parts in (None, [(slice(0, 2), slice(0, 4)), (slice(2, 4), slice(0, 4))]):
         if parts:
-            monkeypatch.setattr(filtering, "together", lambda *_, parts=parts: parts)
+            monkeypatch.setattr("mwdn.fourier.filtering.together", lambda *_, parts=parts: parts)
         x, h = image.clone().requires_grad_(), psf.clone().requires_grad_()
-        y = filtering.filtered(x, wiener.wiener_transfer(h, 0.1, grid), grid, "taper")
+        y = fourier.filtered(x, fourier.wiener_transfer(h, 0.1, grid), grid, "taper")
         y.backward(slope)
         found.append((y, x.grad, h.grad))
     for one, other in zip(*found, strict=True):
@@ -522,14 +522,14 @@ def test_several_samples_at_once_as_on_a_gpu(psf_batch, psf_channels, generator,
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_filtered_keeps_precision_and_memory_format(dtype, generator):
-    grid = wiener.deconvolution_grid((30, 33), "taper")
-    transfer = wiener.wiener_transfer(torch.rand(1, 1, 30, 33, generator=generator), 0.1, grid)
+    grid = fourier.deconvolution_grid((30, 33), "taper")
+    transfer = fourier.wiener_transfer(torch.rand(1, 1, 30, 33, generator=generator), 0.1, grid)
     image = torch.rand(2, 6, 30, 33, generator=generator).to(dtype)
-    expected = filtering.filtered(image.float(), transfer, grid, "taper").to(dtype)
+    expected = fourier.filtered(image.float(), transfer, grid, "taper").to(dtype)
     last = image.contiguous(memory_format=torch.channels_last)
     part = torch.cat([last, last], dim=1)[:, 6:]  # what a gradient of a concatenation is
     for given, form in ((image, torch.contiguous_format), (last, torch.channels_last), (part, torch.channels_last)):
-        found = filtering.filtered(given, transfer, grid, "taper")
+        found = fourier.filtered(given, transfer, grid, "taper")
         assert found.dtype == dtype
         assert torch.equal(found, expected)
         if given is not part:

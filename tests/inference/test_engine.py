@@ -9,7 +9,7 @@ from torch.nn import functional as F
 
 from mwdn import Calibration, Camera, Reconstructor, read_frame
 from mwdn.errors import ParameterError
-from mwdn.inference import engine
+from mwdn.inference import fusion
 from mwdn.inference.engine import Engine
 from mwdn.inference.fusion import Convolution, fold
 from mwdn.networks import NETWORKS, build
@@ -61,7 +61,7 @@ def test_plug_and_play_too(generator):
 def test_folded_convolution(fused, dtype, generator, monkeypatch):
     """Also where torch cannot fuse: another version, another processor."""
     if not fused:
-        monkeypatch.setattr(engine, "_packed", lambda weight, padding: None)
+        monkeypatch.setattr(fusion, "_packed", lambda weight, padding: None)
     layers = nn.Sequential(
         nn.Conv2d(20, 17, 3, padding=1, bias=False), nn.BatchNorm2d(17), nn.ReLU(), nn.Conv2d(17, 18, 1)
     )

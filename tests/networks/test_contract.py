@@ -8,8 +8,8 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch.nn import functional as F
 
+from mwdn import fourier
 from mwdn.errors import MwdnError, ShapeError, UnknownNameError
-from mwdn.fourier import convolution
 from mwdn.inference.engine import Engine
 from mwdn.networks import NETWORKS, build
 
@@ -44,7 +44,7 @@ def pair(generator, size=(24, 24), *, batch=2, channels=3, psf_batch=1):
     scene = F.interpolate(seeds, size=size, mode="bicubic").clamp(0, 1)
     h = torch.rand(psf_batch, channels, *size, generator=generator) ** 8
     h = h / h.sum((-2, -1), keepdim=True)
-    return convolution.convolve(scene, h), h, scene
+    return fourier.convolve(scene, h), h, scene
 
 
 @pytest.fixture(params=NETWORKS)

@@ -15,7 +15,7 @@ from mwdn.optics.design import decades, design_camera, radial_autocorrelation, r
 from mwdn.optics.mask_files import read_mask
 from mwdn.optics.patterns import contour_psf
 
-RECIPES = Path(__file__).resolve().parents[1] / "recipes"
+RECIPES = Path(__file__).resolve().parents[2] / "recipes"
 SMALL = ["--aperture-mm", "0.4", "0.4", "--pixels", "200", "240", "--wavelengths", "2", "-o", "cam"]
 
 

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
-from test_train import log, same
 
 from mwdn.calibration import Calibration
 from mwdn.errors import ParameterError
@@ -24,6 +23,7 @@ from mwdn.runtime import distributed
 from mwdn.training.batch_norm import freeze_cancelled
 from mwdn.training.experiment import prepare
 from mwdn.training.recipe import read_recipe
+from runs import log, same
 
 STEPS = 12
 # 3 samples for two processes: one has one, the other two. At this rate, with small first steps and without the

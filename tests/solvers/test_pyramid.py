@@ -9,8 +9,8 @@ from scipy.optimize import nnls
 from torch.nn import functional as F
 
 import oracles
+from mwdn import fourier
 from mwdn.errors import ParameterError
-from mwdn.fourier import convolution
 from mwdn.optics.noise import noise_level
 from mwdn.optics.patterns import contour_psf
 from mwdn.solvers import Penalties
@@ -50,11 +50,11 @@ def test_low_band_takes_a_coarse_scene_where_the_fine_one_goes(shrink, generator
     for row, column in ((0, 1), (2, 0), (3, 5), (-2, 4)):
         spectrum[row, column] = 1 + 2j
     scene = torch.from_numpy(np.fft.ifft2(spectrum).real)[None, None]
-    H = convolution.transfer_function(psf, grid)
-    fine = convolution.inverse_spectrum(convolution.spectrum(scene, grid) * H, grid, grid)
+    H = fourier.transfer_function(psf, grid)
+    fine = fourier.inverse_spectrum(fourier.spectrum(scene, grid) * H, grid, grid)
     small = grid[0] // shrink, grid[1] // shrink
-    coarse = convolution.spectrum(scene[..., ::shrink, ::shrink], small) * low_band(H, grid, shrink)
-    found = convolution.inverse_spectrum(coarse, small, small)
+    coarse = fourier.spectrum(scene[..., ::shrink, ::shrink], small) * low_band(H, grid, shrink)
+    found = fourier.inverse_spectrum(coarse, small, small)
     torch.testing.assert_close(found, fine[..., ::shrink, ::shrink], rtol=1e-4, atol=1e-5)
 
 
@@ -63,7 +63,7 @@ def test_a_cropped_pattern_is_explained_far_better_than_by_a_wiener_filter(gener
     psf = contour_psf((96, 128), generator=generator)
     scene = torch.full((1, 3, 96, 128), 0.1)
     scene[..., 20:70, 30:90] = torch.tensor([0.8, 0.5, 0.2])[:, None, None]
-    measurement = convolution.convolve(scene, psf)
+    measurement = fourier.convolve(scene, psf)
     errors = [
         float((method(measurement, psf) - scene).square().mean()) for method in (Pyramid(), Wiener(regularisation=1e-4))
     ]
@@ -75,10 +75,10 @@ def test_smoothing_follows_the_noise_of_the_light_not_of_the_dark(generator, mon
     psf = F.pad(contour_psf((48, 64), generator=generator), (32, 32, 24, 24))
     scene = torch.zeros(1, 3, 96, 128)
     scene[..., 36:60, 44:84] = torch.tensor([0.8, 0.5, 0.2])[:, None, None]
-    light = convolution.convolve(scene, psf)
+    light = fourier.convolve(scene, psf)
     light = light / light.max()
     electrons = 2000 * light + (2000 * light + 9).sqrt() * torch.randn(light.shape, generator=generator)
-    truth, found = light.sum() / convolution.convolve(scene, psf).sum() * scene, {}
+    truth, found = light.sum() / fourier.convolve(scene, psf).sum() * scene, {}
     for parts in (16, 1):
         monkeypatch.setattr("mwdn.solvers.pyramid.noise_level", partial(noise_level, parts=parts))
         found[parts] = float((Pyramid()(electrons / 2000, psf) - truth).square().mean())
@@ -119,7 +119,7 @@ def test_a_pyramid_that_stops_early_leaves_the_detail(generator):
     fine[..., 40:44, 50:54] += 5.0
     left = []
     for scene in (smooth, fine):
-        measurement = convolution.convolve(scene, psf)
+        measurement = fourier.convolve(scene, psf)
         found = explain(measurement, psf, tuple(level for level in LEVELS if level.shrink >= 4))
         assert found.scene.shape == measurement.shape
         assert (found.scene >= 0).all()

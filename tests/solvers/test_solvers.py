@@ -9,8 +9,8 @@ from scipy.optimize import nnls
 from skimage.restoration import denoise_tv_chambolle
 
 import oracles
+from mwdn import fourier
 from mwdn.errors import ParameterError, ShapeError, UnknownNameError
-from mwdn.fourier import convolution
 from mwdn.solvers import TEXTBOOK, Admm, Penalties, admm, build, proximal, splitting
 from mwdn.solvers.fista import Fista
 from mwdn.solvers.pyramid import Pyramid
@@ -41,7 +41,7 @@ def capture(generator, *, noise=0.0, size=(24, 30)):
     scene[..., 6:9, 8:20] = torch.tensor([0.2, 0.8, 0.5])[:, None, None]
     h = torch.rand(1, 3, *size, generator=generator) ** 12
     h = h / h.sum((-2, -1), keepdim=True)
-    b = convolution.convolve(scene, h)
+    b = fourier.convolve(scene, h)
     return scene, b + noise * torch.randn(b.shape, generator=generator), h
 
 
@@ -69,8 +69,8 @@ def test_gradient_goes_down_the_rows_and_along_the_columns():
 def test_laplacian_of_the_problem_is_divergence_of_gradient(generator):
     problem = splitting.pose(*pair((6, 9), (5, 4), generator))
     v = torch.randn(1, 3, *problem.grid, generator=generator)
-    product = convolution.spectrum(v, problem.grid) * problem.laplacian
-    found = convolution.inverse_spectrum(product, problem.grid, problem.grid)
+    product = fourier.spectrum(v, problem.grid) * problem.laplacian
+    found = fourier.inverse_spectrum(product, problem.grid, problem.grid)
     torch.testing.assert_close(found, proximal.divergence(proximal.gradient(v)), rtol=0, atol=1e-5)
 
 
@@ -166,8 +166,8 @@ def test_objective_is_what_it_says(variation, generator):
     b, h = pair((6, 7), (5, 5), generator, batch=2)
     problem = splitting.pose(b, h)
     v = torch.rand(2, 3, *problem.grid, generator=generator)
-    V = convolution.spectrum(v, problem.grid)
-    Hv = convolution.inverse_spectrum(problem.transfer * V, problem.grid, problem.sensor)
+    V = fourier.spectrum(v, problem.grid)
+    Hv = fourier.inverse_spectrum(problem.transfer * V, problem.grid, problem.sensor)
     state = splitting.start(problem)._replace(v=v, V=V, Hv=Hv)
     found = splitting.objective(state, problem, 0.3, variation)
     for i in range(2):
@@ -229,7 +229,7 @@ def test_both_solvers_find_the_same_scene_where_it_is_unique(generator):
     scene[..., 5:11, 5:13] = torch.rand(1, 3, 6, 8, generator=generator)
     h = 0.3 * torch.rand(1, 3, 5, 5, generator=generator) / 25
     h[..., 2, 2] = 1
-    b = convolution.convolve(scene, h)
+    b = fourier.convolve(scene, h)
     by_fista = Fista(iterations=300)(b, h)
     by_admm = Admm(regularisation=0.0, penalties=Penalties(0.5, 1e-3, 0.1), iterations=300)(b, h)
     torch.testing.assert_close(by_fista, scene, rtol=0, atol=2e-3)

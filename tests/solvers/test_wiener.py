@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from mwdn import fourier
 from mwdn.errors import ParameterError, ShapeError
-from mwdn.fourier import convolution, memory_format, wiener
 from mwdn.optics import Camera, Sensor
 from mwdn.optics.patterns import contour_psf
 from mwdn.solvers import Wiener, noise_level
@@ -31,9 +31,9 @@ def chosen(measurement, psf, **options):
     """Lambda (B, C, 1, 1) as the solver finds it."""
     solver = Wiener(**options)
     size = tuple(measurement.shape[-2:])
-    grid = wiener.deconvolution_grid(size, solver.boundary)
-    H = convolution.transfer_function(psf / psf.sum((-2, -1), keepdim=True), grid)
-    B = convolution.spectrum(memory_format.extend(measurement, grid, solver.boundary), grid)
+    grid = fourier.deconvolution_grid(size, solver.boundary)
+    H = fourier.transfer_function(psf / psf.sum((-2, -1), keepdim=True), grid)
+    B = fourier.spectrum(fourier.extend(measurement, grid, solver.boundary), grid)
     return solver._discrepancy(measurement, B, H, grid[1])
 
 
@@ -78,7 +78,7 @@ def test_one_row_tells_nothing(size):
 
 
 def test_lambda_grows_with_the_noise(psf, scene, generator):
-    light = convolution.convolve(scene, psf)
+    light = fourier.convolve(scene, psf)
     noise = torch.randn(light.shape, generator=generator)
     found = [chosen(light + sigma * noise, psf).mean().item() for sigma in (0, 0.003, 0.01, 0.03, 0.1)]
     assert found == sorted(found)
@@ -95,12 +95,12 @@ def test_residual_has_the_power_of_noise_and_tolerance(size, tolerance, generato
     psf = contour_psf(size, cell=12, line=3.0, generator=generator)
     scene = torch.zeros(2, 3, *size)
     scene[..., 10:30, 12:20] = torch.tensor([0.9, 0.5, 1.0])[:, None, None]
-    light = convolution.convolve(scene, psf, circular=True)
+    light = fourier.convolve(scene, psf, circular=True)
     measurement = light + 0.003 * torch.randn(light.shape, generator=generator)
     regularisation = chosen(measurement, psf, tolerance=tolerance, boundary="circular")
-    estimate = wiener.wiener(measurement, psf, regularisation, boundary="circular")
+    estimate = fourier.wiener(measurement, psf, regularisation, boundary="circular")
     assert (regularisation < 1).all()
-    residual = measurement - convolution.convolve(estimate, psf, circular=True)
+    residual = measurement - fourier.convolve(estimate, psf, circular=True)
     power = residual.var((-2, -1), correction=0, keepdim=True)  # the mean is left out
     contrast = measurement.var((-2, -1), correction=0, keepdim=True)
     torch.testing.assert_close(power, noise_level(measurement) ** 2 + tolerance**2 * contrast, rtol=1e-3, atol=0)
@@ -117,9 +117,9 @@ def test_chosen_lambda_is_better_than_one_far_from_it(full_well, psf, scene, gen
 
 def test_solver_is_eq_2_with_the_chosen_lambda(psf, scene, generator):
     b = Camera(psf).simulate(scene, generator=generator)
-    expected = wiener.wiener(b, psf, chosen(b, psf)).clamp(min=0)
+    expected = fourier.wiener(b, psf, chosen(b, psf)).clamp(min=0)
     torch.testing.assert_close(Wiener()(b, psf), expected)
-    given = wiener.wiener(b, psf, 1e-3, boundary="replicate").clamp(min=0)
+    given = fourier.wiener(b, psf, 1e-3, boundary="replicate").clamp(min=0)
     torch.testing.assert_close(Wiener(regularisation=1e-3, boundary="replicate")(b, psf), given)
 
 

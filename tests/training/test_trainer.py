@@ -1,7 +1,6 @@
 """The training loop: it learns, and a run that is stopped anywhere ends as one that was not."""
 
 import errno
-import json
 import os
 import random
 import re
@@ -34,6 +33,7 @@ from mwdn.training.trainer import Trainer
 from mwdn.training.training_state import read_state
 from mwdn.training.validation import Validation
 from mwdn.weights.checkpoint import load_network, read_metadata
+from runs import log, same
 
 RECIPE = Recipe(
     {"name": "wiener-bank", "width": 4, "regularisations": (1e-2, 1e-4)},
@@ -70,16 +70,6 @@ def trainer(photos, calibration, tmp_path):
         return prepare(recipe, calibration, photos, tmp_path / folder, "cpu")
 
     return make
-
-
-def same(one, other):
-    one, other = load_file(one), load_file(other)
-    assert one.keys() == other.keys()
-    return all(torch.equal(value, other[key]) for key, value in one.items())
-
-
-def log(folder):
-    return [json.loads(line) for line in (folder / "log.jsonl").read_text(encoding="utf-8").splitlines()]
 
 
 # --- Learning -----------------------------------------------------------------------------------------

@@ -1,17 +1,39 @@
 """Convolution, correlation and Wiener deconvolution by fast Fourier transforms."""
 
-from mwdn.fourier.convolution import Convolution, check_fit, convolution, convolve, correlate
-from mwdn.fourier.padding import Boundary
+from mwdn.fourier.convolution import Convolution, check_fit, convolve, correlate
+from mwdn.fourier.filtering import filtered
+from mwdn.fourier.padding import Boundary, extend
+from mwdn.fourier.transforms import (
+    fast_length,
+    filter_field,
+    frequencies,
+    frequency_grid,
+    gaussian_transfer,
+    inverse_spectrum,
+    plane_spectrum,
+    spectrum,
+    transfer_function,
+)
 from mwdn.fourier.wiener import deconvolution_grid, wiener, wiener_transfer
 
 __all__ = [
     "Boundary",
     "Convolution",
     "check_fit",
-    "convolution",
     "convolve",
     "correlate",
     "deconvolution_grid",
+    "extend",
+    "fast_length",
+    "filter_field",
+    "filtered",
+    "frequencies",
+    "frequency_grid",
+    "gaussian_transfer",
+    "inverse_spectrum",
+    "plane_spectrum",
+    "spectrum",
+    "transfer_function",
     "wiener",
     "wiener_transfer",
 ]

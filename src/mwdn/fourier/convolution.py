@@ -76,12 +76,18 @@ def correlate(measurement: Measurement, psf: Psf, *, size: Size | None = None, c
 
 
 class Convolution(NamedTuple):
-    """`convolve` and `correlate` between fixed sizes, for a method that needs both many times: see `convolution`."""
+    """`convolve` and `correlate` between fixed sizes, for a method that needs both many times."""
 
     transfer: Spectrum
     grid: Size
     scene: Size
     sensor: Size
+
+    @classmethod
+    def from_psf(cls, psf: Psf, scene: Size, sensor: Size) -> "Convolution":
+        """Linear convolution of scenes with a PSF, which is transformed once, here."""
+        transfer, grid = _operator(psf, scene, sensor, circular=False)
+        return cls(transfer, grid, scene, sensor)
 
     def forward(self, scene: Scene) -> Image:
         """What the sensor sees of a scene."""
@@ -90,9 +96,3 @@ class Convolution(NamedTuple):
     def adjoint(self, measurement: Measurement) -> Scene:
         """Exact adjoint of `forward`."""
         return inverse_spectrum(spectrum(measurement, self.grid) * self.transfer.conj(), self.grid, self.scene)
-
-
-def convolution(psf: Psf, scene: Size, sensor: Size) -> Convolution:
-    """Linear convolution of scenes with a PSF that is transformed once, here."""
-    transfer, grid = _operator(psf, scene, sensor, circular=False)
-    return Convolution(transfer, grid, scene, sensor)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from mwdn.fourier.convolution import Convolution, convolution
+from mwdn.fourier.convolution import Convolution
 from mwdn.networks.blocks import check_channels, one_each_colour, stretched
 from mwdn.types import Measurement, Psf, Scene, Size
 
@@ -124,7 +124,7 @@ class Updn(nn.Module):
         """Scene (B, C, H, W), between 0 and 1."""
         check_channels(measurement, self.channels)
         height, width = measurement.shape[-2:]
-        camera = convolution(self.psfs(measurement, psf), (2 * height, 2 * width), (height, width))
+        camera = Convolution.from_psf(self.psfs(measurement, psf), (2 * height, 2 * width), (height, width))
         b = measurement.float().reshape(-1, 1, height, width)
         dual = b.new_zeros(b.shape[0], self.width, height, width)
         primal = b.new_zeros(b.shape[0], self.width, 2 * height, 2 * width)
