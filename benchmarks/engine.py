@@ -32,7 +32,7 @@ import torch
 
 import arithmetic
 from mwdn import Calibration, Reconstructor
-from mwdn.fourier.padding import extend
+from mwdn.fourier.padding import pad
 from mwdn.fourier.transforms import inverse_spectrum, spectrum
 from mwdn.inference.reconstructor import find_method
 from mwdn.networks import NETWORKS, blocks, build
@@ -55,7 +55,7 @@ HEAD = (
 
 def plain_filter(features, transfer, grid, boundary):
     """Transform, multiply, transform back, each for the whole array."""
-    spread = spectrum(extend(features.float(), grid, boundary), grid)
+    spread = spectrum(pad(features.float(), grid, boundary), grid)
     return inverse_spectrum(transfer * spread, grid, features.shape[-2:])
 
 

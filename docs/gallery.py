@@ -18,7 +18,7 @@ from torch.nn import functional as F
 
 from mwdn import Calibration, Camera, Reconstructor, read_picture, write_picture
 from mwdn.evaluation import psnr
-from mwdn.io.contact_sheets import contact_sheet, for_people
+from mwdn.io.contact_sheets import contact_sheet, to_display
 from mwdn.io.files import atomic
 from mwdn.io.images import srgb_encode
 from mwdn.optics import CodedAperture, Contour, Diffuser, Lenslets, Mask, Pinholes, Setup, ZoneAperture, mask_psf
@@ -148,7 +148,7 @@ def compare(designed: Psf, measured: Psf) -> None:
         print(
             f"  ring at {spectra[name][6:].argmax() + 6} / 120; spectrum {fit.min():.2f} to {fit.max():.2f} of measured"
         )
-    picture = (srgb_encode(for_people(designed)[0]).movedim(0, -1).numpy() * 255).round().astype(np.uint8)
+    picture = (srgb_encode(to_display(designed)[0]).movedim(0, -1).numpy() * 255).round().astype(np.uint8)
     sheet = np.concatenate(
         [
             picture[..., ::-1],

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import torch
 
-from mwdn import Calibration, Reconstructor, for_people, read_frame
+from mwdn import Calibration, Reconstructor, read_frame, to_display
 from mwdn.io.contact_sheets import contact_sheet
 from mwdn.io.images import srgb_encode
 
@@ -24,7 +24,7 @@ def main(camera: Path, weights: str, out: Path = Path("docs/objects.jpg")) -> No
         methods = [Reconstructor(method, calibration) for method in ("admm", "pyramid", weights)]
         for capture in sorted((camera / "real-objects").glob(pattern)):
             measurement = calibration.correct(read_frame(capture))
-            found = [for_people(method(measurement)) for method in methods]
+            found = [to_display(method(measurement)) for method in methods]
             top = (found[0].shape[-1] - 200) // 2  # the objects stand in the middle 200 x 200 pixels
             rows.append([picture[..., top : top + 200, top : top + 200] for picture in found])
     # Two halves beside each other: a page is wider than high.

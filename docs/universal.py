@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import torch
 
-from mwdn import Calibration, Reconstructor, for_people, read_frame
+from mwdn import Calibration, Reconstructor, read_frame, to_display
 from mwdn.io.contact_sheets import contact_sheet
 from mwdn.io.images import srgb_encode
 
@@ -22,7 +22,7 @@ def rows(calibration: Calibration, captures: list[Path], *, middle: int = 0) -> 
     found = []
     for capture in captures:
         measurement = calibration.correct(read_frame(capture, bgr=calibration.bgr))
-        pictures = [for_people(method(measurement)) for method in methods]
+        pictures = [to_display(method(measurement)) for method in methods]
         rows, columns = ((size - (middle or size)) // 2 for size in pictures[0].shape[-2:])
         found.append([p[..., rows : p.shape[-2] - rows, columns : p.shape[-1] - columns] for p in pictures])
     return found

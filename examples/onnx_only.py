@@ -84,7 +84,7 @@ def measured(capture, dark, about):
     return np.ascontiguousarray(frame.transpose(2, 0, 1)[None])
 
 
-def for_people(scene):
+def to_display(scene):
     """Scale so that all but the brightest 0.3 % fit into [0, 1], then encode as sRGB in 8 bits."""
     brightest = np.sort(scene, axis=None)[-1 - int(0.003 * scene.size)]
     light = np.clip(scene / max(brightest, 1e-12), 0, 1)
@@ -99,7 +99,7 @@ def main(model, capture, out, dark=None):
     if list(measurement.shape[1:]) != wanted:
         sys.exit(f"{capture} is {measurement.shape[1:]} (channels, height, width), but {model} takes {wanted}.")
     (scene,) = session.run(["scene"], {"measurement": measurement})
-    picture = for_people(scene[0].transpose(1, 2, 0))
+    picture = to_display(scene[0].transpose(1, 2, 0))
     try:
         cv2.imencode(Path(out).suffix, np.ascontiguousarray(picture[..., ::-1]))[1].tofile(out)
     except (OSError, cv2.error):

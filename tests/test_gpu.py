@@ -15,10 +15,10 @@ from mwdn.data.pairs import PairFile
 from mwdn.data.photographs import Photographs
 from mwdn.data.recorded import RecordedPairs, record
 from mwdn.data.simulated import SimulatedPairs
-from mwdn.inference.batch import Darkroom
+from mwdn.inference.batch import Batch
 from mwdn.networks import build
 from mwdn.optics.patterns import contour_psf
-from mwdn.runtime.transfers import fetched, sent
+from mwdn.runtime.transfers import to_device, to_host
 from mwdn.training.recipe import Recipe, Schedule
 from mwdn.training.trainer import Trainer
 
@@ -62,13 +62,13 @@ def test_there_and_back(shape, generator):
     for _ in range(5):
         busy = busy @ busy
     expected = first.clone()
-    there = sent(first, GPU)
+    there = to_device(first, GPU)
     first.zero_()
-    doubled = sent(second, GPU) * 2
-    back = fetched(there)
+    doubled = to_device(second, GPU) * 2
+    back = to_host(there)
     there.zero_()
     torch.testing.assert_close(back, expected, rtol=0, atol=0)
-    torch.testing.assert_close(fetched(doubled), 2 * second, rtol=0, atol=0)
+    torch.testing.assert_close(to_host(doubled), 2 * second, rtol=0, atol=0)
     assert there.device == GPU
     assert not back.is_pinned()
 
@@ -122,7 +122,7 @@ def test_a_folder(calibration, batches, tmp_path):
     found = {}
     for device in (CPU, GPU):
         reconstruct = Reconstructor("universal-small", calibration, device=device, precision="exact")
-        found[device] = list(Darkroom(reconstruct, "name", tmp_path / device.type, "npy").develop(captures))
+        found[device] = list(Batch(reconstruct, "name", tmp_path / device.type, "npy").run(captures))
     for here, there in zip(found[CPU], found[GPU], strict=True):
         assert there.error is None
         assert there.trust.explained == pytest.approx(here.trust.explained, rel=1e-3)

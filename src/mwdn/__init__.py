@@ -1,10 +1,10 @@
 """From the caustic pattern of a lensless camera to a picture.
 
->>> from mwdn import Calibration, Reconstructor, for_people, read_frame, write_picture
+>>> from mwdn import Calibration, Reconstructor, to_display, read_frame, write_picture
 >>> calibration = Calibration.from_file("psf.png")
 >>> reconstruct = Reconstructor("universal", calibration)
 >>> scene = reconstruct(calibration.correct(read_frame("capture.png")))
->>> write_picture("scene.png", for_people(scene))
+>>> write_picture("scene.png", to_display(scene))
 """
 
 from mwdn.calibration import Calibration
@@ -12,7 +12,7 @@ from mwdn.errors import MwdnError
 from mwdn.fourier.convolution import convolve, correlate
 from mwdn.fourier.wiener import wiener
 from mwdn.inference.reconstructor import Reconstructor
-from mwdn.io.contact_sheets import for_people
+from mwdn.io.contact_sheets import to_display
 from mwdn.io.images import read_frame, read_picture, write_linear, write_picture
 from mwdn.networks import build
 from mwdn.optics import Camera, Sensor
@@ -28,7 +28,7 @@ __all__ = [
     "build",
     "convolve",
     "correlate",
-    "for_people",
+    "to_display",
     "keep_memory",
     "read_frame",
     "read_picture",

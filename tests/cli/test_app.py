@@ -220,7 +220,7 @@ def test_resume_leaves_out_what_is_there(run, camera):
 
 
 def test_json_of_the_user_beside_a_capture(run, camera, monkeypatch):
-    monkeypatch.setattr("mwdn.cli.reconstruct.Darkroom", pytest.fail)
+    monkeypatch.setattr("mwdn.cli.reconstruct.Batch", pytest.fail)
     np.save("b.npy", read_frame("captures/b.png"))
     (camera / "b.json").write_text('{"exposure": 8}')
     code, _, err = reconstruct(run, "captures/a.png", "b.npy", out=".")

@@ -12,14 +12,14 @@ import pytest
 import torch
 from torch import nn
 
-from mwdn import Calibration, Reconstructor, for_people, read_frame
+from mwdn import Calibration, Reconstructor, read_frame, to_display
 from mwdn.cli.app import main
 from mwdn.errors import ExportError, ParameterError
 from mwdn.export import exporter as exporting
 from mwdn.export.dft import column_matrices, inverse_row_matrix, row_matrix
 from mwdn.export.exporter import LEAST, agreement, export, read_about, run_file, simulated
 from mwdn.export.onnx_operations import REAL
-from mwdn.fourier.filtering import filtered
+from mwdn.fourier.filtering import filter_image
 from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
 from mwdn.io.files import save_linear, save_png
 from mwdn.io.images import srgb_encode
@@ -115,7 +115,7 @@ class Filter(nn.Module):
 
     def forward(self, measurement, psf):
         grid = deconvolution_grid(measurement.shape[-2:], self.boundary)
-        return filtered(measurement, wiener_transfer(psf, 1e-2, grid), grid, self.boundary)
+        return filter_image(measurement, wiener_transfer(psf, 1e-2, grid), grid, self.boundary)
 
 
 @pytest.mark.parametrize(("size", "boundary"), [((17, 23), "circular"), ((16, 30), "taper"), ((19, 29), "zero")])
@@ -166,7 +166,7 @@ def test_it_runs_without_torch(exported, tmp_path):
     assert camera().psf_hash in told.stdout
     taken = Calibration(camera().psf, bit_depth=12, dark=torch.full((1, 3, *SIZE), 100 / 4095))
     scene = Reconstructor(mwdn, taken, device="cpu", precision="exact")(taken.correct(read_frame(names[0])))
-    expected = srgb_encode(for_people(scene))[0].movedim(0, -1).numpy() * 255
+    expected = srgb_encode(to_display(scene))[0].movedim(0, -1).numpy() * 255
     assert np.abs(read_frame(names[1]) - expected).max() <= 1
 
 

@@ -372,7 +372,7 @@ def test_constant_measurement_gives_a_constant_over_the_sum_of_the_psf(size, psf
 )
 def test_extend_is_numpys_edge_padding(size, grid, boundary, generator):
     picture = noise((2, 3, *size), generator)
-    found = fourier.extend(picture, grid, boundary)
+    found = fourier.pad(picture, grid, boundary)
     assert torch.equal(found[..., : size[0], : size[1]], picture)
     for b in range(2):
         for c in range(3):
@@ -386,7 +386,7 @@ def test_extended_picture_is_continuous_at_both_borders(size, boundary):
     rows, columns = torch.linspace(0, 1, size[0])[:, None], torch.linspace(0, 1, size[1])
     picture = (0.2 + 0.5 * rows + 0.3 * columns)[None, None]
     grid = fourier.deconvolution_grid(size, boundary)
-    wide = fourier.extend(picture, grid, boundary)[0, 0]
+    wide = fourier.pad(picture, grid, boundary)[0, 0]
     height, width = size
     # The taper falls by at most pi/2 / (padding / 2) a pixel, and by the square of that next to the border.
     near = {"replicate": 0.0, "taper": 0.05}[boundary]
@@ -491,10 +491,10 @@ def test_filtered_and_its_gradients_are_those_of_its_definition(
         x, h = image.clone().requires_grad_(), psf.clone().requires_grad_()
         transfer = fourier.wiener_transfer(h, 0.1, grid)
         if defined:
-            spread = fourier.spectrum(fourier.extend(x, grid, boundary), grid)
+            spread = fourier.spectrum(fourier.pad(x, grid, boundary), grid)
             y = fourier.inverse_spectrum(transfer * spread, grid, (21, width))
         else:
-            y = fourier.filtered(x, transfer, grid, boundary)
+            y = fourier.filter_image(x, transfer, grid, boundary)
         y.backward(slope)
         found.append((y, x.grad, h.grad))
     for one, other in zip(*found, strict=True):
@@ -511,9 +511,9 @@ def test_several_samples_at_once_as_on_a_gpu(psf_batch, psf_channels, generator,
     found = []
     for parts in (None, [(slice(0, 2), slice(0, 4)), (slice(2, 4), slice(0, 4))]):
         if parts:
-            monkeypatch.setattr("mwdn.fourier.filtering.together", lambda *_, parts=parts: parts)
+            monkeypatch.setattr("mwdn.fourier.filtering.chunks", lambda *_, parts=parts: parts)
         x, h = image.clone().requires_grad_(), psf.clone().requires_grad_()
-        y = fourier.filtered(x, fourier.wiener_transfer(h, 0.1, grid), grid, "taper")
+        y = fourier.filter_image(x, fourier.wiener_transfer(h, 0.1, grid), grid, "taper")
         y.backward(slope)
         found.append((y, x.grad, h.grad))
     for one, other in zip(*found, strict=True):
@@ -525,11 +525,11 @@ def test_filtered_keeps_precision_and_memory_format(dtype, generator):
     grid = fourier.deconvolution_grid((30, 33), "taper")
     transfer = fourier.wiener_transfer(torch.rand(1, 1, 30, 33, generator=generator), 0.1, grid)
     image = torch.rand(2, 6, 30, 33, generator=generator).to(dtype)
-    expected = fourier.filtered(image.float(), transfer, grid, "taper").to(dtype)
+    expected = fourier.filter_image(image.float(), transfer, grid, "taper").to(dtype)
     last = image.contiguous(memory_format=torch.channels_last)
     part = torch.cat([last, last], dim=1)[:, 6:]  # what a gradient of a concatenation is
     for given, form in ((image, torch.contiguous_format), (last, torch.channels_last), (part, torch.channels_last)):
-        found = fourier.filtered(given, transfer, grid, "taper")
+        found = fourier.filter_image(given, transfer, grid, "taper")
         assert found.dtype == dtype
         assert torch.equal(found, expected)
         if given is not part:

@@ -13,12 +13,12 @@ from mwdn.fourier import memory_format
 def test_folded_is_torchs_unshuffling(shape, block, dtype, generator):
     image = torch.rand(shape, generator=generator).to(dtype)
     for given in (image, image.contiguous(memory_format=torch.channels_last), image.mT):
-        found = memory_format.folded(given, block)
+        found = memory_format.pixel_unshuffle(given, block)
         assert torch.equal(found, F.pixel_unshuffle(given, block))
         assert found.is_contiguous(memory_format=torch.channels_last)
 
 
 def test_folded_passes_gradients_on(generator):
     image = torch.rand((2, 3, 8, 4), generator=generator, requires_grad=True)
-    memory_format.folded(image, 2).square().sum().backward()
+    memory_format.pixel_unshuffle(image, 2).square().sum().backward()
     torch.testing.assert_close(image.grad, 2 * image.detach())

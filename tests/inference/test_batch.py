@@ -20,9 +20,9 @@ from mwdn import Camera, read_frame
 from mwdn.calibration import Calibration
 from mwdn.errors import ImageError, ParameterError
 from mwdn.evaluation.consistency import consistency
-from mwdn.inference.batch import Darkroom, check_outputs, output_name
+from mwdn.inference.batch import Batch, check_outputs, output_name
 from mwdn.inference.reconstructor import Reconstructor
-from mwdn.io.contact_sheets import for_people
+from mwdn.io.contact_sheets import to_display
 from mwdn.io.images import srgb_decode
 from mwdn.networks import build
 from mwdn.optics.patterns import contour_psf
@@ -51,7 +51,7 @@ def captures(tmp_path, psf, generator):
 
 def darkroom(psf, out, method="wiener", **options):
     calibration = psf if isinstance(psf, Calibration) else Calibration(psf)
-    return Darkroom(Reconstructor(method, calibration, device="cpu"), "name", out, **options)
+    return Batch(Reconstructor(method, calibration, device="cpu"), "name", out, **options)
 
 
 def touch(folder, *names):
@@ -140,7 +140,7 @@ def test_json_of_somebody_else_is_not_replaced(tmp_path, content):
 @pytest.mark.parametrize(("form", "suffix"), [("tiff", ".tif"), ("npy", ".npy")])
 def test_linear_formats_hold_what_the_reconstructor_returns(tmp_path, form, suffix, captures, psf):
     room = darkroom(psf, tmp_path / "out", form=form)
-    jobs = list(room.develop(captures))
+    jobs = list(room.run(captures))
     assert [job.number for job in jobs] == [0, 1, 2]
     for job, capture in zip(jobs, captures, strict=True):
         assert (job.capture, job.output) == (capture, tmp_path / "out" / (capture.stem + suffix))
@@ -161,13 +161,13 @@ def test_linear_formats_hold_what_the_reconstructor_returns(tmp_path, form, suff
 @pytest.mark.parametrize(("form", "steps"), [("png", 255), ("png16", 65535)])
 def test_png_is_the_same_picture_in_srgb(tmp_path, form, steps, captures, psf):
     room = darkroom(psf, tmp_path, form=form, judge=False)
-    (job,) = room.develop(captures[:1])
+    (job,) = room.run(captures[:1])
     scene = room.reconstruct(room.reconstruct.calibration.correct(read_frame(captures[0])))
     stored = read_frame(job.output)
     assert np.iinfo(stored.dtype).max == steps
     light = srgb_decode(torch.from_numpy(stored.astype(np.float32) / steps))
     # Half a step of the code is at most 2.275 / 1.055 ... of it in light: the steepest part is at white.
-    torch.testing.assert_close(light, for_people(scene)[0].movedim(0, -1), rtol=0, atol=0.5 * 2.3 / steps + 1e-6)
+    torch.testing.assert_close(light, to_display(scene)[0].movedim(0, -1), rtol=0, atol=0.5 * 2.3 / steps + 1e-6)
     assert job.trust is None
     assert set(json.loads((tmp_path / "0.json").read_text())) == {"method", "psf_hash", "origin"}
 
@@ -178,7 +178,7 @@ def test_network_is_given_the_pose_that_the_picture_is_judged_by(tmp_path, captu
     pictures = []
     for judge in (True, False):
         room = darkroom(psf, tmp_path / str(judge), network, form="npy", judge=judge)
-        (job,) = room.develop(captures[:1])
+        (job,) = room.run(captures[:1])
         pictures.append(torch.from_numpy(read_frame(job.output)))
     torch.testing.assert_close(*pictures, rtol=1e-4, atol=1e-5)
 
@@ -189,7 +189,7 @@ def test_captures_are_read_as_the_calibration_says(tmp_path, psf, captures):
     np.save(tmp_path / "plain.npy", frame)
     np.save(tmp_path / "twisted.npy", frame[::-1, :, ::-1])
     for name, calibration in (("plain", Calibration(psf)), ("twisted", Calibration(psf, bgr=True, upside_down=True))):
-        list(darkroom(calibration, tmp_path / "out", form="tiff").develop([tmp_path / f"{name}.npy"]))
+        list(darkroom(calibration, tmp_path / "out", form="tiff").run([tmp_path / f"{name}.npy"]))
     assert np.array_equal(read_frame(tmp_path / "out/plain.tif"), read_frame(tmp_path / "out/twisted.tif"))
 
 
@@ -197,7 +197,7 @@ def test_nothing_is_written_of_a_bad_capture_and_the_others_go_on(tmp_path, psf,
     (tmp_path / "bad.png").write_bytes(b"\x89PNG\r\n\x1a\n")
     np.save(tmp_path / "small.npy", np.zeros((4, 4, 3), np.uint8))
     files = [captures[0], tmp_path / "bad.png", tmp_path / "small.npy", tmp_path / "none.png", captures[1]]
-    jobs = list(darkroom(psf, tmp_path / "out").develop(files))
+    jobs = list(darkroom(psf, tmp_path / "out").run(files))
     assert [job.capture for job in jobs] == files
     assert [job.error is None for job in jobs] == [True, False, False, False, True]
     assert isinstance(jobs[1].error, ImageError)
@@ -221,7 +221,7 @@ def bright(tmp_path, captures):
 def test_trust_does_not_depend_on_the_brightness(tmp_path, psf, bright, method):
     """Nor do squares of what a camera of many bits counts overflow."""
     room = darkroom(psf, tmp_path / "out", method)
-    plain, large = (next(room.develop([bright(factor)])).trust for factor in (1, 1e15))
+    plain, large = (next(room.run([bright(factor)])).trust for factor in (1, 1e15))
     assert dataclasses.astuple(large) == pytest.approx(dataclasses.astuple(plain), rel=0.01, abs=0.01)
 
 
@@ -229,9 +229,9 @@ def test_trust_does_not_depend_on_the_brightness(tmp_path, psf, bright, method):
 @pytest.mark.parametrize("form", ["png", "npy"])
 def test_result_that_is_not_finite_changes_nothing_and_the_others_go_on(tmp_path, psf, captures, bright, judge, form):
     room = darkroom(psf, tmp_path / "out", Admm(iterations=2), form=form, judge=judge)
-    list(room.develop([bright(1)]))
+    list(room.run([bright(1)]))
     before = {path: path.read_bytes() for path in room.out.iterdir()}
-    refused, done = room.develop([bright(1e37), captures[1]])
+    refused, done = room.run([bright(1e37), captures[1]])
     assert isinstance(refused.error, ImageError)
     assert re.search(r"nothing is written\. The capture's brightest pixel is \d\.\d+e\+36", str(refused.error))
     assert done.error is None
@@ -240,20 +240,20 @@ def test_result_that_is_not_finite_changes_nothing_and_the_others_go_on(tmp_path
 
 def test_a_capture_without_light_is_no_picture(tmp_path, psf):
     np.save(tmp_path / "black.npy", np.zeros((*SIZE, 3), np.uint16))
-    (job,) = darkroom(psf, tmp_path / "out").develop([tmp_path / "black.npy"])
+    (job,) = darkroom(psf, tmp_path / "out").run([tmp_path / "black.npy"])
     assert str(job.error).startswith("The sensor saw no light")
     assert not (tmp_path / "out").exists()
 
 
 def test_scene_too_large_to_be_judged(tmp_path, psf, captures):
-    (job,) = darkroom(psf, tmp_path / "out", lambda b, h: 1e37 * b).develop(captures[:1])
+    (job,) = darkroom(psf, tmp_path / "out", lambda b, h: 1e37 * b).run(captures[:1])
     assert "too large numbers" in str(job.error)
     assert not (tmp_path / "out").exists()
 
 
 def test_disk_that_refuses(tmp_path, psf, captures):
     (tmp_path / "out" / "1.png").mkdir(parents=True)
-    jobs = list(darkroom(psf, tmp_path / "out").develop(captures))
+    jobs = list(darkroom(psf, tmp_path / "out").run(captures))
     assert [job.error is None for job in jobs] == [True, False, True]
     assert "1.png` cannot be written" in str(jobs[1].error)
     assert not (tmp_path / "out" / "1.json").exists()
@@ -261,7 +261,7 @@ def test_disk_that_refuses(tmp_path, psf, captures):
 
 def test_work_stops_with_its_user(tmp_path, psf, captures):
     """And leaves whole files behind."""
-    jobs = darkroom(psf, tmp_path / "out").develop(captures)
+    jobs = darkroom(psf, tmp_path / "out").run(captures)
     next(jobs)
     jobs.close()
     left = sorted(path.name for path in (tmp_path / "out").iterdir())
@@ -272,7 +272,7 @@ def test_summary_shows_the_first_twelve_that_are_there(tmp_path, psf, captures):
     room = darkroom(psf, tmp_path / "out")
     room.summarise(captures)
     assert not (tmp_path / "out").exists()
-    list(room.develop([captures[0], captures[2]]))
+    list(room.run([captures[0], captures[2]]))
     room.summarise([captures[0], captures[1], captures[2]])
     assert read_frame(tmp_path / "out" / "summary.png").shape[0] == 26 + 2 * 246
     room.summarise(captures[:1] * 20)
@@ -284,24 +284,24 @@ def test_summary_shows_the_first_twelve_that_are_there(tmp_path, psf, captures):
 
 def resumed(room_psf, out, captures, *arguments, **options):
     """Names of the captures that were done again."""
-    jobs = list(darkroom(room_psf, out, *arguments, resume=True, **options).develop(captures))
+    jobs = list(darkroom(room_psf, out, *arguments, resume=True, **options).run(captures))
     assert all(job.error is None for job in jobs)
     return [job.capture.name for job in jobs if not job.kept]
 
 
 def test_resumed_work_leaves_out_what_is_there(tmp_path, psf, captures):
     out = tmp_path / "out"
-    list(darkroom(psf, out).develop(captures[:2]))
+    list(darkroom(psf, out).run(captures[:2]))
     before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in out.iterdir()}
     assert resumed(psf, out, captures) == ["2.png"]
     assert {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in before} == before
-    assert len(list(darkroom(psf, out).develop(captures))) == 3
+    assert len(list(darkroom(psf, out).run(captures))) == 3
     assert out.joinpath("0.png").stat().st_mtime_ns > before[out / "0.png"][1]  # not asked to resume
 
 
 def test_resumed_work_judges_what_was_not(tmp_path, psf, captures):
     out = tmp_path / "out"
-    list(darkroom(psf, out, judge=False).develop(captures[:1]))
+    list(darkroom(psf, out, judge=False).run(captures[:1]))
     assert resumed(psf, out, captures[:2]) == ["0.png", "1.png"]
     assert "explained" in json.loads((out / "0.json").read_text())
     assert resumed(psf, out, captures[:2]) == []
@@ -312,7 +312,7 @@ def test_resumed_work_judges_what_was_not(tmp_path, psf, captures):
 @pytest.mark.parametrize("how", ["gone", "empty"])
 def test_half_a_result_is_none(tmp_path, lost, how, psf, captures):
     out = tmp_path / "out"
-    list(darkroom(psf, out).develop(captures))
+    list(darkroom(psf, out).run(captures))
     (out / lost).unlink()
     if how == "empty":
         (out / lost.replace("png", "json")).write_text("[]")
@@ -325,7 +325,7 @@ def test_result_of_anything_else_is_none(tmp_path, what, psf, captures):
     if what == "weights":
         torch.manual_seed(1)
         method = build("wiener-bank", width=2, finest=8)
-    list(darkroom(camera, out, method, judge=False).develop(captures[:1]))
+    list(darkroom(camera, out, method, judge=False).run(captures[:1]))
     assert resumed(camera, out, captures[:1], method, judge=False) == []
     if what == "capture":
         os.utime(captures[0], ns=(0, 0))
@@ -349,13 +349,13 @@ def test_result_of_anything_else_is_none(tmp_path, what, psf, captures):
 def test_old_judgement_never_stands_beside_a_new_picture(tmp_path, psf, captures, monkeypatch):
     """Even if the work stops between the two."""
     out = tmp_path / "out"
-    list(darkroom(psf, out).develop(captures[:1]))
+    list(darkroom(psf, out).run(captures[:1]))
 
     def refuse(path, content):
         raise ImageError("full")
 
     monkeypatch.setattr("mwdn.inference.batch.write_json", refuse)
-    (job,) = darkroom(psf, out, Wiener(regularisation=1.0)).develop(captures[:1])
+    (job,) = darkroom(psf, out, Wiener(regularisation=1.0)).run(captures[:1])
     assert str(job.error) == "full"
     assert [path.name for path in out.iterdir()] == ["0.png"]
 

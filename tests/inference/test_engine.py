@@ -11,7 +11,7 @@ from mwdn import Calibration, Camera, Reconstructor, read_frame
 from mwdn.errors import ParameterError
 from mwdn.inference import fusion
 from mwdn.inference.engine import Engine
-from mwdn.inference.fusion import Convolution, fold
+from mwdn.inference.fusion import Convolution, fuse
 from mwdn.networks import NETWORKS, build
 
 SIZE = 33, 47
@@ -70,7 +70,7 @@ def test_folded_convolution(fused, dtype, generator, monkeypatch):
     image = torch.randn(2, 20, 9, 11, generator=generator)
     with torch.no_grad():
         expected = layers.eval()(image)
-        found = fold(copy.deepcopy(layers), dtype)(image)
+        found = fuse(copy.deepcopy(layers), dtype)(image)
     assert found.dtype == (dtype or torch.float32)
     tolerance = 1e-5 if dtype is None else 0.03
     torch.testing.assert_close(found.float(), expected, rtol=tolerance, atol=tolerance)
@@ -81,14 +81,14 @@ def test_a_convolution_that_sees_the_picture_stays_float32(channels, generator):
     layer = nn.Conv2d(*channels, 3, padding=1)
     image = torch.randn(1, channels[0], 9, 11, generator=generator)
     with torch.no_grad():
-        torch.testing.assert_close(fold(copy.deepcopy(layer), torch.bfloat16)(image), layer(image))
+        torch.testing.assert_close(fuse(copy.deepcopy(layer), torch.bfloat16)(image), layer(image))
 
 
 def test_other_convolutions_are_left_alone(generator):
     strided = nn.Conv2d(4, 4, 3, stride=2, padding=1)
     grouped = nn.Conv2d(4, 4, 3, groups=2, padding="same")
     layers = nn.Sequential(strided, nn.BatchNorm2d(4), nn.ReLU(), grouped)
-    folded = fold(layers, None)
+    folded = fuse(layers, None)
     assert [getattr(module, "layer", module) for module in folded] == list(layers)
     assert not any(isinstance(module, Convolution) for module in folded.modules())
 

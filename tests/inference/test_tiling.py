@@ -10,7 +10,7 @@ from torch.nn import functional as F
 from mwdn.fourier import memory_format
 from mwdn.inference import tiling
 from mwdn.inference.engine import Engine
-from mwdn.inference.fusion import fold
+from mwdn.inference.fusion import fuse
 from mwdn.inference.tiling import StripDecoder, StripEncoder, enlarged
 from mwdn.networks import blocks, build
 from mwdn.networks.blocks import Decoder, Encoder
@@ -51,7 +51,7 @@ def test_strips_are_the_whole_picture(size, pooling, strips, generator):
     unet = lively(build("unet", width=16, pooling=pooling), generator)
     picture = torch.rand(2, 3, *size, generator=generator)
     expected = unet(picture, picture[:1])
-    folded = fold(copy.deepcopy(unet), None)
+    folded = fuse(copy.deepcopy(unet), None)
     assert isinstance(folded.encoder, StripEncoder)
     assert isinstance(folded.decoder, StripDecoder)
     found = folded(picture, picture[:1])
@@ -89,4 +89,4 @@ def test_enlarged_rows(size, generator):
 def test_normalisation_over_the_picture_is_not_cut(generator):
     """GroupNorm sees the whole picture."""
     for unet in (Encoder(3, (8, 8), norm="group"), Decoder(3, (8, 8), norm="group")):
-        assert type(fold(unet.eval(), None)) is type(unet)
+        assert type(fuse(unet.eval(), None)) is type(unet)

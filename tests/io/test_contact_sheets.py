@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mwdn.io.contact_sheets import contact_sheet, for_people
+from mwdn.io.contact_sheets import contact_sheet, to_display
 
 GAP, HEAD = 6, 26
 
@@ -14,7 +14,7 @@ def plain(*colour, size=(20, 30)):
 
 def test_all_but_the_brightest_pixels_fit():
     ramp = torch.linspace(0, 5, 10_000).reshape(1, 1, 100, 100)
-    shown = for_people(torch.cat([ramp, 100 * ramp]))
+    shown = to_display(torch.cat([ramp, 100 * ramp]))
     torch.testing.assert_close(shown[0], shown[1])
     assert (shown[0] == 1).sum().item() == pytest.approx(30, abs=1)
     assert shown[0, 0, 50, 0].item() == pytest.approx(ramp[0, 0, 50, 0].item() / (5 * 0.997), rel=1e-3)
@@ -23,13 +23,13 @@ def test_all_but_the_brightest_pixels_fit():
 def test_one_hot_pixel_does_not_darken_the_rest():
     picture = torch.full((1, 1, 40, 40), 0.5)
     picture[..., 3, 3] = 1000
-    assert (for_people(picture) == 1).all()
+    assert (to_display(picture) == 1).all()
 
 
 def test_darkness_and_negative_numbers_are_black():
-    assert (for_people(torch.zeros(1, 3, 4, 4)) == 0).all()
-    assert (for_people(-torch.rand(1, 3, 4, 4)) == 0).all()
-    assert for_people(torch.full((1, 1, 1, 1), 3.0)).item() == 1
+    assert (to_display(torch.zeros(1, 3, 4, 4)) == 0).all()
+    assert (to_display(-torch.rand(1, 3, 4, 4)) == 0).all()
+    assert to_display(torch.full((1, 1, 1, 1), 3.0)).item() == 1
 
 
 @pytest.mark.parametrize("height", [10, 20, 50])

@@ -104,7 +104,7 @@ def test_environment_of_no_torchrun(monkeypatch, environment, message):
         monkeypatch.delenv(name, raising=False)
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
-    with pytest.raises(ParameterError, match=message), distributed.processes():
+    with pytest.raises(ParameterError, match=message), distributed.process_group():
         pass
 
 
@@ -289,6 +289,6 @@ def test_shares_are_the_batch(monkeypatch, count):
     parts = []
     for rank in range(count):
         monkeypatch.setattr(distributed, "rank", lambda rank=rank: rank)
-        parts.append(distributed.share(range(100, 107)))
+        parts.append(distributed.shard(range(100, 107)))
     assert [number for part in parts for number in part] == list(range(100, 107))
     assert max(map(len, parts)) - min(map(len, parts)) <= 1

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from mwdn import Calibration, Reconstructor
-from mwdn.runtime.streams import ahead, latest
+from mwdn.runtime.streams import latest, prefetch
 from mwdn.solvers import Wiener
 
 WAIT = 30  # seconds, where something that should happen at once does not
@@ -19,7 +19,7 @@ WAIT = 30  # seconds, where something that should happen at once does not
 
 
 def test_results_come_in_order_from_another_thread():
-    with ahead(lambda n: (n * n, threading.get_ident()), range(20)) as results:
+    with prefetch(lambda n: (n * n, threading.get_ident()), range(20)) as results:
         squares, threads = zip(*results, strict=True)
     assert squares == tuple(n * n for n in range(20))
     assert len(set(threads)) == 1
@@ -29,7 +29,7 @@ def test_results_come_in_order_from_another_thread():
 @pytest.mark.parametrize("depth", [1, 3])
 def test_no_more_than_a_few_are_ahead(depth):
     taken = []
-    with ahead(lambda n: n, (taken.append(n) or n for n in range(20)), depth=depth) as results:
+    with prefetch(lambda n: n, (taken.append(n) or n for n in range(20)), depth=depth) as results:
         for number, result in enumerate(results):
             assert result == number
             assert len(taken) == min(number + depth + 1, 20)
@@ -45,7 +45,7 @@ def test_stages_overlap():
             assert used.wait(WAIT)
         return n
 
-    with ahead(work, range(3)) as results:
+    with prefetch(work, range(3)) as results:
         assert next(results) == 0
         assert begun.wait(WAIT)
         used.set()
@@ -53,7 +53,7 @@ def test_stages_overlap():
 
 
 def test_error_is_raised_where_its_result_is_taken():
-    with ahead(lambda n: 6 // (3 - n), range(6)) as results:
+    with prefetch(lambda n: 6 // (3 - n), range(6)) as results:
         assert [next(results) for _ in range(3)] == [2, 3, 6]
         with pytest.raises(ZeroDivisionError):
             next(results)
@@ -64,7 +64,7 @@ def test_thread_ends_with_the_block():
     before, done = threading.active_count(), []
 
     def interrupted():
-        with ahead(done.append, range(100)) as results:
+        with prefetch(done.append, range(100)) as results:
             next(results)
             raise KeyboardInterrupt
 

@@ -33,7 +33,7 @@ def batch_norm():
             one.load_state_dict(one.state_dict() | {"weight": weights[0], "bias": weights[1]})
         synchronise(layer, torch.device("cpu"))
         found = {}
-        for name, one, mine in (("one", whole, range(5)), ("two", layer, distributed.share(range(5)))):
+        for name, one, mine in (("one", whole, range(5)), ("two", layer, distributed.shard(range(5)))):
             mine = slice(mine.start, mine.stop)
             part = x[mine].clone().requires_grad_()
             for _ in range(2):
@@ -42,8 +42,8 @@ def batch_norm():
             outputs, inputs = torch.zeros(2, *x.shape, dtype=dtype)
             outputs[mine], inputs[mine] = y.detach(), part.grad
             if name == "two":
-                distributed.add_gradients(layer)
-                outputs, inputs = distributed.total(outputs), distributed.total(inputs)
+                distributed.all_reduce_gradients(layer)
+                outputs, inputs = distributed.all_reduce_sum(outputs), distributed.all_reduce_sum(inputs)
             norm = layer[0] if name == "two" else whole
             parts = {"y": outputs, "x.grad": inputs, "w.grad": norm.weight.grad, "b.grad": norm.bias.grad}
             parts |= {"mean": norm.running_mean, "var": norm.running_var, "count": norm.num_batches_tracked}
@@ -88,7 +88,7 @@ def main():
 
     with double_precision():  # before the two meet, each is one
         start(f"double/one-{number}", read_recipe("cpsf.toml"), precise).run()
-    with distributed.processes():
+    with distributed.process_group():
         batch_norm()
         with double_precision():
             run = start("double/two", read_recipe("cpsf.toml"), precise)
@@ -96,7 +96,7 @@ def main():
         Path(f"course-{number}.json").write_text(json.dumps(run.course.state()))
         start("mixed").run()  # begun by one process
         attempt(lambda: start("small", replace(recipe, schedule=replace(recipe.schedule, batch=1))))
-        attempt(lambda: distributed.device_here("cuda:0"))
+        attempt(lambda: distributed.local_device("cuda:0"))
         lame = start("lame")
         lame.pairs = Lame(**vars(lame.pairs))
         attempt(lame.run)

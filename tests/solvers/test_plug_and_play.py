@@ -14,7 +14,7 @@ from mwdn.optics.patterns import contour_psf
 from mwdn.solvers import Penalties
 from mwdn.solvers import plug_and_play as module
 from mwdn.solvers.plug_and_play import certainty, plug_and_play
-from mwdn.solvers.pyramid import QUIET, Level, brightness, explain
+from mwdn.solvers.pyramid import QUIET, Level, brightness, solve
 
 SIZE = 24, 32
 
@@ -25,7 +25,7 @@ def found(generator):
     psf = contour_psf(SIZE, cell=6, generator=generator).expand(1, 3, -1, -1)
     scene = torch.zeros(2, 3, *SIZE)
     scene[..., 6:18, 8:26] = 0.2 + torch.rand(2, 3, 12, 18, generator=generator)
-    return explain(convolve(scene, psf), psf), scene, psf
+    return solve(convolve(scene, psf), psf), scene, psf
 
 
 def knowing(scene):
@@ -53,7 +53,7 @@ def test_it_ends_where_sensor_and_denoiser_pull_alike(generator, monkeypatch):
     truth = 1 + torch.rand(7, 8, generator=generator, dtype=torch.float64) + 4 * (torch.arange(8) > 3)
     b = A @ truth.numpy().ravel()
     z = truth[centre] + 0.5 * torch.rand(sensor, generator=generator, dtype=torch.float64)
-    found = explain(
+    found = solve(
         torch.from_numpy(b).view(1, 1, *sensor).float(),
         psf.float()[None, None],
         (Level(1, 50, Penalties(0.5, 0.0, 0.5)),),
@@ -79,7 +79,7 @@ def test_it_ends_where_sensor_and_denoiser_pull_alike(generator, monkeypatch):
         solution = np.linalg.lstsq(system, np.concatenate(wanted), rcond=None)[0]
         return torch.from_numpy(solution.reshape(7, 8)[centre]).float()
 
-    certain = certainty(found.measurement - found.rest)
+    certain = certainty(found.measurement - found.residual)
     expected = least(certain)
     torch.testing.assert_close((seen[-1] * brightest)[0, 0], expected, rtol=0, atol=2e-3)
     assert (z - expected).abs().max() > 0.02  # which is not merely z
@@ -91,7 +91,7 @@ def test_a_denoiser_that_knows_the_scene_explains_the_measurement(found):
     unit = explained.scene.amax((1, 2, 3), keepdim=True)
     ended = plug_and_play(explained, knowing(scene / unit), 8)
     torch.testing.assert_close(ended.scene, scene)
-    assert ended.rest.norm() < 0.3 * explained.rest.norm()
+    assert ended.residual.norm() < 0.3 * explained.residual.norm()
     assert ended.measurement is explained.measurement
     assert (ended.whole >= 0).all()
 
@@ -151,9 +151,9 @@ def test_brighter_light_gives_a_brighter_scene(found):
     torch.manual_seed(0)
     denoise = build("drunet", widths=(4, 6), blocks=1).requires_grad_(False)
     once = plug_and_play(explained, denoise, 2).scene
-    bright = plug_and_play(explain(100 * explained.measurement, psf), denoise, 2).scene
+    bright = plug_and_play(solve(100 * explained.measurement, psf), denoise, 2).scene
     torch.testing.assert_close(bright, 100 * once, rtol=1e-3, atol=1e-2)
-    alone = plug_and_play(explain(explained.measurement[1:], psf), denoise, 2).scene
+    alone = plug_and_play(solve(explained.measurement[1:], psf), denoise, 2).scene
     torch.testing.assert_close(alone, once[1:], rtol=1e-3, atol=1e-4)
 
 
@@ -161,8 +161,8 @@ def test_what_the_psf_does_not_explain_counts_as_noise(found, monkeypatch):
     """Through a PSF that is not the camera's; the levels, which follow the sensor's noise alone, kept."""
     monkeypatch.setattr(module, "POOR", 0.0)
     explained, _, psf = found
-    wrong = explain(explained.measurement, psf.flip(-1))
-    rest = brightness(wrong.rest) / brightness(wrong.measurement)
+    wrong = solve(explained.measurement, psf.flip(-1))
+    rest = brightness(wrong.residual) / brightness(wrong.measurement)
     assert (rest > 1.5 * wrong.noise.clamp(min=QUIET)).all()
     blur = lambda picture, level: torch.nn.functional.avg_pool2d(picture, 3, 1, 1)  # noqa: E731
     told = plug_and_play(as_noisy(wrong, rest), blur, 3).scene

@@ -14,7 +14,7 @@ from mwdn.errors import ParameterError
 from mwdn.optics.noise import noise_level
 from mwdn.optics.patterns import contour_psf
 from mwdn.solvers import Penalties
-from mwdn.solvers.pyramid import LEVELS, Level, Pyramid, explain, halve, low_band
+from mwdn.solvers.pyramid import LEVELS, Level, Pyramid, halve, low_band, solve
 from mwdn.solvers.wiener import Wiener
 
 FINE = Penalties(0.5, 0.0, 0.5)
@@ -25,10 +25,10 @@ def test_one_fine_level_reaches_the_least_squares_of_scipy(generator):
     sensor, psf = (5, 6), torch.rand(1, 1, 5, 6, generator=generator) ** 4
     psf = psf / psf.sum()
     b = torch.rand(1, 1, *sensor, generator=generator)
-    found = explain(b, psf, (Level(1, 3000, FINE),))
+    found = solve(b, psf, (Level(1, 3000, FINE),))
     A = oracles.matrix(psf[0, 0].double().numpy(), sensor)
     _, smallest = nnls(A.reshape(A.shape[0], -1), b.double().numpy().ravel())
-    assert float(found.rest.norm()) == pytest.approx(smallest, abs=2e-3)
+    assert float(found.residual.norm()) == pytest.approx(smallest, abs=2e-3)
 
 
 def test_halving_keeps_place_and_light():
@@ -41,8 +41,8 @@ def test_halving_keeps_place_and_light():
     torch.testing.assert_close(halve(torch.ones(1, 3, 7, 5)), torch.ones(1, 3, 4, 3))
 
 
-@pytest.mark.parametrize("shrink", [1, 2, 4])
-def test_low_band_takes_a_coarse_scene_where_the_fine_one_goes(shrink, generator):
+@pytest.mark.parametrize("downsampling", [1, 2, 4])
+def test_low_band_takes_a_coarse_scene_where_the_fine_one_goes(downsampling, generator):
     """A scene of low frequencies alone may be sampled before or after the convolution."""
     grid = (32, 48)
     psf = torch.rand(1, 1, *grid, generator=generator, dtype=torch.float64)
@@ -52,10 +52,10 @@ def test_low_band_takes_a_coarse_scene_where_the_fine_one_goes(shrink, generator
     scene = torch.from_numpy(np.fft.ifft2(spectrum).real)[None, None]
     H = fourier.transfer_function(psf, grid)
     fine = fourier.inverse_spectrum(fourier.spectrum(scene, grid) * H, grid, grid)
-    small = grid[0] // shrink, grid[1] // shrink
-    coarse = fourier.spectrum(scene[..., ::shrink, ::shrink], small) * low_band(H, grid, shrink)
+    small = grid[0] // downsampling, grid[1] // downsampling
+    coarse = fourier.spectrum(scene[..., ::downsampling, ::downsampling], small) * low_band(H, grid, downsampling)
     found = fourier.inverse_spectrum(coarse, small, small)
-    torch.testing.assert_close(found, fine[..., ::shrink, ::shrink], rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(found, fine[..., ::downsampling, ::downsampling], rtol=1e-4, atol=1e-5)
 
 
 def test_a_cropped_pattern_is_explained_far_better_than_by_a_wiener_filter(generator):
@@ -88,17 +88,17 @@ def test_smoothing_follows_the_noise_of_the_light_not_of_the_dark(generator, mon
 def test_what_is_explained_and_what_is_left_make_the_measurement(generator):
     psf = torch.rand(1, 3, 20, 27, generator=generator) ** 6
     measurement = torch.rand(2, 3, 20, 27, generator=generator)
-    found = explain(measurement, psf)
+    found = solve(measurement, psf)
     assert (found.scene >= 0).all()
-    assert (found.rest.square().sum((1, 2, 3)) < measurement.square().sum((1, 2, 3))).all()
+    assert (found.residual.square().sum((1, 2, 3)) < measurement.square().sum((1, 2, 3))).all()
 
 
-@pytest.mark.parametrize("shrink", [2, 4, 8])
+@pytest.mark.parametrize("downsampling", [2, 4, 8])
 @pytest.mark.parametrize("size", [(33, 48), (40, 41), (47, 70)])
-def test_a_coarse_scene_is_its_enlargement_where_the_sensor_is(shrink, size, generator):
+def test_a_coarse_scene_is_its_enlargement_where_the_sensor_is(downsampling, size, generator):
     psf, measurement = (torch.rand(1, 1, *size, generator=generator) ** power for power in (6, 1))
-    found = explain(measurement, psf, (Level(shrink, 2, FINE),))
-    large = F.interpolate(found.whole, scale_factor=shrink, mode="bilinear")
+    found = solve(measurement, psf, (Level(downsampling, 2, FINE),))
+    large = F.interpolate(found.whole, scale_factor=downsampling, mode="bilinear")
     torch.testing.assert_close(found.scene, large[..., : size[0], : size[1]])
 
 
@@ -120,10 +120,10 @@ def test_a_pyramid_that_stops_early_leaves_the_detail(generator):
     left = []
     for scene in (smooth, fine):
         measurement = fourier.convolve(scene, psf)
-        found = explain(measurement, psf, tuple(level for level in LEVELS if level.shrink >= 4))
+        found = solve(measurement, psf, tuple(level for level in LEVELS if level.downsampling >= 4))
         assert found.scene.shape == measurement.shape
         assert (found.scene >= 0).all()
-        left.append(float(found.rest.norm() / measurement.norm()))
+        left.append(float(found.residual.norm() / measurement.norm()))
         error = (found.scene - scene)[..., 24:66, 34:86].mean((2, 3)) / scene[..., 24:66, 34:86].mean((2, 3))
         assert error.abs().max() < 0.1
     assert left[0] < 0.02

@@ -67,7 +67,7 @@ def test_gradient_goes_down_the_rows_and_along_the_columns():
 
 
 def test_laplacian_of_the_problem_is_divergence_of_gradient(generator):
-    problem = splitting.pose(*pair((6, 9), (5, 4), generator))
+    problem = splitting.Problem.from_psf(*pair((6, 9), (5, 4), generator))
     v = torch.randn(1, 3, *problem.grid, generator=generator)
     product = fourier.spectrum(v, problem.grid) * problem.laplacian
     found = fourier.inverse_spectrum(product, problem.grid, problem.grid)
@@ -131,7 +131,7 @@ def test_five_iterations_are_the_textbooks(sensor, psf, mu, variation, generator
     for tau, psf_channels in ((1e-3, 3), (0.0, 1)):
         b, h = pair(sensor, psf, generator, psf_channels=psf_channels)
         solver = Admm(regularisation=tau, penalties=mu, iterations=5, variation=variation)
-        grid = splitting.pose(b, h).grid
+        grid = splitting.Problem.from_psf(b, h).grid
         v = oracles.admm(
             b[0].double().numpy(),
             h[0].double().numpy(),
@@ -164,11 +164,11 @@ def test_objective_falls(variation, generator):
 @pytest.mark.parametrize("variation", VARIATIONS)
 def test_objective_is_what_it_says(variation, generator):
     b, h = pair((6, 7), (5, 5), generator, batch=2)
-    problem = splitting.pose(b, h)
+    problem = splitting.Problem.from_psf(b, h)
     v = torch.rand(2, 3, *problem.grid, generator=generator)
     V = fourier.spectrum(v, problem.grid)
     Hv = fourier.inverse_spectrum(problem.transfer * V, problem.grid, problem.sensor)
-    state = splitting.start(problem)._replace(v=v, V=V, Hv=Hv)
+    state = splitting.initial_state(problem)._replace(v=v, V=V, Hv=Hv)
     found = splitting.objective(state, problem, 0.3, variation)
     for i in range(2):
         expected, sizes, squares = 0.0, 0.0, []
@@ -210,12 +210,12 @@ def test_fista_reaches_the_least_squares_of_scipy(sensor, psf, generator):
 @pytest.mark.parametrize(("sensor", "psf"), NNLS_SIZES)
 def test_admm_without_prior_reaches_the_least_squares_of_scipy(sensor, psf, generator):
     b, h, least, seen = nnls_problem(sensor, psf, generator)
-    problem = splitting.pose(b / b.norm(), h / h.norm())
-    state, mu = splitting.start(problem), Penalties(data=0.1, gradient=1e-3, sign=0.1)
-    filters = splitting.weigh(problem, mu)
+    problem = splitting.Problem.from_psf(b / b.norm(), h / h.norm())
+    state, mu = splitting.initial_state(problem), Penalties(data=0.1, gradient=1e-3, sign=0.1)
+    filters = splitting.make_filters(problem, mu)
     for _ in range(1000):
-        state = splitting.split(state, problem, mu, 0.0, "anisotropic")
-        state = splitting.merge(state, problem, mu, filters)
+        state = splitting.update_copies(state, problem, mu, 0.0, "anisotropic")
+        state = splitting.update_scene(state, problem, mu, filters)
     found = splitting.objective(state, problem, 0.0, "anisotropic").item() * b.square().sum().item()
     assert math.isclose(found, least, rel_tol=2e-3)
     Hv = state.Hv[0, 0].double().numpy() * b.norm().item()

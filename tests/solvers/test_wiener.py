@@ -33,7 +33,7 @@ def chosen(measurement, psf, **options):
     size = tuple(measurement.shape[-2:])
     grid = fourier.deconvolution_grid(size, solver.boundary)
     H = fourier.transfer_function(psf / psf.sum((-2, -1), keepdim=True), grid)
-    B = fourier.spectrum(fourier.extend(measurement, grid, solver.boundary), grid)
+    B = fourier.spectrum(fourier.pad(measurement, grid, solver.boundary), grid)
     return solver._discrepancy(measurement, B, H, grid[1])
 
 

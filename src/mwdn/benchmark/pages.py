@@ -8,7 +8,7 @@ from pathlib import Path
 from rich.table import Table
 
 from mwdn.evaluation.tables import html_table, markdown_table
-from mwdn.io.files import save_text, written
+from mwdn.io.files import atomic_write, save_text
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def write_markdown(path: Path, title: str, sections: list[Section]) -> None:
         parts.append(f"## {section.title}")
         for block in section.blocks:
             if isinstance(block, Picture):
-                with written(path.parent / "pictures" / block.name) as temporary:
+                with atomic_write(path.parent / "pictures" / block.name) as temporary:
                     temporary.write_bytes(block.content)
             parts.append(_as_markdown(block))
     save_text(path, "\n\n".join(parts) + "\n")

@@ -23,7 +23,7 @@ from mwdn.data.photographs import Photographs
 from mwdn.evaluation import Perceptual
 from mwdn.evaluation.alexnet import SMALLEST
 from mwdn.io.files import save_text
-from mwdn.runtime.distributed import device_here
+from mwdn.runtime.distributed import local_device
 from mwdn.training.trainer import Report
 
 PAGE = "index.html"
@@ -68,7 +68,7 @@ def run(
     Raises:
         MwdnError: a file cannot be read, a method does not fit, training diverges, or ``out`` holds another benchmark.
     """
-    place = device_here(device)
+    place = local_device(device)
     with held(out, "data"):
         opened = {n: open_set(n, data, out / "data", place, watch.track) for n, data in benchmark.data.items()}
     _train_all(benchmark, opened, out, place, watch)

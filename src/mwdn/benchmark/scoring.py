@@ -16,7 +16,7 @@ from mwdn.benchmark.sets import Opened, file_hash
 from mwdn.data.captures import find_captures, read_captures
 from mwdn.evaluation import First, Perceptual, Scores, evaluate
 from mwdn.inference.reconstructor import Reconstructor
-from mwdn.io.files import save_text, written
+from mwdn.io.files import atomic_write, save_text
 from mwdn.version import __version__
 
 TIMED = 3
@@ -123,7 +123,7 @@ def _measure(bound: Reconstructor, opened: Opened, path: Path, perceptual: Perce
     captures = _captures(opened)
     found = [bound(one[None]) for one in captures] if captures is not None else [torch.zeros(0, 3, *size)]
     for name, pictures in (("pictures", [row[2] for row in report.rows]), ("captures", found)):
-        with written(_pictures(path, name)) as temporary:
+        with atomic_write(_pictures(path, name)) as temporary:
             np.save(temporary, torch.cat(pictures).numpy())
     return {"scores": report.methods["it"].content(), "cpu": cpu, "missing": report.missing}
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from mwdn.calibration.report import PsfReport
 from mwdn.calibration.verdict import headline, verdict
-from mwdn.io.files import written
+from mwdn.io.files import atomic_write
 from mwdn.io.images import srgb_encode
 from mwdn.optics import psf_measures
 from mwdn.types import Psf
@@ -47,7 +47,7 @@ def write_page(path: Path, report: PsfReport, psf: Psf, title: str) -> None:
         ImageError: the disk refuses.
     """
     figure = draw_page(report, psf, title)
-    with written(path) as temporary:
+    with atomic_write(path) as temporary:
         figure.savefig(temporary)
 
 

@@ -22,7 +22,7 @@ from mwdn.data.importers import Layout, import_pairs
 from mwdn.errors import MwdnError
 from mwdn.evaluation import Variant
 from mwdn.inference.reconstructor import Reconstructor
-from mwdn.io.files import check_folder, spare
+from mwdn.io.files import check_folder, refuse_overwrite
 from mwdn.runtime.memory import keep_memory
 
 app = App(
@@ -95,7 +95,7 @@ def evaluate(
     pairs = file if first is None else evaluation.First(file, first)
     reconstructors = {method: Reconstructor(method, calibration, device=device) for method in methods}
     warn(*(each.warning for each in reconstructors.values()), other_camera(file, calibration.psf_hash))
-    spare(out / evaluation.SHEET, camera.psf, camera.dark)
+    refuse_overwrite(out / evaluation.SHEET, camera.psf, camera.dark)
     check_folder(out)
     with Progress(console=errors, transient=True) as bars:
         bar = bars.add_task("Evaluating", total=len(reconstructors) * len(pairs))

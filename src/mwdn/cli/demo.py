@@ -11,7 +11,7 @@ from mwdn.calibration import Calibration
 from mwdn.evaluation import psnr
 from mwdn.evaluation.tables import html_table
 from mwdn.inference.reconstructor import Reconstructor
-from mwdn.io.contact_sheets import contact_sheet, for_people
+from mwdn.io.contact_sheets import contact_sheet, to_display
 from mwdn.io.files import save_text
 from mwdn.io.images import write_picture
 from mwdn.io.pictures import dark_scene
@@ -49,7 +49,7 @@ def run(out: Path, seed: int, console: Console) -> None:
         results = [reconstruct(measurement) for reconstruct in reconstructors.values()]
         table.add_row(name, *(f"{psnr(result.clamp(0, 1), scene).item():.2f}" for result in results))
         rows.append([scene, measurement, *results])
-    write_picture(out / "psf.png", for_people(camera.psf))
+    write_picture(out / "psf.png", to_display(camera.psf))
     write_picture(out / "comparison.png", contact_sheet(rows, ["scene", "measurement", *METHODS]))
     save_text(out / "index.html", _PAGE.format(table=html_table(table)))
     console.print(table)

@@ -11,7 +11,7 @@ from rich.markup import escape
 from mwdn.calibration.report import inspect_psf
 from mwdn.calibration.verdict import headline, verdict
 from mwdn.cli.camera import CameraOptions, console
-from mwdn.io.files import check_folder, spare, write_json
+from mwdn.io.files import check_folder, refuse_overwrite, write_json
 from mwdn.io.images import read_frame
 
 _STYLES = {"bad": "bold red", "mind": "yellow", "good": "green"}
@@ -36,7 +36,7 @@ def inspect(
     page = out / f"{camera.psf.stem}.png"
     beside = page.with_suffix(".json")
     for output in (page, beside):
-        spare(output, camera.psf, camera.dark)
+        refuse_overwrite(output, camera.psf, camera.dark)
     calibration = _own_resolution(camera).load()
     check_folder(out)
     report = inspect_psf(calibration, read_frame(camera.psf, bgr=camera.bgr))

@@ -14,7 +14,7 @@ from mwdn.calibration import Calibration
 from mwdn.cli.camera import CameraOptions, complain, console, errors, warn
 from mwdn.data.captures import list_captures
 from mwdn.errors import ParameterError, PsfError
-from mwdn.inference.batch import Darkroom, Format, Job, check_outputs
+from mwdn.inference.batch import Batch, Format, Job, check_outputs
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import check_folder
 from mwdn.runtime import distributed
@@ -52,7 +52,7 @@ def reconstruct(  # noqa: PLR0913
             processes unless --no-resume is given.
         device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
     """
-    with distributed.processes():
+    with distributed.process_group():
         first, apart = distributed.rank() == 0, (camera.psf, camera.dark)
         calibration = _load(camera)
 
@@ -63,19 +63,19 @@ def reconstruct(  # noqa: PLR0913
             return "\0".join(files).encode(errors="surrogateescape")
 
         # Listed once: a folder may still grow.
-        files = distributed.from_first(found).decode(errors="surrogateescape").split("\0")
-        device_here = distributed.device_here(device)
+        files = distributed.broadcast(found).decode(errors="surrogateescape").split("\0")
+        device_here = distributed.local_device(device)
         reconstructor = Reconstructor(method, calibration, regularisation=regularisation, device=device_here)
         if first:
             warn(reconstructor.warning)
             levels = ", ".join(f"{level:.4f}" for level in calibration.background)
             told = f"PSF {calibration.psf_hash}, background {levels} of the full scale subtracted"
             console.print(told, soft_wrap=True)
-        again = distributed.world() > 1 if resume is None else resume
-        darkroom = Darkroom(reconstructor, method, out, format, judge=trust, resume=again)
+        again = distributed.world_size() > 1 if resume is None else resume
+        batch = Batch(reconstructor, method, out, format, judge=trust, resume=again)
         ended: Counter[str] = Counter()
         with (
-            closing(darkroom.develop(files)) as jobs,
+            closing(batch.run(files)) as jobs,
             Progress(console=console, disable=len(files) == 1 or not first) as bars,
         ):
             bar = bars.add_task("Reconstructing", total=len(files))
@@ -83,14 +83,14 @@ def reconstruct(  # noqa: PLR0913
                 bars.update(bar, completed=job.number + 1)  # the others' too
                 ended[_told(job)] += 1
         counts = torch.tensor([ended["failed"], ended["kept"]])
-        failed, kept = distributed.total(counts).tolist()
+        failed, kept = distributed.all_reduce_sum(counts).tolist()
         if first:
-            darkroom.summarise(files)
+            batch.summarise(files)
             there = f", {kept} of them before" if kept else ""
             done = f"{len(files) - failed} of {len(files)} captures reconstructed into {out}{there}"
             console.print(done, highlight=False, markup=False, soft_wrap=True)
     status = 1 if failed else 0
-    distributed.end_with(status)
+    distributed.set_exit_status(status)
     return status
 
 

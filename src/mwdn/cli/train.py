@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from rich.progress import Progress, ProgressColumn, track
 
 from mwdn.cli.camera import CameraOptions, console, errors
-from mwdn.io.files import spare
+from mwdn.io.files import refuse_overwrite
 from mwdn.io.toml import value_of
 from mwdn.runtime import distributed
 from mwdn.training import experiment
@@ -68,7 +68,7 @@ def train(  # noqa: PLR0913
     if captures:
         chosen = replace(chosen, sheet=Sheet(tuple(map(str, captures))))
     columns: list[str | ProgressColumn] = [*Progress.get_default_columns(), "{task.fields[now]}"]
-    with distributed.processes(), ExitStack() as stack:
+    with distributed.process_group(), ExitStack() as stack:
         apart = camera.psf, camera.dark
         trainer = experiment.prepare(chosen, camera.load(), photos, out, device, pairs=pairs, apart=apart)
         first = distributed.rank() == 0
@@ -113,7 +113,7 @@ def simulate(
         exact: simulate a camera that is exactly what its calibration says.
         **changes: any key of the recipe.
     """
-    spare(out, camera.psf, camera.dark, recipe)
+    refuse_overwrite(out, camera.psf, camera.dark, recipe)
     chosen = read_recipe(recipe, **_as_recipe(changes))
     progress = partial(track, description="Simulating", console=errors, transient=True)
     experiment.simulate(chosen, camera.load(), photos, out, count, exact=exact, track=progress)

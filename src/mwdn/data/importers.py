@@ -13,7 +13,7 @@ from mwdn.data.pair_writer import PixelType, check_path, quantise
 from mwdn.data.pairs import PairFile
 from mwdn.data.sources import Found, Source, find_in_folders, find_in_hdf5, find_in_parquet, find_phlatcam
 from mwdn.errors import ImageError, MwdnError, ParameterError, UnknownNameError
-from mwdn.io.files import spare
+from mwdn.io.files import refuse_overwrite
 from mwdn.types import Frame, Size
 
 Pair = tuple[str, Frame, Frame]
@@ -94,7 +94,7 @@ KINDS = {
 
 @dataclass
 class Imported:
-    """What an import did: pairs written, and the name of each that was left out with the reason."""
+    """What an import did: pairs atomic_write, and the name of each that was left out with the reason."""
 
     count: int = 0
     skipped: dict[str, str] = field(default_factory=dict)
@@ -219,7 +219,7 @@ def import_pairs(
         ImageError: nothing to import; a pair is damaged and not to be skipped; ``output`` cannot be written.
     """
     check_path(Path(output))
-    spare(Path(output), Path(path))
+    refuse_overwrite(Path(output), Path(path))
     done = Imported()
     pairs = read_pairs(kind, path, layout=layout, skipped=done.skipped if skip_damaged else None, track=track)
     first = next(pairs, None)

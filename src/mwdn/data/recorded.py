@@ -15,7 +15,7 @@ from mwdn.data.pairs import PairFile
 from mwdn.data.simulated import Pair, Samples
 from mwdn.data.splits import split
 from mwdn.errors import ParameterError, ShapeError
-from mwdn.runtime.transfers import sent
+from mwdn.runtime.transfers import to_device
 from mwdn.types import Psf
 
 HELD_OUT = 20
@@ -92,7 +92,7 @@ class RecordedPairs:
             ImageError: a pair cannot be read.
         """
         pairs = [self.file[self.row(number)] for number in numbers]
-        measurement, scene = (sent(torch.stack(part), self.device) for part in zip(*pairs, strict=True))
+        measurement, scene = (to_device(torch.stack(part), self.device) for part in zip(*pairs, strict=True))
         return Pair(measurement, scene)
 
     def row(self, number: int) -> int:

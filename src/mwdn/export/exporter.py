@@ -23,7 +23,7 @@ from torch.export import Dim, ExportedProgram
 from mwdn.calibration import Calibration
 from mwdn.errors import ExportError, ParameterError
 from mwdn.export.onnx_program import to_onnx
-from mwdn.inference.fusion import Convolution, fold
+from mwdn.inference.fusion import Convolution, fuse
 from mwdn.inference.reconstructor import Method, Reconstructor, find_method
 from mwdn.io.files import atomic
 from mwdn.io.pictures import dark_scene
@@ -69,7 +69,7 @@ class Bound(nn.Module):
         method: a network or a solver.
         psf: (1, 1 or C, H, W).
         channels: of the measurement.
-        dtype: of the convolutions, see `mwdn.inference.fusion.fold`; ``None`` for float32.
+        dtype: of the convolutions, see `mwdn.inference.fusion.fuse`; ``None`` for float32.
     """
 
     def __init__(self, method: Method, psf: Psf, channels: int, *, dtype: torch.dtype | None = None) -> None:
@@ -86,7 +86,7 @@ class Bound(nn.Module):
             self.count = len(bound)
             for index, tensor in enumerate(bound):
                 self.register_buffer(f"bound_{index}", tensor)
-        self.method = fold(network, dtype)
+        self.method = fuse(network, dtype)
         for module in self.method.modules():
             if isinstance(module, Convolution):
                 module.packed = None  # an order of this machine

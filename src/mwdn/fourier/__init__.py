@@ -1,8 +1,8 @@
 """Convolution, correlation and Wiener deconvolution by fast Fourier transforms."""
 
 from mwdn.fourier.convolution import Convolution, check_fit, convolve, correlate
-from mwdn.fourier.filtering import filtered
-from mwdn.fourier.padding import Boundary, extend
+from mwdn.fourier.filtering import filter_image
+from mwdn.fourier.padding import Boundary, pad
 from mwdn.fourier.transforms import (
     fast_length,
     filter_field,
@@ -23,14 +23,14 @@ __all__ = [
     "convolve",
     "correlate",
     "deconvolution_grid",
-    "extend",
     "fast_length",
     "filter_field",
-    "filtered",
+    "filter_image",
     "frequencies",
     "frequency_grid",
     "gaussian_transfer",
     "inverse_spectrum",
+    "pad",
     "plane_spectrum",
     "spectrum",
     "transfer_function",

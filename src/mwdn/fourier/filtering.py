@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mwdn.fourier.memory_format import in_parts, laid_out_as, paired, planar, together, unpaired
-from mwdn.fourier.padding import Boundary, Continuation, extend
+from mwdn.fourier.memory_format import as_channels, as_complex, chunked, chunks, contiguous_planes, match_format
+from mwdn.fourier.padding import Boundary, Padding, pad
 from mwdn.fourier.transforms import (
     filter_field,
     inverse_spectrum,
@@ -17,7 +17,7 @@ from mwdn.fourier.transforms import (
 from mwdn.types import Size, Spectrum
 
 
-def filtered(image: Tensor, transfer: Tensor, grid: Size, boundary: Boundary) -> Tensor:
+def filter_image(image: Tensor, transfer: Tensor, grid: Size, boundary: Boundary) -> Tensor:
     """Multiply a picture's spectrum with a transfer function: the picture continued to ``grid``, the result cropped.
 
     On a CPU a few channels at a time, whose planes stay in its cache: fresh memory for a whole spectrum costs more
@@ -33,7 +33,7 @@ def filtered(image: Tensor, transfer: Tensor, grid: Size, boundary: Boundary) ->
         Of the shape, the precision and the memory format of ``image``; computed in float32.
     """
     if torch.compiler.is_compiling():  # also an export: one transform of everything is simpler to write down
-        spread = spectrum(extend(image.float(), grid, boundary), grid)
+        spread = spectrum(pad(image.float(), grid, boundary), grid)
         return inverse_spectrum(transfer * spread, grid, (image.shape[-2], image.shape[-1])).to(image.dtype)
     return _Filter.apply(image, transfer, grid, boundary)  # type: ignore[no-untyped-call]
 
@@ -46,18 +46,18 @@ class _Filter(torch.autograd.Function):
         function = _filtered
         if transfer.shape[1] == 1 and image.shape[1] % 2 == 0:
             function, transfer = _filtered_pairs, _whole(transfer, grid[1])
-        return in_parts(lambda few, own: function(few, own, grid, boundary), image, transfer)
+        return chunked(lambda few, own: function(few, own, grid, boundary), image, transfer)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:  # noqa: ANN401
         image, transfer = ctx.saved_tensors
         (to_image, to_transfer, *_), grid, size = ctx.needs_input_grad, ctx.grid, (image.shape[-2], image.shape[-1])
-        slopes, planes = planar(gradient), planar(image) if to_transfer else image
+        slopes, planes = contiguous_planes(gradient), contiguous_planes(image) if to_transfer else image
         image_slope = torch.empty_like(slopes) if to_image else None
         transfer_slope = torch.zeros_like(transfer) if to_transfer else None
-        continued = Continuation(size, grid, ctx.boundary, slopes)
-        for part in together(slopes, grid):
+        continued = Padding(size, grid, ctx.boundary, slopes)
+        for part in chunks(slopes, grid):
             G = plane_spectrum(slopes[part], grid)
             if transfer_slope is not None:
                 of_part = _of(transfer_slope, part)
@@ -70,18 +70,18 @@ class _Filter(torch.autograd.Function):
             # Half a spectrum: a column stands for itself and its mirror image, but for the first and, of an even
             # width, the last; and the inverse transform divides by the number of pixels.
             transfer_slope.div_(grid[0] * grid[1])[..., 1 : (grid[1] + 1) // 2].mul_(2)
-        slope = None if image_slope is None else laid_out_as(image, image_slope).to(image.dtype)
+        slope = None if image_slope is None else match_format(image, image_slope).to(image.dtype)
         return slope, transfer_slope, None, None
 
 
 def _filtered(image: Tensor, transfer: Tensor, grid: Size, boundary: Boundary) -> Tensor:
-    planes, size = planar(image), (image.shape[-2], image.shape[-1])
+    planes, size = contiguous_planes(image), (image.shape[-2], image.shape[-1])
     result = torch.empty_like(planes)
-    continued = Continuation(size, grid, boundary, planes)
-    for part in together(planes, grid):
+    continued = Padding(size, grid, boundary, planes)
+    for part in chunks(planes, grid):
         V = plane_spectrum(continued(planes[part]), grid).mul_(_of(transfer, part))
         result[part] = inverse_spectrum(V, grid, size)
-    return laid_out_as(image, result)
+    return match_format(image, result)
 
 
 def _filtered_pairs(image: Tensor, transfer: Tensor, grid: Size, boundary: Boundary) -> Tensor:
@@ -92,13 +92,13 @@ def _filtered_pairs(image: Tensor, transfer: Tensor, grid: Size, boundary: Bound
     A complex transform of two axes is one call of MKL, there and back; back to real numbers it takes several, with
     copies between them.
     """
-    pairs, (height, width) = paired(image), (image.shape[-2], image.shape[-1])
+    pairs, (height, width) = as_complex(image), (image.shape[-2], image.shape[-1])
     result = torch.empty(pairs.shape, dtype=image.dtype, device=image.device)
-    continued = Continuation((height, width), grid, boundary, image)
-    for part in together(pairs, grid):
+    continued = Padding((height, width), grid, boundary, image)
+    for part in chunks(pairs, grid):
         both = filter_field(continued(pairs[part]), _of(transfer, part))
         result[part] = torch.view_as_real(both[..., :height, :width])
-    return unpaired(result, image)
+    return as_channels(result, image)
 
 
 def _whole(half: Spectrum, width: int) -> Tensor:

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 from mwdn.types import Size
 
 
-def together(planes: Tensor, grid: Size) -> Iterator[tuple[slice, slice]]:
+def chunks(planes: Tensor, grid: Size) -> Iterator[tuple[slice, slice]]:
     """Samples and channels (or pairs) transformed together: four megabytes on a CPU, at most a gigabyte on a GPU."""
     samples, channels = planes.shape[:2]
     numbers = grid[0] * grid[1] * (planes.ndim - 3)  # of a pair twice as many
@@ -28,12 +28,12 @@ LARGEST = 2**26
 """Numbers of a picture that are laid out anew at once."""
 
 
-def in_parts(
+def chunked(
     function: Callable[[Tensor, Tensor], Tensor], image: Tensor, other: Tensor, step: int | None = None
 ) -> Tensor:
     """``function(image, other)`` of (B, C, H, W) and (B, 1 or C, ...), ``step`` channels at a time.
 
-    Unless given, these are all, and of a large picture a few: an even number, which can be `paired`.
+    Unless given, these are all, and of a large picture a few: an even number, which can be `as_complex`.
     """
     step = step or max(2, LARGEST // max(1, image[:, :1].numel()) // 2 * 2)
     if step >= image.shape[1]:
@@ -45,7 +45,7 @@ def in_parts(
     return result
 
 
-def planar(image: Tensor) -> Tensor:
+def contiguous_planes(image: Tensor) -> Tensor:
     """The picture with each channel's plane in one piece."""
     if image.is_contiguous() or image.stride(1) != 1:
         return image.contiguous()
@@ -54,7 +54,7 @@ def planar(image: Tensor) -> Tensor:
     return result
 
 
-def laid_out_as(image: Tensor, planes: Tensor) -> Tensor:
+def match_format(image: Tensor, planes: Tensor) -> Tensor:
     """The planes in the memory format of ``image``, which has their shape."""
     if image.is_contiguous() or not image.is_contiguous(memory_format=torch.channels_last):
         return planes
@@ -63,10 +63,10 @@ def laid_out_as(image: Tensor, planes: Tensor) -> Tensor:
     return result
 
 
-def paired(image: Tensor) -> Tensor:
+def as_complex(image: Tensor) -> Tensor:
     """Each two channels as the real and the imaginary part of one plane: (B, C, H, W) to (B, C / 2, H, W, 2).
 
-    Where channels lie side by side, two are moved as one number: half the work of `planar`.
+    Where channels lie side by side, two are moved as one number: half the work of `contiguous_planes`.
     """
     if image.stride(1) != 1:
         return image.unflatten(1, (-1, 2)).movedim(2, -1)  # type: ignore[no-untyped-call]
@@ -76,8 +76,8 @@ def paired(image: Tensor) -> Tensor:
     return result
 
 
-def unpaired(pairs: Tensor, image: Tensor) -> Tensor:
-    """The channels that were `paired`, in the memory format of ``image``, which has their shape."""
+def as_channels(pairs: Tensor, image: Tensor) -> Tensor:
+    """The channels that were `as_complex`, in the memory format of ``image``, which has their shape."""
     if image.is_contiguous() or not image.is_contiguous(memory_format=torch.channels_last):
         return pairs.movedim(-1, 2).flatten(1, 2)
     result = torch.empty_like(image)
@@ -85,7 +85,7 @@ def unpaired(pairs: Tensor, image: Tensor) -> Tensor:
     return result
 
 
-def folded(image: Tensor, block: int) -> Tensor:
+def pixel_unshuffle(image: Tensor, block: int) -> Tensor:
     """`torch.nn.functional.pixel_unshuffle`, channels-last: each ``block`` x ``block`` pixels as one of more channels.
 
     Where blocks are pairs of pairs and no gradient is asked for, each pair is moved as one number: a third of the time.

@@ -19,7 +19,7 @@ Boundary = Literal["circular", "zero", "replicate", "taper"]
 """
 
 
-def extend(image: Image, grid: Size, boundary: Boundary) -> Tensor:
+def pad(image: Image, grid: Size, boundary: Boundary) -> Tensor:
     """Continue a picture to ``grid``: the new pixels come after the last row and column.
 
     On a periodic grid "after the last" is also "before the first": the first half of the new pixels continues the
@@ -37,10 +37,10 @@ def extend(image: Image, grid: Size, boundary: Boundary) -> Tensor:
     return image
 
 
-class Continuation:
-    """`extend` of planes (B, C, H, W) into fresh float32 memory, and its adjoint: the same numbers, fewer copies.
+class Padding:
+    """`pad` of planes (B, C, H, W) into fresh float32 memory, and its adjoint: the same numbers, fewer copies.
 
-    What is `paired` becomes complex planes.
+    What is `as_complex` becomes complex planes.
     """
 
     def __init__(self, size: Size, grid: Size, boundary: Boundary, like: Tensor) -> None:

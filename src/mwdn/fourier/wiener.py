@@ -4,7 +4,7 @@ from torch import Tensor
 
 from mwdn.errors import ParameterError
 from mwdn.fourier.convolution import check_fit
-from mwdn.fourier.filtering import filtered
+from mwdn.fourier.filtering import filter_image
 from mwdn.fourier.padding import Boundary
 from mwdn.fourier.transforms import fast_length, transfer_function
 from mwdn.types import Image, Measurement, Psf, Size, Spectrum
@@ -42,7 +42,7 @@ def wiener(
     """
     check_fit(measurement, psf, "measurement")
     grid = deconvolution_grid((measurement.shape[-2], measurement.shape[-1]), boundary)
-    return filtered(measurement.float(), wiener_transfer(psf, regularisation, grid), grid, boundary)
+    return filter_image(measurement.float(), wiener_transfer(psf, regularisation, grid), grid, boundary)
 
 
 def wiener_transfer(psf: Psf, regularisation: float | Tensor, grid: Size) -> Spectrum:

@@ -18,12 +18,12 @@ from mwdn.data.captures import read_capture
 from mwdn.errors import ImageError, MwdnError, ParameterError
 from mwdn.evaluation.consistency import Consistency, consistency
 from mwdn.inference.reconstructor import Reconstructor
-from mwdn.io.contact_sheets import contact_sheet, for_people, thumbnail
-from mwdn.io.files import naming, resolver, write_json
+from mwdn.io.contact_sheets import contact_sheet, thumbnail, to_display
+from mwdn.io.files import naming_file, resolver, write_json
 from mwdn.io.images import read_frame, read_picture, write_linear, write_picture
 from mwdn.runtime import distributed
-from mwdn.runtime.streams import ahead
-from mwdn.runtime.transfers import fetched, sent
+from mwdn.runtime.streams import prefetch
+from mwdn.runtime.transfers import to_device, to_host
 from mwdn.solvers import Pose, align
 from mwdn.types import Measurement, Scene
 from mwdn.version import __version__
@@ -87,7 +87,7 @@ class Job:
         capture: its file.
         output: the picture's file.
         number: of the capture, from 0.
-        origin: of what the picture is made, see `Darkroom.origin`.
+        origin: of what the picture is made, see `Batch.origin`.
         measurement: (1, C, H, W); it and the next two are there only between the steps that need them.
         pose: of the PSF, if the picture is judged.
         scene: (1, C, H, W).
@@ -115,10 +115,10 @@ class Job:
         return self.saturated > SATURATED_PART
 
 
-def _step(work: Callable[["Darkroom", Job], Job]) -> Callable[["Darkroom", Job], Job]:
+def _step(work: Callable[["Batch", Job], Job]) -> Callable[["Batch", Job], Job]:
     """One that ends a job with the error that concerns this capture alone."""
 
-    def step(darkroom: "Darkroom", job: Job) -> Job:
+    def step(darkroom: "Batch", job: Job) -> Job:
         try:
             return work(darkroom, job)
         except MwdnError as error:
@@ -128,7 +128,7 @@ def _step(work: Callable[["Darkroom", Job], Job]) -> Callable[["Darkroom", Job],
 
 
 @dataclass(frozen=True)
-class Darkroom:
+class Batch:
     """Where the captures of one camera become pictures, by one method, in one folder.
 
     Beside each picture is a ``.json`` that says how far to trust it and of what it was made. It is written after the
@@ -150,12 +150,12 @@ class Darkroom:
     judge: bool = True
     resume: bool = False
 
-    def develop(self, captures: Sequence[str | Path]) -> Generator[Job, None, None]:
+    def run(self, captures: Sequence[str | Path]) -> Generator[Job, None, None]:
         """Turn captures into pictures, in their order; of several processes each turns those that no other does."""
-        numbers = distributed.handed_out(len(captures))
+        numbers = distributed.work_queue(len(captures))
         jobs = (Job(Path(captures[n]), self.out / output_name(captures[n], self.form), n) for n in numbers)
         # To find the pose and to judge takes longer than most methods: on a CPU the three steps share its cores.
-        with ahead(self._read, jobs) as read, ahead(self._finish, map(self._reconstruct, read)) as finished:
+        with prefetch(self._read, jobs) as read, prefetch(self._finish, map(self._reconstruct, read)) as finished:
             yield from finished
 
     @_step
@@ -168,7 +168,7 @@ class Darkroom:
         measurement = calibration.correct(frame)
         if measurement.amax() <= 0:
             raise ImageError("The sensor saw no light: no pixel is brighter than the dark frame, or black.")
-        measurement = sent(measurement, self.reconstruct.device)
+        measurement = to_device(measurement, self.reconstruct.device)
         pose = align(measurement, self.reconstruct.psf) if self.judge else None
         return replace(job, measurement=measurement, pose=pose, saturated=calibration.saturated_part(frame))
 
@@ -193,13 +193,13 @@ class Darkroom:
             content["saturated"] = job.saturated
         if trust:
             content |= {**asdict(trust), "doubtful": trust.doubtful}
-        scene = fetched(job.scene)
-        with naming(beside):
+        scene = to_host(job.scene)
+        with naming_file(beside):
             beside.unlink(missing_ok=True)  # or it would vouch for another picture than it was written for
         if self.form in ("tiff", "npy"):
             write_linear(job.output, scene)
         else:
-            write_picture(job.output, for_people(scene), bits=16 if self.form == "png16" else 8)
+            write_picture(job.output, to_display(scene), bits=16 if self.form == "png16" else 8)
         write_json(beside, content)
         return replace(job, measurement=None, pose=None, scene=None, trust=trust)
 

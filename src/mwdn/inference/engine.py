@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from mwdn.errors import ParameterError
 from mwdn.inference.cuda_graph import CudaGraph
-from mwdn.inference.fusion import fold
+from mwdn.inference.fusion import fuse
 from mwdn.runtime.devices import has_bfloat16, without_tf32
 from mwdn.solvers.alignment import Pose
 from mwdn.types import Measurement, Psf, Scene
@@ -50,9 +50,9 @@ class Engine:
         # Copied before it is moved: the caller's network stays where it is, and the PSF branch exact.
         own = copy.deepcopy(network).to(psf.device).eval().requires_grad_(False)
         half = half_precision(psf.device) if precision == "fast" else None
-        self.folded = fold(copy.deepcopy(own), half)
+        self.folded = fuse(copy.deepcopy(own), half)
         # What binds the PSF, if anything does.
-        self.network = fold(own, None) if half is not None and hasattr(own, "bind") else self.folded
+        self.network = fuse(own, None) if half is not None and hasattr(own, "bind") else self.folded
         self.bound: dict[int, list[Tensor]] = {}
         self.recordings: dict[torch.Size, CudaGraph | None] = {}
 

@@ -85,15 +85,15 @@ def _packed(weight: Tensor, padding: list[int]) -> Tensor | None:
     return packed if torch.allclose(found, expected, rtol=0.05, atol=0.05 * expected.max().item()) else None
 
 
-def fold(module: nn.Module, dtype: torch.dtype | None) -> nn.Module:
+def fuse(module: nn.Module, dtype: torch.dtype | None) -> nn.Module:
     """Replace each convolution, with the BatchNorm and the ReLU right after it, by one `Convolution`; in place.
 
     The U-Nets that are then nothing else work in strips.
     """
     if isinstance(module, nn.Sequential):
-        return nn.Sequential(*_folded(list(module), dtype))
+        return nn.Sequential(*_fused(list(module), dtype))
     for name, child in module.named_children():
-        setattr(module, name, fold(child, dtype))
+        setattr(module, name, fuse(child, dtype))
     if isinstance(module, Encoder | Decoder) and all(
         isinstance(layer, Convolution) for scale in module.scales for layer in scale.children()
     ):
@@ -103,12 +103,12 @@ def fold(module: nn.Module, dtype: torch.dtype | None) -> nn.Module:
     return Float32(module) if isinstance(module, nn.Conv2d | nn.ConvTranspose2d | nn.Linear) else module
 
 
-def _folded(layers: list[nn.Module], dtype: torch.dtype | None) -> list[nn.Module]:
+def _fused(layers: list[nn.Module], dtype: torch.dtype | None) -> list[nn.Module]:
     result: list[nn.Module] = []
     while layers:
         layer = layers.pop(0)
         if not _plain(layer):
-            result.append(fold(layer, dtype))
+            result.append(fuse(layer, dtype))
             continue
         norm = layers[0] if layers and isinstance(layers[0], nn.BatchNorm2d) else None
         layers = layers[norm is not None :]

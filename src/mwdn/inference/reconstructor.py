@@ -14,8 +14,8 @@ from mwdn.fourier.convolution import check_fit
 from mwdn.inference.engine import Engine, Precision
 from mwdn.networks import DENOISERS, NETWORKS
 from mwdn.networks.blocks import check_channels
-from mwdn.runtime.devices import usable
-from mwdn.runtime.transfers import fetched, sent
+from mwdn.runtime.devices import select_device
+from mwdn.runtime.transfers import to_device, to_host
 from mwdn.types import Frame, Measurement, Psf, Scene
 from mwdn.weights.bundled import BUNDLED, find_weights
 from mwdn.weights.checkpoint import SUFFIXES, load_network, read_metadata
@@ -108,7 +108,7 @@ class Reconstructor:
         device: str | torch.device | None = None,
         precision: Precision = "fast",
     ) -> None:
-        self.device = usable(device)
+        self.device = select_device(device)
         self.calibration = calibration
         self.method = find_method(method, regularisation) if isinstance(method, str | Path) else method
         self.warning = _other_camera(method, calibration) if isinstance(method, str | Path) else None
@@ -157,7 +157,7 @@ class Reconstructor:
             measurement = self.calibration.correct(frame)
             due |= aligns and refresh > 0 and number % refresh == 0
             if due and measurement.isfinite().all():
-                here, due = self.at(solvers.align(sent(measurement, self.device), self.psf)), False
+                here, due = self.at(solvers.align(to_device(measurement, self.device), self.psf)), False
             yield measurement, here(measurement)
 
     def _reconstruct(self, measurement: Measurement) -> Scene:
@@ -200,7 +200,7 @@ class Reconstructor:
                 PSF or the network.
             ParameterError: the device has not enough memory for pictures of this size.
         """
-        return fetched(self.on_device(measurement))
+        return to_host(self.on_device(measurement))
 
     @torch.inference_mode()
     def on_device(self, measurement: Measurement) -> Scene:
@@ -213,7 +213,7 @@ class Reconstructor:
         self._check(measurement)
         try:
             parts = torch.split(measurement, self._at_once(measurement))
-            scenes = [self._reconstruct(sent(part, self.device)) for part in parts]
+            scenes = [self._reconstruct(to_device(part, self.device)) for part in parts]
             return scenes[0] if len(scenes) == 1 else torch.cat(scenes)
         except (MemoryError, RuntimeError) as error:
             # On a CPU torch has no type of its own for this.

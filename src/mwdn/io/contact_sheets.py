@@ -9,7 +9,7 @@ from mwdn.io.images import srgb_decode
 from mwdn.types import Image
 
 
-def for_people(image: Image) -> Image:
+def to_display(image: Image) -> Image:
     """Scale each picture of a batch so that all but its brightest 0.3 % fit into [0, 1].
 
     A reconstruction's absolute brightness depends on the exposure and on the PSF's; people want to see a picture.
@@ -20,7 +20,7 @@ def for_people(image: Image) -> Image:
 
 
 def contact_sheet(rows: list[list[Tensor]], titles: list[str], *, height: int = 240) -> Tensor:
-    """Arrange pictures in rows, each scaled by `for_people` and resized to one height.
+    """Arrange pictures in rows, each scaled by `to_display` and resized to one height.
 
     Args:
         rows: lists of (1, 1 or 3, H, W) in linear light, as many a row as there are titles.
@@ -47,7 +47,7 @@ def thumbnail(picture: Image, height: int = 240) -> Tensor:
 
 
 def _cell(picture: Tensor, height: int, gap: int) -> Tensor:
-    picture = thumbnail(for_people(picture), height)
+    picture = thumbnail(to_display(picture), height)
     if picture.shape[-2] < height:
         picture = F.interpolate(picture, (height, _width(picture, height)), mode="bicubic").clamp(0, 1)
     return F.pad(picture.expand(-1, 3, -1, -1), (0, gap, 0, gap), value=1.0)

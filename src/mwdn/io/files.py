@@ -54,18 +54,18 @@ def atomic(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def written(path: str | Path) -> Iterator[Path]:
+def atomic_write(path: str | Path) -> Iterator[Path]:
     """`atomic`, which names the file in what the disk refuses.
 
     Raises:
         ImageError: the disk refuses.
     """
-    with naming(path), atomic(Path(path)) as temporary:
+    with naming_file(path), atomic(Path(path)) as temporary:
         yield temporary
 
 
 @contextmanager
-def naming(path: str | Path) -> Iterator[None]:
+def naming_file(path: str | Path) -> Iterator[None]:
     """Name a file in what the disk refuses.
 
     Raises:
@@ -83,7 +83,7 @@ def save_text(path: Path, text: str) -> None:
     Raises:
         ImageError: the disk refuses.
     """
-    with written(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
@@ -122,7 +122,7 @@ def check_folder(folder: Path) -> None:
             pass
 
 
-def spare(output: Path, *inputs: Path | None) -> None:
+def refuse_overwrite(output: Path, *inputs: Path | None) -> None:
     """See that an output replaces none of the inputs.
 
     Raises:

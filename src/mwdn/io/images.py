@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mwdn.errors import ImageError, ParameterError
-from mwdn.io.files import naming, save_linear, save_png
+from mwdn.io.files import naming_file, save_linear, save_png
 from mwdn.io.formats import decode, kind_of, read
 from mwdn.types import FloatFrame, Frame, Image
 
@@ -143,5 +143,5 @@ def _writable(path: Path, image: Tensor, *suffixes: str) -> FloatFrame:
 
 
 def _write(save: Callable[[Path, Frame], None], path: Path, pixels: Frame) -> None:
-    with naming(path):
+    with naming_file(path):
         save(path, pixels)

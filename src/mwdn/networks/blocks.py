@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mwdn.errors import ParameterError, ShapeError
-from mwdn.fourier.filtering import filtered
-from mwdn.fourier.memory_format import in_parts
+from mwdn.fourier.filtering import filter_image
+from mwdn.fourier.memory_format import chunked
 from mwdn.fourier.padding import Boundary
 from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
 from mwdn.networks.recomputed import Stages
@@ -171,7 +171,7 @@ class Wiener(nn.Module):
         grid = deconvolution_grid((psf.shape[-2], psf.shape[-1]), self.boundary)
         if psf[:, :, 0, 0].numel() * grid[0] * grid[1] > LARGEST:
             return psf.contiguous()
-        parts = [self.transfer(part) for part in psf.split(_together(grid), dim=1)]  # type: ignore[no-untyped-call]
+        parts = [self.transfer(part) for part in psf.split(_channels_per_chunk(grid), dim=1)]  # type: ignore[no-untyped-call]
         return parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
 
     def transfer(self, psf: Psf) -> Tensor:
@@ -185,15 +185,15 @@ class Wiener(nn.Module):
         """Deconvolve each channel with what is `known` of the PSF, or with its own."""
         grid = deconvolution_grid((features.shape[-2], features.shape[-1]), self.boundary)
         if known.is_complex():
-            return filtered(features, known, grid, self.boundary)
+            return filter_image(features, known, grid, self.boundary)
 
         def few(features: Tensor, psf: Tensor) -> Tensor:
-            return filtered(features, self.transfer(psf), grid, self.boundary)
+            return filter_image(features, self.transfer(psf), grid, self.boundary)
 
-        return in_parts(few, features, known, _together(grid))
+        return chunked(few, features, known, _channels_per_chunk(grid))
 
 
-def _together(grid: Size) -> int:
+def _channels_per_chunk(grid: Size) -> int:
     """Channels whose transfer functions are made at once: they need ten times the memory of what comes out."""
     return max(1, LARGEST // (32 * grid[0] * grid[1]))
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from mwdn.fourier.memory_format import folded
+from mwdn.fourier.memory_format import pixel_unshuffle
 from mwdn.types import Image
 
 
@@ -77,7 +77,7 @@ class Drunet(nn.Module):
         step = self.fold * 2 ** len(self.down)
         x = torch.cat([picture, level.to(picture).expand(picture.shape[0], 1, height, width)], dim=1)
         x = F.pad(x, (0, -width % step, 0, -height % step), mode="replicate")
-        x, skips = self.head(folded(x, self.fold)), []
+        x, skips = self.head(pixel_unshuffle(x, self.fold)), []
         for scale, down in zip(self.encoder, self.down, strict=True):
             skips.append(scale(x))
             x = down(F.pixel_unshuffle(skips[-1], 2))

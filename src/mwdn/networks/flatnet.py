@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from mwdn.errors import ParameterError
-from mwdn.fourier.padding import Boundary, extend
+from mwdn.fourier.padding import Boundary, pad
 from mwdn.fourier.transforms import inverse_spectrum, spectrum, transfer_function
 from mwdn.fourier.wiener import deconvolution_grid
 from mwdn.networks.blocks import one_each_colour, stretched
@@ -71,7 +71,7 @@ class FlatNet(nn.Module):
             # (The source gives the filter a rate a millionth of the U-Net's.) At N' pixels taps are N / N' as large.
             taps = stretched(self.correction, size) * (math.sqrt(self.correction.numel()) / (size[0] * size[1]))
             W = W + transfer_function(taps, grid)
-        B = spectrum(extend(measurement.float(), grid, self.boundary), grid)
+        B = spectrum(pad(measurement.float(), grid, self.boundary), grid)
         return inverse_spectrum(W * B, grid, size)
 
     def forward(self, measurement: Measurement, psf: Psf) -> Scene:

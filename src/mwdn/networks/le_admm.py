@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from mwdn.errors import ParameterError
 from mwdn.networks.blocks import check_size
 from mwdn.solvers.proximal import Variation
-from mwdn.solvers.splitting import Penalties, merge, pose, rescale, split, start, weigh
+from mwdn.solvers.splitting import Penalties, Problem, initial_state, make_filters, rescale, update_copies, update_scene
 from mwdn.types import Measurement, Psf, Scene
 
 
@@ -23,7 +23,7 @@ class LeAdmm(nn.Module):
     Different here: the measurement is divided by its maximum first, so that the start values mean the same at every
     exposure (the source's data come so); all four are stored as logarithms, which keeps them positive. Calibration has
     subtracted the PSF's background already. The source cannot train with tau: the length of a zero gradient, which
-    the first iteration has everywhere, has an infinite derivative. `mwdn.solvers.proximal.shrink` has none.
+    the first iteration has everywhere, has an infinite derivative. `mwdn.solvers.proximal.bounded` has none.
 
     Args:
         iterations: how many; each adds 4 learnable numbers.
@@ -70,17 +70,17 @@ class LeAdmm(nn.Module):
         """
         check_size(psf, measurement)
         grey = psf.float().sum(1, keepdim=True)
-        problem = pose(
+        problem = Problem.from_psf(
             brightest_one(measurement.float()), grey / torch.linalg.vector_norm(grey, dim=(1, 2, 3), keepdim=True)
         )
         height, width = problem.sensor
-        state, scenes, last = start(problem), [], None
+        state, scenes, last = initial_state(problem), [], None
         constants = (self.log_data, self.log_gradient, self.log_sign, self.log_threshold)
         for data, gradient, sign, threshold in zip(*(each.exp() for each in constants), strict=True):
             mu = Penalties(data, gradient, sign)
             state = state if last is None else rescale(state, last, mu)
-            state = split(state, problem, mu, threshold * gradient, self.variation)
-            state = merge(state, problem, mu, weigh(problem, mu))
+            state = update_copies(state, problem, mu, threshold * gradient, self.variation)
+            state = update_scene(state, problem, mu, make_filters(problem, mu))
             last = mu
             scenes.append(state.v[..., :height, :width])
         return scenes

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from mwdn.errors import ParameterError
-from mwdn.fourier.padding import Boundary, extend
+from mwdn.fourier.padding import Boundary, pad
 from mwdn.fourier.transforms import inverse_spectrum, spectrum, transfer_function
 from mwdn.fourier.wiener import deconvolution_grid
 from mwdn.networks.blocks import check_channels, one_each_colour, stretched
@@ -87,7 +87,7 @@ class SvDeconv(nn.Module):
         total = psf.sum((-2, -1), keepdim=True)
         size = measurement.shape[-2], measurement.shape[-1]
         grid = deconvolution_grid(size, self.boundary)
-        B = spectrum(extend(measurement.float(), grid, self.boundary), grid)
+        B = spectrum(pad(measurement.float(), grid, self.boundary), grid)
         corrections = torch.split(stretched(self.correction, size), 1, dim=1)
         estimates = []
         for correction, regularisation in zip(corrections, self.log_regularisation.exp(), strict=True):

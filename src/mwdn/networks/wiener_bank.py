@@ -7,8 +7,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mwdn.errors import ParameterError
-from mwdn.fourier.memory_format import folded
-from mwdn.fourier.padding import Boundary, extend
+from mwdn.fourier.memory_format import pixel_unshuffle
+from mwdn.fourier.padding import Boundary, pad
 from mwdn.fourier.transforms import inverse_spectrum, spectrum
 from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
 from mwdn.networks.blocks import Decoder, Encoder, check_channels, paper_widths, peak_one
@@ -69,8 +69,8 @@ class WienerBank(nn.Module):
         super().__init__()
         if not regularisations or min(regularisations) <= 0:
             raise ParameterError(f"`regularisations` {tuple(regularisations)} must be one or more positive numbers.")
-        if finest not in (0, *(level.shrink for level in LEVELS)):
-            raise ParameterError(f"`finest` ({finest}) must be 0 or one of {[level.shrink for level in LEVELS]}.")
+        if finest not in (0, *(level.downsampling for level in LEVELS)):
+            raise ParameterError(f"`finest` ({finest}) must be 0 or one of {[level.downsampling for level in LEVELS]}.")
         if rounds and finest != 1:
             raise ParameterError(f"`rounds` ({rounds}) of plug and play need iterations of the full size: `finest` 1.")
         for name, value, least in (("width", width, 1), ("fold", fold, 1), ("block", block, 1), ("rounds", rounds, 0)):
@@ -78,10 +78,10 @@ class WienerBank(nn.Module):
                 raise ParameterError(f"`{name}` ({value!r}) must be a whole number, at least {least}.")
         self.channels, self.fold, self.regularisations = channels, fold, regularisations
         self.finest, self.align, self.block = finest, align, block
-        self.levels = tuple(level for level in LEVELS if finest and level.shrink >= finest)
+        self.levels = tuple(level for level in LEVELS if finest and level.downsampling >= finest)
         if finest > 1:  # the bank has what total variation would smooth away
             self.levels = tuple(
-                replace(level, regularisation=0.0, iterations=QUICK[level.shrink]) for level in self.levels
+                replace(level, regularisation=0.0, iterations=QUICK[level.downsampling]) for level in self.levels
             )
         self.rounds = rounds
         if rounds:
@@ -140,13 +140,13 @@ class WienerBank(nn.Module):
         if not self.levels:
             return torch.cat([*self._filtered(b, known, BOUNDARY), b], dim=1)
         bands = [Band(*each) for each in zip(self.levels, known[:count:2], known[1:count:2], strict=True)]
-        found = PsfPyramid(tuple(bands)).explain(b)
+        found = PsfPyramid(tuple(bands)).solve(b)
         if self.rounds:
             found = plug_and_play(found, self.denoiser, self.rounds)
         if self.finest == 1:
             details = [found.detail(value) for value in self.regularisations]
         else:
-            details = self._filtered(found.rest, known[count:], "zero")
+            details = self._filtered(found.residual, known[count:], "zero")
         return torch.cat([found.scene, *(found.scene + detail for detail in details), b], dim=1)
 
     def _filtered(self, picture: Tensor, transfers: list[Tensor], boundary: Boundary) -> list[Tensor]:
@@ -154,7 +154,7 @@ class WienerBank(nn.Module):
         size = picture.shape[-2], picture.shape[-1]
         grid = deconvolution_grid(size, BOUNDARY)
         # Transforms continue with zeros by themselves, and then skip the rows that hold nothing else.
-        spread = spectrum(picture if boundary == "zero" else extend(picture, grid, boundary), grid)
+        spread = spectrum(picture if boundary == "zero" else pad(picture, grid, boundary), grid)
         return [inverse_spectrum(spread * transfer, grid, size) for transfer in transfers]
 
     def unit(self, estimates: Tensor) -> Tensor:
@@ -170,7 +170,7 @@ class WienerBank(nn.Module):
         if below or right:
             estimates = F.pad(estimates, (0, right, 0, below))
         rows, columns = (-(-size // self.fold) for size in (height, width))
-        blocks = folded(estimates, self.fold).div_(unit)
+        blocks = pixel_unshuffle(estimates, self.fold).div_(unit)
         correction = self.decoder(self.encoder(blocks))[..., :rows, :columns]
         if self.levels:  # of each place in the folded blocks by itself, or their pattern would be seen in dark areas
             correction = correction - mean_light(correction, max(1, self.block // self.fold))

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import torch
 
 from mwdn.errors import ImageError, MwdnError, ParameterError
-from mwdn.io.files import written
+from mwdn.io.files import atomic_write
 from mwdn.optics.masks import Mask
 
 _FORMAT = "mwdn mask 1"
@@ -52,7 +52,7 @@ def write_mask(path: str | Path, mask: Mask) -> None:
     about |= {"pitch_um": mask.pitch_um, "index": mask.index, "step_um": mask.step_um}
     numbers = np.rint(values / scale).astype(np.uint16)
     per_cm = 1e4 / mask.pitch_um
-    with written(path) as temporary:
+    with atomic_write(path) as temporary:
         tifffile.imwrite(
             temporary,
             numbers,
@@ -118,7 +118,7 @@ def write_gds(path: str | Path, mask: Mask) -> None:
             corner = ((left - columns // 2 - 0.5) * mask.pitch_um, -(top - rows // 2 - 0.5) * mask.pitch_um)
             other = ((right - columns // 2 - 0.5) * mask.pitch_um, -(bottom - rows // 2 - 0.5) * mask.pitch_um)
             cell.add(gdstk.rectangle(corner, other, layer=layer))
-    with written(path) as temporary:
+    with atomic_write(path) as temporary:
         library.write_gds(temporary)
 
 
@@ -152,7 +152,7 @@ def write_stl(path: str | Path, mask: Mask, *, base_um: float = 100.0, every: in
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     facets = np.zeros(len(triangles), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("_", "<u2")])
     facets["normal"], facets["corners"] = normals, triangles
-    with written(path) as temporary, temporary.open("wb") as file:
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
         file.write(b"mwdn mask, unit um".ljust(80))
         file.write(np.uint32(len(facets)).tobytes())
         facets.tofile(file)

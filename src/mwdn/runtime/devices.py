@@ -9,7 +9,7 @@ import torch
 from mwdn.errors import ParameterError
 
 
-def usable(device: str | torch.device | None = None) -> torch.device:
+def select_device(device: str | torch.device | None = None) -> torch.device:
     """Return the device once it has held a number and given it back.
 
     Args:

@@ -19,10 +19,10 @@ from torch import Tensor, nn
 from torch import distributed as dist
 
 from mwdn.errors import ParameterError, ProcessError
-from mwdn.runtime.devices import usable
+from mwdn.runtime.devices import select_device
 
 
-def started() -> int:
+def launched_processes() -> int:
     """Number of processes that torchrun started, whether they have joined or not.
 
     Raises:
@@ -51,20 +51,20 @@ def rank() -> int:
     return dist.get_rank() if _joined() else 0
 
 
-def world() -> int:
+def world_size() -> int:
     """Number of processes."""
     return dist.get_world_size() if _joined() else 1
 
 
 @contextmanager
-def processes() -> Iterator[None]:
+def process_group() -> Iterator[None]:
     """Join the processes that torchrun started, and part from them at the end.
 
     Raises:
         ProcessError: they cannot be reached.
         ParameterError: the environment says that there are several, but not how to reach them.
     """
-    if started() == 1:
+    if launched_processes() == 1:
         yield
         return
     for name in ("RANK", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT"):
@@ -79,7 +79,7 @@ def processes() -> Iterator[None]:
         dist.init_process_group(backend, store=store, rank=rank, world_size=world)
     yield
     # Not after an error: NCCL would wait for processes that may have ended.
-    total(torch.zeros(1))  # nobody hangs up while another still writes the last checkpoint
+    all_reduce_sum(torch.zeros(1))  # nobody hangs up while another still writes the last checkpoint
     dist.destroy_process_group()
     atexit.register(_leave)
 
@@ -94,9 +94,9 @@ def _leave(status: int = 0) -> None:
     os._exit(status)
 
 
-def end_with(status: int) -> None:
+def set_exit_status(status: int) -> None:
     """Exit status of this process, where several have parted."""
-    if started() > 1:
+    if launched_processes() > 1:
         atexit.register(_leave, status)  # before the one above: the last one registered comes first
 
 
@@ -106,7 +106,7 @@ def _end_with_parent() -> None:
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 
 
-def device_here(device: str | torch.device | None = None) -> torch.device:
+def local_device(device: str | torch.device | None = None) -> torch.device:
     """The device of this process: of several GPUs in a machine, each process takes that of its number.
 
     Args:
@@ -115,13 +115,15 @@ def device_here(device: str | torch.device | None = None) -> torch.device:
     Raises:
         ParameterError: torch cannot use it, or it names one GPU for several processes.
     """
-    if started() == 1:
-        return usable(device)
+    if launched_processes() == 1:
+        return select_device(device)
     name = str(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     if name.startswith("cuda:"):
-        raise ParameterError(f"`device` ({name}) must be `cuda`: each of {started()} processes takes a GPU of its own.")
+        raise ParameterError(
+            f"`device` ({name}) must be `cuda`: each of {launched_processes()} processes takes a GPU of its own."
+        )
     # Asked for by its number at once: a first tensor on `cuda` would take memory of the first GPU.
-    found = usable(f"cuda:{os.environ['LOCAL_RANK']}" if name == "cuda" else name)
+    found = select_device(f"cuda:{os.environ['LOCAL_RANK']}" if name == "cuda" else name)
     if found.type == "cuda":
         torch.cuda.set_device(found)
     return found
@@ -140,18 +142,18 @@ def _together() -> Iterator[None]:
         ) from error
 
 
-def total(value: Tensor) -> Tensor:
+def all_reduce_sum(value: Tensor) -> Tensor:
     """Sum over all processes; ``value`` itself is changed. Every process gets the same bits."""
-    if world() > 1:
+    if world_size() > 1:
         with _together():
             dist.all_reduce(value)
     return value
 
 
-def from_first(compute: Callable[[], bytes]) -> bytes:
+def broadcast(compute: Callable[[], bytes]) -> bytes:
     """What the first process computes or reads, on all."""
     content = compute() if rank() == 0 else b""
-    if world() == 1:
+    if world_size() == 1:
         return content
     with _together():
         length = torch.tensor([len(content)])
@@ -162,46 +164,46 @@ def from_first(compute: Callable[[], bytes]) -> bytes:
     return message[:-1].numpy().tobytes()
 
 
-def numbers_of_first(numbers: list[float]) -> list[float]:
+def broadcast_floats(numbers: list[float]) -> list[float]:
     """The numbers that the first process gives, on all, to the last bit."""
-    return json.loads(from_first(lambda: json.dumps(numbers).encode()))
+    return json.loads(broadcast(lambda: json.dumps(numbers).encode()))
 
 
-def check_alike(identity: dict[str, Any]) -> None:
+def check_same(identity: dict[str, Any]) -> None:
     """Check that every process was given the same.
 
     Raises:
         ParameterError: this process was given something else than the first.
     """
     own = json.dumps(identity, sort_keys=True).encode()
-    if from_first(lambda: own) != own:
+    if broadcast(lambda: own) != own:
         raise ParameterError(
             f"Process {rank()} must be given the recipe and PSF that process 0 was given. Copy them to all machines."
         )
 
 
-def share(numbers: range) -> range:
+def shard(numbers: range) -> range:
     """The part of a batch's samples that belongs to this process; parts differ by one sample at most.
 
     Raises:
         ParameterError: there are fewer samples than processes.
     """
     count = len(numbers)
-    if count < world():
+    if count < world_size():
         raise ParameterError(
-            f"`batch` ({count}) must be at least the number of processes ({world()}): each takes a part of it. "
-            f"Make it larger, `--batch {world()}`, or start fewer processes."
+            f"`batch` ({count}) must be at least the number of processes ({world_size()}): each takes a part of it. "
+            f"Make it larger, `--batch {world_size()}`, or start fewer processes."
         )
-    return numbers[rank() * count // world() : (rank() + 1) * count // world()]
+    return numbers[rank() * count // world_size() : (rank() + 1) * count // world_size()]
 
 
-def handed_out(count: int) -> Iterator[int]:
+def work_queue(count: int) -> Iterator[int]:
     """The numbers below ``count``, each to one process alone: to whichever asks first."""
-    if world() == 1:
+    if world_size() == 1:
         yield from range(count)
         return
     # The server of torchrun outlives its processes: each start counts under a name of its own.
-    name = from_first(lambda: secrets.token_hex(8).encode()).decode()
+    name = broadcast(lambda: secrets.token_hex(8).encode()).decode()
     with _together():
         address = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
         store = dist.TCPStore(*address, is_master=False)  # type: ignore[attr-defined]
@@ -209,12 +211,12 @@ def handed_out(count: int) -> Iterator[int]:
             yield number
 
 
-def add_gradients(network: nn.Module) -> None:
+def all_reduce_gradients(network: nn.Module) -> None:
     """Sum every gradient over all processes, in one message: one of 17 million float32 numbers has 69 MB."""
-    if world() == 1:
+    if world_size() == 1:
         return
     gradients = [parameter.grad for parameter in network.parameters() if parameter.grad is not None]
-    flat = total(torch.cat([gradient.flatten() for gradient in gradients]))
+    flat = all_reduce_sum(torch.cat([gradient.flatten() for gradient in gradients]))
     parts = torch.split(flat, [gradient.numel() for gradient in gradients])
     for gradient, part in zip(gradients, parts, strict=True):
         gradient.copy_(part.view_as(gradient))

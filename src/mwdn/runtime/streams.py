@@ -12,7 +12,7 @@ B = TypeVar("B")
 
 
 @contextmanager
-def ahead(work: Callable[[A], B], items: Iterable[A], *, depth: int = 2) -> Iterator[Iterator[B]]:
+def prefetch(work: Callable[[A], B], items: Iterable[A], *, depth: int = 2) -> Iterator[Iterator[B]]:
     """Work on items in a thread of their own, in order, a few ahead of whoever takes the results.
 
     Stages are chained: one that computes in the caller's thread between two of these overlaps with both. Whatever

@@ -16,7 +16,7 @@ def _stream(device: torch.device, way: str) -> torch.cuda.Stream:
     return torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
 
 
-def sent(tensor: Tensor, device: torch.device) -> Tensor:
+def to_device(tensor: Tensor, device: torch.device) -> Tensor:
     """A tensor on the device; what is queued there after this call waits for it, what was before does not."""
     if device.type != "cuda" or tensor.device.type != "cpu":
         return tensor.to(device)
@@ -29,7 +29,7 @@ def sent(tensor: Tensor, device: torch.device) -> Tensor:
     return found
 
 
-def fetched(tensor: Tensor) -> Tensor:
+def to_host(tensor: Tensor) -> Tensor:
     """A tensor in ordinary memory; waits for what was queued before this call, not for what other threads queue."""
     if tensor.device.type != "cuda":
         return tensor.to("cpu")

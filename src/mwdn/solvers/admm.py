@@ -9,7 +9,17 @@ from torch import Tensor
 
 from mwdn.errors import ParameterError
 from mwdn.solvers.proximal import Variation, gradient
-from mwdn.solvers.splitting import Penalties, Problem, State, merge, objective, pose, rescale, split, start, weigh
+from mwdn.solvers.splitting import (
+    Penalties,
+    Problem,
+    State,
+    initial_state,
+    make_filters,
+    objective,
+    rescale,
+    update_copies,
+    update_scene,
+)
 from mwdn.types import Measurement, Psf, Scene
 
 
@@ -152,18 +162,18 @@ class Admm:
         b_norm = b_norm.clamp(min=torch.finfo(torch.float32).tiny)
         b, tau = measurement / b_norm, self.regularisation
         if last is None:
-            problem = pose(b, psf / h_norm)
-            state, mu = start(problem), self.penalties
+            problem = Problem.from_psf(b, psf / h_norm)
+            state, mu = initial_state(problem), self.penalties
         else:
             problem, state, mu = last.problem._replace(measurement=b.float()), last.state, last.penalties
-        filters = weigh(problem, mu)
+        filters = make_filters(problem, mu)
         for iteration in range(1, self.iterations + 1):
             balancing = self.balance_every and iteration % self.balance_every == 0
             checking = self.tolerance and iteration % 10 == 0
             watched = balancing or checking or callback
             old = state if watched else None  # the last state's memory, unless it is compared
-            state = split(state, problem, mu, tau, self.variation)
-            state = merge(state, problem, mu, filters)
+            state = update_copies(state, problem, mu, tau, self.variation)
+            state = update_scene(state, problem, mu, filters)
             if old is None:
                 continue
             found = residuals(old, state)
@@ -175,7 +185,7 @@ class Admm:
                 break
             if balancing:
                 balanced = balance(mu, found)
-                state, mu, filters = rescale(state, mu, balanced), balanced, weigh(problem, balanced)
+                state, mu, filters = rescale(state, mu, balanced), balanced, make_filters(problem, balanced)
         height, width = problem.sensor
         scene = state.v[..., :height, :width].clamp(min=0) * (b_norm / h_norm)
         return scene, Reached(problem, state, mu)

@@ -9,7 +9,7 @@ from torch.nn import functional as F
 from mwdn.fourier.convolution import check_fit
 from mwdn.fourier.transforms import frequency_grid, inverse_spectrum, spectrum
 from mwdn.optics.warp import hazed, warp
-from mwdn.solvers.pyramid import Level, explain, halve
+from mwdn.solvers.pyramid import Level, halve, solve
 from mwdn.solvers.splitting import Penalties
 from mwdn.types import Image, Measurement, Psf, Size
 
@@ -121,9 +121,9 @@ def _haze(measurement: Measurement, psf: Psf) -> Tensor:
     """
     hazes = measurement.new_tensor(_HAZES)
     each = hazed(psf.repeat_interleave(len(hazes), 0), hazes.repeat(len(psf))[:, None, None, None])
-    found = explain(measurement.repeat_interleave(len(hazes), 0), each, _HAZE_LEVELS)
+    found = solve(measurement.repeat_interleave(len(hazes), 0), each, _HAZE_LEVELS)
     grid = found.psf.bands[-1].grid
-    left = inverse_spectrum(found.residual * _low(grid, 4 * _COARSE, measurement.device), grid, grid)
+    left = inverse_spectrum(found.residual_spectrum * _low(grid, 4 * _COARSE, measurement.device), grid, grid)
     left = left.square().sum((1, 2, 3)).reshape(-1, len(hazes))
     slope = (left.diff() / hazes.diff()).cummax(1).values
     curvature = 2 * left[:, -1:] / hazes[-1] ** 2
@@ -155,9 +155,9 @@ def _unexplained(measurement: Tensor, psf: Psf, poses: Tensor) -> Tensor:
     count = poses.shape[1]
     each = psf.expand(len(measurement), -1, -1, -1).repeat_interleave(count, 0)
     moved = Pose(*poses.flatten(0, 1).unbind(-1)).move(each)
-    found = explain(measurement.repeat_interleave(count, 0), _halved(moved), _LEVELS)
+    found = solve(measurement.repeat_interleave(count, 0), _halved(moved), _LEVELS)
     grid = found.psf.bands[-1].grid
-    left = inverse_spectrum(found.residual * (1 - _low(grid, _COARSE, measurement.device)), grid, grid)
+    left = inverse_spectrum(found.residual_spectrum * (1 - _low(grid, _COARSE, measurement.device)), grid, grid)
     return left.reshape(len(measurement), count, -1)
 
 

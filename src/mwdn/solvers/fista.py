@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mwdn.errors import ParameterError
 from mwdn.fourier.transforms import inverse_spectrum, spectrum
-from mwdn.solvers.splitting import Problem, pose
+from mwdn.solvers.splitting import Problem
 from mwdn.types import Measurement, Psf, Scene
 
 INERTIA = 50.0
@@ -68,7 +68,11 @@ class Fista:
         Scene and momentum go on, so a scene that stands still is that of all iterations so far, noise and all, until
         the momentum reaches `INERTIA`.
         """
-        problem = pose(measurement, psf) if last is None else last.problem._replace(measurement=measurement.float())
+        problem = (
+            Problem.from_psf(measurement, psf)
+            if last is None
+            else last.problem._replace(measurement=measurement.float())
+        )
         b, H = problem.measurement, problem.transfer
         # The gradient's Lipschitz constant is at most max |H|^2, a step of 1/L can never overshoot.
         step = 1 / H.abs().square().amax((-2, -1), keepdim=True)

@@ -8,8 +8,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.fourier.transforms import inverse_spectrum, spectrum
-from mwdn.solvers.pyramid import QUIET, Explanation, brightness, caution
-from mwdn.solvers.splitting import opposed, posed
+from mwdn.solvers.pyramid import QUIET, Estimate, brightness, smoothing_scale
+from mwdn.solvers.splitting import Problem, opposed
 
 Denoiser = Callable[[Tensor, Tensor], Tensor]
 """A picture (B, C, H, W), whose brightest pixel is about 1, and its noise level (B, 1, 1, 1); the clean picture."""
@@ -29,7 +29,7 @@ TRUST = 0.1
 0.35, and 0.03 everywhere 0.4 to 4.7."""
 
 
-def plug_and_play(found: Explanation, denoise: Denoiser, rounds: int) -> Explanation:
+def plug_and_play(found: Estimate, denoise: Denoiser, rounds: int) -> Estimate:
     """Explain the measurement by a scene that a denoiser would leave as it is.
 
     How far the measurement is trusted follows what ``found`` leaves unexplained of it: noise, or what the PSF does not
@@ -49,18 +49,18 @@ def plug_and_play(found: Explanation, denoise: Denoiser, rounds: int) -> Explana
         K. Zhang et al., "Plug-and-play image restoration with deep denoiser prior", TPAMI 44 (2022).
     """
     band = found.psf.bands[-1]
-    problem = posed(found.measurement.float(), band.transfer)
+    problem = Problem.from_transfer(found.measurement.float(), band.transfer)
     grid, (height, width) = problem.grid, problem.sensor
     known = (found.whole * band.norm).expand(*found.measurement.shape[:2], *grid)
     brightest = known[..., :height, :width].amax((1, 2, 3), keepdim=True)
     brightest = brightest.clamp(min=torch.finfo(torch.float32).tiny)
-    noise = torch.maximum(found.noise.clamp(min=QUIET) * brightness(found.measurement), brightness(found.rest))
+    noise = torch.maximum(found.noise.clamp(min=QUIET) * brightness(found.measurement), brightness(found.residual))
     power = problem.transfer.abs().square()
     adjoint = problem.transfer.conj().resolve_conj()  # a lazy conjugate would be copied in each round
-    V, Hv = spectrum(known, grid), problem.measurement - found.rest
+    V, Hv = spectrum(known, grid), problem.measurement - found.residual
     pull, certain = Hv, certainty(Hv)
     first, last = LEVELS
-    poor = caution(found.noise).clamp(min=1) ** POOR
+    poor = smoothing_scale(found.noise).clamp(min=1) ** POOR
     for step in range(rounds):
         level = poor * first * (last / first) ** (step / max(1, rounds - 1))
         trust = TRUST * (noise / (level * brightest)).square()

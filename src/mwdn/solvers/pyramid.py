@@ -13,7 +13,7 @@ from mwdn.errors import ParameterError
 from mwdn.fourier.convolution import check_fit
 from mwdn.fourier.transforms import fast_length, inverse_spectrum, spectrum, transfer_function
 from mwdn.optics.noise import noise_level
-from mwdn.solvers.splitting import Penalties, merge, posed, split, start, weigh
+from mwdn.solvers.splitting import Penalties, Problem, initial_state, make_filters, update_copies, update_scene
 from mwdn.types import Measurement, Psf, Scene, Size, Spectrum
 
 
@@ -22,7 +22,7 @@ class Level:
     """One size of the pyramid: ADMM from what the coarser size found, its multipliers forgotten.
 
     Args:
-        shrink: pixels of the measurement along each side of one of its own; a power of two.
+        downsampling: pixels of the measurement along each side of one of its own; a power of two.
         iterations: of ADMM.
         penalties: mu of the data, the gradient and the sign.
         regularisation: tau, weight of the total variation; 0 for none, whatever the gradient's mu. It grows with the
@@ -33,20 +33,20 @@ class Level:
             captures, what the PSF does not say is more than the noise.
     """
 
-    shrink: int
+    downsampling: int
     iterations: int
     penalties: Penalties
     regularisation: float = 0.0
     poor: bool = False
     least: float = 1.0
 
-    def smoothing(self, caution: Tensor) -> tuple[Penalties, Tensor]:
+    def smoothing(self, smoothing_scale: Tensor) -> tuple[Penalties, Tensor]:
         """Weights mu and tau by how much of the usual smoothing the noise asks for."""
-        mu, caution = self.penalties, caution.clamp(min=self.least)
+        mu, smoothing_scale = self.penalties, smoothing_scale.clamp(min=self.least)
         if self.poor:
-            amount = 1 - 1 / caution
-            return mu._replace(gradient=mu.gradient * amount + 1e-4), caution * amount * self.regularisation
-        return mu._replace(gradient=mu.gradient * caution), caution * self.regularisation
+            amount = 1 - 1 / smoothing_scale
+            return mu._replace(gradient=mu.gradient * amount + 1e-4), smoothing_scale * amount * self.regularisation
+        return mu._replace(gradient=mu.gradient * smoothing_scale), smoothing_scale * self.regularisation
 
 
 LEVELS = (
@@ -96,22 +96,22 @@ class Pyramid:
     def __post_init__(self) -> None:
         if not self.regularisation > 0:
             raise ParameterError(f"`regularisation` ({self.regularisation}) must be positive; try 1e-4.")
-        sizes = [level.shrink for level in self.levels]
+        sizes = [level.downsampling for level in self.levels]
         if not sizes or sizes != sorted(set(sizes), reverse=True) or any(s & (s - 1) for s in sizes):
             raise ParameterError(f"`levels` must shrink by falling powers of two, for example 4 and 2, not {sizes}.")
 
     @torch.no_grad()
     def __call__(self, measurement: Measurement, psf: Psf) -> Scene:
         """Reconstruct a batch."""
-        found = explain(measurement, psf, self.levels)
+        found = solve(measurement, psf, self.levels)
         tiny = torch.finfo(torch.float32).tiny
         total = psf.float().sum((-2, -1), keepdim=True).clamp(min=tiny)
-        detail = found.detail(self.regularisation * caution(found.noise).clamp(min=1))
+        detail = found.detail(self.regularisation * smoothing_scale(found.noise).clamp(min=1))
         return (found.scene + detail).clamp(min=0) / total
 
 
 @dataclass(frozen=True)
-class Explanation:
+class Estimate:
     """A smooth scene, and what it leaves unexplained of the measurement.
 
     Args:
@@ -136,26 +136,28 @@ class Explanation:
         return self._on_sensor(self.whole)
 
     @cached_property
-    def rest(self) -> Measurement:
+    def residual(self) -> Measurement:
         """The measurement minus the camera's picture of the whole scene, (B, C, H, W)."""
         finest = self.psf.bands[-1]
-        shrink, (height, width) = finest.level.shrink, self.measurement.shape[-2:]
-        sensor = -(-height // shrink), -(-width // shrink)
+        downsampling, (height, width) = finest.level.downsampling, self.measurement.shape[-2:]
+        sensor = -(-height // downsampling), -(-width // downsampling)
         seen = finest.transfer * finest.norm * spectrum(self.whole, finest.grid)
         return self.measurement - self._on_sensor(inverse_spectrum(seen, finest.grid, sensor))
 
     def _on_sensor(self, picture: Tensor) -> Tensor:
         """Of a picture in the finest level's pixels, in the sensor's."""
-        shrink, (height, width) = self.psf.bands[-1].level.shrink, self.measurement.shape[-2:]
-        if shrink > 1:
-            near = picture[..., : height // shrink + 2, : width // shrink + 2]  # the last pixel's neighbour, too
-            picture = F.interpolate(near, scale_factor=shrink, mode="bilinear")
+        downsampling, (height, width) = self.psf.bands[-1].level.downsampling, self.measurement.shape[-2:]
+        if downsampling > 1:
+            near = picture[
+                ..., : height // downsampling + 2, : width // downsampling + 2
+            ]  # the last pixel's neighbour, too
+            picture = F.interpolate(near, scale_factor=downsampling, mode="bilinear")
         return picture[..., :height, :width]
 
     @cached_property
-    def residual(self) -> Tensor:
+    def residual_spectrum(self) -> Tensor:
         """Spectrum of the rest, zero off the sensor, on the grid of the finest level."""
-        return spectrum(self.rest, self.psf.bands[-1].grid)
+        return spectrum(self.residual, self.psf.bands[-1].grid)
 
     def detail(self, regularisation: float | Tensor) -> Scene:
         """Wiener estimate of the rest of the scene; ``regularisation`` as for `mwdn.fourier.wiener.wiener`.
@@ -164,7 +166,7 @@ class Explanation:
         """
         finest = self.psf.bands[-1]
         H = finest.transfer * finest.norm
-        V = H.conj() * self.residual / (H.abs().square() + regularisation)
+        V = H.conj() * self.residual_spectrum / (H.abs().square() + regularisation)
         return inverse_spectrum(V, finest.grid, (self.scene.shape[-2], self.scene.shape[-1]))
 
 
@@ -190,7 +192,7 @@ class PsfPyramid:
     @classmethod
     def of(cls, psf: Psf, size: Size, levels: tuple[Level, ...] = LEVELS) -> "PsfPyramid":
         """Prepare a PSF (1 or B, 1 or C, h, w), centred, of any sum, for measurements of ``size``."""
-        coarsest = levels[0].shrink
+        coarsest = levels[0].downsampling
         # The grid of a linear convolution, divisible as often as the pyramid halves it.
         reach = zip(size, psf.shape[-2:], strict=True)
         rows, columns = (fast_length(-(-(s + p) // coarsest)) * coarsest for s, p in reach)
@@ -198,29 +200,29 @@ class PsfPyramid:
         H = transfer_function(psf.float() / psf.float().sum((-2, -1), keepdim=True).clamp(min=tiny), (rows, columns))
         bands = []
         for level in levels:
-            low = low_band(H, (rows, columns), level.shrink)
-            grid = rows // level.shrink, columns // level.shrink
+            low = low_band(H, (rows, columns), level.downsampling)
+            grid = rows // level.downsampling, columns // level.downsampling
             norm = inverse_spectrum(low, grid, grid).square().sum((-2, -1), keepdim=True).mean(1, keepdim=True).sqrt()
             norm = norm.clamp(min=tiny)
             bands.append(Band(level, low / norm, norm))
         return cls(tuple(bands))
 
-    def explain(self, measurement: Measurement) -> Explanation:
+    def solve(self, measurement: Measurement) -> Estimate:
         """Find a smooth non-negative scene (B, C, H, W), from coarse to fine. Differentiable."""
         size = measurement.shape[-2], measurement.shape[-1]
         # tau is stated for a measurement of unit mean square.
         unit = brightness(measurement)
         b = measurement.float() / unit
         smooth = any(band.level.regularisation for band in self.bands)
-        wary = caution(relative_noise(measurement)) if smooth else unit  # nobody asks
+        scale = smoothing_scale(relative_noise(measurement)) if smooth else unit  # nobody asks
         fineness = math.sqrt(size[0] * size[1]) / SIDE
         sizes = {1: b}
-        while max(sizes) < self.bands[0].level.shrink:
+        while max(sizes) < self.bands[0].level.downsampling:
             sizes[2 * max(sizes)] = halve(sizes[max(sizes)])
         scene: Tensor = b.new_zeros((1, 1, 1, 1))
         for band in self.bands:
-            scene = _solve(sizes[band.level.shrink], band, scene, wary, fineness)
-        return Explanation(measurement, scene.clamp(min=0) * unit, self)
+            scene = _solve(sizes[band.level.downsampling], band, scene, scale, fineness)
+        return Estimate(measurement, scene.clamp(min=0) * unit, self)
 
 
 def brightness(measurement: Measurement) -> Tensor:
@@ -235,12 +237,12 @@ def relative_noise(measurement: Measurement) -> Tensor:
     return noise_level(b / brightness(b)).square().mean(1, keepdim=True).sqrt()
 
 
-def caution(noise: Tensor) -> Tensor:
+def smoothing_scale(noise: Tensor) -> Tensor:
     """How much of the usual smoothing this noise, over the measurement's brightness, asks for, see `QUIET`."""
     return (noise / QUIET) ** 1.25
 
 
-def explain(measurement: Measurement, psf: Psf, levels: tuple[Level, ...] = LEVELS) -> Explanation:
+def solve(measurement: Measurement, psf: Psf, levels: tuple[Level, ...] = LEVELS) -> Estimate:
     """Find a smooth non-negative scene that explains the measurement, from coarse to fine. Differentiable.
 
     Args:
@@ -252,7 +254,7 @@ def explain(measurement: Measurement, psf: Psf, levels: tuple[Level, ...] = LEVE
         ShapeError: batch or channels do not fit.
     """
     check_fit(measurement, psf, "measurement")
-    return PsfPyramid.of(psf, (measurement.shape[-2], measurement.shape[-1]), levels).explain(measurement)
+    return PsfPyramid.of(psf, (measurement.shape[-2], measurement.shape[-1]), levels).solve(measurement)
 
 
 def halve(picture: Tensor) -> Tensor:
@@ -269,25 +271,25 @@ def halve(picture: Tensor) -> Tensor:
     return (a + d + 3 * (b + c)) / 8
 
 
-def low_band(transfer: Spectrum, grid: Size, shrink: int) -> Tensor:
-    """Transfer function of the camera whose pixels are ``shrink`` times as long: the low frequencies."""
-    rows, columns = grid[0] // shrink, grid[1] // shrink
+def low_band(transfer: Spectrum, grid: Size, downsampling: int) -> Tensor:
+    """Transfer function of the camera whose pixels are ``downsampling`` times as long: the low frequencies."""
+    rows, columns = grid[0] // downsampling, grid[1] // downsampling
     kept = torch.cat([transfer[..., : rows // 2, :], transfer[..., grid[0] - rows + rows // 2 :, :]], dim=-2)
     return kept[..., : columns // 2 + 1].mT.contiguous().mT  # in memory as `spectrum` leaves its own
 
 
-def _solve(measurement: Tensor, band: Band, coarser: Tensor, caution: Tensor, fineness: float) -> Tensor:
+def _solve(measurement: Tensor, band: Band, coarser: Tensor, smoothing_scale: Tensor, fineness: float) -> Tensor:
     """Scene of the whole grid after the iterations of one level from what the coarser one found."""
     # Penalties are stated for a PSF whose colours have a mean square sum of 1.
-    problem = posed(measurement, band.transfer)
+    problem = Problem.from_transfer(measurement, band.transfer)
     known = F.interpolate(coarser, size=band.grid, mode="bilinear").clamp(min=0) * band.norm
     level = band.level
-    mu, tau = level.smoothing(caution)
+    mu, tau = level.smoothing(smoothing_scale)
     tau = fineness * tau
     smooth = level.regularisation > 0
-    filters = weigh(problem, mu, smooth=smooth)
-    state = start(problem, known.expand(*measurement.shape[:2], *band.grid), smooth=smooth)
+    filters = make_filters(problem, mu, smooth=smooth)
+    state = initial_state(problem, known.expand(*measurement.shape[:2], *band.grid), smooth=smooth)
     for _ in range(level.iterations):
-        state = split(state, problem, mu, tau, "colour")
-        state = merge(state, problem, mu, filters)
+        state = update_copies(state, problem, mu, tau, "colour")
+        state = update_scene(state, problem, mu, filters)
     return state.v / band.norm

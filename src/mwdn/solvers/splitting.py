@@ -37,6 +37,27 @@ class Problem(NamedTuple):
     laplacian: Tensor
     grid: Size
 
+    @classmethod
+    def from_psf(cls, measurement: Measurement, psf: Psf) -> "Problem":
+        """Problem on the grid of a linear convolution, sensor at the top left.
+
+        Raises:
+            ShapeError: batch or channels of the PSF are neither 1 nor the measurement's.
+        """
+        check_fit(measurement, psf, "measurement")
+        height, width = (fast_length(s + p) for s, p in zip(measurement.shape[-2:], psf.shape[-2:], strict=True))
+        return cls.from_transfer(measurement.float(), transfer_function(psf, (height, width)))
+
+    @classmethod
+    def from_transfer(cls, measurement: Tensor, transfer: Tensor) -> "Problem":
+        """The same from the PSF's transfer function, (B, C, height, width // 2 + 1) on a grid of even width."""
+        height, width = transfer.shape[-2], 2 * (transfer.shape[-1] - 1)
+        # |Psi|^2 of periodic forward differences is 4 sin^2 along each axis.
+        rows = torch.arange(height, device=transfer.device)[:, None] * (math.pi / height)
+        columns = torch.arange(width // 2 + 1, device=transfer.device) * (math.pi / width)
+        laplacian = 4 * rows.sin().square() + 4 * columns.sin().square()
+        return cls(measurement, transfer, laplacian, (height, width))
+
     @property
     def sensor(self) -> Size:
         """Height and width of the measurement, the top left of the grid."""
@@ -44,7 +65,7 @@ class Problem(NamedTuple):
 
 
 class Filters(NamedTuple):
-    """What `merge` multiplies each part of the new spectrum with: the same as long as the penalties are.
+    """What `update_scene` multiplies each part of the new spectrum with: the same as long as the penalties are.
 
     The gradient's pull counts ``steep`` times as much as the sign's.
     """
@@ -70,28 +91,7 @@ class State(NamedTuple):
     sign: Tensor
 
 
-def pose(measurement: Measurement, psf: Psf) -> Problem:
-    """Set the problem up on the grid of a linear convolution, sensor at the top left.
-
-    Raises:
-        ShapeError: batch or channels of the PSF are neither 1 nor the measurement's.
-    """
-    check_fit(measurement, psf, "measurement")
-    height, width = (fast_length(s + p) for s, p in zip(measurement.shape[-2:], psf.shape[-2:], strict=True))
-    return posed(measurement.float(), transfer_function(psf, (height, width)))
-
-
-def posed(measurement: Tensor, transfer: Tensor) -> Problem:
-    """The same from the PSF's transfer function, (B, C, height, width // 2 + 1) on a grid of even width."""
-    height, width = transfer.shape[-2], 2 * (transfer.shape[-1] - 1)
-    # |Psi|^2 of periodic forward differences is 4 sin^2 along each axis.
-    rows = torch.arange(height, device=transfer.device)[:, None] * (math.pi / height)
-    columns = torch.arange(width // 2 + 1, device=transfer.device) * (math.pi / width)
-    laplacian = 4 * rows.sin().square() + 4 * columns.sin().square()
-    return Problem(measurement, transfer, laplacian, (height, width))
-
-
-def weigh(problem: Problem, mu: Penalties, *, smooth: bool = True) -> Filters:
+def make_filters(problem: Problem, mu: Penalties, *, smooth: bool = True) -> Filters:
     """Filters for these penalties; ``smooth`` for total variation."""
     power = mu.data * problem.transfer.abs().square()
     stiffness = mu.gradient * problem.laplacian + mu.sign if smooth else mu.sign
@@ -100,7 +100,7 @@ def weigh(problem: Problem, mu: Penalties, *, smooth: bool = True) -> Filters:
     return Filters(mu.sign * all_in_all, power * all_in_all, correlate, mu.gradient / mu.sign)
 
 
-def start(problem: Problem, scene: Tensor | None = None, *, smooth: bool = True) -> State:
+def initial_state(problem: Problem, scene: Tensor | None = None, *, smooth: bool = True) -> State:
     """Zero multipliers, and a zero scene unless one of the grid's size is given; ``smooth`` for total variation."""
     b = problem.measurement
     v = b.new_zeros((*b.shape[:2], *problem.grid)) if scene is None else scene
@@ -109,7 +109,7 @@ def start(problem: Problem, scene: Tensor | None = None, *, smooth: bool = True)
     return State(v, V, Hv, at_sensor=Hv, slope=gradient(v) if smooth else (), sign=v)
 
 
-def split(state: State, problem: Problem, mu: Penalties, tau: float | Tensor, variation: Variation) -> State:
+def update_copies(state: State, problem: Problem, mu: Penalties, tau: float | Tensor, variation: Variation) -> State:
     """Update the copies u = Psi v, x = H v and w = v: shrink the gradient, fit the sensor, clip the sign.
 
     A copy is the proximal map of value plus multiplier, and the new pull, copy minus multiplier, is the value less what
@@ -132,7 +132,7 @@ def opposed(value: Tensor, pull: Tensor) -> Tensor:
     return torch.sub(pull, value, alpha=2)
 
 
-def merge(state: State, problem: Problem, mu: Penalties, filters: Filters) -> State:
+def update_scene(state: State, problem: Problem, mu: Penalties, filters: Filters) -> State:
     """Update the scene, on which all pulls must agree, in the Fourier domain; ``filters`` of the same penalties."""
     prior = state.sign
     if state.slope:

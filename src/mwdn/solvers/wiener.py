@@ -7,7 +7,7 @@ from torch import Tensor
 
 from mwdn.errors import ParameterError
 from mwdn.fourier.convolution import check_fit
-from mwdn.fourier.padding import Boundary, extend
+from mwdn.fourier.padding import Boundary, pad
 from mwdn.fourier.transforms import inverse_spectrum, spectrum, transfer_function
 from mwdn.fourier.wiener import deconvolution_grid
 from mwdn.optics.noise import noise_level
@@ -52,7 +52,7 @@ class Wiener:
         grid = deconvolution_grid(size, self.boundary)
         total = psf.sum((-2, -1), keepdim=True)
         H = transfer_function(psf / total, grid)
-        B = spectrum(extend(measurement, grid, self.boundary), grid)
+        B = spectrum(pad(measurement, grid, self.boundary), grid)
         regularisation = self.regularisation or self._discrepancy(measurement, B, H, grid[1])
         V = H.conj() * B / (H.abs().square() + regularisation)
         return (inverse_spectrum(V, grid, size) / total).clamp(min=0)

@@ -35,7 +35,7 @@ def synchronise(network: nn.Module, device: torch.device) -> None:
         network: its layers are replaced; their parameters, and so the checkpoint, stay.
         device: where it computes. On GPUs torch's own layer is taken, which the CPU does not have.
     """
-    if distributed.world() == 1:
+    if distributed.world_size() == 1:
         return
     for name, child in network.named_children():
         if name == PSF_ENCODER:
@@ -75,9 +75,9 @@ def _moments(features: Tensor) -> tuple[Tensor, Tensor, float]:
     own_count = torch.full_like(own_mean, features.numel() // features.shape[1])
     # Every process's row of one table, as a sum with the zeros of all others. Moments of parts, unlike sums of
     # squares, lose no digits where the mean is large.
-    table = own_mean.new_zeros(distributed.world(), 3, len(own_mean), dtype=torch.float64)
+    table = own_mean.new_zeros(distributed.world_size(), 3, len(own_mean), dtype=torch.float64)
     table[distributed.rank()] = torch.stack([own_count, own_mean, own_variance])
-    counts, means, variances = distributed.total(table).unbind(1)
+    counts, means, variances = distributed.all_reduce_sum(table).unbind(1)
     part = counts / counts.sum(0)
     mean = (part * means).sum(0)
     variance = (part * (variances + (means - mean).square())).sum(0)
@@ -116,6 +116,8 @@ class _Normalise(torch.autograd.Function):
         w_s, m, s = (value.to(g)[:, None, None] for value in (w * s, m, s))
         z = (_precise(x) - m) * s
         own = torch.stack([g.sum(AXES), (g * z).sum(AXES)])
-        mean_g, mean_gz = (distributed.total(own.to(torch.float64, copy=True)) / ctx.count).to(g)[..., None, None]
-        # The parameters' gradients are of this process's part: `distributed.add_gradients` sums them with all others.
+        mean_g, mean_gz = (distributed.all_reduce_sum(own.to(torch.float64, copy=True)) / ctx.count).to(g)[
+            ..., None, None
+        ]
+        # The parameters' gradients are of this process's part: `distributed.all_reduce_gradients` sums them.
         return (w_s * (g - mean_g - z * mean_gz)).to(x.dtype), own[1].to(w), own[0].to(w), None, None, None, None

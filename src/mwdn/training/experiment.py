@@ -54,7 +54,7 @@ def prepare(
             another run.
     """
     _check_one(recipe, photos, pairs)
-    place = distributed.device_here(device)
+    place = distributed.local_device(device)
     shown, alone = recipe.sheet.captures, recipe.selfsupervised.consistency > 0
     files = find_captures(shown, apart=apart) if shown else []
     real = read_captures(files if alone else files[:SHOWN], calibration) if files else None

@@ -47,12 +47,12 @@ class RunFolder:
         Raises:
             CheckpointError: the state is damaged, or the folder holds another run.
         """
-        content = distributed.from_first(self._state)
+        content = distributed.broadcast(self._state)
         if content:
             state, header = read_state(self.state, content)
             self._check(header.get("identity", "null"))
             return state, header
-        owner = distributed.from_first(self._owner)
+        owner = distributed.broadcast(self._owner)
         if owner:
             self._check(owner.decode(errors="replace"))
         return None

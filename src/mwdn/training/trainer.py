@@ -118,8 +118,8 @@ class Trainer:
         learned = {name: values for name, values in everything.items() if name not in without}
         one = None if recipe.cameras.sizes else calibration.psf_hash  # of many, the given one is for the validation
         self.identity = {"recipe": learned, "psf_hash": one, "pairs": pairs.name}
-        distributed.check_alike(self.identity)
-        distributed.share(range(self.schedule.batch))  # refuses a batch that is too small
+        distributed.check_same(self.identity)
+        distributed.shard(range(self.schedule.batch))  # refuses a batch that is too small
         self.folder = RunFolder(out, self.identity)
         self._resume()
         if distributed.rank() == 0:
@@ -168,7 +168,7 @@ class Trainer:
         """
         first = self.step * self.schedule.batch
         numbers = range(first, first + self.schedule.batch)
-        own = distributed.share(numbers)
+        own = distributed.shard(numbers)
         for group in self.optimiser.param_groups:
             group["lr"] = self.course.rate(self.step)
         self.loss.weights = self.course.weights
@@ -189,10 +189,12 @@ class Trainer:
         weight = len(own) / len(numbers)  # losses are means over samples
         self.optimiser.zero_grad(set_to_none=True)
         torch.autograd.backward(weight * loss)  # before the loss is read, for which a GPU would have to wait
-        total, *totals = distributed.total(weight * torch.stack([loss.detach(), *parts.values()]).double()).tolist()
+        total, *totals = distributed.all_reduce_sum(
+            weight * torch.stack([loss.detach(), *parts.values()]).double()
+        ).tolist()
         if not math.isfinite(total):
             raise self._diverged(f"step {self.step} ({self._names(numbers)})")
-        distributed.add_gradients(self.network)
+        distributed.all_reduce_gradients(self.network)
         if self.schedule.clip > 0:
             torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.schedule.clip)
         self.optimiser.step()
@@ -249,7 +251,7 @@ class Trainer:
         found = Validation(math.nan, math.nan)
         if distributed.rank() == 0:
             found = self.validator(self.average, self.loss, f"step {self.step}")
-        psnr, loss = distributed.numbers_of_first([found.psnr, found.loss])
+        psnr, loss = distributed.broadcast_floats([found.psnr, found.loss])
         if not math.isfinite(loss):
             raise self._diverged(f"the validation after step {self.step}")
         if found.sheet is not None:
