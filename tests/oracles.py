@@ -21,7 +21,7 @@ def convolve(scene, psf, size=None, *, circular=False):
     return np.pad(full, margin)[np.ix_(rows + margin, columns + margin)]
 
 
-def extend(image, grid, boundary):
+def pad(image, grid, boundary):
     """The measurement on a longer grid, far border continued after the end, near border before the start."""
     pads, fades = [], []
     for length, long in zip(image.shape, grid, strict=True):
@@ -42,11 +42,11 @@ def extend(image, grid, boundary):
 def smooth_even(length):
     """Next even length whose prime factors are all at most 7."""
     while True:
-        rest = length
+        factor = length
         for prime in (2, 3, 5, 7):
-            while rest % prime == 0:
-                rest //= prime
-        if rest == 1 and length % 2 == 0:
+            while factor % prime == 0:
+                factor //= prime
+        if factor == 1 and length % 2 == 0:
             return length
         length += 1
 
@@ -64,7 +64,7 @@ def wiener(measurement, psf, regularisation, boundary="taper"):
     size = b.shape
     grid = size if boundary == "circular" else tuple(smooth_even(n + n // 2) for n in size)
     H = transfer(h, grid)
-    B = np.fft.fft2(b if boundary == "circular" else extend(b, grid, boundary))
+    B = np.fft.fft2(b if boundary == "circular" else pad(b, grid, boundary))
     return np.fft.ifft2(H.conj() * B / (abs(H) ** 2 + regularisation)).real[: size[0], : size[1]]
 
 

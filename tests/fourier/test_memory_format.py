@@ -1,4 +1,4 @@
-"""How planes are laid out in memory, against torch's own operations."""
+"""Memory layouts against torch's own operations."""
 
 import pytest
 import torch
@@ -10,15 +10,29 @@ from mwdn.fourier import memory_format
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
 @pytest.mark.parametrize("block", [1, 2, 4])
 @pytest.mark.parametrize("shape", [(1, 1, 4, 8), (2, 3, 12, 4), (3, 5, 8, 20)])
-def test_folded_is_torchs_unshuffling(shape, block, dtype, generator):
+def test_pixel_unshuffle_is_torchs(shape, block, dtype, generator):
     image = torch.rand(shape, generator=generator).to(dtype)
-    for given in (image, image.contiguous(memory_format=torch.channels_last), image.mT):
-        found = memory_format.pixel_unshuffle(given, block)
-        assert torch.equal(found, F.pixel_unshuffle(given, block))
-        assert found.is_contiguous(memory_format=torch.channels_last)
+    for layout in (image, image.contiguous(memory_format=torch.channels_last), image.mT):
+        result = memory_format.pixel_unshuffle(layout, block)
+        assert torch.equal(result, F.pixel_unshuffle(layout, block))
+        assert result.is_contiguous(memory_format=torch.channels_last)
 
 
-def test_folded_passes_gradients_on(generator):
+def test_pixel_unshuffle_has_a_gradient(generator):
     image = torch.rand((2, 3, 8, 4), generator=generator, requires_grad=True)
     memory_format.pixel_unshuffle(image, 2).square().sum().backward()
     torch.testing.assert_close(image.grad, 2 * image.detach())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("shape", [(1, 2, 4, 8), (2, 6, 5, 3)])
+def test_planes_and_pairs_keep_the_numbers(shape, dtype, generator):
+    image = torch.rand(shape, generator=generator).to(dtype)
+    for layout in (image, image.contiguous(memory_format=torch.channels_last)):
+        planes, pairs = memory_format.contiguous_planes(layout), memory_format.as_complex(layout)
+        assert planes.is_contiguous()
+        assert torch.equal(planes, image)
+        assert torch.equal(pairs, torch.stack([image[:, 0::2], image[:, 1::2]], dim=-1))
+        for restored in (memory_format.match_format(layout, planes), memory_format.as_channels(pairs, layout)):
+            assert torch.equal(restored, image)
+            assert restored.stride() == layout.stride()

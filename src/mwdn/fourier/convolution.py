@@ -10,11 +10,12 @@ from mwdn.types import Image, Measurement, Psf, Scene, Size, Spectrum
 
 
 def _operator(psf: Tensor, scene: Size, sensor: Size, *, circular: bool) -> tuple[Spectrum, Size]:
-    """Transfer function that takes a scene at (0, 0) to a sensor at (0, 0), their centres aligned; and its grid.
+    """Transfer function from a scene at (0, 0) to a sensor at (0, 0), their centres aligned; and its grid.
 
-    The grid must be so long that no wrapped end of the full convolution lands on the sensor. Counted from the
-    centres, the sensor is [-(o//2), o-o//2-1] and the full convolution [-(s//2+p//2), (s-s//2-1)+(p-p//2-1)], so
-    the grid needs 1 + the larger of the two overhangs: 1.5 n for equal sizes n, where 2 n is the usual choice.
+    No wrapped end of the full convolution may land on the sensor. Counted from the centres, for lengths s, o and p of
+    scene, sensor and PSF, the sensor is [-(o//2), o-o//2-1] and the full convolution
+    [-(s//2+p//2), (s-s//2-1)+(p-p//2-1)]. So the grid needs 1 + the larger of the two overhangs: 1.5 n for equal
+    sizes n, where 2 n is the usual choice.
     """
     grid, origin = [], []
     for s, o, p in zip(scene, sensor, psf.shape[-2:], strict=True):
@@ -27,10 +28,11 @@ def _operator(psf: Tensor, scene: Size, sensor: Size, *, circular: bool) -> tupl
 
 
 def check_fit(image: Tensor, psf: Tensor, name: str) -> None:
-    """Raise a `ShapeError` unless the PSF's batch and channels are 1 or those of the picture called ``name``."""
-    for axis, of in ((0, "batch"), (1, "channels")):
+    """Raise a `ShapeError` unless the PSF's batch and channels are 1 or those of the image called ``name``."""
+    shape = tuple(image.shape)
+    for axis, dimension in ((0, "batch"), (1, "channels")):
         if psf.shape[axis] not in (1, image.shape[axis]):
-            raise ShapeError(f"`psf` {tuple(psf.shape)} must have {of} 1 or that of `{name}` {tuple(image.shape)}.")
+            raise ShapeError(f"`psf` {tuple(psf.shape)} must have {dimension} 1 or that of `{name}` {shape}.")
 
 
 def convolve(scene: Scene, psf: Psf, *, size: Size | None = None, circular: bool = False) -> Image:
@@ -39,8 +41,8 @@ def convolve(scene: Scene, psf: Psf, *, size: Size | None = None, circular: bool
     Args:
         scene: (B, C, H, W).
         psf: (1 or B, 1 or C, h, w), centred at ``(h // 2, w // 2)``.
-        size: height and width of the result; the scene's unless given. A smaller one crops, as a sensor does.
-        circular: let what leaves the scene at one border enter at the other, instead of leaving for good.
+        size: height and width of the result; by default the scene's. A smaller one crops, as a sensor does.
+        circular: wrap around: what leaves at one border enters at the opposite one.
 
     Returns:
         (B, C, *size), float32.
@@ -63,7 +65,7 @@ def correlate(measurement: Measurement, psf: Psf, *, size: Size | None = None, c
     Args:
         measurement: (B, C, H, W).
         psf: as for `convolve`.
-        size: height and width of the scene; the measurement's unless given.
+        size: height and width of the scene; by default the measurement's.
         circular: as for `convolve`.
 
     Returns:
@@ -76,7 +78,7 @@ def correlate(measurement: Measurement, psf: Psf, *, size: Size | None = None, c
 
 
 class Convolution(NamedTuple):
-    """`convolve` and `correlate` between fixed sizes, for a method that needs both many times."""
+    """`convolve` and `correlate` between fixed sizes, for iterations: the PSF is transformed once."""
 
     transfer: Spectrum
     grid: Size
@@ -85,12 +87,12 @@ class Convolution(NamedTuple):
 
     @classmethod
     def from_psf(cls, psf: Psf, scene: Size, sensor: Size) -> "Convolution":
-        """Linear convolution of scenes with a PSF, which is transformed once, here."""
+        """Transform a PSF for linear convolutions of scenes."""
         transfer, grid = _operator(psf, scene, sensor, circular=False)
         return cls(transfer, grid, scene, sensor)
 
     def forward(self, scene: Scene) -> Image:
-        """What the sensor sees of a scene."""
+        """Convolve a scene and crop it to the sensor."""
         return inverse_spectrum(spectrum(scene, self.grid) * self.transfer, self.grid, self.sensor)
 
     def adjoint(self, measurement: Measurement) -> Scene:

@@ -1,4 +1,4 @@
-"""Wiener deconvolution, of one picture or of hundreds of features at once."""
+"""Wiener deconvolution, of images or of hundreds of feature channels."""
 
 from torch import Tensor
 
@@ -11,7 +11,7 @@ from mwdn.types import Image, Measurement, Psf, Size, Spectrum
 
 
 def deconvolution_grid(size: Size, boundary: Boundary) -> Size:
-    """Grid on which a measurement of ``size`` is deconvolved: 1.5 times as long, or itself if circular."""
+    """Grid on which a measurement of ``size`` is deconvolved: 1.5 times as long; ``size`` itself if circular."""
     if boundary == "circular":
         return size
     return fast_length(size[0] + size[0] // 2), fast_length(size[1] + size[1] // 2)
@@ -28,7 +28,7 @@ def wiener(
         regularisation: lambda, positive; a number, or a tensor that broadcasts against (B, C, 1, 1). It is the
             noise-to-signal power ratio: as it grows, noise and detail fade and the estimate dims. For a PSF of
             unit sum, |H|^2 is 1 at frequency zero and useful values lie between 1e-5 and 1e-1.
-        boundary: what stands beyond the measurement's border, see `Boundary`.
+        boundary: values beyond the measurement's border, see `Boundary`.
 
     Returns:
         (B, C, H, W), float32; its range is that of ``measurement`` over the sum of ``psf``.
@@ -46,7 +46,7 @@ def wiener(
 
 
 def wiener_transfer(psf: Psf, regularisation: float | Tensor, grid: Size) -> Spectrum:
-    """Transfer function of the Wiener filter, ``conj(H) / (|H|^2 + lambda)``; what it needs of a camera.
+    """Transfer function of the Wiener filter, ``conj(H) / (|H|^2 + lambda)``.
 
     Args:
         psf: (B, C, h, w), centred, at most as large as ``grid``.
