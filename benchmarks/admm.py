@@ -18,7 +18,7 @@ import scipy.fft
 import torch
 
 from mwdn import Calibration, Reconstructor, keep_memory
-from mwdn.optics.patterns import contour_psf
+from mwdn.optics import sample_camera
 from mwdn.solvers import TEXTBOOK, Admm, Pyramid
 
 ITERATIONS = 100
@@ -79,7 +79,7 @@ def main():
     torch.set_num_threads(2)
     keep_memory()
     generator = torch.Generator().manual_seed(0)
-    h = contour_psf(size, generator=generator).repeat(1, 3, 1, 1)
+    h = sample_camera(generator, size, family="contours")
     b = torch.rand(1, 3, *size, generator=generator)
     h, b = h / h.norm(), b / b.norm()
     small = Reconstructor("universal-small", Calibration(h / h.sum((-2, -1), keepdim=True)))

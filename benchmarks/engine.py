@@ -36,7 +36,7 @@ from mwdn.fourier.padding import pad
 from mwdn.fourier.transforms import inverse_spectrum, spectrum
 from mwdn.inference.reconstructor import find_method
 from mwdn.networks import NETWORKS, blocks, build
-from mwdn.optics.patterns import contour_psf
+from mwdn.optics import sample_camera
 from mwdn.solvers import SOLVERS
 from mwdn.weights.bundled import BUNDLED
 
@@ -61,8 +61,9 @@ def plain_filter(features, transfer, grid, boundary):
 
 def problem(size, batch):
     generator = torch.Generator().manual_seed(0)
-    psf = contour_psf(size, generator=generator).repeat(1, 3, 1, 1)
-    return Calibration(psf / psf.sum((-2, -1), keepdim=True)), torch.rand(batch, 3, *size, generator=generator)
+    return Calibration(sample_camera(generator, size, family="contours")), torch.rand(
+        batch, 3, *size, generator=generator
+    )
 
 
 def contenders(method, calibration, device, names=CONTENDERS):

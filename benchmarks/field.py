@@ -17,8 +17,7 @@ from torch.nn import functional as F
 
 from mwdn.evaluation.metrics import best_gain, psnr
 from mwdn.io.images import read_picture
-from mwdn.optics import Aberration, FieldCamera, field_psfs
-from mwdn.optics.patterns import contour_psf
+from mwdn.optics import Aberration, FieldCamera, field_psfs, sample_camera
 from mwdn.optics.psf_measures import likeness
 from mwdn.solvers import build
 
@@ -46,7 +45,7 @@ def parts(size):
 
 def measure(factor, size):
     generator = torch.Generator().manual_seed(0)
-    psf = contour_psf((size, size), cell=16, generator=generator)
+    psf = sample_camera(generator, (size, size), family="contours")
     psfs = field_psfs(psf, GRID, CORNER * factor)
     camera = FieldCamera.from_psfs(psfs, (size, size), rank=RANK)
     scene = scenes(size)

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from mwdn.networks import build
-from mwdn.optics.patterns import contour_psf
+from mwdn.optics import sample_camera
 
 SIZE = 320, 320
 
@@ -50,7 +50,7 @@ def main():
     arguments = parser.parse_args()
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     generator = torch.Generator().manual_seed(0)
-    psf = contour_psf(SIZE, generator=generator).repeat(1, 3, 1, 1).to(device)
+    psf = sample_camera(generator, SIZE, family="contours").to(device)
     scene = torch.rand(arguments.batch, 3, *SIZE, generator=generator).to(device)
     steps = {"plain": trainer(arguments.width, device, fast=False), "mwdn": trainer(arguments.width, device, fast=True)}
     seconds = {name: [] for name in steps}

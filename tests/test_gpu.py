@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from cameras import contour_psf
 from mwdn import Calibration, Camera, Reconstructor, solvers
 from mwdn.data.pairs import PairFile
 from mwdn.data.photographs import Photographs
@@ -17,7 +18,6 @@ from mwdn.data.recorded import RecordedPairs, record
 from mwdn.data.simulated import SimulatedPairs
 from mwdn.inference.batch import Batch
 from mwdn.networks import build
-from mwdn.optics.patterns import contour_psf
 from mwdn.runtime.transfers import to_device, to_host
 from mwdn.training.recipe import Recipe, Schedule
 from mwdn.training.trainer import Trainer

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 import torch
 
+from cameras import contour_psf
 from mwdn.benchmark import read_benchmark, run
 from mwdn.cli.app import main
 from mwdn.data.pairs import PairFile
 from mwdn.errors import CheckpointError, ParameterError, UnknownNameError
 from mwdn.evaluation import bootstrap
-from mwdn.optics.patterns import contour_psf
 
 RECIPE = """
 title = "Two networks & a solver"

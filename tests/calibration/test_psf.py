@@ -8,11 +8,11 @@ import pytest
 import tifffile
 import torch
 
+from cameras import contour_psf
 from mwdn.calibration import Calibration
 from mwdn.calibration.psf import _turn
 from mwdn.errors import ImageError, ParameterError, PsfError, ShapeError
 from mwdn.fourier.convolution import convolve
-from mwdn.optics.patterns import contour_psf
 
 SIZE = 48, 40
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from cameras import contour_psf
 from mwdn.calibration import Calibration
 from mwdn.calibration.report import inspect_psf
 from mwdn.calibration.verdict import headline, verdict
@@ -15,7 +16,6 @@ from mwdn.errors import ImageError
 from mwdn.io.files import write_json
 from mwdn.io.images import read_frame
 from mwdn.optics import psf_measures, sample_camera
-from mwdn.optics.patterns import contour_psf
 from mwdn.optics.random_psf import Variety
 
 SIZE = 96, 80

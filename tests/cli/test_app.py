@@ -12,10 +12,10 @@ import pytest
 import torch
 
 import mwdn
+from cameras import contour_psf
 from mwdn import Camera, read_frame
 from mwdn.cli.app import main
 from mwdn.cli.demo import METHODS
-from mwdn.optics.patterns import contour_psf
 
 SIZE = 32, 40
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from cameras import contour_psf
 from mwdn import read_frame
 from mwdn.calibration import Calibration
 from mwdn.cli.app import main
@@ -16,7 +17,6 @@ from mwdn.data.pairs import PairFile
 from mwdn.fourier.convolution import convolve
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.networks import build
-from mwdn.optics.patterns import contour_psf
 from mwdn.weights.checkpoint import save_network
 
 RECIPE = """

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from cameras import contour_psf
 from mwdn.data.cameras import CameraPairs, Cameras
 from mwdn.data.mismatch import EXACT, Mismatch, perturb
 from mwdn.data.noisy import Denoising, NoisyScenes
@@ -17,7 +18,6 @@ from mwdn.data.simulated import Placement, SimulatedPairs, _resample
 from mwdn.data.unpaired import UnpairedCaptures
 from mwdn.errors import ParameterError
 from mwdn.optics import Camera, Sensor
-from mwdn.optics.patterns import contour_psf
 from mwdn.optics.warp import affine
 
 SIZE = 32, 40

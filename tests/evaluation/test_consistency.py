@@ -3,10 +3,10 @@
 import pytest
 import torch
 
+from cameras import contour_psf
 from mwdn.errors import ShapeError
 from mwdn.evaluation.consistency import Consistency, consistency
 from mwdn.optics.camera import Camera
-from mwdn.optics.patterns import contour_psf
 from mwdn.solvers.alignment import Pose, fine_detail
 from mwdn.solvers.pyramid import Pyramid
 

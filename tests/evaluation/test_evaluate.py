@@ -12,6 +12,7 @@ import torch
 from rich.console import Console
 from torch import nn
 
+from cameras import contour_psf
 from mwdn.calibration import Calibration
 from mwdn.cli import app
 from mwdn.data.pairs import PairFile
@@ -21,7 +22,6 @@ from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.images import read_frame, write_linear
 from mwdn.networks import build
 from mwdn.optics import Camera
-from mwdn.optics.patterns import contour_psf
 from mwdn.solvers import Admm
 
 SIZE = 40, 48

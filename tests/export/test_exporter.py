@@ -12,6 +12,7 @@ import pytest
 import torch
 from torch import nn
 
+from cameras import contour_psf
 from mwdn import Calibration, Reconstructor, read_frame, to_display
 from mwdn.cli.app import main
 from mwdn.errors import ExportError, ParameterError
@@ -24,7 +25,6 @@ from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
 from mwdn.io.files import save_linear, save_png
 from mwdn.io.images import srgb_encode
 from mwdn.networks import NETWORKS, build
-from mwdn.optics.patterns import contour_psf
 from mwdn.solvers import SOLVERS
 from mwdn.solvers import build as build_solver
 

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 
+from cameras import contour_psf
 from mwdn import Camera, read_frame
 from mwdn.calibration import Calibration
 from mwdn.errors import ImageError, ParameterError
@@ -25,7 +26,6 @@ from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.contact_sheets import to_display
 from mwdn.io.images import srgb_decode
 from mwdn.networks import build
-from mwdn.optics.patterns import contour_psf
 from mwdn.solvers import Admm, Wiener
 
 SIZE = 32, 40

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
+from cameras import contour_psf
 from mwdn import Camera, solvers
 from mwdn.calibration import Calibration
 from mwdn.errors import CheckpointError, ParameterError, ShapeError, UnknownNameError
 from mwdn.inference.reconstructor import AT_ONCE, Reconstructor, find_method
 from mwdn.networks import NETWORKS, build
-from mwdn.optics.patterns import contour_psf
 from mwdn.solvers import SOLVERS, Admm, Wiener
 from mwdn.weights.checkpoint import save_network
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
+from cameras import contour_psf
 from mwdn import Calibration, read_frame
 from mwdn.cli.app import main
 from mwdn.optics import Contour, Diffuser, Setup, mask_psf
 from mwdn.optics.design import decades, design_camera, radial_autocorrelation, radial_spectrum, sharpness
 from mwdn.optics.mask_files import read_mask
-from mwdn.optics.patterns import contour_psf
 
 RECIPES = Path(__file__).resolve().parents[2] / "recipes"
 SMALL = ["--aperture-mm", "0.4", "0.4", "--pixels", "200", "240", "--wavelengths", "2", "-o", "cam"]

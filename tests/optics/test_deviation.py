@@ -3,10 +3,10 @@
 import pytest
 import torch
 
+from cameras import contour_psf
 from mwdn.errors import ParameterError
 from mwdn.fourier.convolution import convolve
 from mwdn.optics import Camera, Deviation
-from mwdn.optics.patterns import contour_psf
 
 SIZE = 40, 48
 

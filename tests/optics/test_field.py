@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
+from cameras import contour_psf
 from mwdn.errors import ParameterError, ShapeError
 from mwdn.optics import Aberration, Camera, FieldCamera, Sensor, field_psfs
 from mwdn.optics.field import gaussian_blur
-from mwdn.optics.patterns import contour_psf
 
 
 def gaussian(size, sigma_y, sigma_x):

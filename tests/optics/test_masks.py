@@ -10,8 +10,8 @@ import torch
 from mwdn.errors import ParameterError
 from mwdn.optics import amplitude_masks
 from mwdn.optics.amplitude_masks import CodedAperture, Pinholes, ZoneAperture
+from mwdn.optics.drawing import contours
 from mwdn.optics.masks import Mask, mask_psf
-from mwdn.optics.patterns import contours
 from mwdn.optics.phase_masks import Contour, Diffuser, Lenslets
 from mwdn.optics.phase_retrieval import retrieve_phase
 from mwdn.optics.propagation import coordinates, point_source, propagate

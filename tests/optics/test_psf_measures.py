@@ -8,10 +8,10 @@ import torch
 from scipy.signal import correlate2d
 from scipy.special import k1
 
+from cameras import contour_psf
 from mwdn.errors import ParameterError
 from mwdn.fourier.wiener import wiener
 from mwdn.optics import psf_measures, sample_camera
-from mwdn.optics.patterns import contour_psf
 
 
 def gaussian(size, sigma, centre=None):

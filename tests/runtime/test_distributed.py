@@ -15,10 +15,10 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from cameras import contour_psf
 from mwdn.calibration import Calibration
 from mwdn.errors import ParameterError
 from mwdn.networks import build
-from mwdn.optics.patterns import contour_psf
 from mwdn.runtime import distributed
 from mwdn.training.batch_norm import freeze_cancelled
 from mwdn.training.experiment import prepare

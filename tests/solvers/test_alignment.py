@@ -5,9 +5,9 @@ import pytest
 import torch
 from scipy.ndimage import affine_transform
 
+from cameras import contour_psf
 from mwdn.errors import ShapeError
 from mwdn.optics.camera import Camera
-from mwdn.optics.patterns import contour_psf
 from mwdn.optics.warp import hazed
 from mwdn.solvers.alignment import Pose, align
 from mwdn.solvers.pyramid import Pyramid

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 import oracles
+from cameras import contour_psf
 from mwdn.fourier.convolution import convolve
 from mwdn.networks import build
-from mwdn.optics.patterns import contour_psf
 from mwdn.solvers import Penalties
 from mwdn.solvers import plug_and_play as module
 from mwdn.solvers.plug_and_play import certainty, plug_and_play

@@ -9,10 +9,10 @@ from scipy.optimize import nnls
 from torch.nn import functional as F
 
 import oracles
+from cameras import contour_psf
 from mwdn import fourier
 from mwdn.errors import ParameterError
 from mwdn.optics.noise import noise_level
-from mwdn.optics.patterns import contour_psf
 from mwdn.solvers import Penalties
 from mwdn.solvers.pyramid import LEVELS, Level, Pyramid, halve, low_band, solve
 from mwdn.solvers.wiener import Wiener

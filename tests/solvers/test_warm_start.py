@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch.nn import functional as F
 
+from cameras import contour_psf
 from mwdn import Camera
 from mwdn.errors import ParameterError
-from mwdn.optics.patterns import contour_psf
 from mwdn.solvers import Admm, Fista, Warm
 
 SIZE = 40, 48

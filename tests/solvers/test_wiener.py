@@ -3,10 +3,10 @@
 import pytest
 import torch
 
+from cameras import contour_psf
 from mwdn import fourier
 from mwdn.errors import ParameterError, ShapeError
 from mwdn.optics import Camera, Sensor
-from mwdn.optics.patterns import contour_psf
 from mwdn.solvers import Wiener, noise_level
 
 SIZE = 96, 80

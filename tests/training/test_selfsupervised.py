@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import nn
 
+from cameras import contour_psf
 from mwdn.calibration import Calibration
 from mwdn.data.unpaired import SelfSupervised, UnpairedCaptures
 from mwdn.errors import CheckpointError, ParameterError, ShapeError
@@ -15,7 +16,6 @@ from mwdn.fourier.convolution import convolve
 from mwdn.fourier.wiener import wiener
 from mwdn.networks.recomputed import norms
 from mwdn.optics.noise import noise_level
-from mwdn.optics.patterns import contour_psf
 from mwdn.solvers.alignment import Pose
 from mwdn.training.experiment import prepare
 from mwdn.training.losses import Loss

@@ -16,6 +16,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from cameras import contour_psf
 from mwdn.calibration import Calibration
 from mwdn.data.cameras import Cameras
 from mwdn.data.noisy import Denoising
@@ -24,7 +25,6 @@ from mwdn.data.photographs import Photographs
 from mwdn.data.simulated import SimulatedPairs
 from mwdn.errors import CheckpointError, DivergenceError, ParameterError, ShapeError
 from mwdn.inference.reconstructor import find_method
-from mwdn.optics.patterns import contour_psf
 from mwdn.training.experiment import prepare, simulate
 from mwdn.training.recipe import Plateau, Recipe, Schedule, Sheet
 from mwdn.training.run_folder import RunFolder

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from mwdn.errors import ParameterError
+from mwdn.optics.drawing import contours
 from mwdn.optics.masks import Mask, check_levels, quantised, samples
-from mwdn.optics.patterns import contours
 from mwdn.optics.phase_retrieval import retrieve_phase
 from mwdn.optics.propagation import UM_PER_MM, UM_PER_NM, coordinates, point_source, positive
 from mwdn.optics.setup import Setup
