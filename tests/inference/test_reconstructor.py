@@ -223,12 +223,12 @@ def test_stream_keeps_the_pose(refresh, asked, bank, psf, frames, aligned):
 
 @pytest.mark.parametrize("solver", [Admm(iterations=30), solvers.Fista(iterations=30)], ids=["admm", "fista"])
 def test_stream_goes_on_where_it_was(solver, psf, frames, aligned):
-    warm = solvers.Warm(solver)
+    warm = solvers.WarmStart(solver)
     reconstruct = Reconstructor(solver, Calibration(psf), device="cpu")
     for _ in range(2):  # each stream begins anew
         for measurement, scene in reconstruct.stream(frames):
             assert torch.equal(scene, warm(measurement, psf))
-        warm = solvers.Warm(solver)
+        warm = solvers.WarmStart(solver)
     assert torch.equal(reconstruct(measurement), solver(measurement, psf))
     assert aligned == []
 
@@ -307,7 +307,7 @@ def test_what_belongs_to_each_sample_keeps_a_batch_together(generator, monkeypat
     monkeypatch.setitem(AT_ONCE, "cpu", 1)
     psf = torch.rand(1, 3, 24, 32, generator=generator)
     calibration, batch = Calibration(psf / psf.sum()), torch.rand(3, 3, 24, 32, generator=generator)
-    warm, whole = solvers.Warm(solvers.Admm(iterations=5)), solvers.Warm(solvers.Admm(iterations=5))
+    warm, whole = solvers.WarmStart(solvers.Admm(iterations=5)), solvers.WarmStart(solvers.Admm(iterations=5))
     stream = Reconstructor(warm, calibration, device="cpu")
     for _ in range(2):
         torch.testing.assert_close(stream(batch), whole(batch, stream.psf))

@@ -10,7 +10,7 @@ import oracles
 from mwdn.benchmark.published import PUBLISHED
 from mwdn.networks import NETWORKS, build
 from mwdn.solvers import Admm, Penalties
-from mwdn.solvers.proximal import bounded
+from mwdn.solvers.proximal import dual_projection
 
 COUNTS = {"le-admm": 20, "le-admm-u": 11_772_327, "mmcn": 18_863_559, "updn": 2_744_411}
 
@@ -169,7 +169,7 @@ def test_the_original_shrinkage_does_not():
         return u[0] * kept / (kept + threshold), u[1] * kept / (kept + threshold)
 
     def ours(u, threshold, variation):
-        return [given - part for given, part in zip(u, bounded(u, threshold, variation), strict=True)]
+        return [given - part for given, part in zip(u, dual_projection(u, threshold, variation), strict=True)]
 
     for shrinkage, finite in ((textbook, False), (ours, True)):
         mu = torch.tensor(1e-4, requires_grad=True)

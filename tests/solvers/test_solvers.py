@@ -76,7 +76,7 @@ def test_laplacian_of_the_problem_is_divergence_of_gradient(generator):
 
 def shrunk(u, threshold, variation):
     """The proximal map: what is left of a gradient."""
-    return tuple(given - part for given, part in zip(u, proximal.bounded(u, threshold, variation), strict=True))
+    return tuple(given - part for given, part in zip(u, proximal.dual_projection(u, threshold, variation), strict=True))
 
 
 @pytest.mark.parametrize("threshold", [0.0, 0.3, 1.5])

@@ -7,7 +7,7 @@ from torch.nn import functional as F
 from cameras import contour_psf
 from mwdn import Camera
 from mwdn.errors import ParameterError
-from mwdn.solvers import Admm, Fista, Warm
+from mwdn.solvers import Admm, Fista, WarmStart
 
 SIZE = 40, 48
 FRAMES = 8
@@ -42,7 +42,7 @@ def pairs_of(solvers_):
 @pairs_of(solvers(100))
 @pytest.mark.parametrize("k", [5, 10])
 def test_few_warm_iterations_come_closer_to_the_end_than_as_many_cold_ones(solver, k, psf, film):
-    warm, cold = Warm(solver, iterations=k), type(solver)(iterations=k)
+    warm, cold = WarmStart(solver, iterations=k), type(solver)(iterations=k)
     first, *_, found = (warm(frame, psf) for frame in film)
     assert torch.equal(first, solver(film[0], psf))
     end = type(solver)(iterations=500)(film[-1], psf)
@@ -51,14 +51,14 @@ def test_few_warm_iterations_come_closer_to_the_end_than_as_many_cold_ones(solve
 
 @pairs_of(solvers(20))
 def test_scene_that_stands_still_is_that_of_one_long_run(solver, psf, film):
-    warm = Warm(solver, iterations=10)
+    warm = WarmStart(solver, iterations=10)
     for _ in range(5):
         found = warm(film[0], psf)
     assert torch.equal(found, type(solver)(iterations=60)(film[0], psf))
 
 
 def test_balanced_penalties_go_on(psf, film):
-    warm = Warm(Admm(iterations=20, balance_every=5), iterations=10)
+    warm = WarmStart(Admm(iterations=20, balance_every=5), iterations=10)
     for _ in range(3):
         found = warm(film[0], psf)
     assert torch.equal(found, Admm(iterations=40, balance_every=5)(film[0], psf))
@@ -67,7 +67,7 @@ def test_balanced_penalties_go_on(psf, film):
 @pairs_of(solvers(100))
 def test_another_scene_takes_its_few_frames(solver, psf, film):
     """And ends where a stream of it alone ends."""
-    warm, end = Warm(solver), type(solver)(iterations=400)(film[0].flip(-2), psf)
+    warm, end = WarmStart(solver), type(solver)(iterations=400)(film[0].flip(-2), psf)
     warm(film[0], psf)
     errors = [(warm(film[0].flip(-2), psf) - end).norm().item() for _ in range(20)]
     assert errors[-1] < 0.3 * errors[0]
@@ -76,7 +76,7 @@ def test_another_scene_takes_its_few_frames(solver, psf, film):
 
 def test_admm_follows_an_exposure_at_once(psf, film):
     """The state is kept in units of the measurement."""
-    warm, even = Warm(Admm(iterations=20)), Warm(Admm(iterations=20))
+    warm, even = WarmStart(Admm(iterations=20)), WarmStart(Admm(iterations=20))
     for number, frame in enumerate(film):
         found, expected = warm(2.0**number * frame, psf), even(frame, psf)
         torch.testing.assert_close(found / 2.0**number, expected, rtol=1e-4, atol=1e-5)
@@ -84,7 +84,7 @@ def test_admm_follows_an_exposure_at_once(psf, film):
 
 @pairs_of(solvers(10))
 def test_each_first_frame_is_cold(solver, psf, film):
-    warm = Warm(solver, iterations=2)
+    warm = WarmStart(solver, iterations=2)
     warm(film[0], psf)
     assert torch.equal(warm(film[1][..., :30], psf), solver(film[1][..., :30], psf))  # another shape
     assert torch.equal(warm(film[1][..., :30], psf.clone()), solver(film[1][..., :30], psf))  # another PSF
@@ -95,7 +95,7 @@ def test_each_first_frame_is_cold(solver, psf, film):
 @pairs_of(solvers(10))
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf])
 def test_first_frame_after_one_that_is_not_finite_is_cold(solver, bad, psf, film):
-    warm, after = Warm(solver, iterations=2), Warm(solver, iterations=2)
+    warm, after = WarmStart(solver, iterations=2), WarmStart(solver, iterations=2)
     warm(film[0], psf)
     broken = film[1].clone()
     broken[..., 5, 7] = bad
@@ -106,7 +106,7 @@ def test_first_frame_after_one_that_is_not_finite_is_cold(solver, bad, psf, film
 
 @pairs_of(solvers(10))
 def test_streams_of_a_batch_are_one_by_one(solver, psf, film):
-    together, alone = Warm(solver), Warm(solver)
+    together, alone = WarmStart(solver), WarmStart(solver)
     for one, two in zip(film[:3], film[3:6], strict=True):
         found = together(torch.cat([one, two]), psf)
         torch.testing.assert_close(found[:1], alone(one, psf), rtol=1e-3, atol=1e-4)
@@ -114,4 +114,4 @@ def test_streams_of_a_batch_are_one_by_one(solver, psf, film):
 
 def test_no_iteration():
     with pytest.raises(ParameterError, match=r"`iterations` \(0\) must be at least 1"):
-        Warm(Admm(), iterations=0)
+        WarmStart(Admm(), iterations=0)

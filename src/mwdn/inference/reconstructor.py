@@ -129,7 +129,7 @@ class Reconstructor:
         """Reconstruct one frame of the camera after another, faster than alone: the last one tells much of the next.
 
         A network that aligns the PSF keeps the pose that it found on the first frame. ADMM and FISTA go on where they
-        were (`mwdn.solvers.Warm`). All else is as for single captures.
+        were (`mwdn.solvers.WarmStart`). All else is as for single captures.
 
         Every frame is reconstructed; of a live camera take the newest: ``stream(mwdn.runtime.streams.latest(camera))``.
 
@@ -151,7 +151,7 @@ class Reconstructor:
     def _stream(self, frames: Iterable[Frame], refresh: int) -> Iterator[tuple[Measurement, Scene]]:
         here = copy.copy(self)
         if isinstance(self.method, solvers.Admm | solvers.Fista):
-            here.method = solvers.Warm(self.method)
+            here.method = solvers.WarmStart(self.method)
         due = aligns = bool(self.engine and self.engine.aligns)
         for number, frame in enumerate(frames):
             measurement = self.calibration.correct(frame)
@@ -165,7 +165,7 @@ class Reconstructor:
 
     def _at_once(self, measurement: Measurement) -> int:
         """Pictures of a batch that are reconstructed together."""
-        if isinstance(self.method, solvers.Warm) or (self.engine and len(self.engine.psf) > 1):
+        if isinstance(self.method, solvers.WarmStart) or (self.engine and len(self.engine.psf) > 1):
             return len(measurement)  # each has a past, or a pose, of its own
         return max(1, AT_ONCE.get(self.device.type, AT_ONCE["cpu"]) // (measurement.shape[-2] * measurement.shape[-1]))
 

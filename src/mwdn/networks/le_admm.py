@@ -23,7 +23,7 @@ class LeAdmm(nn.Module):
     Different here: the measurement is divided by its maximum first, so that the start values mean the same at every
     exposure (the source's data come so); all four are stored as logarithms, which keeps them positive. Calibration has
     subtracted the PSF's background already. The source cannot train with tau: the length of a zero gradient, which
-    the first iteration has everywhere, has an infinite derivative. `mwdn.solvers.proximal.bounded` has none.
+    the first iteration has everywhere, has an infinite derivative. `mwdn.solvers.proximal.dual_projection` has none.
 
     Args:
         iterations: how many; each adds 4 learnable numbers.

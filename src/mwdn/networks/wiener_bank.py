@@ -128,7 +128,7 @@ class WienerBank(nn.Module):
         psf = peak_one(psf, measurement)
         psf = psf / psf.sum((-2, -1), keepdim=True)
         size = measurement.shape[-2], measurement.shape[-1]
-        bands = PsfPyramid.of(psf, size, self.levels).bands if self.levels else ()
+        bands = PsfPyramid.from_psf(psf, size, self.levels).bands if self.levels else ()
         known = [tensor for band in bands for tensor in (band.transfer, band.norm)]
         if self.finest == 1:  # its last level has the bank's transfer function
             return known

@@ -9,7 +9,7 @@ from mwdn.solvers.alignment import Pose, align
 from mwdn.solvers.fista import Fista
 from mwdn.solvers.pyramid import Pyramid
 from mwdn.solvers.splitting import TEXTBOOK, Penalties
-from mwdn.solvers.warm_start import Warm
+from mwdn.solvers.warm_start import WarmStart
 from mwdn.solvers.wiener import Wiener
 
 Solver = Admm | Fista | Pyramid | Wiener
@@ -44,7 +44,7 @@ __all__ = [
     "Progress",
     "Pyramid",
     "Solver",
-    "Warm",
+    "WarmStart",
     "Wiener",
     "align",
     "build",

@@ -46,7 +46,7 @@ def total_variation(u: Gradient, variation: Variation) -> Tensor:
     return _squared_length(u, variation).sqrt().sum((1, 2, 3))
 
 
-def bounded(u: Gradient, bound: float | Tensor, variation: Variation) -> Gradient:
+def dual_projection(u: Gradient, bound: float | Tensor, variation: Variation) -> Gradient:
     """What the proximal map of ``bound * total_variation`` takes away: each size or length, at most ``bound`` of it.
 
     A root is taken of the larger of length and bound only, so that a zero gradient, which every first iteration has,

@@ -190,7 +190,7 @@ class PsfPyramid:
     bands: tuple[Band, ...]
 
     @classmethod
-    def of(cls, psf: Psf, size: Size, levels: tuple[Level, ...] = LEVELS) -> "PsfPyramid":
+    def from_psf(cls, psf: Psf, size: Size, levels: tuple[Level, ...] = LEVELS) -> "PsfPyramid":
         """Prepare a PSF (1 or B, 1 or C, h, w), centred, of any sum, for measurements of ``size``."""
         coarsest = levels[0].downsampling
         # The grid of a linear convolution, divisible as often as the pyramid halves it.
@@ -254,7 +254,7 @@ def solve(measurement: Measurement, psf: Psf, levels: tuple[Level, ...] = LEVELS
         ShapeError: batch or channels do not fit.
     """
     check_fit(measurement, psf, "measurement")
-    return PsfPyramid.of(psf, (measurement.shape[-2], measurement.shape[-1]), levels).solve(measurement)
+    return PsfPyramid.from_psf(psf, (measurement.shape[-2], measurement.shape[-1]), levels).solve(measurement)
 
 
 def halve(picture: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from mwdn.fourier.convolution import check_fit
 from mwdn.fourier.transforms import fast_length, inverse_spectrum, spectrum, transfer_function
-from mwdn.solvers.proximal import Gradient, Variation, bounded, divergence, gradient, total_variation
+from mwdn.solvers.proximal import Gradient, Variation, divergence, dual_projection, gradient, total_variation
 from mwdn.types import Measurement, Psf, Size, Spectrum
 
 
@@ -119,7 +119,7 @@ def update_copies(state: State, problem: Problem, mu: Penalties, tau: float | Te
     slope = state.slope
     if slope:
         gy, gx = gradient(state.v)
-        by, bx = bounded((opposed(gy, slope[0]), opposed(gx, slope[1])), tau / mu.gradient, variation)
+        by, bx = dual_projection((opposed(gy, slope[0]), opposed(gx, slope[1])), tau / mu.gradient, variation)
         slope = gy.add_(by), gx.add_(bx)
         del by, bx  # the memory of a large picture
     at_sensor = opposed(state.Hv, state.at_sensor).add_(problem.measurement).div_(1 + mu.data).add_(state.Hv)

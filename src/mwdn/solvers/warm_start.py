@@ -11,7 +11,7 @@ from mwdn.solvers.fista import Fista
 from mwdn.types import Measurement, Psf, Scene
 
 
-class Warm:
+class WarmStart:
     """A solver that takes all its iterations for the first frame of a stream, and a few for each that follows.
 
     A scene that moves slowly is then nearer to where the iterations would end than as many come from darkness; another
