@@ -7,16 +7,16 @@ import time
 
 import pytest
 
-from mwdn.benchmark.locks import held, shared
+from mwdn.benchmark.locks import claim_parts, lock
 from mwdn.errors import ParameterError
 
 AT_WORK = """
 import sys, time
 from pathlib import Path
-from mwdn.benchmark.locks import shared
+from mwdn.benchmark.locks import claim_parts
 
 folder = Path(sys.argv[1])
-for part in shared(folder, ["a", "b", "c", "d"]):
+for part in claim_parts(folder, ["a", "b", "c", "d"]):
     done = folder / part
     if not done.exists():
         with done.open("x") as file:  # fails if another is at it
@@ -41,7 +41,7 @@ def test_a_part_of_a_killed_process_is_another_ones(tmp_path):
     worker = at_work(tmp_path, 600)
     while not (tmp_path / "a").exists():
         time.sleep(0.05)
-    parts = shared(tmp_path, ["a", "b"])
+    parts = claim_parts(tmp_path, ["a", "b"])
     assert next(parts) == "b"
     worker.send_signal(signal.SIGKILL)
     worker.communicate()
@@ -52,4 +52,4 @@ def test_a_part_of_a_killed_process_is_another_ones(tmp_path):
 def test_a_folder_that_cannot_be_is_refused(tmp_path):
     (tmp_path / "out").write_text("")
     with pytest.raises(ParameterError, match="must be a folder"):
-        held(tmp_path / "out", "data")
+        lock(tmp_path / "out", "data")

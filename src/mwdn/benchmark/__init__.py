@@ -1,4 +1,4 @@
-"""Every method under one protocol: trained alike, scored alike, on one page."""
+"""Benchmark: train, score and compare every method of a recipe under one protocol, and write one page."""
 
 from mwdn.benchmark.recipe import Benchmark, read_benchmark
 from mwdn.benchmark.run import Watch, run

@@ -1,4 +1,4 @@
-"""The pictures of a benchmark's page: reconstructions side by side, training curves, robustness."""
+"""Pictures of a benchmark's page: reconstructions side by side, training curves, robustness."""
 
 import io
 import math
@@ -22,30 +22,30 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 HEIGHT = 160
-"""Pixels of each picture of a grid."""
+"""Height in pixels of each picture in a grid."""
 
 LABELS = {
-    "noise": "noise / that of the training",
+    "noise": "noise / noise in training",
     "shift_px": "shift of the PSF / px along each axis",
     "turn_degrees": "rotation of the PSF / degrees",
     "scale": "magnification of the PSF",
     "background": "background / light of the PSF",
-    "off_axis": "off-axis variation (1: as before a display)",
+    "off_axis": "off-axis variation (1: in front of a display)",
 }
 
-Line = tuple[list[str], Tensor]
-"""Titles of pictures, and the pictures, (N, C, H, W) in linear light."""
+Row = tuple[list[str], Tensor]
+"""Titles and pictures of a row; pictures are (N, C, H, W) in linear light."""
 
 
-def grid(name: str, lines: list[Line], words: str) -> Picture:
-    """Arrange lines of pictures, each under its titles; in two columns if there are many.
+def grid(name: str, rows: list[Row], words: str) -> Picture:
+    """Arrange rows of pictures under their titles; more than six rows take two columns.
 
     Args:
-        name: of the picture's file.
-        lines: as many pictures each; scaled for people one by one.
-        words: what is shown.
+        name: file name of the result.
+        rows: with the same number of pictures; each picture is scaled to its own brightest pixels.
+        words: description of the result.
     """
-    strips = [contact_sheet([[one[None] for one in pictures]], titles, height=HEIGHT) for titles, pictures in lines]
+    strips = [contact_sheet([list(torch.split(pictures, 1))], titles, height=HEIGHT) for titles, pictures in rows]
     widest = max(strip.shape[-1] for strip in strips)
     strips = [F.pad(strip, (0, widest - strip.shape[-1]), value=1.0) for strip in strips]
     half = math.ceil(len(strips) / 2) if len(strips) > 6 else len(strips)
@@ -62,12 +62,12 @@ def _jpeg(image: Tensor) -> bytes:
 
 
 def curves(name: str, runs: dict[str, tuple[list[tuple[int, float]], list[tuple[int, float]]]], words: str) -> Picture:
-    """Draw the loss and the validation PSNR of every network over the steps.
+    """Plot the loss and the validation PSNR of every network against the step.
 
     Args:
-        name: of the picture's file.
-        runs: loss by step, and PSNR by step, of each network.
-        words: what is shown.
+        name: file name of the result.
+        runs: of each network its losses and its PSNRs, as pairs of step and value.
+        words: description of the result.
     """
     from matplotlib.figure import Figure
 
@@ -86,28 +86,28 @@ def curves(name: str, runs: dict[str, tuple[list[tuple[int, float]], list[tuple[
 
 
 def _smooth(values: list[float]) -> list[float]:
-    """Mean of each value and those before it, over a twentieth of all."""
-    reach = max(1, len(values) // 20)
-    return [statistics.fmean(values[max(0, i + 1 - reach) : i + 1]) for i in range(len(values))]
+    """Running mean over the last twentieth of all values."""
+    window = max(1, len(values) // 20)
+    return [statistics.fmean(values[max(0, i + 1 - window) : i + 1]) for i in range(len(values))]
 
 
 def robustness(label: str, sweeps: dict[str, Sweep]) -> Picture:
-    """Draw PSNR of one method over every mismatch, with the others in grey.
+    """Plot the PSNR of one method against the size of every mismatch, with the other methods in grey.
 
     Args:
         label: of the method.
-        sweeps: of all methods.
+        sweeps: of all methods, by label.
     """
     from matplotlib.figure import Figure
 
-    axes_names = list(sweeps[label])
-    figure = Figure(figsize=(2.6 * len(axes_names) + 0.6, 2.7), dpi=100, layout="constrained")
-    panels = figure.subplots(1, len(axes_names), sharey=True, squeeze=False)[0]
-    for panel, axis in zip(panels, axes_names, strict=True):
+    mismatches = list(sweeps[label])
+    figure = Figure(figsize=(2.6 * len(mismatches) + 0.6, 2.7), dpi=100, layout="constrained")
+    panels = figure.subplots(1, len(mismatches), sharey=True, squeeze=False)[0]
+    for panel, axis in zip(panels, mismatches, strict=True):
         for other, sweep in sweeps.items():
             if other != label:
-                _draw(panel, sweep[axis], color="0.82", lw=0.8)
-        _draw(panel, sweeps[label][axis], color="C0", marker="o", ms=3, zorder=3)
+                _plot(panel, sweep[axis], color="0.82", lw=0.8)
+        _plot(panel, sweeps[label][axis], color="C0", marker="o", ms=3, zorder=3)
         if axis == "noise":
             panel.set_xscale("log", base=2)
         panel.set_xlabel(LABELS[axis], fontsize=8)
@@ -120,8 +120,8 @@ def robustness(label: str, sweeps: dict[str, Sweep]) -> Picture:
     return Picture(f"robustness-{label}.png", _png(figure), words)
 
 
-def _draw(panel: "Axes", found: dict[float, list[float]], **style: Any) -> None:  # noqa: ANN401
-    panel.plot(list(found), [statistics.fmean(values) for values in found.values()], **style)
+def _plot(panel: "Axes", psnr: dict[float, list[float]], **style: Any) -> None:  # noqa: ANN401
+    panel.plot(list(psnr), [statistics.fmean(values) for values in psnr.values()], **style)
 
 
 def _png(figure: "Figure") -> bytes:

@@ -1,8 +1,8 @@
-"""One benchmark, several processes: whoever is free takes the next part.
+"""File locks that let several processes work on one benchmark: a free process takes the next part.
 
-They need to know nothing of each other but the folder, which may be on a shared disk: started by torchrun, by a
-cluster's scheduler or by hand, together or one after the other. A lock goes with the process that held it, so the
-part of one that was killed goes on in another.
+The processes share nothing but the folder, which may be on a network disk: start them with torchrun, with a cluster's
+scheduler or by hand, at once or one after the other. The operating system releases a lock when its process ends, so
+another process continues the part of a killed one.
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,8 +13,12 @@ from filelock import FileLock, Timeout
 from mwdn.io.files import writable
 
 
-def held(folder: Path, part: str) -> FileLock:
-    """The lock of a part, which may be a path: a context in which no other process is at it.
+def lock(folder: Path, part: str) -> FileLock:
+    """Lock of a part, as a context manager: only one process at a time works on the part.
+
+    Args:
+        folder: of the benchmark.
+        part: name of the part; may be a relative path.
 
     Raises:
         ParameterError: the folder cannot be written to.
@@ -25,20 +29,21 @@ def held(folder: Path, part: str) -> FileLock:
     return FileLock(path)
 
 
-def shared(folder: Path, parts: Sequence[str]) -> Iterator[str]:
-    """Each part in turn, held while the loop is at it: those of nobody first, then the others as they become free.
+def claim_parts(folder: Path, parts: Sequence[str]) -> Iterator[str]:
+    """Iterate over all parts, holding the lock of the current one: free parts first, then those of other processes.
 
-    So after the loop every part has been done; what was done elsewhere should be found done.
+    The loop waits for the other processes' parts, so every part has been done when it ends. Its body should return
+    quickly for a part that another process has finished.
     """
-    others = []
+    busy = []
     for part in parts:
         try:
-            own = held(folder, part).acquire(blocking=False)
+            acquired = lock(folder, part).acquire(blocking=False)
         except Timeout:
-            others.append(part)
+            busy.append(part)
             continue
-        with own:
+        with acquired:
             yield part
-    for part in others:
-        with held(folder, part):
+    for part in busy:
+        with lock(folder, part):
             yield part

@@ -1,4 +1,4 @@
-"""A page of words, tables and pictures, as one HTML file and as Markdown."""
+"""Pages of text, tables and pictures, written as one HTML file and as Markdown."""
 
 import base64
 import html
@@ -13,12 +13,12 @@ from mwdn.io.files import atomic_write, save_text
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture in a file's bytes.
+    """An encoded picture.
 
     Args:
-        name: of the file, with its suffix: png or jpg.
-        content: its bytes.
-        words: what it shows.
+        name: file name, ending in .png or .jpg.
+        content: bytes of the file.
+        words: what the picture shows.
     """
 
     name: str
@@ -28,7 +28,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Code:
-    """Text to be shown as it is."""
+    """Preformatted text."""
 
     text: str
 
@@ -38,7 +38,7 @@ Block = str | Table | Picture | Code
 
 @dataclass(frozen=True)
 class Section:
-    """A heading and what stands under it."""
+    """A heading and the blocks under it."""
 
     title: str
     blocks: list[Block]
@@ -64,7 +64,7 @@ pre {{ background: #f5f5f5; padding: .8rem; overflow-x: auto; font-size: 12px; }
 
 
 def write_html(path: Path, title: str, sections: list[Section]) -> None:
-    """Write a page that needs no other file, atomically."""
+    """Write a self-contained HTML page, atomically."""
     links = "".join(f'<a href="#s{i}">{html.escape(section.title)}</a> ' for i, section in enumerate(sections))
     body = "\n".join(
         f'<h2 id="s{i}">{html.escape(section.title)}</h2>\n' + "\n".join(map(_as_html, section.blocks))
@@ -74,7 +74,7 @@ def write_html(path: Path, title: str, sections: list[Section]) -> None:
 
 
 def write_markdown(path: Path, title: str, sections: list[Section]) -> None:
-    """Write a page and, in the folder ``pictures`` beside it, its pictures, each atomically."""
+    """Write a Markdown page and its pictures, in the folder ``pictures`` beside it, each atomically."""
     parts = [f"# {title}"]
     for section in sections:
         parts.append(f"## {section.title}")

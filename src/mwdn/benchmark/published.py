@@ -1,22 +1,22 @@
-"""How each method's authors trained it, as far as they say: data for a comparison with each one's own settings."""
+"""Training settings that each network's authors published."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Published:
-    """An optimiser as published. ``None`` where the source does not say.
+    """Published training settings of a network; ``None`` if the source does not say.
 
     Args:
         optimiser: name, as in a recipe's ``[schedule]``.
-        rate: learning rate at its highest.
-        source: where this stands.
+        rate: highest learning rate.
+        source: where the settings come from.
         weight_decay: of the optimiser.
-        batch: samples a step, those of accumulated gradients together.
-        epochs: passes over the training pairs, at most.
-        course: of the learning rate: "constant", "cosine" or "plateau".
-        loss: weights of the parts of the loss, by the names of a recipe's ``[loss]``. What a source calls perceptual is
-            named by the nearest part that we have.
+        batch: samples per step, including accumulated gradients.
+        epochs: maximum number of passes over the training pairs.
+        lr_schedule: learning rate schedule: "constant", "cosine" or "plateau".
+        loss: weights of the loss's parts, by their names in a recipe's ``[loss]``. A source's perceptual loss has the
+            name of the nearest part of this package.
     """
 
     optimiser: str
@@ -25,7 +25,7 @@ class Published:
     weight_decay: float = 0.0
     batch: int | None = None
     epochs: int | None = None
-    course: str | None = None
+    lr_schedule: str | None = None
     loss: tuple[tuple[str, float], ...] = (("mse", 1.0),)
 
 
@@ -36,10 +36,10 @@ _MWDN = Published(
     weight_decay=1e-4,
     batch=16,
     epochs=300,
-    course="plateau",
+    lr_schedule="plateau",
     loss=(("mse", 1.0), ("feature_mse", 1.0)),
 )
-_LE_ADMM = Published("adam", None, "Monakhova et al. 2019; neither paper nor code found here gives the rate")
+_LE_ADMM = Published("adam", None, "Monakhova et al. 2019; neither the paper nor the code gives the rate")
 
 PUBLISHED: dict[str, Published] = {
     "wiener": _MWDN,
@@ -55,7 +55,7 @@ PUBLISHED: dict[str, Published] = {
         "code of Kingshott et al. 2022: 2 samples, gradients of 2 added",
         batch=4,
         epochs=5,
-        course="constant",
+        lr_schedule="constant",
     ),
     "flatnet": Published(
         "adam",
@@ -63,7 +63,7 @@ PUBLISHED: dict[str, Published] = {
         "code of Khan et al. 2020 (FlatNet-gen): 4e-10 for the inverse, in its units; also an adversarial part, 0.6",
         batch=5,
         epochs=31,
-        course="cosine",
+        lr_schedule="cosine",
         loss=(("mse", 1.0), ("feature_mse", 1.2)),
     ),
     "svdeconv": Published(
@@ -72,8 +72,8 @@ PUBLISHED: dict[str, Published] = {
         "code of PhoCoLens 2024 for DiffuserCam: 3e-5 for the PSFs; its perceptual part is VGG's",
         batch=5,
         epochs=100,
-        course="cosine",
+        lr_schedule="cosine",
         loss=(("mse", 1.0), ("feature_mse", 0.05)),
     ),
 }
-"""By the names of `NETWORKS`. Missing: `mmcn` and `ifin`, whose settings were not found; `wiener-bank` is our own."""
+"""By network name. `mmcn` and `ifin` are missing because no settings are published; `wiener-bank` is our own."""

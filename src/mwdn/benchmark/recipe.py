@@ -1,14 +1,14 @@
-"""The recipe of a benchmark: methods, data sets, and the one budget for all."""
+"""Recipes of benchmarks: methods, data sets, and one training budget."""
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from inspect import signature
 from pathlib import Path
 from typing import Any
 
-from mwdn.benchmark.sets import PRESETS, DataSet
+from mwdn.benchmark.sets import PRESETS, DatasetRecipe
 from mwdn.errors import ParameterError, UnknownNameError, check_options
 from mwdn.io.toml import fill, read_toml
 from mwdn.networks import NETWORKS
@@ -18,18 +18,18 @@ from mwdn.training.losses import checked_weights
 from mwdn.training.recipe import Schedule
 
 AXES = {"noise": 1.0, **{part.name: 0.0 for part in fields(Deviation)}}
-"""What a robustness sweep varies, and its value in the camera that networks were trained for: noise as a multiple."""
+"""What a robustness sweep varies, and its value in the camera of the training; noise is a factor."""
 
 
 @dataclass(frozen=True)
 class Method:
-    """One line of the table.
+    """One row of the tables.
 
     Args:
-        label: its name there.
-        name: of a network or a solver.
-        options: it is built with.
-        learned: a network.
+        label: its name in the tables.
+        name: of the network or solver.
+        options: to build it with.
+        learned: whether it is a network.
     """
 
     label: str
@@ -40,12 +40,12 @@ class Method:
 
 @dataclass(frozen=True)
 class Robustness:
-    """What happens where the camera differs more from its calibration than it did in training.
+    """Test of cameras that differ more from their calibration than in training.
 
     Args:
-        data: a simulated data set; empty for none.
+        data: a simulated data set; empty for no test.
         count: test pictures for each size.
-        sizes: of each of `AXES` that is swept.
+        sizes: of the mismatch, for each of `AXES` to sweep.
     """
 
     data: str = ""
@@ -55,29 +55,29 @@ class Robustness:
 
 @dataclass(frozen=True)
 class Benchmark:
-    """Every method, one budget, one protocol a data set.
+    """Methods to compare on data sets, under one training budget and one protocol per data set.
 
     Args:
         title: of the page.
         methods: in the order of the tables.
-        data: data sets by their names.
-        schedule: of every network; see `published`.
-        loss: likewise.
-        published: take optimiser, learning rate and weight decay of each network from its own source, if that says.
-        rate_factor: multiplies these learning rates, alike for all: sources that train for days start slower.
+        data: data sets by name.
+        schedule: training schedule of every network; see `published`.
+        loss: weights of the loss's parts, for every network.
+        published: take a network's optimiser, learning rate and weight decay from its publication if that gives them.
+        rate_factor: factor on the published learning rates; less than 1 slows sources that train much longer.
         ablation: labels of the paper's ablation, in its order.
-        compared: label that all others are compared with, picture by picture.
-        shown: test pictures to show of each data set.
-        width_factor: every network's own width times this, the same for all; a line of the recipe may say otherwise.
+        compared: label of the method that all others are compared with, picture by picture.
+        shown: test pictures of each data set on the page.
+        width_factor: factor on every network's default width; a ``width`` in the recipe takes precedence.
         robustness: see `Robustness`.
-        alexnet: file of AlexNet's weights; found or downloaded unless given.
+        alexnet: file of AlexNet's weights; searched for or downloaded unless given.
         heads: file of LPIPS's heads; likewise.
         path: of the recipe.
     """
 
     title: str = "Benchmark"
     methods: tuple[Method, ...] = ()
-    data: dict[str, DataSet] = field(default_factory=dict)
+    data: dict[str, DatasetRecipe] = field(default_factory=dict)
     schedule: Schedule = Schedule()
     loss: dict[str, float] = field(default_factory=lambda: {"mse": 1.0})
     published: bool = True
@@ -97,72 +97,65 @@ def read_benchmark(path: str | Path) -> Benchmark:
 
     Args:
         path: TOML with the tables [networks], [solvers], [data], [schedule], [loss], [shared.network],
-            [shared.data], [robustness], and the other fields of `Benchmark`. Paths begin at its folder, or with the
-            name of an environment variable, as in ``$MWDN_DATA/photos``.
+            [shared.data], [robustness], and the other fields of `Benchmark`. Paths in it are relative to its folder or
+            start with an environment variable, as in ``$MWDN_DATA/photos``.
 
     Raises:
-        ParameterError: the file cannot be read, nothing is to be compared, or a value is outside its range.
-        UnknownNameError: a name, a table or a key that does not exist.
+        ParameterError: the file cannot be read, has no methods or data, or a value is outside its range.
+        UnknownNameError: an unknown name, table or key.
     """
     content = read_toml(path)
-    known = {f.name for f in fields(Benchmark)} - {"methods", "path"} | {"networks", "solvers", "shared"}
+    keys = {f.name for f in fields(Benchmark)} - {"methods", "path"} | {"networks", "solvers", "shared"}
     for key in content:
-        if key not in known:
-            raise UnknownNameError("key of a benchmark's recipe", key, known)
-    shared = content.pop("shared", {})
-    learned = _methods("networks", content.pop("networks", {}), NETWORKS, shared.get("network", {}))
-    methods = *_methods("solvers", content.pop("solvers", {}), SOLVERS, {}), *learned
-    folder = Path(path).parent
-    data = {n: _data_set(n, {**shared.get("data", {}), **t}, folder) for n, t in content.pop("data", {}).items()}
-    schedule = fill(Schedule, "schedule", content.pop("schedule", {}))
-    loss = checked_weights(content.pop("loss", {"mse": 1.0}))
-    robustness = _robustness(content.pop("robustness", {}))
+        if key not in keys:
+            raise UnknownNameError("key of a benchmark's recipe", key, keys)
+    folder, shared = Path(path).parent, content.pop("shared", {})
+    networks = _methods("networks", content.pop("networks", {}), NETWORKS, shared.get("network", {}))
+    methods = [*_methods("solvers", content.pop("solvers", {}), SOLVERS, {}), *networks]
+    tables: dict[str, Any] = {
+        "data": {
+            name: _dataset_recipe(name, {**shared.get("data", {}), **table}, folder)
+            for name, table in content.pop("data", {}).items()
+        },
+        "schedule": fill(Schedule, "schedule", content.pop("schedule", {})),
+        "loss": checked_weights(content.pop("loss", {"mse": 1.0})),
+        "robustness": _robustness(content.pop("robustness", {})),
+    }
     for name in ("alexnet", "heads"):
-        content[name] = _place(content.get(name, ""), folder)
-    plain = fill(_Plain, "the recipe", content)
-    values = {f.name: getattr(plain, f.name) for f in fields(_Plain)}
-    methods = tuple(_narrowed(method, plain.width_factor) for method in methods)
-    found = Benchmark(
-        methods=methods, data=data, schedule=schedule, loss=loss, robustness=robustness, path=str(path), **values
-    )
-    _check(found)
-    return found
-
-
-@dataclass(frozen=True)
-class _Plain:
-    """The fields of `Benchmark` that are no tables."""
-
-    title: str = "Benchmark"
-    published: bool = True
-    rate_factor: float = 1.0
-    ablation: tuple[str, ...] = ()
-    compared: str = ""
-    shown: int = 4
-    width_factor: float = 1.0
-    alexnet: str = ""
-    heads: str = ""
+        content[name] = _absolute(content.get(name, ""), folder)
+    benchmark = fill(Benchmark, "the recipe", content)
+    methods = [_scale_width(method, benchmark.width_factor) for method in methods]
+    benchmark = replace(benchmark, **tables, methods=tuple(methods), path=str(path))
+    _check(benchmark)
+    return benchmark
 
 
 def _methods(table: str, content: dict[str, Any], registry: Mapping[str, Any], shared: dict[str, Any]) -> list[Method]:
-    """Of lines such as ``mwdn = {}`` and ``mwdn-average = { name = "mwdn", psf_pooling = "average" }``."""
-    found = []
-    for label, options in content.items():
-        if not isinstance(options, dict):
-            raise ParameterError(f"`{label}` of [{table}] ({options!r}) must be a table of options: `{label} = {{}}`.")
-        name = options.get("name", label)
+    """Methods of a table with lines such as ``mwdn = {}`` and ``average = { name = "mwdn", psf_pooling = "average" }``.
+
+    Args:
+        table: networks or solvers.
+        content: of the table.
+        registry: classes by name.
+        shared: options for every method that has them; a method's own line takes precedence.
+    """
+    methods = []
+    for label, line in content.items():
+        if not isinstance(line, dict):
+            raise ParameterError(f"`{label}` of [{table}] ({line!r}) must be a table of options: `{label} = {{}}`.")
+        name = line.get("name", label)
         if name not in registry:
             raise UnknownNameError(table.removesuffix("s"), name, registry)
-        has = signature(registry[name]).parameters
-        own = {key: value for key, value in options.items() if key != "name"}
-        check_options(registry[name], f"'{name}'", own)
-        common = {key: value for key, value in shared.items() if key in has}
-        found.append(Method(label, name, {**common, **own}, table == "networks"))
-    return found
+        options = {key: value for key, value in line.items() if key != "name"}
+        check_options(registry[name], f"'{name}'", options)
+        parameters = signature(registry[name]).parameters
+        common = {key: value for key, value in shared.items() if key in parameters}
+        methods.append(Method(label, name, {**common, **options}, table == "networks"))
+    return methods
 
 
-def _narrowed(method: Method, factor: float) -> Method:
-    """With its own width times a factor, where it has one and nobody said another."""
+def _scale_width(method: Method, factor: float) -> Method:
+    """A network with its default width times a factor, unless the recipe gives its width."""
     if not factor > 0:
         raise ParameterError(f"`width_factor` ({factor}) must be positive.")
     width = signature(NETWORKS[method.name]).parameters.get("width") if method.learned else None
@@ -171,32 +164,34 @@ def _narrowed(method: Method, factor: float) -> Method:
     return replace(method, options={**method.options, "width": max(1, round(factor * width.default))})
 
 
-def _data_set(name: str, table: dict[str, Any], folder: Path) -> DataSet:
-    preset = PRESETS.get(table.pop("preset", name), DataSet())
+def _dataset_recipe(name: str, table: dict[str, Any], folder: Path) -> DatasetRecipe:
+    """A preset with the changes of a table; its nested tables change single fields, too."""
+    preset = PRESETS.get(table.pop("preset", name), DatasetRecipe())
+    nested = {f.name: getattr(preset, f.name) for f in fields(DatasetRecipe) if is_dataclass(f.default)}
     changes: dict[str, Any] = {}
-    nested = {f.name: getattr(preset, f.name) for f in fields(DataSet) if is_dataclass(f.default)}
     for key in nested.keys() & table.keys():
-        given = fill(type(nested[key]), f"data.{name}.{key}", table[key])
-        changes[key] = replace(nested[key], **{part: getattr(given, part) for part in table[key]})
-    plain = fill(DataSet, f"data.{name}", {key: value for key, value in table.items() if key not in changes})
+        filled = fill(type(nested[key]), f"data.{name}.{key}", table[key])
+        changes[key] = replace(nested[key], **{part: getattr(filled, part) for part in table[key]})
+    plain = fill(DatasetRecipe, f"data.{name}", {key: value for key, value in table.items() if key not in changes})
     changes |= {key: getattr(plain, key) for key in table if key not in changes}
     for key in ("psf", "photos", "test_photos", "pairs"):
         if key in changes:
-            changes[key] = _place(changes[key], folder)
+            changes[key] = _absolute(changes[key], folder)
     if "captures" in changes:
-        changes["captures"] = tuple(_place(capture, folder) for capture in changes["captures"])
-    found = replace(preset, **changes)
-    if found.pairs:  # photographs of [shared.data] are not for it
-        found = replace(found, photos="", test_photos="")
-    return found
+        changes["captures"] = tuple(_absolute(capture, folder) for capture in changes["captures"])
+    recipe = replace(preset, **changes)
+    if recipe.pairs:  # the photographs of [shared.data] are for simulated data sets only
+        recipe = replace(recipe, photos="", test_photos="")
+    return recipe
 
 
-def _place(text: str, folder: Path) -> str:
+def _absolute(text: str, folder: Path) -> str:
+    """Absolute form of a recipe's path, so that it does not depend on the current folder; empty stays empty."""
     expanded = os.path.expandvars(text)
     if expanded.startswith("$"):
         name = expanded[1:].partition("/")[0]
         raise ParameterError(f"The environment variable `{name}` of `{text}` is not set: `export {name}=/the/folder`.")
-    return str((folder / expanded).resolve()) if text else ""  # the same from whatever folder it is read
+    return str((folder / expanded).resolve()) if text else ""
 
 
 def _robustness(table: dict[str, Any]) -> Robustness:
@@ -206,51 +201,54 @@ def _robustness(table: dict[str, Any]) -> Robustness:
         if not (isinstance(values, list) and values and all(isinstance(v, int | float) for v in values)):
             raise ParameterError(f"`{axis}` of [robustness] ({json.dumps(values)}) must be a list of numbers.")
         sizes[axis] = tuple(sorted(float(value) for value in {AXES[axis], *values}))
-    rest = {key: value for key, value in table.items() if key not in sizes}
-    for key in rest:
+    others = {key: value for key, value in table.items() if key not in sizes}
+    for key in others:
         if key not in ("data", "count"):
             raise UnknownNameError("key of [robustness]", key, ["data", "count", *AXES])
     ordered = {axis: sizes[axis] for axis in AXES if axis in sizes}
-    return replace(fill(Robustness, "robustness", rest), sizes=ordered)
+    return replace(fill(Robustness, "robustness", others), sizes=ordered)
 
 
-def _check(found: Benchmark) -> None:
-    labels = [method.label for method in found.methods]
-    if not labels or not found.data:
+def _check(benchmark: Benchmark) -> None:
+    labels = [method.label for method in benchmark.methods]
+    if not labels or not benchmark.data:
         raise ParameterError(
             "A benchmark needs methods and data: `[networks]`, `mwdn = {}`; `[data]`, `mwdn-sim = {...}`."
         )
     for label in labels:
         if labels.count(label) > 1:
             raise ParameterError(
-                f"`{label}` stands in [networks] and in [solvers]. Call one otherwise: "
+                f"`{label}` must not be in [networks] and in [solvers]. Use another label for one of them: "
                 f'`{label}-solver = {{ name = "{label}" }}`.'
             )
-    for label in (*found.ablation, *([found.compared] if found.compared else [])):
+    for label in (*benchmark.ablation, *([benchmark.compared] if benchmark.compared else [])):
         if label not in labels:
             raise UnknownNameError("method of this recipe", label, labels)
-    if found.schedule.epochs:
-        raise ParameterError("A benchmark counts in steps, the same for all data sets: `steps` of [schedule].")
-    if not found.rate_factor > 0:
-        raise ParameterError(f"`rate_factor` ({found.rate_factor}) must be positive.")
-    for name, data in found.data.items():
-        _check_data(name, data, found.data)
-    swept = found.robustness.data
-    if swept and (swept not in found.data or found.data[swept].pairs):
-        simulated = [name for name, data in found.data.items() if not data.pairs]
-        raise UnknownNameError("simulated data set of this recipe", swept, simulated)
+    if benchmark.schedule.epochs:
+        raise ParameterError("`epochs` of [schedule] depends on the data set. Use `steps`, the same for all data sets.")
+    if not benchmark.rate_factor > 0:
+        raise ParameterError(f"`rate_factor` ({benchmark.rate_factor}) must be positive.")
+    for name, recipe in benchmark.data.items():
+        _check_dataset(name, recipe, benchmark.data)
+    simulated = [name for name, recipe in benchmark.data.items() if not recipe.pairs]
+    if benchmark.robustness.data not in ("", *simulated):
+        raise UnknownNameError("simulated data set of this recipe", benchmark.robustness.data, simulated)
 
 
-def _check_data(name: str, data: DataSet, known: dict[str, DataSet]) -> None:
-    if not data.psf:
+def _check_dataset(name: str, recipe: DatasetRecipe, names: Iterable[str]) -> None:
+    if not recipe.psf:
         raise ParameterError(f'`{name}` of [data] must name a PSF: `psf = "psf.png"`.')
-    if not data.pairs and not (data.photos and data.test_photos):
+    if not recipe.pairs and not (recipe.photos and recipe.test_photos):
         raise ParameterError(f"`{name}` of [data] must name `photos` and `test_photos`, or recorded `pairs`.")
-    if data.trained_on and data.trained_on not in known:
-        raise UnknownNameError("data set of this recipe", data.trained_on, known)
-    if data.pairs and not (data.trained_on or data.split):
+    if recipe.trained_on and recipe.trained_on not in names:
+        raise UnknownNameError("data set of this recipe", recipe.trained_on, names)
+    if recipe.pairs and not (recipe.trained_on or recipe.split):
         raise ParameterError(
-            f"`{name}` of [data] must say which pairs are for what, `split`, or be `trained_on` another."
+            f"`{name}` of [data] must divide its pairs by `split`, or be `trained_on` another data set."
         )
-    if min(data.bin, data.validation) < 1 or min(data.train, data.test) < 0 or not (data.pairs or data.test):
-        raise ParameterError(f"`bin`, `validation` and `test` of [data.{name}] must be at least 1, `train` at least 0.")
+    smallest = 0 if recipe.pairs else 1
+    if min(recipe.bin, recipe.validation) < 1 or recipe.train < 0 or recipe.test < smallest:
+        raise ParameterError(
+            f"`bin` ({recipe.bin}), `validation` ({recipe.validation}) and `test` ({recipe.test}) of [data.{name}] "
+            f"must be at least 1, `train` ({recipe.train}) at least 0."
+        )

@@ -1,4 +1,4 @@
-"""Everything that a benchmark found, and where."""
+"""Results of a benchmark, and the environment they were computed in."""
 
 import subprocess
 from dataclasses import dataclass
@@ -9,29 +9,29 @@ import torch
 from mwdn.benchmark import training
 from mwdn.benchmark.recipe import Benchmark
 from mwdn.benchmark.robustness import Sweep
-from mwdn.benchmark.scoring import Scored
-from mwdn.benchmark.sets import Opened
+from mwdn.benchmark.scoring import MethodResult
+from mwdn.benchmark.sets import Dataset
 from mwdn.evaluation import Report
 from mwdn.runtime.environment import findings
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
-    """Everything that a benchmark found.
+class Results:
+    """All results of a benchmark.
 
     Args:
-        benchmark: its recipe.
-        opened: data sets by their names.
-        scored: by the data set's name, then the method's label.
+        benchmark: the recipe.
+        datasets: by name.
+        methods: results by the data set's name, then the method's label.
         sweeps: robustness by the method's label.
-        runs: folder of the trainings.
-        device: where it was computed.
-        command: that was given.
+        runs: folder of the training runs.
+        device: that computed the results.
+        command: command line, for the page.
     """
 
     benchmark: Benchmark
-    opened: dict[str, Opened]
-    scored: dict[str, dict[str, Scored]]
+    datasets: dict[str, Dataset]
+    methods: dict[str, dict[str, MethodResult]]
     sweeps: dict[str, Sweep]
     runs: Path
     device: torch.device
@@ -39,26 +39,26 @@ class Found:
 
     def report(self, name: str) -> Report:
         """The comparison on one data set."""
-        part, scored = self.opened[name].data.part(), self.scored[name]
-        missing = next(iter(scored.values())).missing
-        return Report(part.name, part.variant, {label: one.scores for label, one in scored.items()}, missing, [])
+        protocol, results = self.datasets[name].protocol, self.methods[name]
+        missing = next(iter(results.values())).missing
+        scores = {label: result.scores for label, result in results.items()}
+        return Report(protocol.name, protocol.variant, scores, missing, [])
 
     def training_seconds(self, name: str, label: str) -> float | None:
-        """How long a network was trained; ``None`` for a solver."""
-        return training.seconds(self.runs / (self.opened[name].data.trained_on or name) / label)
+        """Training time of a network; ``None`` for a solver."""
+        return training.seconds(self.runs / (self.datasets[name].recipe.trained_on or name) / label)
 
 
 def environment(device: torch.device) -> dict[str, str]:
-    """Exact versions, and the hardware."""
+    """Commit, versions and hardware."""
     return {"commit": _commit(), "computed on": str(device), **findings()}
 
 
 def _commit() -> str:
-    """Of the checkout that mwdn runs from, with a mark if it has been changed since."""
-    here = Path(__file__).parent
-    call = ["git", "-C", str(here), "describe", "--always", "--dirty", "--abbrev=40"]
+    """Commit of the checkout that mwdn runs from, marked as dirty if files have changed since."""
+    call = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40"]
     try:
-        done = subprocess.run(call, capture_output=True, text=True, check=True, timeout=20)
+        process = subprocess.run(call, capture_output=True, text=True, check=True, timeout=20)
     except (OSError, subprocess.SubprocessError):
         return "not a checkout"
-    return done.stdout.strip()
+    return process.stdout.strip()

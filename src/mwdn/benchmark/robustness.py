@@ -1,4 +1,4 @@
-"""What becomes of methods where the camera differs more from its calibration than in training."""
+"""Robustness: PSNR of each method as the camera drifts further from its calibration than in training."""
 
 import json
 from collections.abc import Callable
@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from mwdn.benchmark.recipe import AXES, Robustness
-from mwdn.benchmark.scoring import read_kept
-from mwdn.benchmark.sets import Opened, simulated
+from mwdn.benchmark.scoring import read_record
+from mwdn.benchmark.sets import Dataset, simulated_pairs
 from mwdn.data.photographs import Photographs
 from mwdn.evaluation import measure
 from mwdn.inference.reconstructor import Reconstructor
@@ -20,75 +20,76 @@ from mwdn.optics import Sensor
 from mwdn.training.experiment import FILE_START
 
 Sweep = dict[str, dict[float, list[float]]]
-"""PSNR of each picture by the size, by the axis."""
+"""PSNR of each picture, by axis and then by size of the mismatch."""
 
 
 def noisier(sensor: Sensor, factor: float) -> Sensor:
-    """A sensor with ``factor`` times the noise of this one at every brightness.
+    """A sensor with ``factor`` times the noise at every brightness.
 
-    The variance of shot noise is signal / full well, and the deviation of read noise is in electrons.
+    The variance of shot noise is signal / full well; read noise is a standard deviation in electrons.
     """
     return replace(sensor, full_well=sensor.full_well / factor**2, read_noise=sensor.read_noise / factor)
 
 
-def pairs_at(opened: Opened, photographs: Photographs, count: int, axis: str, size: float) -> tuple[Tensor, Tensor]:
-    """Test pairs through the data set's camera with more of one mismatch; photographs and places are the same.
+def pairs_at(dataset: Dataset, photographs: Photographs, count: int, axis: str, size: float) -> tuple[Tensor, Tensor]:
+    """Test pairs through the data set's camera with more of one mismatch; the scenes are the same for all sizes.
 
     Args:
-        opened: a simulated data set.
-        photographs: those of the test.
-        count: of pairs.
-        axis: of `AXES`.
-        size: of the mismatch, beyond what the camera had in training; of the noise, as a multiple.
+        dataset: a simulated data set.
+        photographs: of the test.
+        count: number of pairs.
+        axis: one of `AXES`.
+        size: of the mismatch, added to what the camera had in training; for noise a factor.
 
     Returns:
         measurements and scenes, (count, 3, H, W).
     """
-    data = opened.data
+    recipe = dataset.recipe
     if axis == "noise":
-        data = replace(data, sensor=noisier(data.sensor, size))
+        recipe = replace(recipe, sensor=noisier(recipe.sensor, size))
     else:
-        data = replace(data, deviation=data.deviation.plus(axis, size))
-    source = simulated(data, opened.calibration, photographs, torch.device("cpu"))
-    parts = [source.batch([FILE_START + number]) for number in range(count)]
-    return torch.cat([part.measurement for part in parts]), torch.cat([part.scene for part in parts])
+        recipe = replace(recipe, deviation=recipe.deviation.plus(axis, size))
+    source = simulated_pairs(recipe, dataset.calibration, photographs, torch.device("cpu"))
+    batches = [source.batch([FILE_START + number]) for number in range(count)]
+    return torch.cat([batch.measurement for batch in batches]), torch.cat([batch.scene for batch in batches])
 
 
 def sweep(
-    bind: Callable[[], Reconstructor],
+    make_reconstructor: Callable[[], Reconstructor],
     identity: dict[str, Any],
-    opened: Opened,
-    wanted: Robustness,
+    dataset: Dataset,
+    robustness: Robustness,
     path: Path,
     pairs: Callable[[str, float], tuple[Tensor, Tensor]],
 ) -> Sweep:
-    """PSNR of a method at every size of every axis, each kept as soon as it is known.
+    """Measure the PSNR of a method at every size of every axis; each one is saved at once.
 
     Args:
-        bind: the method.
-        identity: what its numbers depend on.
-        opened: a simulated data set.
-        wanted: the sizes.
-        path: for the numbers.
-        pairs: of an axis and a size, see `pairs_at`.
+        make_reconstructor: called only if a value is missing.
+        identity: everything the values depend on, see `mwdn.benchmark.scoring.identity`.
+        dataset: a simulated data set.
+        robustness: the axes and sizes.
+        path: file of the values.
+        pairs: test pairs of an axis and a size, see `pairs_at`.
     """
-    asked = {**identity, "count": wanted.count}
-    known = (read_kept(path, asked) or {"psnr": {}})["psnr"]
-    bound: Reconstructor | None = None
-    for axis, sizes in wanted.sizes.items():
+    identity = {**identity, "count": robustness.count}
+    psnr = (read_record(path, identity) or {"psnr": {}})["psnr"]
+    reconstruct: Reconstructor | None = None
+    for axis, sizes in robustness.sizes.items():
         for size in sizes:
-            place, key = _place(axis, size)
-            if key in known.get(place, {}):
+            axis_key, size_key = _keys(axis, size)
+            if size_key in psnr.get(axis_key, {}):
                 continue
-            bound = bound or bind()
+            reconstruct = reconstruct or make_reconstructor()
             measurements, scenes = pairs(axis, size)
-            found = torch.cat([bound(one[None]) for one in measurements])
-            known.setdefault(place, {})[key] = measure(found, scenes, opened.data.part())["psnr"].tolist()
-            save_text(path, json.dumps({"identity": asked, "psnr": known}, indent=1))
-    places = {axis: {size: _place(axis, size) for size in sizes} for axis, sizes in wanted.sizes.items()}
-    return {axis: {size: known[at][key] for size, (at, key) in found.items()} for axis, found in places.items()}
+            reconstructions = torch.cat([reconstruct(measurement[None]) for measurement in measurements])
+            values = measure(reconstructions, scenes, dataset.protocol)["psnr"].tolist()
+            psnr.setdefault(axis_key, {})[size_key] = values
+            save_text(path, json.dumps({"identity": identity, "psnr": psnr}, indent=1))
+    keys = {axis: {size: _keys(axis, size) for size in sizes} for axis, sizes in robustness.sizes.items()}
+    return {axis: {size: psnr[a][s] for size, (a, s) in by_size.items()} for axis, by_size in keys.items()}
 
 
-def _place(axis: str, size: float) -> tuple[str, str]:
-    """Where a size is kept: at its beginning every axis is the camera of the training."""
+def _keys(axis: str, size: float) -> tuple[str, str]:
+    """Keys in the file: the camera of the training is the start of every axis and is measured once."""
     return ("none", "0") if size == AXES[axis] else (axis, repr(size))

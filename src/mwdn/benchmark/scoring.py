@@ -1,4 +1,4 @@
-"""One method of a benchmark on one data set: its numbers and its first pictures, kept as they are found."""
+"""Scores of one method on one data set, saved with its first reconstructions."""
 
 import json
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mwdn import solvers
 from mwdn.benchmark.recipe import Method
-from mwdn.benchmark.sets import Opened, file_hash
+from mwdn.benchmark.sets import Dataset, file_hash
 from mwdn.data.captures import find_captures, read_captures
 from mwdn.evaluation import First, Perceptual, Scores, evaluate
 from mwdn.inference.reconstructor import Reconstructor
@@ -20,22 +20,22 @@ from mwdn.io.files import atomic_write, save_text
 from mwdn.version import __version__
 
 TIMED = 3
-"""Pictures for the time on the CPU, where the scores come from a GPU."""
+"""Pictures to time on the CPU when the scores come from a GPU."""
 
 CAPTURES = 6
-"""Real captures that are shown, at most."""
+"""Maximum number of real captures on the page."""
 
 
 @dataclass(frozen=True, eq=False)
-class Scored:
-    """What was found.
+class MethodResult:
+    """Scores and reconstructions of a method on a data set.
 
     Args:
-        scores: under the protocol of the data set.
-        cpu: time and memory on the CPU, where the scores come from a GPU.
+        scores: under the data set's protocol.
+        cpu: time and memory on the CPU if the scores come from a GPU.
         missing: metrics that could not be measured, and why.
         pictures: (N, C, H, W), reconstructions of the first test pictures.
-        captures: (N, C, H, W), reconstructions of the real captures, if there are any.
+        captures: (N, C, H, W), reconstructions of the real captures.
     """
 
     scores: Scores
@@ -45,105 +45,112 @@ class Scored:
     captures: Tensor
 
 
-def bind(method: Method, checkpoint: Path | None, opened: Opened, device: torch.device | str) -> Reconstructor:
-    """A method that knows the calibration of a data set.
+def make_reconstructor(
+    method: Method, checkpoint: Path | None, dataset: Dataset, device: torch.device | str
+) -> Reconstructor:
+    """A method for the camera of a data set.
 
     Args:
-        method: which.
-        checkpoint: of a network.
-        opened: the data set.
+        method: solver or network.
+        checkpoint: weights of a network; ``None`` for a solver.
+        dataset: whose calibration is used.
         device: where to compute.
     """
     if checkpoint is not None:
-        return Reconstructor(checkpoint, opened.calibration, device=device)
-    return Reconstructor(solvers.build(method.name, **method.options), opened.calibration, device=device)
+        return Reconstructor(checkpoint, dataset.calibration, device=device)
+    return Reconstructor(solvers.build(method.name, **method.options), dataset.calibration, device=device)
 
 
-def identity(method: Method, checkpoint: Path | None, opened: Opened) -> dict[str, Any]:
-    """What scores depend on: they are kept as long as it is the same."""
-    weights = file_hash(checkpoint) if checkpoint is not None else None
-    part = opened.data.part()
-    scored = {"pairs": len(opened.test), "data": opened.identity, "protocol": part.name, "variant": part.variant}
-    kept = {"method": [method.name, method.options], "weights": weights, "version": __version__, **scored}
-    return json.loads(json.dumps(kept))
+def identity(method: Method, checkpoint: Path | None, dataset: Dataset) -> dict[str, Any]:
+    """Everything the scores depend on: saved scores with another identity are measured again."""
+    content = {
+        "method": [method.name, method.options],
+        "weights": file_hash(checkpoint) if checkpoint is not None else None,
+        "version": __version__,
+        "pairs": len(dataset.test),
+        "data": dataset.identity,
+        "protocol": dataset.protocol.name,
+        "variant": dataset.protocol.variant,
+    }
+    return json.loads(json.dumps(content))
 
 
 def score(
     method: Method,
     checkpoint: Path | None,
-    opened: Opened,
+    dataset: Dataset,
     folder: Path,
     *,
     device: torch.device,
     perceptual: Callable[[], Perceptual],
     shown: int,
-) -> Scored:
-    """Score a method, unless its scores are there.
+) -> MethodResult:
+    """Score a method, or read its saved scores.
 
     Args:
-        method: which.
-        checkpoint: of a network.
-        opened: the data set.
+        method: solver or network.
+        checkpoint: weights of a network; ``None`` for a solver.
+        dataset: its test pairs are reconstructed.
         folder: for the scores of this data set.
         device: where to compute.
-        perceptual: loads the networks of the metrics, when they are needed.
-        shown: how many reconstructions to keep.
+        perceptual: loads the networks of the metrics; called only if there are no saved scores.
+        shown: how many reconstructions to save.
 
     Raises:
         MwdnError: the method cannot be used, or does not fit the pairs.
     """
     path = folder / f"{method.label}.json"
-    wanted = {**identity(method, checkpoint, opened), "device": device.type, "shown": shown, **_captured(opened)}
-    kept = read_kept(path, wanted)
-    if kept is None:
-        kept = _measure(bind(method, checkpoint, opened, device), opened, path, perceptual(), shown)
-        save_text(path, json.dumps({"identity": wanted, **kept}, indent=1))  # last: what it says is there, is
-    cpu = Scores.read(kept["cpu"]) if kept["cpu"] else None
-    pictures = {name: torch.from_numpy(np.load(_pictures(path, name))) for name in ("pictures", "captures")}
-    return Scored(Scores.read(kept["scores"]), cpu, kept["missing"], **pictures)
+    captures = list(dataset.recipe.captures)
+    record_identity = {
+        **identity(method, checkpoint, dataset),
+        "device": device.type,
+        "shown": shown,
+        "captures": captures,
+    }
+    record = read_record(path, record_identity)
+    if record is None:
+        reconstruct = make_reconstructor(method, checkpoint, dataset, device)
+        record = _measure(reconstruct, dataset, path, perceptual(), shown)
+        save_text(path, json.dumps({"identity": record_identity, **record}, indent=1))  # after the pictures
+    cpu = Scores.read(record["cpu"]) if record["cpu"] else None
+    pictures = {name: torch.from_numpy(np.load(_pictures_file(path, name))) for name in ("pictures", "captures")}
+    return MethodResult(Scores.read(record["scores"]), cpu, record["missing"], **pictures)
 
 
-def read_kept(path: Path, wanted: dict[str, Any]) -> dict[str, Any] | None:
-    """A file's content, if it is of this identity."""
+def read_record(path: Path, identity: dict[str, Any]) -> dict[str, Any] | None:
+    """Content of a file of saved results; ``None`` if it is missing or has another identity."""
     if not path.is_file():
         return None
     content = json.loads(path.read_text(encoding="utf-8"))
-    return content if content["identity"] == wanted else None
+    return content if content["identity"] == identity else None
 
 
-def _measure(bound: Reconstructor, opened: Opened, path: Path, perceptual: Perceptual, shown: int) -> dict[str, Any]:
-    methods = {"it": bound}
-    report = evaluate(methods, opened.test, opened.data.part(), perceptual=perceptual, shown=shown)
+def _measure(
+    reconstruct: Reconstructor, dataset: Dataset, path: Path, perceptual: Perceptual, shown: int
+) -> dict[str, Any]:
+    """Reconstruct the test pairs and the captures; write the pictures, return the scores."""
+    report = evaluate({"method": reconstruct}, dataset.test, dataset.protocol, perceptual=perceptual, shown=shown)
     cpu = None
-    if bound.device.type != "cpu":
-        there = Reconstructor(bound.method, opened.calibration, device="cpu")
-        timed = evaluate({"it": there}, First(opened.test, TIMED), opened.data.part(), perceptual=Perceptual.none())
-        cpu = timed.methods["it"].content()
-    size = opened.calibration.size
-    captures = _captures(opened)
-    found = [bound(one[None]) for one in captures] if captures is not None else [torch.zeros(0, 3, *size)]
-    for name, pictures in (("pictures", [row[2] for row in report.rows]), ("captures", found)):
-        with atomic_write(_pictures(path, name)) as temporary:
-            np.save(temporary, torch.cat(pictures).numpy())
-    return {"scores": report.methods["it"].content(), "cpu": cpu, "missing": report.missing}
+    if reconstruct.device.type != "cpu":
+        on_cpu = Reconstructor(reconstruct.method, dataset.calibration, device="cpu")
+        few = First(dataset.test, TIMED)
+        timing = evaluate({"method": on_cpu}, few, dataset.protocol, perceptual=Perceptual.none())
+        cpu = timing.methods["method"].content()
+    pictures = [row[2] for row in report.rows]
+    captures = [reconstruct(measurement[None]) for measurement in captured_measurements(dataset)]
+    for name, batch in (("pictures", pictures), ("captures", captures)):
+        with atomic_write(_pictures_file(path, name)) as temporary:
+            np.save(temporary, torch.cat(batch or [torch.zeros(0, 3, *dataset.calibration.size)]).numpy())
+    return {"scores": report.methods["method"].content(), "cpu": cpu, "missing": report.missing}
 
 
-def _captured(opened: Opened) -> dict[str, Any]:
-    return {"captures": list(opened.data.captures)}
+def captured_measurements(dataset: Dataset) -> Tensor:
+    """The first `CAPTURES` real captures of a data set, (N, C, H, W); N is 0 if it has none."""
+    files = dataset.recipe.captures
+    if not files:
+        return torch.zeros(0, 3, *dataset.calibration.size)
+    return read_captures(find_captures(files)[:CAPTURES], dataset.calibration)
 
 
-def _captures(opened: Opened) -> Tensor | None:
-    """Real captures of the data set, at most `CAPTURES`."""
-    if not opened.data.captures:
-        return None
-    return read_captures(find_captures(opened.data.captures)[:CAPTURES], opened.calibration)
-
-
-def measurements(opened: Opened) -> Tensor:
-    """The real captures, (N, C, H, W); none where there are none."""
-    captures = _captures(opened)
-    return torch.zeros(0, 3, *opened.calibration.size) if captures is None else captures
-
-
-def _pictures(path: Path, name: str) -> Path:
+def _pictures_file(path: Path, name: str) -> Path:
     return path.with_name(f"{path.stem}-{name}.npy")

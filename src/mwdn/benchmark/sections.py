@@ -1,4 +1,4 @@
-"""What a benchmark found, as the sections of its page."""
+"""The sections of a benchmark's page."""
 
 import json
 import statistics
@@ -8,52 +8,56 @@ from pathlib import Path
 import torch
 from rich.markup import escape
 from rich.table import Table
+from torch import Tensor
 
 from mwdn.benchmark import figures, training
-from mwdn.benchmark.pages import Block, Code, Section
-from mwdn.benchmark.recipe import AXES
-from mwdn.benchmark.results import Found, environment
-from mwdn.benchmark.scoring import Scored, measurements
-from mwdn.benchmark.sets import Opened
+from mwdn.benchmark.pages import Block, Code, Picture, Section
+from mwdn.benchmark.recipe import AXES, Benchmark, Method
+from mwdn.benchmark.results import Results, environment
+from mwdn.benchmark.scoring import MethodResult, captured_measurements
+from mwdn.benchmark.sets import Dataset
 from mwdn.evaluation import Report, bootstrap
 from mwdn.evaluation.metrics import METRICS
 
 
-def sections(found: Found) -> list[Section]:
-    """The page."""
-    parts = [Section("At a glance", _glance(found))]
-    parts += [Section(name, _data_set(found, name)) for name in found.opened]
-    if found.benchmark.ablation:
-        parts.append(Section("Ablation", _ablation(found)))
-    if found.sweeps:
-        parts.append(Section("Robustness", _robustness(found)))
-    return [*parts, Section("How it was made", _made(found))]
+def sections(results: Results) -> list[Section]:
+    """All sections of the page."""
+    page = [Section("At a glance", _glance(results))]
+    page += [Section(name, _dataset(results, name)) for name in results.datasets]
+    if results.benchmark.ablation:
+        page.append(Section("Ablation", _ablation(results)))
+    if results.sweeps:
+        page.append(Section("Robustness", _robustness(results)))
+    return [*page, Section("How it was made", _provenance(results))]
 
 
-def _glance(found: Found) -> list[Block]:
-    benchmark, schedule = found.benchmark, found.benchmark.schedule
+def _glance(results: Results) -> list[Block]:
+    """Mean PSNR of every method on every data set."""
+    benchmark, schedule = results.benchmark, results.benchmark.schedule
     learned = sum(method.learned for method in benchmark.methods)
-    table = _numbers(list(found.opened), "PSNR / dB, mean over the test pictures")
-    reports = {name: found.report(name).methods for name in found.opened}
-    means = {n: {label: s.summary("psnr")[0] for label, s in report.items()} for n, report in reports.items()}
+    table = _method_table(list(results.datasets), "PSNR / dB, mean over the test pictures")
+    means = [
+        {label: scores.summary("psnr")[0] for label, scores in results.report(name).methods.items()}
+        for name in results.datasets
+    ]
     for method in benchmark.methods:
-        cells = [
-            _bold(f"{each[method.label]:.2f}", each[method.label] == max(each.values())) for each in means.values()
-        ]
-        table.add_row(escape(method.label), *cells)
+        label = method.label
+        table.add_row(
+            escape(label), *(_bold(f"{mean[label]:.2f}", mean[label] == max(mean.values())) for mean in means)
+        )
     return [
         f"{learned} networks, each trained for {schedule.steps:,} steps of {schedule.batch} on the same pairs, and "
-        f"{len(benchmark.methods) - learned} methods that need no training, scored alike on {len(found.opened)} data "
-        "sets. Numbers of different data sets must not be compared with each other.",
+        f"{len(benchmark.methods) - learned} methods without training, scored under one protocol on "
+        f"{len(results.datasets)} data sets. Scores on different data sets are not comparable.",
         table,
     ]
 
 
-def _numbers(heads: list[str], title: str) -> Table:
-    """A line for each method, and columns of numbers."""
+def _method_table(columns: list[str], title: str) -> Table:
+    """An empty table with a row per method and columns of numbers."""
     table = Table("method", title=title)
-    for head in heads:
-        table.add_column(head, justify="right")
+    for column in columns:
+        table.add_column(column, justify="right")
     return table
 
 
@@ -61,48 +65,51 @@ def _bold(text: str, best: bool) -> str:
     return f"[bold]{text}[/bold]" if best else text
 
 
-def _data_set(found: Found, name: str) -> list[Block]:
-    opened, report, scored = found.opened[name], found.report(name), found.scored[name]
-    blocks: list[Block] = [_words(opened), report.table(_more(found, name))]
+def _dataset(results: Results, name: str) -> list[Block]:
+    """Scores, pictures and training curves on a data set."""
+    dataset, report, method_results = results.datasets[name], results.report(name), results.methods[name]
+    blocks: list[Block] = [_description(dataset), report.table(_costs(results, name))]
     blocks += [f"{metric} is missing: {reason}" for metric, reason in report.missing.items()]
-    if found.benchmark.compared:
-        blocks += [_differences(found.benchmark.compared, report)]
-    shown = [opened.test[i] for i in range(len(next(iter(scored.values())).pictures))]
-    if shown:
-        blocks.append(_grid(opened, scored, torch.stack([p[1] for p in shown]), torch.stack([p[0] for p in shown])))
-    if opened.data.captures:
-        blocks += ["Real captures, of which nobody knows the scene (each picture scaled to its own brightest pixels):"]
-        lines: list[figures.Line] = [(["measurement", *[""] * (len(seen := measurements(opened)) - 1)], seen)]
-        lines += [([label, *[""] * (len(one.captures) - 1)], one.captures) for label, one in scored.items()]
-        blocks.append(figures.grid(f"{name}-captures.jpg", lines, f"real captures of {name}"))
-    if opened.training is not None:
-        runs = {m.label: found.runs / name / m.label for m in found.benchmark.methods if m.learned}
+    if results.benchmark.compared:
+        blocks.append(_differences(results.benchmark.compared, report))
+    if len(next(iter(method_results.values())).pictures):
+        blocks.append(_grid(dataset, method_results))
+    if dataset.recipe.captures:
+        blocks += [
+            "Real captures, whose scenes are unknown (each picture scaled to its own brightest pixels):",
+            _capture_grid(dataset, method_results),
+        ]
+    if dataset.training is not None:
+        runs = {
+            method.label: results.runs / name / method.label for method in results.benchmark.methods if method.learned
+        }
         if runs:
-            read = {label: training.curve(folder) for label, folder in runs.items()}
-            blocks.append(figures.curves(f"{name}-curves.png", read, f"training on {name}"))
+            curves = {label: training.curve(folder) for label, folder in runs.items()}
+            blocks.append(figures.curves(f"{name}-curves.png", curves, f"training on {name}"))
     return blocks
 
 
-def _words(opened: Opened) -> str:
-    data, (height, width) = opened.data, opened.calibration.size
-    start = f"{height} x {width} pixels, PSF {opened.calibration.psf_hash}. "
-    if data.trained_on:
-        start += f"The networks are those of {data.trained_on}, untouched: no pair of this set was learned from. "
-    if data.pairs:
-        return start + f"{len(opened.test):,} recorded pairs are scored."
-    off = ", ".join(f"{key} {value:g}" for key, value in asdict(data.deviation).items() if value) or "nothing"
-    made = f"{data.train:,} pairs" if data.train else "new pairs at every step"
+def _description(dataset: Dataset) -> str:
+    recipe, (height, width) = dataset.recipe, dataset.calibration.size
+    start = f"{height} x {width} pixels, PSF {dataset.calibration.psf_hash}. "
+    if recipe.trained_on:
+        start += f"The networks are those of {recipe.trained_on}, not trained on any pair of this set. "
+    if recipe.pairs:
+        return start + f"{len(dataset.test):,} recorded pairs are scored."
+    deviation = ", ".join(f"{key} {value:g}" for key, value in asdict(recipe.deviation).items() if value) or "nothing"
+    count = f"{recipe.train:,} pairs" if recipe.train else "new pairs at every step"
     return start + (
-        f"Simulated: {made} for training, {data.validation:,} for validation and {data.test:,} for the test, of "
-        f"photographs that no two of them share. The true camera differs from the calibration that the methods are "
-        f"given by: {off}. Sensor: {data.sensor.full_well:,.0f} electrons, read noise {data.sensor.read_noise:g}."
+        f"Simulated: {count} for training, {recipe.validation:,} for validation and {recipe.test:,} for the test, "
+        f"from three separate sets of photographs. The true camera differs from the calibration that the methods get "
+        f"by: {deviation}. Sensor: {recipe.sensor.full_well:,.0f} electrons, read noise {recipe.sensor.read_noise:g}."
     )
 
 
-def _more(found: Found, name: str) -> dict[str, dict[str, str]]:
-    scored = found.scored[name]
-    columns = {"training": {label: _duration(found.training_seconds(name, label)) for label in scored}}
-    cpu = {label: one.cpu for label, one in scored.items() if one.cpu is not None}
+def _costs(results: Results, name: str) -> dict[str, dict[str, str]]:
+    """Columns with training time, and time and memory on the CPU."""
+    method_results = results.methods[name]
+    columns = {"training": {label: _duration(results.training_seconds(name, label)) for label in method_results}}
+    cpu = {label: result.cpu for label, result in method_results.items() if result.cpu is not None}
     if cpu:
         columns["ms / picture, CPU"] = {label: f"{1000 * scores.median_seconds:.1f}" for label, scores in cpu.items()}
         columns["memory, CPU"] = {
@@ -118,75 +125,86 @@ def _duration(seconds: float | None) -> str:
 
 
 def _differences(label: str, report: Report) -> Table:
+    """Paired differences between one method and every other one."""
     metrics = [metric for metric in METRICS[:3] if metric not in report.missing]
-    heads = [f"{metric} of {label} minus its" for metric in metrics]
+    columns = [f"{metric} of {label} minus its" for metric in metrics]
     title = f"{label} against each, picture by picture: mean difference [95 % confidence]; bold where 0 is outside"
-    table = _numbers(heads, title)
-    own = report.methods[label].values
+    table = _method_table(columns, title)
+    values = report.methods[label].values
     for other, scores in report.methods.items():
         if other == label:
             continue
         cells = []
         for metric in metrics:
-            gaps = [a - b for a, b in zip(own[metric], scores.values[metric], strict=True)]
-            mean, low, high = bootstrap(gaps)
+            differences = [a - b for a, b in zip(values[metric], scores.values[metric], strict=True)]
+            mean, low, high = bootstrap(differences)
             cells.append(f"{_bold(f'{mean:+.3f}', low > 0 or high < 0)} \\[{low:+.3f}, {high:+.3f}]")
         table.add_row(escape(other), *cells)
     return table
 
 
-def _grid(opened: Opened, scored: dict[str, Scored], scenes: torch.Tensor, seen: torch.Tensor) -> Block:
-    part, count = opened.data.part(), len(scenes)
-    blank = [""] * (count - 1)
-    lines: list[figures.Line] = [(["scene", *blank], part.crop(scenes)), (["measurement", *blank], seen)]
-    for label, one in scored.items():
-        values = [f"{value:.1f} dB" for value in one.scores.values["psnr"][:count]]
-        lines.append(([f"{label} {values[0]}", *values[1:]], part.crop(one.pictures)))
-    words = f"{opened.name}: scene, measurement, and every method (each picture scaled to its own brightest pixels)"
-    return figures.grid(f"{opened.name}.jpg", lines, words)
+def _grid(dataset: Dataset, method_results: dict[str, MethodResult]) -> Picture:
+    """The first test pictures: scene, measurement and every method."""
+    protocol, count = dataset.protocol, len(next(iter(method_results.values())).pictures)
+    pairs = [dataset.test[index] for index in range(count)]
+    measurements, scenes = (torch.stack(batch) for batch in zip(*pairs, strict=True))
+    rows = [_row("scene", protocol.crop(scenes)), _row("measurement", measurements)]
+    for label, result in method_results.items():
+        psnr = [f"{value:.1f} dB" for value in result.scores.values["psnr"][:count]]
+        rows.append(([f"{label} {psnr[0]}", *psnr[1:]], protocol.crop(result.pictures)))
+    words = f"{dataset.name}: scene, measurement, and every method (each picture scaled to its own brightest pixels)"
+    return figures.grid(f"{dataset.name}.jpg", rows, words)
 
 
-def _ablation(found: Found) -> list[Block]:
+def _capture_grid(dataset: Dataset, method_results: dict[str, MethodResult]) -> Picture:
+    """The real captures and every method."""
+    rows = [_row("measurement", captured_measurements(dataset))]
+    rows += [_row(label, result.captures) for label, result in method_results.items()]
+    return figures.grid(f"{dataset.name}-captures.jpg", rows, f"real captures of {dataset.name}")
+
+
+def _row(title: str, pictures: Tensor) -> figures.Row:
+    """Pictures of which the first one has a title."""
+    return [title, *[""] * (len(pictures) - 1)], pictures
+
+
+def _ablation(results: Results) -> list[Block]:
     blocks: list[Block] = ["The paper's steps from a single filter to its network, under the same budget:"]
-    for name in found.opened:
-        report = found.report(name)
-        kept = replace(report, methods={label: report.methods[label] for label in found.benchmark.ablation})
-        blocks += [name, kept.table(_more(found, name))]
+    for name in results.datasets:
+        report = results.report(name)
+        selected = replace(report, methods={label: report.methods[label] for label in results.benchmark.ablation})
+        blocks += [name, selected.table(_costs(results, name))]
     return blocks
 
 
-def _robustness(found: Found) -> list[Block]:
-    wanted = found.benchmark.robustness
-    axes = {axis: sizes[-1] for axis, sizes in wanted.sizes.items()}
-    heads = [f"{axis} {size:g}" for axis, size in axes.items()]
-    table = _numbers(["as trained", *heads], "PSNR / dB as trained, and what the largest mismatch changes")
-    for label, sweep in found.sweeps.items():
-        start = statistics.fmean(next(iter(sweep.items()))[1][AXES[next(iter(sweep))]])
-        ends = [statistics.fmean(sweep[axis][size]) - start for axis, size in axes.items()]
-        table.add_row(escape(label), f"{start:.2f}", *(f"{end:+.2f}" for end in ends))
-    pictures = [figures.robustness(label, found.sweeps) for label in found.sweeps]
+def _robustness(results: Results) -> list[Block]:
+    robustness = results.benchmark.robustness
+    largest = {axis: sizes[-1] for axis, sizes in robustness.sizes.items()}
+    columns = ["as trained", *(f"{axis} {size:g}" for axis, size in largest.items())]
+    table = _method_table(columns, "PSNR / dB as trained, and its change at the largest mismatch")
+    for label, sweep in results.sweeps.items():
+        axis, values = next(iter(sweep.items()))
+        as_trained = statistics.fmean(values[AXES[axis]])
+        changes = [statistics.fmean(sweep[axis][size]) - as_trained for axis, size in largest.items()]
+        table.add_row(escape(label), f"{as_trained:.2f}", *(f"{change:+.2f}" for change in changes))
     return [
-        f"{wanted.count} test pictures of {wanted.data}. At the black line the camera is the one that networks were "
-        "trained for, which already differs from its calibration; from there it differs more, in one way at a time, as "
-        "if it had been knocked or warmed since. Methods are given the same calibration all along.",
+        f"{robustness.count} test pictures of {robustness.data}. At the black line the camera is that of the training, "
+        "which already differs from its calibration. Away from it the camera differs more, in one way at a time, as if "
+        "it had been knocked or warmed since. Methods always get the same calibration.",
         table,
-        *pictures,
+        *(figures.robustness(label, results.sweeps) for label in results.sweeps),
     ]
 
 
-def _made(found: Found) -> list[Block]:
-    benchmark = found.benchmark
+def _provenance(results: Results) -> list[Block]:
+    """Settings, versions, hardware, command and recipe."""
+    benchmark = results.benchmark
     table = Table("method", "built with", "optimiser", "rate", "decay", "settings from", title="Methods")
     for method in benchmark.methods:
         options = ", ".join([method.name, *(f"{key} = {value}" for key, value in method.options.items())])
-        own = training.settings(method, benchmark) if method.learned else None
-        schedule = own.schedule if own else None
-        cells = (
-            [schedule.optimiser, f"{schedule.learning_rate:g}", f"{schedule.weight_decay:g}"] if schedule else [""] * 3
-        )
-        table.add_row(*map(escape, [method.label, options, *cells, own.source if own else "no training"]))
+        table.add_row(*map(escape, [method.label, options, *_training_cells(method, benchmark)]))
     facts = Table("what", "value", title="Versions and hardware")
-    for key, value in environment(found.device).items():
+    for key, value in environment(results.device).items():
         facts.add_row(escape(key), escape(value))
     return [
         f"One schedule for all networks: {json.dumps(asdict(benchmark.schedule))}. Loss: {json.dumps(benchmark.loss)}. "
@@ -194,7 +212,15 @@ def _made(found: Found) -> list[Block]:
         table,
         facts,
         "The command:",
-        Code(found.command or "mwdn.benchmark.run()"),
+        Code(results.command or "mwdn.benchmark.run()"),
         "The recipe:",
         Code(Path(benchmark.path).read_text(encoding="utf-8").rstrip() if benchmark.path else ""),
     ]
+
+
+def _training_cells(method: Method, benchmark: Benchmark) -> list[str]:
+    if not method.learned:
+        return ["", "", "", "no training"]
+    settings = training.settings(method, benchmark)
+    schedule = settings.schedule
+    return [schedule.optimiser, f"{schedule.learning_rate:g}", f"{schedule.weight_decay:g}", settings.source]

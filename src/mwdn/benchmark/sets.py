@@ -32,7 +32,7 @@ Track = Callable[[str, list[range]], Iterable[range]]
 
 
 @dataclass(frozen=True)
-class DataSet:
+class DatasetRecipe:
     """Pairs of one camera: simulated from photographs, or recorded.
 
     Args:
@@ -81,8 +81,8 @@ class DataSet:
     captures: tuple[str, ...] = ()
     protocol: str = "full"
 
-    def part(self) -> Protocol:
-        """The protocol at the size of the binned pictures: of "centre-128", binned by 2, "centre-64"."""
+    def binned_protocol(self) -> Protocol:
+        """The protocol at the size of the binned pictures: "centre-128" binned by 2 is "centre-64"."""
         whole = Protocol.parse(self.protocol)
         if whole.centre:
             return Protocol.parse(f"centre-{whole.centre // self.bin}")
@@ -105,12 +105,12 @@ class DataSet:
         )
 
 
-_PAPER = DataSet(protocol="centre-128")
-_DIFFUSERCAM = DataSet(background=0.0, upside_down=True, bgr=True, protocol="60:270,60:440")
-_PHLATCAM = DataSet(background=0.0)
+_PAPER = DatasetRecipe(protocol="centre-128")
+_DIFFUSERCAM = DatasetRecipe(background=0.0, upside_down=True, bgr=True, protocol="60:270,60:440")
+_PHLATCAM = DatasetRecipe(background=0.0)
 _REAL = Deviation(turn_degrees=0.5, background=0.1, off_axis=1.0)
 
-PRESETS: dict[str, DataSet] = {
+PRESETS: dict[str, DatasetRecipe] = {
     # The display took 137 of 320 pixels, 2.5 of the 91.5 beside it off the centre.
     "mwdn-sim": replace(_PAPER, placement=Placement((0.428, 0.428), 1.0, 0.0, 0.027), deviation=_REAL),
     # Scenes of many sizes about the 210 x 380 that its display filled; the noise explains its captures.
@@ -148,32 +148,37 @@ class Part:
 
 
 @dataclass(frozen=True, eq=False)
-class Opened:
-    """A data set that is ready.
+class Dataset:
+    """A data set with its files made and open.
 
     Args:
         name: as in the recipe.
-        data: what the recipe says of it.
-        calibration: of its camera, as the methods know it.
-        test: pairs to be scored on.
-        training: what to learn from, and what to choose weights by; ``None`` where other networks are tested.
-        identity: tells it from another one of the same name.
+        recipe: its table in the recipe.
+        calibration: of its camera, as the methods get it.
+        test: pairs to score on.
+        training: training and validation pairs; ``None`` if the networks of another data set are tested.
+        identity: the settings that its pairs depend on, in values that JSON can hold.
     """
 
     name: str
-    data: DataSet
+    recipe: DatasetRecipe
     calibration: Calibration
     test: Part
     training: tuple[Samples, RecordedPairs] | None
     identity: dict[str, Any]
 
+    @property
+    def protocol(self) -> Protocol:
+        """The part of each picture that is scored."""
+        return self.recipe.binned_protocol()
 
-def open_set(name: str, data: DataSet, folder: Path, device: torch.device, track: Track) -> Opened:
+
+def open_dataset(name: str, recipe: DatasetRecipe, folder: Path, device: torch.device, track: Track) -> Dataset:
     """Make a data set's file of pairs, unless it is there, and open it.
 
     Args:
         name: of the data set.
-        data: what the recipe says.
+        recipe: its table in the recipe.
         folder: for its files.
         device: where to simulate, and where training takes place.
         track: shows progress.
@@ -181,15 +186,15 @@ def open_set(name: str, data: DataSet, folder: Path, device: torch.device, track
     Raises:
         MwdnError: a file cannot be read, or does not fit the camera; or ``folder`` holds other pairs of this name.
     """
-    calibration = data.calibration()
-    data.part().crop(calibration.psf)  # refuses a part that does not fit before anything is trained
-    simulates = not data.pairs
+    calibration = recipe.calibration()
+    recipe.binned_protocol().crop(calibration.psf)  # refuses a part that does not fit before anything is trained
+    simulates = not recipe.pairs
     shown = {"psf", "captures", "protocol"}
-    identity = {key: value for key, value in asdict(data).items() if key not in shown}
+    identity = {key: value for key, value in asdict(recipe).items() if key not in shown}
     identity = json.loads(json.dumps({**identity, "psf_hash": calibration.psf_hash}))
     note = folder / f"{name}.json"
-    own = simulates or data.kind  # else the user's file, of which nothing is made
-    path = folder / f"{name}.h5" if own else Path(data.pairs)
+    own = simulates or recipe.kind  # else the user's file, of which nothing is made
+    path = folder / f"{name}.h5" if own else Path(recipe.pairs)
     made = json.loads(note.read_text(encoding="utf-8")) if own and note.is_file() and path.is_file() else None
     if made not in (None, identity):
         raise ParameterError(
@@ -197,31 +202,31 @@ def open_set(name: str, data: DataSet, folder: Path, device: torch.device, track
         )
     if own and made is None:
         if simulates:
-            _simulate(data, calibration, path, device, lambda rows: track(f"{name}: simulating", rows))
+            _simulate(recipe, calibration, path, device, lambda rows: track(f"{name}: simulating", rows))
         else:
-            size = calibration.size if data.bin > 1 else None
-            import_pairs(data.kind, data.pairs, path, layout=Layout(bin=data.bin, scene_size=size))
+            size = calibration.size if recipe.bin > 1 else None
+            import_pairs(recipe.kind, recipe.pairs, path, layout=Layout(bin=recipe.bin, scene_size=size))
         save_text(note, json.dumps(identity, indent=2))
     file = PairFile(path)
     check_pairs(file, calibration.psf)
-    rows = _rows(data, len(file), simulates)
-    training = None if data.trained_on else _training(data, calibration, file, rows, device)
-    return Opened(name, data, calibration, Part(file, rows["test"]), training, identity)
+    rows = _rows(recipe, len(file), simulates)
+    training = None if recipe.trained_on else _training(recipe, calibration, file, rows, device)
+    return Dataset(name, recipe, calibration, Part(file, rows["test"]), training, identity)
 
 
-def simulated(
-    data: DataSet, calibration: Calibration, photographs: Photographs, device: torch.device
+def simulated_pairs(
+    recipe: DatasetRecipe, calibration: Calibration, photographs: Photographs, device: torch.device
 ) -> SimulatedPairs:
     """The source of a data set's simulated pairs."""
     psf = calibration.psf.to(device)
     return SimulatedPairs(
         photographs.to(device),
         psf,
-        placement=data.placement,
+        placement=recipe.placement,
         mismatch=EXACT,
-        sensor=data.sensor,
-        seed=data.seed,
-        camera=data.deviation.camera(psf),
+        sensor=recipe.sensor,
+        seed=recipe.seed,
+        camera=recipe.deviation.camera(psf),
     )
 
 
@@ -232,45 +237,45 @@ def file_hash(path: Path) -> str:
 
 
 def _simulate(
-    data: DataSet,
+    recipe: DatasetRecipe,
     calibration: Calibration,
     path: Path,
     device: torch.device,
     track: Callable[[list[range]], Iterable[range]],
 ) -> None:
     """Training, validation and test, in this order, from three sets of photographs that share none."""
-    learned, held_out = Photographs(data.photos).split(HELD_OUT)
+    learned, held_out = Photographs(recipe.photos).split(HELD_OUT)
     parts = [
-        (simulated(data, calibration, photographs, device), range(start, start + count))
+        (simulated_pairs(recipe, calibration, photographs, device), range(start, start + count))
         for photographs, start, count in (
-            (learned, 0, data.train),
-            (held_out, START, data.validation),
-            (Photographs(data.test_photos), FILE_START, data.test),
+            (learned, 0, recipe.train),
+            (held_out, START, recipe.validation),
+            (Photographs(recipe.test_photos), FILE_START, recipe.test),
         )
     ]
-    attributes: dict[str, Attribute] = {"psf_hash": calibration.psf_hash, "seed": data.seed}
+    attributes: dict[str, Attribute] = {"psf_hash": calibration.psf_hash, "seed": recipe.seed}
     record(path, parts, calibration.psf, attributes=attributes, track=track)
 
 
-def _rows(data: DataSet, count: int, simulates: bool) -> dict[str, range | list[int]]:
+def _rows(recipe: DatasetRecipe, count: int, simulates: bool) -> dict[str, range | list[int]]:
     if simulates:
-        first, second = data.train, data.train + data.validation
+        first, second = recipe.train, recipe.train + recipe.validation
         return {"train": range(first), "validation": range(first, second), "test": range(second, count)}
-    if not data.split:
-        return {"test": range(min(data.test or count, count))}
-    train, validation = Division(data.split, seed=data.seed).of(count)
-    test = split(count, data.split, seed=data.seed)["test"]
-    return {"train": train, "validation": validation[: data.validation], "test": test[: data.test or len(test)]}
+    if not recipe.split:
+        return {"test": range(min(recipe.test or count, count))}
+    train, validation = Division(recipe.split, seed=recipe.seed).of(count)
+    test = split(count, recipe.split, seed=recipe.seed)["test"]
+    return {"train": train, "validation": validation[: recipe.validation], "test": test[: recipe.test or len(test)]}
 
 
 def _training(
-    data: DataSet,
+    recipe: DatasetRecipe,
     calibration: Calibration,
     file: PairFile,
     rows: dict[str, range | list[int]],
     device: torch.device,
 ) -> tuple[Samples, RecordedPairs]:
-    validation = RecordedPairs(file, rows["validation"], data.seed, False, device)
-    if not data.pairs and not data.train:
-        return simulated(data, calibration, Photographs(data.photos).split(HELD_OUT)[0], device), validation
-    return RecordedPairs(file, rows["train"], data.seed, device=device), validation
+    validation = RecordedPairs(file, rows["validation"], recipe.seed, False, device)
+    if not recipe.pairs and not recipe.train:
+        return simulated_pairs(recipe, calibration, Photographs(recipe.photos).split(HELD_OUT)[0], device), validation
+    return RecordedPairs(file, rows["train"], recipe.seed, device=device), validation
