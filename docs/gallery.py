@@ -44,8 +44,8 @@ PAGE = """# Masks
 
 Made by `python docs/gallery.py`: every mask on the same sensor (1280 x 1280 pixels of 2.4 um, binned by 4) in white
 light, the same scene captured through `Camera` and `Sensor` (15,000 electrons, brightest pixel at 90 %), and
-reconstructed without any training. The scene fills the same part of each sensor: masks nearer to the sensor see a wider
-field, so it is larger for them.
+reconstructed without any training. The scene fills the same fraction of each sensor: masks nearer to the sensor have a
+wider field, so the scene is larger for them.
 
 ![mask, PSF, spectrum, measurement, Wiener and ADMM for each mask](masks.jpg)
 
@@ -53,22 +53,28 @@ field, so it is larger for them.
 | --- | --- | --- | --- | --- | --- | --- |
 {rows}
 
-*Light*: part of what falls onto the aperture that arrives on the sensor. *Exposure*: time until the brightest pixel is
-at 90 %, contour mask = 1. *Resolution*: width of the PSF's autocorrelation as an angle. *Wiener*, *ADMM*: PSNR in dB,
-with the exact PSF; real cameras add what is not exact. One scene and one noise: differences below a dB say nothing.
+- *Light*: fraction of the light on the aperture that reaches the sensor.
+- *Exposure*: time until the brightest pixel is at 90 %, contour mask = 1.
+- *Resolution*: width of the PSF's autocorrelation as an angle.
+- *Wiener*, *ADMM*: PSNR in dB with the exact PSF; real cameras add calibration errors. One scene and one noise sample:
+  differences below a dB are not significant.
 
-What the spectrum does not pass, no method finds again without knowing pictures. A PSF of few bright places (pinholes)
-gives the best picture where the light does not matter, and needs the longest exposure.
+Frequencies that the spectrum does not pass can be recovered only with prior knowledge of pictures. A PSF of few bright
+spots (pinholes) gives the best picture where light is plentiful, and needs the longest exposure.
 
-[optics.md](optics.md) tells how to design one. The contour mask's PSF, and its curves beside those of the measured one:
+[optics.md](optics.md) explains how to design a mask.
+
+## Designed and measured PSF of the paper's camera
+
+The contour mask's PSF, and its curves beside those of the measured one:
 
 ![designed PSF, and its curves beside the measured ones](paper-camera.jpg)
 
-The ring of the lines' even distance (a period of 11 to 12 pixels) and the fall towards high frequencies, that is the
-width of the lines, agree. What the design lacks is the even haze that fills the aperture's shadow in the measured PSF:
-about half of its light. With that part left unbent (chosen such that the spectra's median agrees) the modulus is 0.6 to
-1.15 times the measured one from 0.05 periods a pixel on, lowest below the ring, and the autocorrelation at most 0.07
-away. Errors of etching and reflections are likely sources of the haze.
+The ring from the even line spacing (a period of 11 to 12 pixels) and the fall towards high frequencies (the line width)
+agree. The design lacks the even haze that fills the aperture's shadow in the measured PSF: about half of its light. With
+that fraction left undeflected (chosen so that the medians of the spectra agree) the modulus is 0.6 to 1.15 times the
+measured one from 0.05 periods a pixel on, lowest below the ring, and the autocorrelation differs by at most 0.07. Etching
+errors and reflections are likely sources of the haze.
 """
 
 
