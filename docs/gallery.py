@@ -71,10 +71,10 @@ The contour mask's PSF, and its curves beside those of the measured one:
 ![designed PSF, and its curves beside the measured ones](paper-camera.jpg)
 
 The ring from the even line spacing (a period of 11 to 12 pixels) and the fall towards high frequencies (the line width)
-agree. The design lacks the even haze that fills the aperture's shadow in the measured PSF: about half of its light. With
-that fraction left undeflected (chosen so that the medians of the spectra agree) the modulus is 0.6 to 1.15 times the
-measured one from 0.05 periods a pixel on, lowest below the ring, and the autocorrelation differs by at most 0.07. Etching
-errors and reflections are likely sources of the haze.
+agree. The design lacks the even haze that fills the aperture's shadow in the measured PSF: about half of its light.
+With that fraction left undeflected (chosen so that the medians of the spectra agree) the modulus is 0.6 to 1.15 times
+the measured one from 0.05 periods a pixel on, lowest below the ring, and the autocorrelation differs by at most 0.07.
+Etching errors and reflections are likely sources of the haze.
 """
 
 
