@@ -1,8 +1,8 @@
-"""Put a trained network's weights into the package, as float16.
+"""Convert a trained network's weights to float16, to bundle them with the package.
 
 python recipes/bundle.py runs/universal/best.safetensors src/mwdn/weights/universal.safetensors [DENOISER]
 
-DENOISER: the checkpoint of another denoiser, which takes the place of the network's own.
+DENOISER: checkpoint of a denoiser that replaces the network's own.
 """
 
 import sys
