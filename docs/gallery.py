@@ -22,7 +22,9 @@ from mwdn.io.contact_sheets import contact_sheet, to_display
 from mwdn.io.files import atomic
 from mwdn.io.images import srgb_encode
 from mwdn.optics import CodedAperture, Contour, Diffuser, Lenslets, Mask, Pinholes, Setup, ZoneAperture, mask_psf
-from mwdn.optics.design import Designed, design_camera, radial_autocorrelation, radial_spectrum, sharpness
+from mwdn.optics.design import Designed, design_camera
+from mwdn.optics.psf_measures import radial_autocorrelation, sharpness
+from mwdn.optics.psf_spectrum import radial_spectrum
 from mwdn.types import Psf, Scene
 
 DOCS = Path(__file__).resolve().parent

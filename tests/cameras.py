@@ -24,3 +24,11 @@ def contour_psf(size, *, line=1.2, cell=24, generator=None):
     aperture = ((1 - y.abs()) / 0.25).clamp(0, 1) * ((1 - x.abs()) / 0.25).clamp(0, 1)
     psf = contour_lines(field, line) * aperture
     return psf / psf.sum()
+
+
+def gaussian_psf(size, sigma, centre=None):
+    """A Gaussian of unit sum (1, 1, *size), at ``centre`` = (row, column) or in the middle."""
+    row, column = centre or (size[0] // 2, size[1] // 2)
+    y, x = torch.arange(size[0])[:, None] - row, torch.arange(size[1]) - column
+    psf = torch.exp(-0.5 * (y.square() + x.square()) / sigma**2)
+    return (psf / psf.sum())[None, None]

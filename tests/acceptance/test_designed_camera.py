@@ -9,7 +9,9 @@ import pytest
 from mwdn import Calibration, write_picture
 from mwdn.io.contact_sheets import contact_sheet
 from mwdn.optics import Contour, Setup
-from mwdn.optics.design import design_camera, radial_autocorrelation, radial_spectrum
+from mwdn.optics.design import design_camera
+from mwdn.optics.psf_measures import radial_autocorrelation
+from mwdn.optics.psf_spectrum import radial_spectrum
 
 pytestmark = pytest.mark.acceptance
 OUT = Path("results/acceptance")

@@ -15,7 +15,7 @@ from mwdn.calibration.verdict import headline, verdict
 from mwdn.errors import ImageError
 from mwdn.io.files import write_json
 from mwdn.io.images import read_frame
-from mwdn.optics import psf_measures, sample_camera
+from mwdn.optics import psf_measures, psf_spectrum, sample_camera
 from mwdn.optics.random_psf import Variety
 
 SIZE = 96, 80
@@ -188,11 +188,11 @@ def test_distance_and_angle(psf):
 
 def test_numbers_are_those_of_the_measures(psf):
     report = inspect_psf(Calibration(psf))
-    assert report.noise_gain[1e-3] == max(psf_measures.noise_gain(psf, 1e-3))
+    assert report.noise_gain[1e-3] == max(psf_spectrum.noise_gain(psf, 1e-3))
     gains, kept = list(report.noise_gain.values()), list(report.detail_kept.values())
     assert gains == sorted(gains, reverse=True)
     assert kept == sorted(kept, reverse=True)
-    worst = min(psf_measures.resolved_frequency(psf[:, [c]], 0.003) for c in range(3))
+    worst = min(psf_spectrum.resolved_frequency(psf[:, [c]], 0.003) for c in range(3))
     assert report.resolution_px[0.003] == 0.5 / worst
 
 

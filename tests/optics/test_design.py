@@ -1,18 +1,16 @@
-"""`mwdn design` as a user types it; what a PSF's curves say."""
+"""`mwdn design` as a user types it."""
 
 import json
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
-from cameras import contour_psf
 from mwdn import Calibration, read_frame
 from mwdn.cli.app import main
 from mwdn.optics import Contour, Diffuser, Setup, mask_psf
-from mwdn.optics.design import decades, design_camera, radial_autocorrelation, radial_spectrum, sharpness
+from mwdn.optics.design import design_camera
 from mwdn.optics.mask_files import read_mask
 
 RECIPES = Path(__file__).resolve().parents[2] / "recipes"
@@ -76,7 +74,7 @@ def test_only_another_design_is_replaced(run, tmp_path, monkeypatch, taken, abou
         (tmp_path / "cam" / "camera.json").write_text(about)
     code, _, err = run("diffuser", "--size-mm", "0.5", "0.5", *SMALL, "--stl")
     assert code == 2
-    assert f"`cam/{taken}` would be replaced, and no camera.json says that it is a design's" in err
+    assert f"`cam/{taken}` would be replaced" in err
     assert (tmp_path / "cam" / taken).read_text() == "measured"
 
 
@@ -139,37 +137,6 @@ def test_wrong_call_is_one_message_and_exit_2(run, line, said):
     assert code == 2
     assert said in " ".join(err.split())
     assert "Traceback" not in out + err
-
-
-# --- Curves ---------------------------------------------------------------------------------------------
-
-
-def test_sharpness_of_a_known_spot():
-    """The autocorrelation of a Gaussian of width s is one of sqrt(2) s; less the mean, and in rings, 4 % narrower."""
-    y, x = torch.arange(81.0)[:, None] - 40, torch.arange(91.0) - 45
-    spot = torch.exp(-(y**2 + x**2) / (2 * 3.0**2))[None, None]
-    assert sharpness(spot / spot.sum()) == pytest.approx(2.355 * 2**0.5 * 3.0, rel=0.05)
-
-
-def test_radial_spectrum_of_a_known_spot():
-    y, x = torch.arange(80.0)[:, None] - 40, torch.arange(80.0) - 40
-    spot = torch.exp(-(y**2 + x**2) / (2 * 1.5**2))[None, None]
-    found = radial_spectrum(spot / spot.sum(), bins=40)
-    expected = torch.exp(-2 * (torch.pi * 1.5 * torch.arange(40) / 80) ** 2)
-    torch.testing.assert_close(found[:20], expected[:20].double(), rtol=0.05, atol=1e-3)
-
-
-def test_radial_autocorrelation_sees_the_lines(generator):
-    assert radial_autocorrelation(contour_psf((90, 100), cell=20, generator=generator))[0] == 1.0
-
-
-@pytest.mark.parametrize("size", [(9, 12), (8, 9), (10, 10)])
-def test_spectrum_picture_is_the_shifted_modulus(size, generator):
-    psf = torch.rand(1, 1, *size, generator=generator)
-    modulus = abs(np.fft.fft2(psf[0, 0].double().numpy()))
-    rolled = np.roll(modulus / modulus.max(), (size[0] // 2, (size[1] - 1) // 2), (0, 1))
-    expected = (1 + np.log10(rolled.clip(1e-3)) / 3) ** 2.2
-    np.testing.assert_allclose(decades(psf)[0, 0].numpy(), expected, atol=1e-4)
 
 
 def test_designed_camera_keeps_its_light():

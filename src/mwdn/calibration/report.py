@@ -7,7 +7,7 @@ import torch
 
 from mwdn.calibration.frames import estimate_background, full_scale
 from mwdn.calibration.psf import Calibration, saturated
-from mwdn.optics import psf_measures
+from mwdn.optics import psf_measures, psf_spectrum
 from mwdn.optics.noise import noise_level
 from mwdn.types import Frame, Psf, Size
 
@@ -110,12 +110,12 @@ def inspect_psf(
         calibration: that holds it.
         frame: the file's numbers, as `mwdn.read_frame` gives them; without them nothing is said about levels.
         depth: the PSFs of points at other distances than the calibration's, by the distance.
-        angle: likewise, by the angle. `mwdn.optics.psf_measures.sensitivity` does the same for a function.
+        angle: likewise, by the angle.
     """
     psf = calibration.psf.float().cpu()
     colours = [psf[:, [c]] for c in range(psf.shape[1])]
     pairs = [(a, b) for i, a in enumerate(colours) for b in colours[:i]]
-    peak, weak = psf_measures.autocorrelation(psf), psf_measures.zeros(psf)
+    peak, weak = psf_measures.autocorrelation(psf), psf_spectrum.spectral_zeros(psf)
     levels = _levels(calibration, frame) if frame is not None else None
     return PsfReport(
         psf_hash=calibration.psf_hash,
@@ -128,8 +128,8 @@ def inspect_psf(
         dark_rings=weak[1],
         effective_rank=psf_measures.effective_rank(psf),
         colour_likeness=min((psf_measures.likeness(a, b) for a, b in pairs), default=1.0),
-        noise_gain={value: max(psf_measures.noise_gain(psf, value)) for value in LAMBDAS},
-        detail_kept={value: min(psf_measures.detail_kept(psf, value)) for value in LAMBDAS},
+        noise_gain={value: max(psf_spectrum.noise_gain(psf, value)) for value in LAMBDAS},
+        detail_kept={value: min(psf_spectrum.detail_kept(psf, value)) for value in LAMBDAS},
         resolution_px={noise: _resolution(colours, noise) for noise in NOISES},
         known_frequency=_known(psf, levels.noise_floor if levels else 0.0),
         depth=_likenesses(psf, depth),
@@ -143,13 +143,13 @@ def _likenesses(psf: Psf, others: dict[float, Psf] | None) -> dict[float, float]
 
 def _resolution(colours: list[Psf], noise: float) -> float:
     """Half the shortest visible period, of the colour that sees least."""
-    frequency = min(psf_measures.resolved_frequency(colour, noise) for colour in colours)
+    frequency = min(psf_spectrum.resolved_frequency(colour, noise) for colour in colours)
     return 0.5 / frequency if frequency > 0 else float("inf")
 
 
 def _known(psf: Psf, floor: float) -> float:
     """Lowest frequency from which on the PSF's power is not even twice that of its noise."""
-    ring = psf_measures.rings(psf)
+    ring = psf_spectrum.radial_power(psf)
     lost = (ring.power < 2 * floor).flip(0).long().cumprod(0).flip(0).nonzero()
     return float(ring.frequency[lost[0, 0]]) if len(lost) else 0.5
 
@@ -178,7 +178,7 @@ def _levels(calibration: Calibration, frame: Frame) -> Levels:
         background=tuple(background.flatten().tolist()),
         subtracted=calibration.background,
         pedestal=float(share.max()),
-        between=psf_measures.between_lines(upright.mean((0, 1))[psf_measures.lit_box(calibration.psf)]),
+        between=psf_measures.level_between_lines(upright.mean((0, 1))[psf_measures.support_box(calibration.psf)]),
         noise=float(noise.max()),
         noise_floor=float((pixels * (noise / light).square()).max()),
     )

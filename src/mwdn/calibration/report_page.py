@@ -10,7 +10,7 @@ from mwdn.calibration.report import PsfReport
 from mwdn.calibration.verdict import headline, verdict
 from mwdn.io.files import atomic_write
 from mwdn.io.images import srgb_encode
-from mwdn.optics import psf_measures
+from mwdn.optics import psf_measures, psf_spectrum
 from mwdn.types import Psf
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def _draw_profile(axes: "Axes", psf: Psf) -> None:
 
 def _draw_spectrum(axes: "Axes", psf: Psf, report: PsfReport) -> None:
     for channel, colour in zip(range(psf.shape[1]), ("C3", "C2", "C0") if psf.shape[1] == 3 else ("k",), strict=True):
-        frequency, power = psf_measures.rings(psf[:, [channel]])
+        frequency, power = psf_spectrum.radial_power(psf[:, [channel]])
         axes.plot(frequency[1:], 10 * power[1:].clamp(min=1e-12).log10(), colour, lw=1)
     for ring in report.dark_rings:
         axes.axvline(ring, color=_COLOURS["mind"], lw=0.7)
@@ -106,7 +106,7 @@ def _draw_gain(axes: "Axes", report: PsfReport) -> None:
 def _draw_resolution(axes: "Axes", psf: Psf, report: PsfReport) -> None:
     noises = np.logspace(-4, -1.5, 16)
     frequency = [
-        min(psf_measures.resolved_frequency(psf[:, [c]], float(noise)) for c in range(psf.shape[1])) for noise in noises
+        min(psf_spectrum.resolved_frequency(psf[:, [c]], float(noise)) for c in range(psf.shape[1])) for noise in noises
     ]
     pairs = [(100 * noise, 0.5 / f) for noise, f in zip(noises, frequency, strict=True) if f > 0]
     if pairs:

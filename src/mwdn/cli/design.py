@@ -52,12 +52,16 @@ class Output:
 
     def write(self, name: str, mask: MaskDesign, setup: Setup) -> None:
         """Design, write, and say what came out."""
-        from mwdn.optics.design import check_replaced, design_camera, write_fabrication
+        from mwdn.optics.design import check_replaced, design_camera
+        from mwdn.optics.mask_files import write_gds, write_stl
 
         check_replaced(self.out, gds=self.gds, stl=self.stl)
         designed = design_camera(name, mask, setup)
         designed.write(self.out, sensitive=self.sensitivity)
-        write_fabrication(designed, self.out, gds=self.gds, stl=self.stl, stl_every=self.stl_every)
+        if self.gds:
+            write_gds(self.out / "mask.gds", designed.mask)
+        if self.stl:
+            write_stl(self.out / "mask.stl", designed.mask, every=self.stl_every)
         made = designed.report()["made"]
         light = ", ".join(f"{part:.1%}" for part in made["light_on_sensor"])
         field = " x ".join(f"{angle:.0f}" for angle in made["field_degrees"])

@@ -162,7 +162,7 @@ def _check_slope(mask: Mask, setup: Setup, wavelength_nm: float, angle_degrees: 
         )
 
 
-def numbers(mask: Mask, psf: Psf) -> dict[str, Any]:
+def describe_mask(mask: Mask, psf: Psf) -> dict[str, Any]:
     """What a report says of a mask and its PSF, as plain values."""
     found: dict[str, Any] = {
         "kind": mask.kind,

@@ -1,6 +1,8 @@
-"""What every PSF has: a hash that identifies it."""
+"""Identify and normalise PSFs."""
 
 import hashlib
+
+from torch import Tensor
 
 from mwdn.types import Psf
 
@@ -10,3 +12,8 @@ def psf_hash(psf: Psf) -> str:
     digest = hashlib.sha256(repr(tuple(psf.shape)).encode())
     digest.update(psf.float().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()[:16]
+
+
+def unit_sum(psf: Tensor) -> Tensor:
+    """Divide each channel (..., h, w) by its sum: the camera then keeps the energy of the scene."""
+    return psf / psf.sum((-2, -1), keepdim=True)
