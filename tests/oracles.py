@@ -77,7 +77,7 @@ def admm(b, h, grid, *, mu, tau, iterations, variation):
     height, width = b.shape[-2:]
     b, h = b / np.linalg.norm(b), h / np.linalg.norm(h)
     fourier, inverse = np.fft.fft2, lambda z: np.fft.ifft2(z).real
-    H = np.stack([transfer(each, grid) for each in h])
+    H = np.stack([transfer(psf, grid) for psf in h])
     sensor = np.zeros(grid)
     sensor[:height, :width] = 1
     data = np.zeros((b.shape[0], *grid))
@@ -94,9 +94,9 @@ def admm(b, h, grid, *, mu, tau, iterations, variation):
     difference = lambda z: np.stack([inverse(d * fourier(z)) for d in D])  # noqa: E731
     for _ in range(iterations):
         g = difference(v) + eta / mu2
-        # g is (2 differences, C, H, W): a vector of one number, of two, or of all colours' differences.
-        together = {"anisotropic": (), "isotropic": 0, "colour": (0, 1)}[variation]
-        length = np.sqrt((g**2).sum(together, keepdims=True)) if together != () else abs(g)
+        # g is (2 differences, C, H, W); the length is of one difference, of both, or of those of all colours.
+        axes = {"anisotropic": (), "isotropic": 0, "colour": (0, 1)}[variation]
+        length = np.sqrt((g**2).sum(axes, keepdims=True)) if axes != () else abs(g)
         u = g * np.maximum(length - tau / mu2, 0) / np.where(length > 0, length, 1)
         x = (xi + mu1 * inverse(H * fourier(v)) + data) / (sensor + mu1)
         w = np.maximum(rho / mu3 + v, 0)
@@ -107,6 +107,19 @@ def admm(b, h, grid, *, mu, tau, iterations, variation):
         eta = eta + mu2 * (difference(v) - u)
         rho = rho + mu3 * (v - w)
     return v
+
+
+def objective(v, b, h, *, tau, variation):
+    """``1/2 |crop(h * v) - b|^2 + tau |Psi v|_1`` of a scene (C, rows, columns) on a periodic grid."""
+    height, width = b.shape[-2:]
+    seen = [np.fft.ifft2(np.fft.fft2(scene) * transfer(psf, scene.shape)).real for scene, psf in zip(v, h, strict=True)]
+    down, along = np.roll(v, -1, -2) - v, np.roll(v, -1, -1) - v
+    length = {
+        "anisotropic": abs(down) + abs(along),
+        "isotropic": np.hypot(down, along),
+        "colour": np.sqrt((down**2 + along**2).sum(0)),
+    }[variation]
+    return 0.5 * ((np.stack(seen)[:, :height, :width] - b) ** 2).sum() + tau * length.sum()
 
 
 def matrix(psf, sensor):

@@ -80,7 +80,7 @@ class LeAdmm(nn.Module):
             mu = Penalties(data, gradient, sign)
             state = state if last is None else rescale(state, last, mu)
             state = update_copies(state, problem, mu, threshold * gradient, self.variation)
-            state = update_scene(state, problem, mu, make_filters(problem, mu))
+            state = update_scene(state, problem, make_filters(problem, mu))
             last = mu
             scenes.append(state.v[..., :height, :width])
         return scenes

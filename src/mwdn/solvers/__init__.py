@@ -1,10 +1,19 @@
-"""Classical reconstruction, no training needed. Each is called as ``solver(measurement, psf)``."""
+"""Classical reconstruction without training. Each method is called as ``solver(measurement, psf)``.
+
+- `Wiener`: one linear filter, its lambda chosen from the noise. The fastest.
+- `Admm`: total variation and non-negativity, 100 iterations.
+- `Fista`: non-negativity alone, 200 gradient steps. The cross-check of ADMM.
+- `Pyramid`: ADMM from coarse to fine. Better than `Admm`, in a fraction of its time.
+
+`WarmStart` continues `Admm` or `Fista` from frame to frame of a stream; `align` corrects the PSF of a camera that has
+changed since its calibration.
+"""
 
 from typing import Any
 
 from mwdn.errors import UnknownNameError, check_options
 from mwdn.optics.noise import noise_level
-from mwdn.solvers.admm import Admm, Progress
+from mwdn.solvers.admm import Admm
 from mwdn.solvers.alignment import Pose, align
 from mwdn.solvers.fista import Fista
 from mwdn.solvers.pyramid import Pyramid
@@ -15,7 +24,7 @@ from mwdn.solvers.wiener import Wiener
 Solver = Admm | Fista | Pyramid | Wiener
 
 SOLVERS: dict[str, type[Solver]] = {"admm": Admm, "fista": Fista, "pyramid": Pyramid, "wiener": Wiener}
-"""Every solver by the name that the command line uses."""
+"""Every solver by its name on the command line."""
 
 
 def build(name: str, **options: Any) -> Solver:  # noqa: ANN401
@@ -41,7 +50,6 @@ __all__ = [
     "Fista",
     "Penalties",
     "Pose",
-    "Progress",
     "Pyramid",
     "Solver",
     "WarmStart",

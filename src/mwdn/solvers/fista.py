@@ -1,6 +1,5 @@
 """FISTA with non-negativity: accelerated projected gradient, the cross-check of ADMM."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -12,17 +11,17 @@ from mwdn.fourier.transforms import inverse_spectrum, spectrum
 from mwdn.solvers.splitting import Problem
 from mwdn.types import Measurement, Psf, Scene
 
-INERTIA = 50.0
-"""Momentum with which the next frame of a stream begins, at most: that of about 100 iterations. With it a slowly moving
-scene is followed best; one that grows without end would draw the old scene along for ever longer."""
+MAX_MOMENTUM = 50.0
+"""Largest momentum at the start of a stream's next frame: that of about 100 iterations. It follows a slowly moving
+scene best; with unlimited momentum the old scene would persist for longer and longer."""
 
 
-class Reached(NamedTuple):
-    """Where the iterations for one measurement ended, and those for the next one may begin."""
+class Iterate(NamedTuple):
+    """The last iterate for one measurement, from which the iterations for the next one can start."""
 
     problem: Problem
     v: Tensor
-    ahead: Tensor
+    extrapolated: Tensor
     momentum: float
 
 
@@ -31,11 +30,14 @@ class Fista:
     """Minimise ``1/2 |crop(h * v) - b|^2`` over scenes ``v >= 0`` by accelerated projected gradient steps.
 
     Called with a measurement (B, C, H, W) and a PSF, it returns the part (B, C, H, W) of the scene that faces the
-    sensor. There is no prior but the sign: the number of iterations is what regularises. Few give a smooth
-    picture, many a sharp and noisy one.
+    sensor. There is no prior but the sign: the number of iterations is the regularisation. Few give a smooth image,
+    many a sharp and noisy one.
 
     Args:
         iterations: how many gradient steps.
+
+    Raises:
+        ParameterError: ``iterations`` is below 1.
 
     References:
         A. Beck and M. Teboulle, SIAM J. Imaging Sciences 2, 183 (2009).
@@ -47,47 +49,37 @@ class Fista:
         if self.iterations < 1:
             raise ParameterError(f"`iterations` ({self.iterations}) must be at least 1.")
 
-    @torch.no_grad()
-    def __call__(
-        self, measurement: Measurement, psf: Psf, *, callback: Callable[[int, Tensor], None] | None = None
-    ) -> Scene:
-        """Reconstruct a batch; ``callback`` is told each iteration's number and objectives (B,)."""
-        return self.follow(measurement, psf, callback=callback)[0]
+    def __call__(self, measurement: Measurement, psf: Psf) -> Scene:
+        """Reconstruct a batch."""
+        return self.solve(measurement, psf)[0]
 
     @torch.no_grad()
-    def follow(
-        self,
-        measurement: Measurement,
-        psf: Psf,
-        last: Reached | None = None,
-        *,
-        callback: Callable[[int, Tensor], None] | None = None,
-    ) -> tuple[Scene, Reached]:
-        """Reconstruct a batch from where the iterations for the ``last`` one ended: of this shape, by this PSF.
+    def solve(self, measurement: Measurement, psf: Psf, start: Iterate | None = None) -> tuple[Scene, Iterate]:
+        """Reconstruct a batch, and return the last iterate as the ``start`` for the next one.
 
-        Scene and momentum go on, so a scene that stands still is that of all iterations so far, noise and all, until
-        the momentum reaches `INERTIA`.
+        Args:
+            measurement: (B, C, H, W).
+            psf: (1 or B, 1 or C, h, w), centred.
+            start: of a measurement of this shape, through this PSF. Scene and momentum continue, so a constant
+                measurement gives the result of all iterations so far, noise included, until the momentum reaches
+                `MAX_MOMENTUM`.
         """
-        problem = (
-            Problem.from_psf(measurement, psf)
-            if last is None
-            else last.problem._replace(measurement=measurement.float())
-        )
+        if start is None:
+            problem = Problem.from_psf(measurement, psf)
+            v = extrapolated = problem.measurement.new_zeros((*measurement.shape[:2], *problem.grid))
+            momentum = 1.0
+        else:
+            problem = start.problem._replace(measurement=measurement.float())
+            v, extrapolated, momentum = start.v, start.extrapolated, min(start.momentum, MAX_MOMENTUM)
         b, H = problem.measurement, problem.transfer
-        # The gradient's Lipschitz constant is at most max |H|^2, a step of 1/L can never overshoot.
+        # The gradient's Lipschitz constant L is at most max |H|^2; a step of 1/L cannot overshoot.
         step = 1 / H.abs().square().amax((-2, -1), keepdim=True)
-        zero = b.new_zeros((*b.shape[:2], *problem.grid))
-        _, v, ahead, momentum = last or Reached(problem, zero, zero, 1.0)
-        momentum = momentum if last is None else min(momentum, INERTIA)
-        for iteration in range(1, self.iterations + 1):
-            residual = inverse_spectrum(H * spectrum(ahead, problem.grid), problem.grid, problem.sensor) - b
+        for _ in range(self.iterations):
+            residual = inverse_spectrum(H * spectrum(extrapolated, problem.grid), problem.grid, problem.sensor) - b
             slope = inverse_spectrum(H.conj() * spectrum(residual, problem.grid), problem.grid, problem.grid)
-            new = (ahead - step * slope).clamp(min=0)
-            following = (1 + (1 + 4 * momentum**2) ** 0.5) / 2
-            ahead = new + (momentum - 1) / following * (new - v)
-            v, momentum = new, following
-            if callback:
-                Hv = inverse_spectrum(H * spectrum(v, problem.grid), problem.grid, problem.sensor)
-                callback(iteration, 0.5 * (Hv - b).square().sum((1, 2, 3)))
+            new_v = (extrapolated - step * slope).clamp(min=0)
+            new_momentum = (1 + (1 + 4 * momentum**2) ** 0.5) / 2
+            extrapolated = new_v + (momentum - 1) / new_momentum * (new_v - v)
+            v, momentum = new_v, new_momentum
         height, width = problem.sensor
-        return v[..., :height, :width], Reached(problem, v, ahead, momentum)
+        return v[..., :height, :width], Iterate(problem, v, extrapolated, momentum)

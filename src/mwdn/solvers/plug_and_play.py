@@ -9,7 +9,7 @@ from torch.nn import functional as F
 
 from mwdn.fourier.transforms import inverse_spectrum, spectrum
 from mwdn.solvers.pyramid import QUIET, Estimate, brightness, smoothing_scale
-from mwdn.solvers.splitting import Problem, opposed
+from mwdn.solvers.splitting import Problem, reflected
 
 Denoiser = Callable[[Tensor, Tensor], Tensor]
 """A picture (B, C, H, W), whose brightest pixel is about 1, and its noise level (B, 1, 1, 1); the clean picture."""
@@ -64,7 +64,7 @@ def plug_and_play(found: Estimate, denoise: Denoiser, rounds: int) -> Estimate:
     for step in range(rounds):
         level = poor * first * (last / first) ** (step / max(1, rounds - 1))
         trust = TRUST * (noise / (level * brightest)).square()
-        pull = opposed(Hv, pull).add_(problem.measurement).mul_(certain / (1 + certain)).add_(Hv)
+        pull = reflected(Hv, pull).add_(problem.measurement).mul_(certain / (1 + certain)).add_(Hv)
         V = V.mul_(power).add_(spectrum(pull - Hv, grid).mul_(adjoint))
         V = V.add_(spectrum(known, grid).mul_(trust)).mul_(1 / (power + trust))
         Hv = inverse_spectrum(problem.transfer * V, grid, problem.sensor)

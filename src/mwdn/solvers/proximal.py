@@ -1,4 +1,4 @@
-"""Gradient of a picture, its adjoint, and total variation."""
+"""Gradient of an image, its adjoint, and the proximal map of total variation."""
 
 from typing import Literal
 
@@ -9,12 +9,16 @@ Gradient = tuple[Tensor, Tensor]
 """Differences down the rows and along the columns."""
 
 Variation = Literal["anisotropic", "isotropic", "colour"]
-"""What total variation adds up at each pixel.
+"""Total variation: the sum over all pixels of
 
-- ``anisotropic``: the sizes of both differences.
+- ``anisotropic``: the absolute values of both differences.
 - ``isotropic``: the length of the gradient; edges of all directions cost the same.
-- ``colour``: the length of the gradients of all colours together, so that colours prefer to change at the same
-  places and coloured noise costs more than grey detail.
+- ``colour``: the length of the gradients of all colours together. Edges at the same place in all colours cost less, so
+  coloured noise is removed before grey detail.
+
+References:
+    L. I. Rudin, S. Osher, E. Fatemi, Physica D 60, 259 (1992); for colours P. Blomgren and T. F. Chan, IEEE Trans.
+    Image Process. 7, 304 (1998), here without their root over the colours' totals.
 """
 
 
@@ -24,38 +28,28 @@ def gradient(v: Tensor) -> Gradient:
 
 
 def divergence(u: Gradient) -> Tensor:
-    """Adjoint of `gradient` (the negative of what physics calls divergence)."""
+    """Adjoint of `gradient` (the negative of the divergence of physics)."""
     return u[0].roll(1, -2).sub_(u[0]).add_(u[1].roll(1, -1)).sub_(u[1])
 
 
-def _squared_length(u: Gradient, variation: Variation) -> Tensor:
-    if variation == "colour":
-        return u[0].square().sum(dim=1, keepdim=True) + u[1].square().sum(dim=1, keepdim=True)
-    return u[0].square() + u[1].square()
-
-
-def total_variation(u: Gradient, variation: Variation) -> Tensor:
-    """Total variation of each sample, (B,), from its gradient.
-
-    References:
-        L. I. Rudin, S. Osher, E. Fatemi, Physica D 60, 259 (1992); for colours P. Blomgren and T. F. Chan, IEEE
-        Trans. Image Process. 7, 304 (1998), here without their root over the colours' totals.
-    """
-    if variation == "anisotropic":
-        return (u[0].abs() + u[1].abs()).sum((1, 2, 3))
-    return _squared_length(u, variation).sqrt().sum((1, 2, 3))
-
-
 def dual_projection(u: Gradient, bound: float | Tensor, variation: Variation) -> Gradient:
-    """What the proximal map of ``bound * total_variation`` takes away: each size or length, at most ``bound`` of it.
+    """Project a gradient onto the dual ball of total variation: each value or length is cut to ``bound``.
 
-    A root is taken of the larger of length and bound only, so that a zero gradient, which every first iteration has,
-    does not give an infinite derivative.
+    By Moreau's identity ``u - dual_projection(u)`` is the proximal map of ``bound`` times the total variation.
+
+    The root is taken of the larger of length and bound: at a zero gradient, as in every first iteration, the root of
+    the length has an infinite derivative.
     """
-    # A number is filled in on a GPU, and would else be copied there, for which all before it has to end.
+    # Filled on the device: copying a Python number to a GPU waits for all queued work.
     t = bound if isinstance(bound, Tensor) else torch.full_like(u[0][:1, :1, :1, :1], bound)
     if variation == "anisotropic":
         return u[0].clamp(-t, t), u[1].clamp(-t, t)
+    square = u[0].square() + u[1].square() if variation == "isotropic" else _colour_square(u)
     smallest = t.square().clamp(min=torch.finfo(t.dtype).tiny)
-    part = t / torch.maximum(_squared_length(u, variation), smallest).sqrt_()
-    return u[0] * part, u[1] * part
+    factor = t / torch.maximum(square, smallest).sqrt_()
+    return u[0] * factor, u[1] * factor
+
+
+def _colour_square(u: Gradient) -> Tensor:
+    """Squared length of the gradients of all colours together."""
+    return u[0].square().sum(dim=1, keepdim=True) + u[1].square().sum(dim=1, keepdim=True)

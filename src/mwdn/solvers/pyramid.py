@@ -291,5 +291,5 @@ def _solve(measurement: Tensor, band: Band, coarser: Tensor, smoothing_scale: Te
     state = initial_state(problem, known.expand(*measurement.shape[:2], *band.grid), smooth=smooth)
     for _ in range(level.iterations):
         state = update_copies(state, problem, mu, tau, "colour")
-        state = update_scene(state, problem, mu, filters)
+        state = update_scene(state, problem, filters)
     return state.v / band.norm

@@ -1,4 +1,19 @@
-"""One iteration of ADMM, and what it needs: the scene is split into copies that each obey one constraint."""
+"""One iteration of ADMM for ``1/2 |C H v - b|^2 + tau |Psi v|_1`` over ``v >= 0``.
+
+H convolves the scene v with the PSF, C crops to the sensor, Psi is the gradient. Each term gets a copy, x = H v,
+u = Psi v, w = v, with penalties mu and scaled multipliers xi, eta, rho (multiplier over penalty):
+
+1. ``x = argmin 1/2 |C x - b|^2 + mu1/2 |x - H v - xi|^2``: on the sensor ``(mu1 (H v + xi) + b) / (mu1 + 1)``
+2. ``u = prox of (tau / mu2) |.|_1 at Psi v + eta``
+3. ``w = max(v + rho, 0)``
+4. ``v = D (mu1 H^T p1 + mu2 Psi^T p2 + mu3 p3)`` with ``D = 1 / (mu1 |H|^2 + mu2 |Psi|^2 + mu3)`` in the Fourier domain
+5. ``xi += H v - x``, ``eta += Psi v - u``, ``rho += v - w``
+
+The code keeps neither copies nor multipliers but the targets of (4), ``p1 = x - xi``, ``p2 = u - eta``,
+``p3 = w - rho``. With (5) the multiplier is ``v - p`` for the last target p (H v and Psi v in place of v for p1 and
+p2), so the argument of the proximal map in (1) to (3) is ``z = v + (v - p) = 2 v - p`` and the next target is
+``prox(z) - (v - p) = v - (z - prox(z))``: the value less what the map takes away.
+"""
 
 import math
 from typing import NamedTuple
@@ -8,16 +23,15 @@ from torch import Tensor
 
 from mwdn.fourier.convolution import check_fit
 from mwdn.fourier.transforms import fast_length, inverse_spectrum, spectrum, transfer_function
-from mwdn.solvers.proximal import Gradient, Variation, divergence, dual_projection, gradient, total_variation
+from mwdn.solvers.proximal import Gradient, Variation, divergence, dual_projection, gradient
 from mwdn.types import Measurement, Psf, Size, Spectrum
 
 
 class Penalties(NamedTuple):
-    """Weights mu of the three constraints; numbers, or tensors that broadcast against (B, C, H, W).
+    """Weights mu1, mu2, mu3 of the three constraints; numbers, or tensors that broadcast against (B, C, H, W).
 
-    The usual ones of the literature, `TEXTBOOK`, have ratios much like these, but are so small that 100 iterations
-    never feel tau: stopping early is then what regularises. With these the iterations converge, and tau means
-    something.
+    The usual ones of the literature, `TEXTBOOK`, have similar ratios, but are so small that tau has no effect within
+    100 iterations: stopping early is then the regularisation. With these the iterations converge.
     """
 
     data: float | Tensor = 0.005
@@ -30,7 +44,7 @@ TEXTBOOK = Penalties(1e-6, 1e-5, 4e-5)
 
 
 class Problem(NamedTuple):
-    """What stays fixed during the iterations. The grid holds every scene point that reaches the sensor."""
+    """The constants of the iteration: b, H, |Psi|^2. The grid holds every scene point that reaches the sensor."""
 
     measurement: Measurement
     transfer: Spectrum
@@ -50,7 +64,7 @@ class Problem(NamedTuple):
 
     @classmethod
     def from_transfer(cls, measurement: Tensor, transfer: Tensor) -> "Problem":
-        """The same from the PSF's transfer function, (B, C, height, width // 2 + 1) on a grid of even width."""
+        """Problem of a PSF's transfer function, (B, C, height, width // 2 + 1) on a grid of even width."""
         height, width = transfer.shape[-2], 2 * (transfer.shape[-1] - 1)
         # |Psi|^2 of periodic forward differences is 4 sin^2 along each axis.
         rows = torch.arange(height, device=transfer.device)[:, None] * (math.pi / height)
@@ -64,103 +78,115 @@ class Problem(NamedTuple):
         return self.measurement.shape[-2], self.measurement.shape[-1]
 
 
-class Filters(NamedTuple):
-    """What `update_scene` multiplies each part of the new spectrum with: the same as long as the penalties are.
-
-    The gradient's pull counts ``steep`` times as much as the sign's.
-    """
-
-    prior: Tensor
-    before: Tensor
-    correlate: Spectrum
-    steep: float | Tensor
-
-
 class State(NamedTuple):
-    """The scene v, what the sensor sees of it, and what pulls at the scene: each copy minus its multiplier.
+    """The scene v, its spectrum, H v on the sensor, and the targets p1, p2, p3 of equation (4).
 
-    A multiplier is how far the scene stays away from its pull, over its penalty: xi = H v - at_sensor, eta = Psi v -
-    slope, rho = v - sign. A problem without total variation has no slope: it is empty.
+    A problem without total variation has an empty gradient target.
     """
 
     v: Tensor
     V: Spectrum
     Hv: Measurement
-    at_sensor: Measurement
-    slope: Gradient | tuple[()]
-    sign: Tensor
-
-
-def make_filters(problem: Problem, mu: Penalties, *, smooth: bool = True) -> Filters:
-    """Filters for these penalties; ``smooth`` for total variation."""
-    power = mu.data * problem.transfer.abs().square()
-    stiffness = mu.gradient * problem.laplacian + mu.sign if smooth else mu.sign
-    all_in_all = 1 / (power + stiffness)
-    correlate = problem.transfer.conj() * (mu.data * all_in_all)
-    return Filters(mu.sign * all_in_all, power * all_in_all, correlate, mu.gradient / mu.sign)
+    data_target: Measurement
+    gradient_target: Gradient | tuple[()]
+    sign_target: Tensor
 
 
 def initial_state(problem: Problem, scene: Tensor | None = None, *, smooth: bool = True) -> State:
-    """Zero multipliers, and a zero scene unless one of the grid's size is given; ``smooth`` for total variation."""
+    """State with zero multipliers.
+
+    Args:
+        problem: to solve.
+        scene: (B, C, *grid); zeros by default.
+        smooth: whether the problem has total variation.
+    """
     b = problem.measurement
     v = b.new_zeros((*b.shape[:2], *problem.grid)) if scene is None else scene
     V = spectrum(v, problem.grid)
     Hv = inverse_spectrum(problem.transfer * V, problem.grid, problem.sensor)
-    return State(v, V, Hv, at_sensor=Hv, slope=gradient(v) if smooth else (), sign=v)
+    return State(v, V, Hv, data_target=Hv, gradient_target=gradient(v) if smooth else (), sign_target=v)
 
 
 def update_copies(state: State, problem: Problem, mu: Penalties, tau: float | Tensor, variation: Variation) -> State:
-    """Update the copies u = Psi v, x = H v and w = v: shrink the gradient, fit the sensor, clip the sign.
+    """Equations (1) to (3) and (5): shrink the gradient, fit the measurement, clip the sign.
 
-    A copy is the proximal map of value plus multiplier, and the new pull, copy minus multiplier, is the value less what
-    that map takes away: each of them takes the negative of its argument, `opposed`, and adds. Outside the sensor
-    nothing is measured and the textbook's x obeys ``mu1 x - xi = mu1 H v``, so x and xi are kept on the sensor alone.
+    Each target is value - (z - prox(z)) with z = 2 value - target. What a map takes away is odd in z for (1) and (2),
+    and min(z, 0) = -relu(-z) for (3), so all three start from -z, `reflected`. Off the sensor nothing is measured,
+    (1) gives x = H v + xi, and p1 is H v: it is kept on the sensor alone.
     """
-    slope = state.slope
-    if slope:
+    gradient_target = state.gradient_target
+    if gradient_target:
         gy, gx = gradient(state.v)
-        by, bx = dual_projection((opposed(gy, slope[0]), opposed(gx, slope[1])), tau / mu.gradient, variation)
-        slope = gy.add_(by), gx.add_(bx)
-        del by, bx  # the memory of a large picture
-    at_sensor = opposed(state.Hv, state.at_sensor).add_(problem.measurement).div_(1 + mu.data).add_(state.Hv)
-    sign = state.v + opposed(state.v, state.sign).relu_()
-    return state._replace(at_sensor=at_sensor, slope=slope, sign=sign)
+        by, bx = dual_projection(
+            (reflected(gy, gradient_target[0]), reflected(gx, gradient_target[1])), tau / mu.gradient, variation
+        )
+        gradient_target = gy.add_(by), gx.add_(bx)
+        del by, bx  # frees a large image's memory
+    # z - prox(z) = (z - b) / (1 + mu1)
+    data_target = reflected(state.Hv, state.data_target).add_(problem.measurement).div_(1 + mu.data).add_(state.Hv)
+    sign_target = state.v + reflected(state.v, state.sign_target).relu_()
+    return state._replace(data_target=data_target, gradient_target=gradient_target, sign_target=sign_target)
 
 
-def opposed(value: Tensor, pull: Tensor) -> Tensor:
-    """``pull - 2 value``: the negative of value plus multiplier."""
-    return torch.sub(pull, value, alpha=2)
+def reflected(value: Tensor, target: Tensor) -> Tensor:
+    """``-z = target - 2 value``: the negative argument of a proximal map, value plus multiplier."""
+    return torch.sub(target, value, alpha=2)
 
 
-def update_scene(state: State, problem: Problem, mu: Penalties, filters: Filters) -> State:
-    """Update the scene, on which all pulls must agree, in the Fourier domain; ``filters`` of the same penalties."""
-    prior = state.sign
-    if state.slope:
-        prior = divergence(state.slope).mul_(filters.steep).add_(prior)
-    V = spectrum(prior, problem.grid).mul_(filters.prior).addcmul_(filters.before, state.V)
+class Filters(NamedTuple):
+    """Factors of equation (4), constant as long as the penalties are.
+
+    Off the sensor p1 is H v, so ``H^T p1 = H^T H v + H^T C^T (p1 - C H v)`` and the new spectrum is
+
+    ``V = prior F(p3 + gradient_weight Psi^T p2) + previous V + data F(C^T (p1 - C H v))``.
+
+    Args:
+        prior: mu3 D.
+        previous: mu1 |H|^2 D.
+        data: mu1 conj(H) D.
+        gradient_weight: mu2 / mu3.
+    """
+
+    prior: Tensor
+    previous: Tensor
+    data: Spectrum
+    gradient_weight: float | Tensor
+
+
+def make_filters(problem: Problem, mu: Penalties, *, smooth: bool = True) -> Filters:
+    """Filters for these penalties; ``smooth`` if the problem has total variation."""
+    power = mu.data * problem.transfer.abs().square()
+    D = 1 / (power + (mu.gradient * problem.laplacian + mu.sign if smooth else mu.sign))
+    data = problem.transfer.conj() * (mu.data * D)
+    return Filters(mu.sign * D, power * D, data, mu.gradient / mu.sign)
+
+
+def update_scene(state: State, problem: Problem, filters: Filters) -> State:
+    """Equation (4) in the Fourier domain, as in `Filters`."""
+    prior = state.sign_target
+    if state.gradient_target:
+        prior = divergence(state.gradient_target).mul_(filters.gradient_weight).add_(prior)
+    V = spectrum(prior, problem.grid).mul_(filters.prior).addcmul_(filters.previous, state.V)
     del prior
-    added = spectrum(state.at_sensor - state.Hv, problem.grid)  # by the sensor to H v
-    V.add_(added.mul_(filters.correlate))
-    del added
+    correction = spectrum(state.data_target - state.Hv, problem.grid)
+    V.add_(correction.mul_(filters.data))
+    del correction
     Hv = inverse_spectrum(problem.transfer * V, problem.grid, problem.sensor)
     return state._replace(v=inverse_spectrum(V, problem.grid, problem.grid), V=V, Hv=Hv)
 
 
 def rescale(state: State, old: Penalties, new: Penalties) -> State:
-    """Keep the multipliers what they are when the penalties change."""
-    data, steep, sign = (1 - before / after for before, after in zip(old, new, strict=True))
-    slope = state.slope
-    if slope:
+    """Targets for new penalties with the same multipliers.
+
+    The unscaled multiplier ``mu (v - p)`` stays, so the new target is ``p + (v - p) (1 - old / new)``.
+    """
+    data, slope, sign = (1 - before / after for before, after in zip(old, new, strict=True))
+    target = state.gradient_target
+    if target:
         gy, gx = gradient(state.v)
-        slope = slope[0] + (gy - slope[0]) * steep, slope[1] + (gx - slope[1]) * steep
+        target = target[0] + (gy - target[0]) * slope, target[1] + (gx - target[1]) * slope
     return state._replace(
-        at_sensor=state.at_sensor + (state.Hv - state.at_sensor) * data,
-        slope=slope,
-        sign=state.sign + (state.v - state.sign) * sign,
+        data_target=state.data_target + (state.Hv - state.data_target) * data,
+        gradient_target=target,
+        sign_target=state.sign_target + (state.v - state.sign_target) * sign,
     )
-
-
-def objective(state: State, problem: Problem, tau: float, variation: Variation) -> Tensor:
-    """Value of the minimised function at the scene v, one number a sample."""
-    misfit = (state.Hv - problem.measurement).square().sum((1, 2, 3))
-    return 0.5 * misfit + tau * total_variation(gradient(state.v), variation)
