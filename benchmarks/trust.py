@@ -14,7 +14,7 @@ from pathlib import Path
 
 import torch
 
-from mwdn import Calibration, Reconstructor, read_frame
+from mwdn import Calibration, Reconstructor
 from mwdn.evaluation.consistency import consistency
 from mwdn.io.files import atomic
 from mwdn.optics import sample_camera
@@ -71,7 +71,7 @@ def main():
     for calibration, captures in sets:
         variants = wrong(calibration.psf)
         for capture in captures[: arguments.count]:
-            measurement = calibration.correct(read_frame(capture, bgr=calibration.bgr))
+            measurement = calibration.correct(calibration.frames.read(capture))
             for name, psf in variants.items():
                 scene = Reconstructor(arguments.method, replace(calibration, psf=psf))(measurement)
                 found = consistency(measurement, psf, scene)

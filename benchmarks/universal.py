@@ -38,7 +38,7 @@ PSFS = {
         "diffusercam/psf_recovered_270x480.npy",
         {"background": 0.0, "upside_down": True, "bgr": True},
     ),
-    "DiffuserCam tutorial 300x400": ("diffusercam-tutorial/psf_sample.tif", {"binning": 4}),
+    "DiffuserCam tutorial 300x400": ("diffusercam-tutorial/psf_sample.tif", {"bin": 4}),
     "PhlatCam 384x640": ("phlatcam/psf_384x640.npy", {"background": 0.0}),
 }
 TUNED = {name: f"runs/finetune-{path.partition('/')[0]}/best.safetensors" for name, (path, _) in PSFS.items()}

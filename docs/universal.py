@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import torch
 
-from mwdn import Calibration, Reconstructor, read_frame, to_display
+from mwdn import Calibration, Reconstructor, to_display
 from mwdn.io.contact_sheets import contact_sheet
 from mwdn.io.images import srgb_encode
 
@@ -21,7 +21,7 @@ def rows(calibration: Calibration, captures: list[Path], *, middle: int = 0) -> 
     methods = [Reconstructor(method, calibration) for method in ("admm", "universal")]
     found = []
     for capture in captures:
-        measurement = calibration.correct(read_frame(capture, bgr=calibration.bgr))
+        measurement = calibration.correct(calibration.frames.read(capture))
         pictures = [to_display(method(measurement)) for method in methods]
         rows, columns = ((size - (middle or size)) // 2 for size in pictures[0].shape[-2:])
         found.append([p[..., rows : p.shape[-2] - rows, columns : p.shape[-1] - columns] for p in pictures])
@@ -37,7 +37,7 @@ def main(data: Path, out: Path = Path("docs/universal.jpg")) -> None:
         *rows(small, sorted((camera / "real-objects").glob("object_*")), middle=200),
         *rows(large, sorted((camera / "real-objects").glob("scene*")), middle=200),
         *rows(large, [camera / "display_capture.tif"], middle=240),
-        *rows(Calibration.from_file(tutorial / "psf_sample.tif", binning=4), [tutorial / "rawdata_hand_sample.tif"]),
+        *rows(Calibration.from_file(tutorial / "psf_sample.tif", bin=4), [tutorial / "rawdata_hand_sample.tif"]),
         *rows(
             Calibration.from_file(diffusercam / "psf_recovered_270x480.npy", **DIFFUSERCAM),
             sorted((diffusercam / "diffuser_images").glob("*.npy")),

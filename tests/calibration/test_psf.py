@@ -9,9 +9,9 @@ import tifffile
 import torch
 
 from cameras import contour_psf
-from mwdn.calibration import Calibration
-from mwdn.calibration.psf import _turn
-from mwdn.errors import ImageError, ParameterError, PsfError, ShapeError
+from mwdn.calibration import Calibration, FrameFormat
+from mwdn.calibration.psf import estimate_background, flip_rows_about_centre
+from mwdn.errors import ImageError, ParameterError, PsfError, ShapeError, UnknownNameError
 from mwdn.fourier.convolution import convolve
 
 SIZE = 48, 40
@@ -78,7 +78,7 @@ def test_bgr_and_upside_down_are_undone(tmp_path, caustic):
 def test_centre_of_the_file_is_the_centre_of_the_psf(tmp_path, size, crop, binning, upside_down):
     frame = np.zeros((*size, 1), np.uint16)
     frame[size[0] // 2, size[1] // 2] = 60000
-    options = {"crop": crop, "binning": binning, "upside_down": upside_down, "background": 0.0}
+    options = {"crop": crop, "bin": binning, "upside_down": upside_down, "background": 0.0}
     calibration = Calibration.from_file(store(tmp_path / "psf.npy", frame), **options)
     height, width = (n // binning for n in crop or size)
     expected = torch.zeros(1, 1, height, width)
@@ -92,13 +92,13 @@ def test_turned_scene_through_a_turned_psf_is_the_turned_measurement(size, gener
     scene = torch.rand(1, 3, *size, generator=generator)
     psf = torch.rand(1, 1, *size, generator=generator)
     psf[..., 0, :] = 0  # the row that an even height rolls from one border to the other
-    torch.testing.assert_close(convolve(scene.flip(-2), _turn(psf)), convolve(scene, psf).flip(-2))
+    torch.testing.assert_close(convolve(scene.flip(-2), flip_rows_about_centre(psf)), convolve(scene, psf).flip(-2))
 
 
 def test_captures_of_an_upside_down_camera_are_turned_whole(tmp_path, generator):
     """Row for row, without a row of the opposite border: a ground truth turned by its reader stays aligned."""
     frame = np.random.default_rng(0).integers(1, 200, (6, 4, 1)).astype(np.uint8)
-    calibration = Calibration(torch.ones(1, 1, 6, 4), upside_down=True)
+    calibration = Calibration(torch.ones(1, 1, 6, 4), FrameFormat(upside_down=True))
     np.testing.assert_allclose(calibration.correct(frame)[0, 0], frame[::-1, :, 0] / 255, rtol=1e-6)
 
 
@@ -140,7 +140,7 @@ def test_dark_frame_is_subtracted_from_psf_and_captures(tmp_path, caustic):
 def test_dark_frame_is_cropped_and_binned_with_the_frame(tmp_path, caustic):
     pattern = np.random.default_rng(2).integers(500, 4000, (*SIZE, 1)).astype(np.uint16)
     light = (caustic * 50000).astype(np.uint16)[..., None]
-    options = {"background": 0.0, "crop": (32, 24), "binning": 2}
+    options = {"background": 0.0, "crop": (32, 24), "bin": 2}
     clean = Calibration.from_file(store(tmp_path / "clean.npy", light), **options)
     dark = store(tmp_path / "dark.npy", pattern)
     found = Calibration.from_file(store(tmp_path / "psf.npy", light + pattern), dark=dark, **options)
@@ -162,9 +162,9 @@ def test_correct_by_hand():
     frame = np.zeros((4, 4, 1), np.float32)
     frame[1:3, 1:3, 0] = [[0.8, 0.4], [0.2, 0.6]]
     dark = torch.full((1, 1, 4, 4), 0.1)
-    whole = Calibration(torch.ones(1, 1, 1, 1), dark=dark, crop=(2, 2), binning=2)
+    whole = Calibration(torch.ones(1, 1, 1, 1), FrameFormat(crop=(2, 2), bin=2), dark)
     assert whole.correct(frame).item() == pytest.approx((0.7 + 0.3 + 0.1 + 0.5) / 4)
-    rows = Calibration(torch.ones(1, 1, 2, 2), dark=dark, crop=(2, 2), upside_down=True)
+    rows = Calibration(torch.ones(1, 1, 2, 2), FrameFormat(crop=(2, 2), upside_down=True), dark)
     torch.testing.assert_close(rows.correct(frame), torch.tensor([[[[0.1, 0.5], [0.7, 0.3]]]]))
 
 
@@ -173,7 +173,14 @@ def test_colour_capture_of_a_grey_psf_keeps_its_colours():
     assert calibration.correct(np.zeros((4, 4, 3), np.uint8)).shape == (1, 3, 4, 4)
 
 
-# --- Hash ---------------------------------------------------------------------------------------------
+def test_background_is_the_5th_percentile_of_each_channel(generator):
+    ramp = torch.linspace(0, 1, 400)
+    image = torch.stack([ramp[torch.randperm(400, generator=generator)], 3 + ramp]).reshape(1, 2, 20, 20)
+    torch.testing.assert_close(estimate_background(image).flatten(), torch.tensor([ramp[20], 3 + ramp[20]]))
+    assert estimate_background(image).shape == (1, 2, 1, 1)
+
+
+# --- Colours ------------------------------------------------------------------------------------------
 
 
 def mosaicked(image, mosaic):
@@ -199,10 +206,10 @@ def test_raw_mosaics_become_a_psf_and_measurements_in_colour(tmp_path, generator
     measurement = calibration.correct((mosaicked(light.roll((4, -6), (-2, -1)), mosaic) + dark)[..., None])
     expected = calibration.psf.roll((2, -3), (-2, -1))
     torch.testing.assert_close(measurement / measurement.sum((-2, -1), keepdim=True), expected, atol=1e-7, rtol=1e-4)
-    with pytest.raises(ShapeError, match=r"--grey`; or say how .* `--mosaic rggb`"):
-        calibration.__class__(calibration.psf).correct(np.ones((40, 40, 1), np.float32))
+    with pytest.raises(ShapeError, match=r"`--grey`.*`--mosaic rggb`"):
+        Calibration(calibration.psf).correct(np.ones((40, 40, 1), np.float32))
     with pytest.raises(ShapeError, match="must have one channel"):
-        Calibration(calibration.psf, mosaic=mosaic).correct(np.ones((80, 80, 3), np.float32))
+        Calibration(calibration.psf, FrameFormat(mosaic=mosaic)).correct(np.ones((80, 80, 3), np.float32))
 
 
 def test_grey_averages_psf_and_captures(tmp_path, caustic):
@@ -219,6 +226,9 @@ def test_psf_that_was_subtracted_before_gets_no_light_added(tmp_path, caustic):
     noise = np.random.default_rng(0).normal(0, 0.01, caustic.shape)
     np.save(tmp_path / "psf.npy", (caustic + noise).astype(np.float32))
     assert Calibration.from_file(tmp_path / "psf.npy").background == (0.0,)
+
+
+# --- Hash ---------------------------------------------------------------------------------------------
 
 
 def test_hash_is_that_of_the_content(tmp_path, caustic):
@@ -277,7 +287,7 @@ def test_a_hot_pixel_is_no_saturation(tmp_path, caustic):
 def test_empty_psf(tmp_path, background):
     frame = np.full((8, 8, 3), 100, np.uint8)
     frame[..., 1] = 0
-    with pytest.raises(PsfError, match=r"PSF `.*psf.png` is empty: .* no light is left in a channel\. Expose longer"):
+    with pytest.raises(PsfError, match=r"PSF `.*psf.png` is empty: no light is left in .*green.*Expose longer"):
         Calibration.from_file(store(tmp_path / "psf.png", frame), background=background)
 
 
@@ -285,7 +295,7 @@ def test_empty_psf_says_which_colour_and_why(tmp_path):
     frame = np.zeros((8, 8, 3), np.uint8)
     frame[2, 2] = 100, 100, 0
     store(tmp_path / "psf.png", frame)
-    with pytest.raises(PsfError, match=r"nothing of blue\) no light .* Expose longer\.$"):
+    with pytest.raises(PsfError, match=r"no light is left in blue .* Expose longer\.$"):
         Calibration.from_file(tmp_path / "psf.png")
     with pytest.raises(PsfError, match=r"Expose longer, or take the dark frame `.*psf\.png` without light\.$"):
         Calibration.from_file(tmp_path / "psf.png", dark=tmp_path / "psf.png")
@@ -353,7 +363,7 @@ def test_capture_of_another_size(psf, binning, capture, way_out):
     height, width = (n // binning for n in capture)
     message = f"`psf` ({psf[0]} x {psf[1]}) and the capture ({height} x {width}) must have the same height and width. "
     with pytest.raises(ShapeError, match=re.escape(message + way_out)):
-        Calibration(torch.ones(1, 1, *psf), binning=binning).correct(np.zeros((*capture, 1), np.uint8))
+        Calibration(torch.ones(1, 1, *psf), FrameFormat(bin=binning)).correct(np.zeros((*capture, 1), np.uint8))
 
 
 def test_grey_capture_of_a_colour_psf():
@@ -369,8 +379,23 @@ def test_psf_of_another_resolution_than_the_captures(tmp_path, generator):
     np.save(tmp_path / "small.npy", small)
     np.save(tmp_path / "dark.npy", np.zeros_like(small))
     options = {"background": 0.0, "crop": (8, 10)}
-    found = Calibration.from_file(tmp_path / "raw.npy", psf_binning=4, dark=tmp_path / "dark.npy", **options)
+    found = Calibration.from_file(tmp_path / "raw.npy", psf_bin=4, dark=tmp_path / "dark.npy", **options)
     torch.testing.assert_close(found.psf, Calibration.from_file(tmp_path / "small.npy", **options).psf)
     assert found.correct(small).shape == (1, 1, 8, 10)
-    with pytest.raises(ParameterError, match=r"`binning` \(0\) must be at least 1"):
-        Calibration.from_file(tmp_path / "raw.npy", binning=0, psf_binning=4)
+    with pytest.raises(ParameterError, match=r"`bin` \(0\) must be at least 1"):
+        Calibration.from_file(tmp_path / "raw.npy", bin=0, psf_bin=4)
+
+
+def test_fields_of_the_format_are_keywords(tmp_path, caustic):
+    path = store(tmp_path / "psf.npy", (caustic * 255).astype(np.uint8)[..., None])
+    calibration = Calibration.from_file(path, FrameFormat(bin=2, grey=True), bin=4)
+    assert calibration.frames == FrameFormat(bin=4, grey=True)
+    with pytest.raises(UnknownNameError, match=r"'bitdepth'.*'bit_depth'"):
+        Calibration.from_file(path, bitdepth=8)
+
+
+def test_old_keywords_work_and_name_the_new_ones(tmp_path, caustic):
+    path = store(tmp_path / "psf.npy", (caustic * 255).astype(np.uint8)[..., None])
+    with pytest.warns(DeprecationWarning, match="`bin=2`"), pytest.warns(DeprecationWarning, match="`psf_bin=4`"):
+        old = Calibration.from_file(path, binning=2, psf_binning=4)
+    assert (old.frames.bin, old.psf_hash) == (2, Calibration.from_file(path, bin=2, psf_bin=4).psf_hash)

@@ -221,15 +221,15 @@ def test_small_psfs(size):
         ("mwdn-camera/psf_480.tif", {}, ["at 0.10 of the full scale", "not subtracted"]),
         ("mwdn-camera/psf_320.png", {}, ["at 0.10 of the full scale", "that alone was"]),
         ("mwdn-camera/psf_320.png", {}, ["is cut"]),
-        ("mwdn-camera/psf_raw_1920.png", {"binning": 6}, ["all within the frame"]),
-        ("diffusercam-tutorial/psf_sample.tif", {"binning": 4}, ["192 pixels", "maximum"]),
+        ("mwdn-camera/psf_raw_1920.png", {"bin": 6}, ["all within the frame"]),
+        ("diffusercam-tutorial/psf_sample.tif", {"bin": 4}, ["192 pixels", "maximum"]),
         ("diffusercam/psf_recovered_270x480.npy", {"upside_down": True, "bgr": True}, ["floats"]),
         ("phlatcam/psf_384x640.npy", {}, ["Sharp"]),
     ],
 )
 def test_measured_psfs(file, options, words, data):
     calibration = Calibration.from_file(data / file, **options)
-    report = inspect_psf(calibration, read_frame(data / file, bgr=calibration.bgr))
+    report = inspect_psf(calibration, calibration.frames.read(data / file))
     assert said(report, *words)
     assert not [finding for finding in verdict(report) if finding.weight == "bad"]
     assert report.side_lobe[0] < 0.2

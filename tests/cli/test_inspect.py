@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from mwdn.calibration import FrameFormat
 from mwdn.cli.app import CameraOptions, main
-from mwdn.cli.inspect import _own_resolution
+from mwdn.cli.inspect import at_psf_resolution
 from mwdn.optics import sample_camera
 
 
@@ -81,10 +82,10 @@ def test_json_alone_with_the_options_of_the_camera(run):
 
 def test_psf_at_its_own_resolution():
     """Captures of 32 x 36 raw pixels; the PSF was taken at twice the resolution."""
-    own = _own_resolution(CameraOptions(Path("psf.png"), dark=Path("dark.png"), crop=(32, 36), psf_bin=2))
-    assert (own.bin, own.crop, own.psf_bin, own.dark) == (2, (64, 72), None, None)
-    same = CameraOptions(Path("psf.png"), bin=2, psf_bin=2)
-    assert _own_resolution(same) is same
+    captures = CameraOptions(Path("psf.png"), FrameFormat(crop=(32, 36)), dark=Path("dark.png"), psf_bin=2)
+    assert at_psf_resolution(captures) == CameraOptions(Path("psf.png"), FrameFormat(crop=(64, 72), bin=2))
+    same = CameraOptions(Path("psf.png"), FrameFormat(bin=2), psf_bin=2)
+    assert at_psf_resolution(same) is same
 
 
 def test_saturated_psf_is_refused(run):

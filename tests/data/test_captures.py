@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from mwdn.calibration import Calibration
+from mwdn.calibration import Calibration, FrameFormat
 from mwdn.data.captures import find_captures, read_capture, read_captures
 from mwdn.errors import ParameterError, ShapeError
 
@@ -44,7 +44,8 @@ def test_captures_are_corrected_by_the_calibration(tmp_path):
     np.save(tmp_path / "a.npy", stored)
     np.save(tmp_path / "b.npy", np.full((4, 6, 3), 15, np.uint8))
     dark = torch.full((1, 1, 4, 6), 3 / 15)
-    calibration = Calibration(torch.ones(1, 3, 2, 3) / 6, 4, dark, binning=2, upside_down=True, bgr=True)
+    frames = FrameFormat(bgr=True, bit_depth=4, bin=2, upside_down=True)
+    calibration = Calibration(torch.ones(1, 3, 2, 3) / 6, frames, dark)
     both = read_captures([tmp_path / "a.npy", tmp_path / "b.npy"], calibration)
     expected = torch.zeros(2, 3, 2, 3)
     expected[0, :, 0, 0] = torch.tensor([2, 4, 8]) / 15

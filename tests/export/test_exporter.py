@@ -14,6 +14,7 @@ from torch import nn
 
 from cameras import contour_psf
 from mwdn import Calibration, Reconstructor, read_frame, to_display
+from mwdn.calibration import FrameFormat
 from mwdn.cli.app import main
 from mwdn.errors import ExportError, ParameterError
 from mwdn.export import exporter as exporting
@@ -39,7 +40,7 @@ EXAMPLE = ROOT / "examples" / "onnx_only.py"
 
 def camera(size=SIZE, channels=3):
     psf = contour_psf(size, cell=12, generator=torch.Generator().manual_seed(1)).expand(1, channels, *size).contiguous()
-    return Calibration(psf / psf.sum((-2, -1), keepdim=True), bit_depth=12)
+    return Calibration(psf / psf.sum((-2, -1), keepdim=True), FrameFormat(bit_depth=12))
 
 
 def network(name, **options):
@@ -404,9 +405,8 @@ def test_wrong_calls(out, options, message, tmp_path):
 
 
 def test_the_file_says_how_raw_frames_become_measurements(tmp_path):
-    taken = replace(
-        camera(), upside_down=True, bgr=True, dark=torch.zeros(1, 3, 2 * 40, 2 * 50), crop=(76, 96), binning=2
-    )
+    frames = FrameFormat(bgr=True, bit_depth=12, crop=(76, 96), bin=2, upside_down=True)
+    taken = replace(camera(), frames=frames, dark=torch.zeros(1, 3, 2 * 40, 2 * 50))
     about = export(Unchanged(), taken, tmp_path / "camera.onnx").about
     assert (about["crop"], about["binning"], about["bit_depth"]) == ("76 x 96", "2", "12")
     assert "at the bottom" in about["rows"]

@@ -18,7 +18,7 @@ import torch
 
 from cameras import contour_psf
 from mwdn import Camera, read_frame
-from mwdn.calibration import Calibration
+from mwdn.calibration import Calibration, FrameFormat
 from mwdn.errors import ImageError, ParameterError
 from mwdn.evaluation.consistency import consistency
 from mwdn.inference.batch import Batch, check_outputs, output_name
@@ -188,8 +188,8 @@ def test_captures_are_read_as_the_calibration_says(tmp_path, psf, captures):
     frame = read_frame(captures[0])
     np.save(tmp_path / "plain.npy", frame)
     np.save(tmp_path / "twisted.npy", frame[::-1, :, ::-1])
-    for name, calibration in (("plain", Calibration(psf)), ("twisted", Calibration(psf, bgr=True, upside_down=True))):
-        list(darkroom(calibration, tmp_path / "out", form="tiff").run([tmp_path / f"{name}.npy"]))
+    for name, frames in (("plain", FrameFormat()), ("twisted", FrameFormat(bgr=True, upside_down=True))):
+        list(darkroom(Calibration(psf, frames), tmp_path / "out", form="tiff").run([tmp_path / f"{name}.npy"]))
     assert np.array_equal(read_frame(tmp_path / "out/plain.tif"), read_frame(tmp_path / "out/twisted.tif"))
 
 
@@ -338,7 +338,7 @@ def test_result_of_anything_else_is_none(tmp_path, what, psf, captures):
     elif what == "psf":
         camera = Calibration(psf.flip(-1))
     elif what == "bits":
-        camera = Calibration(psf, bit_depth=16)
+        camera = Calibration(psf, FrameFormat(bit_depth=16))
     elif what == "dark":
         camera = Calibration(psf, dark=torch.zeros(1, 3, *SIZE))
     else:

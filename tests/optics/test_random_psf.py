@@ -203,7 +203,7 @@ def drawn(family):
         ("contours", "mwdn-camera/psf_320.png", {}),
         ("contours", "phlatcam/psf_384x640.npy", {}),
         ("caustics", "diffusercam/psf_recovered_270x480.npy", {"upside_down": True, "bgr": True}),
-        ("caustics", "diffusercam-tutorial/psf_sample.tif", {"binning": 4}),
+        ("caustics", "diffusercam-tutorial/psf_sample.tif", {"bin": 4}),
     ],
 )
 def test_measured_cameras_lie_within_their_family(family, file, options, data):

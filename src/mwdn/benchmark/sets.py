@@ -10,8 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mwdn.calibration import Calibration
-from mwdn.calibration.frames import Background
+from mwdn.calibration import Calibration, FrameFormat
 from mwdn.data.importers import Layout, import_pairs
 from mwdn.data.mismatch import EXACT
 from mwdn.data.pair_writer import Attribute
@@ -94,14 +93,11 @@ class DatasetRecipe:
 
     def calibration(self) -> Calibration:
         """Read the PSF."""
-        background: Background = self.background if self.background >= 0 else "estimate"
         return Calibration.from_file(
             self.psf,
-            background=background,
-            binning=self.bin,
-            psf_binning=self.bin * self.psf_bin,
-            upside_down=self.upside_down,
-            bgr=self.bgr,
+            FrameFormat(bgr=self.bgr, bin=self.bin, upside_down=self.upside_down),
+            background=self.background if self.background >= 0 else "estimate",
+            psf_bin=self.bin * self.psf_bin,
         )
 
 
@@ -205,7 +201,8 @@ def open_dataset(name: str, recipe: DatasetRecipe, folder: Path, device: torch.d
             _simulate(recipe, calibration, path, device, lambda rows: track(f"{name}: simulating", rows))
         else:
             size = calibration.size if recipe.bin > 1 else None
-            import_pairs(recipe.kind, recipe.pairs, path, layout=Layout(bin=recipe.bin, scene_size=size))
+            layout, frames = Layout(scene_size=size), FrameFormat(bin=recipe.bin)
+            import_pairs(recipe.kind, recipe.pairs, path, layout=layout, frames=frames)
         save_text(note, json.dumps(identity, indent=2))
     file = PairFile(path)
     check_pairs(file, calibration.psf)

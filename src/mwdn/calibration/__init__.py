@@ -1,5 +1,6 @@
-"""From raw frames to a PSF that one can trust."""
+"""From raw frames to a PSF, and from captures to measurements."""
 
+from mwdn.calibration.frame_format import FrameFormat
 from mwdn.calibration.psf import Calibration
 
-__all__ = ["Calibration"]
+__all__ = ["Calibration", "FrameFormat"]

@@ -5,8 +5,7 @@ from typing import Any
 
 import torch
 
-from mwdn.calibration.frames import estimate_background, full_scale
-from mwdn.calibration.psf import Calibration, saturated
+from mwdn.calibration.psf import Calibration, estimate_background
 from mwdn.optics import psf_measures, psf_spectrum
 from mwdn.optics.noise import noise_level
 from mwdn.types import Frame, Psf, Size
@@ -155,17 +154,17 @@ def _known(psf: Psf, floor: float) -> float:
 
 
 def _levels(calibration: Calibration, frame: Frame) -> Levels:
-    image = calibration.prepare(frame)
-    upright = image.flip(-2) if calibration.upside_down else image
+    frames = calibration.frames
+    upright = frames.to_measurement(frame, calibration.dark)
+    image = upright.flip(-2) if frames.upside_down else upright
     background = estimate_background(image)
     integers = frame.dtype.kind != "f"
-    full, _ = saturated(frame, calibration.bit_depth)
     # As deep as the file says: numbers left by binning lie between its steps.
-    scale = full_scale(frame, calibration.bit_depth) if integers else 1.0
+    scale = frames.full_scale(frame) if integers else 1.0
     noise = noise_level(image, parts=1)
     if integers:
         # Rounding alone leaves step / sqrt(12), which the median of an 8-bit frame's differences often misses.
-        noise = noise.clamp(min=1 / (12**0.5 * scale * calibration.binning))
+        noise = noise.clamp(min=1 / (12**0.5 * scale * frames.bin))
     subtracted = torch.tensor(calibration.background or (0.0,) * image.shape[1])[:, None, None]
     light = (image - subtracted).clamp(min=0).sum((-2, -1), keepdim=True).clamp(min=1e-30)
     pixels = image.shape[-2] * image.shape[-1]
@@ -174,7 +173,7 @@ def _levels(calibration: Calibration, frame: Frame) -> Levels:
         integers=integers,
         peak=float(frame.max()) / scale,
         steps=int(frame.max()) if integers else 0,
-        saturated=full,
+        saturated=frames.saturated(frame)[0],
         background=tuple(background.flatten().tolist()),
         subtracted=calibration.background,
         pedestal=float(share.max()),

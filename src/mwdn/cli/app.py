@@ -11,6 +11,7 @@ from rich.markup import escape
 from rich.progress import Progress, track
 
 from mwdn import __version__
+from mwdn.calibration import FrameFormat
 from mwdn.cli.benchmark import benchmark
 from mwdn.cli.camera import CameraOptions, complain, console, errors, warn
 from mwdn.cli.design import design
@@ -41,7 +42,8 @@ def import_(
     *,
     out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("pairs.h5"),
     skip_damaged: bool = False,
-    layout: Annotated[Layout, Parameter(name="*")] = Layout(),  # noqa: B008
+    layout: Annotated[Layout, Parameter(name="*")] = Layout(),
+    frames: Annotated[FrameFormat, Parameter(name="*")] = FrameFormat(),
 ) -> None:
     """Turn a public data set, or two folders of pictures, into one file of pairs.
 
@@ -50,11 +52,11 @@ def import_(
         path: of the data set; for parquet a shard, a folder of shards, or owner/name on the Hugging Face hub.
         out: the file of pairs, ending in .h5 or .hdf5; one that exists is replaced when all has gone well.
         skip_damaged: leave out what is damaged or has no partner, and name it.
-        layout: what is unusual about this copy of the data set.
+        layout: where this copy of the data set differs from the usual.
+        frames: format of the captures, where it differs from the usual.
     """
-    done = import_pairs(
-        kind, path, out, layout=layout, skip_damaged=skip_damaged, track=partial(track, description="Importing")
-    )
+    progress = partial(track, description="Importing")
+    done = import_pairs(kind, path, out, layout=layout, frames=frames, skip_damaged=skip_damaged, track=progress)
     for reason in done.skipped.values():
         errors.print(f"[yellow]skipped:[/] {escape(reason)}", highlight=False, soft_wrap=True)
     names = f": {', '.join(done.skipped)}" if done.skipped else ""

@@ -12,7 +12,6 @@ from mwdn.calibration.report import inspect_psf
 from mwdn.calibration.verdict import headline, verdict
 from mwdn.cli.camera import CameraOptions, console
 from mwdn.io.files import check_folder, refuse_overwrite, write_json
-from mwdn.io.images import read_frame
 
 _STYLES = {"bad": "bold red", "mind": "yellow", "good": "green"}
 
@@ -37,9 +36,9 @@ def inspect(
     beside = page.with_suffix(".json")
     for output in (page, beside):
         refuse_overwrite(output, camera.psf, camera.dark)
-    calibration = _own_resolution(camera).load()
+    calibration = at_psf_resolution(camera).load()
     check_folder(out)
-    report = inspect_psf(calibration, read_frame(camera.psf, bgr=camera.bgr))
+    report = inspect_psf(calibration, camera.frames.read(camera.psf))
     found = verdict(report)
     content = {
         "file": str(camera.psf),
@@ -58,10 +57,8 @@ def inspect(
     console.print(f"Look at {page}", highlight=False, markup=False, soft_wrap=True)
 
 
-def _own_resolution(camera: CameraOptions) -> CameraOptions:
-    """The options at the PSF's own resolution, where it differs from the captures'; the dark frame is the captures'."""
-    if camera.psf_bin is None or camera.psf_bin == camera.bin:
+def at_psf_resolution(camera: CameraOptions) -> CameraOptions:
+    """The options for frames at the PSF's resolution, if the captures have another; their dark frame is left out."""
+    if camera.psf_bin is None or camera.psf_bin == camera.frames.bin:
         return camera
-    own = camera.psf_bin
-    crop = camera.crop and (camera.crop[0] * own // camera.bin, camera.crop[1] * own // camera.bin)
-    return replace(camera, bin=own, psf_bin=None, crop=crop, dark=None)
+    return replace(camera, frames=camera.frames.with_bin(camera.psf_bin), psf_bin=None, dark=None)

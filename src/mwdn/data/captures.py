@@ -8,7 +8,7 @@ import torch
 
 from mwdn.calibration import Calibration
 from mwdn.errors import ParameterError, ShapeError
-from mwdn.io.images import READABLE, read_frame
+from mwdn.io.images import READABLE
 from mwdn.types import Measurement
 
 
@@ -61,7 +61,7 @@ def read_capture(path: Path, calibration: Calibration) -> Measurement:
     Raises:
         MwdnError: it cannot be read, or does not fit the camera.
     """
-    return calibration.correct(read_frame(path, bgr=calibration.bgr))
+    return calibration.correct(calibration.frames.read(path))
 
 
 def read_captures(paths: Iterable[Path], calibration: Calibration) -> Measurement:

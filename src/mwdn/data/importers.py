@@ -1,20 +1,23 @@
 """From a public data set, in its own layout, to a file of pairs."""
 
+import dataclasses
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
-from typing import cast
+from typing import TypeVar, cast
 
 import numpy as np
 
-from mwdn.calibration.frames import as_image, bin_pixels, demosaiced, full_scale
+from mwdn.calibration import FrameFormat
 from mwdn.data.pair_writer import PixelType, check_path, quantise
 from mwdn.data.pairs import PairFile
-from mwdn.data.sources import Found, Source, find_in_folders, find_in_hdf5, find_in_parquet, find_phlatcam
+from mwdn.data.sources import Listing, Source, list_folders, list_hdf5, list_parquet, list_phlatcam
 from mwdn.errors import ImageError, MwdnError, ParameterError, UnknownNameError
 from mwdn.io.files import refuse_overwrite
 from mwdn.types import Frame, Size
+
+T = TypeVar("T", "Layout", FrameFormat)
 
 Pair = tuple[str, Frame, Frame]
 """A name, a measurement and a scene, both (H, W, C), RGB, row 0 at the top, integers or floats in [0, 1]."""
@@ -22,82 +25,118 @@ Pair = tuple[str, Frame, Frame]
 
 @dataclass(frozen=True)
 class Layout:
-    """How a data set stores its pairs; ``None`` where it says nothing.
+    """Where a data set stores its pairs; ``None`` for the usual place.
 
     Args:
         captures: folder, data set or column of the measurements.
         scenes: folder, data set or column of the ground truth.
-        bit_depth: of the captures, where their numbers do not fill the file's type.
-        scene_size: height and width to which scenes are resized, where they are not all of one size.
-        bgr: the channels of both are blue, green, red.
-        upside_down: the first row of both is the picture's last.
-        bin: average blocks of so many pixels of a capture along each axis.
+        scene_size: height and width to which scenes are resized, if they are not all of one size.
 
     Raises:
-        ParameterError: a number is outside its range.
+        ParameterError: a size is not positive.
     """
 
     captures: str | None = None
     scenes: str | None = None
-    bit_depth: int | None = None
     scene_size: Size | None = None
-    bgr: bool = False
-    upside_down: bool = False
-    bin: int = 1
 
     def __post_init__(self) -> None:
-        if self.bit_depth is not None and not 1 <= self.bit_depth <= 16:
-            raise ParameterError(f"`bit_depth` ({self.bit_depth}) must be 1 to 16.")
         if self.scene_size is not None and min(self.scene_size) < 1:
             height, width = self.scene_size
             raise ParameterError(f"`scene_size` ({height} x {width}) must be positive: `--scene-size 384 384`.")
-        if self.bin < 1:
-            raise ParameterError(f"`bin` ({self.bin}) must be at least 1.")
-
-    def over(self, usual: "Layout") -> "Layout":
-        """Fill what is not said here with what is usual."""
-        return Layout(
-            self.captures or usual.captures,
-            self.scenes or usual.scenes,
-            self.bit_depth or usual.bit_depth,
-            self.scene_size or usual.scene_size,
-            self.bgr or usual.bgr,
-            self.upside_down or usual.upside_down,
-            self.bin,
-        )
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of data set: how its pairs are found, their usual layout, and the bits of raw captures if it has them."""
+    """A kind of data set.
 
-    find: Callable[[Path, str, str], Found]
-    usual: Layout
-    mosaic_bits: int = 0
+    Args:
+        list_pairs: lists the pairs of a path, given the names of its captures and scenes.
+        layout: the usual one.
+        frames: the usual format of captures; scenes have the same channel order and orientation.
+        raw_frames: the usual format of captures with one channel, if those are raw frames of a colour sensor.
+    """
+
+    list_pairs: Callable[[Path, str, str], Listing]
+    layout: Layout
+    frames: FrameFormat = FrameFormat()
+    raw_frames: FrameFormat | None = None
 
 
 KINDS = {
-    # The paper's own: what OpenCV read, channels first.
-    "mwdn": Kind(find_in_hdf5, Layout("blur", "gt", bgr=True)),
-    "diffusercam": Kind(find_in_folders, Layout("diffuser_images", "ground_truth_lensed", bgr=True, upside_down=True)),
-    # Raw captures of 12 bits; the scenes are ImageNet's originals of all sizes, shown and compared at 384 x 384.
-    "phlatcam": Kind(
-        find_phlatcam,
-        Layout("imagenet_caps_384_12bit_Feb_19", "orig", scene_size=(384, 384)),
-        mosaic_bits=12,
+    # The paper's own data set, written by OpenCV: BGR, channels first.
+    "mwdn": Kind(list_hdf5, Layout("blur", "gt"), FrameFormat(bgr=True)),
+    "diffusercam": Kind(
+        list_folders, Layout("diffuser_images", "ground_truth_lensed"), FrameFormat(bgr=True, upside_down=True)
     ),
-    "folders": Kind(find_in_folders, Layout("captures", "scenes")),
-    "parquet": Kind(find_in_parquet, Layout("lensless", "lensed")),
+    # Raw captures of 12 bits; the scenes are ImageNet's originals of all sizes, displayed and compared at 384 x 384.
+    "phlatcam": Kind(
+        list_phlatcam,
+        Layout("imagenet_caps_384_12bit_Feb_19", "orig", scene_size=(384, 384)),
+        raw_frames=FrameFormat(bit_depth=12, mosaic="rggb"),
+    ),
+    "folders": Kind(list_folders, Layout("captures", "scenes")),
+    "parquet": Kind(list_parquet, Layout("lensless", "lensed")),
 }
 """Every kind that can be imported."""
 
 
 @dataclass
 class Imported:
-    """What an import did: pairs atomic_write, and the name of each that was left out with the reason."""
+    """Result of an import: the number of pairs written, and the name of each skipped pair with the reason."""
 
     count: int = 0
     skipped: dict[str, str] = field(default_factory=dict)
+
+
+def import_pairs(
+    kind: str,
+    path: str | Path,
+    output: str | Path,
+    *,
+    layout: Layout = Layout(),
+    frames: FrameFormat = FrameFormat(),
+    skip_damaged: bool = False,
+    track: Callable[[list[Source]], Iterable[Source]] = iter,
+) -> Imported:
+    """Convert a data set to a file of pairs, which appears when all of it is written.
+
+    Pictures of 8 bits are stored as such, deeper or binned ones as 16 bits, floats as floats.
+
+    Args:
+        kind: of `KINDS`.
+        path: of the data set.
+        output: the new file, ending in .h5 or .hdf5; an existing one is replaced.
+        layout: what differs from the usual layout of the kind.
+        frames: what differs from the usual format of the captures.
+        skip_damaged: leave out pairs that are damaged or incomplete, and name them in the result.
+        track: wraps the list of pairs to read, for a progress bar.
+
+    Raises:
+        UnknownNameError: no such kind.
+        ParameterError: ``output`` has another suffix, or is the data set itself.
+        ImageError: nothing to import; a pair is damaged and not to be skipped; ``output`` cannot be written.
+    """
+    check_path(Path(output))
+    refuse_overwrite(Path(output), Path(path))
+    result = Imported()
+    skipped = result.skipped if skip_damaged else None
+    pairs = read_pairs(kind, path, layout=layout, frames=frames, skipped=skipped, track=track)
+    first = next(pairs, None)
+    if first is None:
+        reason = f" {len(skipped):,} were skipped; {next(iter(skipped.values()))}" if skipped else ""
+        raise ImageError(f"`{path}` has no pair to import.{reason} For the layouts: `mwdn import --help`.")
+    with PairFile.create(
+        output,
+        measurement_shape=first[1].shape,
+        scene_shape=first[2].shape,
+        dtype=cast(PixelType, first[1].dtype.name),
+        attributes={"source": kind},
+    ) as file:
+        for _, measurement, scene in chain([first], pairs):
+            file.append(measurement, scene)
+        result.count = len(file)
+    return result
 
 
 def read_pairs(
@@ -105,6 +144,7 @@ def read_pairs(
     path: str | Path,
     *,
     layout: Layout = Layout(),
+    frames: FrameFormat = FrameFormat(),
     skipped: dict[str, str] | None = None,
     track: Callable[[list[Source]], Iterable[Source]] = iter,
 ) -> Iterator[Pair]:
@@ -115,9 +155,11 @@ def read_pairs(
     Args:
         kind: of `KINDS`.
         path: of the data set: a file for ``"mwdn"``, a folder for the others.
-        layout: what is unusual about this copy of it.
-        skipped: takes the name of each damaged or unpaired one and the reason; without it, the first one raises.
-        track: wraps the list of what will be read, for a progress bar.
+        layout: what differs from the usual layout of the kind.
+        frames: what differs from the usual format of the captures; its channel order and orientation are also those
+            of the scenes.
+        skipped: receives the name of each damaged or incomplete pair and the reason; without it, the first one raises.
+        track: wraps the list of pairs to read, for a progress bar.
 
     Raises:
         UnknownNameError: no such kind.
@@ -125,115 +167,79 @@ def read_pairs(
     """
     if kind not in KINDS:
         raise UnknownNameError("kind of data set", kind, KINDS)
-    layout = layout.over(KINDS[kind].usual)
-    found = KINDS[kind].find(Path(path), layout.captures or "", layout.scenes or "")
-    if found.refused and skipped is None:
-        reason = next(iter(found.refused.values()))
-        more = f" (and {len(found.refused) - 1:,} more like it)" if len(found.refused) > 1 else ""
+    layout = _override(KINDS[kind].layout, layout)
+    listing = KINDS[kind].list_pairs(Path(path), layout.captures or "", layout.scenes or "")
+    if listing.refused and skipped is None:
+        reason = next(iter(listing.refused.values()))
+        more = f" (and {len(listing.refused) - 1:,} more like it)" if len(listing.refused) > 1 else ""
         raise ImageError(f"{reason}{more} To import the others: `--skip-damaged`.")
     if skipped is not None:
-        skipped.update(found.refused)
+        skipped.update(listing.refused)
     first: tuple[Frame, Frame] | None = None
-    for source in track(found.sources):
+    for source in track(listing.sources):
         try:
-            pair = _prepare(source, layout, KINDS[kind].mosaic_bits)
+            pair = _convert(source, KINDS[kind], layout.scene_size, frames)
             first = first or pair
-            _must_be_like(first, pair, source.name)
-        except MwdnError as problem:
-            reason = str(problem) if isinstance(problem, ImageError) else f"`{source.name}`: {problem}"
+            _check_like_first(first, pair, source.name)
+        except MwdnError as error:
+            reason = str(error) if isinstance(error, ImageError) else f"`{source.name}`: {error}"
             if skipped is None:
-                raise ImageError(f"{reason} To import the others: `--skip-damaged`.") from problem
+                raise ImageError(f"{reason} To import the others: `--skip-damaged`.") from error
             skipped[source.name] = reason
             continue
         yield source.name, *pair
 
 
-def _prepare(source: Source, layout: Layout, mosaic_bits: int) -> tuple[Frame, Frame]:
-    """Load a pair and turn it upright, into RGB, and into one type that loses nothing of either."""
-    capture, scene = raw = source.load()
-    mosaic = mosaic_bits > 0 and capture.shape[2] == 1
-    bit_depth = layout.bit_depth or (mosaic_bits if mosaic else None)
-    if mosaic_bits and scene.shape[2] == 1:
+def _override(usual: T, changes: T) -> T:
+    """Replace the fields of ``usual`` that ``changes`` sets to something other than their default."""
+    values = {f.name: (getattr(changes, f.name), f.default) for f in dataclasses.fields(changes)}
+    return replace(usual, **{name: value for name, (value, default) in values.items() if value != default})
+
+
+def _convert(source: Source, kind: Kind, scene_size: Size | None, changes: FrameFormat) -> tuple[Frame, Frame]:
+    """Load a pair as RGB, row 0 at the top, both in the smallest type that is exact for both."""
+    stored = source.load()
+    capture, scene = stored
+    usual = kind.raw_frames if kind.raw_frames is not None and capture.shape[2] == 1 else kind.frames
+    frames = _override(usual, changes)
+    capture = _convert_capture(capture, frames, source.name)
+    if kind.raw_frames is not None and scene.shape[2] == 1:
         scene = scene.repeat(3, axis=2)  # a few of ImageNet's photographs are grey
-    if bit_depth or layout.bin > 1:
-        if bit_depth and bit_depth > 8 * raw[0].dtype.itemsize:
-            raise ImageError(f"The capture of `{source.name}` has {raw[0].dtype}, fewer than {bit_depth} bits.")
-        image = as_image(capture, full_scale(capture, bit_depth))
-        image = demosaiced(image, "rggb") if mosaic else image
-        capture = bin_pixels(image, layout.bin)[0].movedim(0, -1).numpy()
-    if layout.scene_size:
-        scene = _resized(scene, layout.scene_size)
-    shallow = capture.dtype == scene.dtype == np.uint8
-    floats = any(frame.dtype.kind == "f" for frame in raw)
-    dtype = np.dtype("float32" if floats else "uint8" if shallow else "uint16")
-    rows, channels = slice(None, None, -1 if layout.upside_down else 1), slice(None, None, -1 if layout.bgr else 1)
-    named = {"capture": capture, "scene": scene}
-    capture, scene = (quantise(f[rows, :, channels], dtype, f"{n} of {source.name}") for n, f in named.items())
-    return capture, scene
+    if scene_size is not None:
+        scene = _resize(scene, scene_size)
+    scene = scene[:: -1 if frames.upside_down else 1, :, :: -1 if frames.bgr else 1]
+
+    floats = any(frame.dtype.kind == "f" for frame in stored)
+    dtype = np.dtype("float32" if floats else "uint8" if capture.dtype == scene.dtype == np.uint8 else "uint16")
+    return quantise(capture, dtype, f"capture of {source.name}"), quantise(scene, dtype, f"scene of {source.name}")
 
 
-def _resized(scene: Frame, size: Size) -> Frame:
+def _convert_capture(capture: Frame, frames: FrameFormat, name: str) -> Frame:
+    """The capture as a measurement; its numbers stay as stored if the format changes order and orientation alone."""
+    if frames.bit_depth is not None and frames.bit_depth > 8 * capture.dtype.itemsize:
+        raise ImageError(f"The capture of `{name}` has {capture.dtype}, fewer than {frames.bit_depth} bits.")
+    if frames.bgr:
+        capture = capture[:, :, ::-1]
+    if replace(frames, bgr=False, upside_down=False) != FrameFormat():
+        return frames.to_measurement(capture)[0].movedim(0, -1).numpy()
+    return capture[::-1] if frames.upside_down else capture
+
+
+def _resize(scene: Frame, size: Size) -> Frame:
     import cv2
 
     if scene.shape[:2] == size:
         return scene
-    shrinks = scene.shape[0] >= size[0] and scene.shape[1] >= size[1]
-    resized = cv2.resize(scene, size[::-1], interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    smaller = scene.shape[0] >= size[0] and scene.shape[1] >= size[1]
+    resized = cv2.resize(scene, size[::-1], interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
     return np.asarray(resized).reshape(*size, -1)
 
 
-def _must_be_like(first: tuple[Frame, Frame], pair: tuple[Frame, Frame], name: str) -> None:
+def _check_like_first(first: tuple[Frame, Frame], pair: tuple[Frame, Frame], name: str) -> None:
     for what, expected, got in zip(("capture", "scene"), first, pair, strict=True):
         if expected.shape != got.shape or expected.dtype != got.dtype:
-            was, wanted = (f"{' x '.join(map(str, frame.shape))}, {frame.dtype}" for frame in (got, expected))
+            actual, wanted = (f"{' x '.join(map(str, frame.shape))}, {frame.dtype}" for frame in (got, expected))
             raise ImageError(
-                f"The {what} of `{name}` ({was}) must be like that of the first pair ({wanted}). Convert it, "
+                f"The {what} of `{name}` ({actual}) must be like that of the first pair ({wanted}). Convert it, "
                 "or for scenes of several sizes give `--scene-size 384 384`."
             )
-
-
-def import_pairs(
-    kind: str,
-    path: str | Path,
-    output: str | Path,
-    *,
-    layout: Layout = Layout(),
-    skip_damaged: bool = False,
-    track: Callable[[list[Source]], Iterable[Source]] = iter,
-) -> Imported:
-    """Turn a data set into a file of pairs, which appears when all of it is written.
-
-    Pictures of 8 bits are stored as such, deeper or binned ones as 16 bits, floats as floats.
-
-    Args:
-        kind: of `KINDS`.
-        path: of the data set.
-        output: the new file, ending in .h5 or .hdf5; one that exists is replaced.
-        layout: what is unusual about this copy of the data set.
-        skip_damaged: leave out what is damaged or has no partner, and name it in the result.
-        track: wraps the list of what will be read, for a progress bar.
-
-    Raises:
-        UnknownNameError: no such kind.
-        ParameterError: ``output`` has another suffix, or is the data set itself.
-        ImageError: nothing to import; a pair is damaged and not to be skipped; ``output`` cannot be written.
-    """
-    check_path(Path(output))
-    refuse_overwrite(Path(output), Path(path))
-    done = Imported()
-    pairs = read_pairs(kind, path, layout=layout, skipped=done.skipped if skip_damaged else None, track=track)
-    first = next(pairs, None)
-    if first is None:
-        left = f" {len(done.skipped):,} were skipped; {next(iter(done.skipped.values()))}" if done.skipped else ""
-        raise ImageError(f"`{path}` has no pair to import.{left} For how it must be laid out: `mwdn import --help`.")
-    with PairFile.create(
-        output,
-        measurement_shape=first[1].shape,
-        scene_shape=first[2].shape,
-        dtype=cast(PixelType, first[1].dtype.name),
-        attributes={"source": kind},
-    ) as file:
-        for _, measurement, scene in chain([first], pairs):
-            file.append(measurement, scene)
-        done.count = len(file)
-    return done

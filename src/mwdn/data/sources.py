@@ -47,14 +47,14 @@ class Source:
 
 
 @dataclass(frozen=True)
-class Found:
+class Listing:
     """The pairs of a data set, in its order, and what has no partner or cannot be opened, with the reason."""
 
     sources: list[Source]
     refused: dict[str, str] = field(default_factory=dict)
 
 
-def find_in_folders(path: Path, captures: str, scenes: str) -> Found:
+def list_folders(path: Path, captures: str, scenes: str) -> Listing:
     """Pair the pictures of two folders, and of the folders in them, by their stems; numbers count as numbers.
 
     Args:
@@ -75,17 +75,17 @@ def find_in_folders(path: Path, captures: str, scenes: str) -> Found:
             refused[stem] = f"`{other}` has no partner in `{path / missing[0]}`. Add it, or remove this one."
         else:
             sources.append(Source(stem, partial(_read_both, files[captures][stem], files[scenes][stem])))
-    return Found(sources, refused)
+    return Listing(sources, refused)
 
 
-def find_phlatcam(path: Path, captures: str, scenes: str) -> Found:
-    """Pair two folders as `find_in_folders` does, and put the ten classes of the test set last."""
-    found = find_in_folders(path, captures, scenes)
+def list_phlatcam(path: Path, captures: str, scenes: str) -> Listing:
+    """Pair two folders as `list_folders` does, and put the ten classes of the test set last."""
+    found = list_folders(path, captures, scenes)
     last = sorted(found.sources, key=lambda source: source.name.split("/")[0] in PHLATCAM_TEST)
-    return Found(last, found.refused)
+    return Listing(last, found.refused)
 
 
-def find_in_hdf5(path: Path, captures: str, scenes: str) -> Found:
+def list_hdf5(path: Path, captures: str, scenes: str) -> Listing:
     """Rows of the authors' HDF5: two data sets (N, C, H, W) of uint8.
 
     Raises:
@@ -113,13 +113,13 @@ def find_in_hdf5(path: Path, captures: str, scenes: str) -> Found:
         " only. Copy it from its source again."
         for row in range(paired, max(counts))
     }
-    return Found(
+    return Listing(
         [Source(f"row {row}", partial(_read_row, path, file, (captures, scenes), row)) for row in range(paired)],
         refused,
     )
 
 
-def find_in_parquet(path: Path, captures: str, scenes: str) -> Found:
+def list_parquet(path: Path, captures: str, scenes: str) -> Listing:
     """Rows of the Hugging Face hub's parquet shards, whose columns hold encoded pictures.
 
     Args:
@@ -143,7 +143,7 @@ def find_in_parquet(path: Path, captures: str, scenes: str) -> Found:
             refused[shard.name] = str(problem)
             continue
         sources += [Source(f"{shard.name} row {row}", partial(rows.load, row)) for row in range(rows.count)]
-    return Found(sources, refused)
+    return Listing(sources, refused)
 
 
 class _Shard:

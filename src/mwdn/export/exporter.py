@@ -257,19 +257,19 @@ def _about(name: str, calibration: Calibration, channels: int, precision: str) -
         "axes": "batch, channel, height, width; row 0 at the top",
         "measurement": "float32, linear light, dark level subtracted, 1 is saturation",
         "scene": "float32, linear light, not clipped to [0, 1]",
-        "binning": str(calibration.binning),
+        "binning": str(calibration.frames.bin),
     }
-    if calibration.bit_depth is not None:
-        about["bit_depth"] = str(calibration.bit_depth)
-    if calibration.crop is not None:
-        about["crop"] = f"{calibration.crop[0]} x {calibration.crop[1]}"
-    if calibration.upside_down:
+    if calibration.frames.bit_depth is not None:
+        about["bit_depth"] = str(calibration.frames.bit_depth)
+    if calibration.frames.crop is not None:
+        about["crop"] = f"{calibration.frames.crop[0]} x {calibration.frames.crop[1]}"
+    if calibration.frames.upside_down:
         about["rows"] = "raw frames have their first row at the bottom"
-    if calibration.bgr:
+    if calibration.frames.bgr:
         about["colours"] = "raw frames have their channels in the order blue, green, red"
-    if calibration.mosaic:
-        about["mosaic"] = calibration.mosaic
-    if calibration.grey:
+    if calibration.frames.mosaic:
+        about["mosaic"] = calibration.frames.mosaic
+    if calibration.frames.grey:
         about["grey"] = "the colours of raw frames must be averaged"
     if calibration.dark is not None:
         about["dark"] = "a frame taken without light must be subtracted from raw frames"

@@ -164,7 +164,7 @@ class Batch:
         if self.resume and self._is_there(job):
             return replace(job, kept=True)
         calibration = self.reconstruct.calibration
-        frame = read_frame(job.capture, bgr=calibration.bgr)
+        frame = calibration.frames.read(job.capture)
         measurement = calibration.correct(frame)
         if measurement.amax() <= 0:
             raise ImageError("The sensor saw no light: no pixel is brighter than the dark frame, or black.")

@@ -1,11 +1,12 @@
-"""Levels, crop and binning of frames; where the centre goes under them."""
+"""From raw frames to measurements: levels, mosaic, crop, binning."""
 
 import numpy as np
 import pytest
 import torch
 
-from mwdn.calibration.frames import as_image, bin_pixels, crop_centre, demosaiced, estimate_background, full_scale
-from mwdn.errors import ParameterError, ShapeError
+from mwdn.calibration import FrameFormat
+from mwdn.calibration.frame_format import bin_pixels, crop_centre, demosaic
+from mwdn.errors import ParameterError, ShapeError, UnknownNameError
 
 
 def delta(height, width):
@@ -24,29 +25,29 @@ def place(image):
     [("u1", None, 255), ("u2", None, 65535), ("f4", None, 1), ("u2", 12, 4095), ("u2", 16, 65535), ("u1", 1, 1)],
 )
 def test_full_scale(dtype, bit_depth, expected):
-    assert full_scale(np.ones((2, 2, 1), dtype), bit_depth) == expected
+    assert FrameFormat(bit_depth=bit_depth).full_scale(np.ones((2, 2, 1), dtype)) == expected
 
 
 @pytest.mark.parametrize("bit_depth", [0, -1, 17])
 def test_bit_depth_is_1_to_16(bit_depth):
     with pytest.raises(ParameterError, match=rf"`bit_depth` \({bit_depth}\) must be 1 to 16"):
-        full_scale(np.ones((2, 2, 1), np.uint16), bit_depth)
+        FrameFormat(bit_depth=bit_depth)
 
 
 def test_frame_of_more_bits_than_said():
     frame = np.full((2, 2, 1), 5000, np.uint16)
     with pytest.raises(ParameterError, match=r"`bit_depth` \(12\) allows .* 4,095, .* holds 5,000: .* least 13 bits"):
-        full_scale(frame, 12)
+        FrameFormat(bit_depth=12).full_scale(frame)
 
 
 def test_file_of_fewer_bits_than_said():
     with pytest.raises(ParameterError, match=r"`bit_depth` \(12\) must be at most 8"):
-        full_scale(np.ones((2, 2, 1), np.uint8), 12)
+        FrameFormat(bit_depth=12).full_scale(np.ones((2, 2, 1), np.uint8))
 
 
-def test_as_image_moves_the_channels_first():
+def test_normalise_moves_the_channels_first():
     frame = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
-    image = as_image(frame, 255.0)
+    image = FrameFormat().normalise(frame)
     assert image.shape == (1, 3, 2, 4)
     assert image[0, 2, 1, 3].item() == pytest.approx(23 / 255)
     assert image[0, 0, 1, 0].item() == pytest.approx(12 / 255)
@@ -85,15 +86,8 @@ def test_binning_averages_blocks(generator):
 
 @pytest.mark.parametrize("factor", [0, -1, 5])
 def test_binning_factor_is_within_the_frame(factor):
-    with pytest.raises(ParameterError, match=rf"`binning` \({factor}\) must be at least 1 and at most 4"):
+    with pytest.raises(ParameterError, match=rf"`bin` \({factor}\) must be at least 1 and at most 4"):
         bin_pixels(torch.zeros(1, 1, 9, 4), factor)
-
-
-def test_background_is_the_5th_percentile_of_each_channel(generator):
-    ramp = torch.linspace(0, 1, 400)
-    image = torch.stack([ramp[torch.randperm(400, generator=generator)], 3 + ramp]).reshape(1, 2, 20, 20)
-    torch.testing.assert_close(estimate_background(image).flatten(), torch.tensor([ramp[20], 3 + ramp[20]]))
-    assert estimate_background(image).shape == (1, 2, 1, 1)
 
 
 @pytest.mark.parametrize("mosaic", ["rggb", "bggr", "grbg", "gbrg"])
@@ -105,10 +99,33 @@ def test_cells_of_a_mosaic_become_pixels(mosaic):
         row, column = divmod(place, 2)
         image[:, 0, row::2, column::2] = colours[:, "rgb".index(letter)] + (0.1 * row if letter == "g" else 0)
     colours[:, 1] += 0.05  # the two greens differ by their row
-    torch.testing.assert_close(demosaiced(image, mosaic), colours)
+    torch.testing.assert_close(demosaic(image, mosaic), colours)
 
 
-def test_what_is_no_mosaic():
+def test_a_mosaic_has_one_channel_and_even_sides():
     for shape, said in (((1, 3, 8, 8), "3 x 8 x 8"), ((1, 1, 7, 8), "1 x 7 x 8")):
         with pytest.raises(ShapeError, match=rf"A raw mosaic \({said}\) must have one channel and even sides"):
-            demosaiced(torch.zeros(shape), "rggb")
+            demosaic(torch.zeros(shape), "rggb")
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_wrong_numbers():
+    with pytest.raises(ParameterError, match=r"`bin` \(0\)"):
+        FrameFormat(bin=0)
+    with pytest.raises(UnknownNameError, match="'rgbg'"):
+        FrameFormat(mosaic="rgbg")
+
+
+def test_steps_in_their_order():
+    """16 - 1 at the colours' offsets, twice as wide as the crop and binned; row 0 of the file comes last."""
+    frame = np.full((16, 24, 1), 1, np.uint8)
+    frame[4:8, 8:16] += 4  # row 2 to 3 and column 4 to 7 of 8 x 12 cells
+    frames = FrameFormat(bit_depth=4, mosaic="rggb", grey=True, crop=(4, 4), bin=2, upside_down=True)
+    dark = torch.full((1, 1, 16, 24), 1 / 15)
+    expected = torch.tensor([[[[0.0, 0.0], [4 / 15, 4 / 15]]]])
+    torch.testing.assert_close(frames.to_measurement(frame, dark), expected)
+
+
+def test_another_resolution_scales_the_crop():
+    assert FrameFormat(bin=2, crop=(100, 60)).with_bin(4) == FrameFormat(bin=4, crop=(200, 120))
+    assert FrameFormat(bin=2).with_bin(4) == FrameFormat(bin=4)
