@@ -32,8 +32,7 @@ import torch
 
 import arithmetic
 from mwdn import Calibration, Reconstructor
-from mwdn.fourier.padding import pad
-from mwdn.fourier.transforms import inverse_spectrum, spectrum
+from mwdn.fourier.filtering import reference_filter
 from mwdn.inference.reconstructor import find_method
 from mwdn.networks import NETWORKS, blocks, build
 from mwdn.optics import sample_camera
@@ -51,12 +50,6 @@ HEAD = (
     + "| --- " * 12
     + "|"
 )
-
-
-def plain_filter(features, transfer, grid, boundary):
-    """Transform, multiply, transform back, each for the whole array."""
-    spread = spectrum(pad(features.float(), grid, boundary), grid)
-    return inverse_spectrum(transfer * spread, grid, features.shape[-2:])
 
 
 def problem(size, batch):
@@ -81,7 +74,7 @@ def contenders(method, calibration, device, names=CONTENDERS):
 
     @torch.inference_mode()
     def plain(batch):
-        with mock.patch.object(blocks, "filtered", plain_filter), mock.patch.object(blocks, "LARGEST", 2**60):
+        with mock.patch.object(blocks, "filter_image", reference_filter), mock.patch.object(blocks, "LARGEST", 2**60):
             return network(batch.to(device), psf).cpu()
 
     return {"plain": plain, **runs}

@@ -15,10 +15,10 @@ from pathlib import Path
 from statistics import fmean
 
 import torch
-from mwdn.data.as_channels import UnpairedCaptures
 
 import mwdn
 from mwdn.data.photographs import Photographs
+from mwdn.data.unpaired import UnpairedCaptures
 from mwdn.training.recipe import read_recipe
 from mwdn.training.trainer import Trainer
 from universal import METRICS, MISMATCHED, camera, captures, gain, keep, measured
