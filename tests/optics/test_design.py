@@ -125,11 +125,11 @@ def test_recipe_of_the_paper_is_the_default(run, monkeypatch):
     [
         ("contour --levels 0", "Error: `levels` (0) must be 2 to 65,536."),
         ("contour --distance-mm -2", "Error: `distance_mm` (-2) must be positive."),
-        ("diffuser --pitch-um 9", "Error: `pitch_um` (9) cannot sample a surface that turns light"),
+        ("diffuser --pitch-um 9", "Error: `pitch_um` (9) cannot sample"),
         ("contour --recipe none.toml", "Error: `recipe` (none.toml) must be a TOML file"),
         ("contour --levls 3", "Did you mean --levels?"),
         ("kontour", 'Did you mean "contour"?'),
-        ("pinholes --stl --size-mm 0.4 0.4 --count 2", "has no heights for an STL"),
+        ("pinholes --stl --size-mm 0.4 0.4 --count 2", "no heights for an STL"),
     ],
 )
 def test_wrong_call_is_one_message_and_exit_2(run, line, said):

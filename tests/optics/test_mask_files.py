@@ -55,11 +55,11 @@ def test_foreign_files_are_refused(tmp_path):
     tifffile.imwrite(tmp_path / "other.tif", np.zeros((4, 4), np.uint16))
     (tmp_path / "text.tif").write_text("no TIFF")
     for name in ("other.tif", "text.tif"):
-        with pytest.raises(ImageError, match="is no mask of `mwdn design`"):
+        with pytest.raises(ImageError, match="`mwdn design`"):
             read_mask(tmp_path / name)
     with pytest.raises(ImageError, match="cannot be written"):
         write_mask(tmp_path / "text.tif" / "mask.tif", Mask("amplitude", torch.ones(2, 2), 1.0))
-    with pytest.raises(ParameterError, match="must not be negative"):
+    with pytest.raises(ParameterError, match="`values`"):
         write_mask(tmp_path / "mask.tif", Mask("phase", -torch.ones(2, 2), 1.0, 1.5))
 
 
@@ -124,9 +124,9 @@ def test_stl_is_a_closed_body_of_the_right_volume(generator, tmp_path):
 
 
 def test_stl_refuses_what_it_cannot_show(levels, tmp_path):
-    with pytest.raises(ParameterError, match="has no heights for an STL"):
+    with pytest.raises(ParameterError, match="STL"):
         write_stl(tmp_path / "a.stl", Mask("amplitude", torch.ones(4, 4), 1.0))
-    with pytest.raises(ParameterError, match="try `--stl-every 3`"):
+    with pytest.raises(ParameterError, match="`--stl-every 3`"):
         write_stl(tmp_path / "a.stl", Mask("phase", torch.zeros(1).expand(5000, 5000), 1.0, 1.5))
     with pytest.raises(ParameterError, match=r"`base_um` \(0\) must be positive"):
         write_stl(tmp_path / "a.stl", levels, base_um=0.0)

@@ -1,4 +1,4 @@
-"""A camera that does not exist yet: its mask, the light behind it, its forward models and its sensor."""
+"""Lensless cameras in software: masks, propagation of light, PSFs, forward models, the sensor."""
 
 from mwdn.optics.amplitude_masks import CodedAperture, Pinholes, ZoneAperture
 from mwdn.optics.camera import Camera

@@ -1,4 +1,4 @@
-"""Masks that block light: zone aperture, coded aperture, pinholes. What is open shows the shadow's pattern."""
+"""Masks that block light: zone aperture, coded aperture, pinholes."""
 
 import math
 from dataclasses import dataclass
@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from mwdn.errors import ParameterError
-from mwdn.optics.masks import Mask, samples
-from mwdn.optics.propagation import UM_PER_MM, coordinates, positive
+from mwdn.optics.masks import Mask, sample_counts
+from mwdn.optics.propagation import UM_PER_MM, check_positive, coordinates
 from mwdn.optics.setup import Setup
 from mwdn.types import Plane, Size
 
@@ -27,18 +27,18 @@ _TAPS = {
     10: (10, 7),
     11: (11, 9),
 }
-"""Feedback of shift registers that pass all ``2^n - 1`` states but zero: exponents of primitive polynomials."""
+"""Taps of maximum-length shift registers, exponents of primitive polynomials; period ``2^n - 1``."""
 
 
 @dataclass(frozen=True)
 class ZoneAperture:
-    """Rings of equal area, every other one open. Its shadow is a Fresnel zone pattern.
+    """Rings of equal area, every other one open: its shadow is a Fresnel zone pattern.
 
     Args:
         size_mm: height and width.
         pitch_um: distance of the samples.
-        zone_um: radius at which the phase of the pattern, ``pi r^2 / zone^2``, has made half a turn. The rings are
-            ``zone^2 / (2 r)`` wide: the finest at the corners, and they decide about the resolution.
+        zone_um: radius of the first zone: the phase of the pattern is ``pi r^2 / zone^2``, which is pi there. The
+            rings are ``zone^2 / (2 r)`` wide; the finest, at the corners, set the resolution.
 
     References:
         T. Shimano et al., Lensless light-field imaging with Fresnel zone aperture, Appl. Opt. 57, 2841 (2018).
@@ -49,13 +49,13 @@ class ZoneAperture:
     zone_um: float = 400.0
 
     def build(self, setup: Setup) -> Mask:
-        """Compute the mask; it does not depend on the camera.
+        """Compute the mask; it is the same for every camera.
 
         Raises:
             ParameterError: a number is not positive, or the finest ring is narrower than two samples.
         """
-        size = samples(self.size_mm, self.pitch_um)
-        positive(zone_um=self.zone_um)
+        size = sample_counts(self.size_mm, self.pitch_um)
+        check_positive(zone_um=self.zone_um)
         y, x = coordinates(size[0], self.pitch_um)[:, None], coordinates(size[1], self.pitch_um)
         finest = self.zone_um**2 / (2 * math.hypot(*self.size_mm) / 2 * UM_PER_MM)
         if finest < 2 * self.pitch_um:
@@ -69,13 +69,13 @@ class ZoneAperture:
 
 @dataclass(frozen=True)
 class CodedAperture:
-    """A separable pattern of squares without a zero in its spectrum.
+    """A pattern of open and opaque squares whose spectrum has no zeros.
 
     Args:
-        pattern: ``mls``, the product of two maximum-length sequences, or ``mura``, a modified uniformly redundant
-            array.
-        order: of the sequence, which has ``2^order - 1`` squares a side (2 to 11); for ``mura`` the squares a side
-            themselves, a prime.
+        pattern: ``mls``, the separable product of two maximum-length sequences, or ``mura``, a modified uniformly
+            redundant array.
+        order: for ``mls``, of the sequence: ``2^order - 1`` squares a side (2 to 11). For ``mura``, the number of
+            squares a side, a prime.
         feature_um: side of a square.
         pitch_um: distance of the samples.
 
@@ -90,12 +90,12 @@ class CodedAperture:
     pitch_um: float = 2.0
 
     def build(self, setup: Setup) -> Mask:
-        """Compute the mask; it does not depend on the camera.
+        """Compute the mask; it is the same for every camera.
 
         Raises:
-            ParameterError: no such pattern or order, or squares that are narrower than two samples.
+            ParameterError: unknown pattern or order, or squares narrower than two samples.
         """
-        positive(feature_um=self.feature_um, pitch_um=self.pitch_um)
+        check_positive(feature_um=self.feature_um, pitch_um=self.pitch_um)
         if self.feature_um < 2 * self.pitch_um:
             raise ParameterError(
                 f"`pitch_um` ({self.pitch_um:g}) cannot sample squares of {self.feature_um:g} um: use at most "
@@ -105,21 +105,21 @@ class CodedAperture:
             raise ParameterError(f"`pattern` ({self.pattern}) must be mls or mura.")
         code = separable_mls(self.order) if self.pattern == "mls" else mura(self.order)
         side = len(code) * self.feature_um / UM_PER_MM
-        size = samples((side, side), self.pitch_um)
+        size = sample_counts((side, side), self.pitch_um)
         square = ((torch.arange(size[0]) + 0.5) * (self.pitch_um / self.feature_um)).long().clamp(max=len(code) - 1)
         return Mask("amplitude", code[square][:, square], self.pitch_um)
 
 
 @dataclass(frozen=True)
 class Pinholes:
-    """Round holes at random places: as many dim, overlapping pictures as there are holes.
+    """Round holes at random places: each casts a dim picture of the scene, and the pictures overlap.
 
     Args:
-        size_mm: height and width of the part that has holes.
+        size_mm: height and width of the area with holes.
         pitch_um: distance of the samples.
-        count: of holes.
-        diameter_um: of a hole. Below about ``2 sqrt(wavelength distance)`` diffraction widens the spot again.
-        seed: of the places.
+        count: number of holes.
+        diameter_um: diameter of a hole. Below about ``2 sqrt(wavelength distance)`` diffraction widens the spot again.
+        seed: seed of the places.
     """
 
     size_mm: tuple[float, float] = (2.4, 2.4)
@@ -129,13 +129,13 @@ class Pinholes:
     seed: int = 0
 
     def build(self, setup: Setup) -> Mask:
-        """Compute the mask; it does not depend on the camera.
+        """Compute the mask; it is the same for every camera.
 
         Raises:
-            ParameterError: a number is not positive, the holes are narrower than two samples, or they do not fit.
+            ParameterError: a number is not positive, the holes are narrower than two samples, or there is no room.
         """
-        size = samples(self.size_mm, self.pitch_um)
-        positive(count=self.count)
+        size = sample_counts(self.size_mm, self.pitch_um)
+        check_positive(count=self.count)
         if self.diameter_um < 2 * self.pitch_um:
             raise ParameterError(
                 f"`diameter_um` ({self.diameter_um:g}) must be at least 2 samples, {2 * self.pitch_um:g} um."
@@ -144,13 +144,15 @@ class Pinholes:
 
 
 def separable_mls(order: int) -> Plane:
-    """``(1 + m m^T) / 2`` of a maximum-length sequence m of +1 and -1, (2^order - 1) squares a side.
+    """``(1 + m m^T) / 2`` for a maximum-length sequence m of +1 and -1, (2^order - 1) squares a side.
 
     Raises:
         ParameterError: the order is not 2 to 11.
     """
     if order not in _TAPS:
-        raise ParameterError(f"`order` ({order}) of an mls must be {min(_TAPS)} to {max(_TAPS)}.")
+        raise ParameterError(
+            f"`order` ({order}) of an mls must be {min(_TAPS)} to {max(_TAPS)}: it has 2^order - 1 squares a side."
+        )
     register, sequence = [1] * order, []
     for _ in range(2**order - 1):
         sequence.append(register[-1])
@@ -161,13 +163,15 @@ def separable_mls(order: int) -> Plane:
 
 
 def mura(side: int) -> Plane:
-    """Modified uniformly redundant array: open where row and column are both quadratic residues, or both none.
+    """Modified uniformly redundant array of a prime p, p squares a side.
+
+    Open (1) where row and column are both quadratic residues modulo p, or neither; column 0 is open, row 0 is not.
 
     Raises:
-        ParameterError: the side is no odd prime.
+        ParameterError: the side is not an odd prime.
     """
     if side < 3 or any(side % factor == 0 for factor in range(2, math.isqrt(side) + 1)):
-        raise ParameterError(f"`order` ({side}) of a mura must be a prime from 3 on: 31, 61, 101 ...")
+        raise ParameterError(f"`order` ({side}) of a mura must be an odd prime: 31, 61, 101 ...")
     residue = torch.zeros(side, dtype=torch.bool)
     residue[[number**2 % side for number in range(1, side)]] = True
     code = (residue[:, None] == residue[None]).float()
@@ -177,7 +181,7 @@ def mura(side: int) -> Plane:
 
 
 def _holes(design: Pinholes, size: Size) -> Tensor:
-    """Disks at random places that keep two diameters from each other."""
+    """Open disks at random places, at least two diameters apart; rejection sampling."""
     generator = torch.Generator().manual_seed(design.seed)
     y, x = coordinates(size[0], design.pitch_um), coordinates(size[1], design.pitch_um)
     room = torch.tensor(design.size_mm, dtype=torch.float64) * UM_PER_MM - 2 * design.diameter_um
@@ -190,8 +194,8 @@ def _holes(design: Pinholes, size: Size) -> Tensor:
             break
     else:
         raise ParameterError(
-            f"`count` ({design.count}) holes of `diameter_um` ({design.diameter_um:g}) do not fit into "
-            f"{design.size_mm} mm two diameters apart: found room for {len(places)}."
+            f"`count` ({design.count}) holes of `diameter_um` ({design.diameter_um:g}) do not fit into `size_mm` "
+            f"{design.size_mm} two diameters apart; {len(places)} did. Use fewer or smaller holes, or a larger mask."
         )
     open_ = torch.zeros(size)
     for place in places:

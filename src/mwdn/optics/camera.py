@@ -11,12 +11,12 @@ from mwdn.types import Image, Measurement, Psf, Scene, Size
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A thin mask before a sensor, shift-invariant over its field of view.
+    """A thin mask in front of a sensor, shift-invariant over its field of view.
 
     Args:
         psf: (1 or B, 1 or C, h, w), centred; unit sum per channel keeps the energy of the scene.
         size: height and width of the sensor in pixels; the PSF's unless given.
-        sensor: what turns light into numbers; noise-free and unbounded only in `forward`.
+        sensor: noise, saturation and quantisation, which `simulate` applies and `forward` does not.
 
     References:
         Eq. (1) of the MWDN paper.
@@ -43,10 +43,10 @@ class Camera:
         """A capture: `forward`, then noise, black level, saturation and quantisation of the sensor.
 
         Args:
-            scene: (B, C, H, W), linear light; 1 is what just saturates a pixel that receives all of it.
+            scene: (B, C, H, W), linear light; a pixel that receives the light of a scene pixel of 1 just saturates.
             generator: source of the noise, on the scene's device.
 
         Returns:
-            (B, C, *sensor_size), black level subtracted, saturation at 1; the noise of dark pixels reaches below 0.
+            (B, C, *sensor_size), black level subtracted, saturation at 1; noise makes dark pixels negative.
         """
         return self.sensor.expose(self.forward(scene), generator=generator)

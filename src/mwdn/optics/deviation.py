@@ -1,4 +1,4 @@
-"""A camera that is not what its calibration says, in the way a real one is: always the same."""
+"""A camera that differs from its calibration in a fixed way, for robustness tests."""
 
 import math
 from dataclasses import dataclass, fields, replace
@@ -11,38 +11,38 @@ from mwdn.optics.warp import hazed, warp
 from mwdn.types import Psf
 
 OFF_AXIS = Aberration(scale=0.005, stretch=0.02, vignetting=0.3)
-"""What `off_axis` of 1 is at the corner, besides the blur.
+"""Change of the PSF at the corner for an `off_axis` of 1, except the blur.
 
-A display of 14 cm at 20 cm ends 26 degrees off the axis: cos^4 of it leaves 65 % of the light. The way from the mask to
-the sensor is longer there, and what the mask bends, 0.27 mm of a pattern of 2.5 mm (`docs/masks.md`), lands farther out
-by 1 / cos^3 - 1 = 0.38 of it in one direction, 0.1 in the other. Bent by half of this on the average, the pattern grows
-by 2 % and 0.5 %.
+The corner of a 14 cm display at 20 cm is 26 degrees off the axis: cos^4 leaves 65 % of the light. The path from the
+mask to the sensor is longer there: light that the mask deflects by d on the axis, up to 0.27 mm in a pattern of 2.5 mm,
+lands farther out by (1 / cos^3 - 1) d = 0.38 d radially and by (1 / cos - 1) d = 0.1 d tangentially. With the mean
+deflection, half of the largest, the pattern grows by 2 % and 0.5 %.
 """
 
 BLUR = 0.005
-"""Its blur at the corner, an assumption, over the shorter side of the frame: 1.6 pixels of 320."""
+"""Blur at the corner for an `off_axis` of 1, over the shorter side of the frame (assumed): 1.6 pixels of 320."""
 
 GRID = 5
-"""Points along each side of the field whose PSFs are computed."""
+"""PSFs are computed on a grid of 5 x 5 points of the field."""
 
 RANK = 8
-"""Kernels that stand for these 25 PSFs: of the paper's camera they leave out 2 % of the norm at `off_axis` 1."""
+"""Kernels that approximate these 25 PSFs; 2 % of the norm is left for the paper's camera at `off_axis` 1."""
 
 
 @dataclass(frozen=True)
 class Deviation:
-    """How the true camera differs from its calibration: exact, signed sizes, not draws as in `mwdn.data` `Mismatch`.
+    """How the true camera differs from its calibration: fixed, signed sizes (`mwdn.data.mismatch` draws random ones).
 
     Args:
-        shift_px: displacement of the PSF, down and right alike: the length is sqrt(2) times as much.
+        shift_px: displacement of the PSF down, and the same to the right; its length is sqrt(2) times this.
         turn_degrees: rotation of the PSF, clockwise.
         scale: relative magnification of the PSF.
-        background: even light under the PSF, as a part of its sum.
-        off_axis: how much the PSF changes from the axis to the corner, in units of `OFF_AXIS`; 1 is the paper's
-            camera before its display, roughly.
+        background: part of the PSF's light that is spread evenly over the frame.
+        off_axis: change of the PSF from the axis to the corner, in units of `OFF_AXIS`; 1 is about the paper's
+            camera in front of its display.
 
     Raises:
-        ParameterError: a background outside [0, 1), a PSF shrunk to nothing, a negative change off the axis.
+        ParameterError: `background` outside [0, 1), `scale` of -0.9 or less, negative `off_axis`.
     """
 
     shift_px: float = 0.0
@@ -53,31 +53,31 @@ class Deviation:
 
     def __post_init__(self) -> None:
         if not 0 <= self.background < 1:
-            raise ParameterError(f"`background` ({self.background}) must be in [0, 1): a part of the PSF's sum.")
+            raise ParameterError(f"`background` ({self.background}) must be in [0, 1): a part of the light.")
         if not self.scale > -0.9:
             raise ParameterError(f"`scale` ({self.scale}) must be above -0.9: a relative change.")
         if not self.off_axis >= 0:
-            raise ParameterError(f"`off_axis` ({self.off_axis}) must not be negative: it is a size.")
+            raise ParameterError(f"`off_axis` ({self.off_axis}) must not be negative.")
 
     def plus(self, name: str, size: float) -> "Deviation":
-        """The same with one number larger by ``size``.
+        """The same deviation with one number larger by ``size``.
 
         Raises:
-            ParameterError: no such number, or it leaves its range.
+            ParameterError: unknown name, or the number leaves its range.
         """
-        if name not in (known := [part.name for part in fields(self)]):
-            raise ParameterError(f"`{name}` must be one of {', '.join(known)}.")
+        if name not in (names := [field.name for field in fields(self)]):
+            raise ParameterError(f"`name` ({name}) must be one of {', '.join(names)}.")
         return replace(self, **{name: getattr(self, name) + size})
 
     def camera(self, psf: Psf) -> FieldCamera:
-        """The true camera of a calibration with this PSF.
+        """The true camera, given the calibrated PSF.
 
         Args:
             psf: (1, C, H, W) of unit sum; scenes and measurements have its size.
         """
         size = psf.shape[-2], psf.shape[-1]
         angle = math.radians(self.turn_degrees)
-        # Of (row, column) displacements: what lies to the right goes down.
+        # Acts on (row, column): a clockwise turn moves what lies to the right downwards.
         turn = torch.tensor([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
         if self.shift_px or self.turn_degrees or self.scale:
             psf = warp(psf, (1 + self.scale) * turn, (self.shift_px, self.shift_px))

@@ -1,4 +1,4 @@
-"""What random PSFs are drawn from: smooth fields, contour lines, light that rays leave."""
+"""Random fields and patterns of light: smooth fields, contour lines, caustics of rays."""
 
 import math
 
@@ -14,13 +14,14 @@ def contour_lines(field: Tensor, line: float, flattest: float = 1e-3) -> Tensor:
     """Lines along the zeros of a smooth field (..., H, W).
 
     Args:
-        field: whose zeros are drawn.
-        line: full width of a line at half its height, in pixels.
-        flattest: smallest slope a pixel that counts; where the field only touches zero, the line is not wider than
-            with this slope.
+        field: the smooth field.
+        line: full width of a line at half its maximum, in pixels.
+        flattest: smallest slope per pixel; flatter places, where the field only touches zero, are drawn as if they
+            had it, so that they do not become wide blots.
     """
     slope = torch.stack(torch.gradient(field, dim=(-2, -1))).square().sum(0).sqrt()
-    # Distance from the zero contour in pixels is value over slope; a line is a Gaussian of it.
+    # To first order the distance from the zero contour in pixels is field / |slope|. A line is a Gaussian of it;
+    # 2.355 = 2 sqrt(2 ln 2) is its full width at half maximum over its standard deviation.
     distance = field / slope.clamp(min=flattest)
     return torch.exp(-0.5 * (distance / (line / 2.355)).square())
 
@@ -33,15 +34,15 @@ def smooth_field(
     generator: torch.Generator | None = None,
     device: torch.device | str | None = None,
 ) -> Tensor:
-    """Random Gaussian field (H, W) of zero mean and unit variance; it is periodic.
+    """Random periodic Gaussian field (H, W) of zero mean and unit variance.
 
     Args:
         size: height and width in pixels.
-        period: length of its waves in pixels.
-        bandwidth: of their frequencies, over their mean. From 0.5 on the field is a smooth random one; towards 0
-            it holds waves of all directions but one length, whose zero contours keep an even distance.
-        generator: source of the field, on any device.
-        device: where the field shall be.
+        period: wavelength in pixels.
+        bandwidth: relative spread of the frequencies. Towards 0 all waves have one length, in all directions, and
+            the zero contours lie at even distances; from 0.5 on they are irregular.
+        generator: source of randomness, on any device.
+        device: of the result.
     """
     noise = torch.randn(size, generator=generator, device=generator.device if generator else None).to(device)
     rows, columns = frequency_grid(size, device=noise.device)
@@ -55,22 +56,21 @@ def smooth_field(
 def contours(
     size: Size, *, line: float, spacing: float, irregularity: float = 0.15, generator: torch.Generator | None = None
 ) -> Plane:
-    """Contour lines, 1 on their middle and 0 between them, at an even distance from each other.
+    """Contour lines at even distances: 1 on a line, 0 between lines.
 
-    They are the zeros of noise of one wavelength and all directions. Its period is two lines; contours of ordinary
-    Perlin noise, with lines in clusters and empty places between them, lack the ring in the spectrum that the measured
-    PSF of the paper's camera has at one line in about 118 um.
+    They are the zeros of noise with waves of one length in all directions; a period holds two lines. The measured PSF
+    of the paper's camera has a ring in its spectrum, at one line in about 118 um, and so have these. Contours of Perlin
+    noise, whose lines come in clusters with empty places between them, have no such ring.
 
     Args:
         size: height and width in samples.
-        line: full width of a line at half its height, in samples.
+        line: full width of a line at half its maximum, in samples.
         spacing: usual distance from one line to the next, in samples.
         irregularity: spread of the distances, as a part of ``spacing``.
-        generator: source of the noise.
+        generator: source of randomness.
 
     Raises:
-        ParameterError: lines closer than they are wide, narrower than a sample, or not within the frame; an
-            irregularity outside (0, 1].
+        ParameterError: not ``1 <= line < spacing <= min(size)``, or an irregularity outside (0, 1].
     """
     if not 1 <= line < spacing <= min(size):
         raise ParameterError(
@@ -83,20 +83,19 @@ def contours(
     periods = torch.hypot(v[:, None], u[None]) * (2 * spacing)
     ring = torch.exp(-0.5 * ((periods - 1) / irregularity).square()).to(torch.complex64)
     field = filter_field(torch.randn(size, generator=generator).to(torch.complex64), ring).real
-    # The steepest slopes of such noise are about pi / spacing of its standard deviation; a place where it only
-    # touches zero, with hardly any slope, would otherwise become a wide blot.
+    # The steepest slopes are about pi / spacing standard deviations per sample: a sine of period 2 spacing.
     return contour_lines(field / field.std(), line, 0.3 * math.pi / spacing)
 
 
 def scatter_light(rows: Tensor, columns: Tensor, power: Tensor, size: Size) -> Tensor:
-    """Light (H, W) of rays that arrive at pixel coordinates (N,) with a power (N,), shared by the 4 nearest pixels.
+    """Sum rays into pixels (H, W): each ray's power (N,) is shared bilinearly by the 4 pixels around its place (N,).
 
-    The sum is one of integers, in steps of 2^-14 of the strongest ray: rays may then arrive in any order, as they
-    do on a GPU, and the result is the same. 2^17 of the strongest rays fit on one pixel.
+    Powers are summed as integers, in steps of 2^-14 of the strongest ray: the result does not depend on the order of
+    the sum, which varies on a GPU. An int32 pixel holds 2^17 of the strongest rays.
     """
     height, width = size[0] + 3, size[1] + 3
     scale = 2**14 / power.max().clamp(min=1e-20)
-    # A border of one pixel above and left, two below and right, takes the rays that miss the frame.
+    # Rays outside the frame land in a border, one pixel wide above and left and two below and right, cropped below.
     y, x = rows.clamp(-1, size[0]) + 1, columns.clamp(-1, size[1]) + 1
     top, left = y.int(), x.int()
     down, along = y - top, x - left

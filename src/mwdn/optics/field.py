@@ -1,4 +1,4 @@
-"""Where shift invariance ends: a camera whose PSF changes over its field of view."""
+"""A camera whose PSF changes over its field of view: the forward model without shift invariance."""
 
 import math
 from dataclasses import dataclass, field, fields
@@ -16,22 +16,22 @@ from mwdn.optics.warp import warp
 from mwdn.types import Image, Measurement, Psf, Scene, Size
 
 FieldPsfs = Float[Tensor, "rows columns psf_channel psf_height psf_width"]
-"""PSFs of points on a grid that spans the scene from corner to corner, each centred as that of a point on the axis."""
+"""PSFs of points on a grid that spans the scene from corner to corner, each centred like the PSF on the axis."""
 
 
 @dataclass(frozen=True)
 class Aberration:
-    """How a PSF changes from the axis to the corner of the field; in between with the square of the distance.
+    """How a PSF changes from the axis to the corner of the field; in between, with the square of the distance.
 
     Args:
         scale: relative magnification of the PSF at the corner.
-        stretch: relative lengthening along the direction to the axis only: the shear of oblique light.
-        blur_px: standard deviation of a Gaussian blur at the corner; the blur's variance grows with the square of
-            the distance.
+        stretch: further relative magnification at the corner, in the radial direction only: oblique light.
+        blur_px: standard deviation of a Gaussian blur at the corner; its variance grows with the square of the
+            distance from the axis.
         vignetting: part of the light that is lost at the corner.
 
     Raises:
-        ParameterError: a blur that is negative, a vignetting outside [0, 1], a PSF shrunk to nothing.
+        ParameterError: negative `blur_px`, `vignetting` outside [0, 1], `scale` or `stretch` of -0.9 or less.
     """
 
     scale: float = 0.0
@@ -49,41 +49,41 @@ class Aberration:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) must be above -0.9: a relative change.")
 
     def __mul__(self, factor: float) -> "Aberration":
-        """Every change ``factor`` times as large."""
+        """All four changes times a factor."""
         return Aberration(**{part.name: getattr(self, part.name) * factor for part in fields(self)})
 
     def at(self, psf: Psf, y: float, x: float) -> Psf:
-        """Change a PSF into that of a point away from the axis.
+        """The PSF of a point off the axis.
 
         Args:
-            psf: (1, C, h, w) on the axis.
-            y: position of the point below the axis, over half the field's height: 1 at its lower border.
-            x: likewise to the right.
+            psf: (1, C, h, w), the PSF on the axis.
+            y: distance of the point below the axis, over half the field's height: 1 at its lower border.
+            x: distance to the right, over half the field's width.
 
         Returns:
-            (1, C, h, w), its sum smaller by the vignetting and by what leaves the frame.
+            (1, C, h, w). Its sum falls by the vignetting, and by the light outside the frame.
         """
         square = (y * y + x * x) / 2
         if not square:
             return psf
-        # Direction e to the axis: 1 + scale along all directions, and stretch along e e^T besides.
+        # With the unit vector e away from the axis: (1 + s scale) I + s stretch e e^T, s = (y^2 + x^2) / 2.
         e = torch.tensor([y, x]) / math.hypot(y, x)
         matrix = (1 + self.scale * square) * torch.eye(2) + self.stretch * square * torch.outer(e, e)
         changed = warp(psf, matrix) if self.scale or self.stretch else psf
         if self.blur_px:
             changed = gaussian_blur(changed, self.blur_px * math.sqrt(square)).clamp(min=0)
-        # The warp kept the brightness; a larger PSF has the same light on more pixels.
+        # `warp` keeps the brightness; divided by the determinant, the same light falls on more pixels.
         return changed * (1 - self.vignetting * square) / float(matrix.det())
 
 
 def field_psfs(psf: Psf, grid: Size, aberration: Aberration) -> FieldPsfs:
-    """PSFs at the points of a grid, (rows, columns, C, h, w), of a camera with this PSF on its axis.
+    """PSFs (rows, columns, C, h, w) at the points of a grid, for a camera with this PSF on its axis.
 
     Raises:
-        ParameterError: a grid of no points.
+        ParameterError: the grid has no points.
     """
     if min(grid) < 1:
-        raise ParameterError(f"`grid` {grid} must hold at least one point.")
+        raise ParameterError(f"`grid` {grid} must have at least one point along each axis: (5, 5).")
     rows, columns = ([2 * i / (n - 1) - 1 if n > 1 else 0.0 for i in range(n)] for n in grid)
     return torch.stack([torch.stack([aberration.at(psf, y, x)[0] for x in columns]) for y in rows])
 
@@ -92,19 +92,19 @@ def field_psfs(psf: Psf, grid: Size, aberration: Aberration) -> FieldPsfs:
 class FieldCamera:
     """A camera whose PSF changes smoothly over the field: ``crop(sum_k h_k * (w_k . scene))``, then a sensor.
 
-    A point at scene pixel p casts the PSF ``sum_k w_k(p) h_k``, displaced to p. With one h_k and w_k = 1 it is
+    A point at scene pixel p casts the PSF ``sum_k w_k(p) h_k``, displaced to p. One kernel h_1 with w_1 = 1 is
     `mwdn.Camera`.
 
     Args:
-        kernels: h_k, (K, 1 or C, h, w), centred at ``(h // 2, w // 2)``; they may be negative.
-        weights: w_k, (K, 1, H, W) over the scene.
+        kernels: h_k, (K, 1 or C, h, w), centred at ``(h // 2, w // 2)``; of either sign.
+        weights: w_k, (K, 1, H, W), maps over the scene.
         size: height and width of the sensor; the scene's unless given.
-        sensor: what turns light into numbers.
-        truncation: what the kernels leave out of the PSFs they were made from, as a part of their norm.
+        sensor: noise, saturation and quantisation.
+        truncation: relative norm of the difference between the PSFs given to `from_psfs` and these kernels.
 
     References:
         N. Antipa et al., Optica 5, 1 (2018), for the local convolution model; R. C. Flicker and F. J. Rigaut,
-        J. Opt. Soc. Am. A 22, 504 (2005), for PSFs as sums of a few.
+        J. Opt. Soc. Am. A 22, 504 (2005), for PSFs as sums of a few kernels.
     """
 
     kernels: Float[Tensor, "rank psf_channel psf_height psf_width"]
@@ -117,17 +117,20 @@ class FieldCamera:
     def from_psfs(
         cls, psfs: FieldPsfs, scene_size: Size, *, rank: int | None = None, size: Size | None = None
     ) -> "FieldCamera":
-        """Make the best camera of a rank from PSFs on a grid; between its points PSFs are interpolated bilinearly.
+        """Factorise PSFs on a grid by a truncated singular value decomposition; bilinear between the grid's points.
+
+        The PSFs as rows of a matrix are ``U S V^T``: the kernels are rows of V^T, the weights columns of U S. Of all
+        cameras with K kernels this one has the least squared error over the grid: the sum of the squared singular
+        values left out.
 
         Args:
-            psfs: (rows, columns, C, h, w): the first one is that of the scene's upper left corner.
+            psfs: (rows, columns, C, h, w); the first is at the scene's upper left corner.
             scene_size: height and width of scenes.
-            rank: how many kernels; that of the PSFs unless given, which is exact. Of all cameras of this rank it has
-                the least squared error, summed over the grid's PSFs: that of the singular values left out.
-            size: of the sensor; the scene's unless given.
+            rank: number of kernels K; by default the rank of the matrix, which is exact.
+            size: height and width of the sensor; the scene's unless given.
 
         Raises:
-            ParameterError: a rank below 1.
+            ParameterError: `rank` is below 1.
         """
         if rank is not None and rank < 1:
             raise ParameterError(f"`rank` ({rank}) must be at least 1.")
@@ -141,7 +144,7 @@ class FieldCamera:
 
     @property
     def rank(self) -> int:
-        """How many kernels there are."""
+        """Number of kernels."""
         return self.kernels.shape[0]
 
     @property
@@ -155,18 +158,18 @@ class FieldCamera:
         return self.size or self.scene_size
 
     def psf_at(self, row: int, column: int) -> Psf:
-        """PSF (1, C, h, w) of the point at a scene pixel, as if the point were on the axis."""
+        """PSF (1, C, h, w) of the point at a scene pixel, centred like the PSF on the axis."""
         return (self.weights[:, :, row, column][..., None, None] * self.kernels).sum(0, keepdim=True)
 
     def forward(self, scene: Scene) -> Measurement:
         """Light on the sensor.
 
         Raises:
-            ShapeError: the scene does not have the size of the weights.
+            ShapeError: the scene does not have `scene_size`.
         """
         if (scene.shape[-2], scene.shape[-1]) != self.scene_size:
             raise ShapeError(
-                f"`scene` {tuple(scene.shape)} must have the height and width of the field {self.scene_size}. "
+                f"`scene` {tuple(scene.shape)} must have the camera's scene size {self.scene_size}. "
                 "Make the camera for this size: `FieldCamera.from_psfs(psfs, scene_size)`."
             )
         parts = (convolve(scene * w, h[None], size=self.sensor_size) for h, w in self._terms())
@@ -178,7 +181,7 @@ class FieldCamera:
         return torch.stack(list(parts)).sum(0)
 
     def simulate(self, scene: Scene, *, generator: torch.Generator | None = None) -> Image:
-        """A capture: `forward`, then the sensor; see `mwdn.Camera.simulate`."""
+        """A capture: `forward`, then the sensor. See `mwdn.Camera.simulate`."""
         return self.sensor.expose(self.forward(scene), generator=generator)
 
     def _terms(self) -> list[tuple[Tensor, Tensor]]:
@@ -186,9 +189,9 @@ class FieldCamera:
 
 
 def gaussian_blur(image: Image, sigma: float) -> Image:
-    """Blur pictures by a Gaussian of standard deviation ``sigma`` in pixels; darkness lies beyond their border."""
+    """Blur pictures by a Gaussian of standard deviation ``sigma`` in pixels; beyond their border is darkness."""
     size = image.shape[-2], image.shape[-1]
-    # Four standard deviations beside the picture: 6e-5 of the light at its border comes back over them.
+    # Padding by four standard deviations: 6e-5 of the light at a border wraps around to the opposite one.
     margin = math.ceil(4 * sigma)
     grid = fast_length(size[0] + margin), fast_length(size[1] + margin)
     transfer = gaussian_transfer(grid, sigma, device=image.device)

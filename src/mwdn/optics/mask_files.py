@@ -1,4 +1,4 @@
-"""A mask in files: a 16-bit height map that can be read back, GDSII layers and an STL surface for those who make it."""
+"""Mask files: a 16-bit height map that can be read back; GDSII and STL for fabrication."""
 
 import json
 from pathlib import Path
@@ -14,20 +14,20 @@ from mwdn.optics.masks import Mask
 
 _FORMAT = "mwdn mask 1"
 _DEEPEST = 256
-"""Levels into which a continuous surface is divided for GDSII: 8 layers."""
+"""Levels of a continuous surface in GDSII: 8 layers."""
 
 MAX_STL_SAMPLES = 4_000_000
-"""A sample makes two triangles of 50 bytes: 400 MB, about what programs for printers still open."""
+"""Two triangles of 50 bytes a sample: 400 MB, about the largest file that slicers open."""
 
 
 def write_mask(path: str | Path, mask: Mask) -> None:
     """Write a mask as 16-bit grey TIFF, atomically: ``value = number * scale``.
 
-    The scale, the pitch and the index stand as JSON in the tag ImageDescription, the pitch in the resolution tags too.
+    The tag ImageDescription holds scale, pitch and index as JSON; the resolution tags hold the pitch, too.
 
     Args:
-        path: of the TIFF.
-        mask: heights of levels are kept exactly, others to 1/131,070 of the highest.
+        path: the TIFF.
+        mask: heights in levels are stored exactly, others rounded to 1/65,535 of the highest.
 
     Raises:
         ImageError: the file cannot be written.
@@ -38,7 +38,9 @@ def write_mask(path: str | Path, mask: Mask) -> None:
     values = mask.values.numpy().astype(np.float64)
     highest = float(values.max())
     if values.min() < 0 or (mask.kind == "amplitude" and highest > 1):
-        raise ParameterError(f"`values` of a mask ({values.min():g} to {highest:g}) must not be negative or above 1.")
+        raise ParameterError(
+            f"`values` of a mask ({values.min():g} to {highest:g}) must be 0 or more, amplitudes at most 1."
+        )
     scale = highest / 65535 if highest > 0 else 1.0
     if mask.step_um > 0:
         levels = max(1, round(highest / mask.step_um))
@@ -66,10 +68,10 @@ def write_mask(path: str | Path, mask: Mask) -> None:
 
 
 def read_mask(path: str | Path) -> Mask:
-    """Read what `write_mask` has written.
+    """Read a mask written by `write_mask`.
 
     Raises:
-        ImageError: the file cannot be read, or is not such a TIFF.
+        ImageError: the file cannot be read, or `write_mask` did not write it.
     """
     import tifffile
 
@@ -85,20 +87,20 @@ def read_mask(path: str | Path) -> Mask:
         raise
     except OSError as error:
         raise ImageError(f"`{path}` cannot be read: {error.strerror or error}. Check the name.") from error
-    except Exception as error:  # tifffile and json raise whatever a foreign file makes them stumble on
-        raise ImageError(f"`{path}` is no mask of `mwdn design` ({error!r}). Give its mask.tif.") from error
+    except Exception as error:  # a foreign file can raise anything in tifffile and json
+        raise ImageError(f"`{path}` is not a mask written by `mwdn design` ({error!r}). Give its mask.tif.") from error
 
 
 def write_gds(path: str | Path, mask: Mask) -> None:
-    """Write what is etched, or open, as GDSII: one layer a lithography mask, unit 1 um, y upwards, middle at 0.
+    """Write GDSII for lithography, one layer an exposure: unit 1 um, y upwards, origin in the middle of the mask.
 
-    The heights of N levels are binary numbers: layer k (from 0 on) holds the squares whose level has bit k set, to be
-    raised (or the complement etched) by ``2^k`` steps; 3 layers for 8 levels. A continuous surface is divided into 256
-    levels. Of a blocking mask, layer 0 holds what is open.
+    Levels are binary numbers: layer k (from 0) holds the squares whose level has bit k set, to be raised (or their
+    complement etched) by ``2^k`` steps; 8 levels need 3 layers. A continuous surface is rounded to 256 levels. Of an
+    amplitude mask, layer 0 holds the open squares.
 
     Args:
-        path: of the file.
-        mask: of any kind.
+        path: the file.
+        mask: of either kind.
 
     Raises:
         ParameterError: gdstk is not installed.
@@ -114,7 +116,7 @@ def write_gds(path: str | Path, mask: Mask) -> None:
     cell = library.new_cell("MASK")
     for layer in range(max(1, int(level.max()).bit_length())):
         for top, bottom, left, right in _rectangles((level >> layer) & 1).tolist():
-            # Sample i covers i - 1/2 to i + 1/2 around the middle sample n // 2; rows count downwards.
+            # Sample i covers i - 1/2 to i + 1/2; sample n // 2 is the origin; rows count downwards, y upwards.
             corner = ((left - columns // 2 - 0.5) * mask.pitch_um, -(top - rows // 2 - 0.5) * mask.pitch_um)
             other = ((right - columns // 2 - 0.5) * mask.pitch_um, -(bottom - rows // 2 - 0.5) * mask.pitch_um)
             cell.add(gdstk.rectangle(corner, other, layer=layer))
@@ -123,28 +125,28 @@ def write_gds(path: str | Path, mask: Mask) -> None:
 
 
 def write_stl(path: str | Path, mask: Mask, *, base_um: float = 100.0, every: int = 1) -> None:
-    """Write a phase mask as a closed body in binary STL, in um: its surface, four walls and a flat bottom.
+    """Write a phase mask as a closed body in binary STL, in um: the surface, four walls and a flat bottom.
 
     Args:
-        path: of the file.
-        mask: with heights; a level is a slope between two samples, as wide as the pitch.
-        base_um: thickness below the height 0.
-        every: take one sample of so many along each axis.
+        path: the file.
+        mask: a phase mask. A step from one level to the next becomes a slope as wide as the pitch.
+        base_um: thickness below height 0.
+        every: use every n-th sample along each axis.
 
     Raises:
-        ParameterError: a blocking mask, a base that is not positive, or too many samples.
+        ParameterError: an amplitude mask, a number that is not positive, or more than `MAX_STL_SAMPLES`.
         ImageError: the file cannot be written.
     """
     if mask.kind != "phase":
-        raise ParameterError("A blocking mask has no heights for an STL. Make it from its GDSII: `--gds`.")
+        raise ParameterError("An amplitude mask has no heights for an STL. Use GDSII: `--gds`.")
     if not base_um > 0 or every < 1:
         raise ParameterError(f"`base_um` ({base_um:g}) must be positive and `every` ({every}) at least 1.")
     heights = mask.values.numpy()[::every, ::every].astype(np.float64)
     if heights.size > MAX_STL_SAMPLES or min(heights.shape) < 2:
         needed = int(np.ceil(np.sqrt(mask.values.numel() / MAX_STL_SAMPLES)))
         raise ParameterError(
-            f"An STL of {heights.shape[0]:,} x {heights.shape[1]:,} samples must have 2 a side and at most "
-            f"{MAX_STL_SAMPLES:,}: try `--stl-every {needed}`, or use GDSII."
+            f"An STL ({heights.shape[0]:,} x {heights.shape[1]:,} samples) must have at least 2 samples a side and at "
+            f"most {MAX_STL_SAMPLES:,} in all: `--stl-every {needed}`, or use GDSII: `--gds`."
         )
     triangles = np.concatenate(list(_body(heights, mask.pitch_um * every, base_um)))
     sides = triangles[:, 1:] - triangles[:, :1]
@@ -167,7 +169,7 @@ def _levels(mask: Mask) -> npt.NDArray[np.int64]:
 
 
 def _rectangles(filled: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Rectangles (top, bottom, left, right) that cover what is filled: runs of a row, joined with equal runs below."""
+    """Cover filled squares with rectangles (top, bottom, left, right): runs in a row, joined with equal runs below."""
     change = np.diff(np.pad(filled, ((0, 0), (1, 1))), axis=1)
     (row, left), (_, right) = np.nonzero(change == 1), np.nonzero(change == -1)
     order = np.lexsort((row, right, left))
@@ -181,9 +183,9 @@ def _rectangles(filled: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
 
 
 def _body(heights: npt.NDArray[Any], pitch_um: float, base_um: float) -> Any:  # noqa: ANN401
-    """Triangles (n, 3 corners, xyz), counter-clockwise from outside: top, four walls, bottom.
+    """Triangles (n, 3 corners, xyz) of top, walls and bottom, counter-clockwise seen from outside.
 
-    The bottom is a fan around its middle to every point of the border, so that each edge belongs to two triangles.
+    The bottom is a fan from its middle to every point of the border, so that each edge belongs to two triangles.
     """
     rows, columns = heights.shape
     y, x = np.meshgrid(-np.arange(rows) * pitch_um, np.arange(columns) * pitch_um, indexing="ij")
@@ -191,7 +193,7 @@ def _body(heights: npt.NDArray[Any], pitch_um: float, base_um: float) -> Any:  #
     a, b, c, d = top[:-1, :-1], top[:-1, 1:], top[1:, :-1], top[1:, 1:]
     yield np.stack([a, c, d], axis=-2).reshape(-1, 3, 3)
     yield np.stack([a, d, b], axis=-2).reshape(-1, 3, 3)
-    # Around the border, counter-clockwise seen from above: down the left side, along the bottom row, up, back.
+    # The border, counter-clockwise seen from above: down the left side, along the bottom row, up, back.
     border = np.concatenate([top[:-1, 0], top[-1, :-1], top[:0:-1, -1], top[0, :0:-1]])
     following = np.roll(border, -1, axis=0)
     low, low_following = (

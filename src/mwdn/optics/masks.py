@@ -1,4 +1,4 @@
-"""A mask as an optical element, and the PSF of a camera that has it."""
+"""A mask as an optical element, and the PSF of a camera with it."""
 
 import math
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import torch
 
 from mwdn.errors import ParameterError
-from mwdn.optics.propagation import UM_PER_MM, UM_PER_NM, integrate, overlap, point_source, positive, propagate
+from mwdn.optics.propagation import UM_PER_MM, UM_PER_NM, check_positive, integrate, overlap, point_source, propagate
 from mwdn.optics.setup import Setup
 from mwdn.types import Field, Plane, Psf, Size
 
@@ -16,18 +16,18 @@ Kind = Literal["phase", "amplitude"]
 
 @dataclass(frozen=True, eq=False)
 class Mask:
-    """A thin element that delays light (phase) or blocks it (amplitude), opaque beyond its border.
+    """A thin element that delays light (phase mask) or blocks it (amplitude mask); opaque beyond its border.
 
     Args:
-        kind: what ``values`` are.
-        values: heights in um, or transmitted amplitudes in [0, 1]. Row 0 at the top, seen from the scene.
+        kind: phase or amplitude.
+        values: heights in um (phase), or transmitted amplitudes in [0, 1]. Row 0 at the top, seen from the scene.
         pitch_um: distance of the samples.
-        index: refractive index of a phase mask, taken as the same for all wavelengths: fused silica's changes by
-            2 % of its excess over 1 from green to the ends of the visible.
+        index: refractive index n of a phase mask, the same for all wavelengths: n - 1 of fused silica changes by 2 %
+            from green to the ends of the visible spectrum.
         step_um: height of one level; 0 for a continuous surface.
 
     Raises:
-        ParameterError: a number that no mask can have.
+        ParameterError: `pitch_um` is not positive, or `index` of a phase mask not above 1.
     """
 
     kind: Kind
@@ -37,9 +37,9 @@ class Mask:
     step_um: float = 0.0
 
     def __post_init__(self) -> None:
-        positive(pitch_um=self.pitch_um)
-        if self.kind == "phase" and not self.index > 1:
-            raise ParameterError(f"`index` ({self.index:g}) must be above 1, that of air: 1.46 for fused silica.")
+        check_positive(pitch_um=self.pitch_um)
+        if self.kind == "phase":
+            check_index(self.index)
 
     @property
     def size_mm(self) -> tuple[float, float]:
@@ -48,14 +48,14 @@ class Mask:
         return height * self.pitch_um / UM_PER_MM, width * self.pitch_um / UM_PER_MM
 
     def field(self, wavelength_nm: float) -> Field:
-        """What the mask does to light of one wavelength: a complex factor for each sample."""
+        """Complex transmission of each sample: ``exp(2 pi i (index - 1) height / wavelength)``, or the amplitude."""
         if self.kind == "amplitude":
             return torch.complex(self.values, torch.zeros_like(self.values))
         turns = self.values * ((self.index - 1) / (wavelength_nm * UM_PER_NM))
         return torch.polar(torch.ones_like(turns), 2 * math.pi * turns.frac())
 
     def middle(self, size: Size) -> "Mask":
-        """The part of at most ``size`` samples around the centre, which stays the centre."""
+        """Crop to at most ``size`` samples around the centre."""
         (height, width), (h, w) = self.values.shape, (min(a, b) for a, b in zip(self.values.shape, size, strict=True))
         top, left = height // 2 - h // 2, width // 2 - w // 2
         return Mask(self.kind, self.values[top : top + h, left : left + w], self.pitch_um, self.index, self.step_um)
@@ -63,30 +63,30 @@ class Mask:
 
 @runtime_checkable
 class MaskDesign(Protocol):
-    """A few physical numbers that determine a mask."""
+    """Parameters from which a mask can be computed."""
 
     def build(self, setup: Setup) -> Mask:
         """Compute the mask for a camera."""
 
 
-def samples(size_mm: tuple[float, float], pitch_um: float) -> Size:
-    """Rows and columns of a mask.
+def sample_counts(size_mm: tuple[float, float], pitch_um: float) -> Size:
+    """Rows and columns of samples of a mask.
 
     Raises:
         ParameterError: a length is not positive, or there would be fewer than 2 or more than 20,000 samples a side.
     """
-    positive(size_mm=min(size_mm), pitch_um=pitch_um)
+    check_positive(size_mm=min(size_mm), pitch_um=pitch_um)
     rows, columns = (round(side * UM_PER_MM / pitch_um) for side in size_mm)
     if not 2 <= min(rows, columns) <= max(rows, columns) <= 20_000:
         raise ParameterError(
-            f"`pitch_um` ({pitch_um:g}) makes {rows:,} x {columns:,} samples of `size_mm` {size_mm}; "
-            "2 to 20,000 a side are possible."
+            f"`pitch_um` ({pitch_um:g}) makes {rows:,} x {columns:,} samples of `size_mm` {size_mm}, but a side must "
+            "have 2 to 20,000. Change the pitch or the size."
         )
     return rows, columns
 
 
-def quantised(height_um: Plane, levels: int | None) -> tuple[Plane, float]:
-    """Heights rounded to ``levels`` even steps from 0 to the highest, and the step; unchanged and 0 if ``None``.
+def quantise(height_um: Plane, levels: int | None) -> tuple[Plane, float]:
+    """Round heights to ``levels`` even steps from 0 to the highest; returns them with the step. ``None``: no rounding.
 
     Raises:
         ParameterError: fewer than 2 levels or more than 65,536.
@@ -98,26 +98,32 @@ def quantised(height_um: Plane, levels: int | None) -> tuple[Plane, float]:
     return (height_um / step).round() * step, step
 
 
+def check_index(index: float) -> None:
+    """Refuse a refractive index that does not exceed that of air."""
+    if not index > 1:
+        raise ParameterError(f"`index` ({index:g}) must be above 1, the index of air: 1.46 for fused silica.")
+
+
 def check_levels(levels: int) -> None:
-    """Refuse a number of levels that no mask has."""
+    """Refuse a number of levels outside 2 to 65,536."""
     if not 2 <= levels <= 65_536:
         raise ParameterError(f"`levels` ({levels}) must be 2 to 65,536. Leave it out for a continuous surface.")
 
 
 def mask_psf(mask: Mask, setup: Setup, *, angle_degrees: tuple[float, float] = (0.0, 0.0)) -> Psf:
-    """PSF of a camera: light of a point through the mask, on the sensor, summed over wavelengths.
+    """PSF of a camera: a point's light through the mask onto the sensor, its intensity summed over wavelengths.
 
     Args:
-        mask: in the plane of the aperture; of it, only what the aperture leaves open matters.
-        setup: everything else.
-        angle_degrees: of the point from the axis, downwards and to the right. The sensor stays where it is.
+        mask: in the plane of the aperture, and cropped by it.
+        setup: the camera without its mask.
+        angle_degrees: of the point from the axis, downwards and to the right. The sensor does not move.
 
     Returns:
-        (1, 1 or 3, *setup.size). The light that falls onto the aperture is 1 in each channel, so the sum is the part
-        of it that arrives on the sensor; divide by it for a `Camera`.
+        (1, 1 or 3, *setup.size). The sum is the part of the aperture's light that reaches the sensor; divide by it for
+        a `Camera`.
 
     Raises:
-        ParameterError: the mask's pitch cannot sample the light behind it; the message says which could.
+        ParameterError: the mask's pitch cannot sample the light behind it; the message says which pitch can.
     """
     pitch = mask.pitch_um
     opening = tuple(side * UM_PER_MM for side in setup.aperture_mm)
@@ -142,9 +148,10 @@ def mask_psf(mask: Mask, setup: Setup, *, angle_degrees: tuple[float, float] = (
 
 
 def _check_slope(mask: Mask, setup: Setup, wavelength_nm: float, angle_degrees: tuple[float, float]) -> None:
-    """A surface turns light by its slope times ``index - 1``; two samples a period must carry the wave behind it.
+    """Check that the pitch p samples the light behind a continuous surface: ``p <= wavelength / (2 sin(angle))``.
 
-    A surface of levels or a blocking mask has no slope: its samples are the structure itself.
+    A surface deflects light by about its slope times ``index - 1``, on top of the angle of incidence. Surfaces in
+    levels and amplitude masks have no slope: their samples are the structure.
     """
     if mask.kind == "amplitude" or mask.step_um > 0:
         return
@@ -157,14 +164,14 @@ def _check_slope(mask: Mask, setup: Setup, wavelength_nm: float, angle_degrees: 
     if mask.pitch_um > needed * (1 + 1e-6):
         turn = math.degrees(math.asin(min(1.0, steepest)))
         raise ParameterError(
-            f"`pitch_um` ({mask.pitch_um:g}) cannot sample a surface that turns light of {wavelength_nm:g} nm by "
+            f"`pitch_um` ({mask.pitch_um:g}) cannot sample a surface that deflects light of {wavelength_nm:g} nm by "
             f"{turn:.2g} degrees: use at most {needed:.3g} um, or a flatter surface."
         )
 
 
 def describe_mask(mask: Mask, psf: Psf) -> dict[str, Any]:
-    """What a report says of a mask and its PSF, as plain values."""
-    found: dict[str, Any] = {
+    """Size, pitch, material and light efficiency of a mask for a report, as plain values."""
+    report: dict[str, Any] = {
         "kind": mask.kind,
         "samples": list(mask.values.shape),
         "size_mm": list(mask.size_mm),
@@ -173,5 +180,5 @@ def describe_mask(mask: Mask, psf: Psf) -> dict[str, Any]:
     }
     if mask.kind == "phase":
         highest = round(mask.values.max().item(), 6)
-        return found | {"index": mask.index, "step_um": mask.step_um, "highest_um": highest}
-    return found | {"open_part": round(mask.values.square().mean().item(), 6)}
+        return report | {"index": mask.index, "step_um": mask.step_um, "highest_um": highest}
+    return report | {"open_part": round(mask.values.square().mean().item(), 6)}

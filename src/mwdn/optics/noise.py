@@ -5,21 +5,22 @@ from torch import Tensor
 from mwdn.types import Image
 
 SAMPLED = 2**15
-"""Pixels from which the noise is told."""
+"""Pixels used for the estimate."""
 
 
 def noise_level(image: Image, *, parts: int = 16) -> Tensor:
-    """Standard deviation of the noise of each channel, (B, C, 1, 1), if it is white: root mean square over the picture.
+    """Standard deviation of white noise in each channel, (B, C, 1, 1): root mean square over the picture.
 
-    A caustic pattern is smooth from pixel to pixel, so the mixed second difference of 2 x 2 pixels holds nothing
-    but noise, with twice its standard deviation; the median of its size keeps the few sharp edges out. The noise of
-    light grows with the light: the median of a whole measurement tells that of its darker half, half of the mean and
-    less where wide places are dark. So each part is looked at alone. Of a large picture some `SAMPLED` pixels, evenly
-    spread, are looked at.
+    A measurement is smooth from pixel to pixel, so the mixed second difference of 2 x 2 pixels,
+    ``d = b[i+1, j+1] - b[i, j+1] - b[i+1, j] + b[i, j]``, is nearly pure noise with twice the standard deviation, and
+    ``sigma = median(|d|) / (2 * 0.6745)``; the median ignores the few sharp edges. Shot noise grows with the light, so
+    the median over a whole measurement would give the noise of its darker half. The picture is therefore divided into
+    parts, whose variances are averaged. About `SAMPLED` pixels are used, evenly spread.
 
     Args:
         image: (B, C, H, W).
-        parts: at most, along each side, of 16 pixels at least. 1 for a PSF, whose sharp lines fill some parts.
+        parts: number of parts along each side, at most; a part has at least 16 x 16 pixels. Use 1 for a PSF, whose
+            sharp lines can fill a part.
 
     References:
         D. L. Donoho and I. M. Johnstone, Biometrika 81, 425 (1994), for the median of the finest detail.

@@ -1,4 +1,4 @@
-"""Masks that bend light: contour phase mask, diffuser, lenslets."""
+"""Masks that deflect light: contour phase mask, diffuser, lenslets."""
 
 import math
 from dataclasses import dataclass
@@ -9,29 +9,29 @@ from torch import Tensor
 
 from mwdn.errors import ParameterError
 from mwdn.optics.drawing import contours
-from mwdn.optics.masks import Mask, check_levels, quantised, samples
+from mwdn.optics.masks import Mask, check_index, check_levels, quantise, sample_counts
 from mwdn.optics.phase_retrieval import retrieve_phase
-from mwdn.optics.propagation import UM_PER_MM, UM_PER_NM, coordinates, point_source, positive
+from mwdn.optics.propagation import UM_PER_MM, UM_PER_NM, check_positive, coordinates, point_source
 from mwdn.optics.setup import Setup
 from mwdn.types import Size
 
 
 @dataclass(frozen=True)
 class Contour:
-    """A surface of a few levels that concentrates light onto thin contour lines. The defaults are the paper's mask.
+    """A surface in a few levels that concentrates light onto thin contour lines. The defaults are the paper's mask.
 
     Args:
         size_mm: height and width.
-        pitch_um: side of the squares that have one level each.
+        pitch_um: side of a square of constant height.
         index: refractive index; 1.46 is fused silica.
-        levels: of the surface; 2, 4, 8 ... are made by 1, 2, 3 ... etchings.
-        step_nm: height of a level. All levels together delay light of ``levels step_nm (index - 1)`` by one wave:
-            8 x 145 nm x 0.46 = 534 nm. Light of other colours focuses at another distance, and less of it.
-        line_um: full width of a line at half its height, as aimed at.
+        levels: number of levels; 2, 4, 8 ... take 1, 2, 3 ... etchings.
+        step_nm: height of a level. All levels together delay light of wavelength ``levels step_nm (index - 1)`` by one
+            wave: 8 x 145 nm x 0.46 = 534 nm. Other colours focus at other distances, and less sharply.
+        line_um: full width of a line at half its maximum, in the target.
         spacing_um: usual distance from one line to the next.
         irregularity: spread of these distances, as a part of ``spacing_um``.
-        iterations: of the phase retrieval.
-        seed: of the pattern.
+        iterations: iterations of the phase retrieval.
+        seed: seed of the pattern.
 
     References:
         V. Boominathan et al., PhlatCam, IEEE TPAMI 42, 1618 (2020).
@@ -50,19 +50,20 @@ class Contour:
 
     @property
     def design_nm(self) -> float:
-        """Wavelength for which the levels are even parts of one wave."""
+        """Wavelength that all levels together delay by one wave."""
         return self.levels * self.step_nm * (self.index - 1)
 
     def build(self, setup: Setup) -> Mask:
         """Compute the mask for a camera.
 
         Raises:
-            ParameterError: a number is out of its range, the light's band does not hold `design_nm`, or the pitch is
-                too coarse to turn light from between two lines onto one.
+            ParameterError: a number is out of its range, `design_nm` is outside the light's band, or the pitch is too
+                coarse to deflect light from between two lines onto one.
         """
-        size = samples(self.size_mm, self.pitch_um)
+        size = sample_counts(self.size_mm, self.pitch_um)
         check_levels(self.levels)
-        positive(step_nm=self.step_nm, line_um=self.line_um, spacing_um=self.spacing_um, index=self.index - 1)
+        check_index(self.index)
+        check_positive(step_nm=self.step_nm, line_um=self.line_um, spacing_um=self.spacing_um)
         shortest, longest = setup.band_nm
         if not 0.8 * shortest <= self.design_nm <= 1.25 * longest:
             step = (shortest + longest) / 2 / self.levels / (self.index - 1)
@@ -70,11 +71,12 @@ class Contour:
                 f"`levels` ({self.levels}) x `step_nm` ({self.step_nm:g}) x (`index` - 1) ({self.index - 1:.3g}) = "
                 f"{self.design_nm:.4g} nm must be in the light's band {setup.band_nm}: try `step_nm` {step:.0f}."
             )
-        reach = self.spacing_um / 2 / math.hypot(self.spacing_um / 2, setup.distance_mm * UM_PER_MM)
-        needed = self.design_nm * UM_PER_NM / (2 * reach)
+        # Light from halfway between two lines is deflected by asin(sine); a pitch p deflects up to wavelength / (2 p).
+        sine = self.spacing_um / 2 / math.hypot(self.spacing_um / 2, setup.distance_mm * UM_PER_MM)
+        needed = self.design_nm * UM_PER_NM / (2 * sine)
         if self.pitch_um > needed:
             raise ParameterError(
-                f"`pitch_um` ({self.pitch_um:g}) cannot turn light by the {math.degrees(math.asin(reach)):.2g} degrees "
+                f"`pitch_um` ({self.pitch_um:g}) cannot deflect light by {math.degrees(math.asin(sine)):.2g} degrees, "
                 f"from between two lines onto one: use at most {needed:.3g} um, or a smaller `spacing_um`."
             )
         target = contours(
@@ -94,17 +96,17 @@ class Contour:
 
 @dataclass(frozen=True)
 class Diffuser:
-    """A smooth random surface: its hills focus light into a net of caustics.
+    """A smooth random surface whose hills focus light into a net of caustics.
 
     Args:
         size_mm: height and width.
         pitch_um: distance of the samples.
         index: refractive index.
-        feature_um: distance at which the correlation of the heights has fallen to 1/e.
-        deflection_degrees: by which the surface turns light along one axis, root mean square. The caustics are
-            sharpest about ``feature / (2.4 deflection)`` behind it.
-        levels: heights that a printer has; any height unless given.
-        seed: of the surface.
+        feature_um: distance at which the correlation of the heights falls to 1/e.
+        deflection_degrees: deflection of light along one axis, root mean square. The caustics are sharpest about
+            ``feature / (2.4 deflection)`` behind the surface.
+        levels: number of heights of the printer; continuous unless given.
+        seed: seed of the surface.
 
     References:
         N. Antipa et al., DiffuserCam, Optica 5, 1 (2018).
@@ -122,32 +124,34 @@ class Diffuser:
         """Compute the mask; it does not depend on the camera.
 
         Raises:
-            ParameterError: a number is out of its range, or the features are finer than four samples.
+            ParameterError: a number is out of its range, or `feature_um` is below four samples.
         """
-        size = samples(self.size_mm, self.pitch_um)
-        positive(feature_um=self.feature_um, deflection_degrees=self.deflection_degrees, index=self.index - 1)
-        _fits("feature_um", self.feature_um, self.pitch_um, self.size_mm)
+        size = sample_counts(self.size_mm, self.pitch_um)
+        check_index(self.index)
+        check_positive(feature_um=self.feature_um, deflection_degrees=self.deflection_degrees)
+        _check_feature("feature_um", self.feature_um, self.pitch_um, self.size_mm)
         field = _hills(size, self.feature_um / self.pitch_um, torch.Generator().manual_seed(self.seed))
         slope = torch.stack([field.diff(dim=axis).square().mean() for axis in (0, 1)]).mean().sqrt().item()
-        wanted = math.tan(math.radians(self.deflection_degrees)) / (self.index - 1) * self.pitch_um
-        height, step = quantised((field - field.min()) * (wanted / slope), self.levels)
+        # A thin prism deflects light by about (index - 1) times its slope.
+        target = math.tan(math.radians(self.deflection_degrees)) / (self.index - 1) * self.pitch_um
+        height, step = quantise((field - field.min()) * (target / slope), self.levels)
         return Mask("phase", height, self.pitch_um, self.index, step)
 
 
 @dataclass(frozen=True)
 class Lenslets:
-    """Small lenses at random places: each focuses a point of the scene, so the PSF is a cloud of dots.
+    """Small lenses at random places: each focuses a point of the scene, and the PSF is a cloud of dots.
 
     Args:
         size_mm: height and width.
         pitch_um: distance of the samples.
         index: refractive index.
-        spacing_um: usual distance of the lenses.
-        irregularity: how far a lens is from its place on a square lattice at most, as a part of ``spacing_um``; with
-            0 the PSF repeats itself and the reconstruction has ghosts.
-        focal_mm: of each lens; such that a point at the setup's distance is sharp on its sensor unless given.
-        levels: heights that a printer has; any height unless given.
-        seed: of the places.
+        spacing_um: usual distance between lenses.
+        irregularity: largest displacement of a lens from its place on a square lattice, as a part of ``spacing_um``;
+            with 0 the PSF is periodic and the reconstruction has ghosts.
+        focal_mm: focal length; unless given, the one that images a point at ``source_mm`` sharply onto the sensor.
+        levels: number of heights of the printer; continuous unless given.
+        seed: seed of the places.
 
     References:
         G. Kuo et al., On-chip fluorescence microscopy with a random microlens diffuser, Opt. Express 28, 8384 (2020).
@@ -166,31 +170,37 @@ class Lenslets:
         """Compute the mask for a camera.
 
         Raises:
-            ParameterError: a number is out of its range, or the lenses are finer than four samples.
+            ParameterError: a number is out of its range, or `spacing_um` is below four samples.
         """
-        size = samples(self.size_mm, self.pitch_um)
+        size = sample_counts(self.size_mm, self.pitch_um)
+        # 1 / f = 1 / sensor distance + 1 / source distance
         focal = 1 / (1 / setup.distance_mm + 1 / setup.source_mm) if self.focal_mm is None else self.focal_mm
-        positive(focal_mm=focal, index=self.index - 1)
-        _fits("spacing_um", self.spacing_um, self.pitch_um, self.size_mm)
+        check_index(self.index)
+        check_positive(focal_mm=focal)
+        _check_feature("spacing_um", self.spacing_um, self.pitch_um, self.size_mm)
         if not 0 <= self.irregularity <= 0.5:
-            raise ParameterError(f"`irregularity` ({self.irregularity:g}) must be in [0, 0.5].")
-        away = _from_nearest_lens(self, size)
-        # A paraboloid of this height delays light as a thin lens does; the lowest point is at 0.
-        surface = -away / (2 * focal * UM_PER_MM * (self.index - 1))
-        height, step = quantised((surface - surface.min()).float(), self.levels)
+            raise ParameterError(f"`irregularity` ({self.irregularity:g}) must be in [0, 0.5], a part of `spacing_um`.")
+        squared = _squared_distance_to_lens(self, size)
+        # A thin lens of focal length f is the paraboloid -r^2 / (2 f (index - 1)).
+        surface = -squared / (2 * focal * UM_PER_MM * (self.index - 1))
+        height, step = quantise((surface - surface.min()).float(), self.levels)
         return Mask("phase", height, self.pitch_um, self.index, step)
 
 
-def _fits(name: str, um: float, pitch_um: float, size_mm: tuple[float, float]) -> None:
+def _check_feature(name: str, um: float, pitch_um: float, size_mm: tuple[float, float]) -> None:
     if not 4 * pitch_um <= um <= min(size_mm) * UM_PER_MM:
         raise ParameterError(
-            f"`{name}` ({um:g}) must be at least 4 samples ({4 * pitch_um:g} um) and at most the mask's smaller side."
+            f"`{name}` ({um:g}) must be at least 4 samples ({4 * pitch_um:g} um) and at most the "
+            f"mask's smaller side ({min(size_mm) * UM_PER_MM:g} um)."
         )
 
 
 def _hills(size: Size, feature: float, generator: torch.Generator) -> Tensor:
-    """Gaussian hills of random height on a lattice; their correlation falls to 1/e at ``feature`` samples."""
-    width = feature / 2  # of one hill, and of the lattice: the sum is then even to 1e-4
+    """Sum of Gaussian hills of random height on a lattice; the correlation falls to 1/e at ``feature`` samples.
+
+    A hill exp(-r^2 / (2 w^2)) has the autocorrelation exp(-r^2 / (4 w^2)), which is 1/e at r = 2 w = feature.
+    """
+    width = feature / 2  # also the lattice spacing: the variance of the sum is then uniform to 1e-4
     factors = []
     for length in size:
         places = torch.arange(-4, math.ceil(length / width) + 5, dtype=torch.float64) * width
@@ -199,15 +209,15 @@ def _hills(size: Size, feature: float, generator: torch.Generator) -> Tensor:
     return factors[0] @ heights @ factors[1].T
 
 
-def _from_nearest_lens(design: Lenslets, size: Size) -> Tensor:
-    """Squared distance in um^2 of each sample from the nearest lens's middle, float64."""
+def _squared_distance_to_lens(design: Lenslets, size: Size) -> Tensor:
+    """Squared distance in um^2 of each sample from the centre of the nearest lens, float64."""
     generator = torch.Generator().manual_seed(design.seed)
     y, x = coordinates(size[0], design.pitch_um), coordinates(size[1], design.pitch_um)
     counts = [math.ceil(side * UM_PER_MM / design.spacing_um) + 3 for side in design.size_mm]
     rows, columns = (coordinates(count, design.spacing_um) for count in counts)
     shift = (torch.rand(2, *counts, generator=generator, dtype=torch.float64) * 2 - 1) * design.irregularity
-    away = torch.full(size, math.inf, dtype=torch.float64)
-    reach = 2.5 * design.spacing_um  # no sample's nearest lens is farther, wherever the neighbours have gone
+    nearest = torch.full(size, math.inf, dtype=torch.float64)
+    reach = 2.5 * design.spacing_um  # the nearest lens is never farther, however the lenses are displaced
     for i in range(counts[0]):
         for j in range(counts[1]):
             place = rows[i] + shift[0, i, j] * design.spacing_um, columns[j] + shift[1, i, j] * design.spacing_um
@@ -216,6 +226,6 @@ def _from_nearest_lens(design: Lenslets, size: Size) -> Tensor:
                 for axis, middle in zip((y, x), place, strict=True)
             )
             squared = (y[top:bottom, None] - place[0]).square() + (x[left:right] - place[1]).square()
-            part = away[top:bottom, left:right]
+            part = nearest[top:bottom, left:right]
             torch.minimum(part, squared, out=part)
-    return away
+    return nearest

@@ -1,6 +1,6 @@
-"""Light on its way from a point through a mask to the sensor: scalar diffraction on a sampled plane.
+"""Propagation of light from a point through a mask to the sensor: scalar diffraction on sampled planes.
 
-Lengths carry their unit in their name. A plane of n samples is centred at sample ``n // 2``, row 0 at the top.
+Names of lengths end in their unit. A plane of n samples is centred at sample ``n // 2``; row 0 is at the top.
 """
 
 import math
@@ -16,25 +16,25 @@ UM_PER_MM = 1e3
 UM_PER_NM = 1e-3
 
 
-def positive(**numbers: float | int) -> None:
-    """Refuse lengths and counts that are not positive, by their names."""
+def check_positive(**numbers: float | int) -> None:
+    """Check that lengths and counts, given by name, are positive."""
     for name, value in numbers.items():
         if not value > 0:
             raise ParameterError(f"`{name}` ({value:g}) must be positive.")
 
 
 def coordinates(count: int, pitch_um: float) -> Tensor:
-    """Places of ``count`` samples in um, float64, 0 at sample ``count // 2``."""
+    """Coordinates of ``count`` samples in um, float64, 0 at sample ``count // 2``."""
     return (torch.arange(count, dtype=torch.float64) - count // 2) * pitch_um
 
 
 def needed_samples(inside: int, outside: int, *, pitch_um: float, wavelength_nm: float, distance_mm: float) -> int:
-    """Samples along one axis of a grid on which nothing that lands on the output plane has been wrapped around.
+    """Samples along one axis of a grid on which no light wraps around onto the output plane.
 
-    The finest grating that the pitch can carry turns light by ``asin(wavelength / (2 pitch))``. Over the distance
-    that is a displacement e, or half of both planes together, whatever is less: light that is displaced farther
-    lands beside the output. A displacement of e reaches ``inside / 2 + e``, and one grid to the left of that must
-    still lie left of ``-outside / 2``.
+    The finest grating on the mask, with a period of two samples, deflects light by ``asin(wavelength / (2 pitch))``:
+    a displacement e over the distance. Light displaced by more than ``(inside + outside) / 2`` misses the output plane,
+    so e is limited to that. The light reaches ``inside / 2 + e``; its periodic copy, one grid to the left, must lie
+    left of ``-outside / 2``: ``grid >= (inside + outside) / 2 + e``.
 
     Args:
         inside: samples of the input plane.
@@ -61,15 +61,15 @@ def propagate(
     """Propagate light to a parallel plane: band-limited angular spectrum.
 
     Args:
-        field: light on the first plane, zero outside of it.
+        field: light on the first plane; darkness outside.
         pitch_um: distance of the samples, on both planes.
         wavelength_nm: of the light.
         distance_mm: between the planes.
-        size: samples of the second plane, whose centre faces that of the first; those of the first unless given.
-        grid: samples of the grid in between; as many as are needed unless given.
+        size: samples of the second plane, centred opposite the first; those of the first unless given.
+        grid: samples of the FFT grid; `needed_samples` or a few more unless given.
 
     Returns:
-        The light on the second plane. What lands beside it is lost.
+        The light on the second plane. Light that lands beside it is lost.
 
     Raises:
         ParameterError: a length is not positive, or the grid is so small that light wraps around onto the plane.
@@ -78,7 +78,7 @@ def propagate(
         K. Matsushima, T. Shimobaba, Band-limited angular spectrum method for numerical simulation of free-space
         propagation in far and near fields, Opt. Express 17, 19662 (2009).
     """
-    positive(pitch_um=pitch_um, wavelength_nm=wavelength_nm, distance_mm=distance_mm)
+    check_positive(pitch_um=pitch_um, wavelength_nm=wavelength_nm, distance_mm=distance_mm)
     inside = field.shape[0], field.shape[1]
     size = size or inside
     step = {"pitch_um": pitch_um, "wavelength_nm": wavelength_nm, "distance_mm": distance_mm}
@@ -88,7 +88,7 @@ def propagate(
     elif grid[0] < needed[0] or grid[1] < needed[1]:
         raise ParameterError(
             f"`grid` ({grid[0]} x {grid[1]}) lets light wrap around onto the second plane at a pitch of {pitch_um:g} "
-            f"um: pad it to at least {needed[0]} x {needed[1]}."
+            f"um: use at least {needed[0]} x {needed[1]}."
         )
     wide = filter_field(field, angular_spectrum(grid, **step))
     start = inside[0] // 2 - size[0] // 2, inside[1] // 2 - size[1] // 2
@@ -99,19 +99,22 @@ def propagate(
 
 
 def angular_spectrum(grid: Size, *, pitch_um: float, wavelength_nm: float, distance_mm: float) -> Field:
-    """Transfer function of free space, eq. (8) to (13) of Matsushima and Shimobaba, origin first.
+    """Transfer function of free space, eq. (8) to (13) of Matsushima and Shimobaba, frequency 0 first.
+
+    ``H(u, v) = exp(2 pi i z sqrt(1 / wavelength^2 - u^2 - v^2))``, 0 where |u| or |v| exceeds the band limit
+    ``1 / (wavelength sqrt((2 z / width)^2 + 1))``, with z the distance and the width that of the grid.
 
     Args:
         grid: samples.
         pitch_um: distance of the samples.
         wavelength_nm: of the light.
-        distance_mm: to propagate; negative ones lead back, evanescent waves still fading.
+        distance_mm: negative to propagate backwards; evanescent waves decay either way.
     """
     wavelength, distance = wavelength_nm * UM_PER_NM, distance_mm * UM_PER_MM
     v, u = (frequencies(length) / pitch_um for length in grid)
-    # Light of a higher frequency leaves the grid before it arrives: its phase is too steep for the grid.
+    # Above the band limit the phase is too steep for the grid; such light leaves the grid before it arrives.
     limits = [1 / (wavelength * math.hypot(2 * distance / (length * pitch_um), 1)) for length in grid]
-    # In float64: a phase of 2 pi 2 mm / 0.5 um = 25,000 leaves float32 no more than two digits after the point.
+    # In float64: of a phase of 2 pi 2 mm / 0.5 um = 25,000, float32 keeps only two digits after the point.
     squared = wavelength**-2 - v.square()[:, None] - u.square()
     phase = squared.clamp(min=0).sqrt_().mul_(2 * math.pi * distance)
     fading = squared.neg_().clamp_(min=0).sqrt_().mul_(-2 * math.pi * abs(distance)).exp_()
@@ -127,20 +130,20 @@ def point_source(
     distance_mm: float = math.inf,
     angle_degrees: tuple[float, float] = (0.0, 0.0),
 ) -> Field:
-    """Light of a far point on a plane, of modulus 1 in its middle.
+    """Light of a far point on a plane: a spherical or plane wave of modulus 1 in the middle.
 
     Args:
         size: samples of the plane.
         pitch_um: distance of the samples.
         wavelength_nm: of the light.
-        distance_mm: from the plane to the point's plane; infinity for a plane wave.
+        distance_mm: from this plane to the parallel one through the point; infinity for a plane wave.
         angle_degrees: from the axis, downwards and to the right.
 
     Raises:
-        ParameterError: a length is not positive, an angle is not within 90 degrees, or the pitch cannot carry the
-            light's slope; the message says which could.
+        ParameterError: a length is not positive, an angle is not within 90 degrees, or the pitch cannot sample the
+            light's phase; the message says which pitch can.
     """
-    positive(pitch_um=pitch_um, wavelength_nm=wavelength_nm, distance_mm=distance_mm)
+    check_positive(pitch_um=pitch_um, wavelength_nm=wavelength_nm, distance_mm=distance_mm)
     if not max(map(abs, angle_degrees)) < 90:
         raise ParameterError(f"`angle_degrees` {angle_degrees} must be within 90 degrees of the axis.")
     wavelength = wavelength_nm * UM_PER_NM
@@ -165,7 +168,7 @@ def point_source(
 
 
 def _steepest(size: Size, tangents: list[float], pitch_um: float, distance_mm: float) -> float:
-    """Sine of the largest angle to the axis, along one axis, under which the plane sees the point; not quite 0."""
+    """Sine of the largest angle of incidence along either axis, over the whole plane; at least 1e-12."""
     sines = [1e-12]
     for length, tangent in zip(size, tangents, strict=True):
         half = length / 2 * pitch_um / (distance_mm * UM_PER_MM)
@@ -174,18 +177,18 @@ def _steepest(size: Size, tangents: list[float], pitch_um: float, distance_mm: f
 
 
 def integrate(intensity: Plane, *, pitch_um: float, size: Size, pixel_um: float) -> Plane:
-    """Light that falls into each pixel of a sensor whose pixels lie without gaps.
+    """Sum the light in each pixel of a sensor without gaps between its pixels.
 
-    Each sample stands for a square of its pitch, whose light is divided among the pixels by area: no light is lost
-    inside the sensor, and any two pitches fit together. Pixels binned by n are pixels n times as large.
+    A sample is a square of the pitch; its light is divided among the pixels by area. So no light is lost inside the
+    sensor, whatever the two pitches. Pixels binned by n are pixels n times as large.
 
     Args:
         intensity: samples on the sensor's plane.
         pitch_um: distance of the samples.
-        size: rows and columns of pixels; the middle of pixel ``n // 2`` faces the middle of the plane.
+        size: rows and columns of pixels; the middle of pixel ``n // 2`` is the middle of the plane.
         pixel_um: distance of the pixels.
     """
-    positive(pitch_um=pitch_um, pixel_um=pixel_um)
+    check_positive(pitch_um=pitch_um, pixel_um=pixel_um)
     down, across = (
         overlap(length, pixel_um, samples, pitch_um) for length, samples in zip(size, intensity.shape, strict=True)
     )
@@ -193,7 +196,7 @@ def integrate(intensity: Plane, *, pitch_um: float, size: Size, pixel_um: float)
 
 
 def overlap(cells: int, cell_um: float, others: int, other_um: float) -> Tensor:
-    """Part of each of the other grid's cells, along one axis, that each cell covers, (cells, others), float64."""
+    """Part of each cell of the other grid that each cell covers, along one axis: (cells, others), float64."""
     a, b = coordinates(cells, cell_um)[:, None], coordinates(others, other_um)
     right = torch.minimum(a + cell_um / 2, b + other_um / 2)
     left = torch.maximum(a - cell_um / 2, b - other_um / 2)

@@ -1,7 +1,7 @@
-"""Random plausible cameras: PSFs of every kind of mask, drawn fast enough to train a network across cameras.
+"""Random plausible PSFs of every kind of mask, drawn fast enough to train a network across cameras.
 
-Nothing is propagated: each family is drawn as its light looks on the sensor, and what real cameras add (the edge of
-the aperture, blur, halo, haze, speckle, differences of the colours) is put on top of all of them.
+Light is not propagated: each family draws the pattern on the sensor directly. The imperfections of real cameras (the
+edge of the aperture, blur, halo, haze, speckle, differences between colours) are added to all families alike.
 """
 
 import math
@@ -15,6 +15,7 @@ from torch.nn import functional as F
 from mwdn.errors import ParameterError, UnknownNameError
 from mwdn.fourier.transforms import fast_length, gaussian_transfer, inverse_spectrum, spectrum
 from mwdn.optics.drawing import contour_lines, scatter_light, smooth_field
+from mwdn.optics.psf import unit_sum
 from mwdn.types import Psf, Size
 
 Range = tuple[float, float]
@@ -22,24 +23,24 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class Variety:
-    """How different the cameras are. Each number is drawn evenly from its range for each camera.
+    """Ranges from which the properties of random cameras are drawn, uniformly for each camera.
 
     Args:
-        support: height, and width, of the lit part over that of the frame; above 1 the frame cuts it.
-        offset: largest displacement of the lit part's centre, over the frame's height and width.
-        turn_degrees: largest rotation of the mask against the sensor.
+        support: height (and, drawn separately, width) of the lit area over that of the frame; above 1 it is cut off.
+        offset: largest displacement of the lit area's centre, over the frame's height and width.
+        turn_degrees: largest rotation of the mask relative to the sensor.
         detail_px: distance between the mask's lines or spots, in pixels of a frame of 320; scaled with the frame's
             shorter side.
         line_px: width of contour lines, in pixels of the frame.
-        blur_px: standard deviation of the blur of everything.
+        blur_px: standard deviation of a Gaussian blur.
         halo: part of the light in a wide halo around every line.
-        glow: part of the light that fills the aperture evenly: what the mask does not bend.
+        glow: part of the light that fills the aperture evenly, undeflected by the mask.
         background: part of the light that fills the frame evenly.
-        speckle: standard deviation of the logarithm of the brightness along lines.
-        colour_scale: largest relative magnification of red and blue against green, in opposite directions.
-        colour_blur: largest relative difference of their blur.
+        speckle: standard deviation of the logarithm of a random smooth brightness.
+        colour_scale: largest relative magnification of red and blue over green, of opposite signs.
+        colour_blur: largest relative difference of the blur of red and blue from green's, of opposite signs.
         colour_tilt: largest relative change of a colour's brightness from the middle to a side of the frame.
-        grey: part of the cameras whose colours are all alike.
+        grey: probability that all colours are alike.
     """
 
     support: Range = (0.4, 1.15)
@@ -62,18 +63,18 @@ class Variety:
             value = getattr(self, part.name)
             low, high = value if isinstance(value, tuple) else (value, value)
             if not 0 <= low <= high:
-                raise ParameterError(f"`{part.name}` ({value}) must not be negative, and a range in rising order.")
+                raise ParameterError(f"`{part.name}` ({value}) must not be negative, and a range must rise.")
         for name, low in (("support", self.support[0]), ("detail_px", self.detail_px[0]), ("line_px", self.line_px[0])):
             if not low > 0:
                 raise ParameterError(f"`{name}` {getattr(self, name)} must be positive.")
         for name, high in (("halo", self.halo[1]), ("glow", self.glow[1]), ("background", self.background[1])):
             if not high < 1:
-                raise ParameterError(f"`{name}` {getattr(self, name)} must be below 1: it is a part of the light.")
+                raise ParameterError(f"`{name}` {getattr(self, name)} must be below 1: a part of the light.")
 
 
 @dataclass(frozen=True, eq=False)
 class _Draw:
-    """One camera being drawn: its random numbers, its frame, and where its light falls."""
+    """Random numbers and fields for one camera."""
 
     generator: torch.Generator
     variety: Variety
@@ -88,9 +89,9 @@ class _Draw:
         return self.uniform(*getattr(self.variety, name))
 
     def spread(self, name: str) -> float:
-        """A number of either sign, up to the size of that name."""
-        size = getattr(self.variety, name)
-        return self.uniform(-size, size)
+        """A number of either sign, up to the limit of that name."""
+        limit = getattr(self.variety, name)
+        return self.uniform(-limit, limit)
 
     def signs(self, count: int) -> Tensor:
         bits = torch.randint(0, 2, (count,), generator=self.generator, device=self.generator.device)
@@ -100,7 +101,7 @@ class _Draw:
         return torch.randn(shape, generator=self.generator, device=self.generator.device).to(self.device)
 
     def detail(self) -> float:
-        """Distance of lines or spots in pixels; at least 4, below which nothing could be told apart."""
+        """Distance between lines or spots in pixels; at least 4, below which they could not be resolved."""
         return max(self.range("detail_px") * min(self.size) / 320, 4.0)
 
     def field(self, period: float, bandwidth: float = 1.0) -> Tensor:
@@ -109,7 +110,7 @@ class _Draw:
 
 @dataclass(frozen=True, eq=False)
 class _Aperture:
-    """Where light passes: ``light`` (H, W) in [0, 1], at pixels ``y``, ``x`` from its centre along its own axes."""
+    """The lit area: ``light`` (H, W) in [0, 1]; ``y``, ``x`` in pixels from its centre; half its sides."""
 
     light: Tensor
     y: Tensor
@@ -118,7 +119,7 @@ class _Aperture:
 
 
 def _aperture(draw: _Draw) -> _Aperture:
-    """A turned rectangle or ellipse with a soft edge."""
+    """A rotated rectangle or ellipse with a soft edge."""
     height, width = draw.size
     half = draw.range("support") * height / 2, draw.range("support") * width / 2
     turn = math.radians(draw.spread("turn_degrees"))
@@ -135,22 +136,23 @@ def _aperture(draw: _Draw) -> _Aperture:
 
 
 def _contours(draw: _Draw, aperture: _Aperture) -> Tensor:
-    """Contour phase mask (PhlatCam): even, sharp lines that hardly ever meet."""
+    """Contour phase mask (PhlatCam): sharp lines at even distances that rarely meet."""
     spacing = draw.detail()
     field = draw.field(2 * spacing, draw.uniform(0.03, 0.5))
-    # A third of its usual slope: flatter places would become wide blots.
+    # A tenth of the steepest slopes, pi / spacing: flatter places would become wide blots.
     return contour_lines(field, draw.range("line_px"), 0.3 * math.pi / spacing) * aperture.light
 
 
 def _caustics(draw: _Draw, aperture: _Aperture) -> Tensor:
-    """A smooth random diffuser (DiffuserCam): rays bent by the slope of its surface meet in a net of lines."""
+    """Smooth random diffuser (DiffuserCam): rays deflected by the slope of the surface meet in a net of caustics."""
     height, width = draw.size
     surface = draw.field(3 * draw.detail(), draw.uniform(0.3, 0.8))
     slope = torch.stack(torch.gradient(surface, dim=(0, 1)))
     curvature = torch.stack(torch.gradient(slope[0], dim=(0, 1))).square().mean().sqrt()
-    # From 0.3 on the strongest bumps focus onto the sensor and lines are born; at 1 they begin to cross.
+    # Deflection = bend * slope. From bend * curvature = 0.3 on, the strongest bumps focus and lines form; at 1 they
+    # begin to cross.
     bend = draw.uniform(0.3, 1.1) / curvature.clamp(min=1e-12)
-    # Four rays a pixel, so that stretched places stay smooth.
+    # Four rays a pixel, so that stretched areas stay smooth.
     rays = F.interpolate(
         torch.cat([slope * bend, aperture.light[None]])[None], scale_factor=2, mode="bilinear", align_corners=False
     )[0]
@@ -197,7 +199,7 @@ FAMILIES: dict[str, Callable[[_Draw, _Aperture], Tensor]] = {
     "zone-plate": _zone_plate,
     "separable": _separable,
 }
-"""Kinds of masks, drawn by `sample_camera`."""
+"""Families of masks for `sample_camera`."""
 
 
 def sample_camera(
@@ -211,19 +213,19 @@ def sample_camera(
     """Draw the PSF of a random camera.
 
     Args:
-        generator: source of all random numbers, or a seed of one. It may be a CPU's while ``device`` is a GPU, whose
-            PSF then is the CPU's up to rounding.
+        generator: source of randomness, or its seed. A generator on the CPU also serves a ``device`` that is a GPU;
+            the PSF is then the CPU's up to rounding.
         size: height and width in pixels.
-        family: one of `FAMILIES`; drawn as well unless given.
-        variety: how different the cameras are.
-        device: where to compute and to return; the generator's unless given.
+        family: one of `FAMILIES`; drawn unless given.
+        variety: ranges of the cameras' properties.
+        device: where to compute; the generator's unless given.
 
     Returns:
-        (1, 3, *size), float32, not negative, each colour of unit sum; the middle of the lit part is near
+        (1, 3, *size), float32, not negative, each channel of unit sum; the middle of the lit area is near
         ``(H // 2, W // 2)``.
 
     Raises:
-        UnknownNameError: no such family.
+        UnknownNameError: unknown family.
         ParameterError: a size below 8.
 
     References:
@@ -232,7 +234,7 @@ def sample_camera(
         Comput. Imaging 3, 384 (2017) for separable masks.
     """
     if min(size) < 8:
-        raise ParameterError(f"`size` {size} must be at least 8 x 8: no mask has room in less.")
+        raise ParameterError(f"`size` {size} must be at least 8 x 8 pixels.")
     if family is not None and family not in FAMILIES:
         raise UnknownNameError("family", family, FAMILIES)
     if isinstance(generator, int):
@@ -248,11 +250,11 @@ def sample_camera(
     psf = _blur(draw, _colours(draw, pattern))
     background = draw.range("background")
     psf = (1 - background) * psf / psf.sum((-2, -1), keepdim=True) + background / (size[0] * size[1])
-    return psf / psf.sum((-2, -1), keepdim=True)
+    return unit_sum(psf)
 
 
 def _colours(draw: _Draw, pattern: Tensor) -> Tensor:
-    """Red, green and blue (1, 3, H, W): a little magnified against each other, and unevenly bright."""
+    """Red, green and blue (1, 3, H, W), slightly magnified relative to green and shaded differently."""
     grey = draw.uniform(0.0, 1.0) < draw.variety.grey
     scale, tilts = draw.spread("colour_scale"), [draw.spread("colour_tilt") for _ in range(6)]
     if grey:
@@ -279,11 +281,11 @@ def _magnify(plane: Tensor, factor: float) -> Tensor:
 
 
 def _blur(draw: _Draw, psf: Tensor) -> Tensor:
-    """Blur each colour by a narrow Gaussian with a wide one under it; what leaves the frame is lost."""
+    """Blur each colour by the sum of a narrow and a wide Gaussian (the halo); light outside the frame is lost."""
     narrow, wide = draw.range("blur_px"), draw.uniform(0.02, 0.08) * min(draw.size)
     halo, difference = draw.range("halo"), draw.spread("colour_blur")
     height, width = draw.size
-    # Three standard deviations of darkness beside the frame; less than 1e-3 of the halo comes back over them.
+    # Padding by three standard deviations: less than 1e-3 of the halo wraps around.
     margin = math.ceil(3 * wide)
     grid = fast_length(height + margin), fast_length(width + margin)
     widths = [narrow * (1 + colour * difference) for colour in (-1, 0, 1)]

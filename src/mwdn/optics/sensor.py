@@ -1,4 +1,4 @@
-"""From light to numbers: shot noise, read noise, black level, saturation, quantisation."""
+"""Image sensor: shot noise, read noise, black level, saturation, quantisation."""
 
 from dataclasses import dataclass
 
@@ -13,15 +13,14 @@ class Sensor:
     """A linear image sensor.
 
     Args:
-        full_well: electrons at saturation. Photon noise is relatively weaker the larger it is: the best
-            signal-to-noise ratio of a pixel is its square root.
-        read_noise: standard deviation in electrons, the same for each pixel and frame.
+        full_well: electrons at saturation. The best signal-to-noise ratio of a pixel is its square root (shot noise).
+        read_noise: standard deviation in electrons, of every pixel and frame.
         bit_depth: bits of the analogue-to-digital converter.
-        black_level: what a dark pixel reads, as a fraction of the full scale; it keeps the noise of dark pixels
-            from being cut at zero.
+        black_level: mean reading of a dark pixel, as a fraction of the full scale; so that the noise of dark pixels is
+            not clipped at zero.
 
     Raises:
-        ParameterError: a number that no sensor can have.
+        ParameterError: a number is out of its range.
 
     References:
         J. R. Janesick, Photon Transfer (SPIE, 2007): the variance of a measurement in units of the full scale is
@@ -41,18 +40,17 @@ class Sensor:
         if not 1 <= self.bit_depth <= 16:
             raise ParameterError(f"`bit_depth` ({self.bit_depth}) must be 1 to 16.")
         if not 0 <= self.black_level < 1:
-            raise ParameterError(f"`black_level` ({self.black_level}) must be in [0, 1), a part of the full scale.")
+            raise ParameterError(f"`black_level` ({self.black_level}) must be in [0, 1): a fraction of the full scale.")
 
     def expose(self, light: Image, *, generator: torch.Generator | None = None) -> Image:
         """One capture of the light on the sensor.
 
         Args:
-            light: (B, C, H, W); 1 fills the well.
-            generator: source of the noise, on the same device.
+            light: (B, C, H, W); 1 saturates a pixel.
+            generator: source of the noise, on the device of the light.
 
         Returns:
-            Same shape; the black level is subtracted and the rest scaled so that saturation is 1, so the noise of
-            dark pixels reaches below 0.
+            Same shape. The black level is subtracted and saturation is 1; noise makes dark pixels negative.
         """
         electrons = torch.poisson(light.clamp(min=0) * self.full_well, generator=generator)
         electrons += self.read_noise * torch.randn(

@@ -1,4 +1,4 @@
-"""Everything of a lensless camera but its mask: aperture, distances, sensor, light."""
+"""A lensless camera without its mask: aperture, distances, sensor, light."""
 
 import math
 from dataclasses import dataclass
@@ -7,32 +7,32 @@ import torch
 from torch import Tensor
 
 from mwdn.errors import ParameterError
-from mwdn.optics.propagation import positive
+from mwdn.optics.propagation import check_positive
 from mwdn.types import Size
 
-# Means and standard deviations in nm. A white LED is a blue chip and the broad light of its phosphor; the filters
-# are those of a usual Bayer mosaic. The widths are typical ones, not those of a certain part.
+# Gaussians: mean and standard deviation in nm, for the LED also the height. A white LED is a blue chip with a broad
+# phosphor; the filters are red, green and blue of a Bayer mosaic. Typical values, not those of a specific part.
 _LED = ((450.0, 10.0, 1.0), (560.0, 50.0, 0.6))
 _FILTERS = ((605.0, 35.0), (535.0, 38.0), (460.0, 30.0))
 
 
 @dataclass(frozen=True)
 class Setup:
-    """Everything of a camera but its mask. The defaults are the paper's camera.
+    """A camera without its mask. The defaults are the paper's camera.
 
     Args:
-        distance_mm: from the mask to the sensor. The PSF grows sharper in angle with it, the field of view narrower.
+        distance_mm: from the mask to the sensor. A larger one gives a finer angular resolution and a narrower field.
         source_mm: from the point to the mask; infinity for a star.
         aperture_mm: height and width of the opening at the mask.
-        pixels: rows and columns of the sensor that are used.
-        pixel_um: distance of the pixels.
-        bin: pixels that are averaged to one, along each axis.
+        pixels: rows and columns of the sensor.
+        pixel_um: pixel pitch.
+        bin: pixels averaged into one, along each axis.
         band_nm: shortest and longest wavelength.
-        wavelengths: how many of the band are computed, evenly spaced; one stands for the middle of the band.
-        colour: a white LED seen by a sensor with red, green and blue filters; otherwise even light on a grey sensor.
+        wavelengths: number of wavelengths to compute, evenly spaced over the band; 1 is the middle of the band.
+        colour: a white LED and a sensor with red, green and blue filters; otherwise a flat spectrum on a grey sensor.
 
     Raises:
-        ParameterError: a number that no camera can have.
+        ParameterError: a number is not positive, or out of its range.
     """
 
     distance_mm: float = 2.0
@@ -46,10 +46,12 @@ class Setup:
     colour: bool = True
 
     def __post_init__(self) -> None:
-        positive(distance_mm=self.distance_mm, source_mm=self.source_mm, pixel_um=self.pixel_um)
-        positive(aperture_mm=min(self.aperture_mm), pixels=min(self.pixels), bin=self.bin, wavelengths=self.wavelengths)
+        check_positive(distance_mm=self.distance_mm, source_mm=self.source_mm, pixel_um=self.pixel_um)
+        check_positive(
+            aperture_mm=min(self.aperture_mm), pixels=min(self.pixels), bin=self.bin, wavelengths=self.wavelengths
+        )
         if math.isinf(self.distance_mm):
-            raise ParameterError("`distance_mm` (inf) must be finite: a lensless camera has its sensor near the mask.")
+            raise ParameterError("`distance_mm` (inf) must be finite: the sensor is near the mask.")
         if not 0 < self.band_nm[0] <= self.band_nm[1]:
             raise ParameterError(f"`band_nm` {self.band_nm} must be the shortest and the longest wavelength, positive.")
         if self.bin > min(self.pixels):
@@ -62,21 +64,21 @@ class Setup:
 
     @property
     def pitch_um(self) -> float:
-        """Distance of the measurement's pixels, after binning."""
+        """Pixel pitch of a measurement, after binning."""
         return self.pixel_um * self.bin
 
     def spectrum(self) -> tuple[list[float], Tensor]:
-        """Wavelengths in nm, and their part in each channel's light: (1 or 3, wavelengths), float64, rows of sum 1."""
+        """Wavelengths in nm and their weights in each channel: (1 or 3, wavelengths), float64, rows of sum 1."""
         first, last = self.band_nm
         if self.wavelengths == 1:
             return [(first + last) / 2], torch.ones(3 if self.colour else 1, 1, dtype=torch.float64)
         nm = torch.linspace(first, last, self.wavelengths, dtype=torch.float64)
         if not self.colour:
             return nm.tolist(), torch.full((1, self.wavelengths), 1 / self.wavelengths, dtype=torch.float64)
-        led = torch.stack([part * _bell(nm, mean, width) for mean, width, part in _LED]).sum(0)
-        weights = torch.stack([led * _bell(nm, mean, width) + 1e-12 for mean, width in _FILTERS])
+        led = torch.stack([part * _gaussian(nm, mean, width) for mean, width, part in _LED]).sum(0)
+        weights = torch.stack([led * _gaussian(nm, mean, width) + 1e-12 for mean, width in _FILTERS])
         return nm.tolist(), weights / weights.sum(-1, keepdim=True)
 
 
-def _bell(x: Tensor, mean: float, width: float) -> Tensor:
+def _gaussian(x: Tensor, mean: float, width: float) -> Tensor:
     return torch.exp(-0.5 * ((x - mean) / width).square())

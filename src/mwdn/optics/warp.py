@@ -1,4 +1,4 @@
-"""Turn, scale and shear PSFs about their centre; haze."""
+"""Rotate, scale and shear PSFs about their centre; add haze."""
 
 import torch
 from torch import Tensor
@@ -8,15 +8,17 @@ from mwdn.types import Psf
 
 
 def warp(psf: Psf, matrix: Tensor, shift: tuple[float, float] = (0.0, 0.0)) -> Tensor:
-    """Map PSFs by 2 x 2 matrices of (row, column) displacements from their centre ``(h // 2, w // 2)``; bicubic.
+    """Warp PSFs about their centre ``(h // 2, w // 2)``: light at r = (row, column) moves to ``matrix r + shift``.
+
+    Interpolation is bicubic.
 
     Args:
-        psf: (1 or B, C, h, w). Its brightness is kept, so its sum changes with the matrix's determinant.
-        matrix: (2, 2), or (B, 2, 2) for one of each PSF.
-        shift: down and right, in pixels, after that.
+        psf: (1 or B, C, h, w). Brightness is kept, so the sum changes with the determinant of the matrix.
+        matrix: (2, 2), or (B, 2, 2) with one for each PSF.
+        shift: down and right, in pixels.
 
     Returns:
-        (B, C, h, w), not negative; darkness comes in from beyond the frame.
+        (B, C, h, w), not negative; darkness enters from outside the frame.
     """
     height, width = psf.shape[-2:]
     inverse = torch.linalg.inv(matrix.to(psf)).expand(max(len(psf), len(matrix.reshape(-1, 2, 2))), 2, 2)
@@ -30,22 +32,22 @@ def warp(psf: Psf, matrix: Tensor, shift: tuple[float, float] = (0.0, 0.0)) -> T
 
 
 def hazed(psf: Tensor, part: Tensor | float) -> Tensor:
-    """Spread a part of the light of PSFs (..., h, w) evenly over them; ``part`` is a number or broadcasts."""
+    """Spread a part of the light of PSFs (..., h, w) evenly over the frame; ``part`` is a number or broadcasts."""
     return psf + part * (psf.mean((-2, -1), keepdim=True) - psf)
 
 
 def affine(turn: Tensor, scale_y: Tensor, scale_x: Tensor, shift: Tensor, aspect: float) -> Tensor:
-    """(B, 2, 3) matrices for ``affine_grid`` that scale, then turn (clockwise), then shift a picture's content.
+    """(B, 2, 3) matrices for ``affine_grid`` that scale, then turn (clockwise), then shift the content of a picture.
 
     Args:
-        turn: (B,), radian.
-        scale_y: (B,), height of the content over that of the frame.
-        scale_x: (B,), width of the content over that of the frame.
-        shift: (B, 2), down and right, over half the frame.
+        turn: (B,), in radians.
+        scale_y: (B,), vertical magnification of the content.
+        scale_x: (B,), horizontal magnification.
+        shift: (B, 2), down and right, in halves of the frame.
         aspect: width over height of the frame, so that a turned square stays a square.
     """
     c, s = turn.cos(), turn.sin()
-    # affine_grid asks where each output pixel comes from: the inverse map, undone from the outside in.
+    # affine_grid takes the inverse map, from output to input: unshift, turn back, then unscale.
     inverse = torch.stack(
         [
             torch.stack([c / scale_x, s / aspect / scale_x], -1),
