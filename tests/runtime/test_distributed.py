@@ -45,7 +45,7 @@ bfloat16 = false
 """
 CPSF = """
 network = { name = "mwdn-cpsf", width = 4 }
-schedule = { steps = 4, batch = 5, course = "plateau", validate_every = 2, validation = 3, bfloat16 = false }
+schedule = { steps = 4, batch = 5, lr_schedule = "plateau", validate_every = 2, validation = 3, bfloat16 = false }
 loss = { l1 = 0.5, mse = 1.0 }
 """
 
@@ -186,12 +186,12 @@ def test_two_processes_end_as_one_in_float64(worked):
         torch.testing.assert_close(states[1][key], value, rtol=1e-5, atol=1e-8, msg=lambda m, k=key: f"{k}: {m}")
 
 
-def test_both_processes_have_the_course_of_the_first(worked):
+def test_both_processes_have_the_lr_schedule_of_the_first(worked):
     """Only the first validates."""
-    courses = [json.loads((worked / f"course-{rank}.json").read_text()) for rank in (0, 1)]
-    assert courses[0] == courses[1]
+    schedules = [json.loads((worked / f"lr_schedule-{rank}.json").read_text()) for rank in (0, 1)]
+    assert schedules[0] == schedules[1]
     losses = [line["validation_loss"] for line in log(worked / "double" / "two")]
-    assert courses[0]["best"] == min(loss for loss in losses if loss is not None)
+    assert schedules[0]["best"] == min(loss for loss in losses if loss is not None)
 
 
 def test_run_begun_by_one_process_goes_on_with_two(one, worked):
@@ -285,7 +285,7 @@ def test_refusals_of_two_processes(worked):
 
 @pytest.mark.parametrize("count", [2, 3, 4, 7])
 def test_shares_are_the_batch(monkeypatch, count):
-    monkeypatch.setattr(distributed, "world", lambda: count)
+    monkeypatch.setattr(distributed, "world_size", lambda: count)
     parts = []
     for rank in range(count):
         monkeypatch.setattr(distributed, "rank", lambda rank=rank: rank)

@@ -93,7 +93,7 @@ def main():
         with double_precision():
             run = start("double/two", read_recipe("cpsf.toml"), precise)
             run.run()
-        Path(f"course-{number}.json").write_text(json.dumps(run.course.state()))
+        Path(f"lr_schedule-{number}.json").write_text(json.dumps(run.lr_schedule.state()))
         start("mixed").run()  # begun by one process
         attempt(lambda: start("small", replace(recipe, schedule=replace(recipe.schedule, batch=1))))
         attempt(lambda: distributed.local_device("cuda:0"))

@@ -66,6 +66,20 @@ def test_overrides(read):
         read(text, mismatch={"blur": 1})
 
 
+def test_a_renamed_key_still_works_and_warns_once(read):
+    new = NETWORK + '[schedule]\nlr_schedule = "plateau"\n'
+    for text, changes in ((new.replace("lr_schedule", "course"), {}), (NETWORK, {"course": "plateau"})):
+        with pytest.warns(FutureWarning, match="`course` of .schedule. is now called `lr_schedule`") as warned:
+            assert read(text, **changes) == read(new)
+        assert len(warned) == 1
+    with pytest.warns(FutureWarning):  # a change replaces the recipe's value, whichever names they use
+        assert read(new, course="cosine").schedule.lr_schedule == "cosine"
+    with pytest.warns(FutureWarning):
+        assert read(new.replace("lr_schedule", "course"), lr_schedule="cosine").schedule.lr_schedule == "cosine"
+    with pytest.raises(ParameterError, match="`course` and `lr_schedule`"):
+        read(new + 'course = "plateau"\n')
+
+
 def test_without_a_file_all_is_default():
     assert read_recipe(None, seed=3, sensor={"full_well": 2000}) == Recipe(
         schedule=Schedule(seed=3), sensor=Sensor(full_well=2000.0)
@@ -82,7 +96,7 @@ def test_without_a_file_all_is_default():
         (NETWORK + "widht = 3\n", "No option of the network 'wiener-bank' named 'widht'. Did you mean 'width'?"),
         (NETWORK + "[loss]\nmsee = 1\n", "No loss named 'msee'. Did you mean 'mse'?"),
         (NETWORK + "[later_loss]\nmsee = 1\n", "No loss named 'msee'. Did you mean 'mse'?"),
-        (NETWORK + '[schedule]\ncourse = "plato"\n', "No course named 'plato'. Did you mean 'plateau'?"),
+        (NETWORK + '[schedule]\nlr_schedule = "plato"\n', "No lr_schedule named 'plato'. Did you mean 'plateau'?"),
         (NETWORK + '[schedule]\noptimiser = "adamv"\n', "No optimiser named 'adamv'. Did you mean 'adam'?"),
         (NETWORK + "[pairs]\nsplitt = 3\n", "No key of [pairs] named 'splitt'. Did you mean 'split'?"),
     ],
@@ -106,18 +120,18 @@ def test_mistyped_names_get_the_nearest(read, text, said):
         (NETWORK + "[schedule]\nema = 1", "`ema` (1.0) must be in [0, 1)."),
         (NETWORK + "[schedule]\nlearning_rate = nan", "`learning_rate` (nan) must be positive."),
         (NETWORK + "[schedule]\nlearning_rate = inf", "`learning_rate` (inf) must be finite."),
-        (NETWORK + "[schedule]\ncrop = 8", "`crop` (8) is of kept samples: set `pool`, or leave it out."),
+        (NETWORK + "[schedule]\ncrop = 8", "`crop` (8) applies to cached samples: set `pool`"),
         (NETWORK + f"[schedule]\nseed = {2**63 - 1}0", "must have 63 bits at most."),
         ('[network]\nname = "mwdn"\nwidth = 0', "has layers without channels"),
         (NETWORK + "[schedule]\nwarmup = -1", "`warmup` (-1) must not be negative."),
         (NETWORK + "[schedule]\nepochs = -1", "`epochs` (-1) must not be negative."),
         (NETWORK + "[plateau]\nfactor = 1", "`factor` (1.0) must be in (0, 1)"),
         (NETWORK + "[plateau]\npatience = -1", "`patience` (-1) must not be negative"),
-        (NETWORK + "[plateau]\npatience = 3", "[plateau] belongs to another course than 'cosine'. Leave it out"),
-        (NETWORK + "[later_loss]\nmse = 1", "[later_loss] belongs to another course than 'cosine'"),
+        (NETWORK + "[plateau]\npatience = 3", "[plateau] needs `lr_schedule` (cosine) to be plateau."),
+        (NETWORK + "[later_loss]\nmse = 1", "[later_loss] needs `lr_schedule` (cosine) to be plateau."),
         (
-            NETWORK + '[schedule]\ncourse = "plateau"\n[later_loss]\nl1 = 1',
-            "[later_loss] (l1) must have the parts of [loss] (mse). Give a part that shall not count the weight 0.",
+            NETWORK + '[schedule]\nlr_schedule = "plateau"\n[later_loss]\nl1 = 1',
+            "[later_loss] (l1) must have the parts of [loss] (mse). Give",
         ),
         (NETWORK + "[sheet]\ncaptures = [3]", "`captures` of [sheet] ([3]) must be of the same kind"),
         (NETWORK + '[sheet]\ncaptures = "a.png"', "`captures` of [sheet] ('a.png') must be of the same kind"),
@@ -133,8 +147,8 @@ def test_mistyped_names_get_the_nearest(read, text, said):
         (NETWORK + "[loss]\nmse = -1", "The weight of `mse` (-1) must be finite and not negative"),
         (NETWORK + '[loss]\nmse = "much"', "The weight of `mse` ('much') must be finite and not negative"),
         ('[network]\nname = "mwdn"\nwidth = "wide"', "cannot be built"),
-        (DENOISER, "[denoising] and a network of drunet go together"),
-        (NETWORK + "[denoising]\nlevels = [0.01, 0.1]", "[denoising] and a network of drunet go together"),
+        (DENOISER, "[denoising] and a denoising network (drunet)"),
+        (NETWORK + "[denoising]\nlevels = [0.01, 0.1]", "[denoising] and a denoising network (drunet)"),
         (DENOISER + "[denoising]\nlevels = [0.1, 0.01]", "`levels` of [denoising] (0.1, 0.01) must rise from above 0"),
         (DENOISER + '[denoising]\nlevels = [0.01, 0.1]\n[cameras]\nsizes = ["32x32"]', "[denoising] has no camera"),
         (DENOISER + '[denoising]\nlevels = [0.01, 0.1]\n[sheet]\ncaptures = ["a.png"]', "[denoising] has no camera"),
@@ -164,7 +178,7 @@ def test_recipe_of_the_paper():
     schedule, plateau = recipe.schedule, recipe.plateau
     assert sum(p.numel() for p in build(**recipe.network).parameters()) == 17_267_531
     assert (schedule.optimiser, schedule.learning_rate, schedule.weight_decay) == ("adam", 1e-4, 1e-4)
-    assert (schedule.course, schedule.batch, schedule.epochs, schedule.validation) == ("plateau", 16, 300, 2500)
+    assert (schedule.lr_schedule, schedule.batch, schedule.epochs, schedule.validation) == ("plateau", 16, 300, 2500)
     assert (schedule.clip, schedule.ema, schedule.bfloat16) == (0, 0, False)
     assert (plateau.factor, plateau.patience, plateau.later, plateau.stop) == (0.1, 5, 1e-6, 2e-8)
     assert recipe.loss == {"mse": 1, "feature_mse": 1}

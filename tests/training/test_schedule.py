@@ -1,4 +1,4 @@
-"""When to learn how fast: our course by its formula, the paper's against torch's own scheduler."""
+"""Learning rate schedules: the cosine by its formula, the paper's against torch's own scheduler."""
 
 import itertools
 import json
@@ -12,10 +12,10 @@ from torch import nn
 
 from mwdn.networks import build
 from mwdn.training.recipe import Plateau, Recipe, Schedule
-from mwdn.training.schedule import Cosine, Descent, begin, learning_rate, optimiser
+from mwdn.training.schedule import Cosine, ReduceLROnPlateau, learning_rate, make_lr_schedule, make_optimiser
 
 FIRST, LATER = {"mse": 1.0, "feature_mse": 1.0}, {"mse": 1.0, "feature_mse": 0.05}
-PAPER = Recipe({"name": "mwdn"}, Schedule(course="plateau", learning_rate=1e-4), FIRST, later_loss=LATER)
+PAPER = Recipe({"name": "mwdn"}, Schedule(lr_schedule="plateau", learning_rate=1e-4), FIRST, later_loss=LATER)
 
 
 # --- Ours ---------------------------------------------------------------------------------------------
@@ -34,11 +34,11 @@ def test_learning_rate_rises_then_falls_as_half_a_cosine():
 
 
 def test_cosine_does_not_look_at_the_validation():
-    course = begin(replace(PAPER, schedule=Schedule(), later_loss={}))
-    assert isinstance(course, Cosine)
-    assert course.after(1.0) == course
-    assert (course.finished, course.weights, course.state()) == (False, FIRST, {})
-    assert course.rate(7) == learning_rate(7, Schedule())
+    lr = make_lr_schedule(replace(PAPER, schedule=Schedule(), later_loss={}))
+    assert isinstance(lr, Cosine)
+    assert lr.after(1.0) == lr
+    assert (lr.finished, lr.loss_weights, lr.state()) == (False, FIRST, {})
+    assert lr.rate(7) == learning_rate(7, Schedule())
 
 
 # --- The paper's --------------------------------------------------------------------------------------
@@ -59,26 +59,26 @@ def test_learning_rate_falls_when_torchs_does(seed, plateau):
     parameter = nn.Parameter(torch.zeros(1))
     optim = torch.optim.Adam([parameter], lr=1e-4)
     oracle = torch.optim.lr_scheduler.ReduceLROnPlateau(optim, factor=plateau.factor, patience=plateau.patience)
-    course, rates = begin(replace(PAPER, plateau=plateau)), []
+    lr, rates = make_lr_schedule(replace(PAPER, plateau=plateau)), []
     for loss in losses(seed):
-        course = course.after(loss)
+        lr = lr.after(loss)
         oracle.step(loss)
-        rates.append(course.rate(len(rates)))
+        rates.append(lr.rate(len(rates)))
         assert rates[-1] == optim.param_groups[0]["lr"]
-        assert course.weights == (FIRST if rates[-1] > 1.0001e-6 else LATER)
-        assert course.finished == (rates[-1] < 2e-8)
-        if course.finished:
+        assert lr.loss_weights == (FIRST if rates[-1] > 1.0001e-6 else LATER)
+        assert lr.finished == (rates[-1] < 2e-8)
+        if lr.finished:
             break
     assert len(set(rates)) > 4
 
 
 def test_phases_of_the_paper():
     """A loss that never falls: the first validation is the lowest, then each sixth lowers the rate."""
-    course, phases = begin(PAPER), []
+    lr, phases = make_lr_schedule(PAPER), []
     for validation in range(1, 40):
-        course = course.after(1.0)
-        phases.append((validation, round(math.log10(course.rate(0))), course.weights["feature_mse"]))
-        if course.finished:
+        lr = lr.after(1.0)
+        phases.append((validation, round(math.log10(lr.rate(0))), lr.loss_weights["feature_mse"]))
+        if lr.finished:
             break
     changes = [after for before, after in itertools.pairwise(phases) if before[1:] != after[1:]]
     assert phases[0] == (1, -4, 1.0)
@@ -87,25 +87,25 @@ def test_phases_of_the_paper():
 
 
 def test_one_weighting_throughout():
-    course = replace(begin(replace(PAPER, later_loss={})), current=1e-7)
-    assert course.weights == FIRST
+    lr = replace(make_lr_schedule(replace(PAPER, later_loss={})), current=1e-7)
+    assert lr.loss_weights == FIRST
 
 
 def test_the_watched_rate_is_at_the_limit():
     """Rounding must not decide: 1e-4 x 0.1 x 0.1 is a little more than 1e-6."""
     assert 1e-4 * 0.1 * 0.1 > 1e-6
-    assert Descent(PAPER, 1e-4 * 0.1 * 0.1).weights == LATER
-    assert not Descent(PAPER, 2e-8 * (1 - 1e-15)).finished
+    assert ReduceLROnPlateau(PAPER, 1e-4 * 0.1 * 0.1).loss_weights == LATER
+    assert not ReduceLROnPlateau(PAPER, 2e-8 * (1 - 1e-15)).finished
 
 
 def test_state_goes_through_json_to_the_last_bit():
-    course = begin(PAPER)
-    assert begin(PAPER, **json.loads(json.dumps(course.state()))) == course
+    lr = make_lr_schedule(PAPER)
+    assert make_lr_schedule(PAPER, **json.loads(json.dumps(lr.state()))) == lr
     stream = losses(7)
     for _ in range(20):
-        course = course.after(next(stream))
-    assert course.bad or course.current < 1e-4
-    assert begin(PAPER, **json.loads(json.dumps(course.state()))) == course
+        lr = lr.after(next(stream))
+    assert lr.bad or lr.current < 1e-4
+    assert make_lr_schedule(PAPER, **json.loads(json.dumps(lr.state()))) == lr
 
 
 # --- Optimiser ----------------------------------------------------------------------------------------
@@ -116,7 +116,7 @@ def test_adam_decays_all_but_w_and_lambda(name, physical):
     """With gradients of 0 Adam moves what is decayed, by its learning rate, towards 0; and nothing else."""
     network = build(name, width=4)
     before = {key: value.detach().clone() for key, value in network.named_parameters()}
-    optim = optimiser(network, Schedule(optimiser="adam", learning_rate=1e-6, weight_decay=1e-2))
+    optim = make_optimiser(network, Schedule(optimiser="adam", learning_rate=1e-6, weight_decay=1e-2))
     assert type(optim) is torch.optim.Adam
     for parameter in network.parameters():
         parameter.grad = torch.zeros_like(parameter)
@@ -128,7 +128,7 @@ def test_adam_decays_all_but_w_and_lambda(name, physical):
 
 def test_adamw_decays_convolutions_alone():
     network = build("mwdn", width=4)
-    optim = optimiser(network, Schedule(weight_decay=0.3))
+    optim = make_optimiser(network, Schedule(weight_decay=0.3))
     assert type(optim) is torch.optim.AdamW
     decay = {id(p): group["weight_decay"] for group in optim.param_groups for p in group["params"]}
     assert all(decay[id(p)] == (0.3 if p.ndim == 4 else 0) for p in network.parameters())

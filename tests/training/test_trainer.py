@@ -1,6 +1,7 @@
 """The training loop: it learns, and a run that is stopped anywhere ends as one that was not."""
 
 import errno
+import json
 import os
 import random
 import re
@@ -301,7 +302,7 @@ PAPER = Recipe(
     Schedule(
         steps=400,
         batch=2,
-        course="plateau",
+        lr_schedule="plateau",
         learning_rate=1.0,
         optimiser="adam",
         clip=0.0,
@@ -355,10 +356,48 @@ def test_plateau_goes_on_where_it_was(trainer, tmp_path, stop):
         assert same(tmp_path / "whole" / f"{name}.safetensors", tmp_path / "halves" / f"{name}.safetensors")
     steps = second.step
     third = trainer(PAPER, "halves")
-    assert third.course == second.course
-    assert third.course.finished
+    assert third.lr_schedule == second.lr_schedule
+    assert third.lr_schedule.finished
     third.run()
     assert third.step == steps  # it has ended, though not by the number of steps
+
+
+def as_of_an_earlier_version(folder):
+    """The folder of a run with the former name of `lr_schedule`, in recipe.json and in the state's header."""
+    identity = json.loads((folder / "recipe.json").read_text())
+    identity["recipe"]["schedule"]["course"] = identity["recipe"]["schedule"].pop("lr_schedule")
+    (folder / "recipe.json").write_text(json.dumps(identity))
+    path = folder / "state.safetensors"
+    tensors, header = read_state(path, path.read_bytes())
+    header["course"], header["identity"] = header.pop("lr_schedule"), json.dumps(identity)
+    save_file(tensors, path, metadata=header)
+
+
+@pytest.mark.parametrize("recipe", [PAPER, RECIPE], ids=["plateau", "cosine"])
+def test_a_run_of_an_earlier_version_goes_on(trainer, tmp_path, recipe):
+    trainer(recipe, "whole").run()
+
+    def interrupt(report):
+        if report.step == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        trainer(recipe, "halves").run(interrupt)
+    as_of_an_earlier_version(tmp_path / "halves")
+    second = trainer(recipe, "halves")
+    assert second.step in (3, 4)
+    second.run()
+    assert log(tmp_path / "whole") == log(tmp_path / "halves")
+    for name in ("last", "best", "state"):
+        assert same(tmp_path / "whole" / f"{name}.safetensors", tmp_path / "halves" / f"{name}.safetensors")
+
+
+def test_weights_of_an_earlier_version_belong_to_the_same_run(trainer, tmp_path):
+    """Without a state, recipe.json tells whose they are."""
+    trainer().run()
+    as_of_an_earlier_version(tmp_path / "run")
+    (tmp_path / "run" / "state.safetensors").unlink()
+    assert trainer().step == 0
 
 
 @pytest.mark.parametrize("clip", [0.0, 1e-3])

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import tomllib
+import warnings
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -43,6 +44,7 @@ def fill(kind: type[T], name: str, table: dict[str, Any]) -> T:
         UnknownNameError: a key that the dataclass has not.
         ParameterError: a value of another kind than its default, or outside its range.
     """
+    table = current_names(kind, name, table)
     known = {f.name: f.default for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
     for key, value in table.items():
         if key not in known:
@@ -51,6 +53,28 @@ def fill(kind: type[T], name: str, table: dict[str, Any]) -> T:
             example = json.dumps(known[key])
             raise ParameterError(f"`{key}` of [{name}] ({value!r}) must be of the same kind as its default, {example}.")
     return kind(**{key: _as_float(_listless(value), known[key]) for key, value in table.items()})
+
+
+def current_names(kind: type, name: str, table: dict[str, Any], *, warn: bool = True) -> dict[str, Any]:
+    """The table with renamed keys under their new names.
+
+    Args:
+        kind: dataclass of the table; its class variable ``RENAMED``, if any, maps former names to new ones.
+        name: of the table, for messages.
+        table: values by name.
+        warn: emit a warning for each former name.
+
+    Raises:
+        ParameterError: a key is given by both names.
+    """
+    renamed: dict[str, str] = getattr(kind, "RENAMED", {})
+    for old in renamed.keys() & table.keys():
+        new = renamed[old]
+        if new in table:
+            raise ParameterError(f"`{old}` and `{new}` of [{name}] are one key. Leave `{old}` out.")
+        if warn:
+            warnings.warn(f"`{old}` of [{name}] is now called `{new}`. Rename it.", FutureWarning, stacklevel=2)
+    return {renamed.get(key, key): value for key, value in table.items()}
 
 
 def _listless(value: Any) -> Any:  # noqa: ANN401

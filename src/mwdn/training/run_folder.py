@@ -13,6 +13,7 @@ from torch import Tensor
 from mwdn.errors import CheckpointError, ParameterError
 from mwdn.io.files import check_folder, save_text, writable
 from mwdn.runtime import distributed
+from mwdn.training.recipe import with_current_names
 from mwdn.training.training_state import Header, read_state
 
 MAKE_ROOM = "Make room and give the same command again: it goes on from the last saved state."
@@ -69,7 +70,7 @@ class RunFolder:
 
     def _check(self, owner: str) -> None:
         try:
-            own = json.loads(owner) == json.loads(json.dumps(self.identity))
+            own = _with_current_names(json.loads(owner)) == json.loads(json.dumps(self.identity))
         except ValueError:
             own = False
         if not own:
@@ -128,3 +129,10 @@ class RunFolder:
         """
         with writable(self.path, MAKE_ROOM), (self.path / "log.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
+
+
+def _with_current_names(identity: Any) -> Any:  # noqa: ANN401
+    """Identity of a run of an earlier version, whose recipe may have former names of keys."""
+    if not (isinstance(identity, dict) and isinstance(identity.get("recipe"), dict)):
+        return identity
+    return {**identity, "recipe": with_current_names(identity["recipe"])}

@@ -1,4 +1,4 @@
-"""How fast to learn at each step, on which weights of the loss, by which optimiser, and when to stop."""
+"""Learning rate, weights of the loss and end of a training, step by step; and its optimiser."""
 
 import math
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from torch import nn
 from mwdn.training.recipe import Recipe, Schedule
 
 THRESHOLD = 1e-4
-"""A validation loss is a new lowest one if it is lower by this part of the lowest so far."""
+"""A validation loss counts as an improvement if it is lower than the lowest so far by this relative amount."""
 
 
 def learning_rate(step: int, schedule: Schedule) -> float:
@@ -23,7 +23,7 @@ def learning_rate(step: int, schedule: Schedule) -> float:
 
 @dataclass(frozen=True)
 class Cosine:
-    """Our course: it knows its end from the beginning, and so does not look at the validation."""
+    """Cosine schedule, fixed in advance: it does not depend on the validation."""
 
     recipe: Recipe
     finished: ClassVar[bool] = False
@@ -33,34 +33,35 @@ class Cosine:
         return learning_rate(step, self.recipe.schedule)
 
     @property
-    def weights(self) -> dict[str, float]:
-        """Of the parts of the loss."""
+    def loss_weights(self) -> dict[str, float]:
+        """Weights of the parts of the loss."""
         return self.recipe.loss
 
     def after(self, loss: float) -> "Cosine":
-        """The course after a validation: the same."""
+        """The schedule after a validation with this loss: unchanged."""
         return self
 
     def state(self) -> dict[str, Any]:
-        """What a saved run must remember: nothing, as all follows from the step."""
+        """What a saved run must remember: nothing, everything follows from the step."""
         return {}
 
 
 @dataclass(frozen=True)
-class Descent:
-    """The paper's course: the learning rate falls when the validation loss does not.
+class ReduceLROnPlateau:
+    """The paper's schedule: the learning rate is reduced when the validation loss stops falling.
 
-    Its phases follow from the learning rate alone. With the paper's numbers, 1e-4 / 1e-5 are the first phase, 1e-6 /
+    The learning rate alone determines the phase. With the paper's numbers 1e-4 and 1e-5 are the first phase, 1e-6 and
     1e-7 the second, with less weight on features, and the run would end at 1e-8.
 
     Args:
         recipe: with its `Plateau` and both weightings of the loss.
         current: learning rate.
         best: lowest validation loss so far.
-        bad: validations since, at this learning rate.
+        bad: validations since then, at this learning rate.
 
     References:
-        Section 4 of the paper for the two weightings; the numbers are those of the authors' code.
+        Section 4 of the paper for the two weightings; the numbers are those of the authors' code. The rule is that of
+        `torch.optim.lr_scheduler.ReduceLROnPlateau`.
     """
 
     recipe: Recipe
@@ -69,58 +70,59 @@ class Descent:
     bad: int = 0
 
     def rate(self, step: int) -> float:
-        """Learning rate of the next step, whichever it is."""
+        """Learning rate of the next step, whatever its number."""
         return self.current
 
     @property
-    def weights(self) -> dict[str, float]:
-        """Of the parts of the loss, in this phase."""
+    def loss_weights(self) -> dict[str, float]:
+        """Weights of the parts of the loss in the current phase."""
         later = self.recipe.plateau.later
-        # Rounding aside: 1e-4 x 0.1 x 0.1 is 1.0000000000000002e-6, and 1e-6 is meant.
+        # isclose, because of rounding: 1e-4 x 0.1 x 0.1 is 1.0000000000000002e-6, and 1e-6 is meant.
         if self.recipe.later_loss and (self.current < later or math.isclose(self.current, later)):
             return self.recipe.later_loss
         return self.recipe.loss
 
     @property
     def finished(self) -> bool:
-        """Whether the learning rate has become too small to go on with."""
+        """Whether the learning rate has fallen below the limit at which the run ends."""
         stop = self.recipe.plateau.stop
         return self.current < stop and not math.isclose(self.current, stop)
 
-    def after(self, loss: float) -> "Descent":
-        """The course after a validation of this loss, which is weighted as in the first phase."""
+    def after(self, loss: float) -> "ReduceLROnPlateau":
+        """The schedule after a validation with this loss, computed with the weights of the first phase."""
         if loss < self.best * (1 - THRESHOLD):
-            return Descent(self.recipe, self.current, loss)
+            return ReduceLROnPlateau(self.recipe, self.current, loss)
         if self.bad < self.recipe.plateau.patience:
-            return Descent(self.recipe, self.current, self.best, self.bad + 1)
-        return Descent(self.recipe, self.current * self.recipe.plateau.factor, self.best)
+            return ReduceLROnPlateau(self.recipe, self.current, self.best, self.bad + 1)
+        return ReduceLROnPlateau(self.recipe, self.current * self.recipe.plateau.factor, self.best)
 
     def state(self) -> dict[str, Any]:
-        """What a saved run must remember; `begin` takes it back."""
+        """What a saved run must remember; `make_lr_schedule` takes it back."""
         return {"current": self.current, "best": self.best, "bad": self.bad}
 
 
-Course = Cosine | Descent
+LRSchedule = Cosine | ReduceLROnPlateau
 
 
-def begin(recipe: Recipe, **state: Any) -> Course:  # noqa: ANN401
-    """The course of a recipe, at its beginning or where ``state`` says."""
-    if recipe.schedule.course == "cosine":
+def make_lr_schedule(recipe: Recipe, **state: Any) -> LRSchedule:  # noqa: ANN401
+    """The learning rate schedule of a recipe, at its beginning or in a saved ``state``."""
+    if recipe.schedule.lr_schedule == "cosine":
         return Cosine(recipe)
-    return Descent(recipe, **({"current": recipe.schedule.learning_rate} | state))
+    return ReduceLROnPlateau(recipe, **({"current": recipe.schedule.learning_rate} | state))
 
 
-def optimiser(network: nn.Module, schedule: Schedule) -> torch.optim.Optimizer:
-    """Make the optimiser of a schedule.
+def make_optimiser(network: nn.Module, schedule: Schedule) -> torch.optim.Optimizer:
+    """The optimiser of a schedule.
 
-    ``"adamw"`` pulls convolution weights to zero beside the gradient; biases and BatchNorm stay free. ``"adam"`` adds
-    the decay of all parameters to the gradient, as the authors' code does. Neither decays w and lambda (the authors'
-    code does: it pulls them to 0, ours, which are logarithms, would go to 1).
+    ``"adamw"`` decays convolution weights, apart from the gradient; biases and BatchNorm are not decayed. ``"adam"``
+    adds the decay of all parameters to the gradient, as the authors' code does. Neither decays the Wiener filters' w
+    and lambda. The authors' code does, which pulls them to 0; here their logarithms are learned, and decay would pull
+    w and lambda to 1.
     """
     paper = schedule.optimiser == "adam"
     groups: dict[bool, list[nn.Parameter]] = {True: [], False: []}
     for name, parameter in network.named_parameters():
-        physical = name.rpartition(".")[2].startswith("log_")  # w and lambda are the logarithms among the parameters
+        physical = name.rpartition(".")[2].startswith("log_")  # log w and log lambda
         groups[not physical if paper else parameter.ndim > 1].append(parameter)
     kind = torch.optim.Adam if paper else torch.optim.AdamW
     return kind(

@@ -26,7 +26,7 @@ from mwdn.training.losses import Loss
 from mwdn.training.recipe import Recipe
 from mwdn.training.run_folder import MAKE_ROOM, RunFolder
 from mwdn.training.sample_cache import Pool
-from mwdn.training.schedule import begin, optimiser
+from mwdn.training.schedule import make_lr_schedule, make_optimiser
 from mwdn.training.selfsupervised import BlindValidator, judge
 from mwdn.training.training_state import damaged, restore, write_state
 from mwdn.training.validation import Validation, Validator
@@ -107,8 +107,8 @@ class Trainer:
         self.pool = self._pool() if self.schedule.pool else None
         self.ahead = ReadAhead(pairs, self.schedule.batch) if isinstance(pairs, RecordedPairs) else None
         self.loss = Loss(recipe.loss, alexnet=alexnet).to(self.device)
-        self.optimiser = optimiser(self.network, self.schedule)
-        self.course = begin(recipe)
+        self.optimiser = make_optimiser(self.network, self.schedule)
+        self.lr_schedule = make_lr_schedule(recipe)
         self.bfloat16 = self.schedule.bfloat16 and has_bfloat16(self.device)
         self.step, self.best = 0, -math.inf
         # What a checkpoint must agree with to be gone on from.
@@ -143,8 +143,8 @@ class Trainer:
 
     def _run(self, callback: Callable[[Report], None]) -> None:
         last = time.perf_counter()
-        while self.step < self.schedule.steps and not self.course.finished:
-            rate = self.course.rate(self.step)
+        while self.step < self.schedule.steps and not self.lr_schedule.finished:
+            rate = self.lr_schedule.rate(self.step)
             loss, parts = self.advance()
             now = time.perf_counter()
             speed, last = self.schedule.batch / (now - last), now
@@ -170,8 +170,8 @@ class Trainer:
         numbers = range(first, first + self.schedule.batch)
         own = distributed.shard(numbers)
         for group in self.optimiser.param_groups:
-            group["lr"] = self.course.rate(self.step)
-        self.loss.weights = self.course.weights
+            group["lr"] = self.lr_schedule.rate(self.step)
+        self.loss.weights = self.lr_schedule.loss_weights
         self.network.train()
         if self.schedule.fixed_norms:
             for norm in norms(self.network):
@@ -256,7 +256,7 @@ class Trainer:
             raise self._diverged(f"the validation after step {self.step}")
         if found.sheet is not None:
             write_picture(self.out / "validation.png", found.sheet)
-        self.course = self.course.after(loss)
+        self.lr_schedule = self.lr_schedule.after(loss)
         return Validation(psnr, loss, found.sheet)
 
     def save(self, found: Validation) -> None:
@@ -270,7 +270,7 @@ class Trainer:
             return
         metadata = {**self.identity, "step": self.step, "psnr": found.psnr}
         header = {"identity": json.dumps(self.identity), "step": str(self.step), "best": repr(self.best)}
-        header["course"] = json.dumps(self.course.state())
+        header["lr_schedule"] = json.dumps(self.lr_schedule.state())
         with writable(self.out, MAKE_ROOM):
             for name in ("last", *(["best"] if found.psnr == self.best else [])):
                 network = self.recipe.network["name"]
@@ -306,4 +306,5 @@ class Trainer:
         except (KeyError, RuntimeError) as error:
             raise damaged(self.folder.state, "a part is missing") from error
         self.step, self.best = int(header["step"]), float(header["best"])
-        self.course = begin(self.recipe, **json.loads(header["course"]))
+        state = header.get("lr_schedule") or header["course"]  # its former name
+        self.lr_schedule = make_lr_schedule(self.recipe, **json.loads(state))
