@@ -306,5 +306,5 @@ class Trainer:
         except (KeyError, RuntimeError) as error:
             raise damaged(self.folder.state, "a part is missing") from error
         self.step, self.best = int(header["step"]), float(header["best"])
-        state = header.get("lr_schedule") or header["course"]  # its former name
-        self.lr_schedule = make_lr_schedule(self.recipe, **json.loads(state))
+        saved_schedule = header.get("lr_schedule") or header["course"]  # the second is its former name
+        self.lr_schedule = make_lr_schedule(self.recipe, **json.loads(saved_schedule))
