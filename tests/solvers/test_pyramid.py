@@ -1,4 +1,4 @@
-"""The pyramid against scipy's least squares, an independent decimation, and what it is for: a cropped pattern."""
+"""The pyramid against scipy's least squares, direct decimation, and a Wiener filter on cropped patterns."""
 
 from functools import partial
 
@@ -21,14 +21,14 @@ FINE = Penalties(0.5, 0.0, 0.5)
 
 
 def test_one_fine_level_reaches_the_least_squares_of_scipy(generator):
-    """On its own, a level of the whole size is non-negative least squares with the crop."""
+    """Alone, a level of the full size is non-negative least squares with the crop."""
     sensor, psf = (5, 6), torch.rand(1, 1, 5, 6, generator=generator) ** 4
     psf = psf / psf.sum()
     b = torch.rand(1, 1, *sensor, generator=generator)
-    found = solve(b, psf, (Level(1, 3000, FINE),))
+    result = solve(b, psf, (Level(1, 3000, FINE),))
     A = oracles.matrix(psf[0, 0].double().numpy(), sensor)
     _, smallest = nnls(A.reshape(A.shape[0], -1), b.double().numpy().ravel())
-    assert float(found.residual.norm()) == pytest.approx(smallest, abs=2e-3)
+    assert float(result.residual.norm()) == pytest.approx(smallest, abs=2e-3)
 
 
 def test_halving_keeps_place_and_light():
@@ -54,12 +54,12 @@ def test_low_band_takes_a_coarse_scene_where_the_fine_one_goes(downsampling, gen
     fine = fourier.inverse_spectrum(fourier.spectrum(scene, grid) * H, grid, grid)
     small = grid[0] // downsampling, grid[1] // downsampling
     coarse = fourier.spectrum(scene[..., ::downsampling, ::downsampling], small) * low_band(H, grid, downsampling)
-    found = fourier.inverse_spectrum(coarse, small, small)
-    torch.testing.assert_close(found, fine[..., ::downsampling, ::downsampling], rtol=1e-4, atol=1e-5)
+    result = fourier.inverse_spectrum(coarse, small, small)
+    torch.testing.assert_close(result, fine[..., ::downsampling, ::downsampling], rtol=1e-4, atol=1e-5)
 
 
-def test_a_cropped_pattern_is_explained_far_better_than_by_a_wiener_filter(generator):
-    """Shading and colour of a scene that fills the field: what the crop takes from every linear filter."""
+def test_cropped_pattern_is_reconstructed_far_better_than_by_wiener(generator):
+    """Shading and colour of a scene that fills the field: the crop takes them from every linear filter."""
     psf = contour_psf((96, 128), generator=generator)
     scene = torch.full((1, 3, 96, 128), 0.1)
     scene[..., 20:70, 30:90] = torch.tensor([0.8, 0.5, 0.2])[:, None, None]
@@ -71,35 +71,35 @@ def test_a_cropped_pattern_is_explained_far_better_than_by_a_wiener_filter(gener
 
 
 def test_smoothing_follows_the_noise_of_the_light_not_of_the_dark(generator, monkeypatch):
-    """A pattern on a part of the sensor: by the median noise of the whole frame the scene would hardly be smoothed."""
+    """A pattern on a part of the sensor: with the median noise of the whole frame the scene is hardly smoothed."""
     psf = F.pad(contour_psf((48, 64), generator=generator), (32, 32, 24, 24))
     scene = torch.zeros(1, 3, 96, 128)
     scene[..., 36:60, 44:84] = torch.tensor([0.8, 0.5, 0.2])[:, None, None]
     light = fourier.convolve(scene, psf)
     light = light / light.max()
     electrons = 2000 * light + (2000 * light + 9).sqrt() * torch.randn(light.shape, generator=generator)
-    truth, found = light.sum() / fourier.convolve(scene, psf).sum() * scene, {}
+    truth, errors = light.sum() / fourier.convolve(scene, psf).sum() * scene, {}
     for parts in (16, 1):
         monkeypatch.setattr("mwdn.solvers.pyramid.noise_level", partial(noise_level, parts=parts))
-        found[parts] = float((Pyramid()(electrons / 2000, psf) - truth).square().mean())
-    assert found[16] < 0.7 * found[1]
+        errors[parts] = float((Pyramid()(electrons / 2000, psf) - truth).square().mean())
+    assert errors[16] < 0.7 * errors[1]
 
 
-def test_what_is_explained_and_what_is_left_make_the_measurement(generator):
+def test_residual_has_less_energy_than_the_measurement(generator):
     psf = torch.rand(1, 3, 20, 27, generator=generator) ** 6
     measurement = torch.rand(2, 3, 20, 27, generator=generator)
-    found = solve(measurement, psf)
-    assert (found.scene >= 0).all()
-    assert (found.residual.square().sum((1, 2, 3)) < measurement.square().sum((1, 2, 3))).all()
+    result = solve(measurement, psf)
+    assert (result.scene >= 0).all()
+    assert (result.residual.square().sum((1, 2, 3)) < measurement.square().sum((1, 2, 3))).all()
 
 
 @pytest.mark.parametrize("downsampling", [2, 4, 8])
 @pytest.mark.parametrize("size", [(33, 48), (40, 41), (47, 70)])
 def test_a_coarse_scene_is_its_enlargement_where_the_sensor_is(downsampling, size, generator):
     psf, measurement = (torch.rand(1, 1, *size, generator=generator) ** power for power in (6, 1))
-    found = solve(measurement, psf, (Level(downsampling, 2, FINE),))
-    large = F.interpolate(found.whole, scale_factor=downsampling, mode="bilinear")
-    torch.testing.assert_close(found.scene, large[..., : size[0], : size[1]])
+    result = solve(measurement, psf, (Level(downsampling, 2, FINE),))
+    large = F.interpolate(result.grid_scene, scale_factor=downsampling, mode="bilinear")
+    torch.testing.assert_close(result.scene, large[..., : size[0], : size[1]])
 
 
 def test_impossible_constants_are_refused():
@@ -111,20 +111,20 @@ def test_impossible_constants_are_refused():
 
 
 def test_a_pyramid_that_stops_early_leaves_the_detail(generator):
-    """A smooth scene that fills the field is explained at a quarter of the size; a fine one is left."""
+    """A smooth scene that fills the field is fitted at a quarter of the size; fine detail stays in the residual."""
     psf = contour_psf((96, 128), generator=generator)
     smooth = torch.full((1, 3, 96, 128), 0.1)
     smooth[..., 20:70, 30:90] = torch.tensor([0.8, 0.5, 0.2])[:, None, None]
     fine = smooth.clone()
     fine[..., 40:44, 50:54] += 5.0
-    left = []
+    residuals = []
     for scene in (smooth, fine):
         measurement = fourier.convolve(scene, psf)
-        found = solve(measurement, psf, tuple(level for level in LEVELS if level.downsampling >= 4))
-        assert found.scene.shape == measurement.shape
-        assert (found.scene >= 0).all()
-        left.append(float(found.residual.norm() / measurement.norm()))
-        error = (found.scene - scene)[..., 24:66, 34:86].mean((2, 3)) / scene[..., 24:66, 34:86].mean((2, 3))
+        result = solve(measurement, psf, tuple(level for level in LEVELS if level.downsampling >= 4))
+        assert result.scene.shape == measurement.shape
+        assert (result.scene >= 0).all()
+        residuals.append(float(result.residual.norm() / measurement.norm()))
+        error = (result.scene - scene)[..., 24:66, 34:86].mean((2, 3)) / scene[..., 24:66, 34:86].mean((2, 3))
         assert error.abs().max() < 0.1
-    assert left[0] < 0.02
-    assert left[1] > 2 * left[0]
+    assert residuals[0] < 0.02
+    assert residuals[1] > 2 * residuals[0]

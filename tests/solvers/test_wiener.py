@@ -1,4 +1,4 @@
-"""The noise that the Wiener solver finds, and the lambda that it chooses for it."""
+"""The noise level of a measurement, and the lambda that the Wiener solver chooses for it."""
 
 import pytest
 import torch
@@ -28,13 +28,13 @@ def scene():
 
 
 def chosen(measurement, psf, **options):
-    """Lambda (B, C, 1, 1) as the solver finds it."""
+    """The solver's lambda (B, C, 1, 1)."""
     solver = Wiener(**options)
     size = tuple(measurement.shape[-2:])
     grid = fourier.deconvolution_grid(size, solver.boundary)
     H = fourier.transfer_function(psf / psf.sum((-2, -1), keepdim=True), grid)
     B = fourier.spectrum(fourier.pad(measurement, grid, solver.boundary), grid)
-    return solver._discrepancy(measurement, B, H, grid[1])
+    return solver.discrepancy(measurement, B, H, grid[1])
 
 
 def psnr(result, scene):
@@ -59,8 +59,8 @@ def test_smooth_pattern_and_a_few_edges_are_no_noise(generator):
 
 def test_channels_are_measured_apart(generator):
     sigma = torch.tensor([0.01, 0.1, 0.3]).reshape(1, 3, 1, 1)
-    found = noise_level(sigma * torch.randn(1, 3, 200, 200, generator=generator))
-    torch.testing.assert_close(found, sigma, rtol=0.02, atol=0)
+    result = noise_level(sigma * torch.randn(1, 3, 200, 200, generator=generator))
+    torch.testing.assert_close(result, sigma, rtol=0.02, atol=0)
 
 
 def test_noise_of_light_is_that_of_the_whole_picture_not_of_its_dark_half(generator):
@@ -73,24 +73,24 @@ def test_noise_of_light_is_that_of_the_whole_picture_not_of_its_dark_half(genera
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (5, 1)])
-def test_one_row_tells_nothing(size):
+def test_one_row_has_no_noise(size):
     assert noise_level(torch.rand(2, 3, *size)).tolist() == torch.zeros(2, 3, 1, 1).tolist()
 
 
 def test_lambda_grows_with_the_noise(psf, scene, generator):
     light = fourier.convolve(scene, psf)
     noise = torch.randn(light.shape, generator=generator)
-    found = [chosen(light + sigma * noise, psf).mean().item() for sigma in (0, 0.003, 0.01, 0.03, 0.1)]
-    assert found == sorted(found)
-    assert found[-1] > 10 * found[0]
+    result = [chosen(light + sigma * noise, psf).mean().item() for sigma in (0, 0.003, 0.01, 0.03, 0.1)]
+    assert result == sorted(result)
+    assert result[-1] > 10 * result[0]
 
 
 @pytest.mark.parametrize("tolerance", [0.01, 0.03, 0.2])
 @pytest.mark.parametrize("size", [(64, 48), (45, 51)])
 def test_residual_has_the_power_of_noise_and_tolerance(size, tolerance, generator):
-    """On a circle, where the measurement is all there is, in pixels instead of frequencies.
+    """Circular, so that nothing is cropped, and in pixels instead of frequencies.
 
-    An odd width has no Nyquist column: all but the first of its half spectrum stand for two.
+    An odd width has no Nyquist column: all columns of its half spectrum but the first count twice.
     """
     psf = contour_psf(size, cell=12, line=3.0, generator=generator)
     scene = torch.zeros(2, 3, *size)
@@ -110,17 +110,17 @@ def test_residual_has_the_power_of_noise_and_tolerance(size, tolerance, generato
 def test_chosen_lambda_is_better_than_one_far_from_it(full_well, psf, scene, generator):
     b = Camera(psf, sensor=Sensor(full_well=float(full_well))).simulate(scene, generator=generator)
     best = chosen(b, psf).mean().item()
-    own = psnr(Wiener()(b, psf), scene)
-    assert own > psnr(Wiener(regularisation=best / 100)(b, psf), scene) + 0.5
-    assert own > psnr(Wiener(regularisation=best * 100)(b, psf), scene) + 0.5
+    chosen_psnr = psnr(Wiener()(b, psf), scene)
+    assert chosen_psnr > psnr(Wiener(regularisation=best / 100)(b, psf), scene) + 0.5
+    assert chosen_psnr > psnr(Wiener(regularisation=best * 100)(b, psf), scene) + 0.5
 
 
 def test_solver_is_eq_2_with_the_chosen_lambda(psf, scene, generator):
     b = Camera(psf).simulate(scene, generator=generator)
     expected = fourier.wiener(b, psf, chosen(b, psf)).clamp(min=0)
     torch.testing.assert_close(Wiener()(b, psf), expected)
-    given = fourier.wiener(b, psf, 1e-3, boundary="replicate").clamp(min=0)
-    torch.testing.assert_close(Wiener(regularisation=1e-3, boundary="replicate")(b, psf), given)
+    expected = fourier.wiener(b, psf, 1e-3, boundary="replicate").clamp(min=0)
+    torch.testing.assert_close(Wiener(regularisation=1e-3, boundary="replicate")(b, psf), expected)
 
 
 @pytest.mark.parametrize("factor", [0.01, 100.0])

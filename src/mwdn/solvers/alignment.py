@@ -1,4 +1,22 @@
-"""Turn, scale and haze a PSF until it explains the capture: what has changed in a camera since its calibration."""
+"""Align a PSF to a capture: the turn, scale and haze that have changed since the camera's calibration.
+
+The capture b is a scene v through a PSF of pose theta = (turn, scale). Variable projection eliminates the scene:
+
+1. ``v(theta) = argmin |C H(theta) v - b|^2 + tau |Psi v|_1`` over ``v >= 0``, by a short pyramid
+2. ``r(theta) = high_pass(b - C H(theta) v(theta))``
+3. ``E(theta) = |r(theta)|^2``, smooth in theta and least at the true pose: a wrong PSF leaves a larger residual for
+   every scene
+
+Gauss-Newton steps minimise E with a Gaussian prior of standard deviations S on theta:
+
+4. ``A = dr / dtheta`` by finite differences of (2), so with a new scene for each pose. With a fixed scene the steps
+   would be three times too short.
+5. ``(A^T A + s^2 S^-2) step = -(A^T r + s^2 S^-2 theta)``, where s^2 is the noise variance of the residual
+
+Haze is estimated after that. A faint veil over the scene compensates a haze that is missing from the PSF, but nothing
+compensates too much haze, for light is not negative: E at low frequencies is flat up to the true haze, then rises
+steeply. The estimate is the largest haze of the flat part. Blur cannot be estimated: a sharper PSF always fits better.
+"""
 
 from typing import NamedTuple
 
@@ -15,13 +33,13 @@ from mwdn.types import Image, Measurement, Psf, Size
 
 
 class Pose(NamedTuple):
-    """How the PSF of each capture differs from the calibrated one.
+    """Difference of each capture's PSF from the calibrated one.
 
     Args:
         turn_degrees: (B,), clockwise.
         scale: (B,), relative magnification, 0 for none.
-        haze: (B,), part of the light that lies evenly under the PSF: scattered by the mask or the sensor's glass, or
-            taken from the PSF as if it had been the sensor's black.
+        haze: (B,), part of the light that is spread evenly under the PSF: scattered by the mask or the sensor's glass,
+            or subtracted from the PSF as if it were the sensor's black level.
     """
 
     turn_degrees: Tensor
@@ -29,7 +47,7 @@ class Pose(NamedTuple):
     haze: Tensor | float = 0.0
 
     def move(self, psf: Psf) -> Tensor:
-        """The PSF (1 or B, C, h, w) as each capture met it: (B, C, h, w), each colour of unit sum."""
+        """The PSF (1 or B, C, h, w) of each capture: (B, C, h, w), each colour of unit sum."""
         angle, size = torch.deg2rad(self.turn_degrees), 1 + self.scale
         c, s = size * angle.cos(), size * angle.sin()
         moved = warp(psf, torch.stack([torch.stack([c, s], -1), torch.stack([-s, c], -1)], 1))
@@ -37,44 +55,41 @@ class Pose(NamedTuple):
         return hazed(moved, torch.as_tensor(self.haze, device=moved.device).reshape(-1, 1, 1, 1))
 
 
-_PLAIN = Penalties(0.15, 0.0, 0.6)  # without total variation
+_NO_VARIATION = Penalties(0.15, 0.0, 0.6)
 
-# At half the size, where a turn by 0.5 degrees still moves the outer lines of a PSF of 320 pixels by 0.7 of them.
-# Total variation in the last level keeps a shrunken, so sharper PSF from explaining the noise.
+# At half the size, where a turn by 0.5 degrees still moves the outer lines of a PSF of 320 pixels by 0.7 pixels.
+# Total variation in the last level keeps a smaller, so sharper PSF from fitting the noise.
 _LEVELS = (
-    Level(4, 20, _PLAIN),
-    Level(2, 20, _PLAIN),
-    Level(1, 8, Penalties(0.1, 1.5, 1.5), 0.02, least=0.2),
+    Level(4, 20, _NO_VARIATION),
+    Level(2, 20, _NO_VARIATION),
+    Level(1, 8, Penalties(0.1, 1.5, 1.5), 0.02, min_smoothing=0.2),
 )
-_COARSE = 0.03  # periods a pixel: below it, ambient light and iterations that have not ended are most of what is left
-_LIKELY = (0.5, 0.01)  # degrees and relative magnification by which a calibration may be wrong
-_DELTA = (0.1, 0.002)  # for the derivatives
-_WORTH = 1e-3  # part of what is left that a pose explains, or the PSF stays as it was calibrated
-_SHARED = 20.0  # pixels that tell as much as one: what is left is alike in neighbours
+_HIGH_PASS = 0.03  # cycles per pixel: below, most of the residual is ambient light and unconverged iterations
+_PRIOR = (0.5, 0.01)  # standard deviations S of a calibration's errors: degrees and relative magnification
+_DELTA = (0.1, 0.002)  # finite differences
+_CORRELATED = 20.0  # pixels of the residual that count as one independent sample
+MIN_GAIN = 1e-3
+"""Part of the residual's energy that a pose must explain, or the PSF stays as it was calibrated. With an exact PSF a
+smaller gain is noise."""
 
-# At a quarter of the size: haze is nothing but low frequencies.
+# At a quarter of the size: haze has low frequencies only.
 _HAZES = (0.0, 0.02, 0.04, 0.07, 0.1, 0.14, 0.2)
-_HAZE_LEVELS = (Level(2, 20, _PLAIN), Level(1, 20, _PLAIN))
+_HAZE_LEVELS = (Level(2, 20, _NO_VARIATION), Level(1, 20, _NO_VARIATION))
+_HAZE_RISE = 0.014
+"""Rise of E over its minimum that ends the flat part. At this value, the best of 0.5 to 3 %, 16 exact captures through
+two measured PSFs give no haze, and 16 others gain 95 % of the decibels that their best haze gains."""
 
 
 @torch.no_grad()
-def align(measurement: Measurement, psf: Psf, *, steps: int = 2) -> Pose:
-    """Find the turn, scale and haze with which the PSF explains each capture best, from nothing but the capture.
-
-    A wrong PSF leaves more of the measurement unexplained, whatever the scene: the energy that is left by the best
-    scene is smooth in turn and scale, and least at the truth. Gauss-Newton steps go there. Their derivatives are those
-    of what is left once the scene has been found anew (variable projection): with a scene that stands still the steps
-    would be three times too short. A step that leaves more unexplained is not taken, and a PSF whose best pose explains
-    hardly more than its own stays where it is: with an exact one that is noise.
-
-    Then the haze. Faint light all over the scene explains a haze that the PSF lacks, but nothing explains one that the
-    camera lacks, for light is not negative: what is left is level up to the true haze and rises steeply behind it. So
-    it is the largest that explains about as well as none. Blur cannot be found: a sharper PSF always explains more.
+def align(measurement: Measurement, psf: Psf, *, steps: int = 2, min_gain: float = MIN_GAIN) -> Pose:
+    """Estimate the turn, scale and haze of each capture's PSF from the capture alone.
 
     Args:
         measurement: (B, C, H, W).
         psf: (1 or B, 1 or C, h, w), centred.
-        steps: each takes three scenes of half the size. Two find half a degree and 1 % to within a tenth of it.
+        steps: of Gauss-Newton; each solves three scenes of half the size. Two reach half a degree and 1 % to within a
+            tenth of it. A step that increases the residual is not taken.
+        min_gain: part of the residual's energy, see `MIN_GAIN`.
 
     Raises:
         ShapeError: batch or channels do not fit.
@@ -84,88 +99,95 @@ def align(measurement: Measurement, psf: Psf, *, steps: int = 2) -> Pose:
         applications, Inverse Problems 19, R1 (2003).
     """
     check_fit(measurement, psf, "measurement")
-    small = halve(measurement.float())
-    small = small / small.abs().amax((1, 2, 3), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
-    delta, likely = small.new_tensor(_DELTA), small.new_tensor(_LIKELY)
-    around = torch.cat([delta.new_zeros(1, 2), delta.diag()])
-    pose = best = delta.new_zeros(len(small), 2)
-    least = calibrated = delta.new_full((len(small),), torch.inf)
+    half = halve(measurement.float())
+    half = half / half.abs().amax((1, 2, 3), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
+    delta = half.new_tensor(_DELTA)
+    offsets = torch.cat([delta.new_zeros(1, 2), delta.diag()])
+    theta = best = delta.new_zeros(len(half), 2)
+    energy = calibrated = delta.new_full((len(half),), torch.inf)
     for step in range(steps):
-        left = _unexplained(small, psf, pose[:, None] + around)
-        best, least = _better(pose, left[:, 0], best, least)
+        r = _residual(half, psf, theta[:, None] + offsets)
+        best, energy = _better(theta, r[:, 0], best, energy)
         if step == 0:
-            calibrated = least
-        # The likeliest pose, given how wrong calibrations are: a damped step.
-        A = (left[:, 1:] - left[:, :1]) / delta[:, None]
-        noise = _SHARED * left[:, 0].square().mean(1).clamp(min=1e-30)[:, None, None]
-        slope = A @ left[:, 0, :, None] + noise * (pose / likely.square())[..., None]
-        curvature = A @ A.mT + noise * likely.square().reciprocal().diag()
-        pose = pose - torch.linalg.solve(curvature, slope)[..., 0]
-    best, least = _better(pose, _unexplained(small, psf, pose[:, None])[:, 0], best, least)
-    best = torch.where((least < (1 - _WORTH) * calibrated)[:, None], best, 0.0)
-    found = Pose(best[:, 0], best[:, 1])
-    return found._replace(haze=_haze(halve(small), _halved(_halved(found.move(psf)))))
+            calibrated = energy
+        A = (r[:, 1:] - r[:, :1]) / delta[:, None]
+        theta = theta + _gauss_newton_step(A, r[:, 0], theta)
+    best, energy = _better(theta, _residual(half, psf, theta[:, None])[:, 0], best, energy)
+    best = torch.where((energy < (1 - min_gain) * calibrated)[:, None], best, 0.0)
+    pose = Pose(best[:, 0], best[:, 1])
+    return pose._replace(haze=_estimate_haze(halve(half), _halved(_halved(pose.move(psf)))))
 
 
-def _better(pose: Tensor, left: Tensor, best: Tensor, least: Tensor) -> tuple[Tensor, Tensor]:
-    energy = left.square().sum(1)
-    return torch.where((energy < least)[:, None], pose, best), torch.minimum(energy, least)
+def _gauss_newton_step(A: Tensor, r: Tensor, theta: Tensor) -> Tensor:
+    """Equation (5) for A (B, 2, pixels), transposed, r (B, pixels) and theta (B, 2)."""
+    prior = theta.new_tensor(_PRIOR)
+    variance = _CORRELATED * r.square().mean(1).clamp(min=1e-30)[:, None, None]
+    slope = A @ r[..., None] + variance * (theta / prior.square())[..., None]
+    curvature = A @ A.mT + variance * prior.square().reciprocal().diag()
+    return -torch.linalg.solve(curvature, slope)[..., 0]
 
 
-def _haze(measurement: Measurement, psf: Psf) -> Tensor:
-    """Haze (B,) under the PSF (B, C, h, w) of each capture: where what is left at low frequencies begins to rise.
+def _better(theta: Tensor, r: Tensor, best: Tensor, least: Tensor) -> tuple[Tensor, Tensor]:
+    """For each sample the pose with the smaller energy, and that energy."""
+    energy = r.square().sum(1)
+    return torch.where((energy < least)[:, None], theta, best), torch.minimum(energy, least)
 
-    As a parabola that far beyond has the curvature E'' it has then risen by 1.4 % of its least value E. With this part,
-    the best of 0.5 to 3 %, no haze was found in 16 exact captures through two measured PSFs, and 95 % of the decibels
-    gained that the best haze of each of 16 others gains.
+
+def _estimate_haze(measurement: Measurement, psf: Psf) -> Tensor:
+    """Haze (B,) under the PSF (B, C, h, w) of each capture: the end of the flat part of E(haze).
+
+    Beyond the true haze h0, E is about the parabola ``E0 + E''/2 (h - h0)^2``, with ``E'' = 2 E(h) / h^2`` at the
+    largest h. Where it has risen by f E0, at ``h - h0 = sqrt(2 f E0 / E'')``, its slope is ``sqrt(2 f E0 E'')``.
     """
     hazes = measurement.new_tensor(_HAZES)
-    each = hazed(psf.repeat_interleave(len(hazes), 0), hazes.repeat(len(psf))[:, None, None, None])
-    found = solve(measurement.repeat_interleave(len(hazes), 0), each, _HAZE_LEVELS)
-    grid = found.psf.bands[-1].grid
-    left = inverse_spectrum(found.residual_spectrum * _low(grid, 4 * _COARSE, measurement.device), grid, grid)
-    left = left.square().sum((1, 2, 3)).reshape(-1, len(hazes))
-    slope = (left.diff() / hazes.diff()).cummax(1).values
-    curvature = 2 * left[:, -1:] / hazes[-1] ** 2
-    level = slope < (2 * 0.014 * left.amin(1, keepdim=True) * curvature).sqrt()
-    return hazes[level.sum(1)]
+    psfs = hazed(psf.repeat_interleave(len(hazes), 0), hazes.repeat(len(psf))[:, None, None, None])
+    estimate = solve(measurement.repeat_interleave(len(hazes), 0), psfs, _HAZE_LEVELS)
+    grid = estimate.psf.bands[-1].grid
+    low = _low_pass(grid, 4 * _HIGH_PASS, measurement.device)
+    residual = inverse_spectrum(estimate.residual_spectrum * low, grid, grid)
+    energy = residual.square().sum((1, 2, 3)).reshape(-1, len(hazes))
+    slope = (energy.diff() / hazes.diff()).cummax(1).values
+    curvature = 2 * energy[:, -1:] / hazes[-1] ** 2
+    flat = slope < (2 * _HAZE_RISE * energy.amin(1, keepdim=True) * curvature).sqrt()
+    return hazes[flat.sum(1)]
 
 
 @torch.no_grad()
 def misfit(measurement: Measurement, psf: Psf) -> Tensor:
-    """Part of each measurement's detail that no scene explains with this PSF as it is, (B,): what `align` makes small.
+    """Part of each measurement's detail that no scene explains through this PSF, (B,): `align` minimises it.
 
     Args:
         measurement: (B, C, H, W).
-        psf: (1 or B, 1 or C, h, w), centred.
+        psf: (1 or B, 1 or C, h, w), centred; used as it is.
     """
-    small = halve(measurement.float())
-    left = _unexplained(small, psf, small.new_zeros(len(small), 1, 2))[:, 0].square().sum(1)
-    return left / fine_detail(small).square().sum((1, 2, 3)).clamp(min=torch.finfo(torch.float32).tiny)
+    half = halve(measurement.float())
+    energy = _residual(half, psf, half.new_zeros(len(half), 1, 2))[:, 0].square().sum(1)
+    return energy / fine_detail(half).square().sum((1, 2, 3)).clamp(min=torch.finfo(torch.float32).tiny)
 
 
 def fine_detail(image: Image) -> Image:
-    """What is finer than about 30 pixels in a picture, periodically continued."""
+    """High-pass filter: detail finer than about 30 pixels, on a periodic grid."""
     grid = image.shape[-2], image.shape[-1]
-    return inverse_spectrum(spectrum(image, grid) * (1 - _low(grid, _COARSE, image.device)), grid, grid)
+    return inverse_spectrum(spectrum(image, grid) * (1 - _low_pass(grid, _HIGH_PASS, image.device)), grid, grid)
 
 
-def _unexplained(measurement: Tensor, psf: Psf, poses: Tensor) -> Tensor:
-    """Detail that is left of each measurement with each of its poses (B, K, 2): (B, K, pixels)."""
+def _residual(measurement: Tensor, psf: Psf, poses: Tensor) -> Tensor:
+    """Equation (2) for each measurement and each of its poses (B, K, 2): (B, K, pixels)."""
     count = poses.shape[1]
-    each = psf.expand(len(measurement), -1, -1, -1).repeat_interleave(count, 0)
-    moved = Pose(*poses.flatten(0, 1).unbind(-1)).move(each)
-    found = solve(measurement.repeat_interleave(count, 0), _halved(moved), _LEVELS)
-    grid = found.psf.bands[-1].grid
-    left = inverse_spectrum(found.residual_spectrum * (1 - _low(grid, _COARSE, measurement.device)), grid, grid)
-    return left.reshape(len(measurement), count, -1)
+    psfs = psf.expand(len(measurement), -1, -1, -1).repeat_interleave(count, 0)
+    moved = Pose(*poses.flatten(0, 1).unbind(-1)).move(psfs)
+    estimate = solve(measurement.repeat_interleave(count, 0), _halved(moved), _LEVELS)
+    grid = estimate.psf.bands[-1].grid
+    high = 1 - _low_pass(grid, _HIGH_PASS, measurement.device)
+    return inverse_spectrum(estimate.residual_spectrum * high, grid, grid).reshape(len(measurement), count, -1)
 
 
 def _halved(psf: Psf) -> Tensor:
-    """Of pixels twice as long. The centre may move by one of them, and with it the scene, which nobody sees."""
+    """The PSF in pixels twice as long. Its centre may move by one of them, and shift the scene: E does not change."""
     return F.avg_pool2d(F.pad(psf, (0, psf.shape[-1] % 2, 0, psf.shape[-2] % 2)), 2)
 
 
-def _low(grid: Size, limit: float, device: torch.device) -> Tensor:
+def _low_pass(grid: Size, limit: float, device: torch.device) -> Tensor:
+    """Gaussian transfer function of standard deviation ``limit`` in cycles per pixel."""
     rows, columns = frequency_grid(grid, device=device)
     return torch.exp(-(rows.square() + columns.square()) / (2 * limit**2))

@@ -1,4 +1,18 @@
-"""Iterations between what the sensor saw and what scenes look like, which a denoiser knows better than any formula."""
+"""Plug-and-play half-quadratic splitting with a learned denoiser.
+
+Minimises ``1/2 |C H v - b|^2 + R(z) + rho/2 |v - z|^2`` over scenes v and z alternately. H convolves with the PSF, C
+crops to the sensor, b is the measurement, each pixel weighted by W (`certainty`), and R is defined by its denoiser:
+
+1. v fits b near z. C keeps this from being one division in the Fourier domain; one iteration of ADMM (penalty 1,
+   as in `mwdn.solvers.splitting`, p the target on the sensor) approximates it:
+
+   ``p = C H v + W / (1 + W) (b - (2 C H v - p))``
+   ``V = (|H|^2 V + conj(H) F(C^T (p - C H v)) + rho F(z)) / (|H|^2 + rho)``
+
+2. ``z = denoise(max(v, 0), sigma)``, its noise level sigma lower in each round.
+
+As in DPIR, ``rho = weight (noise / sigma)^2``: the prior counts more the noisier the measurement and the cleaner z.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -8,79 +22,85 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.fourier.transforms import inverse_spectrum, spectrum
-from mwdn.solvers.pyramid import QUIET, Estimate, brightness, smoothing_scale
+from mwdn.solvers.pyramid import REFERENCE_NOISE, Estimate, brightness, smoothing_scale
 from mwdn.solvers.splitting import Problem, reflected
 
 Denoiser = Callable[[Tensor, Tensor], Tensor]
-"""A picture (B, C, H, W), whose brightest pixel is about 1, and its noise level (B, 1, 1, 1); the clean picture."""
+"""From an image (B, C, H, W), whose brightest pixel is about 1, and its noise level (B, 1, 1, 1) to the clean image."""
 
-LEVELS = 0.03, 0.005
-"""Noise that the denoiser is told of, in the first round and in the last, over the scene's brightest pixel, in good
-light. From 0.05 on exact captures end 0.06 dB higher, but real ones, which their PSF explains less well, come out
-soft."""
+NOISE_LEVELS = 0.03, 0.005
+"""The denoiser's noise level in the first and in the last round, over the scene's brightest pixel, for little sensor
+noise. From 0.05 on exact captures end 0.06 dB higher, but real ones, which their PSF fits less well, become soft."""
 
-POOR = 0.6
-"""Power of the caution that the noise asks for with which `LEVELS` grow in poor light: with the noise to the power
-0.75. So plug and play ends 0.2 dB higher (26 captures in poor light through random cameras)."""
+NOISE_EXPONENT = 0.6
+"""Power of `smoothing_scale` by which `NOISE_LEVELS` grow: with the noise to the power 0.75. Worth 0.2 dB on 26 noisy
+captures through random cameras."""
 
-TRUST = 0.1
-"""Weight of the denoised scene, over that of a scene whose error is the denoiser's level: the best of six from 0.03 to
-1 on 16 exact captures through four measured PSFs. 0.07 and 0.14 cost less than 0.1 dB, but 0.07 through one of them
-0.35, and 0.03 everywhere 0.4 to 4.7."""
+PRIOR_WEIGHT = 0.1
+"""Weight in rho: the best of six from 0.03 to 1 on 16 exact captures through four measured PSFs. 0.07 and 0.14 cost
+less than 0.1 dB, but 0.07 through one of the PSFs 0.35; 0.03 costs 0.4 to 4.7 dB through all."""
 
 
-def plug_and_play(found: Estimate, denoise: Denoiser, rounds: int) -> Estimate:
-    """Explain the measurement by a scene that a denoiser would leave as it is.
+def plug_and_play(
+    estimate: Estimate,
+    denoise: Denoiser,
+    rounds: int,
+    *,
+    noise_levels: tuple[float, float] = NOISE_LEVELS,
+    noise_exponent: float = NOISE_EXPONENT,
+    prior_weight: float = PRIOR_WEIGHT,
+) -> Estimate:
+    """Alternate between fitting the measurement and denoising the scene.
 
-    How far the measurement is trusted follows what ``found`` leaves unexplained of it: noise, or what the PSF does not
-    say, which in real captures is more.
-
-    Half-quadratic splitting: a scene near the denoised one that explains the measurement (an iteration of ADMM, which
-    knows that the sensor crops the pattern), and this one denoised, by and by at a lower level. Each round shows it to
-    the denoiser mirrored another way, so that what it does to one side of everything does not add up. Light is counted,
-    so the noise of a pixel grows with it, and a dark pixel says more.
+    The noise in rho is the larger of the sensor's and the root mean square residual of ``estimate``, which includes the
+    errors of the PSF and is the larger one in real captures. Each round mirrors the scene another way before it is
+    denoised, so that asymmetric errors of the denoiser do not accumulate.
 
     Args:
-        found: where to begin, of a pyramid that reaches the full size. What lies beyond the frame is not denoised.
+        estimate: the start, of a pyramid that reaches the full size. Only the part on the sensor is denoised.
         denoise: see `Denoiser`.
         rounds: how many.
+        noise_levels: see `NOISE_LEVELS`.
+        noise_exponent: see `NOISE_EXPONENT`.
+        prior_weight: see `PRIOR_WEIGHT`.
 
     References:
         K. Zhang et al., "Plug-and-play image restoration with deep denoiser prior", TPAMI 44 (2022).
     """
-    band = found.psf.bands[-1]
-    problem = Problem.from_transfer(found.measurement.float(), band.transfer)
+    band = estimate.psf.bands[-1]
+    problem = Problem.from_transfer(estimate.measurement.float(), band.transfer)
     grid, (height, width) = problem.grid, problem.sensor
-    known = (found.whole * band.norm).expand(*found.measurement.shape[:2], *grid)
-    brightest = known[..., :height, :width].amax((1, 2, 3), keepdim=True)
-    brightest = brightest.clamp(min=torch.finfo(torch.float32).tiny)
-    noise = torch.maximum(found.noise.clamp(min=QUIET) * brightness(found.measurement), brightness(found.residual))
+    z = (estimate.grid_scene * band.norm).expand(*estimate.measurement.shape[:2], *grid)
+    brightest = z[..., :height, :width].amax((1, 2, 3), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
+    sensor_noise = estimate.noise.clamp(min=REFERENCE_NOISE) * brightness(estimate.measurement)
+    noise = torch.maximum(sensor_noise, brightness(estimate.residual))
     power = problem.transfer.abs().square()
     adjoint = problem.transfer.conj().resolve_conj()  # a lazy conjugate would be copied in each round
-    V, Hv = spectrum(known, grid), problem.measurement - found.residual
-    pull, certain = Hv, certainty(Hv)
-    first, last = LEVELS
-    poor = smoothing_scale(found.noise).clamp(min=1) ** POOR
+    V, Hv = spectrum(z, grid), problem.measurement - estimate.residual
+    target, W = Hv, certainty(Hv)
+    first, last = noise_levels
+    scale = smoothing_scale(estimate.noise).clamp(min=1) ** noise_exponent
     for step in range(rounds):
-        level = poor * first * (last / first) ** (step / max(1, rounds - 1))
-        trust = TRUST * (noise / (level * brightest)).square()
-        pull = reflected(Hv, pull).add_(problem.measurement).mul_(certain / (1 + certain)).add_(Hv)
-        V = V.mul_(power).add_(spectrum(pull - Hv, grid).mul_(adjoint))
-        V = V.add_(spectrum(known, grid).mul_(trust)).mul_(1 / (power + trust))
+        sigma = scale * first * (last / first) ** (step / max(1, rounds - 1))
+        rho = prior_weight * (noise / (sigma * brightest)).square()
+        target = reflected(Hv, target).add_(problem.measurement).mul_(W / (1 + W)).add_(Hv)
+        V = V.mul_(power).add_(spectrum(target - Hv, grid).mul_(adjoint))
+        V = V.add_(spectrum(z, grid).mul_(rho)).mul_(1 / (power + rho))
         Hv = inverse_spectrum(problem.transfer * V, grid, problem.sensor)
-        free = inverse_spectrum(V, grid, grid).clamp(min=0)
-        seen = free[..., :height, :width]
-        mirror = [axis for axis, turn in ((-1, 1), (-2, 2)) if step & turn]
-        clean = brightest * denoise((seen / brightest).flip(mirror), level).flip(mirror).clamp(min=0)
-        known = free + F.pad(clean - seen, (0, grid[1] - width, 0, grid[0] - height))
-    return replace(found, whole=known / band.norm)
+        v = inverse_spectrum(V, grid, grid).clamp(min=0)
+        image = v[..., :height, :width]
+        axes = [axis for axis, bit in ((-1, 1), (-2, 2)) if step & bit]
+        clean = brightest * denoise((image / brightest).flip(axes), sigma).flip(axes).clamp(min=0)
+        z = v + F.pad(clean - image, (0, grid[1] - width, 0, grid[0] - height))
+    return replace(estimate, grid_scene=z / band.norm)
 
 
-def certainty(light: Tensor) -> Tensor:
-    """Weight of each pixel of a pattern (B, C, H, W), 1 on the mean of a sample.
+def certainty(measurement: Tensor) -> Tensor:
+    """Inverse noise variance of each pixel (B, C, H, W), scaled to mean 1 in each sample.
 
-    The variance of its noise grows with its light; as much as the mean light's comes from elsewhere.
+    Photon noise has a variance in proportion to the light; noise from other sources is taken to have as much as the
+    photon noise of the mean.
     """
-    mean = light.mean((1, 2, 3), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
-    weight = mean / (light.clamp(min=0) + mean)
+    mean = measurement.mean((1, 2, 3), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
+    weight = mean / (measurement.clamp(min=0) + mean)
     return weight / weight.mean((1, 2, 3), keepdim=True)

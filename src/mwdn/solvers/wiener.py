@@ -1,4 +1,4 @@
-"""Wiener deconvolution that finds its own regularisation from the noise of the measurement."""
+"""Wiener deconvolution that chooses its regularisation from the noise of the measurement."""
 
 from dataclasses import dataclass
 
@@ -16,16 +16,16 @@ from mwdn.types import Measurement, Psf, Scene
 
 @dataclass(frozen=True)
 class Wiener:
-    """Wiener deconvolution, eq. (2) of the paper, with lambda given or found.
+    """Wiener deconvolution, eq. (2) of the paper, with lambda given or chosen.
 
     Called with a measurement (B, C, H, W) and a PSF, it returns the scene (B, C, H, W), not negative.
 
     Args:
         regularisation: lambda for a PSF of unit sum. ``None`` chooses it for each channel of each sample by the
-            discrepancy principle: as large as it can be while the scene, blurred again, still explains the
-            measurement to within ``tolerance``.
-        tolerance: part of the measurement's contrast that may stay unexplained besides its noise: what a crop,
-            a PSF that was measured, and a field that is not quite shift-invariant cost.
+            discrepancy principle: the largest with which the scene, blurred again, still fits the measurement to
+            within its noise and ``tolerance``.
+        tolerance: part of the measurement's contrast that may remain as residual besides the noise: the error of a
+            cropped pattern, a measured PSF and a field that is not quite shift-invariant.
         boundary: see `mwdn.fourier.padding.Boundary`.
 
     Raises:
@@ -53,24 +53,30 @@ class Wiener:
         total = psf.sum((-2, -1), keepdim=True)
         H = transfer_function(psf / total, grid)
         B = spectrum(pad(measurement, grid, self.boundary), grid)
-        regularisation = self.regularisation or self._discrepancy(measurement, B, H, grid[1])
+        regularisation = self.regularisation or self.discrepancy(measurement, B, H, grid[1])
         V = H.conj() * B / (H.abs().square() + regularisation)
         return (inverse_spectrum(V, grid, size) / total).clamp(min=0)
 
-    def _discrepancy(self, measurement: Measurement, B: Tensor, H: Tensor, width: int) -> Tensor:
-        """Lambda (B, C, 1, 1) whose residual has the power of the noise and the tolerated misfit.
+    def discrepancy(self, measurement: Measurement, B: Tensor, H: Tensor, width: int) -> Tensor:
+        """Lambda (B, C, 1, 1) whose residual has the power of the noise and the tolerance.
 
-        In the Fourier domain the residual is ``B lambda / (|H|^2 + lambda)``; it grows with lambda, so forty
-        halvings of the interval find it.
+        In the Fourier domain the residual is ``B lambda / (|H|^2 + lambda)``. It grows with lambda, so lambda is found
+        by forty bisections of log10 lambda between -16 and 1.
+
+        Args:
+            measurement: (B, C, H, W).
+            B: half spectrum of the padded measurement.
+            H: transfer function for a PSF of unit sum.
+            width: of the grid.
         """
         contrast = measurement.std((-2, -1), correction=0, keepdim=True)
         allowed = noise_level(measurement).square() + (self.tolerance * contrast).square()
-        # Half a spectrum: a column stands for two, but for the first and, of an even width, the last.
-        # Parseval: sum |B|^2 = pixels x variance.
-        times = torch.ones(B.shape[-2:], device=B.device)
-        times[:, 1 : (width + 1) // 2] = 2
-        times[0, 0] = 0  # the mean says nothing about detail
-        power, filtered = B.abs().square() * times, H.abs().square()
+        # Parseval: sum |B|^2 = pixels x variance. In a half spectrum all columns count twice but the first and, of an
+        # even width, the last. The mean is left out.
+        count = torch.ones(B.shape[-2:], device=B.device)
+        count[:, 1 : (width + 1) // 2] = 2
+        count[0, 0] = 0
+        power, filtered = B.abs().square() * count, H.abs().square()
         target = allowed * power.sum((-2, -1), keepdim=True) / contrast.square().clamp(min=1e-20)
         low, high = torch.full_like(target, -16.0), torch.full_like(target, 1.0)
         for _ in range(40):
