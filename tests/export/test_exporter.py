@@ -23,8 +23,7 @@ from mwdn.export.exporter import LEAST, agreement, export, read_about, run_file,
 from mwdn.export.onnx_operations import REAL
 from mwdn.fourier.filtering import filter_image
 from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
-from mwdn.io.files import save_linear, save_png
-from mwdn.io.images import srgb_encode
+from mwdn.io.images import srgb_encode, write_frame
 from mwdn.networks import NETWORKS, build
 from mwdn.solvers import SOLVERS
 from mwdn.solvers import build as build_solver
@@ -186,9 +185,9 @@ def example(monkeypatch, *arguments):
 def raw(tmp_path):
     """A folder with PSF, capture and dark frame of a colour camera, 83 x 101, neither symmetrical nor grey."""
     numbers = np.random.default_rng(4)
-    save_png(tmp_path / "psf.png", (numbers.random((83, 101, 3)) ** 40 * 60000).astype(np.uint16))
-    save_png(tmp_path / "capture.png", numbers.integers(2000, 60000, (83, 101, 3), np.uint16))
-    save_png(tmp_path / "dark.png", numbers.integers(0, 2000, (83, 101, 3), np.uint16))
+    write_frame(tmp_path / "psf.png", (numbers.random((83, 101, 3)) ** 40 * 60000).astype(np.uint16))
+    write_frame(tmp_path / "capture.png", numbers.integers(2000, 60000, (83, 101, 3), np.uint16))
+    write_frame(tmp_path / "dark.png", numbers.integers(0, 2000, (83, 101, 3), np.uint16))
     return tmp_path
 
 
@@ -203,7 +202,7 @@ def raw(tmp_path):
 )
 def test_the_example_gives_the_picture_of_mwdn_reconstruct(capture, options, raw, monkeypatch):
     monkeypatch.chdir(raw)
-    save_linear(raw / "capture.tif", read_frame("capture.png") / np.float32(65535))
+    write_frame(raw / "capture.tif", read_frame("capture.png") / np.float32(65535))
     camera_options = ["--psf", "psf.png", "--background", "0", *options]
     command("export", "wiener", "--regularisation", "1e-3", "--out", "camera.onnx", *camera_options)
     command("reconstruct", capture, "--method", "wiener", "--regularisation", "1e-3", "--no-trust", *camera_options)
@@ -216,8 +215,8 @@ def test_the_example_gives_the_picture_of_mwdn_reconstruct(capture, options, raw
 def test_the_example_knows_how_colours_are_stored(option, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     numbers, shape = np.random.default_rng(4), (84, 102, 3 if option == "--grey" else 1)
-    save_png(tmp_path / "psf.png", (numbers.random(shape) ** 40 * 60000).astype(np.uint16))
-    save_png(tmp_path / "capture.png", numbers.integers(2000, 60000, shape, np.uint16))
+    write_frame(tmp_path / "psf.png", (numbers.random(shape) ** 40 * 60000).astype(np.uint16))
+    write_frame(tmp_path / "capture.png", numbers.integers(2000, 60000, shape, np.uint16))
     options = ["--psf", "psf.png", "--background", "0", "--regularisation", "1e-3", option]
     command("export", "wiener", "--out", "camera.onnx", *options)
     command("reconstruct", "capture.png", "--method", "wiener", "--no-trust", *options)
@@ -251,9 +250,9 @@ def test_the_example_says_in_one_line_what_is_wrong(arguments, message, tmp_path
     del model.metadata_props[:]
     onnx.save(model, "foreign.onnx")
     for name, size in (("capture.png", SIZE), ("dark.png", SIZE), ("small.png", (40, 48))):
-        save_png(Path(name), np.full((*size, 3), 9, np.uint16))
-    save_png(Path("16.png"), np.full((*SIZE, 3), 5000, np.uint16))
-    save_linear(Path("nan.tif"), np.full((*SIZE, 3), np.nan, np.float32))
+        write_frame(Path(name), np.full((*size, 3), 9, np.uint16))
+    write_frame(Path("16.png"), np.full((*SIZE, 3), 5000, np.uint16))
+    write_frame(Path("nan.tif"), np.full((*SIZE, 3), np.nan, np.float32))
     with pytest.raises(SystemExit, match=message) as ended:
         example(monkeypatch, *arguments)
     assert "\n" not in str(ended.value)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from mwdn.io.files import writable
+from mwdn.io.files import as_parameter_error
 
 
 def lock(folder: Path, part: str) -> FileLock:
@@ -24,7 +24,7 @@ def lock(folder: Path, part: str) -> FileLock:
         ParameterError: the folder cannot be written to.
     """
     path = folder / "locks" / f"{part}.lock"
-    with writable(folder):
+    with as_parameter_error(folder):
         path.parent.mkdir(parents=True, exist_ok=True)
     return FileLock(path)
 

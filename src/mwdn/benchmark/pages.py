@@ -8,7 +8,7 @@ from pathlib import Path
 from rich.table import Table
 
 from mwdn.evaluation.tables import html_table, markdown_table
-from mwdn.io.files import atomic_write, save_text
+from mwdn.io.files import atomic_write, write_text
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def write_html(path: Path, title: str, sections: list[Section]) -> None:
         f'<h2 id="s{i}">{html.escape(section.title)}</h2>\n' + "\n".join(map(_as_html, section.blocks))
         for i, section in enumerate(sections)
     )
-    save_text(path, _HTML.format(title=html.escape(title), links=links, body=body))
+    write_text(path, _HTML.format(title=html.escape(title), links=links, body=body))
 
 
 def write_markdown(path: Path, title: str, sections: list[Section]) -> None:
@@ -83,7 +83,7 @@ def write_markdown(path: Path, title: str, sections: list[Section]) -> None:
                 with atomic_write(path.parent / "pictures" / block.name) as temporary:
                     temporary.write_bytes(block.content)
             parts.append(_as_markdown(block))
-    save_text(path, "\n\n".join(parts) + "\n")
+    write_text(path, "\n\n".join(parts) + "\n")
 
 
 def _as_html(block: Block) -> str:

@@ -15,7 +15,7 @@ from mwdn.benchmark.sets import Dataset, simulated_pairs
 from mwdn.data.photographs import Photographs
 from mwdn.evaluation import measure
 from mwdn.inference.reconstructor import Reconstructor
-from mwdn.io.files import save_text
+from mwdn.io.files import write_text
 from mwdn.optics import Sensor
 from mwdn.training.experiment import FILE_START
 
@@ -85,7 +85,7 @@ def sweep(
             reconstructions = torch.cat([reconstruct(measurement[None]) for measurement in measurements])
             values = measure(reconstructions, scenes, dataset.protocol)["psnr"].tolist()
             psnr.setdefault(axis_key, {})[size_key] = values
-            save_text(path, json.dumps({"identity": identity, "psnr": psnr}, indent=1))
+            write_text(path, json.dumps({"identity": identity, "psnr": psnr}, indent=1))
     keys = {axis: {size: _keys(axis, size) for size in sizes} for axis, sizes in robustness.sizes.items()}
     return {axis: {size: psnr[a][s] for size, (a, s) in by_size.items()} for axis, by_size in keys.items()}
 

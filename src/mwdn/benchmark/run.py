@@ -22,7 +22,7 @@ from mwdn.benchmark.training import train
 from mwdn.data.photographs import Photographs
 from mwdn.evaluation import Perceptual
 from mwdn.evaluation.alexnet import SMALLEST
-from mwdn.io.files import save_text
+from mwdn.io.files import write_text
 from mwdn.runtime.distributed import local_device
 from mwdn.training.trainer import Report
 
@@ -103,8 +103,8 @@ def write(results: Results, out: Path) -> None:
     page = sections(results)
     write_html(out / PAGE, title, page)
     write_markdown(out / "benchmark.md", title, page)
-    save_text(out / "benchmark.json", json.dumps(json_content(results), indent=1) + "\n")
-    save_text(out / "benchmark.csv", csv_text(results))
+    write_text(out / "benchmark.json", json.dumps(json_content(results), indent=1) + "\n")
+    write_text(out / "benchmark.csv", csv_text(results))
 
 
 def _train_all(

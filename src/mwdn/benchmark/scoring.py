@@ -16,7 +16,7 @@ from mwdn.benchmark.sets import Dataset, file_hash
 from mwdn.data.captures import find_captures, read_captures
 from mwdn.evaluation import First, Perceptual, Scores, evaluate
 from mwdn.inference.reconstructor import Reconstructor
-from mwdn.io.files import atomic_write, save_text
+from mwdn.io.files import atomic_write, write_text
 from mwdn.version import __version__
 
 TIMED = 3
@@ -111,7 +111,7 @@ def score(
     if record is None:
         reconstruct = make_reconstructor(method, checkpoint, dataset, device)
         record = _measure(reconstruct, dataset, path, perceptual(), shown)
-        save_text(path, json.dumps({"identity": record_identity, **record}, indent=1))  # after the pictures
+        write_text(path, json.dumps({"identity": record_identity, **record}, indent=1))  # after the pictures
     cpu = Scores.read(record["cpu"]) if record["cpu"] else None
     pictures = {name: torch.from_numpy(np.load(_pictures_file(path, name))) for name in ("pictures", "captures")}
     return MethodResult(Scores.read(record["scores"]), cpu, record["missing"], **pictures)

@@ -21,7 +21,7 @@ from mwdn.data.simulated import Placement, Samples, SimulatedPairs
 from mwdn.data.splits import split
 from mwdn.errors import ParameterError
 from mwdn.evaluation import Protocol
-from mwdn.io.files import save_text
+from mwdn.io.files import write_text
 from mwdn.optics import Deviation, Sensor
 from mwdn.training.experiment import FILE_START
 from mwdn.training.validation import START
@@ -203,7 +203,7 @@ def open_dataset(name: str, recipe: DatasetRecipe, folder: Path, device: torch.d
             size = calibration.size if recipe.bin > 1 else None
             layout, frames = Layout(scene_size=size), FrameFormat(bin=recipe.bin)
             import_pairs(recipe.kind, recipe.pairs, path, layout=layout, frames=frames)
-        save_text(note, json.dumps(identity, indent=2))
+        write_text(note, json.dumps(identity, indent=2))
     file = PairFile(path)
     check_pairs(file, calibration.psf)
     rows = _rows(recipe, len(file), simulates)

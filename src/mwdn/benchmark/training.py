@@ -14,7 +14,7 @@ from mwdn.benchmark.published import PUBLISHED
 from mwdn.benchmark.recipe import Benchmark, Method
 from mwdn.benchmark.sets import Dataset
 from mwdn.errors import ParameterError
-from mwdn.io.files import save_text
+from mwdn.io.files import write_text
 from mwdn.networks import NETWORKS
 from mwdn.training.recipe import OPTIMISERS, Recipe, Schedule
 from mwdn.training.trainer import Report, Trainer
@@ -104,7 +104,7 @@ def train(
     def save_time(report: Report) -> None:
         if report.validation is not None:  # the state has just been saved
             total = seconds_before + time.perf_counter() - start
-            save_text(folder / CLOCK, json.dumps({"step": report.step, "seconds": total}))
+            write_text(folder / CLOCK, json.dumps({"step": report.step, "seconds": total}))
         show(report)
 
     trainer.run(save_time)

@@ -12,7 +12,7 @@ from mwdn.evaluation import psnr
 from mwdn.evaluation.tables import html_table
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.contact_sheets import contact_sheet, to_display
-from mwdn.io.files import save_text
+from mwdn.io.files import write_text
 from mwdn.io.images import write_picture
 from mwdn.io.pictures import dark_scene
 from mwdn.optics import Camera, Contour, Setup
@@ -51,7 +51,7 @@ def run(out: Path, seed: int, console: Console) -> None:
         rows.append([scene, measurement, *results])
     write_picture(out / "psf.png", to_display(camera.psf))
     write_picture(out / "comparison.png", contact_sheet(rows, ["scene", "measurement", *METHODS]))
-    save_text(out / "index.html", _PAGE.format(table=html_table(table)))
+    write_text(out / "index.html", _PAGE.format(table=html_table(table)))
     console.print(table)
     console.print(f"Look at {out / 'index.html'}", highlight=False, markup=False, soft_wrap=True)
 

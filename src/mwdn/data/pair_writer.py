@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mwdn.errors import ImageError, ParameterError, ShapeError
-from mwdn.io.files import atomic, naming_file
+from mwdn.io.files import as_image_error, atomic
 from mwdn.types import Frame
 
 Attribute = str | int | float
@@ -83,7 +83,7 @@ class PairWriter:
     def __enter__(self) -> "PairWriter":
         import h5py
 
-        with naming_file(self.path), ExitStack() as stack:
+        with as_image_error(self.path), ExitStack() as stack:
             self._file = stack.enter_context(h5py.File(stack.enter_context(atomic(self.path)), "w"))
             self._file.attrs.update({VERSION_KEY: VERSION, **self._attributes})
             for name, shape in self._shapes.items():
@@ -99,7 +99,7 @@ class PairWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         # An exception of the ``with`` statement's own body passes through unchanged: the stack only cleans up.
-        with naming_file(self.path):
+        with as_image_error(self.path):
             self._stack.__exit__(kind, error, trace)
         self._file = None
 
@@ -124,7 +124,7 @@ class PairWriter:
                 f"`measurement` ({len(rows[0])}) and `scene` ({len(rows[1])}) must be as many. Append whole pairs."
             )
         end = self._length + len(rows[0])
-        with naming_file(self.path):
+        with as_image_error(self.path):
             for name, batch in zip(NAMES, rows, strict=True):
                 self._file[name].resize(end, axis=0)
                 self._file[name][self._length : end] = batch

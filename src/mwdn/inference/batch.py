@@ -19,7 +19,7 @@ from mwdn.errors import ImageError, MwdnError, ParameterError
 from mwdn.evaluation.consistency import Consistency, consistency
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.contact_sheets import contact_sheet, thumbnail, to_display
-from mwdn.io.files import naming_file, resolver, write_json
+from mwdn.io.files import as_image_error, path_resolver, write_json
 from mwdn.io.images import read_frame, read_picture, write_linear, write_picture
 from mwdn.runtime import distributed
 from mwdn.runtime.streams import prefetch
@@ -53,7 +53,7 @@ def check_outputs(
     """
     if out.exists() and not out.is_dir():
         raise ParameterError(f"`{out}` must be a folder, but is a file. Choose another one: `--out`.")
-    real = resolver()
+    real = path_resolver()
     inputs = {real(str(path)) for path in (*captures, *protected) if path is not None}
 
     def check(output: str) -> None:
@@ -194,7 +194,7 @@ class Batch:
         if trust:
             content |= {**asdict(trust), "doubtful": trust.doubtful}
         scene = to_host(job.scene)
-        with naming_file(beside):
+        with as_image_error(beside):
             beside.unlink(missing_ok=True)  # or it would vouch for another picture than it was written for
         if self.form in ("tiff", "npy"):
             write_linear(job.output, scene)

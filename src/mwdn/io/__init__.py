@@ -1,14 +1,13 @@
-"""Pictures, frames and text in and out of files."""
+"""Read and write pictures, frames and text."""
 
-from mwdn.io.files import atomic
-from mwdn.io.images import read_frame, read_picture, srgb_decode, srgb_encode, write_linear, write_picture
+from mwdn.io.images import read_frame, read_picture, srgb_decode, srgb_encode, write_frame, write_linear, write_picture
 
 __all__ = [
-    "atomic",
     "read_frame",
     "read_picture",
     "srgb_decode",
     "srgb_encode",
+    "write_frame",
     "write_linear",
     "write_picture",
 ]

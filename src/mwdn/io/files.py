@@ -1,8 +1,4 @@
-"""Files that are either wholly new or wholly old.
-
-What the disk refuses is raised as its `OSError` by `atomic`, `save_png` and `save_linear`, and is told in the words of
-this package by the others.
-"""
+"""Atomic writing of files, and errors of the disk as errors of this package."""
 
 import json
 import os
@@ -13,39 +9,36 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from safetensors import SafetensorError
 
 from mwdn.errors import ImageError, ParameterError
-from mwdn.types import FloatFrame, Frame
 
 
 @contextmanager
 def atomic(path: Path) -> Iterator[Path]:
-    """Write a file so that nobody ever sees half of it.
+    """Write a file completely or not at all.
 
-    The file is written under a hidden name in the same folder, and renamed once all of it is on the disk. If
-    anything fails before that, an existing ``path`` keeps its bytes and the hidden file is removed.
+    The file is written under a hidden name in the same folder, and renamed once it is on the disk. If anything fails
+    before that, an existing ``path`` keeps its content and the hidden file is removed.
 
     Args:
-        path: where the file shall be; folders that are missing on the way are created, and a symbolic link is
-            followed rather than replaced.
+        path: the file to write. Missing folders are created; a symbolic link is followed, not replaced.
 
     Yields:
-        The name to write to: same folder and suffix as ``path``, unlike that of any other process.
+        The temporary name to write to: same folder and suffix as ``path``, unique to this call.
 
     Raises:
         OSError: the folder cannot be written to, the disk is full, or ``path`` is a folder.
     """
     path = path.resolve()
     path.parent.mkdir(parents=True, exist_ok=True)
-    # The stem is left out: a long one plus a token could pass the 255 bytes that a file system allows.
+    # Without the stem of `path`: a long one plus the token could exceed the 255 bytes of a file name.
     temporary = path.with_name(f".mwdn-{os.getpid()}-{secrets.token_hex(4)}{path.suffix}")
     try:
         temporary.touch()
         mode = temporary.stat().st_mode
         yield temporary
-        temporary.chmod(mode)  # that of any new file here: safetensors writes for its owner alone
+        temporary.chmod(mode)  # the folder's usual mode: safetensors makes its files readable by their owner only
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
         temporary.replace(path)
@@ -54,76 +47,64 @@ def atomic(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def atomic_write(path: str | Path) -> Iterator[Path]:
-    """`atomic`, which names the file in what the disk refuses.
-
-    Raises:
-        ImageError: the disk refuses.
-    """
-    with naming_file(path), atomic(Path(path)) as temporary:
-        yield temporary
-
-
-@contextmanager
-def naming_file(path: str | Path) -> Iterator[None]:
-    """Name a file in what the disk refuses.
-
-    Raises:
-        ImageError: it does.
-    """
+def as_image_error(path: str | Path) -> Iterator[None]:
+    """Turn an `OSError` while writing a file into an `ImageError` that names the file."""
     try:
         yield
     except OSError as error:
         raise ImageError(f"`{path}` cannot be written: {error.strerror or error}. Choose another folder.") from error
 
 
-def save_text(path: Path, text: str) -> None:
+@contextmanager
+def as_parameter_error(folder: Path, advice: str = "Choose another one: `--out`.") -> Iterator[None]:
+    """Turn an error of the disk while writing into a folder into a `ParameterError` that names the folder."""
+    try:
+        yield
+    except (OSError, SafetensorError) as error:  # safetensors raises an error of its own when the disk is full
+        reason = getattr(error, "strerror", None) or error
+        raise ParameterError(f"`{folder}` must be a folder that can be written to: {reason}. {advice}") from error
+
+
+@contextmanager
+def atomic_write(path: str | Path) -> Iterator[Path]:
+    """`atomic`, with errors of the disk as `ImageError`."""
+    with as_image_error(path), atomic(Path(path)) as temporary:
+        yield temporary
+
+
+def write_text(path: Path, text: str) -> None:
     """Write a text file, atomically.
 
     Raises:
-        ImageError: the disk refuses.
+        ImageError: the file cannot be written.
     """
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write a report as JSON, atomically.
+    """Write a JSON file, atomically.
 
     Raises:
-        ImageError: the disk refuses.
+        ImageError: the file cannot be written.
     """
-    save_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
-
-
-@contextmanager
-def writable(folder: Path, way_out: str = "Choose another one: `--out`.") -> Iterator[None]:
-    """Say of which folder it is that the disk refuses something.
-
-    Raises:
-        ParameterError: the disk is full, or refuses otherwise.
-    """
-    try:
-        yield
-    except (OSError, SafetensorError) as error:  # safetensors has a type of its own for what the disk refuses
-        reason = getattr(error, "strerror", None) or error
-        raise ParameterError(f"`{folder}` must be a folder that can be written to: {reason}. {way_out}") from error
+    write_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
 def check_folder(folder: Path) -> None:
-    """Create a folder and see that it can be written to, before the work whose result it shall hold.
+    """Create a folder and check that it can be written to, before any work starts.
 
     Raises:
-        ParameterError: it cannot.
+        ParameterError: it cannot be created or written to.
     """
-    with writable(folder):
+    with as_parameter_error(folder):
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
 
 
 def refuse_overwrite(output: Path, *inputs: Path | None) -> None:
-    """See that an output replaces none of the inputs.
+    """Check that an output file is not one of the inputs.
 
     Raises:
         ParameterError: it is one of them.
@@ -133,64 +114,22 @@ def refuse_overwrite(output: Path, *inputs: Path | None) -> None:
             raise ParameterError(f"`{output}` would overwrite an input. Choose another name: `--out`.")
 
 
-def resolver() -> Callable[[str], str]:
-    """The same as `Path.resolve`, but each folder is looked at once: a million files take seconds, not minutes."""
+def path_resolver() -> Callable[[str], str]:
+    """A function like `Path.resolve` that scans each folder once: a million files take seconds, not minutes."""
     folders: dict[str, tuple[str, dict[str, str]]] = {}
 
-    def look(folder: Path) -> tuple[str, dict[str, str]]:
+    def scan(folder: Path) -> tuple[str, dict[str, str]]:
         links: dict[str, str] = {}
         if folder.is_dir():
             with os.scandir(folder) as entries:
-                links = {each.name: str(Path(each.path).resolve()) for each in entries if each.is_symlink()}
+                links = {entry.name: str(Path(entry.path).resolve()) for entry in entries if entry.is_symlink()}
         return str(folder.resolve() / "x").removesuffix("x"), links
 
-    def real(path: str) -> str:
+    def resolve(path: str) -> str:
         folder, name = os.path.split(path)
         if folder not in folders:
-            folders[folder] = look(Path(folder))
+            folders[folder] = scan(Path(folder))
         start, links = folders[folder]
         return links.get(name) or start + name
 
-    return real
-
-
-def save_png(path: Path, pixels: Frame) -> None:
-    """Write a frame as PNG, atomically.
-
-    Args:
-        path: where the file shall be.
-        pixels: (H, W, 1) or (H, W, 3), RGB, uint8 or uint16.
-
-    Raises:
-        OSError: as for `atomic`, or the frame has over a million rows or columns, which PNG writers refuse.
-    """
-    import cv2
-
-    try:
-        encoded, data = cv2.imencode(".png", np.ascontiguousarray(pixels[..., ::-1]))
-    except cv2.error as error:
-        raise OSError(f"OpenCV: {error.err}") from error
-    if not encoded:
-        raise OSError(f"OpenCV cannot encode {pixels.shape[0]:,} x {pixels.shape[1]:,} pixels as PNG")
-    with atomic(path) as temporary:
-        temporary.write_bytes(data.tobytes())
-
-
-def save_linear(path: Path, frame: FloatFrame) -> None:
-    """Write a frame's float32 numbers as NPY or, by any other suffix, as TIFF, atomically.
-
-    Args:
-        path: where the file shall be.
-        frame: (H, W, 1) or (H, W, 3), RGB.
-
-    Raises:
-        OSError: as for `atomic`.
-    """
-    with atomic(path) as temporary:
-        if path.suffix.lower() == ".npy":
-            with temporary.open("wb") as file:
-                np.save(file, frame, allow_pickle=False)
-        else:
-            import tifffile
-
-            tifffile.imwrite(temporary, frame, photometric="rgb" if frame.shape[-1] == 3 else "minisblack")
+    return resolve

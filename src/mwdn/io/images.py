@@ -1,6 +1,5 @@
-"""Pictures and frames in and out of files: what their numbers mean, and which way is up."""
+"""Read and write pictures (sRGB) and frames (numbers as stored)."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -8,12 +7,12 @@ import torch
 from torch import Tensor
 
 from mwdn.errors import ImageError, ParameterError
-from mwdn.io.files import naming_file, save_linear, save_png
+from mwdn.io.files import atomic_write
 from mwdn.io.formats import decode, kind_of, read
 from mwdn.types import FloatFrame, Frame, Image
 
 READABLE = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".npy"})
-"""Suffixes, in lower case, by which a folder is searched for pictures and frames."""
+"""Suffixes, in lower case, of the files in a folder that are taken for pictures and frames."""
 
 
 def read_frame(path: str | Path, *, bgr: bool = False, upside_down: bool = False, upright: bool = False) -> Frame:
@@ -21,9 +20,9 @@ def read_frame(path: str | Path, *, bgr: bool = False, upside_down: bool = False
 
     Args:
         path: PNG, JPEG, BMP, TIFF (its first picture) or NPY.
-        bgr: the file's channels are blue, green, red, against its format's custom.
-        upside_down: the file's first row is the picture's last. DiffuserCam's ``.npy`` files need both.
-        upright: turn a photograph as its EXIF says; a sensor's frame stays as it lies.
+        bgr: the file's channels are blue, green, red.
+        upside_down: the file's first row is the bottom of the picture. DiffuserCam's ``.npy`` files need both.
+        upright: rotate a photograph according to its EXIF orientation; frames of a sensor are never rotated.
 
     Returns:
         (H, W, 1) or (H, W, 3), RGB, row 0 at the top, uint8 or uint16 as stored, any float as float32.
@@ -42,7 +41,7 @@ def decode_frame(data: bytes, name: str) -> Frame:
 
     Args:
         data: whole content of a PNG, JPEG or BMP.
-        name: of where the bytes come from, for the message.
+        name: of the data, for the error message.
 
     Returns:
         (H, W, 1) or (H, W, 3), as for `read_frame`.
@@ -54,12 +53,12 @@ def decode_frame(data: bytes, name: str) -> Frame:
         if (kind := kind_of(data)) not in ("PNG", "JPEG", "BMP"):
             raise ImageError(f"must be PNG, JPEG or BMP, but starts with {data[:8]!r}. Export it as PNG.")
         return np.ascontiguousarray(decode(kind, data, photograph=False))
-    except ImageError as problem:
-        raise ImageError(f"{name} {problem}") from problem
+    except ImageError as error:
+        raise ImageError(f"{name} {error}") from error
 
 
 def read_picture(path: str | Path) -> Image:
-    """Read a photograph as linear light: turned upright as its EXIF says, decoded from sRGB.
+    """Read a photograph as linear light: rotated according to its EXIF orientation, decoded from sRGB.
 
     Args:
         path: PNG, JPEG, BMP, TIFF (its first picture) or NPY, of 8 or 16 bits.
@@ -68,53 +67,78 @@ def read_picture(path: str | Path) -> Image:
         (1, 3, H, W), in [0, 1]; 1 is the largest number of 8 or 16 bits. Grey is repeated, alpha dropped.
 
     Raises:
-        ImageError: as for `read_frame`, or the file holds floats, for which no gamma is customary.
+        ImageError: as for `read_frame`, or the file holds floats, which have no standard gamma.
     """
     pixels = read(Path(path), photograph=True)
     if pixels.dtype.kind == "f":
         raise ImageError(f"`{path}` holds floats; a photograph has 8 or 16 bits. Read it with `read_frame`.")
     peak = np.iinfo(pixels.dtype).max
-    light = srgb_decode(torch.arange(peak + 1) / peak).numpy()[pixels]  # one power a level, not a pixel
+    light = srgb_decode(torch.arange(peak + 1) / peak).numpy()[pixels]  # a table: one power per level, not per pixel
     return torch.from_numpy(light).movedim(-1, 0)[None].expand(-1, 3, -1, -1).contiguous()
 
 
 def write_picture(path: str | Path, image: Tensor, *, bits: int = 8) -> None:
-    """Write a picture for people: clipped to [0, 1], encoded as sRGB, rounded, as PNG, atomically.
+    """Write a picture for display as PNG, atomically: clipped to [0, 1], encoded as sRGB, rounded.
 
     Args:
         path: ends in ``.png``; missing folders are created.
-        image: (1, C, H, W) or (C, H, W) of 1 or 3 channels, linear light.
+        image: (1, C, H, W) or (C, H, W) with 1 or 3 channels, linear light.
         bits: 8, or 16 for a picture that will be edited.
 
     Raises:
         ParameterError: ``bits`` is neither.
-        ImageError: another suffix or shape, integers, NaN or infinity, or the disk refuses.
+        ImageError: another suffix or shape, integers, NaN or infinity, or the file cannot be written.
     """
     if bits not in (8, 16):
         raise ParameterError(f"`bits` ({bits}) must be 8 or 16, the depths of a PNG in colour.")
-    frame = _writable(Path(path), image, ".png")
+    frame = _as_frame(Path(path), image, ".png")
     encoded = srgb_encode(torch.from_numpy(frame)).mul(2**bits - 1).round().numpy()
-    _write(save_png, Path(path), encoded.astype(f"uint{bits}"))
+    write_frame(path, encoded.astype(f"uint{bits}"))
 
 
 def write_linear(path: str | Path, image: Tensor) -> None:
-    """Write a picture for measuring: its exact float32 numbers, which `read_frame` gives back, atomically.
+    """Write the exact float32 numbers of an image, atomically; `read_frame` returns them.
 
     Args:
         path: ends in ``.tif``, ``.tiff`` or ``.npy``; missing folders are created.
-        image: (1, C, H, W) or (C, H, W) of 1 or 3 channels, any range; stored as (H, W, C).
+        image: (1, C, H, W) or (C, H, W) with 1 or 3 channels, any range; stored as (H, W, C).
 
     Raises:
-        ImageError: another suffix or shape, integers, NaN or infinity, or the disk refuses.
+        ImageError: another suffix or shape, integers, NaN or infinity, or the file cannot be written.
     """
-    _write(save_linear, Path(path), _writable(Path(path), image, ".npy", ".tif", ".tiff"))
+    write_frame(path, _as_frame(Path(path), image, ".npy", ".tif", ".tiff"))
+
+
+def write_frame(path: str | Path, frame: Frame) -> None:
+    """Write a frame, its numbers exactly as they are, atomically; `read_frame` returns them.
+
+    Args:
+        path: PNG for uint8 or uint16; NPY, or by any other suffix TIFF, for floats, too.
+        frame: (H, W, 1) or (H, W, 3), RGB.
+
+    Raises:
+        ImageError: the file cannot be written, or a PNG has over a million rows or columns.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    data = _encode_png(path, frame) if suffix == ".png" else b""  # before there is a temporary file
+    with atomic_write(path) as temporary:
+        if suffix == ".png":
+            temporary.write_bytes(data)
+        elif suffix == ".npy":
+            with temporary.open("wb") as file:
+                np.save(file, frame, allow_pickle=False)
+        else:
+            import tifffile
+
+            tifffile.imwrite(temporary, frame, photometric="rgb" if frame.shape[-1] == 3 else "minisblack")
 
 
 def srgb_encode(linear: Tensor) -> Tensor:
-    """From linear light to the numbers of an sRGB file, of any shape; clipped to [0, 1].
+    """Encode linear light, of any shape and clipped to [0, 1], as sRGB.
 
     References:
-        IEC 61966-2-1:1999, section 5.2: a line in the dark, then a power of 1 / 2.4. 0.2140 becomes 0.5.
+        IEC 61966-2-1:1999, section 5.2: linear up to 0.0031308, then a power of 1 / 2.4. 0.2140 becomes 0.5.
     """
     linear = linear.clamp(0, 1)
     power = linear ** (1 / 2.4)
@@ -123,11 +147,26 @@ def srgb_encode(linear: Tensor) -> Tensor:
 
 
 def srgb_decode(encoded: Tensor) -> Tensor:
-    """From the numbers of an sRGB file, of any shape and in [0, 1], to linear light; undoes `srgb_encode`."""
+    """Decode sRGB numbers in [0, 1], of any shape, to linear light; the inverse of `srgb_encode`."""
     return torch.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
-def _writable(path: Path, image: Tensor, *suffixes: str) -> FloatFrame:
+def _encode_png(path: Path, frame: Frame) -> bytes:
+    import cv2
+
+    try:
+        encoded, data = cv2.imencode(".png", np.ascontiguousarray(frame[..., ::-1]))
+    except cv2.error as error:
+        raise ImageError(f"`{path}` cannot be written: OpenCV: {error.err}.") from error
+    if not encoded:
+        raise ImageError(
+            f"`{path}` cannot be written: OpenCV cannot encode {frame.shape[0]:,} x {frame.shape[1]:,} pixels as PNG."
+        )
+    return data.tobytes()
+
+
+def _as_frame(path: Path, image: Tensor, *suffixes: str) -> FloatFrame:
+    """(H, W, C) float32 numbers of an image, after checks of its shape and of the suffix of ``path``."""
     if path.suffix.lower() not in suffixes:
         raise ImageError(f"`{path}` must end in {' or '.join(suffixes)}, not '{path.suffix}'. Rename it.")
     picture = image[0] if image.ndim == 4 and len(image) == 1 else image
@@ -140,8 +179,3 @@ def _writable(path: Path, image: Tensor, *suffixes: str) -> FloatFrame:
     if not torch.isfinite(picture).all():
         raise ImageError(f"`image` holds NaN or infinity: `{path}` is not written. Use `torch.nan_to_num`.")
     return picture.movedim(0, -1).contiguous().numpy()
-
-
-def _write(save: Callable[[Path, Frame], None], path: Path, pixels: Frame) -> None:
-    with naming_file(path):
-        save(path, pixels)

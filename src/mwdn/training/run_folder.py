@@ -11,7 +11,7 @@ from typing import Any
 from torch import Tensor
 
 from mwdn.errors import CheckpointError, ParameterError
-from mwdn.io.files import check_folder, save_text, writable
+from mwdn.io.files import as_parameter_error, check_folder, write_text
 from mwdn.runtime import distributed
 from mwdn.training.recipe import with_current_names
 from mwdn.training.training_state import Header, read_state
@@ -116,10 +116,10 @@ class RunFolder:
         """
         log = self.path / "log.jsonl"
         with self.alone():
-            save_text(self.path / "recipe.json", json.dumps(self.identity, indent=2))
+            write_text(self.path / "recipe.json", json.dumps(self.identity, indent=2))
             # One line a step; those after the saved step will be written again.
             lines = log.read_text(encoding="utf-8").splitlines(keepends=True) if log.exists() else []
-            save_text(log, "".join(lines[:step]))
+            write_text(log, "".join(lines[:step]))
 
     def log(self, line: dict[str, Any]) -> None:
         """Add a line to the log.
@@ -127,7 +127,7 @@ class RunFolder:
         Raises:
             ParameterError: the disk is full, or refuses otherwise.
         """
-        with writable(self.path, MAKE_ROOM), (self.path / "log.jsonl").open("a", encoding="utf-8") as file:
+        with as_parameter_error(self.path, MAKE_ROOM), (self.path / "log.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
 
 

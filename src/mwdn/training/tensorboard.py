@@ -5,7 +5,7 @@ from types import TracebackType
 from typing import Any
 
 from mwdn.errors import ParameterError
-from mwdn.io.files import writable
+from mwdn.io.files import as_parameter_error
 from mwdn.io.images import srgb_encode
 from mwdn.training.trainer import Report
 
@@ -26,7 +26,7 @@ class Board:
             from torch.utils.tensorboard import SummaryWriter
         except ModuleNotFoundError as error:
             raise ParameterError("`tensorboard` must be installed: `pip install 'mwdn[tensorboard]'`.") from error
-        with writable(folder):
+        with as_parameter_error(folder):
             self._writer: Any = SummaryWriter(str(folder), purge_step=step + 1)
 
     def __call__(self, report: Report) -> None:

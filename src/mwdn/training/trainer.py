@@ -15,7 +15,7 @@ from mwdn.data.recorded import ReadAhead, RecordedPairs
 from mwdn.data.simulated import Samples
 from mwdn.data.unpaired import UnpairedCaptures
 from mwdn.errors import CheckpointError, DivergenceError, MwdnError, ParameterError
-from mwdn.io.files import writable
+from mwdn.io.files import as_parameter_error
 from mwdn.io.images import write_picture
 from mwdn.networks import build
 from mwdn.networks.recomputed import norms, recompute
@@ -271,7 +271,7 @@ class Trainer:
         metadata = {**self.identity, "step": self.step, "psnr": found.psnr}
         header = {"identity": json.dumps(self.identity), "step": str(self.step), "best": repr(self.best)}
         header["lr_schedule"] = json.dumps(self.lr_schedule.state())
-        with writable(self.out, MAKE_ROOM):
+        with as_parameter_error(self.out, MAKE_ROOM):
             for name in ("last", *(["best"] if found.psnr == self.best else [])):
                 network = self.recipe.network["name"]
                 save_network(self.folder.weights(name), self.average, network, self.options, **metadata)
