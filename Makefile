@@ -1,4 +1,4 @@
-# Each target sets up what it needs: a fresh clone and Python 3.11 or later are enough.
+# Each target sets up its own environment: a fresh clone and Python 3.11 or later are enough.
 PYTHON ?= python3
 BIN := .venv/bin
 
@@ -9,11 +9,11 @@ BIN := .venv/bin
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	touch $@
 
-demo: .venv/.ready  ## a synthetic camera, its captures, every untrained method
+demo: .venv/.ready  ## a synthetic camera, its captures, the untrained methods
 	$(BIN)/mwdn demo
 
-# Threads that wait by spinning starve each other where other processes share the machine; alone they are the faster.
-test: .venv/.ready  ## everything but the slow checks on real captures
+# Spinning threads slow down other processes on the same cores, so tests wait passively; a single process is faster without.
+test: .venv/.ready  ## all tests except the slow ones on real captures
 	OMP_WAIT_POLICY=passive OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal
 
 check: .venv/.ready  ## lint, format, types
@@ -21,10 +21,10 @@ check: .venv/.ready  ## lint, format, types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-acceptance: .venv/.ready  ## real captures (MWDN_DATA, or ../shared/data); pictures go to results/acceptance
+acceptance: .venv/.ready  ## reconstruct real captures (MWDN_DATA or ../shared/data) into results/acceptance
 	$(BIN)/python -m pytest -m acceptance -s
 
-benchmark: .venv/.ready  ## speed against plain baselines in the same run
+benchmark: .venv/.ready  ## speed and memory against plain baselines in the same run
 	$(BIN)/python benchmarks/admm.py
 	$(BIN)/python benchmarks/memory.py
 	$(BIN)/python benchmarks/train.py
