@@ -1,9 +1,9 @@
-"""Make docs/masks.md and its pictures, and compare the designed camera of the paper with the measured one.
+"""Write docs/masks.md and its pictures, and compare the designed PSF of the paper's camera with the measured one.
 
     python docs/gallery.py
 
-The measured PSF is read from MWDN_DATA or ../shared/data. Its curves go into docs/paper-camera.jpg; its picture, beside
-the designed one, only into results/gallery/, which git ignores.
+The measured PSF is read from MWDN_DATA or ../shared/data. Its curves go into docs/paper-camera.jpg. Its picture goes
+only into results/gallery/, which git ignores.
 """
 
 import os
@@ -39,8 +39,8 @@ CAMERAS = {
     "coded": (CodedAperture(), replace(PAPER, distance_mm=0.5, aperture_mm=(2.6, 2.6))),
     "pinholes": (Pinholes(), PAPER),
 }
-"""All on the paper's sensor behind its aperture; nearer where diffraction would blur the shadow. Of the paper's mask
-the part that its aperture leaves open, and every 30 nm of the light: a minute instead of three."""
+"""All on the paper's sensor behind its aperture, nearer where diffraction would blur the shadow. The contour mask is
+the open part of the paper's mask, at every 30 nm of the band: a minute instead of three."""
 
 PAGE = """# Masks
 
@@ -81,13 +81,13 @@ Etching errors and reflections are likely sources of the haze.
 
 
 def scene() -> Scene:
-    """The cup of coffee in the middle of a dark field."""
+    """The cup of coffee in the centre of a dark field."""
     picture = read_picture(str(files("mwdn") / "io" / "pictures" / "coffee.jpg"))
     return F.pad(picture, ((PAPER.size[0] - picture.shape[-1]) // 2,) * 4)
 
 
 def captured(designed: Designed) -> tuple[list[torch.Tensor], float, list[float]]:
-    """A row of the sheet, the exposure, and the PSNR of each method."""
+    """One row of the sheet, the exposure, and the PSNR of each method."""
     truth, psf = scene(), designed.psf
     gain = 0.9 / Camera(psf).forward(truth).max().item()
     measurement = Camera(psf * gain).simulate(truth, generator=torch.Generator().manual_seed(0))
@@ -98,7 +98,7 @@ def captured(designed: Designed) -> tuple[list[torch.Tensor], float, list[float]
 
 
 def write_jpeg(path: Path, picture: torch.Tensor, quality: int = 82) -> None:
-    """Linear light to sRGB JPEG."""
+    """Write linear light as an sRGB JPEG."""
     pixels = (srgb_encode(picture[0]).movedim(0, -1).numpy() * 255).round().astype(np.uint8)
     encoded, data = cv2.imencode(".jpg", np.ascontiguousarray(pixels[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not encoded:
@@ -108,7 +108,7 @@ def write_jpeg(path: Path, picture: torch.Tensor, quality: int = 82) -> None:
 
 
 def plot(curves: dict[str, np.ndarray], title: str, ends: tuple[float, float], log: bool) -> np.ndarray:
-    """Curves over an even axis, 420 x 320 pixels of uint8; ``ends`` are those of the horizontal axis."""
+    """Plot curves with even spacing, 420 x 320 pixels of uint8; ``ends`` label the horizontal axis."""
     height, width, left, low, up = 320, 420, 56, 34, 26
     canvas = np.full((height, width, 3), 255, np.uint8)
     lowest, highest = (-3.0, 0.0) if log else (-0.1, 1.0)
@@ -135,26 +135,27 @@ def plot(curves: dict[str, np.ndarray], title: str, ends: tuple[float, float], l
     return canvas
 
 
-def hazy(psf: Psf, part: float) -> Psf:
-    """A PSF with a part of the light in the aperture's shadow, as if it passed without being bent."""
+def hazy(psf: Psf, fraction: float) -> Psf:
+    """A PSF with a fraction of the light undeflected, in the shadow of the aperture."""
     plate = Mask("phase", torch.zeros(1600, 1400), 2.0, 1.46)
     shadow = mask_psf(plate, replace(PAPER, wavelengths=3, colour=False))
-    return (1 - part) * psf + part * shadow / shadow.sum()
+    return (1 - fraction) * psf + fraction * shadow / shadow.sum()
 
 
 def compare(designed: Psf, measured: Psf) -> None:
-    """docs/paper-camera.jpg: our PSF and both cameras' curves; results/gallery: both PSFs."""
+    """Draw docs/paper-camera.jpg (designed PSF, curves of both) and results/gallery/psf.png (both PSFs)."""
     ratio = np.median((radial_spectrum(designed) / radial_spectrum(measured)).numpy()[6:])
     haze = 1 - 1 / ratio
     both = {"designed": designed, "measured": measured, f"designed, {haze:.0%} haze": hazy(designed, haze)}
     spectra = {name: radial_spectrum(psf).numpy() for name, psf in both.items()}
     correlations = {name: radial_autocorrelation(psf, 31).numpy() for name, psf in both.items()}
     for name, psf in both.items():
-        fit = spectra[name][6:] / spectra["measured"][6:]
-        apart = abs(correlations[name] - correlations["measured"]).max()
-        print(f"{name}: autocorrelation {sharpness(psf):.2f} px wide, at most {apart:.2f} from the measured one;")
+        ratios = spectra[name][6:] / spectra["measured"][6:]
+        error = abs(correlations[name] - correlations["measured"]).max()
+        print(f"{name}: autocorrelation {sharpness(psf):.2f} px wide, at most {error:.2f} from the measured one;")
         print(
-            f"  ring at {spectra[name][6:].argmax() + 6} / 120; spectrum {fit.min():.2f} to {fit.max():.2f} of measured"
+            f"  ring at {spectra[name][6:].argmax() + 6} / 120; "
+            f"spectrum {ratios.min():.2f} to {ratios.max():.2f} of measured"
         )
     picture = (srgb_encode(to_display(designed)[0]).movedim(0, -1).numpy() * 255).round().astype(np.uint8)
     sheet = np.concatenate(
@@ -171,17 +172,18 @@ def compare(designed: Psf, measured: Psf) -> None:
 
 
 def main() -> None:
-    """Everything; prints what it found."""
-    rows, table, contour, first = [], [], None, 1.0
+    """Write the page, its pictures and the comparison; print the table."""
+    rows, table, contour, contour_exposure = [], [], None, 1.0
     for name, (mask, setup) in CAMERAS.items():
         designed = design_camera(name, mask, setup)
         row, exposure, scores = captured(designed)
         rows.append(row)
-        contour, first = (designed, exposure) if name == "contour" else (contour, first)
+        if name == "contour":
+            contour, contour_exposure = designed, exposure
         made = designed.report()["made"]
         light = sum(made["light_on_sensor"]) / len(made["light_on_sensor"])
         table.append(
-            f"| {name} | {setup.distance_mm:g} mm | {light:.1%} | {exposure / first:.2g} | "
+            f"| {name} | {setup.distance_mm:g} mm | {light:.1%} | {exposure / contour_exposure:.2g} | "
             f"{made['resolution_mrad']:.0f} mrad | {scores[0]:.1f} | {scores[1]:.1f} |"
         )
         print(table[-1], flush=True)
@@ -194,7 +196,7 @@ def main() -> None:
     if measured.is_file() and contour is not None:
         compare(contour.psf, Calibration.from_file(measured).psf)
     else:
-        print(f"docs/paper-camera.jpg is left as it is: no measured PSF at {measured}. Set MWDN_DATA.")
+        print(f"docs/paper-camera.jpg is unchanged: no measured PSF at {measured}. Set MWDN_DATA.")
 
 
 if __name__ == "__main__":

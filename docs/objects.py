@@ -1,8 +1,8 @@
-"""Real objects of the paper's camera by ADMM, by ADMM from coarse to fine, and by a trained network.
+"""Real objects of the paper's camera, reconstructed by ADMM, by the pyramid and by a trained network.
 
     python docs/objects.py ../shared/data/mwdn-camera runs/mine/best.safetensors [docs/objects.jpg]
 
-The network was trained for `psf_320.png`; the larger captures are of the same mask through `psf_480.tif`.
+The network was trained for `psf_320.png`; the larger captures are from the same mask, with `psf_480.tif`.
 """
 
 import sys
@@ -24,10 +24,10 @@ def main(camera: Path, weights: str, out: Path = Path("docs/objects.jpg")) -> No
         methods = [Reconstructor(method, calibration) for method in ("admm", "pyramid", weights)]
         for capture in sorted((camera / "real-objects").glob(pattern)):
             measurement = calibration.correct(read_frame(capture))
-            found = [to_display(method(measurement)) for method in methods]
-            top = (found[0].shape[-1] - 200) // 2  # the objects stand in the middle 200 x 200 pixels
-            rows.append([picture[..., top : top + 200, top : top + 200] for picture in found])
-    # Two halves beside each other: a page is wider than high.
+            pictures = [to_display(method(measurement)) for method in methods]
+            top = (pictures[0].shape[-1] - 200) // 2  # the objects are in the central 200 x 200 pixels
+            rows.append([picture[..., top : top + 200, top : top + 200] for picture in pictures])
+    # Two halves side by side: a page is wider than high.
     half = (len(rows) + 1) // 2
     pairs = [left + right for left, right in zip(rows[:half], rows[half:], strict=True)]
     sheet = srgb_encode(contact_sheet(pairs, 2 * ["ADMM", "pyramid", "network"], height=200))

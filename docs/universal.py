@@ -1,4 +1,4 @@
-"""Real captures of cameras that the bundled network has never seen, beside ADMM.
+"""Real captures of cameras that the bundled network was not trained on, beside ADMM.
 
 python docs/universal.py ../shared/data [docs/universal.jpg]
 """
@@ -17,15 +17,15 @@ DIFFUSERCAM = {"background": 0.0, "upside_down": True, "bgr": True}
 
 
 def rows(calibration: Calibration, captures: list[Path], *, middle: int = 0) -> list[list[torch.Tensor]]:
-    """ADMM's picture and the network's, and their middle pixels alone where an object stands there."""
+    """Pictures by ADMM and by the network, cropped to their central ``middle`` pixels unless 0."""
     methods = [Reconstructor(method, calibration) for method in ("admm", "universal")]
-    found = []
+    sheet = []
     for capture in captures:
         measurement = calibration.correct(calibration.frames.read(capture))
         pictures = [to_display(method(measurement)) for method in methods]
         rows, columns = ((size - (middle or size)) // 2 for size in pictures[0].shape[-2:])
-        found.append([p[..., rows : p.shape[-2] - rows, columns : p.shape[-1] - columns] for p in pictures])
-    return found
+        sheet.append([p[..., rows : p.shape[-2] - rows, columns : p.shape[-1] - columns] for p in pictures])
+    return sheet
 
 
 def main(data: Path, out: Path = Path("docs/universal.jpg")) -> None:
@@ -33,7 +33,7 @@ def main(data: Path, out: Path = Path("docs/universal.jpg")) -> None:
     camera, diffusercam, tutorial = data / "mwdn-camera", data / "diffusercam", data / "diffusercam-tutorial"
     small = Calibration.from_file(camera / "psf_320.png")
     large = Calibration.from_file(camera / "psf_480.tif")
-    found = [
+    pairs = [
         *rows(small, sorted((camera / "real-objects").glob("object_*")), middle=200),
         *rows(large, sorted((camera / "real-objects").glob("scene*")), middle=200),
         *rows(large, [camera / "display_capture.tif"], middle=240),
@@ -43,9 +43,9 @@ def main(data: Path, out: Path = Path("docs/universal.jpg")) -> None:
             sorted((diffusercam / "diffuser_images").glob("*.npy")),
         ),
     ]
-    third = -(-len(found) // 3)
-    found += [[torch.ones_like(p) for p in found[0]]] * (3 * third - len(found))
-    lines = [a + b + c for a, b, c in zip(found[:third], found[third : 2 * third], found[2 * third :], strict=True)]
+    third = -(-len(pairs) // 3)
+    pairs += [[torch.ones_like(p) for p in pairs[0]]] * (3 * third - len(pairs))
+    lines = [a + b + c for a, b, c in zip(pairs[:third], pairs[third : 2 * third], pairs[2 * third :], strict=True)]
     sheet = srgb_encode(contact_sheet(lines, 3 * ["ADMM", "universal"], height=180))
     cv2.imwrite(str(out), (sheet[0].flip(0).permute(1, 2, 0) * 255).round().byte().numpy())
 
