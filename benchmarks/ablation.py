@@ -1,4 +1,4 @@
-"""Which part of the bundled network does what: one part taken out at a time, without training again.
+"""Ablation of the bundled network: one part removed at a time, without retraining.
 
     python benchmarks/ablation.py ../shared/data [--count 6]
 
@@ -23,7 +23,7 @@ from universal import FULL_WELLS, captures
 
 
 def parts(psf):
-    """The whole and what is left of it, as functions of the measurement."""
+    """The whole network and its ablations, as functions of the measurement."""
     network = find_method("universal").eval()
 
     def changed(target, **attributes):

@@ -1,11 +1,11 @@
-"""ADMM, 100 iterations, two threads: this package against a plain textbook loop in numpy and scipy.
+"""ADMM, 100 iterations, two threads: this package against a textbook loop in numpy and scipy.
 
     python benchmarks/admm.py [--size 270x480] [--repeats 3]
 
-Both run in turn in one process, on the same problem with the same constants, and must agree. The textbook keeps
-every copy and multiplier on the padded grid and transforms six times an iteration, as the equations are written, in
-numpy's usual float64; a second one in float32 shows what that alone is worth. `universal-small`, bound to the camera,
-takes its turn too. What takes less than a second is repeated for one; the shortest time of each counts.
+Both take turns in one process, on the same problem with the same constants, and must agree. The textbook version keeps
+every copy and multiplier on the padded grid and computes six transforms per iteration, as the equations are written, in
+numpy's default float64; a second one uses float32. `universal-small`, prepared for the camera, takes turns too.
+Anything that takes less than a second is repeated for a second; the shortest time of each counts.
 """
 
 import argparse
@@ -60,7 +60,7 @@ def textbook(b, h, dtype, tau=1e-4):
 
 
 def seconds_of(run):
-    """The shortest of a second's calls, at least one; and what it gives."""
+    """The shortest time of repeated calls, for a second and at least once, and the result."""
     times = []
     while sum(times) < 1:
         start = time.perf_counter()

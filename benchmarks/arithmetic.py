@@ -1,4 +1,4 @@
-"""Where an engine's time goes, against what the machine can compute: part of `benchmarks/engine.py`."""
+"""Time of an engine's convolutions and transforms against the arithmetic limit; used by `benchmarks/engine.py`."""
 
 import math
 import time
@@ -16,7 +16,7 @@ FFT = torch.ops.aten
 
 
 def real_transform(shape, dims, *_, **__):
-    """2.5 n log2 n: half of a complex one."""
+    """2.5 n log2 n operations, half of a complex transform."""
     return int(2.5 * math.prod(shape) * math.log2(math.prod(shape[dim] for dim in dims)))
 
 
@@ -32,7 +32,7 @@ COUNTED = {FFT._fft_r2c: real_transform, FFT._fft_c2r: inverse_real_transform, F
 
 
 def operations(method, size):
-    """GFLOP of one picture's convolutions and transforms, as the network is written, what is kept of the PSF aside."""
+    """GFLOP of one picture's convolutions and transforms, without what is prepared from the PSF."""
     with torch.device("meta"), torch.no_grad():
         network, picture = build(method).eval(), torch.empty(1, 3, *size)
         bound = network.bind(picture, picture) if hasattr(network, "bind") else None
@@ -48,7 +48,7 @@ def part_of(name):
 
 
 def milliseconds(engine, picture):
-    """Of each part of one call."""
+    """Milliseconds of each part of one call."""
     cuda = picture.is_cuda
     engine(picture)
     with profile(activities=[ProfilerActivity.CUDA if cuda else ProfilerActivity.CPU]) as found:
@@ -63,7 +63,7 @@ def milliseconds(engine, picture):
 
 
 def limit(dtype, device):
-    """GFLOP/s of a large product of matrices: as fast as this machine multiplies."""
+    """GFLOP/s of a large matrix product, the limit of this machine."""
     n = 8192 if device == "cuda" else 2048
     a, b, best = torch.rand(n, n, device=device).to(dtype), torch.rand(n, n, device=device).to(dtype), math.inf
     for _ in range(5):
@@ -76,7 +76,7 @@ def limit(dtype, device):
 
 
 def rows(method, size, psf, picture, precision):
-    """Each part of one call of the engine."""
+    """One row for each part of a call of the engine."""
     device = psf.device.type
     torch.manual_seed(0)
     engine = Engine(build(method), psf, precision=precision)

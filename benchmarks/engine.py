@@ -1,23 +1,22 @@
-"""Time and memory of every method, bound to a camera by `Reconstructor`, against the plain path in the same run.
+"""Time and memory of every method prepared by `Reconstructor`, against the plain network in the same run.
 
     python benchmarks/engine.py [--sizes 320x320 270x480] [--threads 1 2] [--methods mwdn ...] [--batches 1 4]
 
-Plain is the network as it is written: float32, contiguous tensors, nothing kept from call to call, the Wiener filter
-as eq. (2) says, each step over the whole array. All contenders take turns, round after round, so that other work on
-the machine meets all of them; the shortest time of each counts. ``exact`` is the engine in float32. Solvers are plain
-functions and stand there for comparison; `benchmarks/admm.py` has their textbook. Where there is a GPU, everything is
-measured on it too.
+*Plain* is the network as written: float32, contiguous tensors, nothing kept between calls, the Wiener filter as eq.
+(2), each step over the whole array. *exact* is the engine in float32, *fast* its default. Solvers are listed for
+comparison; `benchmarks/admm.py` has their textbook version. All contenders take turns, so that other work on the
+machine affects all of them; the shortest time of each counts. If there is a GPU, everything is measured on it too.
 
-Left out: what would take longer than ``--longest`` seconds a call, judged by the next smaller size and the number of
-pixels; batches of more than 4 megapixels (64 on a GPU); all but the fast path above 4 megapixels on a CPU, where the
-others need tens of gigabytes. A call of more than 10 seconds is made once, any other once to warm up and ``--repeats``
+Skipped: calls of more than ``--longest`` seconds, estimated from the next smaller size and the number of pixels;
+batches of more than 4 megapixels (64 on a GPU); on a CPU above 4 megapixels everything but the fast path, because the
+others need tens of gigabytes. A call of more than 10 seconds is made once; any other once to warm up and ``--repeats``
 times.
 
-Memory is the largest of a process of its own that reconstructs one capture, less that of the bare package; the engine's
-weights and what it keeps of the PSF are counted, the files of torch are not. On a GPU it is what torch took there.
+Memory is the peak of a separate process that reconstructs one capture, minus that of the imported package. It includes
+weights and what is kept of the PSF, not the files of torch. On a GPU it is what torch reserved there.
 
-A second table says where the time goes (`benchmarks/arithmetic.py`). What an earlier call wrote of other methods, sizes
-or threads stays in the files.
+A second table shows where the time goes (`benchmarks/arithmetic.py`). Rows of earlier calls for other methods, sizes or
+threads stay in the files.
 """
 
 import argparse
@@ -60,7 +59,7 @@ def problem(size, batch):
 
 
 def contenders(method, calibration, device, names=CONTENDERS):
-    """Functions of a batch by their names; plain first."""
+    """Functions of a batch by name; plain first."""
     if method.startswith(SOLVER_PREFIX):
         return {"fast": Reconstructor(method.removeprefix(SOLVER_PREFIX), calibration, device=device)}
     torch.manual_seed(0)
@@ -81,7 +80,7 @@ def contenders(method, calibration, device, names=CONTENDERS):
 
 
 def seconds(runs, batch, repeats, clock):
-    """Shortest time a picture of each."""
+    """Shortest time per picture of each."""
     best, slow = {}, set()
     for repeat in range(repeats + 1):
         for name in [name for name in runs if name not in slow]:
@@ -90,19 +89,19 @@ def seconds(runs, batch, repeats, clock):
             spent = clock() - start
             if spent > 10:
                 slow.add(name)
-            if repeat or name in slow:  # else the first round warms up
+            if repeat or name in slow:  # otherwise the first round warms up
                 best[name] = min(best.get(name, float("inf")), spent / len(batch))
     return best
 
 
 def peak_mb(method, size, contender, device):
-    """Largest memory of a fresh process that reconstructs, above that of one with the imports alone."""
+    """Peak memory of a new process that reconstructs, minus that after the imports."""
     done = alone("engine", method, *size, contender, device)
     return float(done.stdout) if done.returncode == 0 else None
 
 
 def alone(benchmark, *arguments):
-    """What `child` of a benchmark does in a process of its own."""
+    """Run `child` of a benchmark in a separate process."""
     code = f"import sys; sys.path.insert(0, 'benchmarks'); import {benchmark}; {benchmark}.child(*sys.argv[1:])"
     return subprocess.run(
         [sys.executable, "-c", code, *map(str, arguments)], capture_output=True, text=True, check=False
@@ -110,7 +109,7 @@ def alone(benchmark, *arguments):
 
 
 def child(method, height, width, contender, device):
-    """Print the memory, in MB."""
+    """Print the memory in MB."""
     before = highest_mb()
     calibration, batch = problem((int(height), int(width)), 1)
     contenders(method, calibration, device, (contender,))[contender](batch)
@@ -118,20 +117,20 @@ def child(method, height, width, contender, device):
 
 
 def highest_mb():
-    """Of this process; getrusage would begin with its parent's."""
+    """Peak memory of this process in MB; getrusage would start from its parent's."""
     status = Path("/proc/self/status").read_text()
     return int(status.split("VmHWM:")[1].split()[0]) / 1024
 
 
 class Measurement:
-    """All that is measured of the methods, size by size."""
+    """Measures the methods, size by size."""
 
     def __init__(self, arguments):
         self.arguments, self.rates = arguments, {}
         self.clock = time.process_time if arguments.cpu_time else time.perf_counter
 
     def of(self, method, size, device):
-        """Rows of one method at one size: threads and batches."""
+        """Rows of one method at one size, for each number of threads and batch size."""
         pixels, names = size[0] * size[1], CONTENDERS
         if device == "cpu" and pixels > 4 * MEGA:
             names = ("fast",)
@@ -161,7 +160,7 @@ class Measurement:
                     yield row | ratios(times) | {f"{name}_mb": value for name, value in memory.items()}
 
     def seconds_of(self, name, method, device, pixels, threads=None):
-        """What a call will take, by the last that was measured; the fewest of any number of threads unless given."""
+        """Expected time of a call from the measured rates; the shortest over all thread counts by default."""
         known = [
             rate
             for (*key, count), rate in self.rates.items()
@@ -186,7 +185,7 @@ def line(row):
 
 
 def write(path, measured, profiled):
-    """JSON, and the tables beside it."""
+    """Write the JSON, and the tables beside it."""
     known = json.loads(path.read_text()) if path.exists() else {}
     keys = ("size", "method", "device", "threads", "batch", "precision", "part")
     content = {"torch": torch.__version__, "cpu": torch.backends.cpu.get_cpu_capability()}
@@ -203,14 +202,14 @@ def write(path, measured, profiled):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--sizes", nargs="+", default=SIZES, help="3000x4000 is 12 megapixels")
+    parser.add_argument("--sizes", nargs="+", default=SIZES, help="heights and widths; 3000x4000 is 12 megapixels")
     parser.add_argument("--threads", nargs="+", type=int, default=[1, 2])
     parser.add_argument("--methods", nargs="+", default=USUAL, choices=METHODS)
     parser.add_argument("--batches", nargs="+", type=int, default=[1, 4], help="add 16 64 on a GPU")
     parser.add_argument("--devices", nargs="+", default=["cpu", *(["cuda"] if torch.cuda.is_available() else [])])
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--longest", type=float, default=120, help="seconds of a call that is not left out")
-    parser.add_argument("--cpu-time", action="store_true", help="count the process's own time: for a machine in use")
+    parser.add_argument("--longest", type=float, default=120, help="skip calls of more than so many seconds")
+    parser.add_argument("--cpu-time", action="store_true", help="measure the process's own time, on a shared machine")
     parser.add_argument("--memory", action="store_true", help="measure memory too")
     parser.add_argument("--profile", nargs="*", default=["320x320", "1080x1920"], help="sizes of the second table")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/engine.json"))

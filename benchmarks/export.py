@@ -2,13 +2,13 @@
 
     python benchmarks/export.py --psf PSF [--captures FILE ...] [--methods universal-small] [--kinds .onnx:int8]
 
-Agreement is the PSNR against the exact reconstruction, its peak the brightest pixel of that, of the worst capture: of
-those simulated that decide about the file, and of real ones where some are given. All contenders take turns, and the
-shortest time of each counts. On a machine in use by others, `--cpu-time` with one thread counts the process's own time.
+Agreement is the PSNR against the exact reconstruction, with its brightest pixel as peak, of the worst capture: of the
+simulated ones that verify an export, and of real ones if given. All contenders take turns, and the shortest time of
+each counts. On a shared machine, `--cpu-time` with one thread measures the process's own time.
 
     python benchmarks/export.py --transforms
 
-compares ways to transform a plane there and back in onnxruntime: its own operation, and products with matrices.
+compares ways to transform a plane forward and back in onnxruntime: its own operation, and matrix products.
 """
 
 import argparse
@@ -31,7 +31,7 @@ KINDS = [(".onnx", "float32"), (".onnx", "float16"), (".onnx", "int8"), (".pt2",
 
 
 def opened(file, threads):
-    """A function of a measurement, ready to run."""
+    """Load an exported file as a function of a measurement."""
     if file.suffix == ".pt2":
         module = torch.export.load(file).module()
         return torch.no_grad()(lambda measurement: module(measurement))
@@ -52,7 +52,7 @@ def main():
     parser.add_argument("--kinds", nargs="+", default=KINDS, type=lambda text: tuple(text.split(":")))
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--cpu-time", action="store_true", help="count the process's own time: for a machine in use")
+    parser.add_argument("--cpu-time", action="store_true", help="measure the process's own time, on a shared machine")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/export.json"))
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
@@ -64,7 +64,7 @@ def main():
 
 
 def files(arguments, clock):
-    """A table and a JSON: one row a file, and two of the reconstructor."""
+    """Print a table and write a JSON: one row per file, and two of the reconstructor."""
     calibration = Calibration.from_file(arguments.psf)
     captures = read_captures(find_captures(arguments.captures), calibration) if arguments.captures else None
     rows = []
@@ -82,7 +82,7 @@ def files(arguments, clock):
 
 
 def measured(method, calibration, captures, arguments, clock):
-    """Rows of a method."""
+    """Rows of one method."""
     rows, runs = [], {}
     with tempfile.TemporaryDirectory() as folder:
         for suffix, precision in arguments.kinds:
@@ -108,7 +108,7 @@ def measured(method, calibration, captures, arguments, clock):
 
 
 def shortest(runs, batch, repeats, clock):
-    """Seconds of each, which take turns."""
+    """Shortest time of each in seconds, taking turns."""
     best = dict.fromkeys(runs, float("inf"))
     for repeat in range(repeats + 1):
         for name, run in runs.items():
@@ -120,7 +120,7 @@ def shortest(runs, batch, repeats, clock):
 
 
 class ThereAndBack(torch.nn.Module):
-    """A plane, continued with zeros to a grid, and back."""
+    """Transform a zero-padded plane forward and back."""
 
     def __init__(self, size):
         super().__init__()
@@ -131,7 +131,7 @@ class ThereAndBack(torch.nn.Module):
 
 
 def operation(size, grid, channels):
-    """The same with ONNX's own operation, which takes two axes one after the other."""
+    """The same with ONNX's own `DFT`, one axis at a time."""
     g = OnnxGraph()
     whole = g("Pad", "measurement", g.integers([0] * 6 + [grid[0] - size[0], grid[1] - size[1]]))
     found = g("Unsqueeze", whole, g.integers([4]))
@@ -143,7 +143,7 @@ def operation(size, grid, channels):
 
 
 def transforms(arguments, clock):
-    """A table: milliseconds a plane, and the largest error."""
+    """Print a table: milliseconds per plane, and the largest error."""
     import onnx
 
     channels = 8
@@ -165,7 +165,7 @@ def transforms(arguments, clock):
 
 
 def finite(decibels):
-    """What JSON can hold; ``None`` if there is no difference at all."""
+    """Decibels for JSON; ``None`` if there is no difference."""
     return None if decibels == float("inf") else decibels
 
 

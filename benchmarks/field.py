@@ -1,10 +1,10 @@
-"""What a PSF that changes over the field costs methods that believe in one PSF.
+"""The cost of using one PSF when the PSF changes over the field.
 
     python benchmarks/field.py [--size 160]
 
-A contour mask's PSF is magnified, sheared and blurred towards the corners, more and more. The captures of the
-bundled pictures, 0.7 of the field wide, are reconstructed with the PSF of the axis by Wiener and ADMM; one gain and
-offset a picture. Vignetting is left out: it only darkens. Prints a table, and writes it as JSON.
+A contour mask's PSF is magnified, sheared and blurred towards the corners by increasing amounts. Captures of the
+bundled pictures, 0.7 of the field wide, are reconstructed with the PSF on the axis by Wiener and ADMM; one gain and
+offset per picture. Vignetting is omitted: it only darkens. Prints a table and writes it as JSON.
 """
 
 import argparse
@@ -28,7 +28,7 @@ EXTENT = 0.7
 
 
 def scenes(size):
-    """The bundled pictures in the middle of a dark field."""
+    """The bundled pictures in the centre of a dark field."""
     names = ("astronaut", "coffee", "cat")
     pictures = [read_picture(str(files("mwdn") / "io" / "pictures" / f"{name}.jpg")) for name in names]
     margin = round((1 - EXTENT) / 2 * size)
@@ -37,7 +37,7 @@ def scenes(size):
 
 
 def parts(size):
-    """Masks of the picture's inner quarter, and of what lies within a tenth of its side from its border."""
+    """Masks of the picture's inner quarter, and of the area within a tenth of its side from its border."""
     place = torch.linspace(-1, 1, size).abs() / EXTENT
     distance = torch.maximum(place[:, None], place)
     return {"centre": distance < 0.5, "border": (distance > 0.8) & (distance < 1)}

@@ -1,8 +1,8 @@
-"""What limits reconstructions of the real DiffuserCam pairs: each cause taken away with the truth's help.
+"""What limits reconstructions of the real DiffuserCam pairs: each cause removed with the help of the ground truth.
 
     python benchmarks/limits.py ../shared/data
 
-Everything is linear light at 270 x 480; correlations are of detail, of green, a blur over 21 pixels taken off.
+Everything is linear light at 270 x 480. Correlations are of detail in green: the picture minus a blur over 21 pixels.
 """
 
 import argparse
@@ -38,14 +38,14 @@ def score(found: Tensor, truths: Tensor) -> float:
 
 
 def with_true_mean_light(found: Tensor, truths: Tensor, block: int) -> float:
-    """The score if the mean light of blocks were the truth's."""
+    """The score with the true mean light of blocks."""
     found, truths = PART.crop(found), PART.crop(truths)
     found = best_gain(found, truths)
     return float(psnr((found + mean_light(truths - found, block)).clamp(0, 1), truths).mean())
 
 
 def refitted(psf: Tensor, scenes: Tensor, measurements: Tensor, weight: float, steps: int = 40) -> Tensor:
-    """The PSF changed until it explains these measurements: conjugate gradients, ``weight`` on the change."""
+    """Fit the PSF to these measurements by conjugate gradients, with ``weight`` on the change."""
     gains = torch.stack([m.std() for m in measurements])[:, None, None, None]
     scenes, measurements = scenes / gains, measurements / gains
 

@@ -1,10 +1,10 @@
-"""What it is worth that a process keeps the memory it frees (`mwdn.keep_memory`), at one size.
+"""Effect of keeping freed memory in the process (`mwdn.keep_memory`), at one size.
 
     python benchmarks/memory.py [--size 1080x1920] [--methods universal ...] [--threads 2]
 
-Each method reconstructs twice in a process of its own, with and without; the second time counts: wall clock, the
-kernel's part of the processors' time, and the largest memory of the process. Writes `benchmarks/results/memory.json`;
-what an earlier call wrote of other methods and sizes stays in it.
+Each method reconstructs twice in a separate process, with and without; the second time counts: wall clock, the kernel's
+share of processor time, and the peak memory of the process. Writes `benchmarks/results/memory.json`; rows of earlier
+calls for other methods and sizes stay in it.
 """
 
 import argparse
@@ -22,7 +22,7 @@ METHODS = ["mwdn", "universal-small", "solver:pyramid"]
 
 
 def child(method, height, width, threads, kept):
-    """Print what one process measures."""
+    """Measure in this process, and print the numbers."""
     if kept == "kept":
         assert keep_memory()
     torch.set_num_threads(int(threads))

@@ -1,11 +1,11 @@
-"""Which part makes a network for any camera learn fast: padding, a bank of estimates, image space. Each trained anew.
+"""Which part lets a network for any camera learn fast: padding, a bank of estimates, image space. Each is trained anew.
 
     python benchmarks/parts.py ../shared/data [--steps 200]
 
-One change at a time against five Wiener estimates in image space (lambda 3e-2 to 1e-5, the measurement continued and
-tapered) at the input of a U-Net. All learn from the same samples, each through a random camera of its own, by the same
-schedule (recipes/universal.toml without kept samples), and are validated on the same captures through the paper's PSF,
-whose camera none has seen. Two at a time, of one thread each.
+One change at a time against five Wiener estimates in image space (lambda 3e-2 to 1e-5, the measurement padded and
+tapered) as input of a U-Net. All train on the same samples, each through a random camera, with the same schedule
+(recipes/universal.toml without kept samples), and are validated on the same captures through the paper's PSF, which
+none has seen. Two at a time, of one thread each.
 """
 
 import argparse
@@ -33,11 +33,11 @@ PARTS = {
     "feature space: MWDN": ({"name": "mwdn", "width": 20}, "taper"),
     "bank behind iterations": (BANK | {"finest": 1, "regularisations": [1e-3, 1e-4, 2e-5]}, "taper"),
 }
-"""Networks by what they are made of, and how the bank continues the measurement; MWDN tapers by itself."""
+"""Network options, and the boundary of the bank's filters; MWDN tapers by default."""
 
 
 def learned(part, data, steps):
-    """Validation PSNR of one network, by steps."""
+    """Validation PSNR of one network by step."""
     torch.set_num_threads(1)
     changes = {"steps": steps, "validate_every": steps // 4, "warmup": 20, "pool": 0, "crop": 0}
     recipe = read_recipe(RECIPE, **changes, cameras={"sizes": ["320x320"]}, placement={"exposure": [0.4, 0.95]})

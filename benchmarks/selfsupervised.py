@@ -1,11 +1,11 @@
-"""What learning from a camera's own captures alone brings: of scenes that only the judge knows.
+"""Self-supervised training on a camera's own captures, scored with ground truth that the training does not use.
 
     python benchmarks/selfsupervised.py ../shared/data [--exact] [--electrons 15000] [--count 24] [--steps 100]
 
-Captures as in benchmarks/universal.py, through the paper's PSF, mismatched unless told otherwise. `universal`
-reconstructs them, learns from them as recipes/selfsupervised.toml says (in a folder of runs/, where it goes on if it
-was stopped), and reconstructs them again. Measured as `mwdn evaluate` measures (full, clipped). What an earlier call
-wrote of another camera or light stays in the record.
+Captures as in benchmarks/universal.py, through the paper's PSF, mismatched by default. `universal` reconstructs them,
+is trained on them by recipes/selfsupervised.toml (in a folder of runs/, where a stopped run continues), and
+reconstructs them again. Scored as in `mwdn evaluate` (full, clipped). Rows of earlier calls for another camera or light
+stay in the record.
 """
 
 import argparse

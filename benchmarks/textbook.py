@@ -1,9 +1,9 @@
-"""ADMM as other packages run it on files of pairs: DiffuserCam's constants, 100 iterations, each axis by itself.
+"""ADMM as other packages run it, on pair files: DiffuserCam's constants, 100 iterations, anisotropic total variation.
 
     python benchmarks/textbook.py exact.h5 mismatched.h5
 
-The files hold the PSF, as those of `mwdn simulate` do. Measured as `mwdn evaluate` measures (full, clipped). Prints
-means with their 95 % intervals, and writes all numbers of each file as JSON.
+The files must hold the PSF, as those of `mwdn simulate` do. Scored as in `mwdn evaluate` (full, clipped). Prints means
+with 95 % intervals, and writes all numbers of each file as JSON.
 """
 
 import argparse

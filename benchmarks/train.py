@@ -1,8 +1,8 @@
-"""Training throughput of the paper-size MWDN: as `mwdn train` does it, against the plainest way, in the same run.
+"""Training throughput of the paper-size MWDN: as in `mwdn train`, against the plain way, in the same run.
 
     python benchmarks/train.py [--batch 2] [--steps 3] [--width 64]
 
-Plain: float32, contiguous tensors, no autocast. Both take the same pairs and the same optimiser.
+Plain: float32, contiguous tensors, no autocast. Both use the same pairs and the same optimiser.
 """
 
 import argparse

@@ -1,10 +1,10 @@
-"""What the consistency score says of right and wrong PSFs, on real captures of two cameras.
+"""The consistency score with right and wrong PSFs, on real captures of two cameras.
 
     python benchmarks/trust.py ../shared/data [--method universal] [--count 2]
 
-Wrong PSFs: mirrored, turned by 180, 90 and 3 degrees, displaced, and that of another camera. Prints one line each:
-the part of the capture's detail that is explained, over the part that is not noise; the contrast with mirrored and
-turned PSFs; whether the score calls it doubtful. Then the ranges of each kind of PSF.
+Wrong PSFs: mirrored, rotated by 180, 90 and 3 degrees, displaced, and that of another camera. Prints one line each: the
+fraction of the capture's detail that is reproduced, over the fraction that is not noise; the contrast with mirrored and
+rotated PSFs; whether the score is doubtful. Then the ranges for each kind of PSF.
 """
 
 import argparse
@@ -39,7 +39,7 @@ def wrong(psf):
 
 
 def ranges(rows):
-    """Lines of a table: how many captures of each kind of PSF are called doubtful, and between which numbers."""
+    """Lines of a table: for each kind of PSF the number of doubtful captures, and the ranges of the scores."""
     yield "| PSF | captures | doubtful | explained / possible | contrast |\n| --- | --- | --- | --- | --- |"
     for name in dict.fromkeys(row["psf"] for row in rows):
         those = [row for row in rows if row["psf"] == name]

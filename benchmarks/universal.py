@@ -1,15 +1,15 @@
-"""The bundled networks against ADMM through PSFs they have never seen: exact and mismatched, in good and poor light.
+"""The bundled networks against ADMM through PSFs they were not trained on: exact and mismatched, in good and low light.
 
     python benchmarks/universal.py ../shared/data [--count 32] [--methods universal universal-small admm]
                                                 [--psfs "mwdn-camera 320x320" ...]
 
-Four measured PSFs; test photographs placed and mismatched as recipes/mismatched.toml says; 15,000 and 2,000 electrons
-at saturation. Measured as `mwdn evaluate` measures (full, clipped). Prints a table of means, with the confidence
-interval of what the first method gains over the last, and writes what each picture has, a few at a time: what the
-record has is not measured again, so a run goes on where another stopped. Where a method has changed, `--again` forgets
-what the record has of those that are named. A process for each core, of one thread each.
+Four measured PSFs; test photographs placed and mismatched by recipes/mismatched.toml; 15,000 and 2,000 electrons at
+saturation. Scored as in `mwdn evaluate` (full, clipped). Prints a table of means, with the confidence interval of the
+first method's gain over the last, and writes the numbers of each picture, a few at a time. Numbers already in the
+record are not measured again, so a stopped run continues; `--again` measures the named methods again. One process per
+core, of one thread each.
 
-The method `fine-tuned` is of each PSF the network that recipes/finetune.toml made of `universal`, in `TUNED`.
+The method `fine-tuned` is, for each PSF, the network in `TUNED` that recipes/finetune.toml made of `universal`.
 """
 
 import argparse
@@ -69,20 +69,20 @@ def captures(psf, photographs, recipe, full_well, numbers, *, exact):
 
 
 def measured(methods, made, calibration):
-    """Lists of PSNR, SSIM and LPIPS of some captures, by methods of these names."""
+    """Lists of PSNR, SSIM and LPIPS of some captures for each method."""
     bound = {name: Reconstructor(method, calibration) for name, method in methods.items()}
     report = evaluate(bound, made, Protocol.parse("full"), perceptual=Perceptual.load()).methods
     return {name: {key: [round(value, 4) for value in report[name].values[key]] for key in METRICS} for name in methods}
 
 
 def gain(values, other):
-    """What one method gains over another in PSNR, with its confidence interval."""
+    """Gain of one method over another in PSNR, with its confidence interval."""
     both = zip(values["psnr"], other["psnr"], strict=True)
     return "{:+.2f} ({:.2f} to {:.2f})".format(*bootstrap([one - two for one, two in both]))
 
 
 def remembered(out):
-    """What a record has of each row: values by method."""
+    """Values by method of each row in a record."""
     rows = {which: {} for which in itertools.product(PSFS, FULL_WELLS, (True, False))}
     for row in json.loads(out.read_text()) if out.exists() else ():
         rows[tuple(row[key] for key in KEYS)] = row["values"]
@@ -90,7 +90,7 @@ def remembered(out):
 
 
 def lacking(rows, methods, count):
-    """What is to be measured: (row, numbers of captures, methods), first what all rows begin with."""
+    """What remains to be measured: (row, numbers of captures, methods), the first captures of all rows first."""
     for first in range(0, count, AT_ONCE):
         numbers = range(first, min(first + AT_ONCE, count))
         for which, values in rows.items():
@@ -100,13 +100,13 @@ def lacking(rows, methods, count):
 
 
 def keep(rows, out):
-    """Write a record, a line for each row."""
+    """Write a record, one line per row."""
     with atomic(out) as temporary:
         temporary.write_text("[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n")
 
 
 def scores(data, which, numbers, methods):
-    """What is `measured` of captures through one PSF in one light."""
+    """Scores (`measured`) of captures through one PSF in one light."""
     torch.set_num_threads(1)
     mwdn.keep_memory()
     name, full_well, exact = which
@@ -117,7 +117,7 @@ def scores(data, which, numbers, methods):
 
 
 def table(rows, methods):
-    """Lines of means, and what the first method gains over the last."""
+    """Lines of means, and the gain of the first method over the last."""
     columns = ["PSF", "electrons", "calibration", "captures", *methods] + (["gain"] if len(methods) > 1 else [])
     yield f"| {' | '.join(columns)} |"
     yield "| --- " * len(columns) + "|"
@@ -156,7 +156,7 @@ def main():
                     known[key][numbers.start : numbers.stop] = values[key]
             record = [dict(zip(KEYS, which, strict=True)) | {"values": values} for which, values in rows.items()]
             keep(record, arguments.out)
-    print("PSNR in dB / LPIPS, means; what the first gains over the last (95 % confidence)\n")
+    print("PSNR in dB / LPIPS, means; gain of the first method over the last (95 % confidence)\n")
     print("\n".join(table(wanted, arguments.methods)))
 
 
