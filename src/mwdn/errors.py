@@ -9,8 +9,8 @@
     ├── ImageError (ValueError)        a picture or frame that cannot be read or written
     ├── PsfError (ValueError)          a PSF that no reconstruction can trust
     ├── CheckpointError (ValueError)   weights that are damaged or belong to something else
-    ├── ExportError                    a method that cannot be exported, or came out as something else
-    ├── DivergenceError                a loss that is not finite any more
+    ├── ExportError                    a method that cannot be exported, or gives other results after export
+    ├── DivergenceError                a loss that is no longer finite
     └── ProcessError                   another process of a distributed run has ended
 
 A message states what must hold, what was got, and the way out.
@@ -35,12 +35,12 @@ class ParameterError(MwdnError, ValueError):
 
 
 class UnknownNameError(ParameterError):
-    """A name that nothing here has; the message offers the nearest one.
+    """An unknown name; the message offers the nearest known one.
 
     Args:
-        kind: what was looked up, for example ``"network"``.
-        name: what was asked for.
-        known: every name that would have been found.
+        kind: of the thing looked up, for example ``"network"``.
+        name: the unknown name.
+        known: every known name.
     """
 
     def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
@@ -51,15 +51,15 @@ class UnknownNameError(ParameterError):
 
 
 def check_options(of: Callable[..., Any], what: str, options: Iterable[str]) -> None:
-    """See that a function or class takes these keyword arguments.
+    """Check that a function or class takes these keyword arguments.
 
     Args:
         of: the function or class.
-        what: it is called, for example ``"network 'mwdn'"``.
-        options: names.
+        what: its name in the message, for example ``"network 'mwdn'"``.
+        options: names of the keyword arguments.
 
     Raises:
-        UnknownNameError: it has none of a name.
+        UnknownNameError: it does not take one of them.
     """
     known = signature(of).parameters
     for option in options:
@@ -80,11 +80,11 @@ class CheckpointError(MwdnError, ValueError):
 
 
 class ExportError(MwdnError):
-    """A method cannot be written for another runtime, or gives another result there; nothing was written."""
+    """A method cannot be exported to another runtime, or gives another result there; no file was written."""
 
 
 class DivergenceError(MwdnError):
-    """The loss of a training run is not finite any more."""
+    """The loss of a training run is no longer finite."""
 
 
 class ProcessError(MwdnError):

@@ -1,10 +1,10 @@
 """Array types, with axis order and value range said once.
 
-Every picture in this package is a ``torch.Tensor`` of axes (batch, channel, height, width), float32, linear in
+Every image in this package is a ``torch.Tensor`` of axes (batch, channel, height, width), float32, linear in
 light, nominally in [0, 1], row 0 at the top, channels in the order R, G, B. A PSF has the same axes, is centred
 at pixel ``(height // 2, width // 2)``, and has a batch of 1 unless each sample has its own.
 
-A *frame* is what a file or a sensor holds, before any of that is true of it: a numpy array of axes
+A *frame* is an image as a file or a sensor stores it, before any of these conventions apply: a numpy array of axes
 (height, width, channel), in the numbers of the analogue-to-digital converter.
 """
 
@@ -19,25 +19,25 @@ Size = tuple[int, int]
 """(height, width) in pixels."""
 
 Image = Float[Tensor, "batch channel height width"]
-"""Any picture whose relation to the other arguments is free."""
+"""Any image; its size and channels need not match the other arguments."""
 
 Measurement = Float[Tensor, "batch channel height width"]
-"""What the sensor recorded, black level subtracted, saturation at 1."""
+"""Image on the sensor, black level subtracted, saturation at 1."""
 
 Scene = Float[Tensor, "batch scene_channel scene_height scene_width"]
-"""What stood before the camera; it may be larger than the sensor."""
+"""Image of the scene in front of the camera; it may be larger than the sensor."""
 
 Psf = Float[Tensor, "psf_batch psf_channel psf_height psf_width"]
-"""Response to a point; ``psf_batch`` and ``psf_channel`` are 1 or those of the picture."""
+"""Response to a point; ``psf_batch`` and ``psf_channel`` are 1 or those of the image."""
 
 Spectrum = Complex[Tensor, "batch channel height half_width"]
-"""Half of a real picture's Fourier transform, origin first."""
+"""Half of a real image's Fourier transform, origin first."""
 
 Field = Complex[Tensor, "_height _width"]
-"""Monochromatic light on a plane, one number a sample, of any size; its squared modulus is the intensity."""
+"""Complex amplitude of monochromatic light on a plane, of any size; its squared modulus is the intensity."""
 
 Plane = Float[Tensor, "_height _width"]
-"""One real number a sample, of any size: a height, a transmission, an intensity."""
+"""Real quantity on a plane, of any size: a height, a transmission, an intensity."""
 
 Frame = npt.NDArray[Any]
 """(height, width, channel), RGB, uint8, uint16 or float, as stored."""

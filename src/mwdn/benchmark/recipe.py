@@ -10,7 +10,7 @@ from typing import Any
 
 from mwdn.benchmark.sets import PRESETS, DatasetRecipe
 from mwdn.errors import ParameterError, UnknownNameError, check_options
-from mwdn.io.toml import fill, read_toml
+from mwdn.io.toml import read_toml, to_dataclass
 from mwdn.networks import NETWORKS
 from mwdn.optics import Deviation
 from mwdn.solvers import SOLVERS
@@ -117,13 +117,13 @@ def read_benchmark(path: str | Path) -> Benchmark:
             name: _dataset_recipe(name, {**shared.get("data", {}), **table}, folder)
             for name, table in content.pop("data", {}).items()
         },
-        "schedule": fill(Schedule, "schedule", content.pop("schedule", {})),
+        "schedule": to_dataclass(Schedule, "schedule", content.pop("schedule", {})),
         "loss": checked_weights(content.pop("loss", {"mse": 1.0})),
         "robustness": _robustness(content.pop("robustness", {})),
     }
     for name in ("alexnet", "heads"):
         content[name] = _absolute(content.get(name, ""), folder)
-    benchmark = fill(Benchmark, "the recipe", content)
+    benchmark = to_dataclass(Benchmark, "the recipe", content)
     methods = [_scale_width(method, benchmark.width_factor) for method in methods]
     benchmark = replace(benchmark, **tables, methods=tuple(methods), path=str(path))
     _check(benchmark)
@@ -170,9 +170,11 @@ def _dataset_recipe(name: str, table: dict[str, Any], folder: Path) -> DatasetRe
     nested = {f.name: getattr(preset, f.name) for f in fields(DatasetRecipe) if is_dataclass(f.default)}
     changes: dict[str, Any] = {}
     for key in nested.keys() & table.keys():
-        filled = fill(type(nested[key]), f"data.{name}.{key}", table[key])
+        filled = to_dataclass(type(nested[key]), f"data.{name}.{key}", table[key])
         changes[key] = replace(nested[key], **{part: getattr(filled, part) for part in table[key]})
-    plain = fill(DatasetRecipe, f"data.{name}", {key: value for key, value in table.items() if key not in changes})
+    plain = to_dataclass(
+        DatasetRecipe, f"data.{name}", {key: value for key, value in table.items() if key not in changes}
+    )
     changes |= {key: getattr(plain, key) for key in table if key not in changes}
     for key in ("psf", "photos", "test_photos", "pairs"):
         if key in changes:
@@ -206,7 +208,7 @@ def _robustness(table: dict[str, Any]) -> Robustness:
         if key not in ("data", "count"):
             raise UnknownNameError("key of [robustness]", key, ["data", "count", *AXES])
     ordered = {axis: sizes[axis] for axis in AXES if axis in sizes}
-    return replace(fill(Robustness, "robustness", others), sizes=ordered)
+    return replace(to_dataclass(Robustness, "robustness", others), sizes=ordered)
 
 
 def _check(benchmark: Benchmark) -> None:

@@ -11,7 +11,7 @@ from rich.progress import Progress, ProgressColumn, track
 
 from mwdn.cli.camera import CameraOptions, console, errors
 from mwdn.io.files import refuse_overwrite
-from mwdn.io.toml import value_of
+from mwdn.io.toml import parse_value
 from mwdn.runtime import distributed
 from mwdn.training import experiment
 from mwdn.training.recipe import Sheet, read_recipe
@@ -23,7 +23,7 @@ def _as_recipe(given: Any) -> Any:  # noqa: ANN401
     """What a command line says by ``--key value`` and ``--table.key value``, as a recipe has it."""
     if isinstance(given, dict):
         return {key.replace("-", "_"): _as_recipe(each) for key, each in given.items()}
-    return value_of(given[-1].value)
+    return parse_value(given[-1].value)
 
 
 RecipeKeys = Annotated[Any, Parameter(converter=lambda _, tokens: tokens, show=False)]

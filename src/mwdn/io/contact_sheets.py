@@ -1,4 +1,4 @@
-"""Contact sheets: pictures side by side under their titles."""
+"""Contact sheets: pictures side by side, with a title above each column."""
 
 import numpy as np
 import torch
@@ -10,9 +10,9 @@ from mwdn.types import Image
 
 
 def to_display(image: Image) -> Image:
-    """Scale each picture of a batch so that all but its brightest 0.3 % fit into [0, 1].
+    """Scale each image of a batch such that all but its brightest 0.3 % of values are within [0, 1], and clip it.
 
-    A reconstruction's absolute brightness depends on the exposure and on the PSF's; people want to see a picture.
+    The absolute brightness of a reconstruction depends on the exposures of the capture and of the PSF.
     """
     pixels = image.float().flatten(1)
     brightest = pixels.kthvalue(pixels.shape[1] - int(0.003 * pixels.shape[1])).values
@@ -20,27 +20,27 @@ def to_display(image: Image) -> Image:
 
 
 def contact_sheet(rows: list[list[Tensor]], titles: list[str], *, height: int = 240) -> Tensor:
-    """Arrange pictures in rows, each scaled by `to_display` and resized to one height.
+    """Arrange pictures in rows, each scaled by `to_display` and resized to the same height.
 
     Args:
-        rows: lists of (1, 1 or 3, H, W) in linear light, as many a row as there are titles.
+        rows: lists of (1, 1 or 3, H, W) in linear light, one picture per title.
         titles: of the columns.
         height: of each picture.
 
     Returns:
         (1, 3, H, W) in linear light.
     """
-    gap, head = 6, 26
+    gap, heading = 6, 26
     cells = [[_cell(picture, height, gap) for picture in row] for row in rows]
     lines = [torch.cat(row, dim=-1) for row in cells]
     widest = max(line.shape[-1] for line in lines)
     lines = [F.pad(line, (0, widest - line.shape[-1], 0, 0), value=1.0) for line in lines]
     widths = [cell.shape[-1] for cell in cells[0]]
-    return torch.cat([_heading(titles, widths, head, widest), *lines], dim=-2)
+    return torch.cat([_draw_titles(titles, widths, heading, widest), *lines], dim=-2)
 
 
 def thumbnail(picture: Image, height: int = 240) -> Tensor:
-    """Shrink a picture to a sheet's height, if it is taller: what a sheet of large pictures needs of each."""
+    """Downscale a picture to the height of a contact sheet, if it is taller."""
     if picture.shape[-2] <= height:
         return picture
     return F.interpolate(picture, (height, _width(picture, height)), mode="area")
@@ -57,7 +57,7 @@ def _width(picture: Tensor, height: int) -> int:
     return max(1, round(picture.shape[-1] * height / picture.shape[-2]))
 
 
-def _heading(titles: list[str], widths: list[int], height: int, total: int) -> Tensor:
+def _draw_titles(titles: list[str], widths: list[int], height: int, total: int) -> Tensor:
     import cv2
 
     canvas = np.full((height, total), 255, np.uint8)

@@ -1,4 +1,4 @@
-"""Readers of PNG, JPEG, BMP, TIFF and NPY. A file's content, not its name, decides; its header is judged first."""
+"""Readers of PNG, JPEG, BMP, TIFF and NPY. The format is taken from the content, and the header is checked first."""
 
 import logging
 import re
@@ -14,25 +14,25 @@ from mwdn.types import Frame
 
 MAX_PIXELS = 2**28
 """16,384 x 16,384, more than any sensor has. In RGB that is 1.5 GiB of uint16 or 3 GiB of float32; a header that
-claims more is damaged, or made to exhaust the memory of whoever opens it."""
+claims more is damaged, or made to exhaust the reader's memory."""
 
 _SIGNATURES = {b"\x89PNG\r\n\x1a\n": "PNG", b"\xff\xd8\xff": "JPEG", b"BM": "BMP", b"\x93NUMPY": "NPY"}
 _SIGNATURES |= dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "TIFF")  # + is BigTIFF
 _JPEG_MARKER = re.compile(rb"\xff[\x02-\xcf\xd8-\xfe]")  # FF 00 and FF D0 to D7 belong to the compressed data
-_AGAIN = "Copy it from its source again."
+_COPY_AGAIN = "Copy it from its source again."
 
-# tifffile logs each odd tag. Without a handler those lines would reach the terminal beside our one message.
+# tifffile logs unusual tags. Without a handler these lines would reach the terminal.
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 
 def read(path: Path, *, photograph: bool) -> Frame:
     """Read any file as it is stored, (H, W, 1) or (H, W, 3), RGB.
 
-    What the functions below say is wrong gets the file's name put before it here.
+    The functions below raise `ImageError` without the file's name, which is added here.
 
     Args:
         path: of the file.
-        photograph: turn it upright as its EXIF says, and resolve palettes.
+        photograph: rotate it according to its EXIF orientation, and resolve palettes.
 
     Raises:
         ImageError: it cannot be read, or holds NaN or infinity.
@@ -46,17 +46,17 @@ def read(path: Path, *, photograph: bool) -> Frame:
             case kind:
                 frame = decode(kind, path.read_bytes(), photograph)
         if not np.isfinite(frame).all():
-            raise ImageError("holds NaN or infinity. Capture it again, or mend it with `numpy.nan_to_num`.")
-    except ImageError as problem:
-        raise ImageError(f"`{path}` {problem}") from problem
+            raise ImageError("holds NaN or infinity. Capture it again, or replace them with `numpy.nan_to_num`.")
+    except ImageError as error:
+        raise ImageError(f"`{path}` {error}") from error
     except OSError as error:
         raise ImageError(f"`{path}` cannot be read: {error.strerror}. Check its permissions.") from error
     return frame
 
 
 def kind_of(start: bytes) -> str | None:
-    """Name of the format whose files begin like this, or ``None``."""
-    return next((kind for sign, kind in _SIGNATURES.items() if start.startswith(sign)), None)
+    """Name of the format whose files start with these bytes, or ``None``."""
+    return next((kind for signature, kind in _SIGNATURES.items() if start.startswith(signature)), None)
 
 
 def _kind(path: Path) -> str:
@@ -67,14 +67,14 @@ def _kind(path: Path) -> str:
     with path.open("rb") as file:
         start = file.read(8)
     if not start:
-        raise ImageError(f"is empty (0 bytes). {_AGAIN}")
+        raise ImageError(f"is empty (0 bytes). {_COPY_AGAIN}")
     if kind := kind_of(start):
         return kind
     raise ImageError(f"must be PNG, JPEG, BMP, TIFF or NPY, but starts with {start!r}. Export it as PNG.")
 
 
 def _frame_shape(shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, ...]:
-    """(H, W, C) of a stored array, judged by its header before any memory is spent on it."""
+    """(H, W, C) of a stored array; its header is checked before memory is allocated."""
     if dtype.kind != "f" and dtype.str[1:] not in ("u1", "u2"):
         raise ImageError(f"holds {dtype}; a frame has uint8, uint16 or floats. Convert it with `astype`.")
     axes = shape
@@ -91,7 +91,7 @@ def _frame_shape(shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, ...
 
 def _as_frame(stored: Frame, axes: tuple[int, ...]) -> Frame:
     dtype = np.dtype(np.float32) if stored.dtype.kind == "f" else stored.dtype.newbyteorder("=")
-    with np.errstate(over="ignore"):  # a float64 beyond float32 becomes infinity, which `read` refuses
+    with np.errstate(over="ignore"):  # a float64 beyond float32's range becomes infinity, which `read` refuses
         return np.array(stored.reshape(axes)[..., :3], dtype)
 
 
@@ -99,7 +99,7 @@ def _read_npy(path: Path) -> Frame:
     try:
         stored = np.load(path, mmap_mode="r", allow_pickle=False)
     except Exception as error:
-        raise ImageError(f"is no whole NPY of plain numbers ({error}). Copy or save it again.") from error
+        raise ImageError(f"is not a complete NPY file of numbers ({error}). Copy or save it again.") from error
     return _as_frame(stored, _frame_shape(stored.shape, stored.dtype))
 
 
@@ -109,14 +109,14 @@ def _read_tiff(path: Path, photograph: bool) -> Frame:
     try:
         with tifffile.TiffFile(path) as file:
             axes, planar, orientation = _tiff_axes(file)
-            # tifffile is exact for every kind of number; LZW, JPEG and PackBits it leaves to OpenCV.
+            # tifffile reads every type of number exactly, but not LZW, JPEG and PackBits: OpenCV decodes those.
             plain = file.pages[0].compression in (1, 8, 32946)
             stored = file.series[0].asarray() if plain else _decode_tiff(path)
             planar = planar and plain
     except ImageError:
         raise
     except Exception as error:  # a damaged file makes tifffile raise struct.error, ValueError, KeyError ...
-        raise ImageError(f"cannot be read as TIFF: {error}. {_AGAIN}") from error
+        raise ImageError(f"cannot be read as TIFF: {error}. {_COPY_AGAIN}") from error
     frame = _as_frame(np.moveaxis(stored, -3, -1) if planar else stored, axes)
     return _upright(frame, orientation) if photograph else frame
 
@@ -126,7 +126,7 @@ def _decode_tiff(path: Path) -> Frame:
 
     pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
-        raise ImageError(f"is damaged: OpenCV cannot decode this TIFF. {_AGAIN}")
+        raise ImageError(f"is damaged: OpenCV cannot decode this TIFF. {_COPY_AGAIN}")
     pixels = np.atleast_3d(pixels)
     return np.ascontiguousarray(pixels[..., 2::-1] if pixels.shape[2] >= 3 else pixels)
 
@@ -137,11 +137,11 @@ def _upright(frame: Frame, orientation: int) -> Frame:
 
 
 def _tiff_axes(file: Any) -> tuple[tuple[int, ...], bool, int]:  # noqa: ANN401
-    """(H, W, C) of a TIFF's first picture, whether its channels come first, and its EXIF orientation."""
+    """(H, W, C) of a TIFF's first picture, whether its channels are the first axis, and its EXIF orientation."""
     pages, handle = file.pages, file.filehandle
-    # Where the chain of pages breaks off, tifffile shows those before: of a picture in planes, red alone.
+    # If the chain of pages is cut, tifffile silently returns the pages before it: only red of a planar picture.
     if len(pages) == 0 or (handle.seek(pages.next_page_offset) and any(handle.read(file.tiff.offsetsize))):
-        raise ImageError(f"is cut off: its list of pages leads past its end. {_AGAIN}")
+        raise ImageError(f"is cut off: its list of pages leads past its end. {_COPY_AGAIN}")
     if pages[0].photometric not in (1, 2, 32803, 34892):  # grey, RGB, two kinds of raw mosaic
         colours = getattr(pages[0].photometric, "name", pages[0].photometric)
         raise ImageError(f"stores its colours as {colours}. Save it as RGB, or as grey with black at 0.")
@@ -154,12 +154,12 @@ def decode(kind: str, data: bytes, photograph: bool) -> Frame:
     """Read a whole PNG, JPEG or BMP.
 
     Args:
-        kind: as `kind_of` gives it.
+        kind: from `kind_of`.
         data: content of the file.
-        photograph: as for `read`.
+        photograph: as in `read`.
 
     Raises:
-        ImageError: cut off or damaged; the message lacks the file's name.
+        ImageError: cut off or damaged; the message does not name the file.
     """
     import cv2
 
@@ -168,11 +168,11 @@ def decode(kind: str, data: bytes, photograph: bool) -> Frame:
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
-        raise ImageError(f"cannot be decoded as {kind}: {error.err}. {_AGAIN}") from error
+        raise ImageError(f"cannot be decoded as {kind}: {error.err}. {_COPY_AGAIN}") from error
     if pixels is None:
-        raise ImageError(f"is damaged: OpenCV cannot decode this {kind}. {_AGAIN}")
+        raise ImageError(f"is damaged: OpenCV cannot decode this {kind}. {_COPY_AGAIN}")
     pixels = np.atleast_3d(pixels)
-    if pixels.shape[2] == 1 or (kind == "PNG" and data[25] in (0, 4)):  # OpenCV makes grey with alpha BGRA
+    if pixels.shape[2] == 1 or (kind == "PNG" and data[25] in (0, 4)):  # OpenCV decodes grey with alpha as BGRA
         return pixels[..., :1]
     return pixels[..., 2::-1]  # from BGR or BGRA
 
@@ -182,10 +182,10 @@ def _png_size(data: bytes) -> tuple[int, int]:
     while kind != b"IEND":
         end, kind = position + 12 + int.from_bytes(view[position:][:4]), bytes(view[position + 4 :][:4])
         if end > len(data):
-            raise ImageError(f"is cut off: after {len(data):,} bytes this PNG has no end (IEND). {_AGAIN}")
-        # An upper-case first letter marks the chunks without which there is no picture.
+            raise ImageError(f"is cut off: after {len(data):,} bytes this PNG has no end (IEND). {_COPY_AGAIN}")
+        # An upper-case first letter marks critical chunks.
         if kind[:1].isupper() and zlib.crc32(view[position + 4 : end - 4]) != int.from_bytes(view[end - 4 : end]):
-            raise ImageError(f"is damaged: the checksum of {kind!r} at byte {position:,} is wrong. {_AGAIN}")
+            raise ImageError(f"is damaged: the checksum of {kind!r} at byte {position:,} is wrong. {_COPY_AGAIN}")
         position = end
     return int.from_bytes(data[20:24]), int.from_bytes(data[16:20])
 
@@ -198,16 +198,16 @@ def _jpeg_size(data: bytes) -> tuple[int, int]:
             return int.from_bytes(size[:2]), int.from_bytes(size[2:])
         if 0xC0 <= code <= 0xCF and code not in (0xC4, 0xC8, 0xCC):  # the start of a frame, not a table
             size = data[position + 3 : position + 7]
-        position += int.from_bytes(data[position : position + 2])  # past a thumbnail, which has an end of its own
-    raise ImageError(f"is cut off: after {len(data):,} bytes this JPEG has no end (FF D9). {_AGAIN}")
+        position += int.from_bytes(data[position : position + 2])  # skips a thumbnail, which has its own end marker
+    raise ImageError(f"is cut off: after {len(data):,} bytes this JPEG has no end (FF D9). {_COPY_AGAIN}")
 
 
 def _bmp_size(data: bytes) -> tuple[int, int]:
     head = data[:34].ljust(34, b"\0")
     start, header = struct.unpack_from("<II", head, 10)
     width, height, _, bits = struct.unpack_from("<4H" if header == 12 else "<iiHH", head, 18)
-    packed = header > 12 and head[30] not in (0, 3)  # in run lengths, whose sum only the decoder knows
-    needed = start + (0 if packed else (width * bits + 31) // 32 * 4 * abs(height))  # rows of whole 4 bytes
+    packed = header > 12 and head[30] not in (0, 3)  # run-length encoded: only the decoder knows the size
+    needed = start + (0 if packed else (width * bits + 31) // 32 * 4 * abs(height))  # rows are padded to 4 bytes
     if len(data) < max(needed, 26):
-        raise ImageError(f"is cut off: this BMP has {len(data):,} bytes and needs {needed:,}. {_AGAIN}")
+        raise ImageError(f"is cut off: this BMP has {len(data):,} bytes and needs {needed:,}. {_COPY_AGAIN}")
     return abs(height), width  # a negative height puts the top row first

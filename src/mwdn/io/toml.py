@@ -1,4 +1,4 @@
-"""Tables of TOML, from a file or a command line, and the dataclasses they fill."""
+"""TOML from a file or the command line, and dataclasses built from its tables."""
 
 import dataclasses
 import json
@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
-    """Content of a file.
+    """Read a TOML file.
 
     Raises:
         ParameterError: it cannot be read.
@@ -24,35 +24,35 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         raise ParameterError(f"`{path}` cannot be read as a recipe: {error}") from error
 
 
-def value_of(text: str) -> Any:  # noqa: ANN401
-    """What a text would be in TOML; what is nothing there is the text itself, so that paths need no quotes."""
+def parse_value(text: str) -> Any:  # noqa: ANN401
+    """Parse a TOML value. Text that is not TOML is returned as it is, so that paths need no quotes."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         return text
 
 
-def fill(kind: type[T], name: str, table: dict[str, Any]) -> T:
-    """Make a dataclass of a table of TOML.
+def to_dataclass(cls: type[T], name: str, table: dict[str, Any]) -> T:
+    """Build a dataclass from a TOML table.
 
     Args:
-        kind: of which every field has a default, whose type the table's value must have.
-        name: of the table, for messages.
-        table: values by the fields' names.
+        cls: every field has a default; a value in the table must have the type of the default.
+        name: of the table, for error messages.
+        table: values by field name.
 
     Raises:
-        UnknownNameError: a key that the dataclass has not.
-        ParameterError: a value of another kind than its default, or outside its range.
+        UnknownNameError: the dataclass has no such field.
+        ParameterError: a value has another type than its default, or is outside its range.
     """
-    table = current_names(kind, name, table)
-    known = {f.name: f.default for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    table = current_names(cls, name, table)
+    defaults = {f.name: f.default for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
     for key, value in table.items():
-        if key not in known:
-            raise UnknownNameError(f"key of [{name}]", key, known)
-        if not _alike(_listless(value), known[key]):
-            example = json.dumps(known[key])
+        if key not in defaults:
+            raise UnknownNameError(f"key of [{name}]", key, defaults)
+        if not _same_type(_as_tuple(value), defaults[key]):
+            example = json.dumps(defaults[key])
             raise ParameterError(f"`{key}` of [{name}] ({value!r}) must be of the same kind as its default, {example}.")
-    return kind(**{key: _as_float(_listless(value), known[key]) for key, value in table.items()})
+    return cls(**{key: _as_float(_as_tuple(value), defaults[key]) for key, value in table.items()})
 
 
 def current_names(kind: type, name: str, table: dict[str, Any], *, warn: bool = True) -> dict[str, Any]:
@@ -77,19 +77,19 @@ def current_names(kind: type, name: str, table: dict[str, Any], *, warn: bool = 
     return {renamed.get(key, key): value for key, value in table.items()}
 
 
-def _listless(value: Any) -> Any:  # noqa: ANN401
+def _as_tuple(value: Any) -> Any:  # noqa: ANN401
     return tuple(value) if isinstance(value, list) else value
 
 
-def _alike(value: object, example: object) -> bool:
-    if isinstance(value, tuple) and isinstance(example, tuple):
-        # Where the default is empty, any number of texts.
-        return all(map(_alike, value, example or ("",) * len(value))) and len(value) == len(example or value)
-    return type(value) is type(example) or (type(value) is int and type(example) is float)
+def _same_type(value: object, default: object) -> bool:
+    if isinstance(value, tuple) and isinstance(default, tuple):
+        # An empty default stands for any number of strings.
+        return all(map(_same_type, value, default or ("",) * len(value))) and len(value) == len(default or value)
+    return type(value) is type(default) or (type(value) is int and type(default) is float)
 
 
-def _as_float(value: Any, example: object) -> Any:  # noqa: ANN401
-    """TOML's 12 where 12.0 is meant."""
-    if isinstance(value, tuple) and isinstance(example, tuple):
-        return tuple(map(_as_float, value, example or value))
-    return float(value) if isinstance(example, float) else value
+def _as_float(value: Any, default: object) -> Any:  # noqa: ANN401
+    """Convert an integer to a float where the default is a float."""
+    if isinstance(value, tuple) and isinstance(default, tuple):
+        return tuple(map(_as_float, value, default or value))
+    return float(value) if isinstance(default, float) else value

@@ -16,7 +16,7 @@ from mwdn.data.recorded import Division
 from mwdn.data.simulated import Placement
 from mwdn.data.unpaired import SelfSupervised
 from mwdn.errors import MwdnError, ParameterError, UnknownNameError
-from mwdn.io.toml import current_names, fill, read_toml
+from mwdn.io.toml import current_names, read_toml, to_dataclass
 from mwdn.networks import DENOISERS, build
 from mwdn.optics.sensor import Sensor
 from mwdn.training.losses import checked_weights
@@ -252,7 +252,7 @@ def read_recipe(path: str | Path | None, **changes: Any) -> Recipe:  # noqa: ANN
         _check_network(content["network"])
     for table in {"loss", "later_loss"} & content.keys():
         content[table] = checked_weights(content[table])
-    tables = {name: fill(TABLES[name], name, table) for name, table in content.items() if name in TABLES}
+    tables = {name: to_dataclass(TABLES[name], name, table) for name, table in content.items() if name in TABLES}
     recipe = Recipe(**(content | tables))
     captures = tuple(str(Path(path or "").parent / capture) for capture in recipe.sheet.captures)
     return dataclasses.replace(recipe, sheet=Sheet(captures))

@@ -1,4 +1,4 @@
-"""The pictures that come with the package."""
+"""The pictures included in the package."""
 
 from importlib.resources import files
 
@@ -11,7 +11,7 @@ __all__ = ["dark_scene"]
 
 
 def dark_scene(name: str, size: Size, side: int) -> Scene:
-    """A picture in the middle of a dark scene, (1, 3, *size), linear light.
+    """A picture in the centre of a dark scene, (1, 3, *size), linear light.
 
     Args:
         name: of a file in this folder, without ``.jpg``.
@@ -19,5 +19,5 @@ def dark_scene(name: str, size: Size, side: int) -> Scene:
         side: height and width of the picture in it.
     """
     picture = F.interpolate(read_picture(str(files("mwdn.io.pictures") / f"{name}.jpg")), (side, side), mode="area")
-    (height, width), above, left = size, (size[0] - side) // 2, (size[1] - side) // 2
-    return F.pad(picture, (left, width - side - left, above, height - side - above))
+    (height, width), top, left = size, (size[0] - side) // 2, (size[1] - side) // 2
+    return F.pad(picture, (left, width - side - left, top, height - side - top))
