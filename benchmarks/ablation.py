@@ -26,20 +26,22 @@ def parts(psf):
     """The whole network and its ablations, as functions of the measurement."""
     network = find_method("universal").eval()
 
-    def changed(target, **attributes):
-        def reconstruct(measurement):
-            with patch.multiple(target, **attributes):
-                return network(measurement, psf)
-
-        return reconstruct
-
     def aligned(method):
         return lambda measurement: method(measurement, align(measurement, psf).move(psf))
 
+    whole = aligned(network)
+
+    def changed(target, **attributes):
+        def reconstruct(measurement):
+            with patch.multiple(target, **attributes):
+                return whole(measurement)
+
+        return reconstruct
+
     return {
-        "whole": lambda b: network(b, psf),
-        "PSF not aligned": changed(network, align=False),
-        "haze not found": changed(wiener_bank, align=lambda b, p: align(b, p)._replace(haze=0.0)),
+        "whole": whole,
+        "PSF not aligned": lambda b: network(b, psf),
+        "haze not found": lambda b: network(b, align(b, psf)._replace(haze=0.0).move(psf)),
         "no plug and play": changed(network, rounds=0),
         "U-Net free to change the mean light": changed(wiener_bank, mean_light=lambda picture, block: 0),
         "no U-Net: plug and play, PSF aligned": aligned(lambda *known: network.estimates(*known)[:, :3]),

@@ -35,9 +35,9 @@ def operations(method, size):
     """GFLOP of one picture's convolutions and transforms, without what is prepared from the PSF."""
     with torch.device("meta"), torch.no_grad():
         network, picture = build(method).eval(), torch.empty(1, 3, *size)
-        bound = network.bind(picture, picture) if hasattr(network, "bind") else None
+        prepared = network.prepare(picture, picture.shape[-2:])
         with FlopCounterMode(display=False, custom_mapping=COUNTED) as counter:
-            network(picture, picture) if bound is None else network.reconstruct(picture, bound)
+            network.reconstruct(picture, prepared)
     counts = counter.get_flop_counts()["Global"]
     transforms = sum(count for operation, count in counts.items() if operation in COUNTED)
     return {"convolutions": (sum(counts.values()) - transforms) / 1e9, "transforms": transforms / 1e9}

@@ -92,11 +92,10 @@ def measured(method, calibration, captures, arguments, clock):
             row = {"method": method, "file": suffix, "precision": precision, "mb": file.stat().st_size / 1e6}
             rows.append(row | {"agreement_db": finite(done.agreement), "export_s": clock() - start})
             runs[suffix, precision] = opened(file, arguments.threads)
-        network = Reconstructor(method, calibration, device="cpu").method
-        network.align = False  # as in the files
         for precision in ("exact", "fast"):
             rows.append({"method": method, "file": "mwdn", "precision": precision})
-            runs["mwdn", precision] = Reconstructor(network, calibration, device="cpu", precision=precision)
+            # Not aligned, as in the files.
+            runs["mwdn", precision] = Reconstructor(method, calibration, align=False, device="cpu", precision=precision)
         batch = torch.rand(1, 3, *calibration.size) if captures is None else captures[:1]
         best = shortest(runs, batch, arguments.repeats, clock)
         for row in rows:

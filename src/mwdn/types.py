@@ -33,6 +33,9 @@ Psf = Float[Tensor, "psf_batch psf_channel psf_height psf_width"]
 Spectrum = Complex[Tensor, "batch channel height half_width"]
 """Half of a real image's Fourier transform, origin first."""
 
+Transfer = Complex[Tensor, "transfer_batch transfer_channel grid_height half_grid_width"]
+"""Transfer function of a filter or a PSF: half a spectrum on a grid; batch and channels are 1 or the picture's."""
+
 Field = Complex[Tensor, "_height _width"]
 """Complex amplitude of monochromatic light on a plane, of any size; its squared modulus is the intensity."""
 

@@ -266,9 +266,8 @@ def test_alignment_is_off_in_the_file_alone(tmp_path):
     done = export(bank, camera(), tmp_path / "camera.onnx", least=100)
     assert read_about(done.path)["alignment"].startswith("off")
     assert bank.align
-    bank.align = False
     seen = simulated(camera(), ("coffee",), 3)
-    expected = Reconstructor(bank, camera(), device="cpu", precision="exact")(seen)
+    expected = Reconstructor(bank, camera(), align=False, device="cpu", precision="exact")(seen)
     assert agreement(run_file(done.path, seen), expected) >= 100
 
 

@@ -71,7 +71,7 @@ def test_large_pictures_in_parts_everywhere(name, strips, monkeypatch, generator
     monkeypatch.setattr(blocks, "LARGEST", 8 * 96 * 70)
     engine = Engine(network, psf, precision="exact")
     found = engine(measurement)
-    kept = [tensor.is_complex() for tensor in engine.bound[3]]
+    kept = [tensor.is_complex() for tensor in engine.prepared]
     assert kept == ([True] * 4 if name == "mwdn" else [False] * 2 + [True] * 2)
     assert strips
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)

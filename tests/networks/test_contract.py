@@ -19,8 +19,6 @@ FEW = ("wiener", "le-admm")
 NARROW = {"le-admm-u": 8, "mmcn": 8, "flatnet": 8, "svdeconv": 8, "updn": 5}
 """Widths of networks that compute small pictures on grids of twice or four times their sides."""
 
-BOTTOMED = [name for name in NETWORKS if "outputs" in inspect.signature(NETWORKS[name]).parameters]
-
 
 def small(name, **options):
     """The network at an eighth of its width and few steps, without the options that it does not have."""
@@ -157,14 +155,6 @@ def test_measurement_of_other_channels_is_named(name, generator):
     b, h, _ = pair(generator, channels=2)
     with pytest.raises(ShapeError, match=r"2, \d+, \d+\) must have 3 channels"):
         small(name).eval()(b, h[:, :1])
-
-
-@pytest.mark.parametrize("name", BOTTOMED)
-@pytest.mark.parametrize(("channels", "outputs"), [(4, 3), (1, 3), (3, 1)])
-def test_scene_may_have_other_channels_than_the_measurement(name, ready, channels, outputs, generator):
-    """For example, four planes of a Bayer mosaic to three colours."""
-    b, h, _ = pair(generator, channels=channels)
-    assert ready(small(name, channels=channels, outputs=outputs))(b, h).shape == (2, outputs, 24, 24)
 
 
 def test_overfits_four_pairs(name, generator):

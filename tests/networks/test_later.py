@@ -42,11 +42,11 @@ def close(found, expected, part=1e-4):
 def test_flatnet_begins_as_wiener_and_learns_taps(generator):
     network = build("flatnet", width=2, size=(15, 18), regularisation=2e-3)
     b, h = pair(generator)
-    start = network.inverse(b, h)
+    start = network.inverse(b, network.prepare(h, b.shape[-2:]))
     close(start, wiener(b, (h / h.sum((-2, -1), keepdim=True))[0], 2e-3))
     # One tap, 2 rows above and 3 columns right of the centre: it adds the measurement, moved so.
     network.correction[0, 0, 15 // 2 - 2, 18 // 2 + 3] = 1
-    added = (network.inverse(b, h) - start) * (15 * 18) ** 0.5
+    added = (network.inverse(b, network.prepare(h, b.shape[-2:])) - start) * (15 * 18) ** 0.5
     torch.testing.assert_close(added[..., :-2, 3:], b[..., 2:, :-3], rtol=0, atol=1e-3)
 
 
@@ -59,7 +59,8 @@ def test_flatnet_filter_is_stretched_to_other_sizes(generator):
     h[..., 16, 20] = 1
     flat = build("flatnet", width=2, size=None, channels=1)
     assert flat.correction is None
-    taps = (network.inverse(h, h) - flat.inverse(h, h))[0, 0, 8:24, 10:30]
+    learned, start = (each.inverse(h, each.prepare(h, (32, 40))) for each in (network, flat))
+    taps = (learned - start)[0, 0, 8:24, 10:30]
     torch.testing.assert_close(taps.mean().item() * 4, (16 * 20) ** -0.5, rtol=0.02, atol=0)
 
 
@@ -88,7 +89,7 @@ def test_field_weights_add_up_and_favour_the_nearest():
 def test_svdeconv_blends_one_wiener_estimate_a_place(generator):
     network = build("svdeconv", width=2, field=2, size=(15, 18), regularisation=3e-3)
     b, h = pair(generator)
-    for found in network.deconvolve(b, h):
+    for found in network.deconvolve(b, network.prepare(h, b.shape[-2:])):
         close(found, wiener(b, (h / h.sum((-2, -1), keepdim=True))[0], 3e-3))
     network.correction.copy_(0.05 * torch.rand(network.correction.shape, generator=generator))
     network.log_regularisation.add_(torch.randn(5, generator=generator))
@@ -98,7 +99,7 @@ def test_svdeconv_blends_one_wiener_estimate_a_place(generator):
         wiener(b, ((peak + network.correction[:, k : k + 1]) / total)[0], network.log_regularisation[k].exp().item())
         for k in range(5)
     ]
-    single, blend = network.deconvolve(b, h)
+    single, blend = network.deconvolve(b, network.prepare(h, b.shape[-2:]))
     close(single, estimates[0])
     weights = field_weights(2, (15, 18), torch.device("cpu"))
     close(blend, sum(weight * estimate for weight, estimate in zip(weights, estimates[1:], strict=True)))

@@ -19,6 +19,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
+from torch.utils._pytree import tree_flatten, tree_unflatten
 
 from mwdn.calibration import Calibration
 from mwdn.errors import ExportError, ParameterError
@@ -27,6 +28,7 @@ from mwdn.inference.fusion import Convolution, fuse
 from mwdn.inference.reconstructor import Method, Reconstructor, find_method
 from mwdn.io.files import atomic
 from mwdn.io.pictures import dark_scene
+from mwdn.networks.network import Network
 from mwdn.optics import Camera, Sensor
 from mwdn.types import Measurement, Psf, Scene
 from mwdn.version import __version__
@@ -77,15 +79,13 @@ class Bound(nn.Module):
         self.method: Method = method
         self.psf: Tensor
         self.register_buffer("psf", psf)
-        self.count = 0
-        if not isinstance(method, nn.Module):
+        if not isinstance(method, Network):
             return
         network = copy.deepcopy(method).cpu().eval().requires_grad_(False)
-        if hasattr(network, "bind"):
-            bound = network.bind(psf, psf.new_zeros((1, channels, *psf.shape[-2:])))  # type: ignore[operator]
-            self.count = len(bound)
-            for index, tensor in enumerate(bound):
-                self.register_buffer(f"bound_{index}", tensor)
+        tensors, self.layout = tree_flatten(network.prepare(psf, (psf.shape[-2], psf.shape[-1])))
+        self.names = [f"prepared_{index}" for index in range(len(tensors))]
+        for name, tensor in zip(self.names, tensors, strict=True):
+            self.register_buffer(name, tensor)
         self.method = fuse(network, dtype)
         for module in self.method.modules():
             if isinstance(module, Convolution):
@@ -93,10 +93,10 @@ class Bound(nn.Module):
 
     def forward(self, measurement: Measurement) -> Scene:
         """Scene (B, C, H, W), float32, from a measurement of the PSF's size."""
-        if not self.count:
+        if not isinstance(self.method, Network):
             return self.method(measurement, self.psf).float()
-        bound = [getattr(self, f"bound_{index}") for index in range(self.count)]
-        return self.method.reconstruct(measurement, bound).float()  # type: ignore[attr-defined]
+        prepared = tree_unflatten([getattr(self, name) for name in self.names], self.layout)
+        return self.method.reconstruct(measurement, prepared).float()
 
 
 def export(
@@ -133,15 +133,14 @@ def export(
     """
     _check(out, precision, channels)
     name = str(method) if isinstance(method, str | Path) else type(method).__name__
-    found = find_method(method, regularisation) if isinstance(method, str | Path) else method
+    options = {} if regularisation is None else {"regularisation": regularisation}
+    found = find_method(method, **options) if isinstance(method, str | Path) else method
     channels = channels or calibration.psf.shape[1]
     about = _about(name, calibration, channels, precision)
-    if getattr(found, "align", False):
-        found = copy.deepcopy(found)
-        found.align = False  # type: ignore[attr-defined]
+    if isinstance(found, Network) and found.align:
         about["alignment"] = "off: the PSF is taken as it is"
     measurement = simulated(calibration, ("astronaut",), channels)
-    expected = Reconstructor(found, calibration, device="cpu", precision="exact")(measurement)
+    expected = Reconstructor(found, calibration, align=False, device="cpu", precision="exact")(measurement)
     with torch.no_grad(), tempfile.TemporaryDirectory() as folder:
         bound = Bound(found, calibration.psf, channels, dtype=torch.float16 if precision == "float16" else None)
         file = Path(folder) / out.name

@@ -91,6 +91,11 @@ class Convolution(NamedTuple):
         transfer, grid = _operator(psf, scene, sensor, circular=False)
         return cls(transfer, grid, scene, sensor)
 
+    @classmethod
+    def from_transfer(cls, transfer: Spectrum, scene: Size, sensor: Size) -> "Convolution":
+        """The same from the transfer function of another `Convolution` between these sizes."""
+        return cls(transfer, (transfer.shape[-2], 2 * (transfer.shape[-1] - 1)), scene, sensor)  # its grid is even
+
     def forward(self, scene: Scene) -> Image:
         """Convolve a scene and crop it to the sensor."""
         return inverse_spectrum(spectrum(scene, self.grid) * self.transfer, self.grid, self.sensor)

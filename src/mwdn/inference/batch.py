@@ -236,7 +236,7 @@ class Batch:
         if isinstance(method, nn.Module):
             options = {name: value for name, value in vars(method).items() if name[0] != "_"}
             how = (type(method).__name__, options, method.state_dict(), engine and engine.precision)
-        return _digest(__version__, self.form, camera, *how)
+        return _digest(__version__, self.form, camera, self.reconstruct.align, *how)
 
     def _is_there(self, job: Job) -> bool:
         content = _read_beside(job.output.with_suffix(".json"))

@@ -3,9 +3,9 @@
 import copy
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import torch
-from torch import nn
 
 from mwdn import solvers
 from mwdn.calibration import Calibration
@@ -14,36 +14,41 @@ from mwdn.fourier.convolution import check_fit
 from mwdn.inference.engine import Engine, Precision
 from mwdn.networks import DENOISERS, NETWORKS
 from mwdn.networks.blocks import check_channels
+from mwdn.networks.network import Network
 from mwdn.runtime.devices import select_device
 from mwdn.runtime.transfers import to_device, to_host
 from mwdn.types import Frame, Measurement, Psf, Scene
 from mwdn.weights.bundled import BUNDLED, find_weights
 from mwdn.weights.checkpoint import SUFFIXES, load_network, read_metadata
 
-AT_ONCE = {"cpu": 2**17, "cuda": 2**24}
-"""Pixels of a batch that are reconstructed together. A GPU needs many to be busy; on a CPU more than one picture of 320
-x 320 falls out of its caches, and takes longer than one by one: MWDN 15 %, ADMM half as long again."""
+PIXELS_PER_CHUNK = {"cpu": 2**17, "cuda": 2**24}
+"""Pixels of a batch that are reconstructed together. A GPU needs many to be busy. On a CPU more than one picture of
+320 x 320 falls out of the caches: in a batch each takes 15 % longer than alone with MWDN, 50 % with ADMM."""
 
 Method = Callable[[Measurement, Psf], Scene]
 """Anything that is called as ``method(measurement, psf)``: a solver or a network."""
 
 
-def find_method(name: str | Path, regularisation: float | None = None) -> Method:
+def find_method(name: str | Path, **options: Any) -> Method:  # noqa: ANN401
     """Find a solver or a bundled network by its name, or a network by the path of its checkpoint.
 
     Args:
         name: the name or the path; ``hub:owner/name`` for a network on the Hugging Face hub.
-        regularisation: of a solver that has one, in place of its default.
+        **options: of a solver, for example ``regularisation=1e-4``; the options of a network are in its checkpoint.
 
     Raises:
-        UnknownNameError: neither a solver nor a file.
+        UnknownNameError: neither a solver nor a file, or the solver has no such option.
         CheckpointError: the file holds no usable weights.
-        ParameterError: the method has no regularisation to set, or is a network without weights.
+        ParameterError: an option is out of range, or is given for a network; or the network has no weights.
     """
-    if regularisation is not None and str(name) not in ("admm", "wiener"):
-        raise ParameterError(f"`regularisation` belongs to admm and wiener, not to '{name}': `--method admm`.")
     if str(name) in solvers.SOLVERS:
-        return solvers.build(str(name), **({} if regularisation is None else {"regularisation": regularisation}))
+        return solvers.build(str(name), **options)
+    if options:
+        names = ", ".join(f"`{option}`" for option in options)
+        raise ParameterError(
+            f"{names} cannot be set for '{name}': only solvers ({', '.join(solvers.SOLVERS)}) have options. "
+            "See `mwdn methods`."
+        )
     path = find_weights(str(name)) or Path(name)
     if path.suffix in SUFFIXES or path.is_file():
         network = load_network(path)
@@ -85,18 +90,21 @@ class Reconstructor:
     Args:
         method: a solver, a network, the name of a solver or of a bundled network, or the path of a checkpoint.
         calibration: of the camera that took the measurements.
-        regularisation: of a solver given by its name, in place of its default.
+        align: turn, scale and haze the PSF first until it explains the measurement (`mwdn.align`), for a camera that
+            has changed since its calibration. Unless given, as the network was trained: ``universal`` aligns,
+            ``universal-small`` and solvers do not.
         device: where to compute; a GPU if there is one, unless given.
         precision: of a network, see `mwdn.inference.engine.Precision`; solvers are always exact.
+        **options: of a solver given by its name, for example ``regularisation=1e-4``.
 
     Attributes:
-        method: what reconstructs, as given or found. A network is copied: later changes of it do not matter here.
+        method: the solver or network. A network is copied: later changes of it do not matter here.
         warning: why not to trust the result, or ``None``.
 
     Raises:
-        UnknownNameError: no such method.
+        UnknownNameError: no such method, or it has no such option.
         CheckpointError: the checkpoint cannot be used.
-        ParameterError: no such device or precision, or the method has no regularisation to set or no weights.
+        ParameterError: no such device or precision, an option is out of range, or the network has no weights.
     """
 
     def __init__(
@@ -104,38 +112,50 @@ class Reconstructor:
         method: Method | str | Path,
         calibration: Calibration,
         *,
-        regularisation: float | None = None,
+        align: bool | None = None,
         device: str | torch.device | None = None,
         precision: Precision = "fast",
+        **options: Any,  # noqa: ANN401
     ) -> None:
         self.device = select_device(device)
         self.calibration = calibration
-        self.method = find_method(method, regularisation) if isinstance(method, str | Path) else method
-        self.warning = _other_camera(method, calibration) if isinstance(method, str | Path) else None
+        self.warning = None
+        if isinstance(method, str | Path):
+            self.warning = _other_camera(method, calibration)
+            method = find_method(method, **options)
+        elif options:
+            raise ParameterError(f"Options ({', '.join(options)}) belong to a method that is given by its name.")
+        self.method: Method = method
+        self.align = method.align if align is None and isinstance(method, Network) else bool(align)
         self.psf = calibration.psf.to(self.device)
-        self.engine = Engine(self.method, self.psf, precision=precision) if isinstance(self.method, nn.Module) else None
+        self.engine = Engine(method, self.psf, precision=precision) if isinstance(method, Network) else None
 
     def at(self, pose: solvers.Pose) -> "Reconstructor":
-        """The same in a pose of the PSF that is known, for a network that else finds it for each measurement.
+        """The same with the PSF in a known pose, instead of one found for each measurement.
 
-        Any other method takes the PSF as it was calibrated, and is not changed. ``pose`` is that of one capture, for
-        those after it, or has an entry for each sample of a batch: `mwdn.solvers.align`.
+        A `Reconstructor` that does not align keeps its PSF and is returned as it is.
+
+        Args:
+            pose: result of `mwdn.align`, of one capture, or with an entry for each sample of a batch.
         """
+        if not self.align:
+            return self
         fixed = copy.copy(self)
-        fixed.engine = self.engine and self.engine.at(pose)
+        fixed.align, fixed.psf = False, pose.move(self.psf)
+        fixed.engine = self.engine and self.engine.with_psf(fixed.psf)
         return fixed
 
     def stream(self, frames: Iterable[Frame], *, refresh: int = 100) -> Iterator[tuple[Measurement, Scene]]:
-        """Reconstruct one frame of the camera after another, faster than alone: the last one tells much of the next.
+        """Reconstruct frames of a video, each faster than alone: a frame resembles the one before.
 
-        A network that aligns the PSF keeps the pose that it found on the first frame. ADMM and FISTA go on where they
-        were (`mwdn.solvers.WarmStart`). All else is as for single captures.
+        Where the PSF is aligned, the pose found on the first frame is kept. ADMM and FISTA start from the result for
+        the last frame (`mwdn.solvers.WarmStart`). Other methods take each frame by itself.
 
         Every frame is reconstructed; of a live camera take the newest: ``stream(mwdn.runtime.streams.latest(camera))``.
 
         Args:
             frames: raw frames.
-            refresh: find the pose anew every so many frames; 0 for never.
+            refresh: align again every so many frames; 0 for never.
 
         Yields:
             The measurement and the scene, as `__call__` gives it.
@@ -149,25 +169,29 @@ class Reconstructor:
         return self._stream(frames, refresh)
 
     def _stream(self, frames: Iterable[Frame], refresh: int) -> Iterator[tuple[Measurement, Scene]]:
-        here = copy.copy(self)
+        aligning = copy.copy(self)
         if isinstance(self.method, solvers.Admm | solvers.Fista):
-            here.method = solvers.WarmStart(self.method)
-        due = aligns = bool(self.engine and self.engine.aligns)
+            aligning.method = solvers.WarmStart(self.method)
+        reconstruct, due = aligning, self.align
         for number, frame in enumerate(frames):
             measurement = self.calibration.correct(frame)
-            due |= aligns and refresh > 0 and number % refresh == 0
+            due |= self.align and refresh > 0 and number % refresh == 0
             if due and measurement.isfinite().all():
-                here, due = self.at(solvers.align(to_device(measurement, self.device), self.psf)), False
-            yield measurement, here(measurement)
+                pose = solvers.align(to_device(measurement, self.device), self.psf)
+                reconstruct, due = aligning.at(pose), False
+            yield measurement, reconstruct(measurement)
 
     def _reconstruct(self, measurement: Measurement) -> Scene:
+        if self.align:
+            return self.at(solvers.align(measurement, self.psf))._reconstruct(measurement)
         return self.engine(measurement) if self.engine else self.method(measurement, self.psf)
 
-    def _at_once(self, measurement: Measurement) -> int:
+    def _pictures_per_chunk(self, measurement: Measurement) -> int:
         """Pictures of a batch that are reconstructed together."""
-        if isinstance(self.method, solvers.WarmStart) or (self.engine and len(self.engine.psf) > 1):
-            return len(measurement)  # each has a past, or a pose, of its own
-        return max(1, AT_ONCE.get(self.device.type, AT_ONCE["cpu"]) // (measurement.shape[-2] * measurement.shape[-1]))
+        if isinstance(self.method, solvers.WarmStart) or len(self.psf) > 1:
+            return len(measurement)  # each has a last frame, or a pose, of its own
+        pixels = PIXELS_PER_CHUNK.get(self.device.type, PIXELS_PER_CHUNK["cpu"])
+        return max(1, pixels // (measurement.shape[-2] * measurement.shape[-1]))
 
     def _check(self, measurement: Measurement) -> None:
         shape = tuple(measurement.shape)
@@ -181,8 +205,8 @@ class Reconstructor:
                 "raw frames through `Calibration.correct` first."
             )
         check_fit(measurement, self.psf, "measurement")
-        channels = getattr(self.method, "channels", None)
-        if isinstance(channels, int) and shape[1] > 1:  # a grey one serves the universal networks
+        channels = self.method.channels if isinstance(self.method, Network) else 0
+        if channels and shape[1] > 1:  # the universal networks take a grey measurement too
             check_channels(measurement, channels)
 
     @torch.inference_mode()
@@ -212,7 +236,7 @@ class Reconstructor:
         """
         self._check(measurement)
         try:
-            parts = torch.split(measurement, self._at_once(measurement))
+            parts = torch.split(measurement, self._pictures_per_chunk(measurement))
             scenes = [self._reconstruct(to_device(part, self.device)) for part in parts]
             return scenes[0] if len(scenes) == 1 else torch.cat(scenes)
         except (MemoryError, RuntimeError) as error:

@@ -13,6 +13,7 @@ from mwdn.networks.le_admm_u import LeAdmmU
 from mwdn.networks.mmcn import Mmcn
 from mwdn.networks.mwdn import Mwdn
 from mwdn.networks.mwdn_cpsf import MwdnCpsf
+from mwdn.networks.network import Network
 from mwdn.networks.svdeconv import SvDeconv
 from mwdn.networks.unet import UNet
 from mwdn.networks.updn import Updn
@@ -20,7 +21,7 @@ from mwdn.networks.wiener import WienerNetwork
 from mwdn.networks.wiener_bank import WienerBank
 from mwdn.networks.wiener_unet import WienerUNet
 
-NETWORKS: dict[str, type[nn.Module]] = {
+NETWORKS: dict[str, type[Network[Any]]] = {
     "wiener": WienerNetwork,
     "unet": UNet,
     "wiener-unet": WienerUNet,
@@ -70,6 +71,7 @@ __all__ = [
     "Mmcn",
     "Mwdn",
     "MwdnCpsf",
+    "Network",
     "SvDeconv",
     "UNet",
     "Updn",

@@ -1,8 +1,9 @@
 """The parts that the paper's networks share: convolution block, encoder, decoder, learned Wiener filter."""
 
 import math
+from collections.abc import Iterator
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, cast
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +15,7 @@ from mwdn.fourier.memory_format import chunked
 from mwdn.fourier.padding import Boundary
 from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
 from mwdn.networks.recomputed import Stages
-from mwdn.types import Image, Measurement, Psf, Size
+from mwdn.types import Image, Psf, Size
 
 Pooling = Literal["max", "average"]
 
@@ -136,7 +137,9 @@ def paper_widths(width: int) -> tuple[int, ...]:
 
 
 LARGEST = 2**28
-"""Pixels of all channels up to which transfer functions are kept: 1 GB. MWDN-CPSF has more at 1080 x 1920."""
+"""Grid pixels, over all channels, up to which transfer functions are kept: half spectra of 2^27 complex numbers, 1 GB.
+
+MWDN-CPSF has more at 1080 x 1920."""
 
 
 class Wiener(nn.Module):
@@ -163,63 +166,74 @@ class Wiener(nn.Module):
         self.boundary = boundary
 
     def forward(self, features: Tensor, psf: Psf) -> Tensor:
-        """Deconvolve each channel with the PSF, or with its own where the PSF has as many channels."""
-        return self.filtered(features, self.known(psf))
+        """Deconvolve each channel with the PSF, or with its own PSF where there is one for each channel."""
+        return self.deconvolve(features, self.prepare(psf))
 
-    def known(self, psf: Psf) -> Tensor:
-        """All that the filter needs of a camera: its `transfer` function, or the PSF where that would be large."""
-        grid = deconvolution_grid((psf.shape[-2], psf.shape[-1]), self.boundary)
+    def prepare(self, psf: Psf) -> Tensor:
+        """Transfer function of the filter; the PSF itself where the transfer function would exceed `LARGEST`."""
+        grid = self.grid(psf)
         if psf[:, :, 0, 0].numel() * grid[0] * grid[1] > LARGEST:
             return psf.contiguous()
-        parts = [self.transfer(part) for part in psf.split(_channels_per_chunk(grid), dim=1)]  # type: ignore[no-untyped-call]
+        step = _channels_per_chunk(grid)
+        parts = [self.transfer(psf[:, i : i + step]) for i in range(0, psf.shape[1], step)]
         return parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
 
     def transfer(self, psf: Psf) -> Tensor:
-        """Transfer function of the filter for features of the PSF's size."""
+        """``w conj(H) / (|w H|^2 + lambda)`` on the grid for features of the PSF's size."""
         if hasattr(self, "log_weight"):
             psf = self.log_weight.exp() * psf
-        grid = deconvolution_grid((psf.shape[-2], psf.shape[-1]), self.boundary)
-        return wiener_transfer(psf, self.log_regularisation.exp(), grid)
+        return wiener_transfer(psf, self.log_regularisation.exp(), self.grid(psf))
 
-    def filtered(self, features: Tensor, known: Tensor) -> Tensor:
-        """Deconvolve each channel with what is `known` of the PSF, or with its own."""
-        grid = deconvolution_grid((features.shape[-2], features.shape[-1]), self.boundary)
-        if known.is_complex():
-            return filter_image(features, known, grid, self.boundary)
+    def deconvolve(self, features: Tensor, prepared: Tensor) -> Tensor:
+        """The same as `forward`, from the result of `prepare`."""
+        grid = self.grid(features)
+        if prepared.is_complex():
+            return filter_image(features, prepared, grid, self.boundary)
 
-        def few(features: Tensor, psf: Tensor) -> Tensor:
+        def deconvolve_few(features: Tensor, psf: Tensor) -> Tensor:
             return filter_image(features, self.transfer(psf), grid, self.boundary)
 
-        return chunked(few, features, known, _channels_per_chunk(grid))
+        return chunked(deconvolve_few, features, prepared, _channels_per_chunk(grid))
+
+    def grid(self, image: Tensor) -> Size:
+        """Grid of the Fourier transforms for features or a PSF of this size."""
+        return deconvolution_grid((image.shape[-2], image.shape[-1]), self.boundary)
+
+
+class WienerFilters(nn.ModuleList):
+    """Wiener filters, one a scale, finest first."""
+
+    def __iter__(self) -> Iterator[Wiener]:
+        return cast(Iterator[Wiener], super().__iter__())
 
 
 def _channels_per_chunk(grid: Size) -> int:
-    """Channels whose transfer functions are made at once: they need ten times the memory of what comes out."""
+    """Channels whose transfer functions are computed at once: the intermediate arrays take ten times their memory."""
     return max(1, LARGEST // (32 * grid[0] * grid[1]))
 
 
-def one_each_colour(psf: Psf, measurement: Measurement) -> Tensor:
-    """`peak_one`, and a grey PSF repeated for each colour: all colours then cast the same pattern."""
-    psf = peak_one(psf, measurement)
-    return psf.expand(-1, measurement.shape[1], -1, -1) if psf.shape[1] == 1 else psf
-
-
-def peak_one(psf: Psf, measurement: Measurement) -> Psf:
+def peak_one(psf: Psf, size: Size) -> Psf:
     """Scale each PSF so that its largest value is 1, the range that the paper's PSFs have.
 
     Raises:
         ShapeError: the PSF does not have the height and width of the measurement.
     """
-    check_size(psf, measurement)
+    check_size(psf, size)
     return psf / psf.amax(dim=(1, 2, 3), keepdim=True)
 
 
-def check_size(psf: Psf, measurement: Measurement) -> None:
+def peak_one_in_colour(psf: Psf, size: Size, channels: int) -> Tensor:
+    """`peak_one`, and a grey PSF repeated for each colour: all colours then cast the same pattern."""
+    psf = peak_one(psf, size)
+    return psf.expand(-1, channels, -1, -1) if psf.shape[1] == 1 else psf
+
+
+def check_size(psf: Psf, size: Size) -> None:
     """Raise a `ShapeError` unless the PSF has the height and width of the measurement."""
-    if psf.shape[-2:] != measurement.shape[-2:]:
+    if tuple(psf.shape[-2:]) != tuple(size):
         raise ShapeError(
-            f"`psf` {tuple(psf.shape)} and `measurement` {tuple(measurement.shape)} must have the same height "
-            "and width. Bin or crop the PSF: `--bin`, `--crop`."
+            f"`psf` ({psf.shape[-2]} x {psf.shape[-1]}) and `measurement` ({size[0]} x {size[1]}) must have the same "
+            "height and width. Bin or crop the PSF: `--bin`, `--crop`."
         )
 
 
@@ -229,8 +243,8 @@ def at_least(picture: Tensor, side: int) -> Tensor:
     return F.pad(picture, (0, max(0, side - width), 0, max(0, side - height)), mode="replicate")
 
 
-def stretched(image: Tensor, size: Size) -> Tensor:
-    """The picture of another size: what was learned at one serves at another, as a binned PSF does a binned capture."""
+def resized(image: Tensor, size: Size) -> Tensor:
+    """The image at another size: what was learned at one serves at another, as a binned PSF does a binned capture."""
     if tuple(image.shape[-2:]) == tuple(size):
         return image
     return F.interpolate(image, size=size, mode="bilinear", align_corners=False, antialias=True)

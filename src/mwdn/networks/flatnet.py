@@ -9,12 +9,13 @@ from mwdn.errors import ParameterError
 from mwdn.fourier.padding import Boundary, pad
 from mwdn.fourier.transforms import inverse_spectrum, spectrum, transfer_function
 from mwdn.fourier.wiener import deconvolution_grid
-from mwdn.networks.blocks import one_each_colour, stretched
+from mwdn.networks.blocks import check_channels, peak_one_in_colour, resized
 from mwdn.networks.generator import Generator
-from mwdn.types import Measurement, Psf, Scene, Size
+from mwdn.networks.network import Network
+from mwdn.types import Measurement, Psf, Scene, Size, Transfer
 
 
-class FlatNet(nn.Module):
+class FlatNet(Network[Tensor]):
     """FlatNet-gen without its adversarial part: deconvolve with a filter that is learned tap by tap, then denoise.
 
     From the source: an inverse filter as large as the PSF, which begins as the Wiener filter of the measured PSF and
@@ -30,7 +31,6 @@ class FlatNet(nn.Module):
 
     Args:
         channels: colours of the measurement.
-        outputs: colours of the scene; as many unless given.
         width: feature channels at the U-Net's finest scale.
         size: height and width of the sensor whose filter is learned; ``None`` keeps the Wiener filter.
         regularisation: lambda of the Wiener filter that it begins as, for a PSF of unit sum.
@@ -45,7 +45,6 @@ class FlatNet(nn.Module):
         self,
         *,
         channels: int = 3,
-        outputs: int | None = None,
         width: int = 128,
         size: Size | None = (270, 480),
         regularisation: float = 1e-3,
@@ -54,14 +53,13 @@ class FlatNet(nn.Module):
         super().__init__()
         if not regularisation > 0:
             raise ParameterError(f"`regularisation` ({regularisation}) must be positive; try 1e-3.")
-        self.regularisation, self.boundary = regularisation, boundary
+        self.channels, self.regularisation, self.boundary = channels, regularisation, boundary
         self.correction = None if size is None else nn.Parameter(torch.zeros(1, 1, *size))
-        self.generator = Generator(channels, outputs or channels, width=width)
+        self.generator = Generator(channels, channels, width=width)
 
-    def inverse(self, measurement: Measurement, psf: Psf) -> Tensor:
-        """The measurement (B, C, H, W) through the learned filter."""
-        psf = one_each_colour(psf, measurement)
-        size = measurement.shape[-2], measurement.shape[-1]
+    def prepare(self, psf: Psf, size: Size) -> Transfer:
+        """Transfer function of the learned filter."""
+        psf = peak_one_in_colour(psf, size, self.channels)
         grid = deconvolution_grid(size, self.boundary)
         H = transfer_function(psf / psf.sum((-2, -1), keepdim=True), grid)
         W = H.conj() / (H.abs().square() + self.regularisation)
@@ -69,11 +67,18 @@ class FlatNet(nn.Module):
             # All N taps moved by s together move W by N s at frequency 0, where it is about 1. Learned in units of
             # 1 / sqrt(N), a step of 3e-4 is at most 3e-4 sqrt(129,600) = 0.1 there, and 3e-4 where signs are random.
             # (The source gives the filter a rate a millionth of the U-Net's.) At N' pixels taps are N / N' as large.
-            taps = stretched(self.correction, size) * (math.sqrt(self.correction.numel()) / (size[0] * size[1]))
+            taps = resized(self.correction, size) * (math.sqrt(self.correction.numel()) / (size[0] * size[1]))
             W = W + transfer_function(taps, grid)
-        B = spectrum(pad(measurement.float(), grid, self.boundary), grid)
-        return inverse_spectrum(W * B, grid, size)
+        return W
 
-    def forward(self, measurement: Measurement, psf: Psf) -> Scene:
-        """Scene (B, outputs, H, W), between 0 and 1."""
-        return torch.sigmoid(self.generator(self.inverse(measurement, psf)).float())
+    def inverse(self, measurement: Measurement, prepared: Transfer) -> Tensor:
+        """The measurement (B, C, H, W) through the learned filter."""
+        size = measurement.shape[-2], measurement.shape[-1]
+        grid = deconvolution_grid(size, self.boundary)
+        B = spectrum(pad(measurement.float(), grid, self.boundary), grid)
+        return inverse_spectrum(prepared * B, grid, size)
+
+    def reconstruct(self, measurement: Measurement, prepared: Transfer) -> Scene:
+        """Scene (B, C, H, W), between 0 and 1."""
+        check_channels(measurement, self.channels)
+        return torch.sigmoid(self.generator(self.inverse(measurement, prepared)).float())

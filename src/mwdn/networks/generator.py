@@ -11,19 +11,19 @@ class Generator(nn.Module):
 
     Args:
         channels: of the pictures.
-        outputs: colours of the result.
+        colours: of the result.
         width: feature channels at the finest scale.
     """
 
-    def __init__(self, channels: int, outputs: int, *, width: int) -> None:
+    def __init__(self, channels: int, colours: int, *, width: int) -> None:
         super().__init__()
         self.channels = channels
         widths = (width, width, width, 2 * width, 4 * width, 8 * width)
         self.encoder = Encoder(4 * channels, widths, norm="group")
-        self.decoder = Decoder(4 * outputs, widths, norm="group")
+        self.decoder = Decoder(4 * colours, widths, norm="group")
 
     def forward(self, pictures: Tensor) -> Tensor:
-        """Picture (B, outputs, H, W), not limited to any range."""
+        """Picture (B, colours, H, W), not limited to any range."""
         check_channels(pictures, self.channels)
         height, width = pictures.shape[-2:]
         # 64 pixels are 64 / 2 / 2^5 = 1 at the coarsest scale; the folding needs even sides.

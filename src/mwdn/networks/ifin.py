@@ -1,6 +1,7 @@
 """After IFIN: two streams, of the sensor and of the scene, that exchange through the camera's model at every scale."""
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -9,8 +10,17 @@ from torch.nn import functional as F
 from mwdn.fourier.convolution import convolve
 from mwdn.fourier.padding import Boundary
 from mwdn.fourier.wiener import wiener
-from mwdn.networks.blocks import Decoder, Encoder, Wiener, check_channels, convolutions, one_each_colour, paper_widths
-from mwdn.types import Measurement, Psf, Scene
+from mwdn.networks.blocks import (
+    Decoder,
+    Encoder,
+    Wiener,
+    check_channels,
+    convolutions,
+    paper_widths,
+    peak_one_in_colour,
+)
+from mwdn.networks.network import Network
+from mwdn.types import Measurement, Psf, Scene, Size
 
 
 class Exchange(nn.Module):
@@ -43,7 +53,14 @@ class Exchange(nn.Module):
         )
 
 
-class Ifin(nn.Module):
+class IfinPsfs(NamedTuple):
+    """The measured PSF at unit sum, and the kernels of each scale, one a channel."""
+
+    measured: Tensor
+    kernels: list[Tensor]
+
+
+class Ifin(Network[IfinPsfs]):
     """IFIN-like: forward and inverse operators interleaved at each of four scales, with kernels adapted to the camera.
 
     From the source's abstract: differentiable forward operators and learned inverse modules at every stage, which share
@@ -59,7 +76,6 @@ class Ifin(nn.Module):
 
     Args:
         channels: colours of the measurement and the PSF.
-        outputs: colours of the scene; as many unless given.
         width: feature channels at full resolution.
         regularisation: start value of every lambda.
         boundary: what stands beyond the measurement in Wiener filters, see `mwdn.fourier.padding.Boundary`.
@@ -72,7 +88,6 @@ class Ifin(nn.Module):
         self,
         *,
         channels: int = 3,
-        outputs: int | None = None,
         width: int = 32,
         regularisation: float = 1e-2,
         boundary: Boundary = "replicate",
@@ -89,24 +104,28 @@ class Ifin(nn.Module):
             for inputs, own in zip((channels, *widths), widths, strict=False)
         )
         self.bottleneck = convolutions(2 * widths[-1], last, last, norm="group")
-        self.decoder = Decoder(outputs or channels, (*widths, last), norm="group")
+        self.decoder = Decoder(channels, (*widths, last), norm="group")
 
     def kernels(self, psf: Tensor) -> list[Tensor]:
         """One PSF of unit sum for each channel at scales 1, 1/2, 1/4, 1/8, from one of peak 1."""
-        found, grey = [], psf.mean(1, keepdim=True)
+        result, grey = [], psf.mean(1, keepdim=True)
         for gain, features in zip(self.log_gain.exp(), self.psf_encoder(psf), strict=True):
             kernels = grey / grey.amax((-2, -1), keepdim=True) + gain * features.float()
-            found.append(kernels / kernels.sum((-2, -1), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny))
+            result.append(kernels / kernels.sum((-2, -1), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny))
             grey = F.avg_pool2d(grey, 2)
-        return found
+        return result
 
-    def forward(self, measurement: Measurement, psf: Psf) -> Scene:
-        """Scene (B, outputs, H, W) from a measurement and a PSF of the same height, width and colours."""
+    def prepare(self, psf: Psf, size: Size) -> IfinPsfs:
+        """The PSF for the first Wiener filter, and the kernels of each scale."""
+        psf = peak_one_in_colour(psf, size, self.channels)
+        return IfinPsfs(psf / psf.sum((-2, -1), keepdim=True), self.kernels(psf))
+
+    def reconstruct(self, measurement: Measurement, prepared: IfinPsfs) -> Scene:
+        """Scene (B, C, H, W)."""
         check_channels(measurement, self.channels)
-        psf = one_each_colour(psf, measurement)
-        sensor, scene = measurement, self.first(measurement, psf / psf.sum((-2, -1), keepdim=True))
+        sensor, scene = measurement, self.first(measurement, prepared.measured)
         skips: list[Tensor] = []
-        for scale, kernels in zip(self.scales, self.kernels(psf), strict=True):
+        for scale, kernels in zip(self.scales, prepared.kernels, strict=True):
             if skips:
                 sensor, scene = F.max_pool2d(sensor, 2), F.max_pool2d(scene, 2)
             sensor, scene = scale(sensor, scene, kernels)

@@ -6,13 +6,15 @@ import torch
 from torch import Tensor, nn
 
 from mwdn.errors import ParameterError
+from mwdn.fourier.transforms import fast_length, transfer_function
 from mwdn.networks.blocks import check_size
+from mwdn.networks.network import Network
 from mwdn.solvers.proximal import Variation
 from mwdn.solvers.splitting import Penalties, Problem, initial_state, make_filters, rescale, update_copies, update_scene
-from mwdn.types import Measurement, Psf, Scene
+from mwdn.types import Measurement, Psf, Scene, Size, Transfer
 
 
-class LeAdmm(nn.Module):
+class LeAdmm(Network[Tensor]):
     """Five iterations of ADMM with total variation, each with its own mu1, mu2, mu3 and tau: 20 learnable numbers.
 
     From the source: five iterations from a zero scene; a grey PSF, the sum of the colours at unit L2 norm, shared by
@@ -59,29 +61,32 @@ class LeAdmm(nn.Module):
         )
         self.log_threshold = nn.Parameter(torch.full((iterations,), math.log(threshold)))
 
-    def forward(self, measurement: Measurement, psf: Psf) -> Scene:
-        """Scene (B, C, H, W), its brightest pixel 1."""
-        return brightest_one(self.iterates(measurement, psf)[-1])
+    def prepare(self, psf: Psf, size: Size) -> Transfer:
+        """Transfer function (B, 1, ...) of the grey PSF at unit L2 norm, on a grid of twice the sensor."""
+        check_size(psf, size)
+        grey = psf.float().sum(1, keepdim=True)
+        grey = grey / torch.linalg.vector_norm(grey, dim=(1, 2, 3), keepdim=True)
+        return transfer_function(grey, (fast_length(2 * size[0]), fast_length(2 * size[1])))
 
-    def iterates(self, measurement: Measurement, psf: Psf) -> list[Tensor]:
+    def reconstruct(self, measurement: Measurement, prepared: Transfer) -> Scene:
+        """Scene (B, C, H, W), its brightest pixel 1."""
+        return brightest_one(self.iterates(measurement, prepared)[-1])
+
+    def iterates(self, measurement: Measurement, prepared: Transfer) -> list[Tensor]:
         """The scene after each iteration, (B, C, H, W), for a measurement of peak 1 and a PSF of unit L2 norm.
 
         Not yet clipped: as in any ADMM, single pixels are negative before it has converged.
         """
-        check_size(psf, measurement)
-        grey = psf.float().sum(1, keepdim=True)
-        problem = Problem.from_psf(
-            brightest_one(measurement.float()), grey / torch.linalg.vector_norm(grey, dim=(1, 2, 3), keepdim=True)
-        )
+        problem = Problem.from_transfer(brightest_one(measurement.float()), prepared)
         height, width = problem.sensor
-        state, scenes, last = initial_state(problem), [], None
+        state, scenes, previous = initial_state(problem), [], None
         constants = (self.log_data, self.log_gradient, self.log_sign, self.log_threshold)
         for data, gradient, sign, threshold in zip(*(each.exp() for each in constants), strict=True):
             mu = Penalties(data, gradient, sign)
-            state = state if last is None else rescale(state, last, mu)
+            state = state if previous is None else rescale(state, previous, mu)
             state = update_copies(state, problem, mu, threshold * gradient, self.variation)
             state = update_scene(state, problem, make_filters(problem, mu))
-            last = mu
+            previous = mu
             scenes.append(state.v[..., :height, :width])
         return scenes
 

@@ -7,7 +7,8 @@ from torch.nn import functional as F
 from mwdn.networks.blocks import at_least, check_channels, convolutions
 from mwdn.networks.denoiser import SMALLEST, WIDTHS, Denoiser, scaled_widths
 from mwdn.networks.le_admm import LeAdmm, brightest_one
-from mwdn.types import Measurement, Psf, Scene
+from mwdn.networks.network import Network
+from mwdn.types import Measurement, Psf, Scene, Size
 
 
 class Residual(nn.Module):
@@ -26,7 +27,7 @@ class Residual(nn.Module):
         return F.relu(x + self.body(x))
 
 
-class Mmcn(nn.Module):
+class Mmcn(Network[Tensor]):
     """Le-ADMM-U with a branch that sees the measurement and every iterate, and compensates what the model gets wrong.
 
     From the source: K = 5 iterations s^1..s^K of learned ADMM; ``h_1 = f_1(b)``, ``h_{k+1} = f_{k+1}(h_k, g_k(s^k))``
@@ -59,15 +60,15 @@ class Mmcn(nn.Module):
         self.residuals = nn.ModuleList(Residual(channels) for _ in widths[:-1])
         self.denoiser = Denoiser(channels, width=width, joining=widths[-1])
 
-    def forward(self, measurement: Measurement, psf: Psf) -> Scene:
-        """Scene (B, C, H, W).
+    def prepare(self, psf: Psf, size: Size) -> Tensor:
+        """Transfer function of the PSF, see `LeAdmm`."""
+        return self.admm.prepare(psf, size)
 
-        Raises:
-            ShapeError: the measurement has other channels than the network.
-        """
+    def reconstruct(self, measurement: Measurement, prepared: Tensor) -> Scene:
+        """Scene (B, C, H, W)."""
         check_channels(measurement, self.channels)
         height, width = measurement.shape[-2:]
-        scenes = [at_least(brightest_one(each), SMALLEST) for each in self.admm.iterates(measurement, psf)]
+        scenes = [at_least(brightest_one(each), SMALLEST) for each in self.admm.iterates(measurement, prepared)]
         features = F.max_pool2d(self.branch[0](at_least(measurement, SMALLEST)), 2)
         for k, (f, g) in enumerate(zip(self.branch[1:], self.residuals, strict=True)):
             compensation = g(scenes[k])

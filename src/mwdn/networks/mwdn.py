@@ -1,13 +1,23 @@
 """Multi Wiener deconvolution network (section 3.2.1, fig. 1 of the paper)."""
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from mwdn.fourier.padding import Boundary
-from mwdn.networks.blocks import Decoder, Encoder, Pooling, Wiener, halve, one_each_colour, paper_widths
-from mwdn.types import Measurement, Psf, Scene
+from mwdn.networks.blocks import (
+    Decoder,
+    Encoder,
+    Pooling,
+    Wiener,
+    WienerFilters,
+    halve,
+    paper_widths,
+    peak_one_in_colour,
+)
+from mwdn.networks.network import Network
+from mwdn.types import Measurement, Psf, Scene, Size
 
 
-class Mwdn(nn.Module):
+class Mwdn(Network[list[Tensor]]):
     """A U-Net whose four skip connections each pass a Wiener filter at their own scale.
 
     17,267,531 learnable numbers at the paper's width: the U-Net's, w_1..4 and lambda_1..4. The bottleneck is not
@@ -16,7 +26,6 @@ class Mwdn(nn.Module):
 
     Args:
         channels: colours of the measurement.
-        outputs: colours of the scene; as many unless given.
         width: feature channels at full resolution.
         pooling: between the encoder's scales; the authors' code averages.
         psf_pooling: between the PSF's scales; the paper takes the maximum, the authors' code averages.
@@ -25,11 +34,10 @@ class Mwdn(nn.Module):
         boundary: see `mwdn.fourier.padding.Boundary`. The paper writes linear convolutions; its code is circular.
     """
 
-    def __init__(  # noqa: PLR0913
+    def __init__(
         self,
         *,
         channels: int = 3,
-        outputs: int | None = None,
         width: int = 64,
         pooling: Pooling = "max",
         psf_pooling: Pooling = "max",
@@ -40,11 +48,12 @@ class Mwdn(nn.Module):
         super().__init__()
         widths = paper_widths(width)
         self.encoder = Encoder(channels, widths, pooling=pooling)
-        self.filters = nn.ModuleList(
+        self.channels = channels
+        self.filters = WienerFilters(
             Wiener(weight=weight, regularisation=regularisation, boundary=boundary) for _ in widths[:-1]
         )
         self.pool_psf = halve(psf_pooling)
-        self.decoder = Decoder(outputs or channels, widths)
+        self.decoder = Decoder(channels, widths)
 
     def pyramid(self, psf: Psf) -> list[Tensor]:
         """The PSF, colours summed, at scales 1, 1/2, 1/4, 1/8."""
@@ -53,18 +62,14 @@ class Mwdn(nn.Module):
             psfs.append(self.pool_psf(psfs[-1]))
         return psfs
 
-    def forward(self, measurement: Measurement, psf: Psf) -> Scene:
-        """Scene (B, outputs, H, W) from a measurement and a PSF of the same height and width."""
-        return self.reconstruct(measurement, self.bind(psf, measurement))
+    def prepare(self, psf: Psf, size: Size) -> list[Tensor]:
+        """Transfer function of each scale's filter."""
+        psfs = self.pyramid(peak_one_in_colour(psf, size, self.channels))
+        return [wiener.prepare(h) for wiener, h in zip(self.filters, psfs, strict=True)]
 
-    def bind(self, psf: Psf, measurement: Measurement) -> list[Tensor]:
-        """What each scale's filter needs of the PSF: all that the network does."""
-        psfs = self.pyramid(one_each_colour(psf, measurement))
-        return [wiener.known(h) for wiener, h in zip(self.filters, psfs, strict=True)]  # type: ignore[operator]
-
-    def reconstruct(self, measurement: Measurement, bound: list[Tensor]) -> Scene:
-        """The same as `forward`, from what `bind` gave."""
+    def reconstruct(self, measurement: Measurement, prepared: list[Tensor]) -> Scene:
+        """Scene (B, C, H, W)."""
         features = self.encoder(measurement)
-        for scale, (wiener, known) in enumerate(zip(self.filters, bound, strict=True)):
-            features[scale] = wiener.filtered(features[scale], known)  # type: ignore[operator]
+        for scale, (wiener, transfer) in enumerate(zip(self.filters, prepared, strict=True)):
+            features[scale] = wiener.deconvolve(features[scale], transfer)
         return self.decoder(features)

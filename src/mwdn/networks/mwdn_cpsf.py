@@ -4,11 +4,12 @@ import torch
 from torch import Tensor, nn
 
 from mwdn.fourier.padding import Boundary
-from mwdn.networks.blocks import Decoder, Encoder, Pooling, Wiener, one_each_colour, paper_widths
-from mwdn.types import Measurement, Psf, Scene
+from mwdn.networks.blocks import Decoder, Encoder, Pooling, Wiener, WienerFilters, paper_widths, peak_one_in_colour
+from mwdn.networks.network import Network
+from mwdn.types import Measurement, Psf, Scene, Size
 
 
-class MwdnCpsf(nn.Module):
+class MwdnCpsf(Network[list[Tensor]]):
     """MWDN with a second encoder, which turns the PSF into one corrected PSF for each feature channel.
 
     21,956,743 learnable numbers at the paper's width: the U-Net's, those of a second encoder of four scales, and
@@ -16,7 +17,6 @@ class MwdnCpsf(nn.Module):
 
     Args:
         channels: colours of the measurement and of the PSF.
-        outputs: colours of the scene; as many unless given.
         width: feature channels at full resolution.
         pooling: between the scales of both encoders; the authors' code averages.
         regularisation: start value of lambda (the value of the authors' code).
@@ -29,7 +29,6 @@ class MwdnCpsf(nn.Module):
         self,
         *,
         channels: int = 3,
-        outputs: int | None = None,
         width: int = 64,
         pooling: Pooling = "max",
         regularisation: float = 1e-2,
@@ -40,10 +39,11 @@ class MwdnCpsf(nn.Module):
         widths = paper_widths(width)
         self.encoder = Encoder(channels, widths, pooling=pooling)
         self.psf_encoder = Encoder(channels, widths[:-1], pooling=pooling)
-        self.filters = nn.ModuleList(
+        self.channels = channels
+        self.filters = WienerFilters(
             Wiener(weight=None, regularisation=regularisation, boundary=boundary) for _ in widths[:-1]
         )
-        self.decoder = Decoder(outputs or channels, widths)
+        self.decoder = Decoder(channels, widths)
         if authors_scalars:
             self.weight = nn.Parameter(torch.tensor([1e-3]))
             self.unused_regularisation = nn.Parameter(torch.tensor(regularisation))
@@ -52,18 +52,14 @@ class MwdnCpsf(nn.Module):
         """One corrected PSF for each feature channel at scales 1, 1/2, 1/4, 1/8."""
         return self.psf_encoder(self.weight * psf if hasattr(self, "weight") else psf)
 
-    def forward(self, measurement: Measurement, psf: Psf) -> Scene:
-        """Scene (B, outputs, H, W) from a measurement and a PSF of the same height, width and colours."""
-        return self.reconstruct(measurement, self.bind(psf, measurement))
+    def prepare(self, psf: Psf, size: Size) -> list[Tensor]:
+        """Transfer functions of each scale's filter, one a feature channel."""
+        psfs = self.pyramid(peak_one_in_colour(psf, size, self.channels))
+        return [wiener.prepare(psfs.pop(0)) for wiener in self.filters]
 
-    def bind(self, psf: Psf, measurement: Measurement) -> list[Tensor]:
-        """What each scale's filter needs of the PSF: all that the network does."""
-        psfs = self.pyramid(one_each_colour(psf, measurement))
-        return [wiener.known(psfs.pop(0)) for wiener in self.filters]  # type: ignore[operator]
-
-    def reconstruct(self, measurement: Measurement, bound: list[Tensor]) -> Scene:
-        """The same as `forward`, from what `bind` gave."""
+    def reconstruct(self, measurement: Measurement, prepared: list[Tensor]) -> Scene:
+        """Scene (B, C, H, W)."""
         features = self.encoder(measurement)
-        for scale, (wiener, known) in enumerate(zip(self.filters, bound, strict=True)):
-            features[scale] = wiener.filtered(features[scale], known)  # type: ignore[operator]
+        for scale, (wiener, transfer) in enumerate(zip(self.filters, prepared, strict=True)):
+            features[scale] = wiener.deconvolve(features[scale], transfer)
         return self.decoder(features)

@@ -9,8 +9,9 @@ from mwdn.errors import ParameterError
 from mwdn.fourier.padding import Boundary, pad
 from mwdn.fourier.transforms import inverse_spectrum, spectrum, transfer_function
 from mwdn.fourier.wiener import deconvolution_grid
-from mwdn.networks.blocks import check_channels, one_each_colour, stretched
+from mwdn.networks.blocks import check_channels, peak_one_in_colour, resized
 from mwdn.networks.generator import Generator
+from mwdn.networks.network import Network
 from mwdn.types import Measurement, Psf, Scene, Size
 
 
@@ -28,7 +29,7 @@ def field_weights(side: int, size: Size, device: torch.device) -> Tensor:
     return (weights / weights.sum((0, 1))).flatten(0, 1)
 
 
-class SvDeconv(nn.Module):
+class SvDeconv(Network[Tensor]):
     """Wiener filters with a 3 x 3 field of learned PSFs, blended over the picture, then a U-Net.
 
     From the source: K x K PSFs and one more for all of the field, each beginning as the measured one, each with its own
@@ -45,7 +46,6 @@ class SvDeconv(nn.Module):
 
     Args:
         channels: colours of the measurement.
-        outputs: colours of the scene; as many unless given.
         width: feature channels at the U-Net's finest scale.
         field: K, places along each side of the field.
         size: height and width of the sensor whose PSFs are learned.
@@ -61,7 +61,6 @@ class SvDeconv(nn.Module):
         self,
         *,
         channels: int = 3,
-        outputs: int | None = None,
         width: int = 128,
         field: int = 3,
         size: Size = (270, 480),
@@ -74,29 +73,32 @@ class SvDeconv(nn.Module):
         self.channels, self.field, self.boundary = channels, field, boundary
         self.correction = nn.Parameter(torch.zeros(1, field**2 + 1, *size))
         self.log_regularisation = nn.Parameter(torch.full((field**2 + 1,), math.log(regularisation)))
-        self.generator = Generator(2 * channels, outputs or channels, width=width)
+        self.generator = Generator(2 * channels, channels, width=width)
 
-    def deconvolve(self, measurement: Measurement, psf: Psf) -> tuple[Tensor, Tensor]:
-        """Estimates (B, C, H, W) of the PSF for all of the field, and of the field of PSFs.
+    def prepare(self, psf: Psf, size: Size) -> Tensor:
+        """The PSF at peak 1, one for each colour. Transfer functions are not kept: K^2 + 1 of them would be needed."""
+        return peak_one_in_colour(psf, size, self.channels)
+
+    def deconvolve(self, measurement: Measurement, prepared: Tensor) -> tuple[Tensor, Tensor]:
+        """Estimates (B, C, H, W) by the PSF for the whole field, and by the field of PSFs.
 
         Raises:
             ShapeError: the measurement has other channels than the network.
         """
         check_channels(measurement, self.channels)
-        psf = one_each_colour(psf, measurement)
-        total = psf.sum((-2, -1), keepdim=True)
+        total = prepared.sum((-2, -1), keepdim=True)
         size = measurement.shape[-2], measurement.shape[-1]
         grid = deconvolution_grid(size, self.boundary)
         B = spectrum(pad(measurement.float(), grid, self.boundary), grid)
-        corrections = torch.split(stretched(self.correction, size), 1, dim=1)
+        corrections = torch.split(resized(self.correction, size), 1, dim=1)
         estimates = []
         for correction, regularisation in zip(corrections, self.log_regularisation.exp(), strict=True):
-            H = transfer_function((psf + correction) / total, grid)
+            H = transfer_function((prepared + correction) / total, grid)
             estimates.append(inverse_spectrum(H.conj() * B / (H.abs().square() + regularisation), grid, size))
         single, *places = estimates
         weights = field_weights(self.field, size, measurement.device)
         return single, sum((weight * place for weight, place in zip(weights, places, strict=True)), start=0 * single)
 
-    def forward(self, measurement: Measurement, psf: Psf) -> Scene:
-        """Scene (B, outputs, H, W), between 0 and 1."""
-        return torch.sigmoid(self.generator(torch.cat(self.deconvolve(measurement, psf), dim=1)).float())
+    def reconstruct(self, measurement: Measurement, prepared: Tensor) -> Scene:
+        """Scene (B, C, H, W), between 0 and 1."""
+        return torch.sigmoid(self.generator(torch.cat(self.deconvolve(measurement, prepared), dim=1)).float())

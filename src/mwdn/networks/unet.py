@@ -1,28 +1,28 @@
 """The plain U-Net (section 3.2.3 of the paper): no physics."""
 
-from torch import nn
-
 from mwdn.networks.blocks import Decoder, Encoder, Pooling, paper_widths
-from mwdn.types import Measurement, Psf, Scene
+from mwdn.networks.network import Network
+from mwdn.types import Measurement, Psf, Scene, Size
 
 
-class UNet(nn.Module):
+class UNet(Network[None]):
     """Measurement to scene directly. 17,267,523 learnable numbers at the paper's width.
 
     Args:
         channels: colours of the measurement.
-        outputs: colours of the scene; as many unless given.
         width: feature channels at full resolution; the cost grows with its square.
         pooling: between the encoder's scales; the authors' code averages.
     """
 
-    def __init__(
-        self, *, channels: int = 3, outputs: int | None = None, width: int = 64, pooling: Pooling = "max"
-    ) -> None:
+    def __init__(self, *, channels: int = 3, width: int = 64, pooling: Pooling = "max") -> None:
         super().__init__()
+        self.channels = channels
         self.encoder = Encoder(channels, paper_widths(width), pooling=pooling)
-        self.decoder = Decoder(outputs or channels, paper_widths(width))
+        self.decoder = Decoder(channels, paper_widths(width))
 
-    def forward(self, measurement: Measurement, psf: Psf) -> Scene:
-        """Scene (B, outputs, H, W). The PSF is not used: all networks are called alike."""
+    def prepare(self, psf: Psf, size: Size) -> None:
+        """Nothing: the PSF is not used."""
+
+    def reconstruct(self, measurement: Measurement, prepared: None = None) -> Scene:
+        """Scene (B, C, H, W)."""
         return self.decoder(self.encoder(measurement))

@@ -7,8 +7,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mwdn.fourier.convolution import Convolution
-from mwdn.networks.blocks import check_channels, one_each_colour, stretched
-from mwdn.types import Measurement, Psf, Scene, Size
+from mwdn.networks.blocks import check_channels, peak_one_in_colour, resized
+from mwdn.networks.network import Network
+from mwdn.types import Measurement, Psf, Scene, Size, Transfer
 
 
 def _rectified(*widths: int) -> nn.Sequential:
@@ -77,7 +78,7 @@ class PrimalDual(nn.Module):
         return primal + self.primal(torch.cat([back, primal], dim=1)), dual
 
 
-class Updn(nn.Module):
+class Updn(Network[Tensor]):
     """Ten learned primal-dual steps through five learned PSFs, then a small U-Net.
 
     2,744,411 learnable numbers at 270 x 480: 5 x 3 x 270 x 480 = 1,944,000 of the PSFs, 42,400 of the steps, 758,011 of
@@ -111,20 +112,23 @@ class Updn(nn.Module):
         self.steps = nn.ModuleList(PrimalDual(width) for _ in range(depth))
         self.unet = SmallUNet(width, 2 * width)
 
-    def psfs(self, measurement: Measurement, psf: Psf) -> Tensor:
+    def psfs(self, psf: Psf, size: Size) -> Tensor:
         """Learned PSFs, (1 or B, C * width, H, W), of mean sum 1 before their correction."""
-        psf = one_each_colour(psf, measurement)[:, :, None]
+        psf = peak_one_in_colour(psf, size, self.channels)[:, :, None]
         total = psf.sum((-2, -1), keepdim=True).mean(1, keepdim=True)
-        size = measurement.shape[-2], measurement.shape[-1]
         if self.correction is not None:
-            psf = psf + stretched(self.correction, size)
+            psf = psf + resized(self.correction, size)
         return (psf / total).expand(-1, -1, self.width, -1, -1).flatten(1, 2)
 
-    def forward(self, measurement: Measurement, psf: Psf) -> Scene:
+    def prepare(self, psf: Psf, size: Size) -> Transfer:
+        """Transfer functions of the learned PSFs, (1 or B, C * width, ...)."""
+        return Convolution.from_psf(self.psfs(psf, size), (2 * size[0], 2 * size[1]), size).transfer
+
+    def reconstruct(self, measurement: Measurement, prepared: Transfer) -> Scene:
         """Scene (B, C, H, W), between 0 and 1."""
         check_channels(measurement, self.channels)
         height, width = measurement.shape[-2:]
-        camera = Convolution.from_psf(self.psfs(measurement, psf), (2 * height, 2 * width), (height, width))
+        camera = Convolution.from_transfer(prepared, (2 * height, 2 * width), (height, width))
         b = measurement.float().reshape(-1, 1, height, width)
         dual = b.new_zeros(b.shape[0], self.width, height, width)
         primal = b.new_zeros(b.shape[0], self.width, 2 * height, 2 * width)

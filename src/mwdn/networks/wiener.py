@@ -1,13 +1,14 @@
 """A single learned Wiener filter (section 3.2.3 of the paper)."""
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from mwdn.fourier.padding import Boundary
 from mwdn.networks.blocks import Wiener, peak_one
-from mwdn.types import Measurement, Psf, Scene
+from mwdn.networks.network import Network
+from mwdn.types import Measurement, Psf, Scene, Size
 
 
-class WienerNetwork(nn.Module):
+class WienerNetwork(Network[Tensor]):
     """Pure physics: eq. (2) with a learned weight w and regularisation lambda. 2 learnable numbers.
 
     Args:
@@ -20,14 +21,10 @@ class WienerNetwork(nn.Module):
         super().__init__()
         self.filter = Wiener(weight=weight, regularisation=regularisation, boundary=boundary)
 
-    def forward(self, measurement: Measurement, psf: Psf) -> Scene:
+    def prepare(self, psf: Psf, size: Size) -> Tensor:
+        """Transfer function of the filter."""
+        return self.filter.prepare(peak_one(psf, size))
+
+    def reconstruct(self, measurement: Measurement, prepared: Tensor) -> Scene:
         """Scene (B, C, H, W), each colour deconvolved with its own PSF."""
-        return self.reconstruct(measurement, self.bind(psf, measurement))
-
-    def bind(self, psf: Psf, measurement: Measurement) -> list[Tensor]:
-        """Transfer function of the filter: all that the network needs of the PSF."""
-        return [self.filter.known(peak_one(psf, measurement))]
-
-    def reconstruct(self, measurement: Measurement, bound: list[Tensor]) -> Scene:
-        """The same as `forward`, from what `bind` gave."""
-        return self.filter.filtered(measurement, *bound)
+        return self.filter.deconvolve(measurement, prepared)

@@ -1,9 +1,10 @@
 """A bank of Wiener estimates in front of a U-Net; not from the paper."""
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.errors import ParameterError
@@ -13,10 +14,10 @@ from mwdn.fourier.transforms import inverse_spectrum, spectrum
 from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
 from mwdn.networks.blocks import Decoder, Encoder, check_channels, paper_widths, peak_one
 from mwdn.networks.drunet import Drunet
-from mwdn.solvers.alignment import align
+from mwdn.networks.network import Network
 from mwdn.solvers.plug_and_play import plug_and_play
 from mwdn.solvers.pyramid import LEVELS, Band, PsfPyramid
-from mwdn.types import Measurement, Psf, Scene
+from mwdn.types import Measurement, Psf, Scene, Size
 
 QUICK = {8: 12, 4: 18, 2: 8}
 """Iterations of each size where detail is left to the bank: three quarters of the time, for a tenth of a decibel."""
@@ -25,7 +26,19 @@ BOUNDARY: Boundary = "taper"
 """How a measurement goes on beyond its border, where the bank filters it as it is."""
 
 
-class WienerBank(nn.Module):
+class BankTransfers(NamedTuple):
+    """What `WienerBank` needs of a PSF.
+
+    Args:
+        levels: transfer function and norm of the PSF at each level of the iterations, the coarsest first.
+        filters: transfer function of each Wiener filter; none where the last level's serves.
+    """
+
+    levels: tuple[tuple[Tensor, Tensor], ...]
+    filters: tuple[Tensor, ...]
+
+
+class WienerBank(Network[BankTransfers]):
     """Several Wiener filters, from strong to weak regularisation, in picture space; a U-Net corrects their estimates.
 
     A strong lambda leaves a smooth picture of right brightness, a weak one keeps detail and amplifies noise; no single
@@ -46,8 +59,9 @@ class WienerBank(nn.Module):
         finest: pixels of the measurement along each side of those of the finest iterations: 1, 2, 4 or 8. With 4 they
             take a tenth of the time and leave the detail to the bank. 0 for none: the bank filters the measurement,
             continued by its border.
-        align: turn, scale and haze the PSF first until it explains the measurement (`mwdn.solvers.alignment`). In
-            training PSFs are taken as they are: let the captures be mismatched by what the alignment leaves.
+        align: `mwdn.Reconstructor` turns, scales and hazes the PSF until it explains the capture
+            (`mwdn.solvers.alignment`) before it calls the network. The network takes PSFs as they are, in training
+            too: train it with the mismatch that the alignment leaves.
         block: pixels along each side of the blocks whose mean light stays as the iterations found it. They know the
             crop, and measure shading and colour better than a U-Net guesses them, by up to 5 dB.
         rounds: of plug and play (`mwdn.solvers.plug_and_play`) between the iterations and the bank, where ``finest``
@@ -92,70 +106,59 @@ class WienerBank(nn.Module):
         with torch.no_grad():
             self.decoder.head.weight.mul_(0.1)  # begin near the estimate
 
-    def forward(self, measurement: Measurement, psf: Psf) -> Scene:
+    def prepare(self, psf: Psf, size: Size) -> BankTransfers:
+        """Transfer functions and norms of the iterations, and the transfer functions of the bank.
+
+        Args:
+            psf: taken as it is: `mwdn.Reconstructor` aligns it before.
+            size: height and width of the measurement.
+        """
+        psf = peak_one(psf, size)
+        psf = psf / psf.sum((-2, -1), keepdim=True)
+        bands = PsfPyramid.from_psf(psf, size, self.levels).bands if self.levels else ()
+        levels = tuple((band.transfer, band.norm) for band in bands)
+        if self.finest == 1:  # the bank's transfer function is that of the last level
+            return BankTransfers(levels, ())
+        grid = deconvolution_grid(size, BOUNDARY)
+        return BankTransfers(levels, tuple(wiener_transfer(psf, value, grid) for value in self.regularisations))
+
+    def reconstruct(self, measurement: Measurement, prepared: BankTransfers) -> Scene:
         """Scene (B, C, H, W), each colour deconvolved with its own PSF.
 
         Raises:
-            ShapeError: the measurement is neither grey nor of the network's channels.
+            ShapeError: the measurement is neither grey nor has the network's number of channels.
         """
-        return self.reconstruct(measurement, self.bind(psf, measurement))
-
-    def bind(self, psf: Psf, measurement: Measurement) -> list[Tensor]:
-        """The PSF where it is aligned to each measurement, else all that the estimates need of it."""
-        if measurement.shape[1] > 1:  # a grey one stands for all colours
-            check_channels(measurement, self.channels)
-        return [psf] if self.align else self._known(psf, measurement.expand(-1, self.channels, -1, -1))
-
-    def reconstruct(self, measurement: Measurement, bound: list[Tensor]) -> Scene:
-        """The same as `forward`, from what `bind` gave."""
-        if measurement.shape[1] == 1 < self.channels:  # a grey camera: three colours, all alike
-            return self.reconstruct(measurement.expand(-1, self.channels, -1, -1), bound).mean(1, keepdim=True)
-        if self.align:
-            psf = bound[0] if self.training else align(measurement, bound[0]).move(bound[0])
-            bound = self._known(psf, measurement)
-        estimates = self._estimates(measurement, bound)
+        if measurement.shape[1] == 1 < self.channels:  # a grey camera: three equal colours
+            return self.reconstruct(measurement.expand(-1, self.channels, -1, -1), prepared).mean(1, keepdim=True)
+        check_channels(measurement, self.channels)
+        estimates = self._estimates(measurement, prepared)
         return self.correct(estimates, self.unit(estimates))
 
     def estimates(self, measurement: Measurement, psf: Psf) -> Tensor:
-        """Estimates of the scene, the smoothest first, and the measurement: (B, C * pictures, H, W).
+        """Estimates of the scene, the smoothest first, and the measurement: (B, C * pictures, H, W)."""
+        return self._estimates(measurement, self.prepare(psf, (measurement.shape[-2], measurement.shape[-1])))
 
-        The PSF is taken as it is.
-        """
-        return self._estimates(measurement, self._known(psf, measurement))
-
-    def _known(self, psf: Psf, measurement: Measurement) -> list[Tensor]:
-        """Transfer functions and norms of the iterations, then the transfer functions of the bank."""
-        psf = peak_one(psf, measurement)
-        psf = psf / psf.sum((-2, -1), keepdim=True)
-        size = measurement.shape[-2], measurement.shape[-1]
-        bands = PsfPyramid.from_psf(psf, size, self.levels).bands if self.levels else ()
-        known = [tensor for band in bands for tensor in (band.transfer, band.norm)]
-        if self.finest == 1:  # its last level has the bank's transfer function
-            return known
-        grid = deconvolution_grid(size, BOUNDARY)
-        return [*known, *(wiener_transfer(psf, value, grid) for value in self.regularisations)]
-
-    def _estimates(self, measurement: Measurement, known: list[Tensor]) -> Tensor:
-        b, count = measurement.float(), 2 * len(self.levels)
+    def _estimates(self, measurement: Measurement, prepared: BankTransfers) -> Tensor:
+        b = measurement.float()
         if not self.levels:
-            return torch.cat([*self._filtered(b, known, BOUNDARY), b], dim=1)
-        bands = [Band(*each) for each in zip(self.levels, known[:count:2], known[1:count:2], strict=True)]
-        found = PsfPyramid(tuple(bands)).solve(b)
+            return torch.cat([*self._filtered(b, prepared.filters, BOUNDARY), b], dim=1)
+        bands = [Band(level, *each) for level, each in zip(self.levels, prepared.levels, strict=True)]
+        estimate = PsfPyramid(tuple(bands)).solve(b)
         if self.rounds:
-            found = plug_and_play(found, self.denoiser, self.rounds)
+            estimate = plug_and_play(estimate, self.denoiser, self.rounds)
         if self.finest == 1:
-            details = [found.detail(value) for value in self.regularisations]
+            details = [estimate.detail(value) for value in self.regularisations]
         else:
-            details = self._filtered(found.residual, known[count:], "zero")
-        return torch.cat([found.scene, *(found.scene + detail for detail in details), b], dim=1)
+            details = self._filtered(estimate.residual, prepared.filters, "zero")
+        return torch.cat([estimate.scene, *(estimate.scene + detail for detail in details), b], dim=1)
 
-    def _filtered(self, picture: Tensor, transfers: list[Tensor], boundary: Boundary) -> list[Tensor]:
+    def _filtered(self, picture: Tensor, transfers: tuple[Tensor, ...], boundary: Boundary) -> list[Tensor]:
         """The bank: one spectrum, several filters."""
         size = picture.shape[-2], picture.shape[-1]
         grid = deconvolution_grid(size, BOUNDARY)
-        # Transforms continue with zeros by themselves, and then skip the rows that hold nothing else.
-        spread = spectrum(picture if boundary == "zero" else pad(picture, grid, boundary), grid)
-        return [inverse_spectrum(spread * transfer, grid, size) for transfer in transfers]
+        # Transforms pad with zeros by themselves, and skip the rows that hold nothing else.
+        B = spectrum(picture if boundary == "zero" else pad(picture, grid, boundary), grid)
+        return [inverse_spectrum(B * transfer, grid, size) for transfer in transfers]
 
     def unit(self, estimates: Tensor) -> Tensor:
         """Brightest pixel of the smoothest of `estimates`, (B, 1, 1, 1)."""

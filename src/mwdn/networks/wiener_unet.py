@@ -1,20 +1,20 @@
 """One Wiener filter, then a U-Net (section 3.2.3 of the paper)."""
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from mwdn.fourier.padding import Boundary
 from mwdn.networks.blocks import Pooling
+from mwdn.networks.network import Network
 from mwdn.networks.unet import UNet
 from mwdn.networks.wiener import WienerNetwork
-from mwdn.types import Measurement, Psf, Scene
+from mwdn.types import Measurement, Psf, Scene, Size
 
 
-class WienerUNet(nn.Module):
+class WienerUNet(Network[Tensor]):
     """Deconvolve, then denoise. 17,267,525 learnable numbers at the paper's width.
 
     Args:
         channels: colours of the measurement.
-        outputs: colours of the scene; as many unless given.
         width: feature channels of the U-Net at full resolution.
         pooling: between the encoder's scales; the authors' code averages.
         weight: start value of w.
@@ -26,7 +26,6 @@ class WienerUNet(nn.Module):
         self,
         *,
         channels: int = 3,
-        outputs: int | None = None,
         width: int = 64,
         pooling: Pooling = "max",
         weight: float = 1e-3,
@@ -34,17 +33,14 @@ class WienerUNet(nn.Module):
         boundary: Boundary = "taper",
     ) -> None:
         super().__init__()
+        self.channels = channels
         self.wiener = WienerNetwork(weight=weight, regularisation=regularisation, boundary=boundary)
-        self.unet = UNet(channels=channels, outputs=outputs, width=width, pooling=pooling)
+        self.unet = UNet(channels=channels, width=width, pooling=pooling)
 
-    def forward(self, measurement: Measurement, psf: Psf) -> Scene:
-        """Scene (B, outputs, H, W)."""
-        return self.unet(self.wiener(measurement, psf), psf)
+    def prepare(self, psf: Psf, size: Size) -> Tensor:
+        """Transfer function of the filter."""
+        return self.wiener.prepare(psf, size)
 
-    def bind(self, psf: Psf, measurement: Measurement) -> list[Tensor]:
-        """Transfer function of the filter: all that the network needs of the PSF."""
-        return self.wiener.bind(psf, measurement)
-
-    def reconstruct(self, measurement: Measurement, bound: list[Tensor]) -> Scene:
-        """The same as `forward`, from what `bind` gave."""
-        return self.unet.decoder(self.unet.encoder(self.wiener.reconstruct(measurement, bound)))
+    def reconstruct(self, measurement: Measurement, prepared: Tensor) -> Scene:
+        """Scene (B, C, H, W)."""
+        return self.unet.reconstruct(self.wiener.reconstruct(measurement, prepared))

@@ -8,8 +8,9 @@ from torch import Tensor, nn
 
 from mwdn.data.unpaired import UnpairedCaptures
 from mwdn.fourier.convolution import convolve
+from mwdn.networks import Network
 from mwdn.training.losses import Loss
-from mwdn.training.validation import START, Judged, Validator
+from mwdn.training.validation import START, Judged, Validator, reconstruct
 from mwdn.types import Image, Measurement
 
 
@@ -47,8 +48,8 @@ def judge(captures: UnpairedCaptures, network: nn.Module, loss: Loss, numbers: r
     """
     measurement, other, psf = captures.batch(numbers)
     assert psf is not None
-    # A network that aligns the PSF itself takes it as it is while it learns.
-    told = psf if getattr(network, "align", False) else captures.psf
+    # A network whose PSF is aligned at inference is trained on the PSF that fits the capture.
+    told = psf if isinstance(network, Network) and network.align else captures.psf
     found = network(measurement.contiguous(memory_format=torch.channels_last), told).float()
     seen = convolve(found, psf)
     light = (other - seen).mean((-2, -1), keepdim=True).detach()
@@ -94,4 +95,4 @@ class BlindValidator(Validator):
     def captured(self, network: nn.Module) -> list[list[Tensor]]:
         """The first capture and its reconstruction: whether it fits the network is found before training."""
         measurement, _, _ = self.pairs.batch([START])
-        return [[measurement.cpu(), network(measurement, self.psf).cpu()]]
+        return [[measurement.cpu(), reconstruct(network, measurement, self.psf).cpu()]]

@@ -9,9 +9,11 @@ from torch import Tensor, nn
 
 from mwdn.data.simulated import Samples
 from mwdn.io.contact_sheets import contact_sheet
+from mwdn.networks import Network
+from mwdn.solvers import align
 from mwdn.training.losses import Loss
 from mwdn.training.recipe import Recipe
-from mwdn.types import Image, Measurement, Psf
+from mwdn.types import Image, Measurement, Psf, Scene
 
 START = 10**12
 """Samples are numbered; those of the validation start here, where no training ever arrives."""
@@ -86,7 +88,7 @@ class Validator:
     def judged(self, network: nn.Module, loss: Loss, numbers: range) -> Judged:
         """Compare reconstructions of the pairs of these numbers with their scenes."""
         measurement, scene, psf = self.pairs.batch(numbers)
-        found = network(measurement, self.psf if psf is None else psf)
+        found = reconstruct(network, measurement, self.psf if psf is None else psf)
         psnr = -10 * torch.log10((found.clamp(0, 1) - scene).square().mean((1, 2, 3)))
         parts = loss(found, scene)[1]
         weighted = sum(weight * parts[name].item() for name, weight in self.recipe.loss.items())
@@ -96,7 +98,14 @@ class Validator:
     def captured(self, network: nn.Module) -> list[list[Tensor]]:
         """The first six captures and their reconstructions, one after the other: they may be more than a batch."""
         captures = [] if self.captures is None else [one[None] for one in self.captures[:SHOWN]]
-        return [row for capture in captures for row in _rows(capture, network(capture, self.psf))]
+        return [row for capture in captures for row in _rows(capture, reconstruct(network, capture, self.psf))]
+
+
+def reconstruct(network: nn.Module, measurement: Measurement, psf: Psf) -> Scene:
+    """Reconstruct as `mwdn.Reconstructor` does: with the PSF aligned to each capture, if the network is used so."""
+    if isinstance(network, Network) and network.align:
+        psf = align(measurement, psf).move(psf)
+    return network(measurement, psf)
 
 
 def _rows(*pictures: Tensor) -> list[list[Tensor]]:

@@ -40,7 +40,7 @@ def load_authors(state: dict[str, Tensor]) -> nn.Module:
     """
     name = "mwdn-cpsf" if "inc0.double_conv.0.weight" in state else "mwdn"
     extra = {"authors_scalars": True} if name == "mwdn-cpsf" else {"psf_pooling": "average"}
-    first, last = state["inc.double_conv.0.weight"], state["outc.conv.weight"]
+    first = state["inc.double_conv.0.weight"]
     scalars = {"w": 1, "delta": 5} if name == "mwdn-cpsf" else {"w": 4, "delta": 4}
     wrong = [key for key, length in scalars.items() if state[key].shape != (length,)]
     if wrong or first.ndim != 4:
@@ -48,7 +48,7 @@ def load_authors(state: dict[str, Tensor]) -> nn.Module:
             f"`{'`, `'.join(wrong) or 'inc.double_conv.0.weight'}` must have the shape of the authors' {name} "
             f"({scalars} numbers). Take a checkpoint of their code."
         )
-    options = OPTIONS | extra | {"channels": first.shape[1], "outputs": last.shape[0], "width": first.shape[0]}
+    options = OPTIONS | extra | {"channels": first.shape[1], "width": first.shape[0]}
     network = build(name, **options)
     try:
         network.load_state_dict(_renamed(state, name), strict=True)

@@ -91,7 +91,8 @@ def load_network(path: str | Path) -> nn.Module:
         return load_authors(_read_foreign(path)).eval()
     header = read_metadata(path)
     try:
-        network = build(header["name"], **header["options"])
+        options = {key: value for key, value in header["options"].items() if key != "outputs"}
+        network = build(header["name"], **options)
     except (TypeError, ParameterError) as error:
         version = header.get("version", "unknown")
         raise CheckpointError(

@@ -1,0 +1,57 @@
+"""What every network of this package is: a function of a measurement and a PSF, in two steps."""
+
+from typing import Generic, TypeVar
+
+from torch import nn
+
+from mwdn.types import Measurement, Psf, Scene, Size
+
+Prepared = TypeVar("Prepared")
+"""What a network computes from the PSF alone: tensors, or tuples and lists of tensors."""
+
+
+class Network(nn.Module, Generic[Prepared]):
+    """Reconstruct a scene from a measurement and a PSF: ``scene = network(measurement, psf)``.
+
+    The PSF is an input, so one network can serve many cameras. `prepare` does all that needs the PSF only;
+    `reconstruct` does the rest. A camera's PSF is prepared once, its measurements are reconstructed one by one.
+
+    Attributes:
+        channels: colours of the measurement; 0 for any number.
+        align: whether `mwdn.Reconstructor` aligns the PSF to each capture by default, because the network was trained
+            on PSFs that fit. A network itself takes every PSF as it is.
+    """
+
+    channels: int = 0
+    align: bool = False
+
+    def prepare(self, psf: Psf, size: Size) -> Prepared:
+        """Compute what depends on the PSF alone.
+
+        Args:
+            psf: (1 or B, 1 or C, H, W), centred.
+            size: height and width of the measurements.
+
+        Raises:
+            ShapeError: the PSF does not fit the size or the network.
+        """
+        raise NotImplementedError
+
+    def reconstruct(self, measurement: Measurement, prepared: Prepared) -> Scene:
+        """Reconstruct a batch.
+
+        Args:
+            measurement: (B, C, H, W).
+            prepared: result of `prepare` for measurements of this size.
+
+        Returns:
+            (B, C, H, W).
+
+        Raises:
+            ShapeError: the measurement does not have the network's number of channels.
+        """
+        raise NotImplementedError
+
+    def forward(self, measurement: Measurement, psf: Psf) -> Scene:
+        """Scene (B, C, H, W): `prepare`, then `reconstruct`."""
+        return self.reconstruct(measurement, self.prepare(psf, (measurement.shape[-2], measurement.shape[-1])))
