@@ -103,7 +103,7 @@ def test_convolve_is_the_sum_over_points(scene, psf, size, generator):
 
 
 def test_grid_is_long_enough_for_every_small_combination(generator):
-    """One row each, lengths 1 to 7: where the grid is one pixel short, a wrapped end lands on the sensor."""
+    """One row, lengths 1 to 7: on a grid one pixel too short, a wrapped end lands on the sensor."""
     for scene, psf, sensor in itertools.product(range(1, 8), repeat=3):
         v, h = noise((1, 1, 1, scene), generator), noise((1, 1, 1, psf), generator)
         expected = oracles.convolve(v[0, 0], h[0, 0], (1, sensor))
@@ -120,7 +120,7 @@ def test_circular_convolve_wraps_what_leaves(scene, psf, size, generator):
 
 @pytest.mark.parametrize("size", [(5, 5), (8, 8), (7, 10)])
 def test_odd_psfs_agree_with_scipys_same_mode(size, generator):
-    """The one case in which scipy's own centre crop has no ambiguity."""
+    """For odd PSFs alone scipy's "same" mode is unambiguous."""
     v, h = noise((1, 1, *size), generator), noise((1, 1, 3, 5), generator)
     expected = convolve2d(v[0, 0].double(), h[0, 0].double(), mode="same")
     close(fourier.convolve(v, h)[0, 0], expected)
@@ -218,8 +218,8 @@ def test_psf_broadcasts_over_batch_and_channels(operation, batch, channels, gene
     result = operation(v, h)
     for b in range(2):
         for c in range(3):
-            own = h[b % batch, c % channels][None, None]
-            close(result[b, c], operation(v[b, c][None, None], own)[0, 0], 1e-5)
+            kernel = h[b % batch, c % channels][None, None]
+            close(result[b, c], operation(v[b, c][None, None], kernel)[0, 0], 1e-5)
 
 
 @pytest.mark.parametrize("batch", [1, 2])
@@ -230,8 +230,8 @@ def test_wiener_broadcasts_over_batch_and_channels(batch, channels, generator):
     result = fourier.wiener(b, h, k)
     for i in range(2):
         for c in range(3):
-            own = h[i % batch, c % channels].double()
-            close(result[i, c], oracles.wiener(b[i, c], own, k[i, c].item()), 1e-5)
+            kernel = h[i % batch, c % channels].double()
+            close(result[i, c], oracles.wiener(b[i, c], kernel, k[i, c].item()), 1e-5)
 
 
 OPERATIONS = {

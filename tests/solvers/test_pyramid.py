@@ -42,7 +42,7 @@ def test_halving_keeps_place_and_light():
 
 
 @pytest.mark.parametrize("downsampling", [1, 2, 4])
-def test_low_band_takes_a_coarse_scene_where_the_fine_one_goes(downsampling, generator):
+def test_low_band_of_a_coarse_scene_is_the_decimated_result(downsampling, generator):
     """A scene of low frequencies alone may be sampled before or after the convolution."""
     grid = (32, 48)
     psf = torch.rand(1, 1, *grid, generator=generator, dtype=torch.float64)
@@ -95,7 +95,7 @@ def test_residual_has_less_energy_than_the_measurement(generator):
 
 @pytest.mark.parametrize("downsampling", [2, 4, 8])
 @pytest.mark.parametrize("size", [(33, 48), (40, 41), (47, 70)])
-def test_a_coarse_scene_is_its_enlargement_where_the_sensor_is(downsampling, size, generator):
+def test_coarse_scene_is_enlarged_and_cropped(downsampling, size, generator):
     psf, measurement = (torch.rand(1, 1, *size, generator=generator) ** power for power in (6, 1))
     result = solve(measurement, psf, (Level(downsampling, 2, FINE),))
     large = F.interpolate(result.grid_scene, scale_factor=downsampling, mode="bilinear")
@@ -106,11 +106,11 @@ def test_impossible_constants_are_refused():
     with pytest.raises(ParameterError, match=r"`regularisation` \(0.0\) must be positive"):
         Pyramid(0.0)
     for sizes in ((), (2, 4), (3, 1), (2, 2)):
-        with pytest.raises(ParameterError, match="falling powers of two"):
+        with pytest.raises(ParameterError, match=r"`levels` .* powers of two"):
             Pyramid(levels=tuple(Level(size, 1, FINE) for size in sizes))
 
 
-def test_a_pyramid_that_stops_early_leaves_the_detail(generator):
+def test_pyramid_without_fine_levels_leaves_the_detail(generator):
     """A smooth scene that fills the field is fitted at a quarter of the size; fine detail stays in the residual."""
     psf = contour_psf((96, 128), generator=generator)
     smooth = torch.full((1, 3, 96, 128), 0.1)

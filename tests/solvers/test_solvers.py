@@ -52,9 +52,9 @@ def capture(generator, *, noise=0.0, size=(24, 30)):
 def test_divergence_is_the_adjoint_of_the_gradient(size, generator):
     v, y, x = torch.randn(3, 2, 3, *size, generator=generator, dtype=torch.float64)
     down, along = proximal.gradient(v)
-    left = (down * y).sum() + (along * x).sum()
-    right = (v * proximal.divergence((y, x))).sum()
-    torch.testing.assert_close(left, right, rtol=1e-12, atol=1e-12)
+    inner = (down * y).sum() + (along * x).sum()
+    expected = (v * proximal.divergence((y, x))).sum()
+    torch.testing.assert_close(inner, expected, rtol=1e-12, atol=1e-12)
 
 
 def test_gradient_goes_down_the_rows_and_along_the_columns():
@@ -372,7 +372,7 @@ def test_impossible_constants_are_refused(options):
         Admm(**options)
 
 
-def test_fista_needs_an_iteration():
+def test_fista_needs_one_iteration():
     with pytest.raises(ParameterError, match=r"`iterations` \(0\) must be at least 1"):
         Fista(iterations=0)
 

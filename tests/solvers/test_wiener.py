@@ -63,7 +63,7 @@ def test_channels_are_measured_apart(generator):
     torch.testing.assert_close(result, sigma, rtol=0.02, atol=0)
 
 
-def test_noise_of_light_is_that_of_the_whole_picture_not_of_its_dark_half(generator):
+def test_photon_noise_is_the_mean_over_bright_and_dark_parts(generator):
     sigma = torch.full((200, 300), 0.001)
     sigma[:, 120:180] = 0.03
     noise = sigma * torch.randn(1, 1, 200, 300, generator=generator)
@@ -138,7 +138,7 @@ def test_batch_is_one_by_one(psf, scene, generator):
 @pytest.mark.parametrize(
     "measurement", [torch.zeros(1, 3, 9, 12), torch.full((1, 1, 9, 12), 0.3), torch.ones(1, 1, 1, 1)]
 )
-def test_darkness_and_evenness_stay_finite(measurement):
+def test_constant_measurements_stay_finite(measurement):
     psf = torch.zeros(1, 1, *measurement.shape[-2:])
     psf[..., measurement.shape[-2] // 2, measurement.shape[-1] // 2] = 1
     result = Wiener()(measurement, psf)

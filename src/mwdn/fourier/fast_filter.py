@@ -16,7 +16,7 @@ from mwdn.types import Size, Spectrum
 
 
 class FastFilter(torch.autograd.Function):
-    """``y = C F^-1(T F(P x))`` and its gradient, which keeps the image rather than its spectrum.
+    """``y = C F^-1(T F(P x))``; for its gradient the image is kept, not the larger spectrum.
 
     x is the image, P pads it to the grid of N pixels, F is the Fourier transform, T the transfer function, C crops.
     With the gradient g = dL/dy of a loss L and G = F(C^T g), where C^T pads with zeros:
@@ -24,8 +24,8 @@ class FastFilter(torch.autograd.Function):
     1. ``dL/dx = P^T F^-1(conj(T) G)``: the filter's kernel is real, so its adjoint has the transfer function conj(T).
     2. ``dL/dT = conj(F(P x)) G / N``: y is linear in T, and F^-1 divides by N.
 
-    A half spectrum stores one of each two coefficients T(k) and T(-k) = conj T(k). Both depend on the stored one, which
-    doubles (2) in all columns but the first and, of an even width, the last: these hold both.
+    A half spectrum stores T(k) but not T(-k) = conj T(k), which depends on it too: (2) doubles, except in the first
+    column and, of an even width, the last, which hold both.
     """
 
     @staticmethod

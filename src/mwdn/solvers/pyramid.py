@@ -96,7 +96,7 @@ class Pyramid:
             raise ParameterError(f"`regularisation` ({self.regularisation}) must be positive; try 1e-4.")
         sizes = [level.downsampling for level in self.levels]
         if not sizes or sizes != sorted(set(sizes), reverse=True) or any(s & (s - 1) for s in sizes):
-            raise ParameterError(f"`levels` must shrink by falling powers of two, for example 4 and 2, not {sizes}.")
+            raise ParameterError(f"`levels` {sizes} must be powers of two, falling: for example 4, 2, 1.")
 
     @torch.no_grad()
     def __call__(self, measurement: Measurement, psf: Psf) -> Scene:
