@@ -48,7 +48,7 @@ def psf():
 
 def test_a_good_psf_has_nothing_to_mind(tmp_path, psf):
     report = report_of(tmp_path, frame_of(psf))
-    assert headline(report) == "A good PSF: nothing to mind."
+    assert headline(report).startswith("A good PSF")
     assert {finding.weight for finding in verdict(report)} == {"good"}
     assert report.levels.peak == pytest.approx(0.9, abs=1e-4)
     assert report.levels.saturated == 0
@@ -62,7 +62,7 @@ def test_background_is_found_and_said(tmp_path, psf):
     assert report.levels.background == pytest.approx((0.1,) * 3, abs=2e-3)
     share = 0.1 * SIZE[0] * SIZE[1] / (frame / 65535).sum((0, 1)).min()
     assert report.levels.pedestal == pytest.approx(share, rel=0.02)
-    assert [finding.weight for finding in said(report, "0.100", "estimated and subtracted")] == ["mind"]
+    assert [finding.weight for finding in said(report, "0.100", "was subtracted")] == ["mind"]
     kept = report_of(tmp_path, frame, background=0.0)
     assert said(kept, "0.100", "was kept", "--background 0")
     assert said(kept, "at 0.10 of the full scale", "--dark")
@@ -70,7 +70,7 @@ def test_background_is_found_and_said(tmp_path, psf):
 
 
 def test_light_between_the_lines_that_the_estimate_leaves(tmp_path, psf):
-    """The level lies only where the mask is lit, so the darkest 5 % of the frame know nothing of it."""
+    """The level lies only where the mask is lit, so the darkest 5 % of the frame do not show it."""
     lit = torch.zeros(SIZE)
     lit[16:80, 12:68] = 0.1
     light = 0.8 * psf / psf.max() + lit
@@ -78,8 +78,7 @@ def test_light_between_the_lines_that_the_estimate_leaves(tmp_path, psf):
     report = report_of(tmp_path, frame)
     assert max(report.levels.background) == 0
     assert report.levels.between == pytest.approx(0.1, abs=0.005)
-    assert said(report, "at 0.10 of the full scale", "not subtracted", "--dark")
-    assert not said(report, "that alone was")
+    assert said(report, "at 0.10 of the full scale", "no background was subtracted", "--dark")
 
 
 def test_noise_of_the_file(tmp_path, psf, generator):
@@ -102,12 +101,12 @@ def test_a_noisy_picture_of_a_blurred_psf_says_how_far_it_is_known(tmp_path, gen
     # exp(-4 pi^2 9 f^2) meets twice the floor at f of sqrt(-ln(2 floor) / (36 pi^2)).
     expected = math.sqrt(-math.log(2 * report.levels.noise_floor) / (36 * math.pi**2))
     assert report.known_frequency == pytest.approx(expected, abs=0.02)
-    assert said(report, "mostly its own noise")
+    assert said(report, "mostly noise")
 
 
 def test_exposure(tmp_path, psf):
-    assert said(report_of(tmp_path, frame_of(psf, peak=0.2)), "20 % of the full scale", "expose longer")
-    assert said(report_of(tmp_path, frame_of(psf, bits=8)), "230 steps", "16 bits")
+    assert said(report_of(tmp_path, frame_of(psf, peak=0.2)), "20 % of the full scale", "Expose longer")
+    assert said(report_of(tmp_path, frame_of(psf, bits=8)), "230 levels", "16 bits")
     frame = frame_of(psf)
     frame.reshape(-1, 3)[np.argsort(frame[..., 1].ravel())[-5:]] = 65535
     report = report_of(tmp_path, frame)
@@ -119,7 +118,7 @@ def test_floats_have_no_full_scale(tmp_path, psf):
     np.save(tmp_path / "psf.npy", psf[0].movedim(0, -1).numpy())
     report = inspect_psf(Calibration.from_file(tmp_path / "psf.npy"), read_frame(tmp_path / "psf.npy"))
     assert report.levels.steps == 0
-    assert said(report, "floats", "cannot be seen")
+    assert said(report, "floats", "saturation")
     level = 0.05 * psf.max() + psf
     np.save(tmp_path / "psf.npy", level[0].movedim(0, -1).numpy())
     report = inspect_psf(Calibration.from_file(tmp_path / "psf.npy"), read_frame(tmp_path / "psf.npy"))
@@ -153,8 +152,7 @@ def test_defocused_pinhole():
     y, x = torch.arange(96)[:, None] - 48, torch.arange(96) - 48
     disc = ((y.square() + x.square()) <= 12**2).float()[None, None]
     report = inspect_psf(Calibration(disc / disc.sum()))
-    assert said(report, "sees nothing at")
-    assert report.dark_rings
+    assert said(report, f"{report.dark_rings[0]:.3f}", "cycles per pixel in any direction")
 
 
 def test_blurred_psf_can_be_binned():
@@ -183,7 +181,7 @@ def test_distance_and_angle(psf):
     assert report.depth[10.0] == pytest.approx(1, abs=1e-4)
     assert report.depth[20.0] == psf_measures.likeness(psf.flip(-1), psf)
     assert said(report, "distance", "at 20 the camera needs another PSF")
-    assert said(report, "every angle asked for", "1.00")
+    assert said(report, "every angle", "1.00")
 
 
 def test_numbers_are_those_of_the_measures(psf):
@@ -218,8 +216,8 @@ def test_small_psfs(size):
 @pytest.mark.parametrize(
     ("file", "options", "words"),
     [
-        ("mwdn-camera/psf_480.tif", {}, ["at 0.10 of the full scale", "not subtracted"]),
-        ("mwdn-camera/psf_320.png", {}, ["at 0.10 of the full scale", "that alone was"]),
+        ("mwdn-camera/psf_480.tif", {}, ["at 0.10 of the full scale", "--dark"]),
+        ("mwdn-camera/psf_320.png", {}, ["at 0.10 of the full scale", "but only"]),
         ("mwdn-camera/psf_320.png", {}, ["is cut"]),
         ("mwdn-camera/psf_raw_1920.png", {"bin": 6}, ["all within the frame"]),
         ("diffusercam-tutorial/psf_sample.tif", {"bin": 4}, ["192 pixels", "maximum"]),

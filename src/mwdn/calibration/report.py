@@ -1,4 +1,4 @@
-"""What can be said about a PSF: its measures, gathered."""
+"""The report of a PSF: all its measures."""
 
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -11,27 +11,27 @@ from mwdn.optics.noise import noise_level
 from mwdn.types import Frame, Psf, Size
 
 LAMBDAS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
-"""Regularisations that the noise gain is told for."""
+"""Regularisations for which the noise gain is reported."""
 
 NOISES = (0.01, 0.003, 0.001)
-"""Noise of a measurement over its mean that the resolution is told for: 10,000, 100,000 and 1,000,000 electrons."""
+"""Noise of a measurement over its mean for which resolution is reported: 10,000, 100,000 and 1,000,000 electrons."""
 
 
 @dataclass(frozen=True)
 class Levels:
-    """How the PSF's file was exposed.
+    """Exposure and background of the PSF's file.
 
     Args:
         integers: the file holds a sensor's integers; floats have no full scale.
-        peak: largest number, as a part of the full scale.
-        steps: the same, in steps of the file's numbers; 0 of floats.
-        saturated: pixels at the sensor's maximum.
-        background: level of each channel's darkest 5 % of pixels, as a part of the full scale.
+        peak: largest number, as a fraction of the full scale.
+        steps: largest number as stored; 0 for floats.
+        saturated: number of pixels at the sensor's maximum.
+        background: 5th percentile of each channel, as a fraction of the full scale.
         subtracted: level that was subtracted from each channel.
-        pedestal: part of the file's light that this background is.
-        between: level between the lines, as a part of the full scale, of the mean of the colours.
-        noise: standard deviation of a pixel's noise, as a part of the full scale.
-        noise_floor: its power in |H|^2, for the PSF of unit sum.
+        pedestal: fraction of the file's light in this background.
+        between: level between the lines, as a fraction of the full scale; mean of the colours.
+        noise: standard deviation of a pixel's noise, as a fraction of the full scale.
+        noise_floor: power of the noise in |H|^2, for the PSF of unit sum.
     """
 
     integers: bool
@@ -48,26 +48,27 @@ class Levels:
 
 @dataclass(frozen=True)
 class PsfReport:
-    """A PSF's measures.
+    """Measures of a PSF.
 
     Args:
         psf_hash: of the calibration.
         size: height and width.
-        levels: of the file, if there is one.
-        support: where the light is.
-        peak_width_px: of the autocorrelation at half its height; lines are narrower by about sqrt(2).
-        side_lobe: highest value of the autocorrelation beside its peak, and where: (down, along) pixels.
-        weak_part: part of the frequencies with less than 1/100 of their ring's power; 0.01 for any random mask.
-        dark_rings: frequencies, in cycles per pixel, that the camera does not see in any direction.
-        effective_rank: how many separable patterns it is made of.
+        levels: of the file; ``None`` without a file.
+        support: region of the light.
+        peak_width_px: full width of the autocorrelation's peak at half maximum; lines are narrower by about sqrt(2).
+        side_lobe: highest value of the autocorrelation besides its peak, and its position (rows, columns).
+        weak_part: fraction of the frequencies with less than 1/100 of their ring's power; 0.01 for any random mask.
+        dark_rings: frequencies, in cycles per pixel, that have no signal in any direction.
+        effective_rank: number of separable patterns that make up the PSF.
         colour_likeness: correlation of the two colours that differ most; 1 if grey.
-        noise_gain: variance of the Wiener estimate's noise over the measurement's, of the worst channel, by lambda.
-        detail_kept: part of a picture's details that this estimate keeps, of the worst channel, by lambda.
-        resolution_px: width of the finest lines that a photograph shows, by the measurement's noise over its mean;
-            infinite if it shows none.
-        known_frequency: up to which the file's picture of the PSF stands out of its own noise; 0.5 at most.
-        depth: correlation with the PSF it is designed for, by the distance of the point; empty unless asked for.
-        angle: likewise by the angle.
+        noise_gain: variance of the noise in the Wiener estimate over that in the measurement, of the worst channel, by
+            lambda.
+        detail_kept: fraction of a picture's detail that this estimate keeps, of the worst channel, by lambda.
+        resolution_px: width of the finest visible lines in a photograph, by the measurement's noise over its mean;
+            infinite if none are visible.
+        known_frequency: frequency up to which the PSF exceeds the noise of its file; 0.5 at most.
+        depth: correlation with the PSF of the design distance, by the distance of the point; may be empty.
+        angle: correlation with the PSF on the axis, by the angle; may be empty.
     """
 
     psf_hash: str
@@ -88,11 +89,11 @@ class PsfReport:
     angle: dict[float, float] = field(default_factory=dict)
 
     def content(self) -> dict[str, Any]:
-        """Everything as JSON has it: keys are strings, and ``null`` stands for an infinite resolution."""
+        """The report for JSON: keys are strings, and an infinite resolution is ``None``."""
         plain = asdict(self)
         for name, value in plain.items():
             if isinstance(value, dict):
-                plain[name] = {str(key): None if each == float("inf") else each for key, each in value.items()}
+                plain[name] = {str(key): None if number == float("inf") else number for key, number in value.items()}
         return plain
 
 
@@ -106,10 +107,10 @@ def inspect_psf(
     """Measure a PSF.
 
     Args:
-        calibration: that holds it.
-        frame: the file's numbers, as `mwdn.read_frame` gives them; without them nothing is said about levels.
-        depth: the PSFs of points at other distances than the calibration's, by the distance.
-        angle: likewise, by the angle.
+        calibration: of the camera.
+        frame: the PSF's raw frame, from `FrameFormat.read`; without it there are no levels in the report.
+        depth: PSFs of points at other distances, by the distance.
+        angle: PSFs of points off the axis, by the angle.
     """
     psf = calibration.psf.float().cpu()
     colours = [psf[:, [c]] for c in range(psf.shape[1])]
@@ -130,7 +131,7 @@ def inspect_psf(
         noise_gain={value: max(psf_spectrum.noise_gain(psf, value)) for value in LAMBDAS},
         detail_kept={value: min(psf_spectrum.detail_kept(psf, value)) for value in LAMBDAS},
         resolution_px={noise: _resolution(colours, noise) for noise in NOISES},
-        known_frequency=_known(psf, levels.noise_floor if levels else 0.0),
+        known_frequency=_known_frequency(psf, levels.noise_floor if levels else 0.0),
         depth=_likenesses(psf, depth),
         angle=_likenesses(psf, angle),
     )
@@ -141,13 +142,13 @@ def _likenesses(psf: Psf, others: dict[float, Psf] | None) -> dict[float, float]
 
 
 def _resolution(colours: list[Psf], noise: float) -> float:
-    """Half the shortest visible period, of the colour that sees least."""
+    """Half the shortest visible period of the worst colour, in pixels."""
     frequency = min(psf_spectrum.resolved_frequency(colour, noise) for colour in colours)
     return 0.5 / frequency if frequency > 0 else float("inf")
 
 
-def _known(psf: Psf, floor: float) -> float:
-    """Lowest frequency from which on the PSF's power is not even twice that of its noise."""
+def _known_frequency(psf: Psf, floor: float) -> float:
+    """Frequency above which the PSF's power stays below twice that of its noise."""
     ring = psf_spectrum.radial_power(psf)
     lost = (ring.power < 2 * floor).flip(0).long().cumprod(0).flip(0).nonzero()
     return float(ring.frequency[lost[0, 0]]) if len(lost) else 0.5
@@ -159,11 +160,10 @@ def _levels(calibration: Calibration, frame: Frame) -> Levels:
     image = upright.flip(-2) if frames.upside_down else upright
     background = estimate_background(image)
     integers = frame.dtype.kind != "f"
-    # As deep as the file says: numbers left by binning lie between its steps.
     scale = frames.full_scale(frame) if integers else 1.0
     noise = noise_level(image, parts=1)
     if integers:
-        # Rounding alone leaves step / sqrt(12), which the median of an 8-bit frame's differences often misses.
+        # The noise of rounding, step / sqrt(12): the median of an 8-bit frame's differences often misses it.
         noise = noise.clamp(min=1 / (12**0.5 * scale * frames.bin))
     subtracted = torch.tensor(calibration.background or (0.0,) * image.shape[1])[:, None, None]
     light = (image - subtracted).clamp(min=0).sum((-2, -1), keepdim=True).clamp(min=1e-30)

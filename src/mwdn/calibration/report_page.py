@@ -1,4 +1,4 @@
-"""A PSF's report as one page of pictures, drawn by matplotlib."""
+"""The report of a PSF as one page of plots, drawn by matplotlib."""
 
 import textwrap
 from pathlib import Path
@@ -25,7 +25,7 @@ def draw_page(report: PsfReport, psf: Psf, title: str) -> "Figure":
     """Draw the PSF, its autocorrelation, its spectrum, noise gain and resolution over the verdict."""
     from matplotlib.figure import Figure
 
-    # Not by pyplot: a figure of its own needs no display and leaves nothing behind.
+    # Without pyplot, which needs a display and keeps figures open.
     figure = Figure(figsize=(11.7, 11.7), dpi=110, layout="constrained")
     above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.15, 1))[:, 0]
     above.suptitle(f"{title}   {report.size[0]} x {report.size[1]}   PSF {report.psf_hash}", fontsize=12)
@@ -44,7 +44,7 @@ def write_page(path: Path, report: PsfReport, psf: Psf, title: str) -> None:
     """Write the page as PNG, atomically.
 
     Raises:
-        ImageError: the disk refuses.
+        ImageError: the file cannot be written.
     """
     figure = draw_page(report, psf, title)
     with atomic_write(path) as temporary:
@@ -55,7 +55,7 @@ def _draw_psf(axes: "Axes", psf: Psf) -> None:
     bright = psf.flatten(1).sort().values[0, int(0.998 * (psf.numel() - 1))].clamp(min=1e-30)
     picture = srgb_encode(psf[0] / bright).movedim(0, -1).cpu().numpy()
     axes.imshow(picture if picture.shape[-1] == 3 else picture[..., 0], cmap="gray", vmin=0, vmax=1)
-    axes.set_title("PSF (as a screen shows it)", fontsize=10)
+    axes.set_title("PSF (sRGB)", fontsize=10)
 
 
 def _draw_autocorrelation(axes: "Axes", psf: Psf) -> None:
@@ -73,8 +73,8 @@ def _draw_profile(axes: "Axes", psf: Psf) -> None:
     reach = min(row, column, 40)
     steps = np.arange(-reach, reach + 1)
     steps = steps[(steps + row < image.shape[0]) & (steps + column < image.shape[1])]
-    axes.plot(steps, image[row + steps, column], label="down")
-    axes.plot(steps, image[row, column + steps], label="along")
+    axes.plot(steps, image[row + steps, column], label="vertical")
+    axes.plot(steps, image[row, column + steps], label="horizontal")
     axes.set(xlabel="displacement / px", ylim=(-0.35, 1.05))
     axes.set_title("autocorrelation through its peak", fontsize=10)
     axes.legend(fontsize=8)
@@ -96,7 +96,7 @@ def _draw_spectrum(axes: "Axes", psf: Psf, report: PsfReport) -> None:
 def _draw_gain(axes: "Axes", report: PsfReport) -> None:
     values = list(report.noise_gain)
     axes.loglog(values, [gain**0.5 for gain in report.noise_gain.values()], "C1o-", label="noise, standard deviation")
-    axes.loglog(values, list(report.detail_kept.values()), "C4s-", label="part of the detail kept")
+    axes.loglog(values, list(report.detail_kept.values()), "C4s-", label="fraction of the detail kept")
     axes.set(xlabel="lambda")
     axes.set_title("Wiener estimate", fontsize=10)
     axes.legend(fontsize=8)
@@ -111,19 +111,19 @@ def _draw_resolution(axes: "Axes", psf: Psf, report: PsfReport) -> None:
     pairs = [(100 * noise, 0.5 / f) for noise, f in zip(noises, frequency, strict=True) if f > 0]
     if pairs:
         axes.loglog(*zip(*pairs, strict=True), "C2-")
-    told = [(100 * noise, width) for noise, width in report.resolution_px.items() if width < float("inf")]
-    if told:
-        axes.loglog(*zip(*told, strict=True), "C2o")
+    reported = [(100 * noise, width) for noise, width in report.resolution_px.items() if width < float("inf")]
+    if reported:
+        axes.loglog(*zip(*reported, strict=True), "C2o")
     axes.set(xlabel="noise of the measurement / % of its mean", ylabel="finest lines / px")
     axes.set_title("expected resolution", fontsize=10)
     axes.grid(alpha=0.3, which="both")
 
 
-def _write_verdict(part: "Figure", report: PsfReport) -> None:  # a SubFigure, which is drawn on alike
+def _write_verdict(part: "Figure", report: PsfReport) -> None:  # a SubFigure, which has the same methods
     part.text(0.02, 0.96, headline(report), fontsize=13, weight="bold", va="top")
-    place = 0.885
+    top = 0.885
     for weight, text in verdict(report):
         lines = textwrap.wrap(text, 150)
-        part.text(0.02, place, _MARKS[weight], fontsize=9.5, weight="bold", color=_COLOURS[weight], va="top")
-        part.text(0.045, place, "\n".join(lines), fontsize=9.5, color=_COLOURS[weight], va="top")
-        place -= 0.037 * len(lines) + 0.018
+        part.text(0.02, top, _MARKS[weight], fontsize=9.5, weight="bold", color=_COLOURS[weight], va="top")
+        part.text(0.045, top, "\n".join(lines), fontsize=9.5, color=_COLOURS[weight], va="top")
+        top -= 0.037 * len(lines) + 0.018

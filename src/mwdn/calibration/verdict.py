@@ -1,41 +1,41 @@
-"""A PSF's report in words: what is good about it, what to mind, and what to do."""
+"""The verdict on a PSF: what is good about it, what is not, and what to do."""
 
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
-from mwdn.calibration.report import PsfReport
+from mwdn.calibration.report import Levels, PsfReport
 
 Weight = Literal["bad", "mind", "good"]
 """``bad`` costs most of the quality, ``mind`` some of it, ``good`` is as it should be."""
 
 
 class Finding(NamedTuple):
-    """One sentence or two, and how much they weigh."""
+    """A statement about a PSF, and how much it matters."""
 
     weight: Weight
     text: str
 
 
 def verdict(report: PsfReport) -> tuple[Finding, ...]:
-    """Say what the numbers mean, the worst first."""
+    """Say what the numbers of a report mean, the worst first."""
     parts = (_levels, _light, _detail, _frequencies, _noise, _colours, _places)
-    found = [finding for part in parts for finding in part(report)]
-    return tuple(sorted(found, key=lambda finding: ("bad", "mind", "good").index(finding.weight)))
+    findings = [finding for part in parts for finding in part(report)]
+    return tuple(sorted(findings, key=lambda finding: ("bad", "mind", "good").index(finding.weight)))
 
 
 def headline(report: PsfReport) -> str:
-    """One sentence for everything."""
+    """Summarise the verdict in one sentence."""
     weights = [finding.weight for finding in verdict(report)]
     bad, mind = weights.count("bad"), weights.count("mind")
     if bad:
-        return f"A poor PSF: {_count(bad, 'fault')} that cost most of the quality. Read on before you use it."
+        return f"A poor PSF: {_count(bad, 'fault')} that cost{'' if bad > 1 else 's'} most of the quality."
     if mind:
-        return f"A usable PSF, with {_count(mind, 'thing')} to mind."
-    return "A good PSF: nothing to mind."
+        return f"A usable PSF with {_count(mind, 'weakness', 'weaknesses')}."
+    return "A good PSF: no weaknesses."
 
 
-def _count(number: int, thing: str) -> str:
-    return f"{number} {thing}{'s' if number > 1 else ''}"
+def _count(number: int, singular: str, plural: str = "") -> str:
+    return f"{number} {singular if number == 1 else plural or singular + 's'}"
 
 
 def _percent(part: float) -> str:
@@ -47,100 +47,98 @@ def _levels(report: PsfReport) -> Iterator[Finding]:
     if levels is None:
         return
     if not levels.integers:
-        yield Finding("mind", "The file holds floats: whether the sensor was saturated cannot be seen from it.")
+        yield Finding("mind", "The file holds floats, so saturation of the sensor cannot be detected.")
     elif levels.saturated > 1:
         text = f"{levels.saturated:,} pixels are at the sensor's maximum: the brightest lines may be cut. Expose less."
         yield Finding("mind", text)
     elif levels.peak < 0.3:
-        text = f"The brightest pixel reaches {_percent(levels.peak)} of the full scale: expose longer, for less noise."
+        text = f"The brightest pixel reaches only {_percent(levels.peak)} of the full scale. Expose longer."
         yield Finding("mind", text)
     else:
         yield Finding("good", f"Well exposed: the brightest pixel reaches {_percent(levels.peak)} of the full scale.")
     if 0 < levels.steps < 256:
         text = (
-            f"The file has {levels.steps} steps from black to the brightest line; faint light is rounded away. "
+            f"The file has {levels.steps} levels from black to the brightest line, so faint light is rounded away. "
             "Save 16 bits, or average frames."
         )
         yield Finding("mind", text)
-    yield from _background(report)
+    yield from _background(levels)
 
 
-def _background(report: PsfReport) -> Iterator[Finding]:
-    levels = report.levels
-    assert levels is not None
-    # Floats have no full scale: their brightest pixel stands for it.
+def _background(levels: Levels) -> Iterator[Finding]:
+    # Floats have no full scale: levels are relative to their brightest pixel.
     scale, unit = (1.0, "full scale") if levels.integers else (levels.peak, "brightest pixel")
     level = ", ".join(f"{value / scale:.3f}" for value in levels.background)
     if levels.integers and levels.between - max(levels.subtracted, default=0.0) > 0.05 * levels.peak:
+        subtracted = ", ".join(f"{value:.3f}" for value in levels.subtracted)
         text = (
-            f"Between its lines the file is not black but at {levels.between:.2f} of the full scale, and this was not "
-            f"subtracted: the darkest 5 % of the frame are at {level}"
-            + (", and that alone was. " if any(levels.subtracted) else ". ")
-            + "Take a frame with the source switched off and pass it as `--dark`: what it holds goes, the rest is "
-            "light of the mask and belongs to the PSF."
+            f"Between its lines the PSF is at {levels.between:.2f} of the full scale, but "
+            + (f"only {subtracted} was subtracted" if any(levels.subtracted) else "no background was subtracted")
+            + f"; the darkest 5 % of the frame are at {level}. Take a frame with the source switched off and pass it "
+            "as `--dark`: this removes stray light and keeps light from the mask, which belongs to the PSF."
         )
         yield Finding("mind", text)
     if levels.pedestal > 0.02 and not any(levels.subtracted):
         text = (
-            f"An even background of {level} of the {unit} holds {_percent(levels.pedestal)} of the light and was "
-            "kept. Leave out `--background 0` to have it estimated and subtracted."
+            f"A uniform background of {level} of the {unit} contains {_percent(levels.pedestal)} of the light and was "
+            "kept. Leave out `--background 0` to estimate and subtract it."
         )
         yield Finding("bad" if levels.pedestal > 0.3 else "mind", text)
     elif levels.pedestal > 0.02:
         text = (
-            f"An even background of {level} of the {unit}, {_percent(levels.pedestal)} of the file's light, was "
-            "estimated and subtracted. Other programs must do so too."
+            f"A uniform background of {level} of the {unit}, {_percent(levels.pedestal)} of the file's light, was "
+            "subtracted. Other programs that use this file must do the same."
         )
         yield Finding("mind", text)
     else:
-        yield Finding("good", "No even background under the whole frame.")
+        yield Finding("good", "No uniform background.")
 
 
 def _light(report: PsfReport) -> Iterator[Finding]:
-    s, (height, width) = report.support, report.size
-    extent = f"The light covers {s.height} x {s.width} of {height} x {width} pixels"
-    if s.border > 0.1:
+    support, (height, width) = report.support, report.size
+    extent = f"The light covers {support.height} x {support.width} of {height} x {width} pixels"
+    if support.border > 0.1:
         text = (
-            f"{extent}, and the frame's border is still {_percent(s.border)} as bright as the mean: the PSF is cut, or "
-            "has a background. If a larger frame exists, use a larger `--crop`."
+            f"{extent}, but the border of the frame is still {_percent(support.border)} as bright as the mean: the PSF "
+            "is cut off, or has a background. Use a larger `--crop` if the frame is larger."
         )
-        yield Finding("bad" if s.border > 0.5 else "mind", text)
+        yield Finding("bad" if support.border > 0.5 else "mind", text)
     else:
         yield Finding("good", f"{extent}, all within the frame.")
-    off = [abs(d) / n for d, n in zip(s.offset, report.size, strict=True)]
-    if max(off) > 0.02:
-        down, along = s.offset
+    off_centre = max(abs(offset) / length for offset, length in zip(support.offset, report.size, strict=True))
+    if off_centre > 0.02:
+        down, right = support.offset
         text = (
-            f"Its centroid lies {abs(down):.0f} px {'below' if down > 0 else 'above'} and {abs(along):.0f} px to the "
-            f"{'right' if along > 0 else 'left'} of the frame's centre, so the field of view lies as far to the other "
-            "side: the point source stood off the axis, or the mask does."
+            f"Its centroid is {abs(down):.0f} px {'below' if down > 0 else 'above'} and {abs(right):.0f} px to the "
+            f"{'right' if right > 0 else 'left'} of the frame's centre, so the field of view is shifted to the "
+            "opposite side by as much: the point source or the mask was off the axis."
         )
-        yield Finding("mind" if max(off) > 0.1 else "good", text)
-    if s.glow > 0.15:
+        yield Finding("mind" if off_centre > 0.1 else "good", text)
+    if support.glow > 0.15:
         text = (
-            f"{_percent(s.glow)} of its light fills the lit part evenly: it carries no detail but brings its noise. "
-            f"Contrast is {s.contrast:.2f}."
+            f"{_percent(support.glow)} of its light is spread uniformly over the lit area: it carries no detail, but "
+            f"adds noise. Contrast is {support.contrast:.2f}."
         )
-        yield Finding("bad" if s.contrast < 0.4 else "mind", text)
+        yield Finding("bad" if support.contrast < 0.4 else "mind", text)
     else:
-        yield Finding("good", f"Dark between its lines: contrast {s.contrast:.2f}.")
+        yield Finding("good", f"Dark between its lines: contrast {support.contrast:.2f}.")
 
 
 def _detail(report: PsfReport) -> Iterator[Finding]:
-    lobe, (down, along) = report.side_lobe
+    lobe, (rows, columns) = report.side_lobe
     if lobe > 0.3:
         text = (
-            f"It looks like itself displaced by {down} rows and {along} columns (correlation {lobe:.2f}): expect "
-            "ghosts there. An irregular mask has none."
+            f"It repeats itself {rows} rows and {columns} columns away (correlation {lobe:.2f}): expect ghosts at this "
+            "distance. An irregular mask has none."
         )
         yield Finding("bad" if lobe > 0.6 else "mind", text)
     else:
-        yield Finding("good", f"It repeats itself nowhere: the highest side lobe is {lobe:.2f} of the peak.")
+        yield Finding("good", f"It does not repeat itself: the highest side lobe is {lobe:.2f} of the peak.")
     width = report.peak_width_px
     if width > 8:
         text = (
-            f"Its lines are about {width / 2**0.5:.1f} px wide: finer detail comes back faint and noisy. Binning by "
-            f"{int(width / 4)} loses little."
+            f"Its lines are about {width / 2**0.5:.1f} px wide: finer detail is reconstructed faint and noisy. "
+            f"Binning by {int(width / 4)} loses little: `--bin {int(width / 4)}`."
         )
         yield Finding("mind", text)
     else:
@@ -150,45 +148,46 @@ def _detail(report: PsfReport) -> Iterator[Finding]:
 def _frequencies(report: PsfReport) -> Iterator[Finding]:
     if report.dark_rings:
         text = (
-            "It sees nothing at "
+            "No signal at "
             + ", ".join(f"{frequency:.3f}" for frequency in report.dark_rings[:4])
-            + " cycles per pixel, in any direction: detail of that size is missing from every reconstruction. A "
-            "mask in focus, with lines of all directions, has no such rings."
+            + " cycles per pixel in any direction: detail of this size is missing from every reconstruction. A mask "
+            "in focus, with lines in all directions, has no such rings."
         )
         yield Finding("mind", text)
     if report.weak_part > 0.03:
         text = (
-            f"{_percent(report.weak_part)} of the frequencies are nearly dark; of a random mask 1 % are. Straight or "
-            "separable structure does that."
+            f"{_percent(report.weak_part)} of the frequencies are nearly dark; for a random mask it is 1 %. Straight "
+            "lines and separable patterns cause this."
         )
         yield Finding("mind", text)
     if not report.dark_rings and report.weak_part <= 0.03:
         text = (
-            f"Its spectrum has no dark rings, and {_percent(report.weak_part)} nearly dark places, as a random mask's."
+            f"Its spectrum has no dark rings, and {_percent(report.weak_part)} of its frequencies are nearly dark; for "
+            "a random mask it is 1 %."
         )
         yield Finding("good", text)
     if report.known_frequency < 0.4:
         text = (
-            f"Beyond {report.known_frequency:.2f} cycles per pixel this picture of the PSF is mostly its own noise. "
-            "Average more frames."
+            f"Above {report.known_frequency:.2f} cycles per pixel this picture of the PSF is mostly noise. Average "
+            "more frames."
         )
         yield Finding("mind", text)
 
 
 def _noise(report: PsfReport) -> Iterator[Finding]:
-    told = ", ".join(f"{width:.1f} px at {_percent(noise)}" for noise, width in report.resolution_px.items())
+    widths = ", ".join(f"{width:.1f} px at {_percent(noise)}" for noise, width in report.resolution_px.items())
     middle = sorted(report.resolution_px.values())[len(report.resolution_px) // 2]
     gains = ", ".join(f"{report.noise_gain[value] ** 0.5:.3g} at {value:g}" for value in (1e-4, 1e-3, 1e-2))
     text = (
-        f"Finest lines that a photograph shows, by the noise of the measurement: {told}. The Wiener estimate "
-        f"multiplies this noise, as a standard deviation, by {gains} (lambda)."
+        f"Finest visible lines of a photograph, by the noise of the measurement: {widths}. The Wiener estimate "
+        f"multiplies the standard deviation of this noise, by lambda: {gains}."
     )
     yield Finding("bad" if middle > 16 else "mind" if middle > 8 else "good", text)
 
 
 def _colours(report: PsfReport) -> Iterator[Finding]:
     if report.colour_likeness < 0.97:
-        text = f"Its colours differ (correlation {report.colour_likeness:.2f}): keep all three, a grey PSF would blur."
+        text = f"Its colours differ (correlation {report.colour_likeness:.2f}): use all three. A grey PSF would blur."
         yield Finding("bad" if report.colour_likeness < 0.5 else "good", text)
 
 
@@ -196,14 +195,12 @@ def _places(report: PsfReport) -> Iterator[Finding]:
     for what, by_place in (("distance", report.depth), ("angle", report.angle)):
         if not by_place:
             continue
-        kept = [place for place, correlation in by_place.items() if correlation >= 0.7]
-        lost = [place for place, correlation in by_place.items() if correlation < 0.7]
-        if lost:
-            where = f"from {min(kept):g} to {max(kept):g}" if kept else "nowhere else that was asked for"
-            text = f"By the {what} of the point it stays alike (correlation 0.7 and more) {where}; at "
-            text += ", ".join(f"{place:g}" for place in lost) + " the camera needs another PSF."
+        valid = [place for place, correlation in by_place.items() if correlation >= 0.7]
+        invalid = [place for place, correlation in by_place.items() if correlation < 0.7]
+        if invalid:
+            where = f"from {min(valid):g} to {max(valid):g}" if valid else "at none of the others"
+            text = f"By {what} of the point, this PSF is valid (correlation 0.7 or more) {where}; at "
+            text += ", ".join(f"{place:g}" for place in invalid) + " the camera needs another PSF."
         else:
-            text = (
-                f"It is alike for points of every {what} asked for: correlation {min(by_place.values()):.2f} or more."
-            )
-        yield Finding("mind" if lost else "good", text)
+            text = f"This PSF is valid at every {what} compared: correlation {min(by_place.values()):.2f} or more."
+        yield Finding("mind" if invalid else "good", text)
