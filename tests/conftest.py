@@ -58,3 +58,19 @@ def data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"No real captures: {folder} is not a folder. Set MWDN_DATA to where they are.")
     return folder
+
+
+@pytest.fixture
+def lpips_files(data: Path) -> dict[str, Path]:
+    """Public weights of AlexNet and of the heads of LPIPS."""
+    folder = data / "lpips"
+    return {"alexnet": folder / "alexnet_features_torchvision.pth", "heads": folder / "lin_v0.1_alex.pth"}
+
+
+@pytest.fixture
+def noisy_pair(generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+    """Two smooth pictures with noise of two strengths, and the same without noise."""
+    coarse = torch.rand(2, 3, 8, 8, generator=generator)
+    scene = torch.nn.functional.interpolate(coarse, (48, 57), mode="bicubic")
+    noise = torch.randn(scene.shape, generator=generator) * torch.tensor([0.02, 0.2]).view(2, 1, 1, 1)
+    return (scene + noise).clamp(0, 1), scene.clamp(0, 1)

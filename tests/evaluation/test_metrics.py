@@ -13,9 +13,8 @@ from mwdn.evaluation.metrics import METRICS, Perceptual, Protocol, best_gain, bo
 
 
 @pytest.fixture
-def perceptual(data):
-    folder = data / "lpips"
-    return Perceptual.load(folder / "alexnet_features_torchvision.pth", folder / "lin_v0.1_alex.pth")
+def perceptual(lpips_files):
+    return Perceptual.load(**lpips_files)
 
 
 @pytest.fixture

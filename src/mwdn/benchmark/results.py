@@ -12,7 +12,7 @@ from mwdn.benchmark.robustness import Sweep
 from mwdn.benchmark.scoring import MethodResult
 from mwdn.benchmark.sets import Dataset
 from mwdn.evaluation import Report
-from mwdn.runtime.environment import findings
+from mwdn.runtime.environment import describe_environment
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class Results:
 
 def environment(device: torch.device) -> dict[str, str]:
     """Commit, versions and hardware."""
-    return {"commit": _commit(), "computed on": str(device), **findings()}
+    return {"commit": _commit(), "computed on": str(device), **describe_environment()}
 
 
 def _commit() -> str:

@@ -131,9 +131,9 @@ def demo(*, out: Path = Path("results/demo"), seed: int = 0) -> None:
 @app.command
 def doctor() -> None:
     """Print versions, devices, supported precisions and threads."""
-    from mwdn.runtime.environment import report
+    from mwdn.runtime.environment import print_environment
 
-    report(console)
+    print_environment(console)
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:

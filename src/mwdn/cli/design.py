@@ -1,4 +1,4 @@
-"""The commands for a camera that does not exist yet."""
+"""The command `mwdn design`: a mask and its PSF from a few parameters."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,19 +14,19 @@ from mwdn.optics.masks import MaskDesign
 
 
 def _recipe(app: App, commands: tuple[str, ...], arguments: Any) -> None:  # noqa: ANN401
-    """What the file of ``--recipe`` says stands for what the command line does not."""
+    """Read options that the command line does not set from the file of ``--recipe``."""
     for argument in arguments:
         if argument.name == "--recipe" and argument.tokens:
             path = Path(argument.tokens[0].value)
             if not path.is_file():
-                raise ParameterError(f"`recipe` ({path}) must be a TOML file; see recipes/camera-*.toml.")
+                raise ParameterError(f"`recipe` ({path}) must be a TOML file, such as recipes/camera-mwdn.toml.")
             Toml(path, use_commands_as_keys=False)(app, commands, arguments)
             return
 
 
 design = App(
     name="design",
-    help="Design a mask, and compute the PSF of the camera that has it.",
+    help="Design a mask and compute the PSF of a camera with it.",
     config=_recipe,
     default_parameter=Parameter(negative_iterable=()),
 )
@@ -35,23 +35,23 @@ design = App(
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Output:
-    """What is written, and where."""
+    """Which files are written, and where."""
 
     out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("camera")
     """Folder for mask.tif, psf.tif, camera.json and preview.png."""
     recipe: Path | None = None
-    """TOML file with options of this command; those on the command line go before."""
+    """TOML file with options of this command; options on the command line take precedence."""
     sensitivity: bool = False
-    """Say how alike the PSFs of nearer, farther and off-axis points are. Takes several times as long."""
+    """Compare the PSFs of nearer, farther and off-axis points with this one. Takes several times as long."""
     gds: bool = False
-    """Write mask.gds too: one layer a lithography mask."""
+    """Also write mask.gds: one layer per lithography mask."""
     stl: bool = False
-    """Write mask.stl too: a closed body in um."""
+    """Also write mask.stl: a closed body in um."""
     stl_every: int = 1
-    """Take one sample of so many along each axis for the STL."""
+    """Use every n-th sample along each axis for the STL, which can have 4 million samples."""
 
     def write(self, name: str, mask: MaskDesign, setup: Setup) -> None:
-        """Design, write, and say what came out."""
+        """Compute the mask and its PSF, write the files, print a summary."""
         from mwdn.optics.design import check_replaced, design_camera
         from mwdn.optics.mask_files import write_gds, write_stl
 
@@ -66,8 +66,9 @@ class Output:
         light = ", ".join(f"{part:.1%}" for part in made["light_on_sensor"])
         field = " x ".join(f"{angle:.0f}" for angle in made["field_degrees"])
         console.print(
-            f"PSF {made['psf_hash']}: {light} of the aperture's light, resolution {made['resolution_mrad']:.1f} mrad, "
-            f"field {field} degrees. Use it: --psf {self.out / 'psf.tif'} --background 0",
+            f"PSF {made['psf_hash']}: {light} of the aperture's light on the sensor, resolution "
+            f"{made['resolution_mrad']:.1f} mrad, field {field} degrees. Use it: "
+            f"--psf {self.out / 'psf.tif'} --background 0",
             highlight=False,
             markup=False,
             soft_wrap=True,
@@ -75,7 +76,7 @@ class Output:
 
 
 Flat = Parameter(name="*")
-"""Its fields are options of the command."""
+"""Makes each field of a dataclass an option of the command."""
 
 
 @design.command
@@ -85,7 +86,7 @@ def contour(
     setup: Annotated[Setup, Flat] = Setup(),
     output: Output = Output(),
 ) -> None:
-    """Contour phase mask: levels that concentrate light onto thin lines. The defaults are the paper's camera."""
+    """Contour phase mask: light concentrated onto thin lines. The defaults are the paper's camera."""
     output.write("contour", mask, setup)
 
 
@@ -107,7 +108,7 @@ def lenslets(
     setup: Annotated[Setup, Flat] = Setup(),
     output: Output = Output(),
 ) -> None:
-    """Small lenses at random places: a cloud of dots."""
+    """Small lenses at random places: a PSF of dots."""
     output.write("lenslets", mask, setup)
 
 
@@ -129,7 +130,7 @@ def coded(
     setup: Annotated[Setup, Flat] = Setup(),
     output: Output = Output(),
 ) -> None:
-    """Separable coded aperture: squares by a maximum-length sequence or a MURA."""
+    """Coded aperture: squares from a maximum-length sequence (MLS) or a MURA."""
     output.write("coded", mask, setup)
 
 

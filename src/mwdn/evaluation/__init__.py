@@ -1,4 +1,4 @@
-"""Metrics, protocols and the comparison of methods."""
+"""Metrics, protocols, and the comparison of methods."""
 
 from mwdn.evaluation.consistency import Consistency, consistency
 from mwdn.evaluation.evaluate import First, evaluate, learnable_numbers

@@ -1,4 +1,4 @@
-"""AlexNet's features and the heads of LPIPS: two small networks with public, frozen weights."""
+"""The features of AlexNet and the heads of LPIPS, with public, frozen weights."""
 
 import hashlib
 import logging
@@ -19,16 +19,16 @@ from mwdn.types import Image
 from mwdn.weights.checkpoint import first_difference, read_plain
 
 SMALLEST = 31
-"""Pixels along each axis below which relu3 to relu5 would be empty: 31 -> 7 (stride 4) -> 3 -> 1 (pooled)."""
+"""Least pixels along each axis: 31 -> 7 (stride 4) -> 3 -> 1 (pooled); with fewer, relu3 to relu5 are empty."""
 
 CHANNELS = 64, 192, 384, 256, 256
-"""Of relu1 to relu5."""
+"""Channels of relu1 to relu5."""
 
 _Network = TypeVar("_Network", bound=nn.Module)
 
 
 class AlexNet(nn.Module):
-    """The convolutions of AlexNet; their keys in a state dict are torchvision's, ``features.N.weight``.
+    """The convolutions of AlexNet, with torchvision's keys in the state dict, ``features.N.weight``.
 
     References:
         A. Krizhevsky, "One weird trick for parallelizing convolutional neural networks", arXiv:1404.5997 (2014).
@@ -56,7 +56,7 @@ class AlexNet(nn.Module):
 
         Args:
             image: (B, 3, H, W), or (B, 1, H, W), which is repeated; scaled by the caller.
-            last: where to stop; relu5 unless given.
+            last: number of the last ReLU to compute; relu5 unless given.
 
         Returns:
             relu1 to relu``last``, (B, `CHANNELS`, h, w), h and w about H and W over 4, 8, 16, 16, 16.
@@ -67,48 +67,48 @@ class AlexNet(nn.Module):
         if image.shape[1] not in (1, 3) or min(image.shape[-2:]) < SMALLEST:
             raise ShapeError(
                 f"`image` {tuple(image.shape)} must have 1 or 3 channels and at least {SMALLEST} x {SMALLEST} pixels "
-                "for AlexNet. Take a larger part, or leave out `feature_mse` and `lpips`."
+                "for AlexNet. Use a larger part, or leave out `feature_mse` and `lpips`."
             )
-        value, found = image.expand(-1, 3, -1, -1), []
+        value, outputs = image.expand(-1, 3, -1, -1), []
         for layer in self.features:
             value = layer(value)
             if isinstance(layer, nn.ReLU):
-                found.append(value)
-            if len(found) == last:
+                outputs.append(value)
+            if len(outputs) == last:
                 break
-        return found
+        return outputs
 
 
 class Heads(nn.Module):
-    """The five learned 1x1 convolutions of LPIPS 0.1, which weigh the channels of AlexNet's features.
+    """The five learned 1x1 convolutions of LPIPS 0.1, which weight the channels of AlexNet's features.
 
-    Their keys in a state dict are those of the public file, ``linN.model.1.weight``.
+    The keys in the state dict are those of the public file, ``linN.model.1.weight``.
     """
 
     def __init__(self) -> None:
         super().__init__()
         for i, channels in enumerate(CHANNELS):
-            # The public file counts a dropout as layer 0.
+            # In the public file, layer 0 is a dropout.
             layer = nn.ModuleDict({"model": nn.ModuleDict({"1": nn.Conv2d(channels, 1, 1, bias=False)})})
             self.add_module(f"lin{i}", layer)
 
     def forward(self, differences: Sequence[Tensor]) -> Tensor:
-        """Weigh squared differences (B, `CHANNELS`, h, w), average each over its pixels and add them: (B,)."""
+        """Weighted sum of squared differences (B, `CHANNELS`, h, w), each averaged over its pixels: (B,)."""
         convolutions = [module for module in self.modules() if isinstance(module, nn.Conv2d)]
-        maps = [weigh(difference) for weigh, difference in zip(convolutions, differences, strict=True)]
-        return torch.stack([each.mean((1, 2, 3)) for each in maps]).sum(0)
+        maps = [convolution(difference) for convolution, difference in zip(convolutions, differences, strict=True)]
+        return torch.stack([weighted.mean((1, 2, 3)) for weighted in maps]).sum(0)
 
 
 @dataclass(frozen=True)
 class _Public:
-    """Weights that somebody else publishes."""
+    """A public weights file."""
 
     what: str
     file: str
     variable: str
     address: str
     sha256: str
-    """Its first digits."""
+    """The first digits of the file's SHA-256."""
     mebibytes: int
 
 
@@ -120,7 +120,7 @@ _ALEXNET = _Public(
     "7be5be79",
     233,
 )
-# The publisher names no checksum; this is of the file that torchmetrics ships and of the project's own copy.
+# The publisher gives no checksum; this is the one of the file that torchmetrics ships.
 _HEADS = _Public(
     "the heads of LPIPS",
     "lin_v0.1_alex.pth",
@@ -132,7 +132,7 @@ _HEADS = _Public(
 
 
 def cache_folder() -> Path:
-    """Where public weights are kept between runs: ``~/.cache/mwdn``."""
+    """Folder where downloaded weights are kept: ``~/.cache/mwdn``."""
     return Path.home() / ".cache" / "mwdn"
 
 
@@ -140,44 +140,44 @@ def load_alexnet(path: str | Path | None = None) -> AlexNet:
     """Load AlexNet with its ImageNet weights, frozen, in evaluation mode, on the CPU.
 
     Args:
-        path: a state dict with torchvision's keys; a whole AlexNet or its convolutions. Unless given, the file
-            that the environment names in ``MWDN_ALEXNET``, else ``~/.cache/mwdn/alexnet-owt-7be5be79.pth``, which
+        path: a state dict with torchvision's keys, of the whole AlexNet or of its convolutions. Unless given, the file
+            named by the environment variable ``MWDN_ALEXNET``, else ``~/.cache/mwdn/alexnet-owt-7be5be79.pth``, which
             is downloaded once (233 MiB) and checked.
 
     Raises:
-        CheckpointError: no file, and no way to download it; or not these weights.
+        CheckpointError: the file is missing and cannot be downloaded, or holds other weights.
     """
-    return _filled(AlexNet(), _locate(_ALEXNET, path), "features.")
+    return _load_weights(AlexNet(), _locate(_ALEXNET, path), "features.")
 
 
 def load_heads(path: str | Path | None = None, *, alexnet: str | Path | None = None) -> Heads:
     """Load the calibrated heads of LPIPS 0.1 for AlexNet, frozen, in evaluation mode, on the CPU.
 
     Args:
-        path: the public ``lin_v0.1_alex.pth``. Unless given, the file that the environment names in
-            ``MWDN_LPIPS``, else one of that name beside AlexNet's, else in ``~/.cache/mwdn``, to where it is
-            downloaded once (6 kB) and checked.
+        path: the public ``lin_v0.1_alex.pth``. Unless given, the file named by the environment variable
+            ``MWDN_LPIPS``, else ``lin_v0.1_alex.pth`` beside AlexNet's file, else the one in ``~/.cache/mwdn``, which
+            is downloaded once (6 kB) and checked.
         alexnet: the path given to `load_alexnet`, if any.
 
     Raises:
-        CheckpointError: no file, and no way to download it; or not these weights.
+        CheckpointError: the file is missing and cannot be downloaded, or holds other weights.
     """
     neighbour = alexnet or os.environ.get(_ALEXNET.variable)
     beside = Path(neighbour).with_name(_HEADS.file) if neighbour else None
     if path is None and _HEADS.variable not in os.environ and beside and beside.is_file():
         path = beside
-    return _filled(Heads(), _locate(_HEADS, path), "lin")
+    return _load_weights(Heads(), _locate(_HEADS, path), "lin")
 
 
 def _locate(public: _Public, path: str | Path | None) -> Path:
-    named = path or os.environ.get(public.variable)
-    if named:
-        if not Path(named).is_file():
+    chosen = path or os.environ.get(public.variable)
+    if chosen:
+        if not Path(chosen).is_file():
             origin = f" (from {public.variable})" if path is None else ""
             raise CheckpointError(
-                f"No weights of {public.what} at `{named}`{origin}. Correct the path or leave it out."
+                f"No weights of {public.what} at `{chosen}`{origin}. Correct the path, or leave it out to download."
             )
-        return Path(named)
+        return Path(chosen)
     cached = cache_folder() / public.file
     if not cached.is_file():
         _download(public, cached)
@@ -185,7 +185,7 @@ def _locate(public: _Public, path: str | Path | None) -> Path:
 
 
 def _download(public: _Public, path: Path) -> None:
-    # Shown on the error stream even where nobody has set up logging: 233 MiB take a while.
+    # A warning, which reaches the error stream even without logging set up: 233 MiB take a while.
     logging.getLogger(__name__).warning(
         "Downloading %s (%d MiB, once) from %s", public.what, public.mebibytes, public.address
     )
@@ -194,19 +194,19 @@ def _download(public: _Public, path: Path) -> None:
             digest = _fetch(public.address, temporary)
             if not digest.startswith(public.sha256):
                 raise CheckpointError(
-                    f"{public.address} gave a file whose SHA-256 starts with {digest[:8]} instead of "
-                    f"{public.sha256[:8]}: damaged or replaced on its way. Try again, or from another network."
+                    f"The SHA-256 of {public.address} must start with {public.sha256[:8]}, but starts with "
+                    f"{digest[:8]}: damaged or replaced on its way. Try again, or use another network."
                 )
     except (OSError, HTTPException) as error:
         raise CheckpointError(
-            f"The weights of {public.what} are not at `{path}` and cannot be downloaded ({error}). Where there is a "
-            f"network: `curl -fL -o {public.file} {public.address}`; then copy the file here and "
+            f"The weights of {public.what} are not at `{path}` and cannot be downloaded ({error}). On a computer with "
+            f"internet access run `curl -fL -o {public.file} {public.address}`, copy the file to this one, then "
             f"`export {public.variable}=/PATH/TO/{public.file}`."
         ) from error
 
 
 def _fetch(address: str, path: Path) -> str:
-    """Write what is at an address to a file and return its SHA-256."""
+    """Download a file and return its SHA-256."""
     digest = hashlib.sha256()
     with urlopen(address, timeout=30) as reply, path.open("wb") as file:
         while block := reply.read(2**20):
@@ -215,7 +215,7 @@ def _fetch(address: str, path: Path) -> str:
     return digest.hexdigest()
 
 
-def _filled(network: _Network, path: Path, prefix: str) -> _Network:
+def _load_weights(network: _Network, path: Path, prefix: str) -> _Network:
     content = read_plain(path)
     try:
         network.load_state_dict({key: value for key, value in content.items() if key.startswith(prefix)})

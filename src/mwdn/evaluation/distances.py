@@ -1,8 +1,8 @@
-"""Distances between pictures, one number a sample.
+"""Distances between pictures, one number per sample.
 
-All of them are computed in float32, also inside autocast, on the device of the pictures, and are differentiable:
-their gradients are finite, also between identical pictures. (AlexNet's convolutions on a GPU follow torch's setting
-for TF32, which costs the third digit.)
+All are computed in float32, also inside autocast, on the device of the pictures. All are differentiable, with finite
+gradients even between identical pictures. (On a GPU, AlexNet's convolutions follow torch's TF32 setting, which costs
+the third digit.)
 """
 
 import math
@@ -21,7 +21,7 @@ _Distance = TypeVar("_Distance", bound=Callable[..., Tensor])
 
 
 def _comparing(distance: _Distance) -> _Distance:
-    """Refuse pictures of different shapes, and compute in float32 outside autocast."""
+    """Check that the shapes agree, and compute in float32 outside autocast."""
 
     @wraps(distance)
     def wrapped(image: Tensor, reference: Tensor, *networks: nn.Module, **named: nn.Module) -> Tensor:
@@ -74,7 +74,7 @@ def l1(image: Image, reference: Image) -> Tensor:
 def log_mse(image: Image, reference: Image) -> Tensor:
     """Logarithm to base 10 of each sample's mean squared error: minus a tenth of its PSNR in dB.
 
-    `mse` is decided by the samples that are spoiled most; here a decibel counts the same in each.
+    The worst samples dominate a mean of `mse`; here a decibel counts the same in every sample.
 
     Args:
         image: (B, C, H, W), any range.
@@ -87,7 +87,7 @@ def log_mse(image: Image, reference: Image) -> Tensor:
         ShapeError: the shapes differ.
 
     References:
-        L. Chen et al., "Simple baselines for image restoration", ECCV (2022), whose networks learn from PSNR.
+        L. Chen et al., "Simple baselines for image restoration", ECCV (2022), which trains networks on PSNR.
     """
     return mse(image, reference).clamp(min=1e-8).log10()
 
@@ -100,7 +100,7 @@ WINDOW = 11
 def ssim(image: Image, reference: Image) -> Tensor:
     """Structural similarity of each sample, in a Gaussian window of 11 x 11 pixels, sigma 1.5, for a range of 1.
 
-    Averaged over colours and over all windows that lie wholly inside the picture. It equals scikit-image's
+    Averaged over channels and over all windows inside the picture, as scikit-image's
     ``structural_similarity(gaussian_weights=True, use_sample_covariance=False, data_range=1)``. torchmetrics also
     counts windows that reach into a reflected border, which changes the second decimal place of small pictures.
 
@@ -109,7 +109,7 @@ def ssim(image: Image, reference: Image) -> Tensor:
         reference: of the same shape.
 
     Returns:
-        (B,), at most 1, for identical pictures; larger is more similar. As a loss, `Loss` takes 1 - SSIM.
+        (B,), at most 1, for identical pictures; larger is more similar. The loss is 1 - SSIM.
 
     Raises:
         ShapeError: the shapes differ, or a side is shorter than 11 pixels.
@@ -130,26 +130,26 @@ def ssim(image: Image, reference: Image) -> Tensor:
 
 
 def _blurred(planes: Tensor) -> Tensor:
-    """Average (..., H, W) in each Gaussian window that fits: (..., H - 10, W - 10)."""
+    """Gaussian average of (..., H, W) over each window inside the picture: (..., H - 10, W - 10)."""
     weights = [math.exp(-0.5 * ((i - WINDOW // 2) / 1.5) ** 2) for i in range(WINDOW)]
-    # Shifted sums, four times as fast as `conv2d` on a CPU. On a GPU, where convolutions round to TF32, variances
-    # as differences of squares would lose all their digits.
+    # Shifted sums are four times as fast as `conv2d` on a CPU. On a GPU, convolutions may round to TF32, and the
+    # variances, differences of nearly equal squares, would lose all their digits.
     for axis in (-2, -1):
-        fitting = planes.shape[axis] - WINDOW + 1
-        blurred = planes.narrow(axis, 0, fitting) * (weights[0] / sum(weights))
+        length = planes.shape[axis] - WINDOW + 1
+        blurred = planes.narrow(axis, 0, length) * (weights[0] / sum(weights))
         for i in range(1, WINDOW):
-            blurred.add_(planes.narrow(axis, i, fitting), alpha=weights[i] / sum(weights))
+            blurred.add_(planes.narrow(axis, i, length), alpha=weights[i] / sum(weights))
         planes = blurred
     return planes
 
 
 @_comparing
 def feature_mse(image: Image, reference: Image, alexnet: AlexNet) -> Tensor:
-    """Mean squared error of AlexNet's features relu2 plus that of relu4, of each sample.
+    """Mean squared error of AlexNet's relu2 features plus that of relu4, of each sample.
 
-    This is what the MWDN paper and its public code call LPIPS, in training and in tables; `lpips` is another
-    number. Pictures enter as they are, without the normalisation of ImageNet. (The authors' files are BGR, and so
-    are the pictures behind their published numbers.)
+    The MWDN paper and its public code call this number LPIPS, in training and in tables; it is not `lpips`. Pictures
+    are not normalised as for ImageNet. (The authors' files are BGR, and so are the pictures behind their published
+    numbers.)
 
     Args:
         image: (B, 1 or 3, H, W), nominally in [0, 1], at least 31 x 31 pixels; grey is repeated.
@@ -166,17 +166,17 @@ def feature_mse(image: Image, reference: Image, alexnet: AlexNet) -> Tensor:
         Eq. (3) of the MWDN paper.
     """
     pairs = zip(alexnet(image, 4), alexnet(reference, 4), strict=True)
-    relu = [(found - wanted).square().mean((1, 2, 3)) for found, wanted in pairs]
+    relu = [(a - b).square().mean((1, 2, 3)) for a, b in pairs]
     return relu[1] + relu[3]
 
 
 @_comparing
 def lpips(image: Image, reference: Image, alexnet: AlexNet, heads: Heads) -> Tensor:
-    """LPIPS 0.1 of each sample: calibrated distance of AlexNet's features.
+    """LPIPS 0.1 of each sample: calibrated distance between AlexNet's features.
 
     Args:
-        image: (B, 1 or 3, H, W) in [0, 1], at least 31 x 31 pixels; grey is repeated. LPIPS was calibrated on the
-            numbers of sRGB files, not on linear light.
+        image: (B, 1 or 3, H, W) in [0, 1], at least 31 x 31 pixels; grey is repeated. LPIPS was calibrated on
+            sRGB values, not on linear light.
         reference: of the same shape.
         alexnet: from `mwdn.evaluation.alexnet.load_alexnet`, on the device of the pictures.
         heads: from `mwdn.evaluation.alexnet.load_heads`, on the same device.
@@ -191,13 +191,13 @@ def lpips(image: Image, reference: Image, alexnet: AlexNet, heads: Heads) -> Ten
         R. Zhang et al., "The unreasonable effectiveness of deep features as a perceptual metric", CVPR (2018),
         eq. (1).
     """
-    # LPIPS wants [-1, 1]; this shift and scale are ImageNet's mean and deviation, carried over to that range.
+    # LPIPS takes pictures in [-1, 1]; shift and scale are ImageNet's mean and standard deviation for that range.
     shift = image.new_tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1)
     scale = image.new_tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1)
-    found, wanted = (alexnet((2 * picture - 1 - shift) / scale) for picture in (image, reference))
-    return heads([(_unit(a) - _unit(b)).square() for a, b in zip(found, wanted, strict=True)])
+    features = (alexnet((2 * picture - 1 - shift) / scale) for picture in (image, reference))
+    return heads([(_unit_norm(a) - _unit_norm(b)).square() for a, b in zip(*features, strict=True)])
 
 
-def _unit(features: Tensor) -> Tensor:
+def _unit_norm(features: Tensor) -> Tensor:
     # `vector_norm` has the gradient 0 where all channels are 0, where a square root would give NaN.
     return features / (torch.linalg.vector_norm(features, dim=1, keepdim=True) + 1e-10)

@@ -1,4 +1,4 @@
-"""The comparison of methods on one set of pairs, under one protocol."""
+"""Compare methods on one set of pairs under one protocol."""
 
 import ctypes
 import sys
@@ -19,13 +19,13 @@ from mwdn.evaluation.metrics import METRICS, Perceptual, Protocol, Variant, meas
 from mwdn.evaluation.report import Report, Scores
 from mwdn.types import Measurement, Scene
 
-Bound = Callable[[Measurement], Scene]
-"""A method bound to its camera, (1, C, H, W) to (1, C, H, W): a `Reconstructor`, or any function like it."""
+Method = Callable[[Measurement], Scene]
+"""Reconstruction for one camera, (1, C, H, W) to (1, C, H, W): a `Reconstructor`, or any such function."""
 
 
 @typing.runtime_checkable
 class Pairs(typing.Protocol):
-    """Pairs (measurement, scene), each (C, H, W), by their positions: a list or a `PairFile`."""
+    """Pairs (measurement, scene), each (C, H, W), by index: a list or a `PairFile`."""
 
     def __len__(self) -> int: ...
 
@@ -34,14 +34,14 @@ class Pairs(typing.Protocol):
 
 @dataclass(frozen=True)
 class First:
-    """The first pairs of many, read only when asked for.
+    """The first pairs of a sequence, read when indexed.
 
     Args:
-        pairs: all of them.
-        count: how many to keep; all, if there are no more.
+        pairs: the sequence.
+        count: number of pairs, at most.
 
     Raises:
-        ParameterError: fewer than one.
+        ParameterError: `count` is below 1.
     """
 
     pairs: Pairs
@@ -59,7 +59,7 @@ class First:
 
 
 def evaluate(
-    methods: Mapping[str, Bound],
+    methods: Mapping[str, Method],
     pairs: Pairs,
     protocol: Protocol,
     *,
@@ -68,24 +68,24 @@ def evaluate(
     shown: int = 4,
     progress: Callable[[str, int], None] | None = None,
 ) -> Report:
-    """Reconstruct every measurement by every method, one at a time, and compare with the scenes.
+    """Reconstruct every measurement with every method, one at a time, and compare with the scenes.
 
     Args:
-        methods: by the names that the report shall use.
+        methods: by their names in the report.
         pairs: measurements and scenes; scenes in [0, 1], of the size of the reconstructions.
-        protocol: the part of each picture that counts.
-        variant: what is done to a reconstruction first; that of the protocol unless given.
-        perceptual: networks for `lpips` and `feature_mse`; unless given they are found or downloaded, and what
-            cannot be had, or needs larger pictures, is reported as missing.
-        shown: number of pictures that the report keeps for its sheet.
-        progress: called with the method's name and the position of each picture that is done.
+        protocol: the part of each picture that is compared.
+        variant: adjustment of a reconstruction before the comparison; the protocol's unless given.
+        perceptual: networks for `lpips` and `feature_mse`; loaded or downloaded unless given. Metrics without weights,
+            or with too small pictures, are reported as missing.
+        shown: number of pictures that the report keeps for its contact sheet.
+        progress: called with the method's name and the picture's index after each picture.
 
     Raises:
-        ParameterError: no method or no pair, or a pair holds NaN or infinity.
-        ShapeError: a reconstruction and its scene differ in shape, or the protocol does not fit.
+        ParameterError: no method, no pair, or NaN or infinity in a pair.
+        ShapeError: a reconstruction and its scene differ in shape, or the protocol's part exceeds them.
     """
     if not methods:
-        raise ParameterError("`methods` must not be empty. Name one: admm, wiener, universal, or a checkpoint's path.")
+        raise ParameterError("`methods` must not be empty. Name one: admm, wiener, universal, or a checkpoint.")
     _check(pairs)
     if min(protocol.crop(pairs[0][1][None]).shape[-2:]) < SMALLEST:
         perceptual = Perceptual.none(f"the part {protocol.name} has less than {SMALLEST} pixels a side, for AlexNet")
@@ -101,9 +101,9 @@ def evaluate(
             measurement, scene = pairs[i]
             reconstruction, elapsed = _timed(method, measurement[None])
             seconds.append(elapsed)
-            found = measure(reconstruction.cpu(), scene[None], protocol, variant=variant, perceptual=perceptual)
-            for metric, value in found.items():
-                values[metric].append(value.item())
+            numbers = measure(reconstruction.cpu(), scene[None], protocol, variant=variant, perceptual=perceptual)
+            for metric, number in numbers.items():
+                values[metric].append(number.item())
             if i < len(rows):
                 rows[i].append(reconstruction.cpu())
             if progress:
@@ -114,31 +114,31 @@ def evaluate(
 
 
 def _check(pairs: Pairs) -> None:
-    """Find what no method can be judged by before the first one is."""
+    """Check all pairs before the first reconstruction."""
     if not len(pairs):
-        raise ParameterError("`pairs` must not be empty: the file holds none. Make it again, with `mwdn import`.")
+        raise ParameterError("`pairs` must not be empty: the file holds none. Make it anew with `mwdn import`.")
     for i in range(len(pairs)):
         for name, picture in zip(NAMES, pairs[i], strict=True):
             if not picture.isfinite().all():
                 raise ParameterError(
-                    f"The {name} of pair {i}, counted from 0, holds NaN or infinity. Make the file again without it."
+                    f"The {name} of pair {i}, counted from 0, holds NaN or infinity. Make the file anew without it."
                 )
 
 
-def learnable_numbers(method: Bound) -> int:
-    """Parameters of the network inside a method; 0 where there is none."""
+def learnable_numbers(method: Method) -> int:
+    """Number of parameters of the network inside a method; 0 without a network."""
     network = getattr(method, "method", method)
     return sum(p.numel() for p in network.parameters()) if isinstance(network, nn.Module) else 0
 
 
-def _device(method: Bound) -> torch.device:
-    """Where a method computes: its ``device``, or else the CPU."""
+def _device(method: Method) -> torch.device:
+    """The ``device`` of a method; the CPU if it has none."""
     return torch.device(getattr(method, "device", "cpu"))
 
 
 @torch.no_grad()
-def _timed(method: Bound, measurement: Measurement) -> tuple[Scene, float]:
-    """Reconstruct, and take the seconds with the way to the device and back."""
+def _timed(method: Method, measurement: Measurement) -> tuple[Scene, float]:
+    """Reconstruct; returns the result and the seconds, transfers to and from the device included."""
     device = _device(method)
     _synchronise(device)
     start = time.perf_counter()
@@ -152,30 +152,30 @@ def _synchronise(device: torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
-def _warm_up(method: Bound, measurement: Measurement) -> int | None:
-    """Reconstruct twice, so that plans, caches and clocks have settled; returns the peak memory in bytes.
+def _warm_up(method: Method, measurement: Measurement) -> int | None:
+    """Reconstruct twice to fill caches and settle clocks; returns the peak memory in bytes.
 
-    On a GPU, all that torch holds there at its highest, weights included. On a CPU, by how much the memory of the
-    whole process rises above what it holds before. Where that peak cannot be forgotten (Linux can), above the highest
-    it ever held: 0 if the method needs less than another one before it.
+    On a GPU: the peak of torch's allocations, weights included. On a CPU: the rise of the process's peak resident
+    memory. Only Linux can reset that peak. Elsewhere it is the rise above all earlier peaks: 0 for a method that needs
+    less than one before it.
     """
     device = _device(method)
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
-    _forget_peak()
-    before = _highest_resident()
+    _reset_peak()
+    before = _peak_resident()
     for _ in range(2):
         _timed(method, measurement)
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
-    after = _highest_resident()
+    after = _peak_resident()
     return None if before is None or after is None or device.type != "cpu" else after - before
 
 
-def _forget_peak() -> None:
-    """Let `_highest_resident` begin again at what the process holds now; see proc_pid_clear_refs(5).
+def _reset_peak() -> None:
+    """Reset `_peak_resident` to the memory in use now; see proc_pid_clear_refs(5).
 
-    What methods before have freed, and glibc keeps for the next ones, is given back first: it would hide their need.
+    Memory that earlier methods freed and glibc kept is returned to the system first: reusing it would not count.
     """
     with suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)
@@ -183,8 +183,8 @@ def _forget_peak() -> None:
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 
 
-def _highest_resident() -> int | None:
-    """Highest resident memory of this process so far, in bytes; unknown on Windows."""
+def _peak_resident() -> int | None:
+    """Peak resident memory of this process in bytes; unknown on Windows."""
     if sys.platform == "win32":
         return None
     import resource

@@ -1,4 +1,4 @@
-"""What is compared, under which protocol, by which numbers, and how sure they are."""
+"""Protocols, metrics and their confidence intervals."""
 
 import math
 import re
@@ -16,18 +16,18 @@ from mwdn.evaluation.alexnet import AlexNet, Heads, load_alexnet, load_heads
 from mwdn.types import Image
 
 Variant = Literal["raw", "clipped", "best-gain"]
-"""What is done to a reconstruction, after the crop and before it is compared.
+"""Adjustment of a reconstruction, after the crop and before the comparison.
 
-- ``raw``: nothing.
-- ``clipped``: clipped to [0, 1], as every picture is that somebody looks at.
-- ``best-gain``: one gain and one offset a picture, by least squares over all its pixels and colours; not clipped.
-  For methods and data whose absolute brightness means nothing.
+- ``raw``: none.
+- ``clipped``: clipped to [0, 1], as for display.
+- ``best-gain``: one gain and one offset per picture, by least squares over all pixels and channels; not clipped. For
+  methods and data whose absolute brightness has no meaning.
 """
 
 VARIANTS = ("raw", "clipped", "best-gain")
 
 METRICS = ("psnr", "ssim", "lpips", "feature_mse", "mse")
-"""What `measure` gives, in the order of tables."""
+"""The metrics of `measure`, in the order of tables."""
 
 LARGER_IS_BETTER = frozenset({"psnr", "ssim"})
 
@@ -37,10 +37,10 @@ class Protocol:
     """The part of each picture that is compared.
 
     Args:
-        name: as `parse` understands it.
+        name: as for `parse`.
         centre: side of the central square, or ``None``.
-        rows: first row and the row after the last, or ``None``.
-        columns: likewise.
+        rows: first row and the row after the last one, or ``None``.
+        columns: first column and the column after the last one, or ``None``.
     """
 
     name: str = "full"
@@ -50,14 +50,14 @@ class Protocol:
 
     @classmethod
     def parse(cls, text: str) -> "Protocol":
-        """Read a protocol's name.
+        """The protocol of a name.
 
         Args:
-            text: ``full``; ``centre-128``, the paper's, or another side; or rows and columns, the end excluded,
-                such as ``60:270,60:440``, the region of interest of DiffuserCam.
+            text: ``full``; ``centre-128`` (the paper's) or another side; or rows and columns, end excluded, such as
+                ``60:270,60:440``, DiffuserCam's region of interest.
 
         Raises:
-            ParameterError: none of these, or a part without pixels.
+            ParameterError: another text, or a part without pixels.
         """
         name = text.replace(" ", "")
         if name == "full":
@@ -75,14 +75,14 @@ class Protocol:
 
     @property
     def variant(self) -> Variant:
-        """The one that goes with it unless another is asked for: the paper's central part is not clipped."""
+        """Default variant: ``raw`` for a central square, as in the paper, else ``clipped``."""
         return "raw" if self.centre else "clipped"
 
     def crop(self, image: Image) -> Tensor:
-        """Cut out the part that is compared, as a view.
+        """Crop to the part that is compared, as a view.
 
         Raises:
-            ShapeError: it does not lie inside the picture.
+            ShapeError: the part exceeds the picture.
         """
         height, width = image.shape[-2:]
         rows, columns = self.rows or (0, height), self.columns or (0, width)
@@ -99,12 +99,12 @@ class Protocol:
 
 @dataclass(frozen=True)
 class Perceptual:
-    """The networks behind `lpips` and `feature_mse`, as far as they can be had.
+    """The networks of `lpips` and `feature_mse`; ``None`` where they are not available.
 
     Args:
-        alexnet: for both.
-        heads: for `lpips` alone.
-        missing: metrics that cannot be measured, and why.
+        alexnet: features for both metrics.
+        heads: for `lpips`.
+        missing: metrics that cannot be measured, with the reason.
     """
 
     alexnet: AlexNet | None
@@ -113,7 +113,7 @@ class Perceptual:
 
     @classmethod
     def load(cls, alexnet: str | Path | None = None, heads: str | Path | None = None) -> "Perceptual":
-        """Find or download the weights; what cannot be had goes to ``missing`` with its reason.
+        """Load the weights, downloading them if necessary; metrics without weights go to ``missing``.
 
         Args:
             alexnet: file of AlexNet's weights; see `mwdn.evaluation.alexnet.load_alexnet`.
@@ -129,8 +129,8 @@ class Perceptual:
             return cls(features, None, {"lpips": str(error)})
 
     @classmethod
-    def none(cls, reason: str = "not asked for") -> "Perceptual":
-        """Neither network."""
+    def none(cls, reason: str = "not requested") -> "Perceptual":
+        """Neither network, for a reason."""
         return cls(None, None, dict.fromkeys(("lpips", "feature_mse"), reason))
 
 
@@ -142,7 +142,7 @@ def psnr(image: Image, reference: Image) -> Tensor:
         reference: of the same shape.
 
     Returns:
-        (B,); 6.02 dB more for half the error, infinite for identical pictures.
+        (B,), ``-10 log10(mse)``: half the error is 6.02 dB more; infinite for identical pictures.
 
     Raises:
         ShapeError: the shapes differ.
@@ -151,9 +151,9 @@ def psnr(image: Image, reference: Image) -> Tensor:
 
 
 def best_gain(image: Image, reference: Image) -> Image:
-    """Each picture times one gain plus one offset, so that its squared error is the least; nothing is clipped.
+    """Apply to each picture x the gain a and offset c that minimise ``|a x + c - reference|^2``; nothing is clipped.
 
-    An even picture becomes the mean of its reference. The gain may be negative.
+    ``a = cov(x, reference) / var(x)``, of either sign. A uniform picture becomes the mean of its reference.
 
     Args:
         image: (B, C, H, W), any range.
@@ -178,23 +178,23 @@ def measure(
 ) -> dict[str, Tensor]:
     """Compare reconstructions with their scenes.
 
-    Numbers are compared as they are: of scenes in linear light, LPIPS and SSIM are not those of sRGB pictures, in which
-    papers give them.
+    Values are compared as they are: for scenes in linear light, LPIPS and SSIM differ from those of sRGB pictures,
+    which papers report.
 
     Args:
-        reconstruction: (B, C, H, W), in the numbers of the scene.
+        reconstruction: (B, C, H, W), on the scale of the scene.
         scene: (B, C, H, W), in [0, 1], as the data set stores it.
         protocol: the part to compare.
-        variant: see `Variant`; that of the protocol unless given.
-        perceptual: networks on the device of the pictures; without them, `lpips` and `feature_mse` are missing.
+        variant: see `Variant`; the protocol's unless given.
+        perceptual: networks on the device of the pictures; without them `lpips` and `feature_mse` are NaN.
 
     Returns:
-        (B,) for each of `METRICS`, float32: `psnr` in dB, `ssim`, `lpips`, `feature_mse`, `mse`. NaN stands for
-        missing, and ``perceptual.missing`` says why.
+        (B,) for each of `METRICS`, float32: `psnr` in dB, `ssim`, `lpips`, `feature_mse`, `mse`. Missing values are
+        NaN, with the reason in ``perceptual.missing``.
 
     Raises:
-        ShapeError: the shapes differ, the protocol does not fit, or its part is too small for a metric.
-        ParameterError: no such variant.
+        ShapeError: the shapes differ, the part exceeds the picture, or is too small for a metric.
+        ParameterError: unknown variant.
     """
     variant = variant or protocol.variant
     if variant not in VARIANTS:
@@ -202,7 +202,7 @@ def measure(
     if reconstruction.shape != scene.shape:
         raise ShapeError(
             f"`reconstruction` {tuple(reconstruction.shape)} and `scene` {tuple(scene.shape)} must have the same "
-            "shape. Crop the scene to what the sensor sees."
+            "shape. Crop the scene to the field of view of the sensor."
         )
     image, reference = protocol.crop(reconstruction).float(), protocol.crop(scene).float()
     if variant == "clipped":
@@ -224,21 +224,21 @@ def measure(
 def bootstrap(
     values: Sequence[float] | Tensor, confidence: float = 0.95, *, resamples: int = 2000, seed: int = 0
 ) -> tuple[float, float, float]:
-    """Mean, and a confidence interval for it by the percentile bootstrap.
+    """Mean, and its confidence interval by the percentile bootstrap.
 
-    Numbers of equal count and seed are resampled alike, so two methods on the same pictures stay comparable.
+    Equal counts and seeds are resampled alike, so two methods on the same pictures stay comparable.
 
     Args:
-        values: one number a picture.
-        confidence: part of all data sets of this kind whose interval would hold the true mean.
-        resamples: data sets that are drawn, with replacement, from this one; more make the ends steadier.
-        seed: of the draws.
+        values: one number per picture.
+        confidence: probability that an interval computed in this way holds the true mean.
+        resamples: number of data sets drawn, with replacement, from this one; more make the ends more stable.
+        seed: seed of the draws.
 
     Returns:
-        Mean, lower end, upper end. The interval of few pictures, below about 20, is too narrow; of one it is empty.
+        Mean, lower end, upper end. Below about 20 pictures the interval is too narrow; of one picture it is empty.
 
     Raises:
-        ParameterError: no values, or a number outside its range.
+        ParameterError: no values, or an argument outside its range.
 
     References:
         B. Efron and R. J. Tibshirani, An Introduction to the Bootstrap (1993), section 13.3.
@@ -250,9 +250,9 @@ def bootstrap(
             f"and `resamples` ({resamples}) must be positive."
         )
     generator = torch.Generator().manual_seed(seed)
-    draws = (torch.randint(len(numbers), (len(numbers),), generator=generator) for _ in range(resamples))
-    means = torch.stack([numbers[draw].mean() for draw in draws])
+    samples = (torch.randint(len(numbers), (len(numbers),), generator=generator) for _ in range(resamples))
+    means = torch.stack([numbers[sample].mean() for sample in samples])
     tail = torch.tensor([(1 - confidence) / 2, (1 + confidence) / 2], dtype=torch.float64)
-    # The nearest draw, not one between two: infinite values (a PSNR without error) have nothing between them.
+    # The nearest mean: infinite values (the PSNR of identical pictures) cannot be interpolated.
     low, high = torch.quantile(means, tail, interpolation="nearest").tolist()
     return numbers.mean().item(), low, high

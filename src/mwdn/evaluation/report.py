@@ -1,4 +1,4 @@
-"""What a comparison found: numbers, a table, a sheet of pictures."""
+"""Results of a comparison: numbers, a table, a contact sheet."""
 
 import json
 import math
@@ -30,15 +30,15 @@ _FORMATS = {"psnr": ".2f", "ssim": ".3f", "lpips": ".3f", "feature_mse": ".4g", 
 
 @dataclass(frozen=True)
 class Scores:
-    """One method on all pictures.
+    """Results of one method on all pictures.
 
     Args:
-        values: of each metric, one number a picture; NaN where it is missing.
-        seconds: for each picture, warmed up, from the measurement in the host's memory to the reconstruction.
-        peak_bytes: memory for one picture, ``None`` where it is unknown. On a GPU the highest total of torch,
-            weights included. On a CPU what the method takes beside its weights and all that the process holds.
-        device: kind of device that the method used.
-        learnable: count of learnable numbers.
+        values: by metric, one number per picture; NaN where missing.
+        seconds: for each picture after warm-up, from the measurement in host memory to the reconstruction.
+        peak_bytes: memory for one picture, ``None`` if unknown. On a GPU the peak of torch's allocations, weights
+            included. On a CPU the rise of the process's memory, without weights.
+        device: type of device, cpu or cuda.
+        learnable: number of learnable parameters.
     """
 
     values: dict[str, tuple[float, ...]]
@@ -48,11 +48,11 @@ class Scores:
     learnable: int
 
     def summary(self, metric: str, confidence: float = 0.95) -> tuple[float, float, float]:
-        """Mean over the pictures and its confidence interval, by `bootstrap`; NaN where the metric is missing.
+        """Mean over the pictures and its confidence interval, by `bootstrap`; NaN for a missing metric.
 
         Raises:
-            UnknownNameError: no such metric.
-            ParameterError: the confidence is outside (0, 1).
+            UnknownNameError: unknown metric.
+            ParameterError: `confidence` is outside (0, 1).
         """
         if metric not in self.values:
             raise UnknownNameError("metric", metric, self.values)
@@ -60,16 +60,16 @@ class Scores:
 
     @property
     def median_seconds(self) -> float:
-        """For one picture."""
+        """Median time for one picture."""
         return statistics.median(self.seconds)
 
     def content(self) -> dict[str, Any]:
-        """Everything, with the means and their intervals, in values that JSON can hold."""
+        """All numbers, with means and intervals, as plain values for JSON."""
         return _finite(_plain(self))
 
     @classmethod
     def read(cls, content: Mapping[str, Any]) -> "Scores":
-        """From what `content` gave; an infinite PSNR is missing then."""
+        """Inverse of `content`, except that an infinite PSNR becomes NaN."""
         numbers = {m: tuple(math.nan if v is None else v for v in row) for m, row in content["values"].items()}
         seconds = tuple(content["seconds"])
         return cls(numbers, seconds, content["peak_bytes"], content["device"], content["learnable"])
@@ -81,11 +81,11 @@ class Report:
 
     Args:
         protocol: name of the part that was compared.
-        variant: what was done to reconstructions first.
+        variant: adjustment of reconstructions before the comparison.
         methods: scores by the method's name.
-        missing: metrics that could not be measured, and why.
-        rows: of the sheet: scene, measurement and one reconstruction a method, each (1, C, H, W), for the first
-            pictures.
+        missing: metrics that could not be measured, with the reason.
+        rows: of the contact sheet, one per picture: scene, measurement, then one reconstruction per method, each
+            (1, C, H, W).
     """
 
     protocol: str
@@ -96,15 +96,15 @@ class Report:
 
     @property
     def pictures(self) -> int:
-        """How many were compared."""
+        """Number of pictures compared."""
         return len(next(iter(self.methods.values())).seconds)
 
     def table(self, more: Mapping[str, Mapping[str, str]] | None = None, *, narrow: bool = False) -> Table:
-        """Means with their 95 % confidence intervals, the best in bold; time, memory, learnable numbers.
+        """Means with 95 % confidence intervals, the best in bold; time, memory, learnable parameters.
 
         Args:
-            more: further columns: by their heading, what to say of each method.
-            narrow: each number on a line of its own, for a terminal of 80 columns.
+            more: further columns: heading to text by method.
+            narrow: one number per line, for a terminal of 80 columns.
         """
         more = more or {}
         title = f"{self.pictures} pictures, protocol {self.protocol}, {self.variant}: mean [95 % confidence]"
@@ -124,14 +124,14 @@ class Report:
         return table
 
     def _missing(self) -> str:
-        """A line for each reason why metrics are missing."""
+        """One line per reason why metrics are missing."""
         names: dict[str, list[str]] = {}
         for metric, reason in self.missing.items():
             names.setdefault(reason, []).append(_TITLES[metric])
         return "\n".join(f"Without {' and '.join(titles)}: {escape(reason)}" for reason, titles in names.items())
 
     def json(self) -> str:
-        """Everything but the pictures, as JSON.
+        """All numbers as JSON.
 
         ``null`` stands for a number that is missing, and for the infinite PSNR of a picture without any error.
         """
@@ -150,14 +150,14 @@ class Report:
         return _finite(content)
 
     def sheet(self) -> Tensor:
-        """Arrange the first pictures, (1, 3, H, W) in linear light: scene, measurement, then each method."""
+        """Contact sheet of the first pictures, (1, 3, H, W) in linear light: scene, measurement, each method."""
         return contact_sheet(self.rows, ["scene", "measurement", *(Path(name).name for name in self.methods)])
 
     def write(self, out: Path) -> None:
         """Write ``report.json`` and ``comparison.png`` into a folder, atomically.
 
         Raises:
-            ImageError: the folder cannot be written to.
+            ImageError: a file cannot be written.
         """
         write_json(out / JSON, self._content())
         if self.rows:
@@ -165,13 +165,13 @@ class Report:
 
     def _best(self, metric: str) -> set[str]:
         means = {name: statistics.fmean(scores.values[metric]) for name, scores in self.methods.items()}
-        wanted = (max if metric in LARGER_IS_BETTER else min)(means.values())
-        return {name for name, mean in means.items() if mean == wanted}
+        best = (max if metric in LARGER_IS_BETTER else min)(means.values())
+        return {name for name, mean in means.items() if mean == best}
 
 
 def _cell(metric: str, summary: tuple[float, float, float], best: bool) -> str:
     mean, low, high = (format(value, _FORMATS[metric]) for value in summary)
-    # The backslash keeps rich from reading the interval as a style.
+    # The backslash keeps rich from parsing the interval as a style.
     return f"{f'[bold]{mean}[/bold]' if best else mean} \\[{low}, {high}]"
 
 
@@ -194,7 +194,7 @@ def _plain(scores: Scores) -> dict[str, Any]:
 
 
 def _finite(content: Any) -> Any:  # noqa: ANN401
-    """Replace NaN and infinity, which JSON has not, by ``None``."""
+    """Replace NaN and infinity, which JSON does not have, by ``None``."""
     if isinstance(content, dict):
         return {key: _finite(value) for key, value in content.items()}
     if isinstance(content, list | tuple):

@@ -1,4 +1,4 @@
-"""A table of the terminal on a page: the same cells as HTML or Markdown."""
+"""Convert a rich table to HTML or Markdown."""
 
 import html
 from collections.abc import Callable
@@ -8,7 +8,7 @@ from rich.text import Text
 
 
 def html_table(table: Table) -> str:
-    """A ``<table>`` with its title as caption; what is bold stays bold, and columns keep their side."""
+    """A ``<table>`` with the title as caption; bold cells and the alignment of columns are kept."""
     rows = _rows(table, html.escape, lambda text: f"<b>{text}</b>")
     styles = ["" if column.justify == "right" else ' class="left"' for column in table.columns]
     heads = "".join(
@@ -24,27 +24,27 @@ def html_table(table: Table) -> str:
 
 
 def markdown_table(table: Table) -> str:
-    """A Markdown table, its title in italics above it."""
-    heads = [_unpiped(str(column.header)) for column in table.columns]
+    """A Markdown table, with the title in italics above it."""
+    heads = [_escape_pipes(str(column.header)) for column in table.columns]
     rules = ["---:" if column.justify == "right" else "---" for column in table.columns]
-    rows = [heads, rules, *_rows(table, _unpiped, lambda text: f"**{text}**")]
+    rows = [heads, rules, *_rows(table, _escape_pipes, lambda text: f"**{text}**")]
     title = f"*{table.title}*\n\n" if table.title else ""
     return title + "\n".join("| " + " | ".join(row) + " |" for row in rows)
 
 
-def _unpiped(text: str) -> str:
+def _escape_pipes(text: str) -> str:
     return text.replace("|", "\\|")
 
 
 def _rows(table: Table, escape: Callable[[str], str], bold: Callable[[str], str]) -> list[list[str]]:
-    columns = [[_styled(cell, escape, bold) for cell in column.cells] for column in table.columns]
+    columns = [[_with_bold(cell, escape, bold) for cell in column.cells] for column in table.columns]
     return [list(row) for row in zip(*columns, strict=True)]
 
 
-def _styled(cell: object, escape: Callable[[str], str], bold: Callable[[str], str]) -> str:
+def _with_bold(cell: object, escape: Callable[[str], str], bold: Callable[[str], str]) -> str:
     text = cell if isinstance(cell, Text) else Text.from_markup(str(cell))
-    found, end = "", 0
+    result, end = "", 0
     for span in sorted(text.spans):
-        found += escape(text.plain[end : span.start]) + bold(escape(text.plain[span.start : span.end]))
+        result += escape(text.plain[end : span.start]) + bold(escape(text.plain[span.start : span.end]))
         end = span.end
-    return found + escape(text.plain[end:])
+    return result + escape(text.plain[end:])

@@ -35,8 +35,8 @@ class ZoneAperture:
     """Rings of equal area, every other one open: its shadow is a Fresnel zone pattern.
 
     Args:
-        size_mm: height and width.
-        pitch_um: distance of the samples.
+        size_mm: height and width of the mask.
+        pitch_um: sample spacing of the mask.
         zone_um: radius of the first zone: the phase of the pattern is ``pi r^2 / zone^2``, which is pi there. The
             rings are ``zone^2 / (2 r)`` wide; the finest, at the corners, set the resolution.
 
@@ -77,7 +77,7 @@ class CodedAperture:
         order: for ``mls``, of the sequence: ``2^order - 1`` squares a side (2 to 11). For ``mura``, the number of
             squares a side, a prime.
         feature_um: side of a square.
-        pitch_um: distance of the samples.
+        pitch_um: sample spacing of the mask.
 
     References:
         M. S. Asif et al., FlatCam, IEEE Trans. Comput. Imaging 3, 384 (2017), for ``mls``. S. R. Gottesman, E. E.
@@ -116,7 +116,7 @@ class Pinholes:
 
     Args:
         size_mm: height and width of the area with holes.
-        pitch_um: distance of the samples.
+        pitch_um: sample spacing of the mask.
         count: number of holes.
         diameter_um: diameter of a hole. Below about ``2 sqrt(wavelength distance)`` diffraction widens the spot again.
         seed: seed of the places.

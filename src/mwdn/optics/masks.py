@@ -21,7 +21,7 @@ class Mask:
     Args:
         kind: phase or amplitude.
         values: heights in um (phase), or transmitted amplitudes in [0, 1]. Row 0 at the top, seen from the scene.
-        pitch_um: distance of the samples.
+        pitch_um: sample spacing.
         index: refractive index n of a phase mask, the same for all wavelengths: n - 1 of fused silica changes by 2 %
             from green to the ends of the visible spectrum.
         step_um: height of one level; 0 for a continuous surface.

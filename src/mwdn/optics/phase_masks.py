@@ -21,7 +21,7 @@ class Contour:
     """A surface in a few levels that concentrates light onto thin contour lines. The defaults are the paper's mask.
 
     Args:
-        size_mm: height and width.
+        size_mm: height and width of the mask.
         pitch_um: side of a square of constant height.
         index: refractive index; 1.46 is fused silica.
         levels: number of levels; 2, 4, 8 ... take 1, 2, 3 ... etchings.
@@ -99,8 +99,8 @@ class Diffuser:
     """A smooth random surface whose hills focus light into a net of caustics.
 
     Args:
-        size_mm: height and width.
-        pitch_um: distance of the samples.
+        size_mm: height and width of the mask.
+        pitch_um: sample spacing of the mask.
         index: refractive index.
         feature_um: distance at which the correlation of the heights falls to 1/e.
         deflection_degrees: deflection of light along one axis, root mean square. The caustics are sharpest about
@@ -143,8 +143,8 @@ class Lenslets:
     """Small lenses at random places: each focuses a point of the scene, and the PSF is a cloud of dots.
 
     Args:
-        size_mm: height and width.
-        pitch_um: distance of the samples.
+        size_mm: height and width of the mask.
+        pitch_um: sample spacing of the mask.
         index: refractive index.
         spacing_um: usual distance between lenses.
         irregularity: largest displacement of a lens from its place on a square lattice, as a part of ``spacing_um``;

@@ -29,7 +29,7 @@ def retrieve_phase(
     Args:
         target: intensity on the sensor, of any scale.
         illumination: light that falls onto the mask; as many samples as ``target``.
-        pitch_um: distance of the samples.
+        pitch_um: sample spacing.
         wavelength_nm: of the light.
         distance_mm: from the mask to the sensor.
         iterations: rounds; the light on a contour mask's lines after 20 is within 1 % of that after 60.

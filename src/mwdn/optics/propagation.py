@@ -39,7 +39,7 @@ def needed_samples(inside: int, outside: int, *, pitch_um: float, wavelength_nm:
     Args:
         inside: samples of the input plane.
         outside: samples of the output plane.
-        pitch_um: distance of the samples.
+        pitch_um: sample spacing.
         wavelength_nm: of the light.
         distance_mm: between the planes.
     """
@@ -62,7 +62,7 @@ def propagate(
 
     Args:
         field: light on the first plane; darkness outside.
-        pitch_um: distance of the samples, on both planes.
+        pitch_um: sample spacing, on both planes.
         wavelength_nm: of the light.
         distance_mm: between the planes.
         size: samples of the second plane, centred opposite the first; those of the first unless given.
@@ -106,7 +106,7 @@ def angular_spectrum(grid: Size, *, pitch_um: float, wavelength_nm: float, dista
 
     Args:
         grid: samples.
-        pitch_um: distance of the samples.
+        pitch_um: sample spacing.
         wavelength_nm: of the light.
         distance_mm: negative to propagate backwards; evanescent waves decay either way.
     """
@@ -134,7 +134,7 @@ def point_source(
 
     Args:
         size: samples of the plane.
-        pitch_um: distance of the samples.
+        pitch_um: sample spacing.
         wavelength_nm: of the light.
         distance_mm: from this plane to the parallel one through the point; infinity for a plane wave.
         angle_degrees: from the axis, downwards and to the right.
@@ -184,7 +184,7 @@ def integrate(intensity: Plane, *, pitch_um: float, size: Size, pixel_um: float)
 
     Args:
         intensity: samples on the sensor's plane.
-        pitch_um: distance of the samples.
+        pitch_um: sample spacing.
         size: rows and columns of pixels; the middle of pixel ``n // 2`` is the middle of the plane.
         pixel_um: distance of the pixels.
     """

@@ -22,7 +22,7 @@ class Setup:
 
     Args:
         distance_mm: from the mask to the sensor. A larger one gives a finer angular resolution and a narrower field.
-        source_mm: from the point to the mask; infinity for a star.
+        source_mm: from the point source to the mask; infinity for a star.
         aperture_mm: height and width of the opening at the mask.
         pixels: rows and columns of the sensor.
         pixel_um: pixel pitch.

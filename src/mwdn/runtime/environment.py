@@ -1,4 +1,4 @@
-"""What this machine offers."""
+"""Describe the machine and the installed packages, for `mwdn doctor` and benchmark reports."""
 
 import os
 import platform
@@ -20,29 +20,29 @@ def _version(package: str) -> str:
         return "not installed"
 
 
-def findings() -> dict[str, str]:
-    """Everything worth knowing before one reports a problem, by its name."""
-    found = {"python": f"{platform.python_version()} on {platform.platform()}"}
-    found |= {package: _version(package) for package in _PACKAGES}
-    found["CPU"] = (
+def describe_environment() -> dict[str, str]:
+    """Versions and hardware, by name: what a bug report needs."""
+    facts = {"python": f"{platform.python_version()} on {platform.platform()}"}
+    facts |= {package: _version(package) for package in _PACKAGES}
+    facts["CPU"] = (
         f"{platform.machine()}, {os.cpu_count()} cores, instructions {torch.backends.cpu.get_cpu_capability()}"
     )
-    found["threads"] = f"{torch.get_num_threads()} (set OMP_NUM_THREADS to change)"
-    found["bfloat16 on the CPU"] = (
+    facts["threads"] = f"{torch.get_num_threads()} (set OMP_NUM_THREADS to change)"
+    facts["bfloat16 on the CPU"] = (
         "yes, in hardware" if has_bfloat16(torch.device("cpu")) else "emulated: float32 is faster"
     )
     if not torch.cuda.is_available():
-        found["GPU"] = "none that torch can use"
+        facts["GPU"] = "none that torch can use"
     for index in range(torch.cuda.device_count()):
         card = torch.cuda.get_device_properties(index)
         bfloat = "with" if has_bfloat16(torch.device("cuda", index)) else "without"
-        found[f"cuda:{index}"] = f"{card.name}, {card.total_memory / 2**30:.0f} GiB, {bfloat} bfloat16"
-    return found
+        facts[f"cuda:{index}"] = f"{card.name}, {card.total_memory / 2**30:.0f} GiB, {bfloat} bfloat16"
+    return facts
 
 
-def report(console: Console) -> None:
-    """Print the findings as a table."""
+def print_environment(console: Console) -> None:
+    """Print `describe_environment` as a table."""
     table = Table(show_header=False)
-    for name, value in findings().items():
+    for name, value in describe_environment().items():
         table.add_row(name, value)
     console.print(table)

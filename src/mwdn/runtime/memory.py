@@ -1,21 +1,21 @@
-"""Freed memory of the CPU: kept for the next array, or handed back and forth."""
+"""Keep freed CPU memory in the process, for the next arrays."""
 
 import ctypes
 import sys
 
 _MALLOPT = {"M_TRIM_THRESHOLD": (-1, -1), "M_MMAP_MAX": (-4, 0), "M_ARENA_MAX": (-8, 1)}
-"""Options of glibc's malloc.h, and what they are set to: no memory goes back, all comes from one heap."""
+"""Options of glibc's malloc.h and their values: never return memory to the system, allocate all of it on one heap."""
 
 
 def keep_memory() -> bool:
-    """Let this process keep the memory that it frees, and use it for its next arrays; for all libraries in it.
+    """Make this process keep freed memory for its next arrays, in all libraries.
 
-    Otherwise glibc asks Linux for every large array anew, and Linux fills it with zeros, page by page: of a picture of
-    1080 x 1920 that takes longer than all arithmetic. The price: the process stays as large as it ever was. The command
-    line does this.
+    By default glibc requests memory for every large array from Linux, which fills it with zeros page by page: for a
+    picture of 1080 x 1920 this takes longer than the arithmetic. The price: the process never shrinks. The command line
+    calls this function.
 
     Returns:
-        Whether it does from now on; only glibc, on Linux, can be asked.
+        Whether it succeeded; it needs glibc, on Linux.
     """
     if sys.platform != "linux":
         return False

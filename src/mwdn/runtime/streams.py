@@ -1,4 +1,4 @@
-"""Work that does not wait for other work: items prepared ahead in a thread, and the newest frame of a source."""
+"""Overlap work in threads: prefetching, and the newest frame of a live source."""
 
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
@@ -13,18 +13,18 @@ B = TypeVar("B")
 
 @contextmanager
 def prefetch(work: Callable[[A], B], items: Iterable[A], *, depth: int = 2) -> Iterator[Iterator[B]]:
-    """Work on items in a thread of their own, in order, a few ahead of whoever takes the results.
+    """Apply ``work`` to items in a thread, in order, a few items ahead of the consumer.
 
-    Stages are chained: one that computes in the caller's thread between two of these overlaps with both. Whatever
-    ends the ``with`` block ends the thread after its present item.
+    Stages can be chained: work in the caller's thread between two of them overlaps with both. At the end of the
+    ``with`` block, also on an error, the thread stops after its current item.
 
     Args:
         work: called in the thread.
-        items: taken in the caller's thread, so an item may be the result of work done there.
-        depth: at most so many items wait or are worked on, beside the one that is being taken.
+        items: iterated in the caller's thread, so an item may be a result computed there.
+        depth: largest number of items that wait or are in progress, besides the one being consumed.
 
     Yields:
-        The results in order. An error of ``work`` is raised where its result is taken.
+        An iterator over the results, in order. An error of ``work`` is raised in place of its result.
     """
     pool = ThreadPoolExecutor(1)
 
@@ -44,13 +44,13 @@ def prefetch(work: Callable[[A], B], items: Iterable[A], *, depth: int = 2) -> I
 
 
 def latest(frames: Iterable[A]) -> Generator[A, None, None]:
-    """Take the newest frame of a source whenever one is asked for; those that came meanwhile are dropped.
+    """Yield the newest frame of a source each time, and drop the frames in between.
 
-    The source runs in a thread of its own, at its own pace, and one of its frames is kept. Close the generator before
-    what it reads from: ``with camera, contextlib.closing(latest(camera)) as frames``.
+    The source is iterated in a thread, at its own pace, and only its newest frame is kept. Close the generator before
+    its source: ``with camera, contextlib.closing(latest(camera)) as frames``.
 
     Args:
-        frames: a camera, or whatever else gives frames without end; if it ends, its last frame is still given.
+        frames: a camera, or any endless iterable of frames. If it ends, its last frame is still yielded.
 
     Yields:
         Frames in order, each at most once. An error of the source is raised after its last frame.
@@ -66,7 +66,7 @@ def latest(frames: Iterable[A]) -> Generator[A, None, None]:
                 with changed:
                     newest.append(frame)
                     changed.notify()
-                del frame  # or it would live until the next one
+                del frame  # else it would stay alive until the next one
                 if closed:
                     break
         except BaseException as problem:
@@ -75,7 +75,7 @@ def latest(frames: Iterable[A]) -> Generator[A, None, None]:
             ended.append(error)
             changed.notify()
 
-    source = Thread(target=run, daemon=True)  # one that hangs must not keep the process alive
+    source = Thread(target=run, daemon=True)  # a source that hangs must not keep the process alive
     source.start()
     try:
         while True:
