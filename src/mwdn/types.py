@@ -8,7 +8,7 @@ A *frame* is an image as a file or a sensor stores it, before any of these conve
 (height, width, channel), in the numbers of the analogue-to-digital converter.
 """
 
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -46,3 +46,11 @@ Frame = npt.NDArray[Any]
 """(height, width, channel), RGB, uint8, uint16 or float, as stored."""
 
 FloatFrame = npt.NDArray[np.float32]
+
+
+@runtime_checkable
+class ArrayPicture(Protocol):
+    """A numpy array or a PIL picture: anything with numpy's array interface."""
+
+    @property
+    def __array_interface__(self) -> dict[str, Any]: ...

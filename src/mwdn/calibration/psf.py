@@ -11,8 +11,9 @@ from torch import Tensor
 
 from mwdn.calibration.frame_format import FrameFormat
 from mwdn.errors import ParameterError, PsfError, ShapeError, check_options
+from mwdn.io.formats import as_frame
 from mwdn.optics.psf import psf_hash
-from mwdn.types import Frame, Image, Measurement, Psf, Size
+from mwdn.types import ArrayPicture, Frame, Image, Measurement, Psf, Size
 
 Background = float | Literal["estimate"]
 """A level as a fraction of the full scale, or ``"estimate"``."""
@@ -72,14 +73,46 @@ class Calibration:
         """
         if "psf_binning" in fields:
             psf_bin = _renamed("psf_binning", "psf_bin", fields.pop("psf_binning"))
-        if "binning" in fields:
-            fields["bin"] = _renamed("binning", "bin", fields.pop("binning"))
-        check_options(FrameFormat, "`Calibration.from_file`", fields)
-        frames = replace(frames, **fields)
+        frames = _with_fields(frames, fields)
+        dark_frame = None if dark is None else frames.read(dark)
+        return cls._from_frame(frames.read(path), frames, dark_frame, background, psf_bin)
 
-        frame = frames.read(path)
+    @classmethod
+    def from_array(
+        cls,
+        picture: ArrayPicture,
+        frames: FrameFormat = FrameFormat(),
+        *,
+        dark: ArrayPicture | None = None,
+        background: Background = "estimate",
+        psf_bin: int | None = None,
+        **fields: Any,  # noqa: ANN401
+    ) -> "Calibration":
+        """The same from a numpy array or a PIL picture of a point source.
+
+        Args:
+            picture: (H, W) or (H, W, 1 or 3), RGB, row 0 at the top, linear in light; uint8 and uint16 up to their
+                type's maximum unless ``bit_depth`` is given, floats up to 1.
+            frames: as for `from_file`, as are the other arguments.
+            dark: frame taken with the same exposure and no light.
+            background: uniform light under the PSF.
+            psf_bin: ``bin`` of the PSF.
+            **fields: fields of `FrameFormat`.
+
+        Raises:
+            ImageError: the array has other axes or numbers.
+            MwdnError: as for `from_file`.
+        """
+        frames = _with_fields(frames, fields)
+        dark_frame = None if dark is None else as_frame(dark)
+        return cls._from_frame(as_frame(picture), frames, dark_frame, background, psf_bin)
+
+    @classmethod
+    def _from_frame(
+        cls, frame: Frame, frames: FrameFormat, dark: Frame | None, background: Background, psf_bin: int | None
+    ) -> "Calibration":
         _refuse_saturated(frames, frame)
-        dark_image = None if dark is None else frames.normalise(frames.read(dark))
+        dark_image = None if dark is None else frames.normalise(dark)
         # The PSF is flipped last, about its centre.
         psf_frames, psf_dark = replace(frames, upside_down=False), dark_image
         if psf_bin is not None and psf_bin != frames.bin:
@@ -90,7 +123,7 @@ class Calibration:
         psf = (psf - level).clamp(min=0)
         total = psf.sum((-2, -1), keepdim=True)
         if not (total > 0).all():
-            raise PsfError(_empty(path, total.flatten() > 0, level.flatten(), dark))
+            raise PsfError(_empty(total.flatten() > 0, level.flatten(), with_dark=dark is not None))
         psf = psf / total
         return cls(
             flip_rows_about_centre(psf) if frames.upside_down else psf,
@@ -124,11 +157,12 @@ class Calibration:
         """Fraction of a raw frame's pixels that are saturated; 0 for floats, which have no known maximum."""
         return self.frames.saturated(frame)[0] / (frame.shape[0] * frame.shape[1])
 
-    def correct(self, frame: Frame) -> Measurement:
+    def correct(self, frame: ArrayPicture) -> Measurement:
         """Turn a raw frame into a measurement of the PSF's size.
 
         Args:
-            frame: (H, W, C) numbers of the sensor, RGB, from `FrameFormat.read`.
+            frame: (H, W) or (H, W, C) numbers of the sensor, RGB: from `FrameFormat.read`, or another numpy array or
+                PIL picture of uint8, uint16 or floats.
 
         Returns:
             (1, C, *size), linear light; 1 is saturation.
@@ -137,7 +171,7 @@ class Calibration:
             ShapeError: the frame does not fit the PSF.
             ParameterError: a number of the frame exceeds the bit depth.
         """
-        measurement = self.frames.to_measurement(frame, self.dark)
+        measurement = self.frames.to_measurement(as_frame(frame), self.dark)
         size = measurement.shape[-2], measurement.shape[-1]
         if size != self.size:
             raise ShapeError(
@@ -172,8 +206,16 @@ def flip_rows_about_centre(psf: Psf) -> Psf:
     return flipped.roll(1, -2) if psf.shape[-2] % 2 == 0 else flipped
 
 
+def _with_fields(frames: FrameFormat, fields: dict[str, Any]) -> FrameFormat:
+    """The format with these fields replaced; a `ParameterError` names one that it does not have."""
+    if "binning" in fields:
+        fields["bin"] = _renamed("binning", "bin", fields.pop("binning"))
+    check_options(FrameFormat, "`Calibration`", fields)
+    return replace(frames, **fields)
+
+
 def _renamed(old: str, new: str, value: int | None) -> int | None:
-    warnings.warn(f"`{old}` is now called `{new}`: `{new}={value}`.", DeprecationWarning, stacklevel=3)
+    warnings.warn(f"`{old}` is now called `{new}`: `{new}={value}`.", DeprecationWarning, stacklevel=4)
     return value
 
 
@@ -195,14 +237,14 @@ def _background_level(psf: Tensor, background: Background) -> Tensor:
     return torch.full((1, psf.shape[1], 1, 1), float(background))
 
 
-def _empty(path: str | Path, has_light: Tensor, level: Tensor, dark: str | Path | None) -> str:
+def _empty(has_light: Tensor, level: Tensor, *, with_dark: bool) -> str:
     names = ["grey"] if len(has_light) == 1 else ["red", "green", "blue"]
     empty = [name for name, light in zip(names, has_light.tolist(), strict=True) if not light]
     advice = ["Expose longer"]
-    advice += [f"take the dark frame `{dark}` without light"] if dark else []
+    advice += ["take the dark frame without light"] if with_dark else []
     advice += ["give `--background 0`"] if level.max() > 0 else []
     return (
-        f"PSF `{path}` is empty: no light is left in {', '.join(empty)} after subtracting the background "
+        f"PSF is empty: no light is left in {', '.join(empty)} after subtracting the background "
         f"({', '.join(f'{v:.3g}' for v in level)} of the full scale). {', or '.join(advice)}."
     )
 

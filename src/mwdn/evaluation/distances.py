@@ -7,14 +7,14 @@ the third digit.)
 
 import math
 from collections.abc import Callable
-from functools import wraps
+from functools import cache, wraps
 from typing import TypeVar, cast
 
 import torch
 from torch import Tensor, nn
 
 from mwdn.errors import ShapeError
-from mwdn.evaluation.alexnet import AlexNet, Heads
+from mwdn.evaluation.alexnet import AlexNet, Heads, load_alexnet, load_heads
 from mwdn.types import Image
 
 _Distance = TypeVar("_Distance", bound=Callable[..., Tensor])
@@ -171,31 +171,43 @@ def feature_mse(image: Image, reference: Image, alexnet: AlexNet) -> Tensor:
 
 
 @_comparing
-def lpips(image: Image, reference: Image, alexnet: AlexNet, heads: Heads) -> Tensor:
+def lpips(image: Image, reference: Image, alexnet: AlexNet | None = None, heads: Heads | None = None) -> Tensor:
     """LPIPS 0.1 of each sample: calibrated distance between AlexNet's features.
 
     Args:
         image: (B, 1 or 3, H, W) in [0, 1], at least 31 x 31 pixels; grey is repeated. LPIPS was calibrated on
             sRGB values, not on linear light.
         reference: of the same shape.
-        alexnet: from `mwdn.evaluation.alexnet.load_alexnet`, on the device of the pictures.
-        heads: from `mwdn.evaluation.alexnet.load_heads`, on the same device.
+        alexnet: from `mwdn.evaluation.alexnet.load_alexnet`, on the device of the pictures; loaded unless given.
+        heads: from `mwdn.evaluation.alexnet.load_heads`, on the same device; loaded unless given.
 
     Returns:
         (B,), 0 for identical pictures, about 0.1 for slight and 0.7 for strong distortions.
 
     Raises:
         ShapeError: the shapes differ or do not suit AlexNet.
+        CheckpointError: the weights are not given and cannot be loaded.
 
     References:
         R. Zhang et al., "The unreasonable effectiveness of deep features as a perceptual metric", CVPR (2018),
         eq. (1).
     """
+    alexnet, heads = alexnet or _alexnet(image.device), heads or _heads(image.device)
     # LPIPS takes pictures in [-1, 1]; shift and scale are ImageNet's mean and standard deviation for that range.
     shift = image.new_tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1)
     scale = image.new_tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1)
     features = (alexnet((2 * picture - 1 - shift) / scale) for picture in (image, reference))
     return heads([(_unit_norm(a) - _unit_norm(b)).square() for a, b in zip(*features, strict=True)])
+
+
+@cache
+def _alexnet(device: torch.device) -> AlexNet:
+    return load_alexnet().to(device)
+
+
+@cache
+def _heads(device: torch.device) -> Heads:
+    return load_heads().to(device)
 
 
 def _unit_norm(features: Tensor) -> Tensor:

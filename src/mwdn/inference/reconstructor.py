@@ -3,9 +3,10 @@
 import copy
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import torch
+from torch import Tensor
 
 from mwdn import solvers
 from mwdn.calibration import Calibration
@@ -17,7 +18,7 @@ from mwdn.networks.blocks import check_channels
 from mwdn.networks.network import Network
 from mwdn.runtime.devices import select_device
 from mwdn.runtime.transfers import to_device, to_host
-from mwdn.types import Frame, Measurement, Psf, Scene
+from mwdn.types import ArrayPicture, FloatFrame, Frame, Measurement, Psf, Scene
 from mwdn.weights.bundled import BUNDLED, find_weights
 from mwdn.weights.checkpoint import SUFFIXES, load_network, read_metadata
 
@@ -209,21 +210,35 @@ class Reconstructor:
         if channels and shape[1] > 1:  # the universal networks take a grey measurement too
             check_channels(measurement, channels)
 
-    @torch.inference_mode()
-    def __call__(self, measurement: Measurement) -> Scene:
-        """Reconstruct a batch.
+    @overload
+    def __call__(self, measurement: Tensor) -> Tensor: ...
+
+    @overload
+    def __call__(self, measurement: ArrayPicture) -> FloatFrame: ...
+
+    def __call__(self, measurement: Tensor | ArrayPicture) -> Tensor | FloatFrame:
+        """Reconstruct a batch of measurements, or one raw frame.
 
         Args:
-            measurement: (B, C, H, W), as `Calibration.correct` gives it.
+            measurement: tensor (B, C, H, W), as `Calibration.correct` gives it; or a raw frame as numpy array or PIL
+                picture, (H, W) or (H, W, C), which is corrected first.
 
         Returns:
-            (B, C, H, W) on the CPU, linear light. Solvers give non-negative values; networks may leave [0, 1].
+            In linear light: (B, C, H, W) on the CPU for a tensor, (H, W, C) float32 for a raw frame. Solvers give
+            non-negative values; networks may leave [0, 1]. `mwdn.to_display` scales either for display.
 
         Raises:
             ShapeError: the measurement is no batch, does not have the size of the PSF, or has other channels than the
                 PSF or the network.
+            ImageError: the raw frame has other axes or numbers than a frame.
             ParameterError: the device has not enough memory for pictures of this size.
         """
+        if isinstance(measurement, Tensor):
+            return self._to_host(measurement)
+        return self._to_host(self.calibration.correct(measurement))[0].movedim(0, -1).numpy()
+
+    @torch.inference_mode()
+    def _to_host(self, measurement: Measurement) -> Scene:
         return to_host(self.on_device(measurement))
 
     @torch.inference_mode()

@@ -1,19 +1,28 @@
 """Contact sheets: pictures side by side, with a title above each column."""
 
+from typing import TypeVar
+
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.io.images import srgb_decode
-from mwdn.types import Image
+from mwdn.types import FloatFrame, Image
+
+_Picture = TypeVar("_Picture", Tensor, FloatFrame)
 
 
-def to_display(image: Image) -> Image:
+def to_display(image: _Picture) -> _Picture:
     """Scale each image of a batch such that all but its brightest 0.3 % of values are within [0, 1], and clip it.
 
     The absolute brightness of a reconstruction depends on the exposures of the capture and of the PSF.
+
+    Args:
+        image: (B, C, H, W), or one numpy array (H, W, C), linear light.
     """
+    if not isinstance(image, Tensor):
+        return to_display(torch.from_numpy(image)[None])[0].numpy()
     pixels = image.float().flatten(1)
     brightest = pixels.kthvalue(pixels.shape[1] - int(0.003 * pixels.shape[1])).values
     return (image / brightest.clamp(min=1e-12)[:, None, None, None]).clamp(0, 1)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mwdn.errors import ImageError
-from mwdn.types import Frame
+from mwdn.types import ArrayPicture, Frame
 
 MAX_PIXELS = 2**28
 """16,384 x 16,384, more than any sensor has. In RGB that is 1.5 GiB of uint16 or 3 GiB of float32; a header that
@@ -93,6 +93,29 @@ def _as_frame(stored: Frame, axes: tuple[int, ...]) -> Frame:
     dtype = np.dtype(np.float32) if stored.dtype.kind == "f" else stored.dtype.newbyteorder("=")
     with np.errstate(over="ignore"):  # a float64 beyond float32's range becomes infinity, which `read` refuses
         return np.array(stored.reshape(axes)[..., :3], dtype)
+
+
+def as_frame(picture: ArrayPicture) -> Frame:
+    """Bring a numpy array or a PIL picture to the axes and types of a frame; nothing is copied that fits.
+
+    Args:
+        picture: (H, W) or (H, W, C) of 1, 3 or 4 channels, RGB, row 0 at the top, uint8, uint16 or floats. Alpha is
+            dropped.
+
+    Raises:
+        ImageError: other axes or numbers; NaN or infinity; a PIL picture with a palette.
+    """
+    if getattr(picture, "mode", None) == "P":
+        raise ImageError("The picture has a palette (mode P), not colours. Convert it: `picture.convert('RGB')`.")
+    stored = np.asarray(picture)
+    try:
+        frame = stored.reshape(_frame_shape(stored.shape, stored.dtype))[..., :3]
+    except ImageError as problem:
+        raise ImageError(f"The array {problem}") from problem
+    frame = frame.astype(np.float32 if frame.dtype.kind == "f" else frame.dtype.newbyteorder("="), copy=False)
+    if frame.dtype.kind == "f" and not np.isfinite(frame).all():
+        raise ImageError("The array holds NaN or infinity. Replace them: `numpy.nan_to_num`.")
+    return frame
 
 
 def _read_npy(path: Path) -> Frame:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from mwdn.errors import ImageError, ParameterError
 from mwdn.io.files import atomic_write
-from mwdn.io.formats import decode, kind_of, read
+from mwdn.io.formats import as_frame, decode, kind_of, read
 from mwdn.types import FloatFrame, Frame, Image
 
 READABLE = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".npy"})
@@ -77,7 +77,7 @@ def read_picture(path: str | Path) -> Image:
     return torch.from_numpy(light).movedim(-1, 0)[None].expand(-1, 3, -1, -1).contiguous()
 
 
-def write_picture(path: str | Path, image: Tensor, *, bits: int = 8) -> None:
+def write_picture(path: str | Path, image: Tensor | FloatFrame, *, bits: int = 8) -> None:
     """Write a picture for display as PNG, atomically: clipped to [0, 1], encoded as sRGB, rounded.
 
     Args:
@@ -96,7 +96,7 @@ def write_picture(path: str | Path, image: Tensor, *, bits: int = 8) -> None:
     write_frame(path, encoded.astype(f"uint{bits}"))
 
 
-def write_linear(path: str | Path, image: Tensor) -> None:
+def write_linear(path: str | Path, image: Tensor | FloatFrame) -> None:
     """Write the exact float32 numbers of an image, atomically; `read_frame` returns them.
 
     Args:
@@ -165,10 +165,12 @@ def _encode_png(path: Path, frame: Frame) -> bytes:
     return data.tobytes()
 
 
-def _as_frame(path: Path, image: Tensor, *suffixes: str) -> FloatFrame:
+def _as_frame(path: Path, image: Tensor | FloatFrame, *suffixes: str) -> FloatFrame:
     """(H, W, C) float32 numbers of an image, after checks of its shape and of the suffix of ``path``."""
     if path.suffix.lower() not in suffixes:
         raise ImageError(f"`{path}` must end in {' or '.join(suffixes)}, not '{path.suffix}'. Rename it.")
+    if not isinstance(image, Tensor):
+        image = torch.from_numpy(as_frame(image)).movedim(-1, 0)
     picture = image[0] if image.ndim == 4 and len(image) == 1 else image
     fits = picture.ndim == 3 and len(picture) in (1, 3) and picture.numel() > 0
     if not (fits and picture.is_floating_point()):

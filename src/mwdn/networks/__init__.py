@@ -4,7 +4,7 @@ from typing import Any
 
 from torch import nn
 
-from mwdn.errors import UnknownNameError, check_options
+from mwdn.errors import ParameterError, UnknownNameError, check_options
 from mwdn.networks.drunet import Drunet
 from mwdn.networks.flatnet import FlatNet
 from mwdn.networks.ifin import Ifin
@@ -20,6 +20,7 @@ from mwdn.networks.updn import Updn
 from mwdn.networks.wiener import WienerNetwork
 from mwdn.networks.wiener_bank import WienerBank
 from mwdn.networks.wiener_unet import WienerUNet
+from mwdn.solvers import SOLVERS
 
 NETWORKS: dict[str, type[Network[Any]]] = {
     "wiener": WienerNetwork,
@@ -51,8 +52,11 @@ def build(name: str, **options: Any) -> nn.Module:  # noqa: ANN401
 
     Raises:
         UnknownNameError: there is no such network, or it has no such option.
+        ParameterError: the name is a solver's.
     """
     kind = NETWORKS.get(name) or DENOISERS.get(name)
+    if kind is None and name in SOLVERS:
+        raise ParameterError(f"'{name}' is a solver, not a network: `mwdn.solvers.build('{name}')`.")
     if kind is None:
         raise UnknownNameError("network", name, NETWORKS)
     check_options(kind, f"the network '{name}'", options)

@@ -35,6 +35,10 @@ class Camera:
         """Light on the sensor: the scene convolved with the PSF, cropped to the sensor."""
         return convolve(scene, self.psf, size=self.sensor_size)
 
+    def __call__(self, scene: Scene) -> Measurement:
+        """The same as `forward`."""
+        return self.forward(scene)
+
     def adjoint(self, measurement: Measurement, *, scene_size: Size | None = None) -> Scene:
         """Exact adjoint of `forward` for scenes of ``scene_size`` (the sensor's unless given)."""
         return correlate(measurement, self.psf, size=scene_size)

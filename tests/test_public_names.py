@@ -1,0 +1,128 @@
+"""What `import mwdn` offers, and arrays where people hold arrays."""
+
+import numpy as np
+import pytest
+import torch
+
+import mwdn
+from mwdn import Calibration, Camera, Reconstructor
+from mwdn.errors import ImageError, ParameterError
+
+SIZE = (32, 40)
+
+
+@pytest.fixture
+def psf():
+    """A uint16 picture (H, W, C) of a point source: a few dots on black."""
+    picture = np.zeros((*SIZE, 3), np.uint16)
+    for row, column in ((16, 20), (9, 13), (22, 31), (25, 8)):
+        picture[row, column] = 40000
+    return picture
+
+
+@pytest.fixture
+def capture(psf):
+    """A float32 capture (H, W, C) of a bright rectangle."""
+    scene = torch.zeros(1, 3, *SIZE)
+    scene[..., 10:20, 12:22] = 0.9
+    return Camera(Calibration.from_array(psf).psf)(scene)[0].movedim(0, -1).numpy()
+
+
+@pytest.mark.parametrize("name", [*mwdn.__all__, "data", "evaluation", "export", "training"])
+def test_every_name_is_there(name):
+    assert getattr(mwdn, name) is not None
+
+
+def test_an_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="nothing"):
+        _ = mwdn.nothing
+
+
+def test_a_renamed_name_still_works_and_says_the_new_one():
+    with pytest.warns(DeprecationWarning, match=r"mwdn\.to_display"):
+        assert mwdn.for_people is mwdn.to_display
+
+
+def test_an_array_in_is_an_array_out(psf, capture):
+    reconstruct = Reconstructor("wiener", Calibration.from_array(psf), device="cpu")
+    scene = reconstruct(capture)
+    assert isinstance(scene, np.ndarray)
+    assert scene.shape == (*SIZE, 3)
+    assert scene.dtype == np.float32
+    expected = reconstruct(torch.from_numpy(capture).movedim(-1, 0)[None])[0].movedim(0, -1)
+    np.testing.assert_array_equal(scene, expected.numpy())
+
+
+def test_eight_bits_are_parts_of_255(psf, capture):
+    reconstruct = Reconstructor("wiener", Calibration.from_array(psf), device="cpu", regularisation=1e-3)
+    eight = (capture * 255).round().astype(np.uint8)
+    np.testing.assert_allclose(reconstruct(eight), reconstruct(eight / np.float32(255)), atol=1e-6)
+
+
+def test_grey_arrays_have_no_axis_of_channels(psf, capture):
+    calibration = Calibration.from_array(psf[..., 0])
+    assert calibration.psf.shape == (1, 1, *SIZE)
+    assert Reconstructor("wiener", calibration, device="cpu")(capture[..., 0]).shape == (*SIZE, 1)
+
+
+def test_a_pil_picture(psf, capture):
+    Image = pytest.importorskip("PIL.Image")
+    reconstruct = Reconstructor("wiener", Calibration.from_array(psf), device="cpu")
+    eight = (capture * 255).round().astype(np.uint8)
+    picture = Image.fromarray(eight)
+    np.testing.assert_array_equal(reconstruct(picture), reconstruct(eight))
+    with pytest.raises(ImageError, match=r"convert\('RGB'\)"):
+        reconstruct(picture.convert("P"))
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda x: x.astype(np.int64), "int64"),
+        (lambda x: np.stack([x, x]), "2 x 32 x 40 x 3"),
+        (lambda x: np.where(x == x.max(), np.nan, x).astype(np.float32), "NaN"),
+        (lambda x: x[..., :2], "32 x 40 x 2"),
+    ],
+)
+def test_what_is_no_frame_is_refused(change, named, psf, capture):
+    with pytest.raises(ImageError, match=named):
+        Reconstructor("wiener", Calibration.from_array(psf), device="cpu")(change(capture))
+
+
+def test_the_psf_of_an_array_is_that_of_its_file(psf, tmp_path):
+    np.save(tmp_path / "psf.npy", psf)
+    file = Calibration.from_file(tmp_path / "psf.npy", bin=2, grey=True)
+    array = Calibration.from_array(psf, bin=2, grey=True)
+    assert file.psf_hash == array.psf_hash
+    assert file.frames == array.frames
+
+
+def test_arrays_are_written_and_scaled_as_tensors_are(capture, tmp_path):
+    tensor = torch.from_numpy(capture).movedim(-1, 0)[None]
+    np.testing.assert_array_equal(mwdn.to_display(capture), mwdn.to_display(tensor)[0].movedim(0, -1).numpy())
+    mwdn.write_picture(tmp_path / "array.png", capture)
+    mwdn.write_picture(tmp_path / "tensor.png", tensor)
+    assert (tmp_path / "array.png").read_bytes() == (tmp_path / "tensor.png").read_bytes()
+
+
+def test_a_solver_is_no_network():
+    with pytest.raises(ParameterError, match=r"mwdn\.solvers\.build\('admm'\)"):
+        mwdn.build("admm")
+
+
+@pytest.mark.parametrize("method", ["admm", "fista", "wiener"])
+def test_any_method_can_align(method, psf, capture):
+    calibration = Calibration.from_array(psf)
+    pose = mwdn.align(torch.from_numpy(capture).movedim(-1, 0)[None], calibration.psf)
+    aligned = Reconstructor(method, calibration, align=True, device="cpu")
+    moved = Reconstructor(method, Calibration(pose.move(calibration.psf)), device="cpu")
+    np.testing.assert_allclose(aligned(capture), moved(capture), rtol=1e-4, atol=1e-5)
+    np.testing.assert_array_equal(aligned.at(pose)(capture), aligned(capture))
+
+
+def test_options_belong_to_a_method_given_by_its_name(psf):
+    calibration = Calibration.from_array(psf)
+    with pytest.raises(ParameterError, match="iterations"):
+        Reconstructor(mwdn.solvers.Admm(), calibration, iterations=3)
+    with pytest.raises(ParameterError, match="'universal'"):
+        Reconstructor("universal", calibration, regularisation=1e-3)
