@@ -138,7 +138,7 @@ def test_warning_of_a_reconstructor(camera):
             TRAIN + " --pairs p.h5",
             "`--photos` (photos) and `--pairs` (p.h5) exclude each other. Leave one of them out.",
         ),
-        (TRAIN.replace("--photos photos", "--pairs p.h5"), "`p.h5` is no file"),
+        (TRAIN.replace("--photos photos", "--pairs p.h5"), "`p.h5` is not a file"),
         (TRAIN + " --captures runs", "`runs`"),
         (TRAIN.replace("train r.toml", "train r.tml"), "`r.tml` cannot be read as a recipe"),
         (TRAIN.replace("--steps 4", "--steps 0"), "`steps` (0) must be positive"),

@@ -26,8 +26,8 @@ def test_captures_are_found_in_order_and_once(tmp_path):
 
 def test_psf_dark_frame_and_hidden_files_in_a_folder_are_no_captures(tmp_path):
     a, psf, dark, _ = touch(tmp_path, "a.png", "psf.png", "dark.npy", "._a.png")
-    assert find_captures([tmp_path], apart=(psf, dark, None)) == [a]
-    assert find_captures([psf], apart=(psf,)) == [psf]  # named, so wanted
+    assert find_captures([tmp_path], exclude=(psf, dark, None)) == [a]
+    assert find_captures([psf], exclude=(psf,)) == [psf]  # named, so wanted
 
 
 def test_nothing_to_reconstruct(tmp_path):

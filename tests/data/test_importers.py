@@ -101,13 +101,13 @@ def test_damaged_rows_and_files_of_the_authors_kind(tmp_path):
     done = import_pairs("mwdn", path, tmp_path / "pairs.h5", skip_damaged=True)
     assert (done.count, list(done.skipped)) == (3, ["row 1"])
     path.write_bytes(whole[:-10])
-    with pytest.raises(ImageError, match=r"a\.h5` is no whole HDF5"):
+    with pytest.raises(ImageError, match=r"a\.h5` is not a complete HDF5"):
         import_pairs("mwdn", path, tmp_path / "other.h5", skip_damaged=True)
     with pytest.raises(ImageError, match=r"must have `blur`.* has \['measurement', 'scene'\]"):
         import_pairs("mwdn", tmp_path / "pairs.h5", tmp_path / "other.h5")
     with pytest.raises(ParameterError, match="would overwrite an input"):
         import_pairs("mwdn", path, path)
-    with pytest.raises(ImageError, match="is no file"):
+    with pytest.raises(ImageError, match="is not a file"):
         import_pairs("mwdn", tmp_path / "none.h5", tmp_path / "other.h5")
     assert not (tmp_path / "other.h5").exists()
 
@@ -223,7 +223,7 @@ def test_floats_of_another_scale_are_refused(tmp_path):
 
 
 def test_nothing_to_import(tmp_path):
-    with pytest.raises(ImageError, match=r"captures` is no folder.*--captures"):
+    with pytest.raises(ImageError, match=r"captures` is not a folder.*--captures"):
         import_pairs("folders", tmp_path, tmp_path / "pairs.h5")
     (tmp_path / "captures").mkdir()
     (tmp_path / "scenes").mkdir()
@@ -233,7 +233,7 @@ def test_nothing_to_import(tmp_path):
     with pytest.raises(ImageError, match=r"no pair to import\. 1 were skipped; .* has no partner"):
         import_pairs("folders", tmp_path, tmp_path / "pairs.h5", skip_damaged=True)
     write(tmp_path / "captures" / "a.bmp", flag())
-    with pytest.raises(ImageError, match="differ in their suffix only"):
+    with pytest.raises(ImageError, match="differ only in their suffix"):
         import_pairs("folders", tmp_path, tmp_path / "pairs.h5")
     with pytest.raises(UnknownNameError, match="Did you mean 'folders'"):
         import_pairs("folder", tmp_path, tmp_path / "pairs.h5")
@@ -302,19 +302,19 @@ def test_damaged_rows_and_shards(shards, tmp_path):
         import_pairs("parquet", shards, tmp_path / "pairs.h5")
     whole = (shards / "train-00000-of-00002.parquet").read_bytes()
     (shards / "train-00000-of-00002.parquet").write_bytes(whole[:-50])
-    with pytest.raises(ImageError, match=r"train-00000-of-00002\.parquet` is no whole parquet file"):
+    with pytest.raises(ImageError, match=r"train-00000-of-00002\.parquet` is not a complete parquet file"):
         import_pairs("parquet", shards, tmp_path / "pairs.h5")
     done = import_pairs("parquet", shards, tmp_path / "pairs.h5", skip_damaged=True)
     assert done.count == 3
     assert list(done.skipped) == ["train-00000-of-00002.parquet", "a.parquet row 0", "a.parquet row 1"]
-    assert "holds no bytes" in done.skipped["a.parquet row 1"]
+    assert "must hold the bytes" in done.skipped["a.parquet row 1"]
     with pytest.raises(ImageError, match=r"must have the columns \['x', 'lensed'\], but has \['lensless', 'lensed'\]"):
         import_pairs("parquet", shards / "a.parquet", tmp_path / "no.h5", layout=Layout(captures="x"))
 
 
 def test_the_hub_needs_its_package(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    with pytest.raises(ImageError, match=r"`owner/name` is not here.*pip install 'mwdn\[hub\]'"):
+    with pytest.raises(ImageError, match=r"`owner/name` is not on this machine.*pip install 'mwdn\[hub\]'"):
         import_pairs("parquet", "owner/name", tmp_path / "pairs.h5")
     for name in ("no/such/folder", "data/a.parquet"):
         with pytest.raises(ImageError, match="does not exist"):

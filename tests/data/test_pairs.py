@@ -178,16 +178,16 @@ def test_a_file_cut_off_anywhere_is_refused(pairs, tmp_path):
     whole = pairs[0].read_bytes()
     for size in (0, 5, 100, len(whole) // 2, len(whole) - 1):
         (tmp_path / "cut.h5").write_bytes(whole[:size])
-        with pytest.raises(ImageError, match=r"cut\.h5` is no whole HDF5 file.*mwdn import"):
+        with pytest.raises(ImageError, match=r"cut\.h5` is not a complete HDF5 file.*mwdn import"):
             PairFile(tmp_path / "cut.h5")
 
 
 def test_foreign_files_are_named(tmp_path):
     path = tmp_path / "a.h5"
-    with pytest.raises(ImageError, match=r"a\.h5` is no file"):
+    with pytest.raises(ImageError, match=r"a\.h5` is not a file"):
         PairFile(path)
     path.write_text("hello")
-    with pytest.raises(ImageError, match="is no whole HDF5"):
+    with pytest.raises(ImageError, match="is not a complete HDF5"):
         PairFile(path)
     contents = [
         ({"gt": np.zeros(1), "blur": np.zeros(1)}, "mwdn import mwdn"),
@@ -231,7 +231,7 @@ def test_wrong_calls(tmp_path, generator, unchecked):
     with create(tmp_path / "a.h5") as file:
         with pytest.raises(ShapeError, match=r"`scene` \(2 x 6 x 9 x 3 .* must be 8 x 10 x 3"):
             file.append(measurement, measurement)
-        with pytest.raises(ShapeError, match=r"`measurement` \(1\) and `scene` \(2\) must be as many"):
+        with pytest.raises(ShapeError, match=r"`measurement` \(1\) and `scene` \(2\) must match"):
             file.append(measurement[0], scene)
         with pytest.raises(ShapeError):
             file.append(torch.zeros(3), scene)

@@ -18,18 +18,22 @@ errors = Console(stderr=True)
 @Parameter(name="*")
 @dataclass(frozen=True)
 class CameraOptions:
-    """The camera's calibration and how its raw frames are stored."""
+    """The camera's PSF and the format of its raw frames.
+
+    Args:
+        psf: picture of a point source: PNG, TIFF or NPY, linear in light.
+        frames: format of the PSF, the dark frame and the captures.
+        psf_bin: the value of --bin for the PSF, if it was taken at another resolution than the captures.
+        dark: frame taken without light, subtracted from the PSF and the captures.
+        background: uniform light under the PSF, as a fraction of the full scale; estimated if not given.
+    """
 
     psf: Path
-    """Picture of a point source: PNG, TIFF or NPY, linear in light."""
     frames: Annotated[FrameFormat, Parameter(name="*")] = FrameFormat()
     _: KW_ONLY
     psf_bin: int | None = None
-    """Bin of the PSF, if it was taken at another resolution than the captures."""
     dark: Path | None = None
-    """Frame taken without light, subtracted from the PSF and the captures."""
     background: float | None = None
-    """Uniform light under the PSF, as a fraction of the full scale; estimated if not given."""
 
     def load(self) -> Calibration:
         """Read the calibration."""

@@ -1,4 +1,4 @@
-"""`mwdn inspect`: what a PSF is worth, before anything is reconstructed with it."""
+"""`mwdn inspect`: measure the quality of a PSF."""
 
 import json as format_json
 from dataclasses import replace
@@ -22,37 +22,37 @@ def inspect(
     json: Annotated[bool, Parameter(negative=())] = False,
     out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("results/inspect"),
 ) -> None:
-    """Report what a PSF is worth: exposure, background, sharpness, spectrum, noise gain, resolution.
+    """Report the quality of a PSF: exposure, background, sharpness, spectrum, noise gain, resolution.
 
     Args:
-        camera: the PSF, and how its frame is stored.
-        json: print the report as JSON instead of words.
-        out: folder for the page and the JSON, named after the PSF's file.
+        camera: the PSF and its format.
+        json: print the report as JSON instead of text.
+        out: folder for the page and the JSON file, which are named after the PSF's file.
     """
-    # matplotlib, a second to load, is needed by no other command.
+    # matplotlib takes a second to load, and no other command needs it.
     from mwdn.calibration.report_page import write_page
 
     page = out / f"{camera.psf.stem}.png"
-    beside = page.with_suffix(".json")
-    for output in (page, beside):
+    json_file = page.with_suffix(".json")
+    for output in (page, json_file):
         refuse_overwrite(output, camera.psf, camera.dark)
     calibration = at_psf_resolution(camera).load()
     check_folder(out)
     report = inspect_psf(calibration, camera.frames.read(camera.psf))
-    found = verdict(report)
+    findings = verdict(report)
     content = {
         "file": str(camera.psf),
         "headline": headline(report),
-        "verdict": [finding._asdict() for finding in found],
+        "verdict": [finding._asdict() for finding in findings],
         **report.content(),
     }
     write_page(page, report, calibration.psf, camera.psf.name)
-    write_json(beside, content)
+    write_json(json_file, content)
     if json:
         console.print(format_json.dumps(content, indent=2), highlight=False, markup=False, soft_wrap=True)
         return
     console.print(f"[bold]{escape(headline(report))}[/]", highlight=False, soft_wrap=True)
-    for weight, text in found:
+    for weight, text in findings:
         console.print(f"[{_STYLES[weight]}]{weight:4}[/] {escape(text)}", highlight=False, soft_wrap=True)
     console.print(f"Look at {page}", highlight=False, markup=False, soft_wrap=True)
 

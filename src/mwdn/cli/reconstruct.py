@@ -57,7 +57,7 @@ def reconstruct(  # noqa: PLR0913
         calibration = _load(camera)
 
         def found() -> bytes:
-            files = list_captures(captures, apart=apart)
+            files = list_captures(captures, exclude=apart)
             check_outputs(files, out, format, protected=apart)
             _check_out(out, captures, files)
             return "\0".join(files).encode(errors="surrogateescape")

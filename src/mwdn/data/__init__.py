@@ -1,4 +1,4 @@
-"""Pairs of measurement and scene: recorded, imported, simulated."""
+"""Pairs of a measurement and a scene: recorded, imported or simulated."""
 
 from mwdn.data.importers import import_pairs, read_pairs
 from mwdn.data.pairs import PairFile

@@ -1,4 +1,4 @@
-"""Real captures: where they are, and as measurements."""
+"""List captures, and read them as measurements."""
 
 import os
 from collections.abc import Iterable
@@ -12,54 +12,54 @@ from mwdn.io.images import READABLE
 from mwdn.types import Measurement
 
 
-def list_captures(paths: Iterable[str | Path], *, apart: Iterable[Path | None] = ()) -> list[str]:
-    """Files as named, and every readable file of each folder, in the order of their names; each once.
+def list_captures(paths: Iterable[str | Path], *, exclude: Iterable[Path | None] = ()) -> list[str]:
+    """List files, and the readable files of folders in alphabetical order, without duplicates.
 
-    As strings: a million of them take about 0.2 GB.
+    Strings instead of paths save memory: a million of them take about 0.2 GB.
 
     Args:
         paths: files and folders.
-        apart: files that are no captures where a folder holds them: the PSF, the dark frame. Hidden ones are none.
+        exclude: files in these folders that are not captures: the PSF, the dark frame. Hidden files are excluded too.
 
     Raises:
-        ParameterError: nothing was named, or a folder holds no picture.
+        ParameterError: ``paths`` is empty, or a folder holds no capture.
     """
-    found: list[str] = []
-    others = {path.resolve() for path in apart if path is not None}
+    captures: list[str] = []
+    excluded = {path.resolve() for path in exclude if path is not None}
     for path in map(Path, paths):
-        inside = _inside(path, others) if path.is_dir() else [str(path)]
-        if not inside:
+        files = _list_folder(path, excluded) if path.is_dir() else [str(path)]
+        if not files:
             raise ParameterError(f"The folder `{path}` holds no capture. Readable: {', '.join(sorted(READABLE))}.")
-        found += inside
-    if not found:
+        captures += files
+    if not captures:
         raise ParameterError("Name at least one capture, or a folder of captures.")
-    return list(dict.fromkeys(found))
+    return list(dict.fromkeys(captures))
 
 
-def _inside(folder: Path, others: set[Path]) -> list[str]:
-    """The captures of a folder. What it is asked of a file is in the folder's own entry, but for links."""
-    beside = {path.name for path in others if path.parent == folder.resolve()}
+def _list_folder(folder: Path, excluded: set[Path]) -> list[str]:
+    """The captures in a folder; only links are resolved, as that takes a system call per file."""
+    excluded_names = {path.name for path in excluded if path.parent == folder.resolve()}
 
     def is_capture(entry: os.DirEntry[str]) -> bool:
         if entry.name.startswith(".") or Path(entry.name).suffix.lower() not in READABLE or not entry.is_file():
             return False
-        return Path(entry.path).resolve() not in others if entry.is_symlink() else entry.name not in beside
+        return Path(entry.path).resolve() not in excluded if entry.is_symlink() else entry.name not in excluded_names
 
     start = str(folder / "x").removesuffix("x")
     with os.scandir(folder) as entries:
         return [start + name for name in sorted(entry.name for entry in entries if is_capture(entry))]
 
 
-def find_captures(paths: Iterable[str | Path], *, apart: Iterable[Path | None] = ()) -> list[Path]:
-    """The same as `list_captures`, as paths."""
-    return [Path(path) for path in list_captures(paths, apart=apart)]
+def find_captures(paths: Iterable[str | Path], *, exclude: Iterable[Path | None] = ()) -> list[Path]:
+    """`list_captures` as paths."""
+    return [Path(path) for path in list_captures(paths, exclude=exclude)]
 
 
 def read_capture(path: Path, calibration: Calibration) -> Measurement:
     """Read a raw frame as a measurement, (1, C, H, W).
 
     Raises:
-        MwdnError: it cannot be read, or does not fit the camera.
+        MwdnError: the file cannot be read, or does not fit the camera.
     """
     return calibration.correct(calibration.frames.read(path))
 
@@ -68,7 +68,7 @@ def read_captures(paths: Iterable[Path], calibration: Calibration) -> Measuremen
     """Read raw frames as one batch of measurements, (B, C, H, W).
 
     Raises:
-        MwdnError: one cannot be read, does not fit the camera, or has other channels than the first.
+        MwdnError: a file cannot be read, does not fit the camera, or has other channels than the first.
     """
     measurements: list[Measurement] = []
     for path in paths:
@@ -80,7 +80,7 @@ def read_captures(paths: Iterable[Path], calibration: Calibration) -> Measuremen
             channels = measurements[0].shape[1]
             raise ShapeError(
                 f"`{path}` ({measurement.shape[1]} channels) must have as many as the captures before it ({channels}). "
-                "Take all in one mode of the camera."
+                "Take all captures in the same mode of the camera."
             )
         measurements.append(measurement)
     return torch.cat(measurements)

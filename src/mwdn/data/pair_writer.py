@@ -1,4 +1,4 @@
-"""Writing files of pairs, which `mwdn.data.pairs` reads."""
+"""Write files of pairs, which `mwdn.data.pairs` reads."""
 
 from contextlib import ExitStack
 from pathlib import Path
@@ -14,42 +14,42 @@ from mwdn.io.files import as_image_error, atomic
 from mwdn.types import Frame
 
 Attribute = str | int | float
-"""What is worth knowing about the camera: ``psf_hash``, ``pitch_um``, anything else."""
+"""Metadata of the camera: ``psf_hash``, ``pitch_um`` or any other."""
 
 PixelType = Literal["uint8", "uint16", "float32"]
-"""How a file stores its numbers. Integers are [0, 1] times their largest one."""
+"""Type of the numbers in a file. Integers are [0, 1] times the type's maximum."""
 
 Shape = tuple[int, int, int]
-"""Height, width and channels of one sample, in the order in which the file stores them."""
+"""Height, width and channels of one sample, in the file's order of axes."""
 
 VERSION = 1
-"""Of the format, stored as the attribute `VERSION_KEY`."""
+"""Version of the format, stored as the attribute `VERSION_KEY`."""
 
 VERSION_KEY = "mwdn_pairs"
 NAMES = ("measurement", "scene")
 SUFFIXES = ".h5", ".hdf5"
 
-# A number outside this is no noise around [0, 1] but another scale, 0 to 255 for instance.
+# Numbers outside this range are not noise around [0, 1] but have another scale, for example 0 to 255.
 _LOWEST, _HIGHEST = -0.5, 1.5
 
 
 def check_path(path: Path) -> None:
-    """See that a file of pairs may have this name: never that of a picture, which it would replace.
+    """Check that a file of pairs can have this name, so that it never replaces a picture.
 
     Raises:
-        ImageError: it is a folder.
-        ParameterError: it has another suffix.
+        ImageError: the path is a folder.
+        ParameterError: it does not end in .h5 or .hdf5.
     """
     if path.is_dir():
         raise ImageError(f"`{path}` is a folder. Name a file in it: `{path / 'pairs.h5'}`.")
-    real = path.resolve()  # what a link points to is what would be replaced
+    real = path.resolve()  # writing to a link would replace its target
     if real.suffix.lower() not in SUFFIXES:
         name = real.with_suffix(".h5").name
-        raise ParameterError(f"`{real.name}` must end in .h5 or .hdf5, as files of pairs do: `{name}`.")
+        raise ParameterError(f"`{real.name}` must end in .h5 or .hdf5: `{name}`.")
 
 
 class PairWriter:
-    """A file of pairs while it is being written; `PairFile.create` makes one.
+    """A file of pairs that is being written, from `PairFile.create`.
 
     It has a hidden name in the folder of ``path`` until the ``with`` statement ends without an exception.
     """
@@ -72,7 +72,7 @@ class PairWriter:
             if not isinstance(value, str | int | float) or key == VERSION_KEY:
                 raise ParameterError(f"`attributes` must hold text and numbers; '{key}' is {type(value).__name__}.")
         self.path, self.dtype = path, np.dtype(dtype)
-        self._shapes, self._attributes, self._psf = dict(zip(NAMES, shapes, strict=True)), attributes, _stored(psf)
+        self._shapes, self._attributes, self._psf = dict(zip(NAMES, shapes, strict=True)), attributes, _psf_array(psf)
         self._stack = ExitStack()
         self._file: Any = None
         self._length = 0
@@ -98,7 +98,7 @@ class PairWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        # An exception of the ``with`` statement's own body passes through unchanged: the stack only cleans up.
+        # The stack removes the hidden file; an exception from the body of the ``with`` statement is raised unchanged.
         with as_image_error(self.path):
             self._stack.__exit__(kind, error, trace)
         self._file = None
@@ -108,20 +108,20 @@ class PairWriter:
 
         Args:
             measurement: a tensor (B, C, H, W) or (C, H, W), or an array (B, H, W, C) or (H, W, C). Floats are
-                nominally in [0, 1]; integers are parts of their type's largest number.
-            scene: likewise, as many.
+                nominally in [0, 1]; integers are fractions of their type's maximum.
+            scene: likewise, as many as measurements.
 
         Raises:
-            ShapeError: another size than the file's, or not as many scenes as measurements.
-            ParameterError: NaN, or numbers of another scale than [0, 1].
-            ImageError: the disk refuses, or the ``with`` statement has not begun or is over.
+            ShapeError: the size is not the file's, or the numbers of scenes and measurements differ.
+            ParameterError: NaN, or numbers on another scale than [0, 1].
+            ImageError: the file cannot be written, or is not open.
         """
         if self._file is None:
             raise ImageError(f"`{self.path}` is not open. Append inside `with PairFile.create(...) as file:`.")
         rows = [self._rows(name, pixels) for name, pixels in zip(NAMES, (measurement, scene), strict=True)]
         if len(rows[0]) != len(rows[1]):
             raise ShapeError(
-                f"`measurement` ({len(rows[0])}) and `scene` ({len(rows[1])}) must be as many. Append whole pairs."
+                f"`measurement` ({len(rows[0])}) and `scene` ({len(rows[1])}) must match. Append whole pairs."
             )
         end = self._length + len(rows[0])
         with as_image_error(self.path):
@@ -131,7 +131,7 @@ class PairWriter:
         self._length = end
 
     def _rows(self, name: str, pixels: Tensor | Frame) -> Frame:
-        """(B, H, W, C), in the numbers of the file."""
+        """Convert to (B, H, W, C) in the type of the file."""
         if isinstance(pixels, Tensor):
             array = pixels.detach().cpu().movedim(-3, -1).numpy() if pixels.ndim >= 3 else pixels.numpy()
         else:
@@ -140,22 +140,21 @@ class PairWriter:
         if batch.ndim != 4 or batch.shape[1:] != self._shapes[name]:
             got, wanted = (" x ".join(map(str, shape)) for shape in (array.shape, self._shapes[name]))
             raise ShapeError(
-                f"`{name}` ({got} in the order of the file: height, width, channels) must be {wanted}, as the first "
-                f"of `{self.path}`. Crop or resize it."
+                f"`{name}` ({got}: height, width, channels) must be {wanted}, as in `{self.path}`. Crop or resize it."
             )
         return quantise(batch, self.dtype, name)
 
 
 def quantise(pixels: Frame, dtype: np.dtype[Any], name: str = "pixels") -> Frame:
-    """Turn numbers of one type into those of another, 1 being the largest integer of each.
+    """Convert pixels to another type; 1 corresponds to the maximum of an integer type.
 
     Args:
         pixels: uint8, uint16, or floats nominally in [0, 1].
-        dtype: uint8 and uint16 clip to [0, 1] and round; float32 keeps what lies a little outside.
-        name: of the pixels, for the message.
+        dtype: uint8 and uint16 clip to [0, 1] and round; float32 keeps numbers slightly outside of it.
+        name: of the pixels, for the error message.
 
     Raises:
-        ParameterError: NaN, infinity, another type, or numbers of another scale.
+        ParameterError: NaN, infinity, another type, or numbers on another scale.
     """
     if pixels.dtype == dtype and dtype.kind == "u":
         return pixels
@@ -171,7 +170,7 @@ def quantise(pixels: Frame, dtype: np.dtype[Any], name: str = "pixels") -> Frame
     return np.rint(pixels.clip(0, 1) * np.float64(np.iinfo(dtype).max)).astype(dtype)
 
 
-def _stored(psf: Tensor | None) -> Frame | None:
+def _psf_array(psf: Tensor | None) -> Frame | None:
     if psf is None:
         return None
     picture = psf[0] if psf.ndim == 4 and len(psf) == 1 else psf

@@ -1,4 +1,4 @@
-"""Files of (measurement, scene) pairs: HDF5, one raw chunk a sample, read in any order by any number of workers."""
+"""Files of (measurement, scene) pairs: HDF5 with one raw chunk per sample, for random access by several workers."""
 
 import operator
 import os
@@ -16,12 +16,12 @@ from mwdn.data.pair_writer import NAMES, VERSION, VERSION_KEY, Attribute, PairWr
 from mwdn.errors import ImageError
 from mwdn.types import Psf
 
-_AGAIN = "Make it again, with `mwdn import`."
+_MAKE_AGAIN = "Make it again, with `mwdn import`."
 
 
 @dataclass(frozen=True)
 class _Header:
-    """All of a file but its pixels, read once and handed to the workers."""
+    """Everything in a file except the pixels. It is read once and passed to the workers."""
 
     length: int
     measurement_shape: Shape
@@ -30,24 +30,24 @@ class _Header:
 
 
 class PairFile(Dataset[tuple[Tensor, Tensor]]):
-    """A file of pairs, as a data set that `torch.utils.data.DataLoader` understands.
+    """A file of pairs, as a data set for `torch.utils.data.DataLoader`.
 
-    Each process opens the file for itself when it first reads, so that workers may be forked or spawned.
+    Each process opens the file on its first read, so workers can be forked or spawned.
 
     Args:
         path: HDF5 with the data sets ``measurement`` and ``scene``, both (N, H, W, C) of uint8, uint16 or float32,
-            and if it is known ``psf``, (C, H, W) of float32.
+            and optionally ``psf``, (C, H, W) of float32.
 
     Raises:
-        ImageError: no such file; damaged, cut off, or something else than pairs.
+        ImageError: no such file; damaged, cut off, or not a file of pairs.
     """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self._file: Any = None
-        self._rows: dict[str, Any] = {}  # looking a data set up by its name takes as long as reading a pair
+        self._rows: dict[str, Any] = {}  # a lookup by name takes as long as reading a pair
         self._owner = 0
-        file = _open(self.path)
+        file = _open_hdf5(self.path)
         with file:
             self._header = _read_header(self.path, file)
 
@@ -62,18 +62,18 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
         attributes: Mapping[str, Attribute] | None = None,
         psf: Tensor | None = None,
     ) -> PairWriter:
-        """Begin a new file; use it in a ``with`` statement, at whose end the file gets its name.
+        """Create a file; use it in a ``with`` statement, at the end of which the file gets its name.
 
         Args:
-            path: of the file, ending in .h5 or .hdf5. One that exists is replaced only when all has gone well.
+            path: of the file, ending in .h5 or .hdf5. An existing file is replaced only after success.
             measurement_shape: (H, W, C) of each measurement.
             scene_shape: (H, W, C) of each scene, which may be larger than the sensor.
-            dtype: of both. float32 keeps what noise pushed below 0; integers clip it.
-            attributes: of the camera.
+            dtype: of both. float32 keeps negative noise; integers clip it.
+            attributes: metadata of the camera.
             psf: (C, H, W) or (1, C, H, W), stored as float32.
 
         Raises:
-            ParameterError: the suffix, a shape, the type or an attribute is none of these.
+            ParameterError: wrong suffix, shape, type or attribute.
             ImageError: the path is a folder.
             ShapeError: the PSF has other axes.
         """
@@ -93,7 +93,7 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
 
     @property
     def attributes(self) -> dict[str, Attribute]:
-        """What the file says about its camera."""
+        """Metadata of the camera."""
         return dict(self._header.attributes)
 
     @property
@@ -108,17 +108,17 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
 
     @property
     def psf(self) -> Psf | None:
-        """(1, C, H, W), as it was given, or ``None`` if the file has none."""
-        file = self._opened()
+        """(1, C, H, W), as stored, or ``None`` if the file has none."""
+        file = self._open()
         if "psf" not in file:
             return None
         try:
             return torch.from_numpy(np.asarray(file["psf"][()], np.float32))[None]
         except (OSError, ValueError) as error:
-            raise ImageError(f"`psf` of `{self.path}` cannot be read: {error}. {_AGAIN}") from error
+            raise ImageError(f"`psf` of `{self.path}` cannot be read: {error}. {_MAKE_AGAIN}") from error
 
     def close(self) -> None:
-        """Close the file of this process; the next reading opens it again."""
+        """Close the file in this process; the next read opens it again."""
         if self._file is not None:
             self._file.close()
             self._file, self._rows = None, {}
@@ -132,37 +132,37 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_file": None, "_rows": {}}
 
-    def _opened(self) -> Any:  # noqa: ANN401
+    def _open(self) -> Any:  # noqa: ANN401
         if self._owner != os.getpid():
-            # After a fork the handle is the parent's; closing this process's copy of it does not close theirs.
+            # After a fork the handle is the parent's. Closing this copy does not close the parent's.
             self.close()
         if self._file is None:
-            self._file, self._owner = _open(self.path), os.getpid()
+            self._file, self._owner = _open_hdf5(self.path), os.getpid()
             self._rows = {name: self._file[name] for name in NAMES}
         return self._file
 
     def _read(self, name: str, number: int) -> Tensor:
         try:
-            self._opened()
+            self._open()
             stored = self._rows[name][number]
         except (OSError, KeyError, ValueError) as error:
-            raise ImageError(f"`{name}` {number} of `{self.path}` cannot be read: {error}. {_AGAIN}") from error
+            raise ImageError(f"`{name}` {number} of `{self.path}` cannot be read: {error}. {_MAKE_AGAIN}") from error
         pixels = stored.transpose(2, 0, 1).astype(np.float32, order="C")
         if stored.dtype.kind == "u":
             pixels /= np.float32(np.iinfo(stored.dtype).max)
         return torch.from_numpy(pixels)
 
 
-def _open(path: Path) -> Any:  # noqa: ANN401
+def _open_hdf5(path: Path) -> Any:  # noqa: ANN401
     import h5py
 
     if not path.is_file():
-        raise ImageError(f"`{path}` is no file. Check the name, or make one with `mwdn import`.")
+        raise ImageError(f"`{path}` is not a file. Check the name, or make one with `mwdn import`.")
     try:
-        # No lock: written files never change, and shared folders of clusters often know no locks.
+        # No lock: finished files never change, and many shared file systems of clusters do not support locks.
         return h5py.File(path, "r", locking=False)
     except OSError as error:
-        raise ImageError(f"`{path}` is no whole HDF5 file: {error}. {_AGAIN}") from error
+        raise ImageError(f"`{path}` is not a complete HDF5 file: {error}. {_MAKE_AGAIN}") from error
 
 
 def _read_header(path: Path, file: Any) -> _Header:  # noqa: ANN401
@@ -174,15 +174,15 @@ def _read_header(path: Path, file: Any) -> _Header:  # noqa: ANN401
     for name in NAMES:
         data = file.get(name)
         if not isinstance(data, h5py.Dataset):
-            raise ImageError(f"`{path}` must have the data set `{name}`, but has {sorted(file)}. {_AGAIN}")
+            raise ImageError(f"`{path}` must have the data set `{name}`, but has {sorted(file)}. {_MAKE_AGAIN}")
         if data.ndim != 4 or data.dtype.str not in ("|u1", "<u2", ">u2", "<f4", ">f4"):
             raise ImageError(
                 f"`{name}` of `{path}` ({data.shape}, {data.dtype}) must be (N, H, W, C) of uint8, uint16 or float32."
             )
         shapes.append(data.shape)
     if shapes[0][0] != shapes[1][0]:
-        raise ImageError(f"`{path}` has {shapes[0][0]:,} measurements and {shapes[1][0]:,} scenes. {_AGAIN}")
+        raise ImageError(f"`{path}` has {shapes[0][0]:,} measurements and {shapes[1][0]:,} scenes. {_MAKE_AGAIN}")
     attributes = {key: value.item() if hasattr(value, "item") else value for key, value in file.attrs.items()}
     if (version := attributes.pop(VERSION_KEY, VERSION)) != VERSION:
-        raise ImageError(f"`{path}` has version {version} of this format; {VERSION} can be read. Update mwdn.")
+        raise ImageError(f"`{path}` has format version {version}, but version {VERSION} is needed. Update mwdn.")
     return _Header(shapes[0][0], shapes[0][1:], shapes[1][1:], attributes)

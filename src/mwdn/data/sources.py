@@ -1,4 +1,4 @@
-"""Where the pairs of a public data set are, and how one of them is read: one function a layout."""
+"""List the pairs of a public data set and read them one by one: one function per layout."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -13,10 +13,10 @@ from mwdn.errors import ImageError
 from mwdn.io.images import READABLE, decode_frame, read_frame
 from mwdn.types import Frame
 
-AGAIN = "Copy it from its source again."
+COPY_AGAIN = "Copy it from its source again."
 
-# The ten ImageNet classes of which FlatNet's authors tested; of each class the data set has ten pictures, so these
-# are its 100 test pairs. From `val_target.txt` of their code (S. S. Khan et al., TPAMI 44, 1934, 2022).
+# The ten ImageNet classes on which FlatNet's authors tested. The data set has ten pictures of each class, so these are
+# its 100 test pairs. From `val_target.txt` of their code (S. S. Khan et al., TPAMI 44, 1934, 2022).
 PHLATCAM_TEST = frozenset(
     {
         "n01818515",
@@ -38,8 +38,8 @@ class Source:
     """One pair that has not been read yet.
 
     Args:
-        name: by which a person finds it again: a file's stem, or a row.
-        load: reads the capture and the scene as they are stored, (H, W, C), and raises `ImageError`.
+        name: a file's stem, or a row.
+        load: reads the capture and the scene as stored, (H, W, C), or raises `ImageError`.
     """
 
     name: str
@@ -48,14 +48,14 @@ class Source:
 
 @dataclass(frozen=True)
 class Listing:
-    """The pairs of a data set, in its order, and what has no partner or cannot be opened, with the reason."""
+    """The pairs of a data set, in its order, and the reason for each file or row that cannot be used, by its name."""
 
     sources: list[Source]
     refused: dict[str, str] = field(default_factory=dict)
 
 
 def list_folders(path: Path, captures: str, scenes: str) -> Listing:
-    """Pair the pictures of two folders, and of the folders in them, by their stems; numbers count as numbers.
+    """Pair the pictures of two folders and their subfolders by stem, in natural order (im2 before im10).
 
     Args:
         path: of the data set.
@@ -63,7 +63,7 @@ def list_folders(path: Path, captures: str, scenes: str) -> Listing:
         scenes: folder of the ground truth in ``path``.
 
     Raises:
-        ImageError: a folder is missing, or two files differ by nothing but their suffix.
+        ImageError: a folder is missing, or two files differ only in their suffix.
     """
     files = {folder: _by_stem(path / folder) for folder in (captures, scenes)}
     stems = sorted(set(files[captures]) | set(files[scenes]), key=_natural)
@@ -71,34 +71,34 @@ def list_folders(path: Path, captures: str, scenes: str) -> Listing:
     for stem in stems:
         missing = [folder for folder in (captures, scenes) if stem not in files[folder]]
         if missing:
-            other = next(found[stem] for found in files.values() if stem in found)
-            refused[stem] = f"`{other}` has no partner in `{path / missing[0]}`. Add it, or remove this one."
+            present = next(paths[stem] for paths in files.values() if stem in paths)
+            refused[stem] = f"`{present}` has no partner in `{path / missing[0]}`. Add it, or remove this one."
         else:
             sources.append(Source(stem, partial(_read_both, files[captures][stem], files[scenes][stem])))
     return Listing(sources, refused)
 
 
 def list_phlatcam(path: Path, captures: str, scenes: str) -> Listing:
-    """Pair two folders as `list_folders` does, and put the ten classes of the test set last."""
-    found = list_folders(path, captures, scenes)
-    last = sorted(found.sources, key=lambda source: source.name.split("/")[0] in PHLATCAM_TEST)
-    return Listing(last, found.refused)
+    """`list_folders`, with the ten classes of the test set at the end."""
+    listing = list_folders(path, captures, scenes)
+    sources = sorted(listing.sources, key=lambda source: source.name.split("/")[0] in PHLATCAM_TEST)
+    return Listing(sources, listing.refused)
 
 
 def list_hdf5(path: Path, captures: str, scenes: str) -> Listing:
-    """Rows of the authors' HDF5: two data sets (N, C, H, W) of uint8.
+    """List the rows of the authors' HDF5 file: two data sets (N, C, H, W) of uint8.
 
     Raises:
-        ImageError: no HDF5, cut off, or without these data sets.
+        ImageError: not HDF5, cut off, or without these data sets.
     """
     import h5py
 
     if not path.is_file():
-        raise ImageError(f"`{path}` is no file. Check the name.")
+        raise ImageError(f"`{path}` is not a file. Check the name.")
     try:
         file = h5py.File(path, "r", locking=False)
     except OSError as error:
-        raise ImageError(f"`{path}` is no whole HDF5 file: {error}. {AGAIN}") from error
+        raise ImageError(f"`{path}` is not a complete HDF5 file: {error}. {COPY_AGAIN}") from error
     for name in (captures, scenes):
         data = file.get(name)
         if not isinstance(data, h5py.Dataset) or data.ndim != 4 or data.shape[1] not in (1, 3) or data.dtype != "u1":
@@ -110,7 +110,7 @@ def list_hdf5(path: Path, captures: str, scenes: str) -> Listing:
     paired = min(counts)
     refused = {
         f"row {row}": f"Row {row} of `{path}` is in one of `{captures}` ({counts[0]:,}) and `{scenes}` ({counts[1]:,})"
-        " only. Copy it from its source again."
+        f" only. {COPY_AGAIN}"
         for row in range(paired, max(counts))
     }
     return Listing(
@@ -120,7 +120,7 @@ def list_hdf5(path: Path, captures: str, scenes: str) -> Listing:
 
 
 def list_parquet(path: Path, captures: str, scenes: str) -> Listing:
-    """Rows of the Hugging Face hub's parquet shards, whose columns hold encoded pictures.
+    """List the rows of parquet shards, as on the Hugging Face hub, whose columns hold encoded pictures.
 
     Args:
         path: a shard, a folder of shards, or a name on the hub such as ``owner/name``.
@@ -133,21 +133,21 @@ def list_parquet(path: Path, captures: str, scenes: str) -> Listing:
     folder = path if path.exists() else _download(path)
     shards = sorted(folder.rglob("*.parquet"), key=lambda shard: _natural(str(shard))) if folder.is_dir() else [folder]
     if not shards:
-        raise ImageError(f"`{path}` has no file that ends in .parquet. Name a shard, or the folder that has them.")
+        raise ImageError(f"`{path}` has no file that ends in .parquet. Name a shard, or the folder of the shards.")
     sources: list[Source] = []
     refused = {}
     for shard in shards:
         try:
             rows = _Shard(shard, (captures, scenes))
-        except ImageError as problem:
-            refused[shard.name] = str(problem)
+        except ImageError as error:
+            refused[shard.name] = str(error)
             continue
         sources += [Source(f"{shard.name} row {row}", partial(rows.load, row)) for row in range(rows.count)]
     return Listing(sources, refused)
 
 
 class _Shard:
-    """A parquet file, which can be read in groups of rows only: the latest group is kept."""
+    """A parquet file. It can only be read in groups of rows; the latest group is kept in memory."""
 
     def __init__(self, path: Path, columns: Sequence[str]) -> None:
         try:
@@ -157,12 +157,12 @@ class _Shard:
         self.path, self.columns = path, list(columns)
         try:
             self._file: Any = parquet.ParquetFile(path)
-        except (OSError, ValueError) as error:  # pyarrow's own errors are of these
-            raise ImageError(f"`{path}` is no whole parquet file: {error}. {AGAIN}") from error
+        except (OSError, ValueError) as error:  # pyarrow's errors are subclasses of these
+            raise ImageError(f"`{path}` is not a complete parquet file: {error}. {COPY_AGAIN}") from error
         names = self._file.schema_arrow.names
         if not set(self.columns) <= set(names):
-            way_out = "Name two of them: `--captures lensless --scenes lensed`."
-            raise ImageError(f"`{path}` must have the columns {self.columns}, but has {names}. {way_out}")
+            advice = "Name two of them: `--captures lensless --scenes lensed`."
+            raise ImageError(f"`{path}` must have the columns {self.columns}, but has {names}. {advice}")
         metadata = self._file.metadata
         self.count = metadata.num_rows
         self._ends = np.cumsum([metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)])
@@ -176,7 +176,7 @@ class _Shard:
             first = self._ends[group] - self._latest[1].num_rows
             cells = [self._latest[1][column][int(row - first)].as_py() for column in self.columns]
         except (OSError, ValueError) as error:
-            raise ImageError(f"Row {row} of `{self.path}` cannot be read: {error}. {AGAIN}") from error
+            raise ImageError(f"Row {row} of `{self.path}` cannot be read: {error}. {COPY_AGAIN}") from error
         capture, scene = (self._decode(cell, column, row) for cell, column in zip(cells, self.columns, strict=True))
         return capture, scene
 
@@ -184,7 +184,7 @@ class _Shard:
         data = cell.get("bytes") if isinstance(cell, dict) else cell
         name = f"`{column}` of row {row} of `{self.path}`"
         if not isinstance(data, bytes):
-            raise ImageError(f"{name} holds no bytes of a picture, but {type(data).__name__}. {AGAIN}")
+            raise ImageError(f"{name} must hold the bytes of a picture, but holds {type(data).__name__}. {COPY_AGAIN}")
         return decode_frame(data, name)
 
 
@@ -194,35 +194,38 @@ def _download(name: Path) -> Path:
     try:
         from huggingface_hub import snapshot_download
     except ModuleNotFoundError as error:
-        before = f"`{name}` is not here. To look for it on the hub, "
-        raise _missing("huggingface_hub", "hub", before) from error
+        raise _missing("huggingface_hub", "hub", f"`{name}` is not on this machine. To download it, ") from error
     try:
         return Path(snapshot_download(name.as_posix(), repo_type="dataset", allow_patterns="*.parquet"))
-    except Exception as error:  # its errors are those of its network library, which changes
+    except Exception as error:  # the errors of its network library, which changes between versions
         reason = str(error).partition("\n")[0].rstrip(".")
-        raise ImageError(f"`{name}` cannot be had from the hub: {reason}. Download it and name its folder.") from error
+        raise ImageError(
+            f"`{name}` cannot be downloaded from the hub: {reason}. Download it and name its folder."
+        ) from error
 
 
-def _missing(package: str, extra: str, before: str = "") -> ImageError:
-    return ImageError(f"{before}`{package}` must be installed: `pip install 'mwdn[{extra}]'`.")
+def _missing(package: str, extra: str, purpose: str = "") -> ImageError:
+    return ImageError(f"{purpose}`{package}` must be installed: `pip install 'mwdn[{extra}]'`.")
 
 
 def _by_stem(folder: Path) -> dict[str, Path]:
     if not folder.is_dir():
-        raise ImageError(f"`{folder}` is no folder. Name the folders inside the data set: `--captures A --scenes B`.")
-    found: dict[str, Path] = {}
+        raise ImageError(
+            f"`{folder}` is not a folder. Name the folders inside the data set: `--captures A --scenes B`."
+        )
+    paths: dict[str, Path] = {}
     for file in sorted(folder.rglob("*")):
         if file.suffix.lower() not in READABLE or file.name.startswith(".") or not file.is_file():
             continue
         stem = file.relative_to(folder).with_suffix("").as_posix()
-        if stem in found:
-            raise ImageError(f"`{found[stem]}` and `{file}` differ in their suffix only. Remove one of them.")
-        found[stem] = file
-    return found
+        if stem in paths:
+            raise ImageError(f"`{paths[stem]}` and `{file}` differ only in their suffix. Remove one of them.")
+        paths[stem] = file
+    return paths
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """Sorting key by which im2 comes before im10."""
+    """Sort key that places im2 before im10."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
@@ -234,5 +237,5 @@ def _read_row(path: Path, file: Any, names: tuple[str, str], row: int) -> tuple[
     try:
         capture, scene = (np.moveaxis(file[name][row], 0, -1) for name in names)
     except OSError as error:
-        raise ImageError(f"Row {row} of `{path}` cannot be read: {error}. {AGAIN}") from error
+        raise ImageError(f"Row {row} of `{path}` cannot be read: {error}. {COPY_AGAIN}") from error
     return capture, scene

@@ -1,4 +1,4 @@
-"""Which pairs are for training and which are not."""
+"""Division of pairs into training, validation and test."""
 
 from collections.abc import Sequence
 
@@ -7,31 +7,31 @@ import numpy as np
 from mwdn.errors import ParameterError, UnknownNameError
 
 Split = dict[str, range | list[int]]
-"""Positions of pairs by ``"train"``, ``"test"`` and, where the protocol has it, ``"validation"``."""
+"""Positions of the pairs for ``"train"``, ``"test"`` and, if the protocol has it, ``"validation"``."""
 
 KINDS = ("paper", "diffusercam", "phlatcam", "random")
 
 
 def split(count: int, kind: str = "paper", *, fractions: Sequence[float] = (0.8, 0.1, 0.1), seed: int = 0) -> Split:
-    """Positions of the pairs of each part, by a published protocol or at random.
+    """Divide pairs by a published protocol or at random.
 
-    The published protocols count positions, so they hold for a data set of which no pair was skipped.
+    The published protocols are defined by position, so they are valid only if no pair was skipped at the import.
 
     Args:
-        count: pairs of the file.
+        count: number of pairs in the file.
         kind: ``"paper"``, 8:1:1 by position, test first, then validation, then training;
             ``"diffusercam"``, test the first 1,000 (im1 to im1000), the rest training;
-            ``"phlatcam"``, 9,900 for training, then 100 for test, the order of ``mwdn import phlatcam``;
+            ``"phlatcam"``, 9,900 for training, then 100 for test, in the order of ``mwdn import phlatcam``;
             ``"random"``, by ``fractions`` and ``seed``.
-        fractions: of training, validation and test, of sum 1; of ``"random"`` only.
-        seed: of ``"random"`` only; the same one gives the same parts everywhere.
+        fractions: of training, validation and test, with sum 1; only for ``"random"``.
+        seed: only for ``"random"``; the same seed gives the same division on every machine.
 
     Returns:
-        Disjoint positions that together are all of ``range(count)``, in ascending order.
+        Disjoint positions in ascending order; together they are ``range(count)``.
 
     Raises:
         UnknownNameError: no such kind.
-        ParameterError: too few pairs for the kind, not 10,000 for ``"phlatcam"``, or fractions of another sum.
+        ParameterError: too few pairs for the kind, not 10,000 for ``"phlatcam"``, or fractions that do not sum to 1.
     """
     match kind:
         case "paper":
@@ -64,11 +64,11 @@ def _require(count: int, least: int, kind: str) -> None:
 
 def _random(count: int, fractions: Sequence[float], seed: int) -> Split:
     if len(fractions) != 3 or min(fractions) < 0 or abs(sum(fractions) - 1) > 1e-6:
-        raise ParameterError(f"`fractions` {tuple(fractions)} must be three, not negative, of sum 1: (0.8, 0.1, 0.1).")
+        raise ParameterError(f"`fractions` {tuple(fractions)} must be three numbers >= 0 with sum 1: (0.8, 0.1, 0.1).")
     parts = dict(zip(("train", "validation", "test"), fractions, strict=True))
     ends = np.rint(np.cumsum(list(fractions)) * count).astype(int)
     order = np.random.default_rng(seed).permutation(count)
     result: Split = {name: sorted(part.tolist()) for name, part in zip(parts, np.split(order, ends[:-1]), strict=True)}
     if empty := [name for name, fraction in parts.items() if fraction > 0 and not result[name]]:
-        raise ParameterError(f"`count` ({count:,}) leaves no pair for {', '.join(empty)}. Give it a larger fraction.")
+        raise ParameterError(f"`count` ({count:,}) leaves no pair for {', '.join(empty)}. Use a larger fraction.")
     return result

@@ -56,7 +56,7 @@ def prepare(
     _check_one(recipe, photos, pairs)
     place = distributed.local_device(device)
     shown, alone = recipe.sheet.captures, recipe.selfsupervised.consistency > 0
-    files = find_captures(shown, apart=apart) if shown else []
+    files = find_captures(shown, exclude=apart) if shown else []
     real = read_captures(files if alone else files[:SHOWN], calibration) if files else None
     training: Samples
     validation: Samples
