@@ -1,4 +1,4 @@
-"""Shape checking of every annotated function, reproducible noise, and the way to the real captures."""
+"""Shape checking of every annotated function, fixtures and small objects that many tests share."""
 
 import os
 import socket
@@ -16,6 +16,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 jaxtyping.install_import_hook("mwdn", "beartype.beartype")
 
 import torch  # noqa: E402
+from torch import nn  # noqa: E402
 
 torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else 2)
 
@@ -24,27 +25,27 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @pytest.fixture(autouse=True)
 def _seed() -> None:
-    """Initial weights and anything else that draws from the global generator."""
+    """Seed of the global generator: initial weights."""
     torch.manual_seed(0)
 
 
 @pytest.fixture
 def generator() -> torch.Generator:
-    """Source of all random numbers that a test asks for itself."""
+    """Source of a test's own random numbers."""
     return torch.Generator().manual_seed(20230731)
 
 
 @pytest.fixture
 def free_port() -> int:
-    """Where nothing listens, for what must be told a port beforehand."""
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return found.getsockname()[1]
+    """A TCP port that is free now."""
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return listener.getsockname()[1]
 
 
 @pytest.fixture
 def unchecked() -> Iterator[None]:
-    """Without the import hook's checks, as users run it: what they would catch, mwdn must catch itself."""
+    """Switch the import hook's checks off, as for users: mwdn itself must catch their mistakes."""
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
@@ -53,8 +54,8 @@ def unchecked() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def data() -> Path:
     """Folder of the real captures: ``MWDN_DATA``, or ``../shared/data`` beside the repository."""
-    named = os.environ.get("MWDN_DATA")
-    folder = Path(named) if named else ROOT.parent / "shared" / "data"
+    variable = os.environ.get("MWDN_DATA")
+    folder = Path(variable) if variable else ROOT.parent / "shared" / "data"
     if not folder.is_dir():
         pytest.skip(f"No real captures: {folder} is not a folder. Set MWDN_DATA to where they are.")
     return folder
@@ -74,3 +75,31 @@ def noisy_pair(generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
     scene = torch.nn.functional.interpolate(coarse, (48, 57), mode="bicubic")
     noise = torch.randn(scene.shape, generator=generator) * torch.tensor([0.02, 0.2]).view(2, 1, 1, 1)
     return (scene + noise).clamp(0, 1), scene.clamp(0, 1)
+
+
+def trained(network: nn.Module, generator: torch.Generator, *, spread: float = 0.0, power: float = 1.0) -> nn.Module:
+    """Evaluation mode, BatchNorm's moments as after training: means of 0 and variances of 1 would hide mistakes.
+
+    Args:
+        spread: standard deviation of what is added to the logarithms of learned constants (names with ``log_``).
+        power: mean of the variances, which lie within 50 % of it.
+    """
+    with torch.no_grad():
+        if spread:
+            for key, parameter in network.named_parameters():
+                if "log_" in key:
+                    parameter.add_(spread * torch.randn(parameter.shape, generator=generator))
+        for module in network.modules():
+            if isinstance(module, nn.BatchNorm2d):
+                module.running_mean.copy_(0.1 * torch.randn(module.num_features, generator=generator))
+                module.running_var.copy_(power * (0.5 + torch.rand(module.num_features, generator=generator)))
+    return network.eval()
+
+
+def touch(folder: Path, *names: str) -> list[Path]:
+    """Empty files of these names in a folder, which is made."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / name for name in names]
+    for path in paths:
+        path.touch()
+    return paths

@@ -1,18 +1,15 @@
-"""The house rules that a machine can check: who may import whom, what an import costs, what is documented."""
+"""The house rules that a machine can check. Each test lists all offenders as ``file:line``."""
 
 import ast
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "src" / "mwdn"
 
-SOURCE = Path(__file__).resolve().parents[1] / "src"
-PACKAGE = SOURCE / "mwdn"
-MODULES = sorted(PACKAGE.rglob("*.py"))
-
-# From the ground up: a folder imports from itself and from the folders above it in this list, nothing else.
 FLOORS = [
     "errors",
     "types",
@@ -35,93 +32,96 @@ FLOORS = [
     "__main__",
     "",  # mwdn/__init__.py: the public names
 ]
-FLOOR = {name: number for number, name in enumerate(FLOORS)}
+"""From the ground up: a folder imports from itself and from those before it in this list, nothing else."""
 
 NETWORKS_MAY_IMPORT = {"errors", "types", "fourier", "solvers", "networks"}
 HEAVY = ["cv2", "h5py", "starlette", "matplotlib", "tifffile", "cyclopts", "skimage", "scipy"]
 
+LONGEST = 300
+"""Lines of a file."""
+LONGER = {"mwdn.export.exporter", "mwdn.training.trainer"}
+"""Files that are still a few lines longer."""
+
 
 def dotted(path: Path) -> str:
     """``mwdn.networks.unet`` of a file, ``mwdn.networks`` of a folder's ``__init__.py``."""
-    parts = path.relative_to(SOURCE).with_suffix("").parts
+    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-KNOWN = {dotted(path) for path in MODULES}
+FILES = {path: path.read_text(encoding="utf-8") for path in sorted(PACKAGE.rglob("*.py"))}
+TREES = {path: ast.parse(text) for path, text in FILES.items()}
+MODULES = {dotted(path) for path in FILES}
 
 
-def imports(path: Path) -> list[tuple[int, str]]:
-    """Line and full name of each import, also of those inside functions."""
-    found = []
-    folder = dotted(path).split(".") if path.name == "__init__.py" else dotted(path).split(".")[:-1]
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+def place(path: Path, line: int = 1) -> str:
+    return f"{path.relative_to(ROOT)}:{line}"
+
+
+def imports(path: Path) -> Iterator[tuple[int, str]]:
+    """Line and full name of each imported module, inside functions too."""
+    package = dotted(path).split(".")[: None if path.name == "__init__.py" else -1]
+    for node in ast.walk(TREES[path]):
         if isinstance(node, ast.Import):
-            found += [(node.lineno, alias.name) for alias in node.names]
+            yield from ((node.lineno, alias.name) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            base = node.module or ""
-            if node.level:
-                base = ".".join([*folder[: len(folder) - node.level + 1], *([base] if base else [])])
+            parents = package[: len(package) - node.level + 1] if node.level else []
+            source = ".".join([*parents, *([node.module] if node.module else [])])
             for alias in node.names:
-                # `from mwdn import fourier` is a module, `from mwdn.fourier.convolution import wiener` a name of one.
-                full = f"{base}.{alias.name}"
-                if full == "mwdn.__version__":  # a string, not a module
-                    continue
-                found.append((node.lineno, full if full in KNOWN else base))
-    return found
+                # `from mwdn import fourier` names a module, `from mwdn.fourier import wiener` a function of one.
+                full = f"{source}.{alias.name}"
+                yield node.lineno, full if full in MODULES else source
 
 
-def folder(module: str) -> str:
-    """Name in `FLOORS` that a module of mwdn belongs to."""
+def floor(module: str) -> str:
+    """Name in `FLOORS` of a module of mwdn."""
     return module.removeprefix("mwdn").removeprefix(".").split(".")[0]
 
 
-def each(paths):
-    return pytest.mark.parametrize("path", paths, ids=[dotted(path) for path in paths])
+def test_imports_point_down():
+    unknown = [place(path) for path in FILES if floor(dotted(path)) not in FLOORS]
+    assert not unknown, "their folder needs a place in FLOORS"
+    upwards = [
+        f"{place(path, line)} imports {name}"
+        for path in FILES
+        for line, name in imports(path)
+        if name.split(".")[0] == "mwdn" and FLOORS.index(floor(name)) > FLOORS.index(floor(dotted(path)))
+    ]
+    assert not upwards
 
 
-@each(MODULES)
-def test_imports_point_down(path):
-    own = folder(dotted(path))
-    assert own in FLOOR, f"{path} is on no floor: give its folder a place in FLOORS"
-    for line, name in imports(path):
-        if name.split(".")[0] != "mwdn":
-            continue
-        other = folder(name)
-        assert other in FLOOR, f"{path}:{line} imports {name}, which is on no floor"
-        assert FLOOR[other] <= FLOOR[own], f"{path}:{line}: {own} must not import {name}, which is above it"
-
-
-@each([path for path in MODULES if dotted(path).startswith("mwdn.networks")])
-def test_networks_can_be_read_beside_the_paper(path):
-    for line, name in imports(path):
-        top = name.split(".")[0]
-        if top == "mwdn":
-            assert folder(name) in NETWORKS_MAY_IMPORT, f"{path}:{line} imports {name}"
-        else:
-            assert top in {"torch", "numpy"} | sys.stdlib_module_names, f"{path}:{line} imports {name}"
+def test_networks_can_be_read_beside_the_paper():
+    """They import torch, numpy and the lower folders only."""
+    others = {"torch", "numpy"} | sys.stdlib_module_names
+    beyond = [
+        f"{place(path, line)} imports {name}"
+        for path in FILES
+        if floor(dotted(path)) == "networks"
+        for line, name in imports(path)
+        if (floor(name) not in NETWORKS_MAY_IMPORT if name.startswith("mwdn") else name.split(".")[0] not in others)
+    ]
+    assert not beyond
 
 
 def test_nothing_is_imported_from_the_tests_or_relatively_beyond_the_package():
-    for path in MODULES:
-        for line, name in imports(path):
-            assert name.split(".")[0] not in {"tests", "oracles", "conftest", ""}, f"{path}:{line}"
+    tests = {"", "tests", *(path.stem for path in (ROOT / "tests").glob("*.py"))}
+    assert not [place(path, line) for path in FILES for line, name in imports(path) if name.split(".")[0] in tests]
 
 
 def test_only_fourier_mentions_torch_fft():
-    """Elsewhere nobody would think of float32 and of where a PSF's centre is."""
+    """There alone: float32, and where the centre of a PSF is."""
     pattern = re.compile(r"torch\.fft|from\s+torch\s+import\s[^\n]*\bfft\b|\bfft\.i?r?fftn?2?\(")
-    found = [dotted(path) for path in MODULES if pattern.search(path.read_text(encoding="utf-8"))]
-    assert found == ["mwdn.fourier.transforms"]
+    assert [dotted(path) for path, text in FILES.items() if pattern.search(text)] == ["mwdn.fourier.transforms"]
 
 
 def test_import_is_light():
-    """In a fresh process, so that no other test has imported anything before."""
+    """In a fresh process, where no other test has imported anything."""
     code = f"import sys, mwdn; print(*[name for name in {HEAVY} if name in sys.modules])"
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False, timeout=60
     )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == []
+    assert process.returncode == 0, process.stderr
+    assert process.stdout.split() == []
 
 
 def public(tree: ast.Module | ast.ClassDef, prefix: str = ""):
@@ -133,35 +133,53 @@ def public(tree: ast.Module | ast.ClassDef, prefix: str = ""):
                 yield from public(node, f"{prefix}{node.name}.")
 
 
-@each(MODULES)
-def test_public_names_are_documented(path):
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    missing = [f"{path}:{node.lineno} {name}" for name, node in public(tree) if not ast.get_docstring(node)]
-    assert not missing
-    assert ast.get_docstring(tree) or not tree.body, f"{path} does not say what it is for"
-
-
-@each([path for path in MODULES if path.name == "__init__.py"])
-def test_all_names_what_is_there(path):
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+def test_public_names_are_documented():
+    modules = [place(path) for path, tree in TREES.items() if tree.body and not ast.get_docstring(tree)]
     names = [
-        ast.literal_eval(node.value)
-        for node in tree.body
-        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "__all__"
+        f"{place(path, node.lineno)} {name}"
+        for path, tree in TREES.items()
+        for name, node in public(tree)
+        if not ast.get_docstring(node)
     ]
-    if not names:
-        assert not any(name.startswith("mwdn") for _, name in imports(path)), f"{path} needs an `__all__`"
-        return
-    assert len(set(names[0])) == len(names[0])
-    bound = {
-        alias.asname or alias.name
-        for node in ast.walk(tree)
-        if isinstance(node, ast.ImportFrom)
-        for alias in node.names
-    }
-    bound |= {node.name for node in tree.body if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+    assert not modules + names
+
+
+def test_files_are_short():
+    lengths = {path: len(text.splitlines()) for path, text in FILES.items()}
+    long = [place(path, length) for path, length in lengths.items() if length > LONGEST and dotted(path) not in LONGER]
+    assert not long, f"they end at these lines; the most is {LONGEST}"
+
+
+def bound(tree: ast.Module) -> set[str]:
+    """Names that a module's imports, functions, classes and assignments make."""
+    names = {node.name for node in tree.body if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            names |= {alias.asname or alias.name for alias in node.names}
     for node in tree.body:
         targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
-        bound |= {target.id for target in targets if isinstance(target, ast.Name)}
-    if "__getattr__" not in bound:
-        assert set(names[0]) <= bound
+        names |= {target.id for target in targets if isinstance(target, ast.Name)}
+    return names
+
+
+def listed(tree: ast.Module) -> list[str] | None:
+    """What `__all__` holds."""
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "__all__":
+            return ast.literal_eval(node.value)
+    return None
+
+
+def test_a_folder_lists_its_names_once_and_has_them():
+    wrong = []
+    for path, tree in TREES.items():
+        if path.name != "__init__.py":
+            continue
+        names, known = listed(tree), bound(tree)
+        if names is None and any(name.startswith("mwdn") for _, name in imports(path)):
+            wrong.append(f"{place(path)} needs an `__all__`")
+        elif names and len(set(names)) < len(names):
+            wrong.append(f"{place(path)} lists a name twice")
+        elif names and "__getattr__" not in known and not set(names) <= known:
+            wrong.append(f"{place(path)} lists {set(names) - known}, which it does not have")
+    assert not wrong

@@ -4,16 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from conftest import touch
 from mwdn.calibration import Calibration, FrameFormat
 from mwdn.data.captures import find_captures, read_capture, read_captures
 from mwdn.errors import ParameterError, ShapeError
-
-
-def touch(folder, *names):
-    folder.mkdir(parents=True, exist_ok=True)
-    for name in names:
-        (folder / name).write_bytes(b"")
-    return [folder / name for name in names]
 
 
 def test_captures_are_found_in_order_and_once(tmp_path):

@@ -13,6 +13,7 @@ import torch
 from torch import nn
 
 from cameras import contour_psf
+from conftest import trained
 from mwdn import Calibration, Reconstructor, read_frame, to_display
 from mwdn.calibration import FrameFormat
 from mwdn.cli.app import main
@@ -43,15 +44,10 @@ def camera(size=SIZE, channels=3):
 
 
 def network(name, **options):
-    """Narrow, with statistics as after some training."""
-    generator = torch.Generator().manual_seed(2)
+    """Narrow, as after some training."""
     torch.manual_seed(3)
-    made = build(name, **({} if name in ("wiener", "le-admm") else {"width": 4} | options))
-    for module in made.modules():
-        if isinstance(module, nn.BatchNorm2d):
-            module.running_mean.copy_(0.1 * torch.randn(module.num_features, generator=generator))
-            module.running_var.copy_(0.5 + torch.rand(module.num_features, generator=generator))
-    return made.eval()
+    network = build(name, **({} if name in ("wiener", "le-admm") else {"width": 4} | options))
+    return trained(network, torch.Generator().manual_seed(2))
 
 
 class Unchanged(nn.Module):

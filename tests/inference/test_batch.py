@@ -17,6 +17,7 @@ import pytest
 import torch
 
 from cameras import contour_psf
+from conftest import touch
 from mwdn import Camera, read_frame
 from mwdn.calibration import Calibration, FrameFormat
 from mwdn.errors import ImageError, ParameterError
@@ -52,13 +53,6 @@ def captures(tmp_path, psf, generator):
 def darkroom(psf, out, method="wiener", **options):
     calibration = psf if isinstance(psf, Calibration) else Calibration(psf)
     return Batch(Reconstructor(method, calibration, device="cpu"), "name", out, **options)
-
-
-def touch(folder, *names):
-    folder.mkdir(parents=True, exist_ok=True)
-    for name in names:
-        (folder / name).write_bytes(b"")
-    return [folder / name for name in names]
 
 
 # --- Files --------------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
+from conftest import trained
 from mwdn import Calibration, Camera, Reconstructor, read_frame
 from mwdn.errors import ParameterError
 from mwdn.inference import fusion
@@ -17,14 +18,8 @@ from mwdn.networks import NETWORKS, build
 SIZE = 33, 47
 
 
-def trained(name, generator):
-    """Small, with statistics as after some training, in evaluation mode."""
-    network = build(name, **({} if name in ("wiener", "le-admm") else {"width": 8}))
-    for module in network.modules():
-        if isinstance(module, nn.BatchNorm2d):
-            module.running_mean.copy_(0.1 * torch.randn(module.num_features, generator=generator))
-            module.running_var.copy_(0.5 + torch.rand(module.num_features, generator=generator))
-    return network.eval()
+def small(name):
+    return build(name, **({} if name in ("wiener", "le-admm") else {"width": 8}))
 
 
 def psf_and_batch(generator, batch=2):
@@ -39,7 +34,7 @@ def psnr(found, expected):
 @pytest.mark.parametrize("name", NETWORKS)
 def test_exact_is_the_network_and_fast_is_close(name, generator):
     psf, batch = psf_and_batch(generator)
-    network = trained(name, generator)
+    network = trained(small(name), generator)
     with torch.no_grad():
         expected = network(batch, psf)
     torch.testing.assert_close(Engine(network, psf, precision="exact")(batch), expected, rtol=1e-4, atol=1e-5)
@@ -95,7 +90,7 @@ def test_other_convolutions_are_left_alone(generator):
 
 def test_psf_branch_is_computed_once(generator):
     psf, batch = psf_and_batch(generator)
-    network = trained("mwdn-cpsf", generator)
+    network = trained(small("mwdn-cpsf"), generator)
     bound = Engine(network, psf)
     seen = []
     bound.exact.psf_encoder.register_forward_hook(lambda *_: seen.append(1))
@@ -106,7 +101,7 @@ def test_psf_branch_is_computed_once(generator):
 
 def test_callers_network_is_left_alone_and_later_changes_do_not_matter(generator):
     psf, batch = psf_and_batch(generator)
-    network = trained("mwdn", generator).train()
+    network = trained(small("mwdn"), generator).train()
     before = copy.deepcopy(network.state_dict())
     bound = Engine(network, psf)
     found = bound(batch)
@@ -121,7 +116,7 @@ def test_callers_network_is_left_alone_and_later_changes_do_not_matter(generator
 
 def test_batches_of_any_size_and_order(generator):
     psf, batch = psf_and_batch(generator, batch=3)
-    bound = Engine(trained("mwdn", generator), psf, precision="exact")
+    bound = Engine(trained(small("mwdn"), generator), psf, precision="exact")
     together = bound(batch)
     for part in (slice(1, 3), slice(0, 1)):
         torch.testing.assert_close(bound(batch[part]), together[part], rtol=1e-4, atol=1e-5)

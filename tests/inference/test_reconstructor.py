@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from cameras import contour_psf
+from conftest import touch
 from mwdn import Camera, solvers
 from mwdn.calibration import Calibration
 from mwdn.errors import CheckpointError, ParameterError, ShapeError, UnknownNameError
@@ -29,13 +30,6 @@ def measurement(psf, generator):
     scene = torch.zeros(1, 3, *SIZE)
     scene[..., 10:20, 12:22] = torch.tensor([0.9, 0.5, 0.2])[:, None, None]
     return Camera(psf).simulate(scene, generator=generator)
-
-
-def touch(folder, *names):
-    folder.mkdir(parents=True, exist_ok=True)
-    for name in names:
-        (folder / name).write_bytes(b"")
-    return [folder / name for name in names]
 
 
 # --- Method -------------------------------------------------------------------------------------------

@@ -4,9 +4,9 @@ import copy
 
 import pytest
 import torch
-from torch import nn
 from torch.nn import functional as F
 
+from conftest import trained
 from mwdn.fourier import memory_format
 from mwdn.inference import tiling
 from mwdn.inference.engine import Engine
@@ -14,15 +14,6 @@ from mwdn.inference.fusion import fuse
 from mwdn.inference.tiling import StripDecoder, StripEncoder, enlarged
 from mwdn.networks import blocks, build
 from mwdn.networks.blocks import Decoder, Encoder
-
-
-def lively(network, generator):
-    """Statistics of BatchNorm as after some training, in evaluation mode."""
-    for module in network.modules():
-        if isinstance(module, nn.BatchNorm2d):
-            module.running_mean.copy_(0.1 * torch.randn(module.num_features, generator=generator))
-            module.running_var.copy_(0.5 + torch.rand(module.num_features, generator=generator))
-    return network.eval()
 
 
 @pytest.fixture
@@ -48,7 +39,7 @@ def strips(monkeypatch):
 @torch.no_grad()
 def test_strips_are_the_whole_picture(size, pooling, strips, generator):
     """Of 7 rows and of fewer at one scale and of more at another, of which the last is cut off."""
-    unet = lively(build("unet", width=16, pooling=pooling), generator)
+    unet = trained(build("unet", width=16, pooling=pooling), generator)
     picture = torch.rand(2, 3, *size, generator=generator)
     expected = unet(picture, picture[:1])
     folded = fuse(copy.deepcopy(unet), None)
@@ -64,7 +55,7 @@ def test_strips_are_the_whole_picture(size, pooling, strips, generator):
 @torch.no_grad()
 def test_large_pictures_in_parts_everywhere(name, strips, monkeypatch, generator):
     """Strips, channels filtered a few at a time, transfer functions made when they are needed."""
-    network = lively(build(name, width=16), generator)
+    network = trained(build(name, width=16), generator)
     psf, measurement = torch.rand(1, 3, 64, 45, generator=generator), torch.rand(2, 3, 64, 45, generator=generator)
     expected = network(measurement, psf)
     monkeypatch.setattr(memory_format, "LARGEST", 3 * 2 * 64 * 45)

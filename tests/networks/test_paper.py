@@ -9,6 +9,7 @@ from torch import nn
 from torch.nn import functional as F
 
 import oracles
+from conftest import trained
 from mwdn.networks import build
 
 COUNTS = {
@@ -70,20 +71,6 @@ def test_filters_start_at_the_authors_values():
 # --- Figures 1 and 2, step by step ------------------------------------------------------------
 
 
-def trained(name, generator, **options):
-    """A small network whose numbers are all different from each other and from their start."""
-    network = build(name, **options)
-    with torch.no_grad():
-        for key, parameter in network.named_parameters():
-            if "log_" in key:
-                parameter.add_(torch.randn((), generator=generator))
-        for module in network.modules():
-            if isinstance(module, nn.BatchNorm2d):
-                module.running_mean.copy_(0.1 * torch.randn(module.num_features, generator=generator))
-                module.running_var.copy_(0.5 + torch.rand(module.num_features, generator=generator))
-    return network.eval()
-
-
 def halved(picture, pooling):
     """2x2 blocks of the last two axes, an odd last row or column dropped, in numpy."""
     height, width = (n // 2 * 2 for n in picture.shape[-2:])
@@ -138,7 +125,7 @@ FORMS = [
 @pytest.mark.parametrize("size", [(32, 48), (33, 47)])
 @pytest.mark.parametrize("form", FORMS, ids=["paper", "authors", "mixed"])
 def test_mwdn_is_figure_1(form, size, generator):
-    network = trained("mwdn", generator, width=4, **form)
+    network = trained(build("mwdn", width=4, **form), generator, spread=1.0)
     b, h = torch.rand(2, 3, *size, generator=generator), torch.rand(1, 3, *size, generator=generator) ** 4
     *skips, bottleneck = encode(network.encoder, b, form["pooling"])
     psf = h.double().numpy()
@@ -161,7 +148,7 @@ def test_mwdn_is_figure_1(form, size, generator):
 def test_mwdn_cpsf_is_figure_2(authors, pooling, generator):
     boundary = "circular" if authors else "taper"
     options = {"width": 4, "pooling": pooling, "boundary": boundary, "authors_scalars": authors}
-    network = trained("mwdn-cpsf", generator, **options)
+    network = trained(build("mwdn-cpsf", **options), generator, spread=1.0)
     b, h = torch.rand(2, 3, 32, 35, generator=generator), torch.rand(1, 3, 32, 35, generator=generator) ** 4
     *skips, bottleneck = encode(network.encoder, b, pooling)
     start = h / h.max() * (network.weight if authors else 1)
@@ -176,7 +163,7 @@ def test_mwdn_cpsf_is_figure_2(authors, pooling, generator):
 
 @torch.no_grad()
 def test_unet_has_no_filter_and_wiener_unet_has_one_before(generator):
-    network = trained("wiener-unet", generator, width=4)
+    network = trained(build("wiener-unet", width=4), generator, spread=1.0)
     b, h = torch.rand(2, 3, 33, 32, generator=generator), torch.rand(1, 3, 33, 32, generator=generator) ** 4
     named = dict(network.wiener.named_parameters())
     w, constant = (
@@ -197,7 +184,7 @@ def test_authors_form_is_their_unshifted_wiener(generator):
 
     On even sizes, which theirs was made for, that is eq. (2) on a circle.
     """
-    network = trained("mwdn", generator, width=2, **FORMS[1])
+    network = trained(build("mwdn", width=2, **FORMS[1]), generator, spread=1.0)
     features = torch.rand(1, 2, 16, 24, generator=generator)
     psf = torch.rand(1, 1, 16, 24, generator=generator)
     wiener = network.filters[0]

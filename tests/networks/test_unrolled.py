@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import torch
-from torch import nn
 from torch.nn import functional as F
 
 import oracles
+from conftest import trained
 from mwdn.benchmark.published import PUBLISHED
 from mwdn.networks import NETWORKS, build
 from mwdn.solvers import Admm, Penalties
@@ -40,20 +40,6 @@ def test_published_settings_are_of_known_networks():
     assert set(PUBLISHED) <= set(NETWORKS)
     assert PUBLISHED["updn"].rate == 5e-4
     assert all(each.rate is None or 0 < each.rate < 1 for each in PUBLISHED.values())
-
-
-def lively(network, generator):
-    """All numbers different from each other and from their start."""
-    with torch.no_grad():
-        for key, parameter in network.named_parameters():
-            if "log_" in key:
-                parameter.add_(0.5 * torch.randn(parameter.shape, generator=generator))
-        for module in network.modules():
-            if isinstance(module, nn.BatchNorm2d):
-                module.running_mean.copy_(0.1 * torch.randn(module.num_features, generator=generator))
-                # torch's first weights and a ReLU leave a sixth of the power: with this variance layers keep it.
-                module.running_var.copy_(0.1 + 0.15 * torch.rand(module.num_features, generator=generator))
-    return network.eval()
 
 
 def pair(generator, size, *, batch=2):
@@ -112,7 +98,7 @@ def close(found, expected, part=2e-3):
 @torch.no_grad()
 @pytest.mark.parametrize("size", [(12, 16), (13, 9)])
 def test_le_admm_is_its_equations(size, generator):
-    network = lively(build("le-admm"), generator)
+    network = trained(build("le-admm"), generator, spread=0.5, power=0.2)
     b, h = pair(generator, size)
     iterates, scenes = network.iterates(b, network.prepare(h, b.shape[-2:])), network(b, h)
     assert len(iterates) == 5
@@ -209,7 +195,7 @@ def enlarged(x, size):
 @torch.no_grad()
 @pytest.mark.parametrize("size", [(64, 66), (40, 67)])
 def test_le_admm_u_is_its_equations(size, generator):
-    network = lively(build("le-admm-u", width=3, iterations=2), generator)
+    network = trained(build("le-admm-u", width=3, iterations=2), generator, spread=0.5, power=0.2)
     b, h = pair(generator, size, batch=1)
     x = le_admm(b[0].double().numpy(), h[0].double().numpy(), constants_of(network.admm))[-1]
     x = torch.from_numpy(np.pad(x / x.max(), ((0, 0), (0, max(0, 64 - size[0])), (0, 0)), mode="edge"))[None]
@@ -234,7 +220,7 @@ def test_le_admm_u_is_its_equations(size, generator):
 
 @torch.no_grad()
 def test_mmcn_without_compensation_is_le_admm_u(generator):
-    network = lively(build("mmcn", width=4), generator)
+    network = trained(build("mmcn", width=4), generator, spread=0.5, power=0.2)
     b, h = pair(generator, (20, 33))
     with_branch = network(b, h)
     weight = network.denoiser.centre[0].weight
@@ -251,7 +237,7 @@ def test_mmcn_without_compensation_is_le_admm_u(generator):
 @torch.no_grad()
 def test_mmcn_sees_every_iterate(generator):
     """The branch of step k + 1 is fed by iterate k, at half the scale of the step before."""
-    network = lively(build("mmcn", width=4), generator)
+    network = trained(build("mmcn", width=4), generator, spread=0.5, power=0.2)
     b, h = pair(generator, (20, 33))
     seen = []
     for module in network.residuals:

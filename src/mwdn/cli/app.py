@@ -10,7 +10,6 @@ from cyclopts import App, Parameter
 from rich.markup import escape
 from rich.progress import Progress, track
 
-from mwdn import __version__
 from mwdn.calibration import FrameFormat
 from mwdn.cli.benchmark import benchmark
 from mwdn.cli.camera import CameraOptions, complain, console, errors, warn
@@ -25,6 +24,7 @@ from mwdn.evaluation import Variant
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import check_folder, refuse_overwrite
 from mwdn.runtime.memory import keep_memory
+from mwdn.version import __version__
 
 app = App(
     name="mwdn",
