@@ -89,14 +89,15 @@ def _frame_shape(shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, ...
     return axes
 
 
-def _as_frame(stored: Frame, axes: tuple[int, ...]) -> Frame:
+def _to_frame(stored: Frame, axes: tuple[int, ...], *, copy: bool = True) -> Frame:
+    """Reshape to (H, W, C), drop alpha, and convert to native byte order and floats to float32."""
     dtype = np.dtype(np.float32) if stored.dtype.kind == "f" else stored.dtype.newbyteorder("=")
-    with np.errstate(over="ignore"):  # a float64 beyond float32's range becomes infinity, which `read` refuses
-        return np.array(stored.reshape(axes)[..., :3], dtype)
+    with np.errstate(over="ignore"):  # a float64 beyond float32's range becomes infinity, which is refused later
+        return stored.reshape(axes)[..., :3].astype(dtype, copy=copy, subok=False)
 
 
 def as_frame(picture: ArrayPicture) -> Frame:
-    """Bring a numpy array or a PIL picture to the axes and types of a frame; nothing is copied that fits.
+    """Convert a numpy array or a PIL picture to a frame, without a copy where its axes and type fit.
 
     Args:
         picture: (H, W) or (H, W, C) of 1, 3 or 4 channels, RGB, row 0 at the top, uint8, uint16 or floats. Alpha is
@@ -109,10 +110,9 @@ def as_frame(picture: ArrayPicture) -> Frame:
         raise ImageError("The picture has a palette (mode P), not colours. Convert it: `picture.convert('RGB')`.")
     stored = np.asarray(picture)
     try:
-        frame = stored.reshape(_frame_shape(stored.shape, stored.dtype))[..., :3]
-    except ImageError as problem:
-        raise ImageError(f"The array {problem}") from problem
-    frame = frame.astype(np.float32 if frame.dtype.kind == "f" else frame.dtype.newbyteorder("="), copy=False)
+        frame = _to_frame(stored, _frame_shape(stored.shape, stored.dtype), copy=False)
+    except ImageError as error:
+        raise ImageError(f"The array {error}") from error
     if frame.dtype.kind == "f" and not np.isfinite(frame).all():
         raise ImageError("The array holds NaN or infinity. Replace them: `numpy.nan_to_num`.")
     return frame
@@ -123,7 +123,7 @@ def _read_npy(path: Path) -> Frame:
         stored = np.load(path, mmap_mode="r", allow_pickle=False)
     except Exception as error:
         raise ImageError(f"is not a complete NPY file of numbers ({error}). Copy or save it again.") from error
-    return _as_frame(stored, _frame_shape(stored.shape, stored.dtype))
+    return _to_frame(stored, _frame_shape(stored.shape, stored.dtype))
 
 
 def _read_tiff(path: Path, photograph: bool) -> Frame:
@@ -140,7 +140,7 @@ def _read_tiff(path: Path, photograph: bool) -> Frame:
         raise
     except Exception as error:  # a damaged file makes tifffile raise struct.error, ValueError, KeyError ...
         raise ImageError(f"cannot be read as TIFF: {error}. {_COPY_AGAIN}") from error
-    frame = _as_frame(np.moveaxis(stored, -3, -1) if planar else stored, axes)
+    frame = _to_frame(np.moveaxis(stored, -3, -1) if planar else stored, axes)
     return _upright(frame, orientation) if photograph else frame
 
 

@@ -82,7 +82,7 @@ def write_picture(path: str | Path, image: Tensor | FloatFrame, *, bits: int = 8
 
     Args:
         path: ends in ``.png``; missing folders are created.
-        image: (1, C, H, W) or (C, H, W) with 1 or 3 channels, linear light.
+        image: tensor (1, C, H, W) or (C, H, W), or array (H, W, C), with 1 or 3 channels, linear light.
         bits: 8, or 16 for a picture that will be edited.
 
     Raises:
@@ -91,7 +91,7 @@ def write_picture(path: str | Path, image: Tensor | FloatFrame, *, bits: int = 8
     """
     if bits not in (8, 16):
         raise ParameterError(f"`bits` ({bits}) must be 8 or 16, the depths of a PNG in colour.")
-    frame = _as_frame(Path(path), image, ".png")
+    frame = _float_frame(Path(path), image, ".png")
     encoded = srgb_encode(torch.from_numpy(frame)).mul(2**bits - 1).round().numpy()
     write_frame(path, encoded.astype(f"uint{bits}"))
 
@@ -101,12 +101,12 @@ def write_linear(path: str | Path, image: Tensor | FloatFrame) -> None:
 
     Args:
         path: ends in ``.tif``, ``.tiff`` or ``.npy``; missing folders are created.
-        image: (1, C, H, W) or (C, H, W) with 1 or 3 channels, any range; stored as (H, W, C).
+        image: tensor (1, C, H, W) or (C, H, W), or array (H, W, C), with 1 or 3 channels; any range.
 
     Raises:
         ImageError: another suffix or shape, integers, NaN or infinity, or the file cannot be written.
     """
-    write_frame(path, _as_frame(Path(path), image, ".npy", ".tif", ".tiff"))
+    write_frame(path, _float_frame(Path(path), image, ".npy", ".tif", ".tiff"))
 
 
 def write_frame(path: str | Path, frame: Frame) -> None:
@@ -165,7 +165,7 @@ def _encode_png(path: Path, frame: Frame) -> bytes:
     return data.tobytes()
 
 
-def _as_frame(path: Path, image: Tensor | FloatFrame, *suffixes: str) -> FloatFrame:
+def _float_frame(path: Path, image: Tensor | FloatFrame, *suffixes: str) -> FloatFrame:
     """(H, W, C) float32 numbers of an image, after checks of its shape and of the suffix of ``path``."""
     if path.suffix.lower() not in suffixes:
         raise ImageError(f"`{path}` must end in {' or '.join(suffixes)}, not '{path.suffix}'. Rename it.")

@@ -1,0 +1,86 @@
+"""A file is written completely or not at all."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from image_files import put
+from mwdn.errors import ImageError
+from mwdn.io.files import atomic
+from mwdn.io.images import read_frame, write_linear, write_picture
+
+
+def test_a_writer_that_fails_half_way_leaves_the_old_file(tmp_path: Path) -> None:
+    path = put(tmp_path / "a.bin", b"old")
+    with pytest.raises(RuntimeError, match="half-way"), atomic(path) as temporary:  # noqa: PT012
+        assert temporary.parent == tmp_path
+        assert temporary.suffix == ".bin"
+        temporary.write_bytes(b"ne")
+        raise RuntimeError("half-way")
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_writer_that_succeeds_replaces_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "a.bin"
+    for content in (b"old", b"new"):
+        with atomic(path) as temporary:
+            temporary.write_bytes(content)
+    assert path.read_bytes() == b"new"
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_a_link_is_followed(tmp_path: Path) -> None:
+    target, link = put(tmp_path / "target.bin", b"old"), tmp_path / "link.bin"
+    link.symlink_to(target)
+    with atomic(link) as temporary:
+        temporary.write_bytes(b"new")
+    assert link.is_symlink()
+    assert target.read_bytes() == b"new"
+
+
+@pytest.mark.parametrize(
+    ("write", "name"), [(write_picture, "a.png"), (write_linear, "a.npy"), (write_linear, "a.tif")]
+)
+def test_a_full_disk_is_an_image_error_and_keeps_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, write: Callable[..., None], name: str
+) -> None:
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    path = put(tmp_path / name, b"old")
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(ImageError, match=rf"{name}` cannot be written: No space left on device"):
+        write(path, torch.rand(3, 4, 4))
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_file_where_a_folder_should_be(tmp_path: Path) -> None:
+    put(tmp_path / "taken", b"")
+    with pytest.raises(ImageError, match="cannot be written"):
+        write_picture(tmp_path / "taken" / "a.png", torch.rand(3, 4, 4))
+
+
+def test_a_folder_where_the_file_should_be(tmp_path: Path) -> None:
+    (tmp_path / "a.png").mkdir()
+    with pytest.raises(ImageError, match="cannot be written: Is a directory"):
+        write_picture(tmp_path / "a.png", torch.rand(3, 4, 4))
+    assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
+
+
+@pytest.mark.skipif(hasattr(os, "geteuid") and os.geteuid() == 0, reason="nothing is read-only to root")
+def test_a_read_only_folder(tmp_path: Path) -> None:
+    path = put(tmp_path / "a.png", b"secret")
+    path.chmod(0)
+    tmp_path.chmod(0o500)
+    try:
+        with pytest.raises(ImageError, match="cannot be written: Permission denied"):
+            write_picture(tmp_path / "b.png", torch.rand(3, 4, 4))
+        with pytest.raises(ImageError, match="cannot be read: Permission denied"):
+            read_frame(path)
+    finally:
+        tmp_path.chmod(0o700)
