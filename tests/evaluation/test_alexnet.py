@@ -1,4 +1,4 @@
-"""Public weights: found, refused, downloaded once, and what to do without a network."""
+"""Public weights: located, refused, downloaded once; the message without internet access."""
 
 import hashlib
 import io
@@ -16,7 +16,7 @@ from mwdn.evaluation.alexnet import CHANNELS, AlexNet, Heads, load_alexnet, load
 
 @pytest.fixture(autouse=True)
 def fetched(monkeypatch, tmp_path):
-    """An empty home, no environment, and a network that is not there; the addresses that were asked for."""
+    """An empty home, no environment variables, no internet access; yields the requested addresses."""
     asked = []
 
     def unroutable(address, timeout):
@@ -31,7 +31,7 @@ def fetched(monkeypatch, tmp_path):
 
 
 def serve(monkeypatch, name, network):
-    """Let the publisher give a network's weights, under their checksum; returns the file's bytes."""
+    """Serve a network's weights with their checksum as a download; returns the file's bytes."""
     file = io.BytesIO()
     torch.save(network.state_dict(), file)
     content = file.getvalue()
@@ -43,12 +43,12 @@ def serve(monkeypatch, name, network):
 
 @pytest.mark.parametrize(("height", "width"), [(31, 31), (64, 47), (227, 227)])
 def test_features_have_torchvisions_sizes(height, width):
-    found = AlexNet()(torch.rand(2, 3, height, width))
+    features = AlexNet()(torch.rand(2, 3, height, width))
     first = [(n + 4 - 11) // 4 + 1 for n in (height, width)]
     second = [(n - 3) // 2 + 1 for n in first]
     third = [(n - 3) // 2 + 1 for n in second]
-    assert [each.shape[1] for each in found] == list(CHANNELS)
-    assert [list(each.shape[2:]) for each in found] == [first, second, third, third, third]
+    assert [feature.shape[1] for feature in features] == list(CHANNELS)
+    assert [list(feature.shape[2:]) for feature in features] == [first, second, third, third, third]
 
 
 def test_keys_are_torchvisions():
@@ -57,7 +57,7 @@ def test_keys_are_torchvisions():
     assert list(Heads().state_dict()) == [f"lin{i}.model.1.weight" for i in range(5)]
 
 
-def test_grey_is_repeated_and_the_walk_can_stop_early():
+def test_grey_is_repeated_and_later_layers_can_be_left_out():
     network, grey = AlexNet(), torch.rand(1, 1, 40, 40)
     whole, part = network(grey.expand(-1, 3, -1, -1)), network(grey, 4)
     assert len(part) == 4
@@ -144,8 +144,13 @@ def test_other_weights_and_damaged_files_are_refused(tmp_path):
     (tmp_path / "picture.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(50))
     torch.save([1, 2], tmp_path / "list.pth")
     other, damaged = "does not hold the weights of `AlexNet`", "cannot be read as plain weights: it is damaged"
-    for file, said in (("other.pth", other), ("list.pth", other), ("damaged.pth", damaged), ("picture.png", damaged)):
-        with pytest.raises(CheckpointError, match=said) as caught:
+    for file, message in (
+        ("other.pth", other),
+        ("list.pth", other),
+        ("damaged.pth", damaged),
+        ("picture.png", damaged),
+    ):
+        with pytest.raises(CheckpointError, match=message) as caught:
             load_alexnet(tmp_path / file)
         assert "\n" not in str(caught.value)
         assert "weights_only" not in str(caught.value)

@@ -1,4 +1,4 @@
-"""The score on captures whose camera, noise and scene are known."""
+"""The consistency score on simulated captures, with known PSF, noise and scene."""
 
 import pytest
 import torch
@@ -14,7 +14,7 @@ SIZE, NOISE = (128, 144), 0.004
 
 
 @pytest.fixture(scope="module")
-def known():
+def capture():
     """A PSF, a scene of coloured rectangles, and its capture with white noise."""
     generator = torch.Generator().manual_seed(2)
     psf = contour_psf(SIZE, generator=generator).expand(-1, 3, -1, -1)
@@ -26,18 +26,18 @@ def known():
     return psf, scene, light + NOISE * light.amax() * torch.randn(light.shape, generator=generator)
 
 
-def test_the_true_scene_explains_all_that_is_not_noise(known):
-    psf, scene, measurement = known
-    found = consistency(measurement, psf, scene)
-    assert found.explained == pytest.approx(found.possible, abs=0.02)
-    assert found.contrast > 1.5
-    assert not found.doubtful
+def test_the_true_scene_explains_all_that_is_not_noise(capture):
+    psf, scene, measurement = capture
+    result = consistency(measurement, psf, scene)
+    assert result.explained == pytest.approx(result.possible, abs=0.02)
+    assert result.contrast > 1.5
+    assert not result.doubtful
 
 
-def test_possible_is_what_white_noise_leaves(known):
-    psf, scene, _ = known
+def test_possible_is_what_white_noise_leaves(capture):
+    psf, scene, _ = capture
     light = Camera(psf).forward(scene)
-    # The finest patterns count as noise too, a little.
+    # A little of the finest detail counts as noise, too.
     clean = consistency(light, psf, scene)
     assert clean.possible > 0.99
     noise = 0.5 * light.std() * torch.randn(light.shape, generator=torch.Generator().manual_seed(3))
@@ -47,22 +47,22 @@ def test_possible_is_what_white_noise_leaves(known):
     assert noisy.possible == pytest.approx(float(share), abs=0.1)
 
 
-def test_wrong_psfs_are_doubted_and_a_turned_one_is_found(known):
-    psf, _, measurement = known
+def test_wrong_psfs_are_doubtful_and_a_turned_one_is_aligned(capture):
+    psf, _, measurement = capture
     for wrong in (psf.flip(-1), psf.flip(-2), psf.flip(-1, -2)):
         assert consistency(measurement, wrong, Pyramid()(measurement, wrong)).doubtful
     turned = Pose(torch.tensor([-0.9]), torch.tensor([0.0])).move(psf)
-    found = consistency(measurement, turned, Pyramid()(measurement, psf))
-    assert not found.doubtful
-    assert found.turn_degrees == pytest.approx(0.9, abs=0.2)
-    assert "turned by" in found.sentence
+    result = consistency(measurement, turned, Pyramid()(measurement, psf))
+    assert not result.doubtful
+    assert result.turn_degrees == pytest.approx(0.9, abs=0.2)
+    assert "turned by" in result.sentence
 
 
-def test_gain_and_even_light_do_not_matter(known):
-    psf, scene, measurement = known
+def test_gain_and_even_light_do_not_matter(capture):
+    psf, scene, measurement = capture
     plain = consistency(measurement, psf, scene)
-    found = consistency(3 * measurement + 0.5, 7 * psf, 0.2 * scene)
-    assert found.explained == pytest.approx(plain.explained, abs=5e-3)
+    result = consistency(3 * measurement + 0.5, 7 * psf, 0.2 * scene)
+    assert result.explained == pytest.approx(plain.explained, abs=5e-3)
 
 
 def test_sentences():
@@ -76,7 +76,7 @@ def test_sentences():
     )
 
 
-def test_one_capture_at_a_time(known):
-    psf, scene, measurement = known
+def test_one_capture_at_a_time(capture):
+    psf, scene, measurement = capture
     with pytest.raises(ShapeError, match="one shape"):
         consistency(measurement, psf, scene[..., 1:])

@@ -42,16 +42,16 @@ def distances(networks):
 @pytest.mark.parametrize("channels", [1, 3])
 def test_ssim_is_that_of_scikit_image_and_torchmetrics(noisy_pair, channels):
     image, reference = (picture[:, :channels] for picture in noisy_pair)
-    found = ssim(image, reference)
+    result = ssim(image, reference)
     options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1}
-    wanted = [
+    expected = [
         structural_similarity(x.double().numpy(), y.double().numpy(), channel_axis=0, **options)
         for x, y in zip(image, reference, strict=True)
     ]
-    np.testing.assert_allclose(found, wanted, atol=2e-5)
+    np.testing.assert_allclose(result, expected, atol=2e-5)
     # torchmetrics averages over windows that reach into a reflected border, too: leave those out.
     _, windows = structural_similarity_index_measure(image, reference, data_range=1.0, return_full_image=True)
-    torch.testing.assert_close(found, windows[..., 5:-5, 5:-5].mean((1, 2, 3)), atol=2e-5, rtol=0)
+    torch.testing.assert_close(result, windows[..., 5:-5, 5:-5].mean((1, 2, 3)), atol=2e-5, rtol=0)
 
 
 def test_mse_its_logarithm_and_l1_by_hand():
@@ -62,11 +62,11 @@ def test_mse_its_logarithm_and_l1_by_hand():
 
 
 def test_feature_mse_is_equation_3(noisy_pair, networks):
-    """The authors' form, over one sample: two means, added; the pictures as they are."""
+    """The authors' formula for one sample: the sum of two means, of pictures without normalisation."""
     for x, y in zip(*noisy_pair, strict=True):
         a, b = networks[0](x[None]), networks[0](y[None])
-        wanted = nn.functional.mse_loss(a[1], b[1]) + nn.functional.mse_loss(a[3], b[3])
-        torch.testing.assert_close(feature_mse(x[None], y[None], networks[0])[0], wanted)
+        expected = nn.functional.mse_loss(a[1], b[1]) + nn.functional.mse_loss(a[3], b[3])
+        torch.testing.assert_close(feature_mse(x[None], y[None], networks[0])[0], expected)
 
 
 def test_lpips_has_the_published_numbers(data, lpips_files):
@@ -74,8 +74,8 @@ def test_lpips_has_the_published_numbers(data, lpips_files):
     read = lambda name: cv2.imread(str(data / "lpips" / "examples" / f"ex_{name}.png"))[..., ::-1]  # noqa: E731
     pictures = [torch.from_numpy(read(name) / np.float32(255)).movedim(-1, 0) for name in ("ref", "p0", "p1")]
     reference = torch.stack([pictures[0]] * 2)
-    found = lpips(torch.stack(pictures[1:]), reference, network, heads)
-    np.testing.assert_allclose(found, [0.7219, 0.1376], atol=1e-3)
+    result = lpips(torch.stack(pictures[1:]), reference, network, heads)
+    np.testing.assert_allclose(result, [0.7219, 0.1376], atol=1e-3)
 
 
 @pytest.mark.parametrize("name", DISTANCES)

@@ -19,13 +19,13 @@ def perceptual(lpips_files):
 
 @pytest.fixture
 def pair(generator):
-    """Two pictures, of which the first leaves [0, 1]."""
+    """Noisy pictures, with values outside [0, 1], and their scenes."""
     scene = torch.rand(2, 3, 40, 44, generator=generator)
     return scene + 0.3 * torch.randn(scene.shape, generator=generator), scene
 
 
 def grid(height, width):
-    """Each pixel holds 1000 times its row plus its column."""
+    """Each pixel is 1000 times its row plus its column."""
     return (1000 * torch.arange(height)[:, None] + torch.arange(width)).float().expand(1, 1, -1, -1)
 
 
@@ -80,11 +80,11 @@ def test_a_part_must_lie_inside_the_picture(text):
 
 
 def test_psnr_is_that_of_torchmetrics_and_scikit_image(pair):
-    found = psnr(*pair)
+    result = psnr(*pair)
     oracle = torchmetrics_psnr(*pair, data_range=1.0, reduction="none", dim=(1, 2, 3))
-    torch.testing.assert_close(found, oracle)
-    wanted = [peak_signal_noise_ratio(y.numpy(), x.numpy(), data_range=1) for x, y in zip(*pair, strict=True)]
-    np.testing.assert_allclose(found, wanted, rtol=1e-5)
+    torch.testing.assert_close(result, oracle)
+    expected = [peak_signal_noise_ratio(y.numpy(), x.numpy(), data_range=1) for x, y in zip(*pair, strict=True)]
+    np.testing.assert_allclose(result, expected, rtol=1e-5)
     assert psnr(pair[0], pair[0]).tolist() == [math.inf, math.inf]
 
 
@@ -93,24 +93,24 @@ def test_psnr_by_hand():
 
 
 def test_measure_crops_then_clips_then_compares(pair, perceptual):
-    found = measure(*pair, Protocol.parse("2:38,4:40"), variant="clipped", perceptual=perceptual)
+    result = measure(*pair, Protocol.parse("2:38,4:40"), variant="clipped", perceptual=perceptual)
     image, scene = (picture[..., 2:38, 4:40] for picture in pair)
-    assert tuple(found) == METRICS
-    torch.testing.assert_close(found["psnr"], psnr(image.clamp(0, 1), scene))
+    assert tuple(result) == METRICS
+    torch.testing.assert_close(result["psnr"], psnr(image.clamp(0, 1), scene))
     for i in range(2):
         x, y = image[i].clamp(0, 1).numpy(), scene[i].numpy()
         options = {"gaussian_weights": True, "use_sample_covariance": False, "data_range": 1, "channel_axis": 0}
-        assert found["ssim"][i].item() == pytest.approx(structural_similarity(x, y, **options), abs=2e-5)
-    assert all(value.shape == (2,) and value.isfinite().all() for value in found.values())
+        assert result["ssim"][i].item() == pytest.approx(structural_similarity(x, y, **options), abs=2e-5)
+    assert all(value.shape == (2,) and value.isfinite().all() for value in result.values())
 
 
 def test_raw_is_not_clipped(pair):
-    found = measure(*pair, Protocol(), variant="raw")["mse"]
-    torch.testing.assert_close(found, (pair[0] - pair[1]).square().mean((1, 2, 3)))
-    assert (found > measure(*pair, Protocol(), variant="clipped")["mse"]).all()
+    result = measure(*pair, Protocol(), variant="raw")["mse"]
+    torch.testing.assert_close(result, (pair[0] - pair[1]).square().mean((1, 2, 3)))
+    assert (result > measure(*pair, Protocol(), variant="clipped")["mse"]).all()
 
 
-def test_the_papers_protocol_is_raw_unless_said_otherwise(pair):
+def test_the_papers_protocol_is_raw_by_default(pair):
     part = Protocol.parse("centre-32")
     assert torch.equal(measure(*pair, part)["mse"], measure(*pair, part, variant="raw")["mse"])
     assert torch.equal(measure(*pair, Protocol())["mse"], measure(*pair, Protocol(), variant="clipped")["mse"])
@@ -120,16 +120,16 @@ def test_best_gain_undoes_an_affine_change(pair):
     scene = pair[1]
     change = torch.tensor([3.0, 0.01]).view(2, 1, 1, 1) * scene + torch.tensor([-2.0, 0.7]).view(2, 1, 1, 1)
     torch.testing.assert_close(best_gain(change, scene), scene, atol=2e-5, rtol=0)
-    found = measure(change, scene, Protocol(), variant="best-gain")
-    assert (found["psnr"] > 90).all()
-    assert (found["ssim"] > 0.9999).all()
+    result = measure(change, scene, Protocol(), variant="best-gain")
+    assert (result["psnr"] > 90).all()
+    assert (result["ssim"] > 0.9999).all()
 
 
 def test_best_gain_is_least_squares_over_all_colours(pair):
     for x, y in zip(*pair, strict=True):
         design = np.stack([x.flatten(), np.ones(x.numel())], axis=1)
-        wanted = design @ np.linalg.lstsq(design, y.flatten().numpy(), rcond=None)[0]
-        np.testing.assert_allclose(best_gain(x[None], y[None]).flatten(), wanted, atol=1e-5)
+        expected = design @ np.linalg.lstsq(design, y.flatten().numpy(), rcond=None)[0]
+        np.testing.assert_allclose(best_gain(x[None], y[None]).flatten(), expected, atol=1e-5)
 
 
 def test_best_gain_does_not_clip_and_an_even_picture_becomes_the_mean(pair):
@@ -149,13 +149,13 @@ def test_missing_networks_are_nan_and_have_a_reason(pair, tmp_path, data):
     absent = Perceptual.load(tmp_path / "absent.pth")
     assert set(absent.missing) == {"lpips", "feature_mse"}
     assert "absent.pth" in absent.missing["lpips"]
-    found = measure(*pair, Protocol(), perceptual=absent)
-    assert all(found[name].isnan().all() == (name in absent.missing) for name in METRICS)
+    result = measure(*pair, Protocol(), perceptual=absent)
+    assert all(result[name].isnan().all() == (name in absent.missing) for name in METRICS)
     heads = Perceptual.load(data / "lpips" / "alexnet_features_torchvision.pth", tmp_path / "absent.pth")
     assert set(heads.missing) == {"lpips"}
-    found = measure(*pair, Protocol(), perceptual=heads)
-    assert found["feature_mse"].isfinite().all()
-    assert found["lpips"].isnan().all()
+    result = measure(*pair, Protocol(), perceptual=heads)
+    assert result["feature_mse"].isfinite().all()
+    assert result["lpips"].isnan().all()
     assert measure(*pair, Protocol())["lpips"].isnan().all()
 
 
@@ -184,8 +184,8 @@ def test_bootstrap_has_the_width_of_the_standard_error(generator):
     assert (high - low) / (2 * 1.96 * values.std().item() / 20) == pytest.approx(1, abs=0.08)
 
 
-def test_bootstrap_covers_the_truth_as_often_as_it_says(generator):
-    """Of 200 skewed data sets, whose true mean is 1, about 90 % of intervals hold it: 3 standard errors are 6 %."""
+def test_bootstrap_covers_the_true_mean_at_its_confidence(generator):
+    """Of 200 skewed data sets, whose true mean is 1, about 90 % of the intervals hold it; 3 standard errors are 6 %."""
     held = 0
     for _ in range(200):
         values = -torch.rand(60, generator=generator, dtype=torch.float64).log()

@@ -1,4 +1,4 @@
-"""A table of the terminal as HTML and as Markdown; scores through a file and back."""
+"""Tables as HTML and Markdown; scores written and read back."""
 
 import json
 import math
@@ -37,7 +37,7 @@ def test_markdown():
 
 def test_scores_survive_json():
     scores = Scores({"psnr": (20.0, 21.5), "lpips": (math.nan, math.nan)}, (0.1, 0.2), None, "cpu", 7)
-    found = Scores.read(json.loads(json.dumps(scores.content(), allow_nan=False)))
-    assert found.values["psnr"] == scores.values["psnr"]
-    assert all(map(math.isnan, found.values["lpips"]))
-    assert (found.seconds, found.peak_bytes, found.device, found.learnable) == ((0.1, 0.2), None, "cpu", 7)
+    result = Scores.read(json.loads(json.dumps(scores.content(), allow_nan=False)))
+    assert result.values["psnr"] == scores.values["psnr"]
+    assert all(map(math.isnan, result.values["lpips"]))
+    assert (result.seconds, result.peak_bytes, result.device, result.learnable) == ((0.1, 0.2), None, "cpu", 7)

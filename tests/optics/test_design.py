@@ -56,7 +56,7 @@ def test_every_mask_becomes_a_camera(run, tmp_path, line):
     assert about["made"]["psf_hash"] == calibration.psf_hash
     assert calibration.psf_hash in out
     assert about["mask"]["name"] == line.split()[0]
-    # The files are enough to compute the PSF again.
+    # The PSF can be computed again from the files.
     setup = {name: tuple(value) if isinstance(value, list) else value for name, value in about["setup"].items()}
     again = mask_psf(read_mask("cam/mask.tif"), Setup(**setup))
     again = again / again.sum((-2, -1), keepdim=True)
@@ -108,20 +108,20 @@ def test_recipe_stands_behind_the_command_line(run, tmp_path):
 
 @pytest.mark.parametrize(("recipe", "mask"), [("mwdn", "contour"), ("diffuser", "diffuser"), ("coded", "coded")])
 def test_recipes_of_the_project_are_understood(run, recipe, mask):
-    """One wrong number is named, after all the others have been read."""
+    """Every key of the recipe is read; the only error is the wrong number on the command line."""
     code, _, err = run(mask, "--recipe", RECIPES / f"camera-{recipe}.toml", "--pitch-um", "-1")
     assert (code, err) == (2, "Error: `pitch_um` (-1) must be positive.\n")
 
 
 def test_recipe_of_the_paper_is_the_default(run, monkeypatch):
-    found = []
-    monkeypatch.setattr("mwdn.cli.design.Output.write", lambda self, *arguments: found.append(arguments))
+    calls = []
+    monkeypatch.setattr("mwdn.cli.design.Output.write", lambda self, *arguments: calls.append(arguments))
     assert run("contour", "--recipe", RECIPES / "camera-mwdn.toml")[0] == 0
-    assert found == [("contour", Contour(), Setup())]
+    assert calls == [("contour", Contour(), Setup())]
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "message"),
     [
         ("contour --levels 0", "Error: `levels` (0) must be 2 to 65,536."),
         ("contour --distance-mm -2", "Error: `distance_mm` (-2) must be positive."),
@@ -132,10 +132,10 @@ def test_recipe_of_the_paper_is_the_default(run, monkeypatch):
         ("pinholes --stl --size-mm 0.4 0.4 --count 2", "no heights for an STL"),
     ],
 )
-def test_wrong_call_is_one_message_and_exit_2(run, line, said):
+def test_wrong_call_is_one_message_and_exit_2(run, line, message):
     code, out, err = run(*line.split(), *SMALL)
     assert code == 2
-    assert said in " ".join(err.split())
+    assert message in " ".join(err.split())
     assert "Traceback" not in out + err
 
 
@@ -150,11 +150,11 @@ def test_designed_camera_keeps_its_light():
 
 
 def test_sensitivity_falls_with_the_distance_from_where_the_psf_was_taken(run, tmp_path):
-    status, _, said = run("diffuser", "--size-mm", "0.5", "0.5", *SMALL, "--sensitivity")
-    assert status == 0, said
+    status, _, message = run("diffuser", "--size-mm", "0.5", "0.5", *SMALL, "--sensitivity")
+    assert status == 0, message
     likeness = json.loads((tmp_path / "cam" / "camera.json").read_text())["likeness"]
     angles = likeness["angle_degrees"]
-    # So small an aperture moves its pattern and hardly changes it.
+    # The pattern of such a small aperture moves, but hardly changes.
     assert all(0.8 < value < 1 for value in angles.values())
     assert "10" not in angles  # the pitch of 2 um cannot sample it
     near, half, far = (likeness["source_mm"][key] for key in ("50", "100", "800"))

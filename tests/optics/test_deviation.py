@@ -1,4 +1,4 @@
-"""Where a true camera differs from its calibration."""
+"""Cameras that differ from their calibration."""
 
 import pytest
 import torch
@@ -32,24 +32,24 @@ def test_shift_is_down_and_right():
 
 
 def test_turn_is_clockwise():
-    """A quarter: what lies 5 pixels to the right goes 5 pixels down. Row 0 is at the top."""
+    """A quarter turn moves a point 5 pixels to the right of the centre to 5 pixels below it. Row 0 is at the top."""
     camera = Deviation(turn_degrees=90.0).camera(point(SIZE, 20, 29))
     torch.testing.assert_close(camera.psf_at(0, 0), point(SIZE, 25, 24), rtol=0, atol=1e-4)
 
 
 def test_scale_moves_points_outwards():
     camera = Deviation(scale=0.25).camera(point(SIZE, 20, 28))
-    found = camera.psf_at(0, 0)[0, 0]
-    assert divmod(int(found.argmax()), SIZE[1]) == (20, 29)
-    assert found.sum() == pytest.approx(1.0, abs=1e-4)
+    psf = camera.psf_at(0, 0)[0, 0]
+    assert divmod(int(psf.argmax()), SIZE[1]) == (20, 29)
+    assert psf.sum() == pytest.approx(1.0, abs=1e-4)
 
 
 def test_background_is_even_and_keeps_the_light():
     camera = Deviation(background=0.25).camera(point(SIZE, 20, 24))
-    found = camera.psf_at(3, 3)[0, 0]
-    assert found.sum() == pytest.approx(1.0, abs=1e-4)
-    assert found[0, 0] == pytest.approx(0.25 / (40 * 48), rel=1e-3)
-    assert found[20, 24] == pytest.approx(0.75 + 0.25 / (40 * 48), rel=1e-3)
+    psf = camera.psf_at(3, 3)[0, 0]
+    assert psf.sum() == pytest.approx(1.0, abs=1e-4)
+    assert psf[0, 0] == pytest.approx(0.25 / (40 * 48), rel=1e-3)
+    assert psf[20, 24] == pytest.approx(0.75 + 0.25 / (40 * 48), rel=1e-3)
 
 
 def test_off_axis_changes_the_corner_and_not_the_centre(generator):
@@ -59,7 +59,7 @@ def test_off_axis_changes_the_corner_and_not_the_centre(generator):
     assert (middle - psf).norm() < 0.05 * psf.norm()
     assert (corner - psf).norm() > 0.2 * psf.norm()
     assert corner.sum() == pytest.approx(0.7 * float(psf.sum()), rel=0.1)  # 30 % are lost at the corner
-    # No single convolution gives its measurement.
+    # The measurement is not a convolution with a single PSF.
     scene = torch.zeros(1, 3, 41, 49)
     scene[..., 1, 1] = 1
     assert (camera.forward(scene) - convolve(scene, psf)).norm() > 0.2 * convolve(scene, psf).norm()

@@ -39,7 +39,7 @@ def brute_force(psfs, scene, sensor):
             for dr, wr in ((0, 1 - (a - r)), (1, a - r)):
                 for dc, wc in ((0, 1 - (b - c)), (1, b - c)):
                     psf = psf + wr * wc * psfs[min(r + dr, rows - 1), min(c + dc, columns - 1)].double()
-            # Scene centre before sensor centre: pixel (i, j) stands before this sensor pixel.
+            # The centres of scene and sensor coincide: pixel (i, j) lies opposite this sensor pixel.
             top, left = i - H // 2 + h // 2 - height // 2, j - W // 2 + w // 2 - width // 2
             for y in range(max(top, 0), min(top + height, h)):
                 for x in range(max(left, 0), min(left + width, w)):
@@ -91,8 +91,8 @@ def test_same_psf_everywhere_is_the_plain_camera(generator):
 def test_truncation_costs_the_singular_values_left_out(rank, generator):
     """Eckart and Young: summed over all points, the squared error is the sum of the other squared singular values.
 
-    The grid has a point for each scene pixel, and the sensor holds every PSF whole, so it is the error of the forward
-    model over a complete set of scenes too.
+    The grid has a point for each scene pixel, and the sensor holds every PSF whole, so it is also the error of the
+    forward model over a complete set of scenes.
     """
     psfs = torch.rand(3, 4, 2, 5, 6, generator=generator)
     values = torch.linalg.svdvals(psfs.reshape(12, -1).double())
@@ -122,7 +122,7 @@ def test_points_cast_the_psf_of_their_place(generator):
     scene = torch.zeros(1, 1, 21, 25)
     scene[..., 20, 12] = 1
     captured = camera.forward(scene)
-    # Pixel (20, 12) of the scene stands 10 rows below its centre, so before sensor pixel (40, 30).
+    # Pixel (20, 12) of the scene is 10 rows below its centre, opposite sensor pixel (40, 30).
     cut = captured[..., 40 - 10 : 40 - 10 + 20, 30 - 12 : 30 - 12 + 24]
     torch.testing.assert_close(cut, psfs[2, 1][None], rtol=1e-3, atol=1e-6)
     torch.testing.assert_close(captured.sum(), cut.sum(), rtol=1e-4, atol=0)
@@ -172,7 +172,7 @@ def test_blur_keeps_light_within_and_loses_it_at_the_border():
     torch.testing.assert_close(gaussian_blur(point, 2.0), gaussian((31, 31), 2.0, 2.0), rtol=1e-3, atol=1e-6)
     border = torch.zeros(1, 1, 31, 31)
     border[..., 0, 15] = 1
-    # Half of it lies beyond, and half of the middle row's share, 1 / (2 sqrt(2 pi)), is more than half.
+    # Half of the light remains, and half of the middle row, whose share is 1 / (2 sqrt(2 pi)).
     expected = 0.5 + 0.5 / (2 * math.sqrt(2 * math.pi))
     assert gaussian_blur(border, 2.0).sum().item() == pytest.approx(expected, abs=1e-3)
 

@@ -1,4 +1,4 @@
-"""Masks in files: exact round trips, geometry of GDSII and STL."""
+"""Mask files: exact round trips, geometry of GDSII and STL."""
 
 import json
 from collections import Counter
@@ -68,15 +68,15 @@ def test_gds_layers_are_the_bits_of_the_levels(levels, tmp_path):
     write_gds(tmp_path / "mask.gds", levels)
     cell = gdstk.read_gds(tmp_path / "mask.gds").cells[0]
     number = (levels.values / 0.145).round().long()
-    found = torch.zeros_like(number)
+    drawn = torch.zeros_like(number)
     for polygon in cell.polygons:
         (left, low), (right, high) = polygon.bounding_box()
         assert polygon.area() == pytest.approx((right - left) * (high - low))
         rows = slice(round(9 // 2 + 0.5 - high / 2), round(9 // 2 + 0.5 - low / 2))
         columns = slice(round(left / 2 + 12 // 2 + 0.5), round(right / 2 + 12 // 2 + 0.5))
-        assert (found[rows, columns] & 2**polygon.layer == 0).all()  # no square twice
-        found[rows, columns] += 2**polygon.layer
-    assert torch.equal(found, number)
+        assert (drawn[rows, columns] & 2**polygon.layer == 0).all()  # no square twice
+        drawn[rows, columns] += 2**polygon.layer
+    assert torch.equal(drawn, number)
 
 
 def test_gds_joins_equal_rows(tmp_path):
@@ -103,7 +103,7 @@ def test_stl_is_a_closed_body_of_the_right_volume(generator, tmp_path):
     mask = Mask("phase", 5 * torch.rand(6, 9, generator=generator), 2.0, 1.5)
     write_stl(tmp_path / "mask.stl", mask, base_um=30.0)
     normals, corners = read_stl(tmp_path / "mask.stl")
-    # Closed: each edge is passed once in each direction.
+    # Closed: the triangles traverse each edge once in each direction.
     edges = Counter()
     for triangle in corners:
         points = [tuple(point) for point in triangle.tolist()]
@@ -111,7 +111,7 @@ def test_stl_is_a_closed_body_of_the_right_volume(generator, tmp_path):
             edges[edge] += 1
     assert set(edges.values()) == {1}
     assert all((end, start) in edges for start, end in edges)
-    # Turned outwards: the divergence theorem gives the volume, and with a plus.
+    # Oriented outwards: the divergence theorem gives the volume with a positive sign.
     wide = corners.astype(np.float64)
     volume = np.einsum("ni,ni->n", wide[:, 0], np.cross(wide[:, 1], wide[:, 2])).sum() / 6
     h = mask.values.double().numpy() + 30.0

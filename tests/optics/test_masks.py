@@ -1,4 +1,4 @@
-"""Masks against what is known of them, and the PSF of a camera that has one."""
+"""Masks against their known properties, and the PSF of a camera with a mask."""
 
 import dataclasses
 import math
@@ -31,7 +31,7 @@ def green(setup=SMALL):
 
 
 def test_contour_mask_of_the_paper_has_its_numbers():
-    """8 x 145 nm in fused silica are one wave of green light, 7/8 of which the highest level delays."""
+    """8 x 145 nm of fused silica delay green light by one wave; the highest of the 8 levels by 7/8 of it."""
     design = Contour()
     assert (design.size_mm, design.pitch_um, design.levels, design.step_nm) == ((7.0, 7.0), 2.0, 8, 145.0)
     assert design.design_nm == pytest.approx(533.6)
@@ -46,7 +46,7 @@ def test_contour_mask_of_the_paper_has_its_numbers():
 
 
 def test_contour_mask_puts_the_light_onto_its_lines():
-    """Of what falls onto the lines without a mask (their part of the area), many times as much."""
+    """The lines receive many times the light that falls onto their area without a mask."""
     design = CONTOUR
     mask = design.build(green())
     lines = contours((300, 250), line=4.0, spacing=52.0, generator=torch.Generator().manual_seed(0)) > 0.3
@@ -62,13 +62,13 @@ def test_contour_mask_puts_the_light_onto_its_lines():
     for each in (fine, coarse):
         field = each.field(533.6) * point_source((300, 250), distance_mm=200.0, **light)
         parts.append((propagate(field, distance_mm=2.0, **light).abs().square() * lines).sum().item() / (300 * 250))
-    # N levels send sinc^2(1 / N) of the light where a smooth surface would: 0.95 for 8, 0.41 for 2.
+    # The efficiency of N levels is sinc^2(1 / N) of that of a smooth surface: 0.95 for 8, 0.41 for 2.
     assert part.item() / parts[0] == pytest.approx(np.sinc(1 / 8) ** 2, abs=0.03)
     assert parts[1] / parts[0] < 0.62
 
 
 def test_phase_retrieval_finds_a_lens():
-    """Wanted: a spot. The answer is known: a thin lens, up to a constant."""
+    """The phase that focuses light into a spot is a thin lens, up to a constant."""
     count, focal = 100, 1.0
     light = {"pitch_um": 2.0, "wavelength_nm": 500.0}
     y, x = coordinates(count, 2.0)[:, None], coordinates(count, 2.0)
@@ -85,7 +85,7 @@ def test_phase_retrieval_finds_a_lens():
 def test_contours_are_as_wide_and_as_far_apart_as_asked():
     lines = contours((600, 600), line=5.0, spacing=50.0, generator=torch.Generator().manual_seed(1))
     bright = lines[100:500, 100:500] > 0.5
-    # Of a cut at random angles the lines take a part of width / distance; angles lengthen both alike.
+    # On a straight cut the lines take width / distance of the length; oblique angles lengthen both alike.
     assert bright.float().mean().item() == pytest.approx(5 / 50, rel=0.35)
     power = np.fft.fft2(lines.numpy() - lines.mean().item())
     radius = np.hypot(np.fft.fftfreq(600)[:, None], np.fft.fftfreq(600))
@@ -148,7 +148,7 @@ def test_mls_has_the_flat_spectrum_of_maximum_length(order):
 
 @pytest.mark.parametrize("side", [5, 13, 31])
 def test_mura_decodes_to_one_peak(side):
-    """Gottesman and Fenimore: correlated with its decoding array it is a delta."""
+    """Gottesman and Fenimore: its correlation with the decoding array is a delta."""
     code = amplitude_masks.mura(side).double().numpy()
     decoder = 2 * code - 1
     decoder[0, 0] = 1
@@ -177,7 +177,7 @@ def test_pinholes_have_their_number_and_area():
 
 
 def test_pinhole_makes_a_shadow_of_its_size_in_the_middle():
-    """Half a mm behind a hole of 100 um: all light of the hole, magnified by 1 + 0.5 / 200."""
+    """0.5 mm behind a hole of 100 um: all light of the hole, magnified by 1 + 0.5 / 200."""
     values = torch.zeros(251, 251)
     values[100:151, 100:151] = 1
     setup = green(Setup(distance_mm=0.5, aperture_mm=(0.5, 0.5), pixels=(128, 128), bin=1))
@@ -187,7 +187,7 @@ def test_pinhole_makes_a_shadow_of_its_size_in_the_middle():
     for axis in (0, 1):
         profile = psf.sum(1 - axis)
         assert (profile * places).sum() / profile.sum() == pytest.approx(0.0, abs=0.05)
-        # A band of width a has the second moment a^2 / 12; diffraction's tails are cut at 75 um.
+        # A band of width a has the second moment a^2 / 12; the tails of diffraction are cut at 75 um.
         near = places.abs() < 75
         second = (profile * places**2)[near].sum() / profile[near].sum()
         assert second.sqrt().item() == pytest.approx(102 * 1.0025 / math.sqrt(12), rel=0.05)
@@ -205,7 +205,7 @@ def test_source_above_the_axis_casts_the_pattern_below():
 
 
 def test_all_light_arrives_and_colours_differ():
-    """Through a clear plate that is smaller than the sensor: 1 in each channel, but for what is diffracted away."""
+    """A clear plate smaller than the sensor: 1 in each channel, less the light diffracted beyond the sensor."""
     plate = Mask("phase", torch.zeros(300, 250), 2.0, 1.5)
     psf = mask_psf(plate, SMALL)
     assert psf.shape == (1, 3, 64, 60)
@@ -217,7 +217,7 @@ def test_all_light_arrives_and_colours_differ():
 
 
 def test_finer_pitch_gives_the_same_psf():
-    """The diffuser is one surface, however it is sampled."""
+    """The diffuser's surface does not depend on the sampling."""
     setup = green()
     coarse, fine = (
         mask_psf(Diffuser(size_mm=(0.6, 0.6), pitch_um=pitch).build(setup), setup)[0, 0] for pitch in (2.0, 1.0)
@@ -260,15 +260,15 @@ IMPOSSIBLE = [
 ]
 
 
-@pytest.mark.parametrize(("design", "said"), IMPOSSIBLE, ids=[said[:40] for _, said in IMPOSSIBLE])
-def test_impossible_masks(design, said):
+@pytest.mark.parametrize(("design", "message"), IMPOSSIBLE, ids=[message[:40] for _, message in IMPOSSIBLE])
+def test_impossible_masks(design, message):
     with pytest.raises(ParameterError) as caught:
         design.build(SMALL)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"distance_mm": -2.0}, "`distance_mm` (-2) must be positive"),
         ({"distance_mm": math.inf}, "`distance_mm` (inf) must be finite"),
@@ -280,10 +280,10 @@ def test_impossible_masks(design, said):
         ({"wavelengths": 0}, "`wavelengths` (0) must be positive"),
     ],
 )
-def test_impossible_setups(change, said):
+def test_impossible_setups(change, message):
     with pytest.raises(ParameterError) as caught:
         Setup(**change)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
 
 
 def test_pitch_that_cannot_sample_the_surface():

@@ -11,7 +11,7 @@ from mwdn.errors import ParameterError
 from mwdn.optics.propagation import coordinates, integrate, needed_samples, point_source, propagate
 
 LIGHT = {"pitch_um": 2.0, "wavelength_nm": 500.0}
-"""Nyquist sine 0.125: 0.126 mm of displacement over a mm."""
+"""The pitch samples angles up to a sine of 0.125: 0.126 mm of displacement per mm."""
 
 
 def grid(height, width, pitch=2.0):
@@ -27,13 +27,13 @@ def gaussian(shape, waist, *, middle=(0.0, 0.0)):
 def test_gaussian_beam(shape):
     """Waist 50 um, Rayleigh range 15.7 mm: modulus, curvature of the front and Gouy phase after 10 mm."""
     waist, wavelength, z = 50.0, 0.5, 10_000.0
-    found = propagate(gaussian(shape, waist), distance_mm=10.0, **LIGHT)
+    result = propagate(gaussian(shape, waist), distance_mm=10.0, **LIGHT)
     rayleigh, k = math.pi * waist**2 / wavelength, 2 * math.pi / wavelength
     y, x = grid(*shape)
     expected = torch.exp(-(y**2 + x**2) / (waist**2 * (1 + 1j * z / rayleigh))) / (1 + 1j * z / rayleigh)
     expected = expected * complex(math.cos(k * z), math.sin(k * z))
-    # The paraxial beam itself is exact to about (wavelength / (pi waist))^2 = 1e-5 a Rayleigh range.
-    torch.testing.assert_close(found, expected.to(torch.complex64), rtol=0, atol=3e-4)
+    # The paraxial solution is exact to about (wavelength / (pi waist))^2 = 1e-5 per Rayleigh range.
+    torch.testing.assert_close(result, expected.to(torch.complex64), rtol=0, atol=3e-4)
 
 
 def rayleigh_sommerfeld(field, points, pitch, wavelength, z):
@@ -48,21 +48,21 @@ def rayleigh_sommerfeld(field, points, pitch, wavelength, z):
 
 
 def test_agrees_with_the_rayleigh_sommerfeld_integral():
-    """Another formula, in space and not in frequency, for a field without any symmetry."""
+    """An independent formula, in space instead of frequency, for a field without symmetry."""
     y, x = grid(64, 81)
     field = gaussian((64, 81), 16.0, middle=(-10.0, 8.0)) + 0.5j * gaussian((64, 81), 12.0, middle=(20.0, -25.0))
     field = field * torch.exp(0.12j * (x - 0.5 * y)).to(torch.complex64)
-    found = propagate(field, distance_mm=0.8, size=(101, 90), **LIGHT)
+    result = propagate(field, distance_mm=0.8, size=(101, 90), **LIGHT)
     rows, columns = np.arange(0, 101, 7), np.arange(0, 90, 9)
     points = [((i - 50) * 2.0, (j - 45) * 2.0) for i in rows for j in columns]
     expected = rayleigh_sommerfeld(field.numpy().astype(complex), points, 2.0, 0.5, 800.0)
-    np.testing.assert_allclose(found.numpy()[np.ix_(rows, columns)].ravel(), expected, rtol=0, atol=2e-4)
+    np.testing.assert_allclose(result.numpy()[np.ix_(rows, columns)].ravel(), expected, rtol=0, atol=2e-4)
 
 
 def test_slit_casts_fresnels_shadow():
     """Rectangle 200 x 120 um, 2 mm behind it: products of Fresnel integrals, edges on the samples' borders."""
     height, width, z, wavelength = 100, 60, 2000.0, 0.5
-    found = propagate(torch.ones(height, width, dtype=torch.complex64), distance_mm=2.0, size=(160, 120), **LIGHT)
+    result = propagate(torch.ones(height, width, dtype=torch.complex64), distance_mm=2.0, size=(160, 120), **LIGHT)
 
     def along(count, samples):
         places = coordinates(count, 2.0).numpy()
@@ -71,8 +71,8 @@ def test_slit_casts_fresnels_shadow():
         return (c[1] - c[0] + 1j * (s[1] - s[0])) / np.sqrt(2j)
 
     expected = abs(np.outer(along(160, height), along(120, width))) ** 2
-    intensity = found.abs().square().numpy()
-    # The pitch carries 0.25 periods a um; of a sharp edge that leaves ripples of a few percent.
+    intensity = result.abs().square().numpy()
+    # The pitch samples 0.25 periods per um; a sharp edge then has ripples of a few percent.
     assert np.sqrt(((intensity - expected) ** 2).mean()) < 0.02
     assert np.corrcoef(intensity.ravel(), expected.ravel())[0, 1] > 0.998
 
@@ -92,8 +92,8 @@ def test_lens_focuses_to_airys_spot():
     assert spot[20, 20] == pytest.approx((math.pi * diameter**2 / 4 / (wavelength * focal)) ** 2, rel=0.02)
 
 
-def test_grating_has_its_orders_where_and_as_bright_as_the_equation_says():
-    """Sinusoidal phase of depth 1 and period 20 um: sin = m / 40, efficiency J_m(1)^2; orders apart after 20 mm."""
+def test_grating_has_the_orders_of_the_equation():
+    """Sinusoidal phase of depth 1 and period 20 um: sin = m / 40, efficiency J_m(1)^2; separate after 20 mm."""
     from scipy.special import jv
 
     shape, period, z = (100, 200), 20.0, 20.0
@@ -106,30 +106,30 @@ def test_grating_has_its_orders_where_and_as_bright_as_the_equation_says():
     for m in (-2, -1, 0, 1, 2):
         sine = m * 0.5 / period
         middle = z * 1e3 * sine / math.sqrt(1 - sine**2)
-        near = abs(places - middle) < 240  # half the distance of two orders
+        near = abs(places - middle) < 240  # half the distance between two orders
         assert (far[near] * places[near]).sum() / far[near].sum() == pytest.approx(middle, abs=3.0)
         assert far[near].sum() / total == pytest.approx(jv(m, 1.0) ** 2, abs=4e-3)
 
 
 def test_energy_and_reciprocity(generator):
-    """Of all light that arrives, none is lost; and source and detector can change places."""
+    """Energy is conserved on a plane wide enough; source and detector can be exchanged."""
     smooth = gaussian((60, 71), 22.0)
     noise = torch.randn(2, 60, 71, generator=generator)
     field = smooth * torch.complex(noise[0], noise[1])
     wide = propagate(field, distance_mm=1.0, size=(400, 400), grid=(420, 450), **LIGHT)
     assert wide.abs().square().sum() == pytest.approx(field.abs().square().sum().item(), rel=1e-3)
     other = gaussian((60, 71), 15.0, middle=(12.0, -20.0))
-    there = (propagate(field, distance_mm=1.0, **LIGHT) * other).sum()
+    forward = (propagate(field, distance_mm=1.0, **LIGHT) * other).sum()
     back = (field * propagate(other, distance_mm=1.0, **LIGHT)).sum()
-    assert abs(there - back) < 1e-4 * abs(there)
+    assert abs(forward - back) < 1e-4 * abs(forward)
 
 
 @pytest.mark.parametrize(("first", "second"), [((40, 41), (40, 41)), ((33, 30), (70, 81)), ((64, 64), (9, 12))])
 def test_centres_face_each_other(first, second):
-    """A spot at sample n // 2 arrives at sample n // 2, whatever the two planes' sizes."""
-    there = propagate(gaussian(first, 6.0), distance_mm=0.1, size=second, **LIGHT).abs()
-    assert there.shape == second
-    assert divmod(int(there.argmax()), second[1]) == (second[0] // 2, second[1] // 2)
+    """A spot at sample n // 2 arrives at sample n // 2, whatever the sizes of the two planes."""
+    forward = propagate(gaussian(first, 6.0), distance_mm=0.1, size=second, **LIGHT).abs()
+    assert forward.shape == second
+    assert divmod(int(forward.argmax()), second[1]) == (second[0] // 2, second[1] // 2)
 
 
 def test_larger_grid_changes_nothing():
@@ -155,7 +155,7 @@ def test_point_source_is_a_sphere_and_far_away_a_plane():
 
 
 def test_light_from_above_goes_down():
-    """A point above the axis (a negative angle down) lights what lies below the axis behind the mask."""
+    """Light of a point above the axis (a negative angle) lands below the axis behind the mask."""
     field = gaussian((120, 120), 40.0) * point_source((120, 120), angle_degrees=(-3.0, 2.0), **LIGHT)
     spot = propagate(field, distance_mm=1.0, **LIGHT).abs().square().double()
     y, x = grid(120, 120)
@@ -166,8 +166,8 @@ def test_light_from_above_goes_down():
 @pytest.mark.parametrize("pixel", [1.0, 2.0, 2.4, 7.0])
 def test_pixels_collect_all_light(pixel, generator):
     light = torch.rand(30, 41, generator=generator)
-    found = integrate(light, pitch_um=2.0, size=(90, 100), pixel_um=pixel)
-    assert found.sum() == pytest.approx(light.sum().item(), rel=1e-5)
+    result = integrate(light, pitch_um=2.0, size=(90, 100), pixel_um=pixel)
+    assert result.sum() == pytest.approx(light.sum().item(), rel=1e-5)
 
 
 def test_pixels_as_large_as_samples_are_the_samples_and_bins_their_sums(generator):
@@ -179,16 +179,16 @@ def test_pixels_as_large_as_samples_are_the_samples_and_bins_their_sums(generato
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"pitch_um": -2.0}, r"`pitch_um` \(-2\) must be positive"),
         ({"wavelength_nm": 0.0}, r"`wavelength_nm` \(0\) must be positive"),
         ({"distance_mm": -1.0}, r"`distance_mm` \(-1\) must be positive"),
     ],
 )
-def test_impossible_lengths(change, said):
+def test_impossible_lengths(change, message):
     for function, first in ((propagate, torch.ones(4, 4, dtype=torch.complex64)), (point_source, (4, 4))):
-        with pytest.raises(ParameterError, match=said):
+        with pytest.raises(ParameterError, match=message):
             function(first, **(LIGHT | {"distance_mm": 1.0} | change))
 
 

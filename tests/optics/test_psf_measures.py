@@ -23,57 +23,57 @@ def test_effective_rank(generator):
 
 @pytest.mark.parametrize("sigma", [1.5, 3.0])
 def test_autocorrelation_of_a_spot(sigma):
-    """Of a Gaussian less its blur by h = size / 20: Gaussians of variance 2 s^2, 2 s^2 + h^2 (twice), 2 s^2 + 2 h^2."""
+    """A Gaussian less its blur by h = size / 20: terms of variance 2 s^2, 2 s^2 + h^2 (twice), 2 s^2 + 2 h^2."""
     size = 200
-    found = psf_measures.autocorrelation(gaussian_psf((size, size + 1), sigma))
+    result = psf_measures.autocorrelation(gaussian_psf((size, size + 1), sigma))
     r, blur = np.linspace(0, 20, 20_001), size / 20
     parts = [(1, 2 * sigma**2), (-2, 2 * sigma**2 + blur**2), (1, 2 * sigma**2 + 2 * blur**2)]
     profile = sum(weight * np.exp(-(r**2) / (2 * v)) / v for weight, v in parts)
-    assert found.width == pytest.approx(2 * r[profile < profile[0] / 2][0], rel=0.02)
-    # Pixels lie at whole distances: rings are not quite round, and the line between them not quite the curve.
-    assert found.image[100, 100] == pytest.approx(1.0, abs=1e-5)
-    assert found.image[100, 104] == pytest.approx(profile[4000] / profile[0], abs=1e-3)
-    assert found.lobe < 0.05
+    assert result.width == pytest.approx(2 * r[profile < profile[0] / 2][0], rel=0.02)
+    # Pixels sample the rings coarsely, and the interpolation between rings is linear: 2 %.
+    assert result.image[100, 100] == pytest.approx(1.0, abs=1e-5)
+    assert result.image[100, 104] == pytest.approx(profile[4000] / profile[0], abs=1e-3)
+    assert result.lobe < 0.05
 
 
 def test_autocorrelation_finds_where_a_pattern_repeats(generator):
-    """Two copies 30 rows and 12 columns apart: half of the light meets the other half."""
+    """Two copies 30 rows and 12 columns apart: at that displacement half of the light overlaps with the other half."""
     spots = (torch.rand(60, 60, generator=generator) < 0.01).float()
     psf = torch.zeros(1, 1, 128, 128)
     psf[..., 20:80, 20:80] += spots
     psf[..., 50:110, 32:92] += spots
-    found = psf_measures.autocorrelation(psf / psf.sum())
-    assert found.lobe == pytest.approx(0.5, abs=0.12)
-    assert found.lobe_at in ((30, 12), (-30, -12))
+    result = psf_measures.autocorrelation(psf / psf.sum())
+    assert result.lobe == pytest.approx(0.5, abs=0.12)
+    assert result.lobe_at in ((30, 12), (-30, -12))
 
 
 def test_support_of_a_box():
     """A box of ones, 21 x 41, on a frame of 100 x 120; 1 % at each side is less than a row."""
     psf = torch.zeros(1, 1, 100, 120)
     psf[..., 43:64, 30:71] = 1
-    found = psf_measures.support(psf / psf.sum())
-    assert (found.height, found.width) == (21, 41)
-    assert found.offset == pytest.approx((3, -10))
-    assert found.pixels == pytest.approx(21 * 41)
-    assert found.border == 0
-    assert found.glow == pytest.approx(1, abs=1e-6)  # a box is nothing but glow
-    assert found.contrast == 0
+    result = psf_measures.support(psf / psf.sum())
+    assert (result.height, result.width) == (21, 41)
+    assert result.offset == pytest.approx((3, -10))
+    assert result.pixels == pytest.approx(21 * 41)
+    assert result.border == 0
+    assert result.glow == pytest.approx(1, abs=1e-6)  # a box is nothing but glow
+    assert result.contrast == 0
 
 
 def test_glow_and_border_of_lines_on_a_level(generator):
     """Lines that hold 60 % of the light, on a level over the whole frame: the rest is glow, and lights the border."""
     lines = (torch.rand(100, 100, generator=generator) < 0.05).float()
     psf = 0.6 * lines / lines.sum() + 0.4 / 10_000
-    found = psf_measures.support(psf[None, None])
-    assert found.glow == pytest.approx(0.4, abs=1e-3)
-    assert 0.4 < found.border < 1.6
+    result = psf_measures.support(psf[None, None])
+    assert result.glow == pytest.approx(0.4, abs=1e-3)
+    assert 0.4 < result.border < 1.6
     bright = 0.6 / lines.sum().item() + 0.4e-4
-    assert found.contrast == pytest.approx((bright - 0.4e-4) / (bright + 0.4e-4), rel=1e-3)
+    assert result.contrast == pytest.approx((bright - 0.4e-4) / (bright + 0.4e-4), rel=1e-3)
 
 
 def test_likeness_is_the_best_correlation_over_all_displacements(generator):
     first, second = torch.rand(2, 1, 1, 13, 16, generator=generator)
-    a, b = ((each[0, 0] - each.mean()).double().numpy() for each in (first, second))
+    a, b = ((psf[0, 0] - psf.mean()).double().numpy() for psf in (first, second))
     expected = correlate2d(a, b).max() / np.sqrt((a**2).sum() * (b**2).sum())
     assert psf_measures.likeness(first, second) == pytest.approx(expected, rel=1e-5)
     psf = gaussian_psf((40, 40), 2.0, (14, 20))
@@ -82,11 +82,11 @@ def test_likeness_is_the_best_correlation_over_all_displacements(generator):
 
 
 def test_sharpness_of_a_known_spot():
-    """The autocorrelation of a Gaussian of width s is one of sqrt(2) s; less the mean, and in rings, 4 % narrower."""
+    """A Gaussian of width s has an autocorrelation of width sqrt(2) s; without its mean, on rings, 4 % less."""
     y, x = torch.arange(81.0)[:, None] - 40, torch.arange(91.0) - 45
     spot = torch.exp(-(y**2 + x**2) / (2 * 3.0**2))[None, None]
     assert psf_measures.sharpness(spot / spot.sum()) == pytest.approx(2.355 * 2**0.5 * 3.0, rel=0.05)
 
 
-def test_radial_autocorrelation_sees_the_lines(generator):
+def test_radial_autocorrelation_is_1_at_0(generator):
     assert psf_measures.radial_autocorrelation(contour_psf((90, 100), cell=20, generator=generator))[0] == 1.0

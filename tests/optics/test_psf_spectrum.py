@@ -23,29 +23,29 @@ def test_ring_means_are_a_plain_sum_over_pixels(generator):
     values, radius = torch.rand(5, 6, generator=generator), 6 * torch.rand(5, 6, generator=generator)
     radius[radius.round() == 2] = 3.0
     counts = torch.randint(1, 3, (5, 6), generator=generator).float()
-    for often in (1.0, counts):
-        found = psf_spectrum.ring_means(values, radius, 5, counts=often)
+    for multiplicity in (1.0, counts):
+        result = psf_spectrum.ring_means(values, radius, 5, counts=multiplicity)
         expected = [0.0] * 5
         for ring in (0, 1, 3, 4):
-            here = (radius >= ring - 0.5) & (radius < ring + 0.5)
-            weights = (counts if often is counts else torch.ones(5, 6))[here].tolist()
-            expected[ring] = sum(w * v for w, v in zip(weights, values[here].tolist(), strict=True)) / sum(weights)
-        assert found.tolist() == pytest.approx(expected)
+            on_ring = (radius >= ring - 0.5) & (radius < ring + 0.5)
+            weights = (counts if multiplicity is counts else torch.ones(5, 6))[on_ring].tolist()
+            expected[ring] = sum(w * v for w, v in zip(weights, values[on_ring].tolist(), strict=True)) / sum(weights)
+        assert result.tolist() == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("size", [(48, 40), (31, 45), (40, 33)])
 @pytest.mark.parametrize("regularisation", [1e-4, 1e-2])
 def test_noise_gain_is_what_the_wiener_estimate_does_to_noise(size, regularisation, generator):
-    """Monte Carlo: 60 fields of unit noise. Their mean square deviates by about gain * sqrt(2 / (60 independent ones)).
+    """Monte Carlo: 60 fields of unit noise. Their mean square deviates by about gain * sqrt(2 / (60 n)).
 
-    The noise that is left has as many independent values as it has bright frequencies: at least a tenth of the pixels.
+    n is the number of independent values, or bright frequencies, of the filtered noise: a tenth of the pixels at least.
     """
     psf = sample_camera(11, size, family="contours")
     noise = torch.randn(60, 3, *size, generator=generator)
-    found = wiener(noise, psf, regularisation, boundary="circular").square().mean((0, 2, 3))
+    result = wiener(noise, psf, regularisation, boundary="circular").square().mean((0, 2, 3))
     expected = torch.tensor(psf_spectrum.noise_gain(psf, regularisation))
     tolerance = 5 * math.sqrt(2 / (60 * 0.1 * size[0] * size[1]))
-    torch.testing.assert_close(found, expected, rtol=tolerance, atol=0)
+    torch.testing.assert_close(result, expected, rtol=tolerance, atol=0)
 
 
 def test_noise_gain_of_a_point():
@@ -68,11 +68,11 @@ def test_lambda_must_be_positive():
 
 @pytest.mark.parametrize("sigma", [1.0, 2.0])
 def test_rings_of_a_gaussian(sigma):
-    """|H|^2 = exp(-4 pi^2 sigma^2 f^2); sampling adds what lies beyond 1 - f, 4 % in amplitude at 0.4 at most."""
+    """|H|^2 = exp(-4 pi^2 sigma^2 f^2); aliasing from beyond 1 - f adds at most 4 % in amplitude at 0.4."""
     frequency, power = psf_spectrum.radial_power(gaussian_psf((128, 128), sigma))
     expected = torch.exp(-4 * math.pi**2 * sigma**2 * frequency.square())
-    seen = frequency <= 0.4
-    torch.testing.assert_close(power[seen], expected[seen], rtol=0.1, atol=1e-6)
+    low = frequency <= 0.4
+    torch.testing.assert_close(power[low], expected[low], rtol=0.1, atol=1e-6)
 
 
 def test_resolution_of_a_gaussian_is_where_it_falls_below_the_noise():
@@ -106,7 +106,7 @@ def test_dark_rings_of_a_disc():
 
 
 def test_random_mask_has_no_dark_rings_and_a_hundredth_of_weak_frequencies(generator):
-    """Power of independent pixels is exponential: 1 - exp(-0.01) of it lies below 1/100 of its mean."""
+    """The power of independent pixels has an exponential distribution: 1 - exp(-0.01) lies below 1/100 of the mean."""
     psf = torch.rand(1, 1, 200, 200, generator=generator)
     part, rings = psf_spectrum.spectral_zeros(psf / psf.sum())
     assert rings == ()
@@ -123,9 +123,9 @@ def test_separable_mask_has_more_weak_frequencies(generator):
 def test_radial_spectrum_of_a_known_spot():
     y, x = torch.arange(80.0)[:, None] - 40, torch.arange(80.0) - 40
     spot = torch.exp(-(y**2 + x**2) / (2 * 1.5**2))[None, None]
-    found = psf_spectrum.radial_spectrum(spot / spot.sum(), bins=40)
+    result = psf_spectrum.radial_spectrum(spot / spot.sum(), bins=40)
     expected = torch.exp(-2 * (torch.pi * 1.5 * torch.arange(40) / 80) ** 2)
-    torch.testing.assert_close(found[:20], expected[:20].double(), rtol=0.05, atol=1e-3)
+    torch.testing.assert_close(result[:20], expected[:20].double(), rtol=0.05, atol=1e-3)
 
 
 @pytest.mark.parametrize("size", [(9, 12), (8, 9), (10, 10)])

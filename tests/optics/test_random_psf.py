@@ -1,4 +1,4 @@
-"""Random cameras: valid PSFs, different from each other, like the measured ones."""
+"""Random cameras: valid PSFs that differ from each other and resemble measured ones."""
 
 import math
 from functools import cache
@@ -33,7 +33,7 @@ def test_a_psf_of_any_size(family, size):
     assert psf.isfinite().all()
     assert psf.min() >= 0
     torch.testing.assert_close(psf.double().sum((-2, -1)), torch.ones(1, 3, dtype=torch.float64), rtol=0, atol=1e-5)
-    Calibration(psf)  # refuses what no camera could have
+    Calibration(psf)  # checks that the PSF is valid
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -52,7 +52,7 @@ def test_the_global_generator_is_left_alone():
 
 
 def test_cameras_are_distinct():
-    """No two of sixty are alike: at its best shift no pair correlates by 0.95; two zone plates come nearest, 0.91."""
+    """Among sixty PSFs no pair correlates by 0.95 at its best shift; the highest is 0.91, of two zone plates."""
     psfs = torch.cat([sample_camera(seed, (64, 64)) for seed in range(60)]).mean(1)
     spectra = torch.fft.rfft2(psfs - psfs.mean((-2, -1), keepdim=True))
     energy = psfs.sub(psfs.mean((-2, -1), keepdim=True)).square().sum((-2, -1))
@@ -62,7 +62,7 @@ def test_cameras_are_distinct():
 
 
 def test_every_family_occurs_as_often(monkeypatch):
-    """Five of equal chance among 400: a count deviates from 80 by more than 5 sqrt(400 / 5 * 4 / 5) never in life."""
+    """400 draws of 5 families: each count is 80, within 5 standard deviations, sqrt(400 / 5 * 4 / 5)."""
     counts = dict.fromkeys(FAMILIES, 0)
 
     def counted(name, draw):
@@ -80,14 +80,14 @@ def test_every_family_occurs_as_often(monkeypatch):
 
 @pytest.mark.parametrize("size", [(64, 64), (65, 65), (64, 97), (51, 80)])
 def test_the_centre_is_the_pixel_that_stands_for_no_displacement(size):
-    """A zone plate without offset, edge or noise of its own is even about its centre."""
+    """A zone plate without offset and noise is symmetric about its centre."""
     psf = sample_camera(0, size, family="zone-plate", variety=CLEAN)[0, 1]
     turned = psf.flip((0, 1)).roll([1 - n % 2 for n in size], (0, 1))
     torch.testing.assert_close(turned, psf, rtol=1e-3, atol=1e-3 * psf.max().item())
 
 
 def test_offset_moves_the_light():
-    """The centroid of the aperture is within the largest offset, and does use it."""
+    """The centroid of the aperture moves up to the largest offset, and no farther."""
     size, farthest = (80, 120), 0.0
     variety = Variety(**{**vars(CLEAN), "offset": 0.1, "support": (0.5, 0.5)})
     for seed in range(20):
@@ -110,7 +110,7 @@ def test_colours_are_alike_if_grey_and_differ_otherwise():
 
 
 def test_background_is_what_was_asked_for():
-    """Light that fills the frame evenly: of each of the n pixels, 20 % / n of the sum."""
+    """A background of 20 % gives each of the n pixels 20 % / n of the sum."""
     variety = Variety(**{**vars(CLEAN), "background": (0.2, 0.2), "support": (0.4, 0.4)})
     psf = sample_camera(4, (96, 96), family="separable", variety=variety)
     corner = psf[..., :5, :5] * 96 * 96
@@ -122,9 +122,9 @@ def test_a_gpu_gives_the_camera_of_the_cpu(device):
     if not getattr(torch, device).is_available():
         pytest.skip(f"no {device} here")
     for family in FAMILIES:
-        here, there = sample_camera(5, SIZE, family=family), sample_camera(5, SIZE, family=family, device=device)
-        assert there.device.type == device
-        torch.testing.assert_close(there.cpu(), here, rtol=1e-3, atol=1e-3 * here.max().item())
+        expected, result = sample_camera(5, SIZE, family=family), sample_camera(5, SIZE, family=family, device=device)
+        assert result.device.type == device
+        torch.testing.assert_close(result.cpu(), expected, rtol=1e-3, atol=1e-3 * expected.max().item())
 
 
 def test_scattered_light_is_conserved_and_its_centroid_kept(generator):
@@ -207,8 +207,8 @@ def drawn(family):
     ],
 )
 def test_measured_cameras_lie_within_their_family(family, file, options, data):
-    """In each measure, among 40 random ones."""
-    found = measures(Calibration.from_file(data / file, **options).psf)
+    """Measured PSFs lie within the range of 40 random ones in each measure."""
+    measured = measures(Calibration.from_file(data / file, **options).psf)
     low, high = drawn(family).aminmax(dim=0)
-    assert (found >= low).all(), (found, low)
-    assert (found <= high).all(), (found, high)
+    assert (measured >= low).all(), (measured, low)
+    assert (measured <= high).all(), (measured, high)

@@ -21,7 +21,7 @@ from mwdn.optics import Sensor
     ids=["few electrons", "coarse", "deep well", "no read noise"],
 )
 def test_photon_transfer(sensor, signal, generator):
-    """Mean and variance follow the theory of the docstring, within the spread of what was drawn.
+    """Mean and variance follow the theory of the docstring, within the statistical error of the sample.
 
     The mean of n samples of variance s^2 has variance s^2 / n. Their sample variance has a relative spread
     of sqrt((2 + k) / n), where k, the excess kurtosis of electrons, is 1 / their number. Five standard
@@ -109,7 +109,7 @@ def test_light_is_left_as_it_was_and_negative_light_is_dark(generator):
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"full_well": 0.0}, r"`full_well` \(0.0\) must be positive"),
         ({"full_well": -3.0}, "`full_well`"),
@@ -123,6 +123,6 @@ def test_light_is_left_as_it_was_and_negative_light_is_dark(generator):
         ({"black_level": math.nan}, "`black_level`"),
     ],
 )
-def test_impossible_sensors_are_refused(options, said):
-    with pytest.raises(ParameterError, match=said):
+def test_impossible_sensors_are_refused(options, message):
+    with pytest.raises(ParameterError, match=message):
         Sensor(**options)

@@ -1,4 +1,4 @@
-"""Memory that is kept is not asked for again."""
+"""Kept memory is reused, not requested from the system again."""
 
 import subprocess
 import sys
@@ -17,7 +17,7 @@ def work():
     for size in (2**20, 2**24, 2**22):  # 4 to 64 MB
         torch.ones(size)
 
-for _ in range(3):  # until each has found its place
+for _ in range(3):  # until the heap has its final size
     work()
 before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 work()
@@ -25,17 +25,17 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="glibc alone can be asked")
+@pytest.mark.skipif(sys.platform != "linux", reason="glibc only")
 def test_freed_memory_is_used_again():
     """84 MB have 21,504 pages of 4 kB, or 42 of 2 MB."""
-    found = {
+    faults = {
         name: int(
             subprocess.run([sys.executable, "-c", FAULTS, name], capture_output=True, check=True, text=True).stdout
         )
         for name in ("usual", "kept")
     }
-    assert found["kept"] < 100
-    assert found["usual"] > max(20, 10 * found["kept"])
+    assert faults["kept"] < 100
+    assert faults["usual"] > max(20, 10 * faults["kept"])
 
 
 def test_elsewhere_nothing_happens(monkeypatch):

@@ -1,4 +1,4 @@
-"""Work ahead in a thread, the newest frame of a source, and the memory of both."""
+"""Prefetching, the newest frame of a source, and the memory of both."""
 
 import threading
 import weakref
@@ -13,9 +13,9 @@ from mwdn import Calibration, Reconstructor
 from mwdn.runtime.streams import latest, prefetch
 from mwdn.solvers import Wiener
 
-WAIT = 30  # seconds, where something that should happen at once does not
+WAIT = 30  # seconds until a test fails that should not have to wait
 
-# --- Ahead --------------------------------------------------------------------------------------------
+# --- Prefetch --------------------------------------------------------------------------------------------
 
 
 def test_results_come_in_order_from_another_thread():
@@ -36,7 +36,7 @@ def test_no_more_than_a_few_are_ahead(depth):
 
 
 def test_stages_overlap():
-    """The second item is worked on while the first result is in use: else neither would go on."""
+    """The second item is processed while the first result is in use; otherwise both would wait for ever."""
     begun, used = threading.Event(), threading.Event()
 
     def work(n):
@@ -60,7 +60,7 @@ def test_error_is_raised_where_its_result_is_taken():
 
 
 def test_thread_ends_with_the_block():
-    """After the item it is at, whatever has ended the block."""
+    """The thread stops after its current item, whatever ended the block."""
     before, done = threading.active_count(), []
 
     def interrupted():
@@ -78,13 +78,13 @@ def test_thread_ends_with_the_block():
 
 
 class Source:
-    """Frames 0, 1 ... of a camera that waits to be told how many it may have taken."""
+    """A camera that takes frames 0, 1 ... only when the test allows it."""
 
     def __init__(self, count):
         self.count, self.allowed, self.taken = count, threading.Semaphore(0), 0
 
     def take(self, count):
-        """Let it take some, and wait until it asks for one more."""
+        """Allow some frames, and wait until the camera is ready for the next."""
         goal = self.taken + count
         for _ in range(count):
             self.allowed.release()
@@ -111,10 +111,10 @@ def test_newest_frame_wins():
     with closing(latest(source)) as frames:
         source.allowed.release()
         assert next(frames) == 0
-        source.take(4)  # frames 1 to 4, and the consumer was busy
+        source.take(4)  # frames 1 to 4, while the consumer is busy
         assert next(frames) == 4
         source.take(5)
-        assert list(frames) == [9]  # the last one is given, although the source has ended
+        assert list(frames) == [9]  # the last frame is yielded although the source has ended
 
 
 def test_frames_of_a_slow_source_all_come():
@@ -141,7 +141,7 @@ def test_error_of_the_source_comes_after_its_last_frame():
         next(frames)
 
 
-def test_source_stops_when_nobody_looks():
+def test_source_stops_with_its_consumer():
     ended = threading.Event()
 
     def endless():
@@ -185,13 +185,13 @@ def test_frames_are_not_kept():
     for frame in latest(camera()):
         most = max(most, len(alive))
         del frame
-    assert 0 < most <= 3  # one in use, one that waits, one that is being taken
+    assert 0 < most <= 3  # one in use, one waiting, one being taken
     assert len(alive) == 0
 
 
 @pytest.fixture
 def one_thread():
-    """Such small frames have no work for two."""
+    """Frames this small have no work for two threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -208,5 +208,5 @@ def test_memory_is_steady_over_ten_thousand_frames(generator):
         if number % 1000 == 999:
             used.append(resident())
     assert len(used) == 10
-    # A picture of each frame kept would be 10,000 x 12 kB = 120 MB.
+    # Keeping one picture per frame would take 10,000 x 12 kB = 120 MB.
     assert max(used[2:]) - used[1] < 4e6

@@ -86,7 +86,7 @@ def evaluate(
     """
     if not methods:
         raise ParameterError("`methods` must not be empty. Name one: admm, wiener, universal, or a checkpoint.")
-    _check(pairs)
+    _check_pairs(pairs)
     if min(protocol.crop(pairs[0][1][None]).shape[-2:]) < SMALLEST:
         perceptual = Perceptual.none(f"the part {protocol.name} has less than {SMALLEST} pixels a side, for AlexNet")
     perceptual = perceptual or Perceptual.load()
@@ -113,7 +113,7 @@ def evaluate(
     return Report(protocol.name, variant or protocol.variant, scores, perceptual.missing, rows)
 
 
-def _check(pairs: Pairs) -> None:
+def _check_pairs(pairs: Pairs) -> None:
     """Check all pairs before the first reconstruction."""
     if not len(pairs):
         raise ParameterError("`pairs` must not be empty: the file holds none. Make it anew with `mwdn import`.")

@@ -5,7 +5,6 @@ import math
 import statistics
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from mwdn.evaluation.metrics import LARGER_IS_BETTER, METRICS, bootstrap
 from mwdn.io.contact_sheets import contact_sheet
 from mwdn.io.files import write_json
 from mwdn.io.images import write_picture
+from mwdn.version import __version__
 
 JSON = "report.json"
 SHEET = "comparison.png"
@@ -139,7 +139,7 @@ class Report:
 
     def _content(self) -> dict[str, Any]:
         content = {
-            "version": version("mwdn"),
+            "version": __version__,
             "torch": torch.__version__,
             "protocol": self.protocol,
             "variant": self.variant,

@@ -50,14 +50,15 @@ def write_mask(path: str | Path, mask: Mask) -> None:
         "kind": mask.kind,
         "scale": scale,
         "unit": "um" if mask.kind == "phase" else "amplitude",
+        "pitch_um": mask.pitch_um,
+        "index": mask.index,
+        "step_um": mask.step_um,
     }
-    about |= {"pitch_um": mask.pitch_um, "index": mask.index, "step_um": mask.step_um}
-    numbers = np.rint(values / scale).astype(np.uint16)
     per_cm = 1e4 / mask.pitch_um
     with atomic_write(path) as temporary:
         tifffile.imwrite(
             temporary,
-            numbers,
+            np.rint(values / scale).astype(np.uint16),
             photometric="minisblack",
             compression="zlib",
             description=json.dumps(about),

@@ -61,6 +61,23 @@ class Contour:
                 coarse to deflect light from between two lines onto one.
         """
         size = sample_counts(self.size_mm, self.pitch_um)
+        self._check(setup)
+        target = contours(
+            size,
+            line=self.line_um / self.pitch_um,
+            spacing=self.spacing_um / self.pitch_um,
+            irregularity=self.irregularity,
+            generator=torch.Generator().manual_seed(self.seed),
+        )
+        light: dict[str, Any] = {"pitch_um": self.pitch_um, "wavelength_nm": self.design_nm}
+        source = point_source(size, distance_mm=setup.source_mm, **light)
+        phase = retrieve_phase(target, source, distance_mm=setup.distance_mm, iterations=self.iterations, **light)
+        level = (phase * (self.levels / (2 * math.pi))).round().remainder(self.levels)
+        step_um = self.step_nm * UM_PER_NM
+        return Mask("phase", level * step_um, self.pitch_um, self.index, step_um)
+
+    def _check(self, setup: Setup) -> None:
+        """Check everything that the mask or the light of a camera limits."""
         check_levels(self.levels)
         check_index(self.index)
         check_positive(step_nm=self.step_nm, line_um=self.line_um, spacing_um=self.spacing_um)
@@ -79,19 +96,6 @@ class Contour:
                 f"`pitch_um` ({self.pitch_um:g}) cannot deflect light by {math.degrees(math.asin(sine)):.2g} degrees, "
                 f"from between two lines onto one: use at most {needed:.3g} um, or a smaller `spacing_um`."
             )
-        target = contours(
-            size,
-            line=self.line_um / self.pitch_um,
-            spacing=self.spacing_um / self.pitch_um,
-            irregularity=self.irregularity,
-            generator=torch.Generator().manual_seed(self.seed),
-        )
-        light: dict[str, Any] = {"pitch_um": self.pitch_um, "wavelength_nm": self.design_nm}
-        source = point_source(size, distance_mm=setup.source_mm, **light)
-        phase = retrieve_phase(target, source, distance_mm=setup.distance_mm, iterations=self.iterations, **light)
-        level = (phase * (self.levels / (2 * math.pi))).round().remainder(self.levels)
-        step_um = self.step_nm * UM_PER_NM
-        return Mask("phase", level * step_um, self.pitch_um, self.index, step_um)
 
 
 @dataclass(frozen=True)
