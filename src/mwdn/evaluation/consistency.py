@@ -104,13 +104,13 @@ def consistency(measurement: Measurement, psf: Psf, scene: Scene, *, pose: Pose 
     pose = pose or align(measurement, psf)
     unit = measurement.abs().amax().clamp(min=torch.finfo(torch.float32).tiny)
     measurement, scene = measurement.float() / unit, scene.float() / unit
-    posed = pose.move(psf)
+    aligned = pose.move(psf)
     d = fine_detail(measurement)
-    s = fine_detail(convolve(scene.expand(2, -1, -1, -1), torch.cat([posed, psf.float()])))
+    s = fine_detail(convolve(scene.expand(2, -1, -1, -1), torch.cat([aligned, psf.float()])))
     d_energy, s_energy = (detail.square().sum((-2, -1)).clamp(min=1e-30) for detail in (d, s))
     explained = (s * d).sum((-2, -1)).clamp(min=0).square() / s_energy
     noise = noise_level(measurement)[..., 0, 0].square() * d[0, 0].numel()
-    images = _mirrored(posed), _mirrored(_QUARTER_TURN.move(posed))
+    images = _mirrored(aligned), _mirrored(_QUARTER_TURN.move(aligned))
     of_psf, *of_images = torch.cat([misfit(measurement.expand(4, -1, -1, -1), four) for four in images]).tolist()
     return Consistency(
         explained=float(explained.sum(1).max() / d_energy.sum()),
