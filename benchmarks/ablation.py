@@ -59,20 +59,22 @@ def main():
     recipe = read_recipe(Path(__file__).parents[1] / "recipes" / "mismatched.toml")
     photographs, perceptual = Photographs(arguments.data / "photos" / "test"), Perceptual.load()
     psf = Calibration.from_file(arguments.data / "mwdn-camera" / "psf_320.png").psf
-    found = {name: [] for name in parts(psf)}
+    scores = {name: [] for name in parts(psf)}
     for full_well in FULL_WELLS:
         for exact in (True, False):
             made = captures(psf, photographs, recipe, full_well, range(arguments.count), exact=exact)
             report = evaluate(parts(psf), made, Protocol.parse("full"), perceptual=perceptual)
-            for name, rows in found.items():
+            for name, rows in scores.items():
                 rows.append([report.methods[name].summary(key)[0] for key in ("psnr", "lpips")])
     print(f"PSNR in dB / LPIPS, means of {arguments.count}\n")
     conditions = [f"{n:,.0f} e, {kind}" for n in FULL_WELLS for kind in ("exact", "mismatched")]
     print("| |", " | ".join(conditions), "|")
     print("| --- " * (1 + len(conditions)) + "|")
-    for name, rows in found.items():
+    for name, rows in scores.items():
         print("|", name, "|", " | ".join(f"{psnr:.2f} / {lpips:.3f}" for psnr, lpips in rows), "|")
-    arguments.out.write_text(json.dumps({"count": arguments.count, "conditions": conditions, "found": found}, indent=1))
+    arguments.out.write_text(
+        json.dumps({"count": arguments.count, "conditions": conditions, "found": scores}, indent=1)
+    )
 
 
 if __name__ == "__main__":

@@ -51,12 +51,12 @@ def milliseconds(engine, picture):
     """Milliseconds of each part of one call."""
     cuda = picture.is_cuda
     engine(picture)
-    with profile(activities=[ProfilerActivity.CUDA if cuda else ProfilerActivity.CPU]) as found:
+    with profile(activities=[ProfilerActivity.CUDA if cuda else ProfilerActivity.CPU]) as profiler:
         engine._reconstruct(picture)  # a recorded graph would be one kernel
         if cuda:
             torch.cuda.synchronize()
     spent = {"convolutions": 0.0, "transforms": 0.0, "the rest": 0.0}
-    for event in found.key_averages():
+    for event in profiler.key_averages():
         microseconds = event.self_device_time_total if cuda else event.self_cpu_time_total
         spent[part_of(event.key)] += microseconds / 1e3
     return spent

@@ -171,8 +171,8 @@ class Measurement:
 
 def ratios(times):
     plain = times.get("plain")
-    found = {f"{name}_s": value for name, value in times.items()}
-    return found | {f"{name}_ratio": plain / times[name] for name in ("exact", "fast") if plain and name in times}
+    row = {f"{name}_s": value for name, value in times.items()}
+    return row | {f"{name}_ratio": plain / times[name] for name in ("exact", "fast") if plain and name in times}
 
 
 def line(row):
@@ -229,9 +229,9 @@ def main():
             calibration, picture = problem(size, 1)
             for method in (method for method in arithmetic.METHODS if method in arguments.methods):
                 for precision in ("exact", "fast"):
-                    found = list(arithmetic.rows(method, size, calibration.psf.to(device), picture, precision))
-                    print(*map(arithmetic.line, found), sep="\n", flush=True)
-                    write(arguments.out, [], found)
+                    rows = list(arithmetic.rows(method, size, calibration.psf.to(device), picture, precision))
+                    print(*map(arithmetic.line, rows), sep="\n", flush=True)
+                    write(arguments.out, [], rows)
 
 
 if __name__ == "__main__":

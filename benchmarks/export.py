@@ -133,12 +133,12 @@ def operation(size, grid, channels):
     """The same with ONNX's own `DFT`, one axis at a time."""
     g = OnnxGraph()
     whole = g("Pad", "measurement", g.integers([0] * 6 + [grid[0] - size[0], grid[1] - size[1]]))
-    found = g("Unsqueeze", whole, g.integers([4]))
+    planes = g("Unsqueeze", whole, g.integers([4]))
     for axis, options in ((3, {}), (2, {}), (2, {"inverse": 1}), (3, {"inverse": 1})):
-        found = g("DFT", found, None, axis=axis, **options)
-    found = g("Slice", found, g.integers([0, 0, 0]), g.integers([*size, 1]), g.integers([2, 3, 4]))
+        planes = g("DFT", planes, None, axis=axis, **options)
+    planes = g("Slice", planes, g.integers([0, 0, 0]), g.integers([*size, 1]), g.integers([2, 3, 4]))
     shape = [1, channels, *size]
-    return g.model(g("Squeeze", found, g.integers([4])), {"measurement": shape, "scene": shape})
+    return g.model(g("Squeeze", planes, g.integers([4])), {"measurement": shape, "scene": shape})
 
 
 def transforms(arguments, clock):
@@ -171,8 +171,8 @@ def finite(decibels):
 def line(row):
     """A row of the table."""
     numbers = [row.get("mb"), row.get("agreement_db"), row.get("captures_db"), row.get("export_s")]
-    told = ["" if value is None else f"{value:.1f}" for value in numbers]
-    return f"| {row['method']} | {row['file']} | {row['precision']} | {' | '.join(told)} | {row['s']:.3f} |"
+    cells = ["" if value is None else f"{value:.1f}" for value in numbers]
+    return f"| {row['method']} | {row['file']} | {row['precision']} | {' | '.join(cells)} | {row['s']:.3f} |"
 
 
 if __name__ == "__main__":

@@ -56,10 +56,10 @@ def measure(factor, size):
         "truncation": camera.truncation,
     }
     for name in ("wiener", "admm"):
-        found = best_gain(build(name)(captured, psf), scene)
-        row[name] = psnr(found, scene).mean().item()
+        result = best_gain(build(name)(captured, psf), scene)
+        row[name] = psnr(result, scene).mean().item()
         for part, mask in parts(size).items():
-            error = (found - scene)[..., mask].square().mean((1, 2))
+            error = (result - scene)[..., mask].square().mean((1, 2))
             row[f"{name}_{part}"] = (-10 * error.log10()).mean().item()
     return row
 
@@ -71,7 +71,7 @@ def main():
     arguments = parser.parse_args()
     rows = [measure(factor, arguments.size) for factor in FACTORS]
     print(
-        "| magnification, shear | blur / px | likeness of the corner | Wiener / dB | centre, border | ADMM / dB |"
+        "| magnification, shear | blur / px | correlation of the corner | Wiener / dB | centre, border | ADMM / dB |"
         " centre, border |\n| --- | --- | --- | --- | --- | --- | --- |"
     )
     for row in rows:

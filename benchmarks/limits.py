@@ -32,16 +32,16 @@ def correlation(a: Tensor, b: Tensor) -> float:
     return float(torch.corrcoef(torch.stack(detail))[0, 1])
 
 
-def score(found: Tensor, truths: Tensor) -> float:
-    found, truths = PART.crop(found), PART.crop(truths)
-    return float(psnr(best_gain(found, truths).clamp(0, 1), truths).mean())
+def score(results: Tensor, truths: Tensor) -> float:
+    results, truths = PART.crop(results), PART.crop(truths)
+    return float(psnr(best_gain(results, truths).clamp(0, 1), truths).mean())
 
 
-def with_true_mean_light(found: Tensor, truths: Tensor, block: int) -> float:
+def with_true_mean_light(results: Tensor, truths: Tensor, block: int) -> float:
     """The score with the true mean light of blocks."""
-    found, truths = PART.crop(found), PART.crop(truths)
-    found = best_gain(found, truths)
-    return float(psnr((found + mean_light(truths - found, block)).clamp(0, 1), truths).mean())
+    results, truths = PART.crop(results), PART.crop(truths)
+    results = best_gain(results, truths)
+    return float(psnr((results + mean_light(truths - results, block)).clamp(0, 1), truths).mean())
 
 
 def refitted(psf: Tensor, scenes: Tensor, measurements: Tensor, weight: float, steps: int = 40) -> Tensor:
@@ -81,8 +81,8 @@ def main() -> None:
     print("Correlation of the measurements' detail with that of the true scenes through the PSF")
     green = slice(1, 2)
     for tone in (0.5, 1.0, 1.5, 2.2):
-        told = zip(convolve(scenes[:, green] ** tone, psf[:, green]), measurements[:, green], strict=True)
-        print(f"  scenes to the power {tone}: " + " ".join(f"{correlation(*each):.2f}" for each in told))
+        pairs_of_detail = zip(convolve(scenes[:, green] ** tone, psf[:, green]), measurements[:, green], strict=True)
+        print(f"  scenes to the power {tone}: " + " ".join(f"{correlation(*each):.2f}" for each in pairs_of_detail))
     for held in (0, 3, 6):
         others = [n for n in range(8) if n != held]
         fit = refitted(psf[:, green], scenes[others][:, green], measurements[others][:, green], weight=1e-3)
@@ -103,15 +103,15 @@ def main() -> None:
     def by_pyramid(given: Tensor) -> Tensor:
         return torch.cat([Pyramid()(each[None], pose) for each, pose in zip(given, poses, strict=True)])
 
-    found = by_pyramid(measurements)
-    print(f"Pyramid, PSF aligned: {score(found, scenes):.2f} dB")
+    results = by_pyramid(measurements)
+    print(f"Pyramid, PSF aligned: {score(results, scenes):.2f} dB")
     shares = unexplained / measurements.mean((1, 2, 3), keepdim=True)
     common = torch.stack([shares[[n for n in range(8) if n != m]].mean(0) for m in range(8)])
     without = measurements - common * measurements.mean((1, 2, 3), keepdim=True)
     print(f"  without what the others share of that light: {score(by_pyramid(without.clamp(min=0)), scenes):.2f} dB")
     print(f"  without their own: {score(by_pyramid((measurements - unexplained).clamp(min=0)), scenes):.2f} dB")
     for block in (64, 32, 16):
-        reached = with_true_mean_light(found, scenes, block)
+        reached = with_true_mean_light(results, scenes, block)
         print(f"  with the true mean light of blocks of {block} pixels: {reached:.2f} dB")
 
 

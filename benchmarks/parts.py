@@ -43,17 +43,17 @@ def learned(part, data, steps):
     recipe = read_recipe(RECIPE, **changes, cameras={"sizes": ["320x320"]}, placement={"exposure": [0.4, 0.95]})
     network, boundary = PARTS[part]
     recipe = replace(recipe, network=network)
-    calibration, found = Calibration.from_file(data / "mwdn-camera" / "psf_320.png"), {}
+    calibration, psnr = Calibration.from_file(data / "mwdn-camera" / "psf_320.png"), {}
 
     def note(report):
         if report.validation is not None:
-            found[report.step] = round(report.validation.psnr, 2)
+            psnr[report.step] = round(report.validation.psnr, 2)
 
     with TemporaryDirectory() as folder, patch.object(wiener_bank, "BOUNDARY", boundary):
         trainer = prepare(recipe, calibration, data / "photos" / "train", Path(folder) / "run", "cpu")
         trainer.run(note)
         number = sum(p.numel() for p in trainer.network.parameters() if p.requires_grad)
-    return {"learnable": number, "psnr": found}
+    return {"learnable": number, "psnr": psnr}
 
 
 def main():
@@ -64,13 +64,13 @@ def main():
     arguments = parser.parse_args()
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as processes:
         work = {part: processes.submit(learned, part, arguments.data, arguments.steps) for part in PARTS}
-        found = {part: each.result() for part, each in work.items()}
-    steps = list(next(iter(found.values()))["psnr"])
+        parts = {part: each.result() for part, each in work.items()}
+    steps = list(next(iter(parts.values()))["psnr"])
     print(f"| validation PSNR / dB after steps | learnable | {' | '.join(map(str, steps))} |")
     print("| --- " * (2 + len(steps)) + "|")
-    for part, each in found.items():
+    for part, each in parts.items():
         print(f"| {part} | {each['learnable']:,} | {' | '.join(f'{psnr:.2f}' for psnr in each['psnr'].values())} |")
-    write_json(arguments.out, {"steps": arguments.steps, "torch": torch.__version__, "parts": found})
+    write_json(arguments.out, {"steps": arguments.steps, "torch": torch.__version__, "parts": parts})
 
 
 if __name__ == "__main__":

@@ -31,8 +31,8 @@ def trainer(width, device, *, fast):
         if fast:
             measurement = measurement.contiguous(memory_format=torch.channels_last)
         with torch.autocast(device.type, torch.bfloat16, enabled=fast):
-            found = network(measurement, psf)
-        loss = (found.float() - scene).square().mean()
+            reconstruction = network(measurement, psf)
+        loss = (reconstruction.float() - scene).square().mean()
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()

@@ -23,7 +23,7 @@ from mwdn.solvers.alignment import Pose
 
 def wrong(psf):
     size = (psf.shape[-2], psf.shape[-1])
-    found = {
+    variants = {
         "right": psf,
         "mirrored left to right": psf.flip(-1),
         "mirrored top to bottom": psf.flip(-2),
@@ -34,8 +34,8 @@ def wrong(psf):
         "another camera's": sample_camera(torch.Generator().manual_seed(3), size, family="contours").expand_as(psf),
     }
     if size[0] == size[1]:
-        found["turned by 90 degrees"] = torch.rot90(psf, 1, (-2, -1)).contiguous()
-    return found
+        variants["turned by 90 degrees"] = torch.rot90(psf, 1, (-2, -1)).contiguous()
+    return variants
 
 
 def ranges(rows):
@@ -74,11 +74,11 @@ def main():
             measurement = calibration.correct(calibration.frames.read(capture))
             for name, psf in variants.items():
                 scene = Reconstructor(arguments.method, replace(calibration, psf=psf))(measurement)
-                found = consistency(measurement, psf, scene)
-                rows.append({"capture": capture.name, "psf": name, "doubtful": found.doubtful, **asdict(found)})
-                share = found.explained / found.possible
-                told = f"| {capture.stem} | {name} | {share:.2f} | {found.contrast:.2f} |"
-                print(told, "yes |" if found.doubtful else "no |", flush=True)
+                score = consistency(measurement, psf, scene)
+                rows.append({"capture": capture.name, "psf": name, "doubtful": score.doubtful, **asdict(score)})
+                share = score.explained / score.possible
+                line = f"| {capture.stem} | {name} | {share:.2f} | {score.contrast:.2f} |"
+                print(line, "yes |" if score.doubtful else "no |", flush=True)
     with atomic(arguments.out) as temporary:
         temporary.write_text(json.dumps({"method": arguments.method, "rows": rows}, indent=1) + "\n")
     print("", *ranges(rows), sep="\n")

@@ -121,9 +121,9 @@ def table(rows, methods):
     columns = ["PSF", "electrons", "calibration", "captures", *methods] + (["gain"] if len(methods) > 1 else [])
     yield f"| {' | '.join(columns)} |"
     yield "| --- " * len(columns) + "|"
-    for (name, full_well, exact), found in rows.items():
-        count = min(len(found[method]["psnr"]) for method in methods)
-        values = {method: {key: each[:count] for key, each in found[method].items()} for method in methods}
+    for (name, full_well, exact), results in rows.items():
+        count = min(len(results[method]["psnr"]) for method in methods)
+        values = {method: {key: each[:count] for key, each in results[method].items()} for method in methods}
         cells = [name, f"{full_well:,.0f}", "exact" if exact else "mismatched", str(count)]
         cells += [f"{fmean(values[m]['psnr']):.2f} / {fmean(values[m]['lpips']):.3f}" for m in methods]
         if len(methods) > 1:
