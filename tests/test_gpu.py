@@ -114,7 +114,7 @@ def test_training(calibration, photographs, tmp_path):
 
 
 def test_a_folder(calibration, batches, tmp_path):
-    """Read, judged and written by threads of their own, which share the GPU."""
+    """Read, checked and written by threads of their own, which share the GPU."""
     captures = []
     for number, measurement in enumerate(torch.cat(batches)):
         captures.append(tmp_path / f"{number}.tif")
@@ -125,6 +125,6 @@ def test_a_folder(calibration, batches, tmp_path):
         found[device] = list(Batch(reconstruct, "name", tmp_path / device.type, "npy").run(captures))
     for here, there in zip(found[CPU], found[GPU], strict=True):
         assert there.error is None
-        assert there.trust.explained == pytest.approx(here.trust.explained, rel=1e-3)
+        assert there.consistency.explained == pytest.approx(here.consistency.explained, rel=1e-3)
         pictures = (torch.from_numpy(np.load(job.output)) for job in (there, here))
         assert psnr(*pictures) > 60

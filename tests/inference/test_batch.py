@@ -1,4 +1,4 @@
-"""Captures to pictures in files: where they go, what is written, what is left out when it is there."""
+"""Batches of captures: output names, formats, errors, resuming, several processes."""
 
 import dataclasses
 import json
@@ -50,7 +50,7 @@ def captures(tmp_path, psf, generator):
     return [tmp_path / f"in/{number}.png" for number in range(3)]
 
 
-def darkroom(psf, out, method="wiener", **options):
+def make_batch(psf, out, method="wiener", **options):
     calibration = psf if isinstance(psf, Calibration) else Calibration(psf)
     return Batch(Reconstructor(method, calibration, device="cpu"), "name", out, **options)
 
@@ -58,12 +58,12 @@ def darkroom(psf, out, method="wiener", **options):
 # --- Files --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("form", "suffix"), [("png", ".png"), ("png16", ".png"), ("tiff", ".tif"), ("npy", ".npy")])
-def test_outputs_have_the_captures_names(tmp_path, form, suffix):
+@pytest.mark.parametrize(("format", "suffix"), [("png", ".png"), ("png16", ".png"), ("tiff", ".tif"), ("npy", ".npy")])
+def test_outputs_have_the_captures_names(tmp_path, format, suffix):
     captures = touch(tmp_path / "in", "a.tif", "b.c.npy")
     out = tmp_path / "out"
-    check_outputs(captures, out, form)
-    assert [out / output_name(capture, form) for capture in captures] == [out / f"a{suffix}", out / f"b.c{suffix}"]
+    check_outputs(captures, out, format)
+    assert [out / output_name(capture, format) for capture in captures] == [out / f"a{suffix}", out / f"b.c{suffix}"]
     assert not out.exists()
 
 
@@ -122,7 +122,7 @@ def test_json_of_somebody_else_is_not_replaced(tmp_path, content):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "b.json").write_text(content)
     check_outputs([a], tmp_path / "out", "png")
-    with pytest.raises(ParameterError, match=r"out/b\.json` is not of mwdn and would be lost\. Choose another folder"):
+    with pytest.raises(ParameterError, match=r"`.*out/b\.json`.*: `--out`"):
         check_outputs([a, b], tmp_path / "out", "png")
     (tmp_path / "out" / "b.json").write_text('{"origin": "0123456789abcdef"}')
     check_outputs([a, b], tmp_path / "out", "png")
@@ -131,48 +131,48 @@ def test_json_of_somebody_else_is_not_replaced(tmp_path, content):
 # --- What is written ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("form", "suffix"), [("tiff", ".tif"), ("npy", ".npy")])
-def test_linear_formats_hold_what_the_reconstructor_returns(tmp_path, form, suffix, captures, psf):
-    room = darkroom(psf, tmp_path / "out", form=form)
-    jobs = list(room.run(captures))
+@pytest.mark.parametrize(("format", "suffix"), [("tiff", ".tif"), ("npy", ".npy")])
+def test_linear_formats_hold_what_the_reconstructor_returns(tmp_path, format, suffix, captures, psf):
+    batch = make_batch(psf, tmp_path / "out", format=format)
+    jobs = list(batch.run(captures))
     assert [job.number for job in jobs] == [0, 1, 2]
     for job, capture in zip(jobs, captures, strict=True):
         assert (job.capture, job.output) == (capture, tmp_path / "out" / (capture.stem + suffix))
-        measurement = room.reconstruct.calibration.correct(read_frame(capture))
-        scene = room.reconstruct(measurement)
+        measurement = batch.reconstruct.calibration.correct(read_frame(capture))
+        scene = batch.reconstruct(measurement)
         found = read_frame(job.output)
         assert found.dtype == np.float32
         assert np.array_equal(found, scene[0].movedim(0, -1).numpy())
-        assert job.trust == consistency(measurement, psf, scene)
+        assert job.consistency == consistency(measurement, psf, scene)
         assert job.measurement is job.pose is job.scene is job.error is None  # a million jobs may be kept
         beside = json.loads(job.output.with_suffix(".json").read_text())
         assert beside["method"] == "name"
-        assert beside["psf_hash"] == room.reconstruct.calibration.psf_hash
-        assert beside["explained"] == job.trust.explained
-        assert beside["doubtful"] == job.trust.doubtful
+        assert beside["psf_hash"] == batch.reconstruct.calibration.psf_hash
+        assert beside["explained"] == job.consistency.explained
+        assert beside["doubtful"] == job.consistency.doubtful
 
 
-@pytest.mark.parametrize(("form", "steps"), [("png", 255), ("png16", 65535)])
-def test_png_is_the_same_picture_in_srgb(tmp_path, form, steps, captures, psf):
-    room = darkroom(psf, tmp_path, form=form, judge=False)
-    (job,) = room.run(captures[:1])
-    scene = room.reconstruct(room.reconstruct.calibration.correct(read_frame(captures[0])))
+@pytest.mark.parametrize(("format", "steps"), [("png", 255), ("png16", 65535)])
+def test_png_is_the_same_picture_in_srgb(tmp_path, format, steps, captures, psf):
+    batch = make_batch(psf, tmp_path, format=format, check_consistency=False)
+    (job,) = batch.run(captures[:1])
+    scene = batch.reconstruct(batch.reconstruct.calibration.correct(read_frame(captures[0])))
     stored = read_frame(job.output)
     assert np.iinfo(stored.dtype).max == steps
     light = srgb_decode(torch.from_numpy(stored.astype(np.float32) / steps))
     # Half a step of the code is at most 2.275 / 1.055 ... of it in light: the steepest part is at white.
     torch.testing.assert_close(light, to_display(scene)[0].movedim(0, -1), rtol=0, atol=0.5 * 2.3 / steps + 1e-6)
-    assert job.trust is None
+    assert job.consistency is None
     assert set(json.loads((tmp_path / "0.json").read_text())) == {"method", "psf_hash", "origin"}
 
 
-def test_network_is_given_the_pose_that_the_picture_is_judged_by(tmp_path, captures, psf):
+def test_check_and_network_share_the_pose(tmp_path, captures, psf):
     """It would find the same, at the same price."""
     network = build("wiener-bank", width=2, finest=4)
     pictures = []
-    for judge in (True, False):
-        room = darkroom(psf, tmp_path / str(judge), network, form="npy", judge=judge)
-        (job,) = room.run(captures[:1])
+    for check in (True, False):
+        batch = make_batch(psf, tmp_path / str(check), network, format="npy", check_consistency=check)
+        (job,) = batch.run(captures[:1])
         pictures.append(torch.from_numpy(read_frame(job.output)))
     torch.testing.assert_close(*pictures, rtol=1e-4, atol=1e-5)
 
@@ -183,7 +183,7 @@ def test_captures_are_read_as_the_calibration_says(tmp_path, psf, captures):
     np.save(tmp_path / "plain.npy", frame)
     np.save(tmp_path / "twisted.npy", frame[::-1, :, ::-1])
     for name, frames in (("plain", FrameFormat()), ("twisted", FrameFormat(bgr=True, upside_down=True))):
-        list(darkroom(Calibration(psf, frames), tmp_path / "out", form="tiff").run([tmp_path / f"{name}.npy"]))
+        list(make_batch(Calibration(psf, frames), tmp_path / "out", format="tiff").run([tmp_path / f"{name}.npy"]))
     assert np.array_equal(read_frame(tmp_path / "out/plain.tif"), read_frame(tmp_path / "out/twisted.tif"))
 
 
@@ -191,7 +191,7 @@ def test_nothing_is_written_of_a_bad_capture_and_the_others_go_on(tmp_path, psf,
     (tmp_path / "bad.png").write_bytes(b"\x89PNG\r\n\x1a\n")
     np.save(tmp_path / "small.npy", np.zeros((4, 4, 3), np.uint8))
     files = [captures[0], tmp_path / "bad.png", tmp_path / "small.npy", tmp_path / "none.png", captures[1]]
-    jobs = list(darkroom(psf, tmp_path / "out").run(files))
+    jobs = list(make_batch(psf, tmp_path / "out").run(files))
     assert [job.capture for job in jobs] == files
     assert [job.error is None for job in jobs] == [True, False, False, False, True]
     assert isinstance(jobs[1].error, ImageError)
@@ -214,18 +214,18 @@ def bright(tmp_path, captures):
 @pytest.mark.parametrize("method", ["fista", "admm", "pyramid"])
 def test_trust_does_not_depend_on_the_brightness(tmp_path, psf, bright, method):
     """Nor do squares of what a camera of many bits counts overflow."""
-    room = darkroom(psf, tmp_path / "out", method)
-    plain, large = (next(room.run([bright(factor)])).trust for factor in (1, 1e15))
+    batch = make_batch(psf, tmp_path / "out", method)
+    plain, large = (next(batch.run([bright(factor)])).consistency for factor in (1, 1e15))
     assert dataclasses.astuple(large) == pytest.approx(dataclasses.astuple(plain), rel=0.01, abs=0.01)
 
 
-@pytest.mark.parametrize("judge", [True, False])
-@pytest.mark.parametrize("form", ["png", "npy"])
-def test_result_that_is_not_finite_changes_nothing_and_the_others_go_on(tmp_path, psf, captures, bright, judge, form):
-    room = darkroom(psf, tmp_path / "out", Admm(iterations=2), form=form, judge=judge)
-    list(room.run([bright(1)]))
-    before = {path: path.read_bytes() for path in room.out.iterdir()}
-    refused, done = room.run([bright(1e37), captures[1]])
+@pytest.mark.parametrize("check", [True, False])
+@pytest.mark.parametrize("format", ["png", "npy"])
+def test_result_that_is_not_finite_changes_nothing_and_the_others_go_on(tmp_path, psf, captures, bright, check, format):
+    batch = make_batch(psf, tmp_path / "out", Admm(iterations=2), format=format, check_consistency=check)
+    list(batch.run([bright(1)]))
+    before = {path: path.read_bytes() for path in batch.out.iterdir()}
+    refused, done = batch.run([bright(1e37), captures[1]])
     assert isinstance(refused.error, ImageError)
     assert re.search(r"nothing is written\. The capture's brightest pixel is \d\.\d+e\+36", str(refused.error))
     assert done.error is None
@@ -234,20 +234,20 @@ def test_result_that_is_not_finite_changes_nothing_and_the_others_go_on(tmp_path
 
 def test_a_capture_without_light_is_no_picture(tmp_path, psf):
     np.save(tmp_path / "black.npy", np.zeros((*SIZE, 3), np.uint16))
-    (job,) = darkroom(psf, tmp_path / "out").run([tmp_path / "black.npy"])
+    (job,) = make_batch(psf, tmp_path / "out").run([tmp_path / "black.npy"])
     assert str(job.error).startswith("The sensor saw no light")
     assert not (tmp_path / "out").exists()
 
 
-def test_scene_too_large_to_be_judged(tmp_path, psf, captures):
-    (job,) = darkroom(psf, tmp_path / "out", lambda b, h: 1e37 * b).run(captures[:1])
+def test_scene_too_large_to_be_checked(tmp_path, psf, captures):
+    (job,) = make_batch(psf, tmp_path / "out", lambda b, h: 1e37 * b).run(captures[:1])
     assert "too large numbers" in str(job.error)
     assert not (tmp_path / "out").exists()
 
 
 def test_disk_that_refuses(tmp_path, psf, captures):
     (tmp_path / "out" / "1.png").mkdir(parents=True)
-    jobs = list(darkroom(psf, tmp_path / "out").run(captures))
+    jobs = list(make_batch(psf, tmp_path / "out").run(captures))
     assert [job.error is None for job in jobs] == [True, False, True]
     assert "1.png` cannot be written" in str(jobs[1].error)
     assert not (tmp_path / "out" / "1.json").exists()
@@ -255,7 +255,7 @@ def test_disk_that_refuses(tmp_path, psf, captures):
 
 def test_work_stops_with_its_user(tmp_path, psf, captures):
     """And leaves whole files behind."""
-    jobs = darkroom(psf, tmp_path / "out").run(captures)
+    jobs = make_batch(psf, tmp_path / "out").run(captures)
     next(jobs)
     jobs.close()
     left = sorted(path.name for path in (tmp_path / "out").iterdir())
@@ -263,64 +263,64 @@ def test_work_stops_with_its_user(tmp_path, psf, captures):
 
 
 def test_summary_shows_the_first_twelve_that_are_there(tmp_path, psf, captures):
-    room = darkroom(psf, tmp_path / "out")
-    room.summarise(captures)
+    batch = make_batch(psf, tmp_path / "out")
+    batch.summarise(captures)
     assert not (tmp_path / "out").exists()
-    list(room.run([captures[0], captures[2]]))
-    room.summarise([captures[0], captures[1], captures[2]])
+    list(batch.run([captures[0], captures[2]]))
+    batch.summarise([captures[0], captures[1], captures[2]])
     assert read_frame(tmp_path / "out" / "summary.png").shape[0] == 26 + 2 * 246
-    room.summarise(captures[:1] * 20)
+    batch.summarise(captures[:1] * 20)
     assert read_frame(tmp_path / "out" / "summary.png").shape[0] == 26 + 12 * 246
 
 
 # --- What is there already ----------------------------------------------------------------------------
 
 
-def resumed(room_psf, out, captures, *arguments, **options):
+def resumed(psf, out, captures, *arguments, **options):
     """Names of the captures that were done again."""
-    jobs = list(darkroom(room_psf, out, *arguments, resume=True, **options).run(captures))
+    jobs = list(make_batch(psf, out, *arguments, resume=True, **options).run(captures))
     assert all(job.error is None for job in jobs)
-    return [job.capture.name for job in jobs if not job.kept]
+    return [job.capture.name for job in jobs if not job.existing]
 
 
 def test_resumed_work_leaves_out_what_is_there(tmp_path, psf, captures):
     out = tmp_path / "out"
-    list(darkroom(psf, out).run(captures[:2]))
+    list(make_batch(psf, out).run(captures[:2]))
     before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in out.iterdir()}
     assert resumed(psf, out, captures) == ["2.png"]
     assert {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in before} == before
-    assert len(list(darkroom(psf, out).run(captures))) == 3
+    assert len(list(make_batch(psf, out).run(captures))) == 3
     assert out.joinpath("0.png").stat().st_mtime_ns > before[out / "0.png"][1]  # not asked to resume
 
 
-def test_resumed_work_judges_what_was_not(tmp_path, psf, captures):
+def test_resumed_work_checks_what_was_not(tmp_path, psf, captures):
     out = tmp_path / "out"
-    list(darkroom(psf, out, judge=False).run(captures[:1]))
+    list(make_batch(psf, out, check_consistency=False).run(captures[:1]))
     assert resumed(psf, out, captures[:2]) == ["0.png", "1.png"]
     assert "explained" in json.loads((out / "0.json").read_text())
     assert resumed(psf, out, captures[:2]) == []
-    assert resumed(psf, out, captures[:2], judge=False) == []  # more is there than was asked for
+    assert resumed(psf, out, captures[:2], check_consistency=False) == []  # more is there than was asked for
 
 
 @pytest.mark.parametrize("lost", ["0.png", "0.json"])
 @pytest.mark.parametrize("how", ["gone", "empty"])
 def test_half_a_result_is_none(tmp_path, lost, how, psf, captures):
     out = tmp_path / "out"
-    list(darkroom(psf, out).run(captures))
+    list(make_batch(psf, out).run(captures))
     (out / lost).unlink()
     if how == "empty":
         (out / lost.replace("png", "json")).write_text("[]")
     assert resumed(psf, out, captures) == ["0.png"]
 
 
-@pytest.mark.parametrize("what", ["capture", "regularisation", "network", "weights", "psf", "bits", "dark", "form"])
+@pytest.mark.parametrize("what", ["capture", "regularisation", "network", "weights", "psf", "bits", "dark", "format"])
 def test_result_of_anything_else_is_none(tmp_path, what, psf, captures):
-    out, method, camera, form = tmp_path / "out", Wiener(), Calibration(psf), "png"
+    out, method, camera, format = tmp_path / "out", Wiener(), Calibration(psf), "png"
     if what == "weights":
         torch.manual_seed(1)
         method = build("wiener-bank", width=2, finest=8)
-    list(darkroom(camera, out, method, judge=False).run(captures[:1]))
-    assert resumed(camera, out, captures[:1], method, judge=False) == []
+    list(make_batch(camera, out, method, check_consistency=False).run(captures[:1]))
+    assert resumed(camera, out, captures[:1], method, check_consistency=False) == []
     if what == "capture":
         os.utime(captures[0], ns=(0, 0))
     elif what == "regularisation":
@@ -336,20 +336,20 @@ def test_result_of_anything_else_is_none(tmp_path, what, psf, captures):
     elif what == "dark":
         camera = Calibration(psf, dark=torch.zeros(1, 3, *SIZE))
     else:
-        form = "png16"
-    assert resumed(camera, out, captures[:1], method, judge=False, form=form) == ["0.png"]
+        format = "png16"
+    assert resumed(camera, out, captures[:1], method, check_consistency=False, format=format) == ["0.png"]
 
 
-def test_old_judgement_never_stands_beside_a_new_picture(tmp_path, psf, captures, monkeypatch):
+def test_old_sidecar_never_stands_beside_a_new_picture(tmp_path, psf, captures, monkeypatch):
     """Even if the work stops between the two."""
     out = tmp_path / "out"
-    list(darkroom(psf, out).run(captures[:1]))
+    list(make_batch(psf, out).run(captures[:1]))
 
     def refuse(path, content):
         raise ImageError("full")
 
     monkeypatch.setattr("mwdn.inference.batch.write_json", refuse)
-    (job,) = darkroom(psf, out, Wiener(regularisation=1.0)).run(captures[:1])
+    (job,) = make_batch(psf, out, Wiener(regularisation=1.0)).run(captures[:1])
     assert str(job.error) == "full"
     assert [path.name for path in out.iterdir()] == ["0.png"]
 

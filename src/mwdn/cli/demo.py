@@ -1,13 +1,13 @@
-"""A synthetic camera, captures through it, and every method that needs no training of yours."""
+"""`mwdn demo`: a simulated camera, its captures, and every method that needs no training."""
 
 from dataclasses import replace
 from pathlib import Path
 
 import torch
-from rich.console import Console
 from rich.table import Table
 
 from mwdn.calibration import Calibration
+from mwdn.cli.camera import console
 from mwdn.evaluation import psnr
 from mwdn.evaluation.tables import html_table
 from mwdn.inference.reconstructor import Reconstructor
@@ -19,21 +19,20 @@ from mwdn.optics import Camera, Contour, Setup
 from mwdn.optics.design import design_camera
 
 SETUP = Setup(wavelengths=9)
-"""The paper's camera, in fewer colours."""
+"""The paper's camera at fewer wavelengths."""
 
 MASK = Contour(size_mm=(3.0, 2.5), pitch_um=4.0)
-"""The part of the paper's mask that its aperture leaves open, of squares twice as large: a second's work."""
+"""The open part of the paper's mask, with squares twice as large: takes a second to simulate."""
 
 METHODS = ("universal", "pyramid", "admm", "fista", "wiener")
 
 
-def run(out: Path, seed: int, console: Console) -> None:
-    """Simulate, reconstruct, print a table; write the pictures and a page into ``out``.
+def demo(*, out: Path = Path("results/demo"), seed: int = 0) -> None:
+    """Simulate a small lensless camera and reconstruct its captures with every method that needs no training.
 
     Args:
-        out: a folder; its files of the same names are replaced.
-        seed: of the camera and its noise.
-        console: where to print.
+        out: folder for the comparison picture and the page.
+        seed: of the camera's mask and of its noise.
     """
     generator = torch.Generator().manual_seed(seed)
     camera = Camera(design_camera("contour", replace(MASK, seed=seed), SETUP).psf)
@@ -62,13 +61,13 @@ _PAGE = """<!doctype html>
 body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 78rem; margin: 2rem auto; padding: 0 1rem; color: #222; }}
 img {{ max-width: 100%; }} td, th {{ padding: .2rem 1rem; text-align: right; }} th:first-child {{ text-align: left; }}
 </style>
-<h1>From a caustic pattern to a picture</h1>
+<h1>Lensless imaging</h1>
 <p>A camera without a lens: a thin mask in front of the sensor turns each point of the scene into the pattern
-below, its point spread function, computed here from a mask of eight levels by diffraction. What the sensor
-records is the scene convolved with it.</p>
+below, the point spread function, computed here from a mask of eight levels by diffraction. The sensor records
+the scene convolved with it.</p>
 <img src="psf.png" alt="point spread function" width="320">
-<p>None of the reconstructions below needed any training for this camera: <em>universal</em> is a network that comes
-with the package and has learned from thousands of random cameras; the others are classical.</p>
+<p>The methods below needed no training for this camera: <em>universal</em> is a network that comes with the
+package and was trained on thousands of random cameras; the others are classical.</p>
 <img src="comparison.png" alt="scene, measurement and reconstructions">
 {table}
 </html>

@@ -164,6 +164,14 @@ def broadcast(compute: Callable[[], bytes]) -> bytes:
     return message[:-1].numpy().tobytes()
 
 
+def broadcast_json(compute: Callable[[], Any]) -> Any:  # noqa: ANN401
+    """A value that JSON can hold, computed by the first process, on all.
+
+    Strings may hold lone surrogates: file names that are not UTF-8.
+    """
+    return compute() if world_size() == 1 else json.loads(broadcast(lambda: json.dumps(compute()).encode()))
+
+
 def broadcast_floats(numbers: list[float]) -> list[float]:
     """The numbers that the first process gives, on all, to the last bit."""
     return json.loads(broadcast(lambda: json.dumps(numbers).encode()))

@@ -1,0 +1,119 @@
+"""Options of solvers and networks: read from their signatures and docstrings, and converted from the command line."""
+
+import difflib
+import inspect
+import re
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import fields
+from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
+
+from cyclopts import Parameter
+
+from mwdn.cli.camera import CameraOptions
+from mwdn.errors import ParameterError
+from mwdn.solvers import SOLVERS
+
+MethodOptions = Annotated[Any, Parameter(converter=lambda _, tokens: tokens, show=False)]
+"""Type of a command's ``**options``: the tokens of each ``--name value`` that the command itself does not have."""
+
+
+class Option(NamedTuple):
+    """A keyword argument of a solver or network.
+
+    Args:
+        name: of the argument.
+        type: as annotated.
+        default: its value unless given.
+        meaning: its entry in the docstring.
+    """
+
+    name: str
+    type: Any
+    default: Any
+    meaning: str
+
+
+def list_options(method: Callable[..., Any]) -> list[Option]:
+    """Keyword arguments of the class of a solver or network."""
+    meanings = _docstring_arguments(inspect.getdoc(method) or "")
+    return [
+        Option(name, parameter.annotation, parameter.default, meanings.get(name, ""))
+        for name, parameter in inspect.signature(method).parameters.items()
+    ]
+
+
+def _docstring_arguments(docstring: str) -> dict[str, str]:
+    """Entries of a Google-style Args section, each as one line."""
+    section = re.search(r"^Args:\n((?: +.*\n?|\n)*)", docstring, re.MULTILINE)
+    entries = re.findall(r"^ {4}(\w+): (.*(?:\n {5,}.*)*)", section[1], re.MULTILINE) if section else []
+    return {name: " ".join(text.split()) for name, text in entries}
+
+
+def summary(method: Callable[..., Any]) -> str:
+    """First line of a docstring."""
+    return (inspect.getdoc(method) or "").partition("\n")[0]
+
+
+def read_options(method: str, tokens: Mapping[str, Any], command: Callable[..., object]) -> dict[str, Any]:
+    """Convert the options of a method from the command line.
+
+    Args:
+        method: as given by the user.
+        tokens: of `MethodOptions`.
+        command: the command, whose own options are suggested for a mistyped one.
+
+    Raises:
+        ParameterError: the method has no such option, or the value does not fit its type.
+    """
+    options = {option.name: option for option in (list_options(SOLVERS[method]) if method in SOLVERS else [])}
+    values = {}
+    for key, given in tokens.items():
+        name = key.replace("-", "_")
+        if name not in options:
+            raise ParameterError(_unknown(method, name, list(options), command))
+        values[name] = _convert(options[name], given)
+    return values
+
+
+def _unknown(method: str, name: str, options: list[str], command: Callable[..., object]) -> str:
+    parameters = inspect.signature(command).parameters.values()
+    names = [parameter.name for parameter in parameters if parameter.kind == inspect.Parameter.KEYWORD_ONLY]
+    nearest = difflib.get_close_matches(name, [*options, *names, *(field.name for field in fields(CameraOptions))], n=1)
+    hint = f" Did you mean {_flag(nearest[0])}?" if nearest else ""
+    known = ", ".join(map(_flag, options)) or f"none; solvers ({', '.join(SOLVERS)}) have some"
+    return f"Unknown option: {_flag(name)}.{hint} Options of the method '{method}': {known}. See `mwdn methods`."
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def _convert(option: Option, given: Any) -> Any:  # noqa: ANN401
+    """Value of an option: a number, a word of a `Literal`, or a NamedTuple with ``--name.field value`` for fields."""
+    if isinstance(given, Mapping):
+        parts = getattr(option.type, "__annotations__", {})
+        nested = {key: Option(f"{option.name}.{key}", parts.get(key), None, "") for key in given}
+        if given.keys() <= parts.keys():
+            return option.default._replace(**{key: _convert(nested[key], tokens) for key, tokens in given.items()})
+        known = ", ".join(parts) or "none"
+        raise ParameterError(f"`{_flag(option.name)}` has the parts {known}, not {', '.join(given)}.")
+    text = given[-1].value
+    for kind in [option.type] if get_origin(option.type) is Literal else get_args(option.type) or [option.type]:
+        if get_origin(kind) is Literal and text in get_args(kind):
+            return text
+        if kind in (int, float):
+            with suppress(ValueError):
+                return kind(text)
+    raise ParameterError(f"`{_flag(option.name)}` ({text}) must be {type_name(option.type)}.")
+
+
+def type_name(kind: Any) -> str:  # noqa: ANN401
+    """A type in words: ``int``, ``float or none``, ``colour | isotropic``."""
+    if get_origin(kind) is Literal:
+        return " | ".join(map(str, get_args(kind)))
+    if kind is type(None):
+        return "none"
+    if get_args(kind) and get_origin(kind) is not tuple:
+        return " or ".join(map(type_name, get_args(kind)))
+    return kind.__name__ if isinstance(kind, type) and not get_args(kind) else str(kind)

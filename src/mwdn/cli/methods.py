@@ -1,0 +1,64 @@
+"""`mwdn methods`: the reconstruction methods and their options."""
+
+from typing import Any
+
+from rich.markup import escape
+from rich.padding import Padding
+from rich.table import Table
+
+from mwdn.cli.camera import console
+from mwdn.cli.method_options import Option, list_options, summary, type_name
+from mwdn.errors import UnknownNameError
+from mwdn.networks import NETWORKS
+from mwdn.solvers import SOLVERS
+from mwdn.weights.bundled import BUNDLED, find_weights
+from mwdn.weights.checkpoint import read_metadata
+
+
+def methods(name: str | None = None, /) -> None:
+    """List the reconstruction methods, or the options of one.
+
+    Args:
+        name: of a solver, a bundled network or a network type; all methods are listed unless given.
+    """
+    if name is None:
+        console.print(_overview())
+        return
+    if name not in {*SOLVERS, *BUNDLED, *NETWORKS}:
+        raise UnknownNameError("method", name, {*SOLVERS, *BUNDLED, *NETWORKS})
+    if name in SOLVERS:  # `wiener` is a solver and a network type
+        _print(f"Solver {name}. Options, as --name value:", list_options(SOLVERS[name]))
+    if name in BUNDLED:
+        metadata = read_metadata(find_weights(name) or name)
+        options = [
+            option._replace(default=metadata["options"].get(option.name, option.default))
+            for option in list_options(NETWORKS[metadata["name"]])
+        ]
+        _print(f"Bundled network {name}, a {metadata['name']}. Options, fixed by its training:", options)
+    if name in NETWORKS:
+        _print(f"Network type {name}. Options, for [network] of a training recipe:", list_options(NETWORKS[name]))
+
+
+def _overview() -> Table:
+    table = Table("name", "kind", "description")
+    for name, solver in SOLVERS.items():
+        table.add_row(name, "solver", escape(summary(solver)))
+    for name in BUNDLED:
+        network = read_metadata(find_weights(name) or name)["name"]
+        table.add_row(name, "bundled network", f"A {network} trained for any camera.")
+    for name, network in NETWORKS.items():
+        table.add_row(name, "network type, to be trained", escape(summary(network)))
+    return table
+
+
+def _print(title: str, options: list[Option]) -> None:
+    console.print(title, style="bold", markup=False, highlight=False)
+    for name, annotation, default, meaning in options:
+        line = f"[bold cyan]{name}[/]: {escape(type_name(annotation))} = {escape(_short(default))}"
+        console.print(Padding(line, (0, 2)), highlight=False)
+        console.print(Padding(escape(meaning), (0, 6)), highlight=False)
+
+
+def _short(value: Any, length: int = 60) -> str:  # noqa: ANN401
+    text = str(value)
+    return text if len(text) <= length else f"{text[: length - 3]}..."

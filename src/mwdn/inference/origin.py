@@ -1,0 +1,103 @@
+"""Hash of everything that a picture depends on, so that an interrupted batch resumes without repeating work.
+
+The hash of a picture stays the same from version to version of the code, so it is made of the names below, not of
+whatever attributes an object has today.
+"""
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+
+from torch import Tensor, nn
+
+from mwdn.calibration import Calibration
+from mwdn.inference.reconstructor import Reconstructor
+from mwdn.solvers import Admm
+from mwdn.version import __version__
+
+_OPTIONS = {
+    "WienerBank": ("channels", "fold", "regularisations", "finest", "align", "block", "levels", "rounds"),
+    "LeAdmm": ("variation",),
+    "Updn": ("channels", "width"),
+    "FlatNet": ("regularisation", "boundary"),
+    "SvDeconv": ("channels", "field", "boundary"),
+    **dict.fromkeys(("Mmcn", "Ifin"), ("channels",)),
+    **dict.fromkeys(("WienerNetwork", "UNet", "WienerUNet", "Mwdn", "MwdnCpsf", "LeAdmmU"), ()),
+}
+"""What counts of a network besides its weights; all public attributes of any other module."""
+
+_FIRST_NAMES = {"downsampling": "shrink", "only_if_noisy": "poor", "min_smoothing": "least"}
+"""Fields of `mwdn.solvers.pyramid.Level` that have been renamed."""
+
+
+def settings_hash(reconstruct: Reconstructor, format: str) -> str:
+    """Hash of the method with its weights, the calibration, the file format and the version of this package."""
+    return _digest(__version__, format, _camera(reconstruct.calibration), *_method(reconstruct))
+
+
+def origin(settings: str, capture: Path) -> str:
+    """Hash of the settings and of the size and time of modification of a capture; empty if it cannot be read.
+
+    Args:
+        settings: see `settings_hash`.
+        capture: its file.
+    """
+    try:
+        status = capture.stat()
+    except OSError:  # reading the file gives the error
+        return ""
+    return _digest(settings, status.st_size, status.st_mtime_ns)
+
+
+def _camera(calibration: Calibration) -> dict[str, object]:
+    frames = calibration.frames
+    return {
+        "psf": calibration.psf,
+        "bit_depth": frames.bit_depth,
+        "dark": calibration.dark,
+        "crop": frames.crop,
+        "binning": frames.bin,
+        "background": calibration.background,
+        "upside_down": frames.upside_down,
+        "bgr": frames.bgr,
+        "pitch_um": calibration.pitch_um,
+        "distance_mm": calibration.distance_mm,
+        "mosaic": frames.mosaic,
+        "grey": frames.grey,
+    }
+
+
+def _method(reconstruct: Reconstructor) -> tuple[object, ...]:
+    """What counts of the method; alignment has always been an option of some networks, now of every method."""
+    method, aligned = reconstruct.method, ("aligned",) if reconstruct.align else ()
+    if not isinstance(method, nn.Module):
+        return (method, *aligned)
+    kind = type(method).__name__
+    names = _OPTIONS.get(kind, tuple(name for name in vars(method) if name[0] != "_" and name != "training"))
+    options = {"training": method.training, **{name: getattr(method, name) for name in names}}
+    if "align" in options:
+        options["align"], aligned = reconstruct.align, ()
+    return kind, options, method.state_dict(), reconstruct.engine and reconstruct.engine.precision, *aligned
+
+
+def _digest(*parts: object) -> str:
+    """First 16 hexadecimal digits of the SHA-256 of tensors' bytes and of other objects' text, also in mappings."""
+    digest = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, Mapping):
+            digest.update(_digest(*(value for item in part.items() for value in item)).encode())
+        elif isinstance(part, Tensor):
+            digest.update(repr((part.shape, part.dtype)).encode() + part.cpu().contiguous().numpy().tobytes())
+        else:
+            digest.update(_text(part).encode() + b"\0")
+    return digest.hexdigest()[:16]
+
+
+def _text(part: object) -> str:
+    """`repr`, with the names that a solver's fields had when the first hashes were written."""
+    text = repr(part)
+    for name, first_name in _FIRST_NAMES.items():
+        text = text.replace(f"{name}=", f"{first_name}=")
+    if isinstance(part, Admm):
+        text = text.removesuffix(")") + ", tolerance=0.0, balance_every=0)"
+    return text
