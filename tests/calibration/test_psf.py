@@ -118,7 +118,7 @@ def test_given_background_is_subtracted(tmp_path, caustic):
 
 
 @pytest.mark.parametrize("level", [0.02, 0.1])
-def test_even_light_is_found(tmp_path, caustic, level):
+def test_uniform_light_is_estimated(tmp_path, caustic, level):
     calibration = Calibration.from_file(store(tmp_path / "psf.tif", noisy(caustic, level)))
     assert calibration.background[0] == pytest.approx(level, abs=0.005)
     clean = caustic / caustic.sum()
@@ -143,9 +143,9 @@ def test_dark_frame_is_cropped_and_binned_with_the_frame(tmp_path, caustic):
     options = {"background": 0.0, "crop": (32, 24), "bin": 2}
     clean = Calibration.from_file(store(tmp_path / "clean.npy", light), **options)
     dark = store(tmp_path / "dark.npy", pattern)
-    found = Calibration.from_file(store(tmp_path / "psf.npy", light + pattern), dark=dark, **options)
-    assert found.size == (16, 12)
-    torch.testing.assert_close(found.psf, clean.psf, rtol=1e-4, atol=1e-7)
+    calibration = Calibration.from_file(store(tmp_path / "psf.npy", light + pattern), dark=dark, **options)
+    assert calibration.size == (16, 12)
+    torch.testing.assert_close(calibration.psf, clean.psf, rtol=1e-4, atol=1e-7)
 
 
 def test_twelve_bits_in_a_file_of_sixteen(tmp_path, caustic):
@@ -218,8 +218,8 @@ def test_grey_averages_psf_and_captures(tmp_path, caustic):
     mean = coloured(caustic).mean(-1)
     np.testing.assert_allclose(calibration.psf[0, 0], mean / mean.sum(), rtol=1e-5)
     frame = np.random.default_rng(0).random((*SIZE, 3), np.float32)
-    for seen in (frame, frame.mean(-1, keepdims=True)):
-        np.testing.assert_allclose(calibration.correct(seen)[0, 0], frame.mean(-1), rtol=1e-5)
+    for capture in (frame, frame.mean(-1, keepdims=True)):
+        np.testing.assert_allclose(calibration.correct(capture)[0, 0], frame.mean(-1), rtol=1e-5)
 
 
 def test_psf_that_was_subtracted_before_gets_no_light_added(tmp_path, caustic):
@@ -379,9 +379,9 @@ def test_psf_of_another_resolution_than_the_captures(tmp_path, generator):
     np.save(tmp_path / "small.npy", small)
     np.save(tmp_path / "dark.npy", np.zeros_like(small))
     options = {"background": 0.0, "crop": (8, 10)}
-    found = Calibration.from_file(tmp_path / "raw.npy", psf_bin=4, dark=tmp_path / "dark.npy", **options)
-    torch.testing.assert_close(found.psf, Calibration.from_file(tmp_path / "small.npy", **options).psf)
-    assert found.correct(small).shape == (1, 1, 8, 10)
+    calibration = Calibration.from_file(tmp_path / "raw.npy", psf_bin=4, dark=tmp_path / "dark.npy", **options)
+    torch.testing.assert_close(calibration.psf, Calibration.from_file(tmp_path / "small.npy", **options).psf)
+    assert calibration.correct(small).shape == (1, 1, 8, 10)
     with pytest.raises(ParameterError, match=r"`bin` \(0\) must be at least 1"):
         Calibration.from_file(tmp_path / "raw.npy", bin=0, psf_bin=4)
 

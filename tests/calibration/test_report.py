@@ -28,7 +28,7 @@ def said(report, *words):
 
 
 def frame_of(psf, *, level=0.0, peak=0.9, bits=16, noise=0.0, generator=None):
-    """(H, W, C) integers: the PSF over an even level, its brightest pixel at ``peak`` of the full scale."""
+    """(H, W, C) integers: the PSF over a uniform level, its brightest pixel at ``peak`` of the full scale."""
     light = (peak - level) * psf / psf.max() + level
     light = light + noise * torch.randn(light.shape, generator=generator)
     top = 2**bits - 1
@@ -55,8 +55,8 @@ def test_a_good_psf_has_nothing_to_mind(tmp_path, psf):
     assert report.size == SIZE
 
 
-def test_background_is_found_and_said(tmp_path, psf):
-    """An even level of 0.1 of the full scale, as the file of the paper's camera has between its lines."""
+def test_background_is_reported(tmp_path, psf):
+    """A uniform level of 0.1 of the full scale, as the file of the paper's camera has between its lines."""
     frame = frame_of(psf, level=0.1)
     report = report_of(tmp_path, frame)
     assert report.levels.background == pytest.approx((0.1,) * 3, abs=2e-3)
@@ -170,7 +170,7 @@ def test_colours_that_differ():
 
 def test_centroid_beside_the_centre(psf):
     moved = psf.roll((12, -8), (-2, -1))
-    before, after = (inspect_psf(Calibration(each)).support.offset for each in (psf, moved))
+    before, after = (inspect_psf(Calibration(image)).support.offset for image in (psf, moved))
     assert [b - a for a, b in zip(before, after, strict=True)] == pytest.approx([12, -8], abs=0.5)
     assert said(inspect_psf(Calibration(moved)), "px below", "to the left")
 

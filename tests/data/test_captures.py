@@ -32,7 +32,7 @@ def test_nothing_to_reconstruct(tmp_path):
 
 
 def test_captures_are_corrected_by_the_calibration(tmp_path):
-    """Twice as large, 4 bits, dark level 3, upside down, blue first: each of it must be undone."""
+    """Twice as large, 4 bits, dark level 3, upside down, blue first: all of it must be undone."""
     stored = np.full((4, 6, 3), 3, np.uint8)
     stored[2:, :2] = 3 + np.array([8, 4, 2], np.uint8)  # BGR; the file's lower left
     np.save(tmp_path / "a.npy", stored)

@@ -99,11 +99,11 @@ def test_one_raw_chunk_a_sample(tmp_path, generator, dtype):
 
 def test_attributes_and_psf(tmp_path, generator):
     psf = torch.rand(1, 3, 5, 7, generator=generator)
-    known = {"psf_hash": "0123abcd", "pitch_um": 6.9, "exposure": 12, "camera": "Kamera 1, grün"}
-    with create(tmp_path / "a.h5", attributes=known, psf=psf):
+    attributes = {"psf_hash": "0123abcd", "pitch_um": 6.9, "exposure": 12, "camera": "Kamera 1, grün"}
+    with create(tmp_path / "a.h5", attributes=attributes, psf=psf):
         pass
     file = PairFile(tmp_path / "a.h5")
-    assert file.attributes == known
+    assert file.attributes == attributes
     assert {type(value) for value in file.attributes.values()} == {str, float, int}
     assert torch.equal(file.psf, psf)
     assert len(file) == 0

@@ -123,8 +123,8 @@ def huge_tiff() -> bytes:
     data = tiff(noise()[..., 0])
     for tag, number in ((256, WIDTH), (257, HEIGHT)):
         entries = [struct.pack("<HHIHxx", tag, kind, 1, number) for kind in (3, 4)]
-        found = next(entry for entry in entries if entry in data)
-        data = data.replace(found, struct.pack("<HHII", tag, 4, 1, 2**15))
+        entry = next(entry for entry in entries if entry in data)
+        data = data.replace(entry, struct.pack("<HHII", tag, 4, 1, 2**15))
     return data
 
 

@@ -202,27 +202,29 @@ def _convert(source: Source, kind: Kind, scene_size: Size | None, changes: Frame
     capture, scene = stored
     usual = kind.raw_frames if kind.raw_frames is not None and capture.shape[2] == 1 else kind.frames
     frames = _override(usual, changes)
-    capture = _convert_capture(capture, frames, source.name)
+    capture = _orient(_correct_levels(capture, frames, source.name), frames)
     if kind.raw_frames is not None and scene.shape[2] == 1:
         scene = scene.repeat(3, axis=2)  # a few of ImageNet's photographs are grey
     if scene_size is not None:
         scene = _resize(scene, scene_size)
-    scene = scene[:: -1 if frames.upside_down else 1, :, :: -1 if frames.bgr else 1]
+    scene = _orient(scene, frames)
 
     floats = any(frame.dtype.kind == "f" for frame in stored)
     dtype = np.dtype("float32" if floats else "uint8" if capture.dtype == scene.dtype == np.uint8 else "uint16")
     return quantise(capture, dtype, f"capture of {source.name}"), quantise(scene, dtype, f"scene of {source.name}")
 
 
-def _convert_capture(capture: Frame, frames: FrameFormat, name: str) -> Frame:
-    """The capture as a measurement; its numbers stay as stored if the format changes order and orientation alone."""
+def _correct_levels(capture: Frame, frames: FrameFormat, name: str) -> Frame:
+    """Apply every step of the format but channel order and orientation; without any, the numbers stay as stored."""
     if frames.bit_depth is not None and frames.bit_depth > 8 * capture.dtype.itemsize:
         raise ImageError(f"The capture of `{name}` has {capture.dtype}, fewer than {frames.bit_depth} bits.")
-    if frames.bgr:
-        capture = capture[:, :, ::-1]
-    if replace(frames, bgr=False, upside_down=False) != FrameFormat():
-        return frames.to_measurement(capture)[0].movedim(0, -1).numpy()
-    return capture[::-1] if frames.upside_down else capture
+    steps = replace(frames, bgr=False, upside_down=False)
+    return capture if steps == FrameFormat() else steps.to_measurement(capture)[0].movedim(0, -1).numpy()
+
+
+def _orient(frame: Frame, frames: FrameFormat) -> Frame:
+    """Reorder to RGB, row 0 at the top."""
+    return frame[:: -1 if frames.upside_down else 1, :, :: -1 if frames.bgr else 1]
 
 
 def _resize(scene: Frame, size: Size) -> Frame:

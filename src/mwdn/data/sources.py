@@ -107,14 +107,14 @@ def list_hdf5(path: Path, captures: str, scenes: str) -> Listing:
                 "Name the data sets: `--captures blur --scenes gt`."
             )
     counts = [len(file[name]) for name in (captures, scenes)]
-    paired = min(counts)
+    complete = min(counts)
     refused = {
         f"row {row}": f"Row {row} of `{path}` is in one of `{captures}` ({counts[0]:,}) and `{scenes}` ({counts[1]:,})"
         f" only. {COPY_AGAIN}"
-        for row in range(paired, max(counts))
+        for row in range(complete, max(counts))
     }
     return Listing(
-        [Source(f"row {row}", partial(_read_row, path, file, (captures, scenes), row)) for row in range(paired)],
+        [Source(f"row {row}", partial(_read_row, path, file, (captures, scenes), row)) for row in range(complete)],
         refused,
     )
 
