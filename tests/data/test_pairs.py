@@ -229,7 +229,7 @@ def test_a_damaged_row_is_named(tmp_path):
 def test_wrong_calls(tmp_path, generator, unchecked):
     measurement, scene = batch(2, generator)
     with create(tmp_path / "a.h5") as file:
-        with pytest.raises(ShapeError, match=r"`scene` \(2 x 6 x 9 x 3 .* must be 8 x 10 x 3"):
+        with pytest.raises(ShapeError, match=r"`scene` \(2 x 6 x 9 x 3.* must be 8 x 10 x 3"):
             file.append(measurement, measurement)
         with pytest.raises(ShapeError, match=r"`measurement` \(1\) and `scene` \(2\) must match"):
             file.append(measurement[0], scene)
