@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from mwdn.calibration import FrameFormat
-from mwdn.cli.app import CameraOptions, main
+from mwdn.cli.app import main
+from mwdn.cli.camera import CameraOptions
 from mwdn.cli.inspect import at_psf_resolution
 from mwdn.optics import sample_camera
 
