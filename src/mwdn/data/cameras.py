@@ -1,26 +1,27 @@
-"""Pairs across cameras: every sample through a camera of its own, none twice."""
+"""Pairs across cameras: every sample has its own random camera."""
 
 from dataclasses import dataclass, replace
 
 import torch
 
 from mwdn.data.random import seeded
-from mwdn.data.simulated import Pair, SimulatedPairs, full_precision
+from mwdn.data.simulated import Batch, Samples, SimulatedPairs, full_precision
 from mwdn.errors import ParameterError
 from mwdn.optics.random_psf import FAMILIES, sample_camera
 from mwdn.types import Size
 
 CAMERA_SEED = 7
-"""Apart from the generators of the samples themselves."""
+"""Separates the generators of the cameras from those of the samples."""
 
 
 @dataclass(frozen=True)
 class Cameras:
-    """The [cameras] of a recipe: learn to reconstruct with any PSF, not with one.
+    """The [cameras] of a recipe: learn to reconstruct with any PSF instead of one.
 
     Args:
-        sizes: of the sensors, such as "320x320" (height first), one drawn for each batch; empty for one camera only.
-        families: kinds of masks, see `mwdn.optics.FAMILIES`; all of them unless named.
+        sizes: sensor sizes such as "320x320" (height first), one per batch in turn; empty to train for the given
+            camera.
+        families: kinds of masks, see `mwdn.optics.FAMILIES`; empty for all of them.
     """
 
     sizes: tuple[str, ...] = ()
@@ -36,34 +37,34 @@ class Cameras:
                 raise ParameterError(f'`families` of [cameras] ("{name}") must be of {", ".join(FAMILIES)}.')
 
     def size(self, number: int) -> Size:
-        """Size of the sensor of a batch."""
+        """Sensor size of a batch."""
         height, _, width = self.sizes[number % len(self.sizes)].partition("x")
         return int(height), int(width)
 
 
 @dataclass(frozen=True, eq=False)
-class CameraPairs:
-    """A source of pairs, each through a random camera, which the network is told the PSF of.
+class CameraPairs(Samples):
+    """Simulated pairs, each of its own random camera, whose PSF is part of the sample.
 
     Args:
-        pairs: how scenes are made and captured; its own PSF is not used.
-        cameras: what they are like.
-        together: samples in a row that have the same size: a batch.
+        pairs: makes the scenes and their measurements; its own PSF is not used.
+        cameras: sizes and kinds of the cameras.
+        batch_size: consecutive samples that share a sensor size.
     """
 
     pairs: SimulatedPairs
     cameras: Cameras
-    together: int
+    batch_size: int
 
     @property
     def name(self) -> str:
-        """The same for all photographs."""
+        """Independent of the photographs, so that a run may resume with more of them."""
         return "simulated across cameras"
 
     @full_precision
-    def batch(self, numbers: range | list[int]) -> Pair:
-        """Make the samples of these numbers, which must lie in one batch."""
-        size = self.cameras.size(numbers[0] // self.together)
+    def batch(self, numbers: range | list[int]) -> Batch:
+        """Simulate the samples of these numbers, which must belong to one batch."""
+        size = self.cameras.size(numbers[0] // self.batch_size)
         device = self.pairs.psf.device
         psfs = []
         for number in numbers:

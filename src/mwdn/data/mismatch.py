@@ -1,4 +1,4 @@
-"""How a camera differs from its calibration: a PSF that is turned, scaled, shifted, blurred, hazed; shaded light."""
+"""How a camera differs from its calibration: rotated, scaled, shifted, blurred, hazy PSF; uneven light."""
 
 import math
 from dataclasses import dataclass, fields
@@ -15,21 +15,24 @@ from mwdn.types import Psf, Size
 
 @dataclass(frozen=True)
 class Mismatch:
-    """How the camera differs from its calibration. Each number is the largest size of a draw.
+    """The [mismatch] of a recipe: how the camera differs from its calibration.
+
+    Each value is the largest magnitude; the actual ones are drawn uniformly for each sample.
 
     Args:
         shift_px: displacement of the PSF.
         turn_degrees: rotation of the PSF.
         scale: relative magnification of the PSF.
         blur_px: standard deviation of a Gaussian blur of the PSF.
-        sharpen: how much finer than its calibration the PSF is: weight of what a blur by one pixel takes from it.
-        background: even light under the PSF, as a part of its sum.
-        colour_shift_px: displacement of red and blue against green.
+        sharpen: sharpening of the PSF by unsharp masking: weight of the difference to a blur by one pixel.
+        background: uniform haze under the PSF, as a fraction of its sum.
+        colour_shift_px: displacement of red and blue relative to green, in opposite directions.
         vignetting: relative loss of light in the corners of the measurement.
-        tilt: relative gain or loss of light at one side of the measurement against its centre, in any direction.
-        grain: relative error of the single pixels of the calibrated PSF, as its own noise leaves it.
-        full: draw the largest sizes always, with a random sign where there is one.
-        exact: part of the samples whose camera is what its calibration says.
+        tilt: relative gain or loss of light at an edge of the measurement compared with its centre, in a random
+            direction.
+        grain: relative error of single pixels of the PSF, such as noise of the calibration shot leaves.
+        full: always use the largest magnitudes, with random signs.
+        exact: fraction of the samples whose camera equals its calibration.
     """
 
     shift_px: float = 0.5
@@ -47,31 +50,31 @@ class Mismatch:
 
     def __post_init__(self) -> None:
         if not self.exact <= 1:
-            raise ParameterError(f"`exact` ({self.exact}) must be in [0, 1]: it is a part of the samples.")
+            raise ParameterError(f"`exact` ({self.exact}) must be in [0, 1]: it is a fraction of the samples.")
         for part in fields(self):
             if not getattr(self, part.name) >= 0:
-                raise ParameterError(f"`{part.name}` ({getattr(self, part.name)}) must not be negative: it is a size.")
+                raise ParameterError(f"`{part.name}` ({getattr(self, part.name)}) must not be negative: it is a magnitude.")
         for name in ("scale", "background", "vignetting", "tilt"):
             if not getattr(self, name) < 1:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) must be below 1.")
 
     def size(self, generators: list[torch.Generator], largest: float) -> Tensor:
-        """(B, 1) draws from [0, largest]."""
-        drawn = uniform(generators, 0.0, 1.0)
-        return largest * (torch.ones_like(drawn) if self.full else drawn)
+        """(B, 1) random values in [0, largest]."""
+        values = uniform(generators, 0.0, 1.0)
+        return largest * (torch.ones_like(values) if self.full else values)
 
     def signed(self, generators: list[torch.Generator], largest: float, count: int = 1) -> Tensor:
-        """(B, count) draws from [-largest, largest]."""
-        drawn = uniform(generators, -1.0, 1.0, count)
-        return largest * (torch.where(drawn < 0, -1.0, 1.0) if self.full else drawn)
+        """(B, count) random values in [-largest, largest]."""
+        values = uniform(generators, -1.0, 1.0, count)
+        return largest * (torch.where(values < 0, -1.0, 1.0) if self.full else values)
 
 
 EXACT = Mismatch(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-"""A camera that is what its calibration says."""
+"""A camera that equals its calibration."""
 
 
 def shading(mismatch: Mismatch, generators: list[torch.Generator], size: Size) -> Tensor:
-    """(B, 1, H, W) factors of the light of each pixel: vignetting, and a tilt towards a side of its own."""
+    """(B, 1, H, W) factors of the light at each pixel: vignetting, and a tilt in a random direction."""
     loss = mismatch.size(generators, mismatch.vignetting)[..., None, None]
     y, x = torch.linspace(-1, 1, size[0])[:, None], torch.linspace(-1, 1, size[1])
     factors = 1 - loss * (y.square() + x.square()) / 2
@@ -83,12 +86,12 @@ def shading(mismatch: Mismatch, generators: list[torch.Generator], size: Size) -
 
 
 def perturb(psf: Psf, mismatch: Mismatch, generators: list[torch.Generator]) -> Psf:
-    """Turn, scale, shift, blur and haze each PSF of a batch, each by its own draw; sums stay 1.
+    """Rotate, scale, shift, sharpen, blur and haze each PSF of a batch at random; sums stay 1.
 
     Args:
         psf: (B, C, H, W) of unit sum.
-        mismatch: largest sizes.
-        generators: one a sample.
+        mismatch: largest magnitudes.
+        generators: one per sample.
     """
     if mismatch == EXACT:
         return psf
@@ -97,7 +100,7 @@ def perturb(psf: Psf, mismatch: Mismatch, generators: list[torch.Generator]) -> 
     base = mismatch.signed(generators, mismatch.shift_px, 2)
     spread = mismatch.signed(generators, mismatch.colour_shift_px, 2)
     shift = base[:, None] + colours[:, None] * spread[:, None]
-    # The PSF's centre is pixel n // 2, half a pixel from the middle of an even frame: turn about it.
+    # Rotate about the PSF's centre, pixel n // 2, which is half a pixel from the middle of an even frame.
     turn = torch.deg2rad(mismatch.signed(generators, mismatch.turn_degrees)[:, 0]).repeat_interleave(channels)
     scale = (1 + mismatch.signed(generators, mismatch.scale)[:, 0]).repeat_interleave(channels)
     half = torch.tensor([height, width]) / 2
@@ -122,7 +125,7 @@ def perturb(psf: Psf, mismatch: Mismatch, generators: list[torch.Generator]) -> 
 
 
 def _blur(planes: Tensor, sigma: Tensor) -> Tensor:
-    """Gaussian blur of (N, 1, H, W), each plane by its own sigma (N,) in pixels, over 7 pixels."""
+    """Gaussian blur of planes (N, 1, H, W) with 7 taps; sigma (N,) in pixels."""
     distance = torch.arange(-3, 4, device=planes.device)
     weights = torch.exp(-0.5 * (distance / sigma.clamp(min=1e-3)[:, None]).square())
     weights = weights / weights.sum(1, keepdim=True)

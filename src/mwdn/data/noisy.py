@@ -1,4 +1,4 @@
-"""Noisy pictures and clean ones: what a denoiser learns from, whatever the camera."""
+"""Pairs of noisy and clean scenes to train a denoiser on, independent of any camera."""
 
 import math
 from dataclasses import dataclass
@@ -6,17 +6,17 @@ from dataclasses import dataclass
 import torch
 
 from mwdn.data.random import uniform
-from mwdn.data.simulated import Pair, SimulatedPairs, full_precision
+from mwdn.data.simulated import Batch, Samples, SimulatedPairs, full_precision
 from mwdn.errors import ParameterError
 
 
 @dataclass(frozen=True)
 class Denoising:
-    """The [denoising] of a recipe: learn to take noise out of scenes, not to reconstruct.
+    """The [denoising] of a recipe: train a denoiser of scenes instead of a reconstruction.
 
     Args:
-        levels: lowest and highest standard deviation of the noise, over the scene's brightest pixel; each factor
-            between them is as likely. Zeros for no denoising.
+        levels: lowest and highest standard deviation of the noise, relative to the scene's brightest pixel; drawn
+            log-uniformly. Zeros for no denoising.
     """
 
     levels: tuple[float, float] = (0.0, 0.0)
@@ -27,12 +27,12 @@ class Denoising:
 
 
 @dataclass(frozen=True, eq=False)
-class NoisyScenes:
-    """A source of pairs without a camera.
+class NoisyScenes(Samples):
+    """Pairs of a noisy and a clean scene.
 
     Args:
-        pairs: how scenes are made; camera and sensor are not used.
-        denoising: how noisy they are.
+        pairs: makes the scenes; its camera and sensor are not used.
+        denoising: noise levels.
     """
 
     pairs: SimulatedPairs
@@ -40,16 +40,16 @@ class NoisyScenes:
 
     @property
     def name(self) -> str:
-        """The same for all photographs."""
+        """Independent of the photographs, so that a run may resume with more of them."""
         return "noisy scenes"
 
     @full_precision
-    def batch(self, numbers: range | list[int]) -> Pair:
-        """Make the samples of these numbers.
+    def batch(self, numbers: range | list[int]) -> Batch:
+        """Simulate the samples of these numbers.
 
         Returns:
-            the noisy scene (B, 3, H, W); the scene, its brightest pixel 1; in place of a PSF the noise level
-            (B, 1, 1, 1).
+            noisy scene (B, 3, H, W) as the measurement; scene with a brightest pixel of 1; noise level (B, 1, 1, 1) in
+            place of the PSF, as a denoiser's second input.
         """
         generators = self.pairs.generators(numbers)
         scene = self.pairs.scenes(generators)
@@ -57,4 +57,4 @@ class NoisyScenes:
         lowest, highest = map(math.log, self.denoising.levels)
         level = uniform(generators, lowest, highest).exp()[..., None, None].to(scene)
         noise = torch.stack([torch.randn(scene.shape[1:], generator=generator) for generator in generators])
-        return Pair(scene + level * noise.to(scene), scene, level)
+        return Batch(scene + level * noise.to(scene), scene, level)

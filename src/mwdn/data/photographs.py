@@ -1,4 +1,4 @@
-"""A folder of photographs, held in memory as a training set wants it."""
+"""A folder of photographs in memory, cropped and scaled for training."""
 
 import copy
 from concurrent.futures import ThreadPoolExecutor
@@ -14,19 +14,18 @@ from mwdn.types import Frame
 
 
 class Photographs:
-    """The middle square of every photograph of a folder, as sRGB bytes.
+    """The central square of every photograph of a folder, as sRGB bytes.
 
-    3,000 photographs of 208 x 208 take 390 MB and are decoded once; cropping and turning belongs to whoever places
-    them in a scene.
+    Each file is decoded once; 3,000 photographs of 208 x 208 pixels take 390 MB.
 
     Args:
-        folder: searched for pictures, also in its folders; hidden ones are none.
+        folder: searched for pictures with its subfolders; hidden files are skipped.
         side: pixels along each side of a square.
-        limit: read only the first so many, in the order of their names.
+        limit: read only this many, in the order of their names.
 
     Raises:
         ParameterError: the folder holds no picture.
-        ImageError: a picture cannot be read; the message names it.
+        ImageError: a picture cannot be read; the message has its path.
     """
 
     def __init__(self, folder: str | Path, *, side: int = 208, limit: int | None = None) -> None:
@@ -46,12 +45,12 @@ class Photographs:
         return self._light[self._pixels[index].long()].movedim(-1, 1)
 
     def split(self, every: int) -> tuple["Photographs", "Photographs"]:
-        """All but one in ``every`` photographs, and those; of fewer than ``every``, all are in both."""
-        held = torch.arange(len(self), device=self._pixels.device) % every == every - 1
-        if not held.any():
+        """Split off one photograph in ``every`` for validation; of fewer than ``every``, all are in both parts."""
+        held_out = torch.arange(len(self), device=self._pixels.device) % every == every - 1
+        if not held_out.any():
             return self, self
         parts = []
-        for chosen in (~held, held):
+        for chosen in (~held_out, held_out):
             part = copy.copy(self)
             part._pixels = self._pixels[chosen]
             part.names = [name for name, taken in zip(self.names, chosen.tolist(), strict=True) if taken]
@@ -59,7 +58,7 @@ class Photographs:
         return parts[0], parts[1]
 
     def to(self, device: torch.device | str) -> "Photographs":
-        """Keep the pictures on a device, where they are sampled."""
+        """Move the pictures to a device, on which `light` then works."""
         self._pixels, self._light = self._pixels.to(device), self._light.to(device)
         return self
 
@@ -73,7 +72,7 @@ def _square(path: Path, side: int) -> Frame:
 
     frame = read_frame(path, upright=True)
     if frame.dtype != np.uint8:
-        raise ImageError(f"`{path}` holds {frame.dtype}; photographs for training have 8 bits. Save it as JPEG.")
+        raise ImageError(f"`{path}` holds {frame.dtype}; photographs for training must have 8 bits. Save it as JPEG.")
     height, width = frame.shape[:2]
     short = min(height, width)
     top, left = (height - short) // 2, (width - short) // 2

@@ -1,4 +1,4 @@
-"""Recorded pairs as a source of numbered samples, like the simulated ones."""
+"""Recorded pairs as numbered samples, like the simulated ones; and samples recorded in a file."""
 
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -12,24 +12,24 @@ import torch
 
 from mwdn.data.pair_writer import Attribute
 from mwdn.data.pairs import PairFile
-from mwdn.data.simulated import Pair, Samples
+from mwdn.data.simulated import Batch, Samples
 from mwdn.data.splits import split
 from mwdn.errors import ParameterError, ShapeError
 from mwdn.runtime.transfers import to_device
 from mwdn.types import Psf
 
 HELD_OUT = 20
-"""Every 20th is held out for validation: of photographs, and of the training pairs of a split without such a part."""
+"""One in this many photographs is held out for validation, or training pairs of a split without a validation part."""
 
 
 @dataclass(frozen=True)
 class Division:
-    """Which pairs of a file are for training, and which for validation.
+    """The [pairs] of a recipe: which pairs of a file are for training and which for validation.
 
     Args:
-        split: see `mwdn.data.splits.split`. The published ones count positions, so that no pair may be missing.
-        fractions: of training, validation and test; of "random" only.
-        seed: of "random" only.
+        split: see `mwdn.data.splits.split`. The published ones go by position, so no pair may be missing.
+        fractions: of training, validation and test; only for "random".
+        seed: only for "random".
     """
 
     split: str = "paper"
@@ -37,7 +37,7 @@ class Division:
     seed: int = 0
 
     def of(self, count: int) -> tuple[range | list[int], range | list[int]]:
-        """Positions of the pairs for training and of those for validation; the test part is in neither.
+        """Positions of the pairs for training and for validation, without the test part.
 
         Raises:
             UnknownNameError: no such split.
@@ -46,119 +46,136 @@ class Division:
         parts = split(count, self.split, fractions=self.fractions, seed=self.seed)
         train, validation = parts["train"], parts.get("validation", [])
         if not validation:
-            held = train[HELD_OUT - 1 :: HELD_OUT]
-            train, validation = sorted(set(train) - set(held)), held
+            validation = train[HELD_OUT - 1 :: HELD_OUT]
+            train = sorted(set(train) - set(validation))
         if not train or not validation:
             raise ParameterError(
                 f"The split '{self.split}' of {count:,} pairs leaves {len(train):,} for training and "
-                f"{len(validation):,} for validation; both need some. Name other `fractions` in [pairs]."
+                f"{len(validation):,} for validation; both need at least one. Choose other `fractions` in [pairs]."
             )
         return train, validation
 
 
 @dataclass(frozen=True, eq=False)
-class RecordedPairs:
-    """A source of the pairs of a file: each once, in another order, in each epoch.
+class RecordedPairs(Samples):
+    """The pairs of a file: each once per epoch, in another order.
 
     Args:
         file: of the pairs, opened when the first one is read.
-        rows: positions of those to use.
+        rows: positions of the pairs to use.
+        psf: (1, C, H, W), of the camera; its device is where the pairs are put.
         seed: of the orders.
-        shuffled: in the order of ``rows`` otherwise, over and over.
-        device: where to put the pairs.
+        shuffled: otherwise in the order of ``rows``, repeatedly.
     """
 
     file: PairFile
     rows: range | list[int]
+    psf: Psf
     seed: int = 0
     shuffled: bool = True
-    device: torch.device = torch.device("cpu")  # noqa: RUF009
 
     def __len__(self) -> int:
         return len(self.rows)
 
     @property
     def name(self) -> str:
-        """Says how many there are, on which the order depends."""
+        """States the number of pairs, which determines their order."""
         return f"{len(self):,} of {len(self.file):,} recorded"
 
-    def batch(self, numbers: range | list[int]) -> Pair:
+    def batch(self, numbers: range | list[int]) -> Batch:
         """Read the samples of these numbers.
 
         Returns:
-            measurement and scene, (B, C, H, W) each, linear light, nominally in [0, 1].
+            measurement and scene, (B, C, H, W) each, linear light, nominally in [0, 1]; and the PSF.
 
         Raises:
             ImageError: a pair cannot be read.
         """
         pairs = [self.file[self.row(number)] for number in numbers]
-        measurement, scene = (to_device(torch.stack(part), self.device) for part in zip(*pairs, strict=True))
-        return Pair(measurement, scene)
+        measurement, scene = (to_device(torch.stack(part), self.psf.device) for part in zip(*pairs, strict=True))
+        return Batch(measurement, scene, self.psf)
 
     def row(self, number: int) -> int:
-        """Position in the file of a sample."""
+        """Position of a sample's pair in the file."""
         epoch, place = divmod(number, len(self.rows))
         return self.rows[int(_order(len(self.rows), self.seed, epoch)[place]) if self.shuffled else place]
 
+    def describe(self, numbers: range) -> str:
+        """Names the samples with their rows in the file."""
+        return f"{super().describe(numbers)}, rows {[self.row(number) for number in numbers]} of the file"
 
-class ReadAhead:
-    """Recorded pairs, of which the next batch is read while whoever took the last one works.
+    def prefetched(self, stride: int) -> "PrefetchedPairs":
+        """The same pairs, the next batch read while the last one is used."""
+        return PrefetchedPairs(self, stride)
+
+
+class PrefetchedPairs(Samples):
+    """Recorded pairs whose next batch is read by another thread.
 
     Args:
-        pairs: to be read.
-        stride: from a batch's numbers to those of the next.
+        pairs: to read.
+        stride: from the numbers of one batch to those of the next.
     """
 
     def __init__(self, pairs: RecordedPairs, stride: int) -> None:
         self.pairs, self.stride = pairs, stride
         self._thread = ThreadPoolExecutor(1)
-        self._expected: range | None = None
-        self._next = Future[Pair]()
+        self._expected: list[int] = []
+        self._next = Future[Batch]()
 
-    def batch(self, numbers: range) -> Pair:
-        """Samples of these numbers, as `RecordedPairs.batch` reads them; its errors are raised where they are taken."""
-        found = self._next.result() if numbers == self._expected else self.pairs.batch(numbers)
-        self._expected = range(numbers.start + self.stride, numbers.stop + self.stride)
+    @property
+    def name(self) -> str:
+        """The name of the pairs."""
+        return self.pairs.name
+
+    def batch(self, numbers: range | list[int]) -> Batch:
+        """The samples of these numbers, as `RecordedPairs.batch` gives them, with its errors."""
+        batch = self._next.result() if list(numbers) == self._expected else self.pairs.batch(numbers)
+        self._expected = [number + self.stride for number in numbers]
         self._next = self._thread.submit(self.pairs.batch, self._expected)
-        return found
+        return batch
+
+    def describe(self, numbers: range) -> str:
+        """Names the samples with their rows in the file."""
+        return self.pairs.describe(numbers)
 
 
 def recorded_pairs(
     path: Path, psf: Psf, division: Division, *, seed: int = 0, device: torch.device | str = "cpu"
 ) -> tuple[RecordedPairs, RecordedPairs]:
-    """Pairs for training and for validation.
+    """Open a file of pairs for training and for validation.
 
     Args:
         path: of the file.
-        psf: of the camera that took them.
-        division: which are for what.
+        psf: of its camera.
+        division: into training and validation.
         seed: of the order in each epoch.
-        device: where to put them.
+        device: where to put the pairs.
 
     Raises:
-        ImageError: no such file; damaged, or something else than pairs.
+        ImageError: no such file, or it is damaged or not a file of pairs.
         ShapeError: the pairs do not fit the PSF.
-        ParameterError: the division does not fit their number.
+        ParameterError: the division does not fit the number of pairs.
     """
     file = PairFile(path)
     check_pairs(file, psf)
     train, validation = division.of(len(file))
-    place = torch.device(device)
-    return RecordedPairs(file, train, seed, device=place), RecordedPairs(file, validation, seed, False, place)
+    psf = psf.to(device)
+    return RecordedPairs(file, train, psf, seed), RecordedPairs(file, validation, psf, seed, shuffled=False)
 
 
 def check_pairs(file: PairFile, psf: Psf) -> None:
-    """See that a file's pairs are of a camera with this PSF.
+    """Check that a file's pairs fit the PSF.
 
     Raises:
-        ShapeError: another size or other channels.
+        ShapeError: they have another size or other channels.
     """
     (h, w, channels), (H, W), colours = file.measurement_shape, psf.shape[-2:], psf.shape[1]
     if (h, w) != (H, W):
         factor = H // h
-        way_out = "Use the PSF of the camera that took them, cropped and binned as they are: `--crop`, `--psf-bin`."
+        way_out = "Use the PSF of their camera, cropped and binned as they are: `--crop`, `--psf-bin`."
         if factor > 1 and (h * factor, w * factor) == (H, W):
-            way_out = f"The PSF is {factor} times as large: bin it by {factor} times as much, `--psf-bin`."
+            way_out = f"The PSF is {factor} times as large: multiply its binning by {factor}, `--psf-bin`."
         raise ShapeError(f"`psf` ({H} x {W}) and the measurements of `{file.path}` ({h} x {w}) must match. {way_out}")
     if colours not in (1, channels):
         raise ShapeError(
@@ -174,14 +191,14 @@ def check_pairs(file: PairFile, psf: Psf) -> None:
 
 
 def other_camera(file: PairFile, psf_hash: str) -> str | None:
-    """Say so, if a file's pairs are of another PSF than the one of this hash."""
-    known = file.attributes.get("psf_hash")
-    if known in (None, psf_hash):
+    """A warning if a file's pairs have another PSF than the one of this hash, otherwise ``None``."""
+    own_hash = file.attributes.get("psf_hash")
+    if own_hash in (None, psf_hash):
         return None
     return (
-        f"`{file.path}` holds pairs of the camera of PSF {known}, but the PSF given is {psf_hash}. Expect blur, ghosts "
-        "and low numbers, unless both are of one camera; another crop, binning or background of one PSF file counts as "
-        "another PSF."
+        f"`{file.path}` holds pairs of PSF {own_hash}, but the PSF given is {psf_hash}. Expect blur, ghosts and low "
+        "scores, unless both belong to one camera: another crop, binning or background of the same PSF file also gives "
+        "another hash."
     )
 
 
@@ -194,15 +211,15 @@ def record(
     attributes: Mapping[str, Attribute] | None = None,
     track: Callable[[list[range]], Iterable[range]] = iter,
 ) -> None:
-    """Write samples to a file of pairs, one part after the other; the file is there only once it is whole.
+    """Write samples to a file of pairs, one part after the other. The file appears when it is complete.
 
     Args:
-        path: of the file, ending in .h5 or .hdf5; one that exists is replaced when all has gone well.
-        parts: sources, and the numbers of their samples.
+        path: of the file, ending in .h5 or .hdf5; an existing one is replaced on success.
+        parts: sources, each with the numbers of its samples.
         psf: of the calibration.
-        batch: samples that are made at once.
+        batch: samples to make at once.
         attributes: see `PairFile.create`.
-        track: shows the progress of each part.
+        track: wraps the batches of each part to show progress.
 
     Raises:
         MwdnError: a sample cannot be made, or the file cannot be written.
@@ -210,9 +227,9 @@ def record(
     shape = (psf.shape[-2], psf.shape[-1], 3)
     with PairFile.create(path, measurement_shape=shape, scene_shape=shape, attributes=attributes, psf=psf) as file:
         for samples, numbers in parts:
-            for some in track([numbers[i : i + batch] for i in range(0, len(numbers), batch)]):
-                measurement, scene, _ = samples.batch(some)
-                file.append(measurement.cpu(), scene.cpu())
+            for chunk in track([numbers[i : i + batch] for i in range(0, len(numbers), batch)]):
+                made = samples.batch(chunk)
+                file.append(made.measurement.cpu(), made.scene.cpu())
 
 
 @lru_cache(maxsize=4)

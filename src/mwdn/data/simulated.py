@@ -1,7 +1,7 @@
-"""Pairs made on the fly: photographs placed in a scene, passed through a camera that is not quite the calibrated one.
+"""Pairs simulated during training: photographs placed in scenes, seen by a camera slightly unlike its calibration.
 
-Every sample draws from its own generator, seeded by (seed, number of the sample): a run gives the same pairs however
-many processes share it, and in whatever batches.
+Every sample has its own random generator, seeded by (seed, number of the sample): a run makes the same pairs for any
+number of processes and any batch size.
 """
 
 import math
@@ -31,17 +31,22 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class Placement:
-    """How a photograph stands in the scene. Each number is drawn evenly from its range for each sample.
+    """The [placement] of a recipe: where a photograph is in the scene, and how it is lit.
+
+    Each value is drawn for each sample, uniformly unless stated otherwise.
 
     Args:
-        extent: side of the photograph over the shorter side of the sensor. The paper's display takes 137 / 320.
-        aspect: width over height, drawn from [1 / aspect, aspect].
-        turn_degrees: drawn from [-turn, turn].
-        offset: displacement of its centre, over half the space beside it; 1 lets it touch the border.
-        ambient: light that reaches the whole sensor from elsewhere, over the mean of the measurement.
-        exposure: brightest pixel of the measurement over saturation: the less, the noisier. Each stop is as likely.
-        backdrop: even light beside the photograph, as of a wall behind an object, each colour drawn by itself; 1 is
-            the photograph's white.
+        extent: range of the photograph's side, relative to the shorter side of the sensor. The paper's display has
+            137 / 320.
+        aspect: width over height is drawn log-uniformly from [1 / aspect, aspect].
+        turn_degrees: rotation, drawn from [-turn_degrees, turn_degrees].
+        offset: largest displacement of the centre, relative to half the free space; at 1 the photograph can touch the
+            border.
+        ambient: range of uniform stray light on the sensor, relative to the mean of the measurement.
+        exposure: range of the measurement's brightest pixel, relative to saturation; drawn log-uniformly. The lower,
+            the noisier.
+        backdrop: range of uniform light around the photograph, such as a wall behind an object, drawn for each colour;
+            1 is the photograph's white.
     """
 
     extent: Range = (0.3, 0.7)
@@ -56,10 +61,10 @@ class Placement:
         for name in ("extent", "ambient", "exposure", "backdrop"):
             low, high = getattr(self, name)
             if not 0 <= low <= high:
-                raise ParameterError(f"`{name}` ({low}, {high}) must be a range: not negative, the smaller one first.")
-        for name, of in (("extent", "the sensor's shorter side"), ("exposure", "saturation")):
+                raise ParameterError(f"`{name}` ({low}, {high}) must be a range: not negative, the smaller value first.")
+        for name, whole in (("extent", "the sensor's shorter side"), ("exposure", "saturation")):
             if not getattr(self, name)[0] > 0:
-                raise ParameterError(f"`{name}` {getattr(self, name)} must be positive: a part of {of}.")
+                raise ParameterError(f"`{name}` {getattr(self, name)} must be positive: it is a fraction of {whole}.")
         if not self.backdrop[1] <= 1:
             raise ParameterError(f"`backdrop` {self.backdrop} must be 1 at most, the photograph's white.")
         if not self.aspect >= 1:
@@ -68,30 +73,48 @@ class Placement:
             raise ParameterError(f"`offset` ({self.offset}) must be in [0, 1]; 1 reaches the border.")
 
 
-class Pair(NamedTuple):
-    """What the network sees and what it should give; and each sample's PSF where cameras differ."""
+class Batch(NamedTuple):
+    """Samples for a network: its two inputs and the output it should give.
+
+    Args:
+        measurement: (B, C, H, W).
+        scene: (B, C, H, W).
+        psf: (1, C, H, W) of the one camera, or (B, C, H, W) of each sample's camera.
+    """
 
     measurement: Measurement
     scene: Scene
-    psf: Psf | None = None
+    psf: Psf
 
 
 @runtime_checkable
 class Samples(Protocol):
-    """A source of pairs that are numbered without end: the same number is the same pair."""
+    """A source of pairs with unlimited numbers: the same number always gives the same pair."""
 
     @property
     def name(self) -> str:
-        """Tells it from another source, on which a run must not go on."""
+        """Identifies the source when a run resumes."""
 
-    def batch(self, numbers: range | list[int]) -> Pair:
-        """Pairs of these numbers, on one device."""
+    def batch(self, numbers: range | list[int]) -> Batch:
+        """The samples of these numbers, on one device."""
+
+    def describe(self, numbers: range) -> str:
+        """Names the samples in an error message."""
+        return f"samples {numbers.start} to {numbers.stop - 1}"
+
+    def prefetched(self, stride: int) -> "Samples":
+        """The same samples, the next batch loaded in advance where loading is slow.
+
+        Args:
+            stride: from the numbers of one batch to those of the next.
+        """
+        return self
 
 
 def full_precision(make: Callable[P, R]) -> Callable[P, R]:
-    """Make samples in float32, whatever the network that asks for them computes in.
+    """Decorator: make samples in float32, also inside the autocast of a network's training.
 
-    Half precision would move a scene's pixels by up to one, and spoil a PSF by 7 % of its norm.
+    bfloat16 would displace a scene by up to one pixel, and change a PSF by 7 % of its norm.
     """
 
     @wraps(make)
@@ -103,17 +126,17 @@ def full_precision(make: Callable[P, R]) -> Callable[P, R]:
 
 
 @dataclass(frozen=True, eq=False)
-class SimulatedPairs:
-    """A source of pairs for one calibrated camera.
+class SimulatedPairs(Samples):
+    """Simulated pairs of one calibrated camera.
 
     Args:
-        photographs: what stands in the scenes.
-        psf: of the calibration, (1, C, H, W), unit sum; also the size of the sensor.
-        placement: how photographs stand in the scene.
+        photographs: shown in the scenes.
+        psf: of the calibration, (1, C, H, W), unit sum; its size is the sensor's.
+        placement: where the photographs are in the scenes.
         mismatch: how the camera differs from its calibration.
         sensor: noise, black level and saturation.
-        seed: of everything.
-        camera: the true one, where it is known and always the same; no PSF is perturbed then.
+        seed: of all random numbers.
+        camera: a fixed true camera, in place of randomly perturbed PSFs.
     """
 
     photographs: Photographs
@@ -126,16 +149,16 @@ class SimulatedPairs:
 
     @property
     def name(self) -> str:
-        """The same for all photographs: more of them do not make another run."""
+        """Independent of the photographs, so that a run may resume with more of them."""
         return "simulated"
 
     @full_precision
-    def batch(self, numbers: range | list[int]) -> Pair:
-        """Make the samples of these numbers.
+    def batch(self, numbers: range | list[int]) -> Batch:
+        """Simulate the samples of these numbers.
 
         Returns:
-            measurement (B, 3, H, W), its noise relative to the exposure, in units of the scene; and the scene
-            (B, 3, H, W), linear light in [0, 1].
+            measurement (B, 3, H, W), with the noise of its exposure, in units of the scene; scene (B, 3, H, W), linear
+            light in [0, 1]; PSF of the calibration (1, C, H, W).
         """
         generators = self.generators(numbers)
         scene = self.scenes(generators)
@@ -153,15 +176,15 @@ class SimulatedPairs:
         stops = uniform(generators, math.log(darkest), math.log(lightest))
         gain = stops.exp()[..., None, None].to(light) / brightest
         exposed = torch.cat([self._expose(one, g) for one, g in zip(light * gain, generators, strict=True)])
-        return Pair(exposed / gain, scene)
+        return Batch(exposed / gain, scene, self.psf)
 
     def generators(self, numbers: range | list[int]) -> list[torch.Generator]:
-        """One for each sample of these numbers."""
-        # Two neighbouring seeds share no sample before the millionth.
+        """A random generator for each sample of these numbers."""
+        # Neighbouring seeds share no sample before the millionth.
         return [seeded(self.seed * 1_000_003 + n) for n in numbers]
 
     def scenes(self, generators: list[torch.Generator]) -> Scene:
-        """Place one photograph in each scene: chosen, mirrored, scaled, turned, shifted, before its backdrop."""
+        """Choose a photograph for each scene; mirror, scale, rotate and shift it, in front of a backdrop."""
         height, width = self.psf.shape[-2:]
         index = torch.cat([torch.randint(len(self.photographs), (1,), generator=g) for g in generators])
         pictures = self.photographs.light(index.to(self.psf.device))
@@ -178,8 +201,8 @@ class SimulatedPairs:
         theta = affine(turn, scale_y, scale_x, shift, width / height).to(pictures)
         scene = _resample(pictures, theta, (height, width))
         if p.backdrop[1]:
-            beside = 1 - _resample(torch.ones_like(pictures[:, :1]), theta, (height, width))
-            scene = scene + beside * uniform(generators, *p.backdrop, 3)[..., None, None].to(scene)
+            background = 1 - _resample(torch.ones_like(pictures[:, :1]), theta, (height, width))
+            scene = scene + background * uniform(generators, *p.backdrop, 3)[..., None, None].to(scene)
         return scene
 
     def _expose(self, light: Tensor, generator: torch.Generator) -> Tensor:
@@ -190,7 +213,7 @@ class SimulatedPairs:
 
 
 def _resample(pictures: Tensor, theta: Tensor, size: Size) -> Tensor:
-    """Draw pictures into frames of ``size``, each frame pixel the mean of 2 x 2 samples; black outside."""
+    """Resample pictures into frames of ``size``: the mean of 2 x 2 samples for each pixel, black outside."""
     fine = [len(pictures), pictures.shape[1], 2 * size[0], 2 * size[1]]
     grid = F.affine_grid(theta, fine, align_corners=False)
     return F.avg_pool2d(F.grid_sample(pictures, grid, align_corners=False), 2).clamp(0, 1)

@@ -1,14 +1,15 @@
-"""A camera's own captures as something to learn from, although nobody knows their scenes."""
+"""A camera's own captures to learn from, without their scenes."""
 
 import hashlib
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.data.random import seeded
-from mwdn.data.simulated import Pair, full_precision
+from mwdn.data.simulated import full_precision
 from mwdn.errors import ParameterError
 from mwdn.fourier.convolution import convolve
 from mwdn.optics.noise import noise_level
@@ -18,17 +19,17 @@ from mwdn.types import Image, Measurement, Psf, Scene
 
 @dataclass(frozen=True)
 class SelfSupervised:
-    """The [selfsupervised] of a recipe: learn from captures alone.
+    """The [selfsupervised] of a recipe: learn from captures without scenes.
 
     Args:
-        consistency: weight of the part of a measurement that its reconstruction, seen through the camera, leaves
-            unexplained; 0 for a recipe that learns from pairs.
-        equivariance: weight of the [loss] between a reconstruction moved elsewhere, and what the network makes of a
-            capture of it. Without it the network may leave out what the camera does not see.
-        recorruption: how unevenly the noise is split between the measurement that is reconstructed, whose noise
-            rises by sqrt(1 + its square), and the one to be explained, sqrt(1 + 1 / its square). With 0 both are the
-            measurement itself, whose noise is then explained too.
-        shift: largest displacement of the reconstruction, as a part of each side.
+        consistency: weight of the part of a measurement that its reconstruction, convolved with the PSF, does not
+            explain; 0 for a recipe that learns from pairs.
+        equivariance: weight of the [loss] between a moved reconstruction and the network's reconstruction of a simulated
+            capture of it. Without it, nothing constrains what the camera does not see.
+        recorruption: r, which splits the noise between the measurement to reconstruct, whose noise is multiplied by
+            sqrt(1 + r^2), and the one to explain, sqrt(1 + 1 / r^2). At 0 both are the measurement itself, and the
+            network learns to explain its noise too.
+        shift: largest displacement of the reconstruction, as a fraction of each side.
     """
 
     consistency: float = 0.0
@@ -41,18 +42,33 @@ class SelfSupervised:
             if not getattr(self, name) >= 0:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) must not be negative.")
         if not 0 <= self.shift < 1:
-            raise ParameterError(f"`shift` ({self.shift}) must be in [0, 1): a part of each side.")
+            raise ParameterError(f"`shift` ({self.shift}) must be in [0, 1): it is a fraction of each side.")
+
+
+class CaptureBatch(NamedTuple):
+    """Captures for a network that learns without scenes.
+
+    Args:
+        measurement: (B, C, H, W), to reconstruct.
+        target: (B, C, H, W), to explain: the same light with independent noise.
+        psf: (B, 1 or C, H, W), aligned to each capture.
+    """
+
+    measurement: Measurement
+    target: Measurement
+    psf: Psf
 
 
 @dataclass(frozen=True, eq=False)
 class UnpairedCaptures:
-    """A source of captures: each once, in another order, in each epoch, its noise split in another way.
+    """Captures as numbered samples: each once per epoch, in another order, its noise split in another way.
 
     Args:
         measurements: (N, C, H, W).
-        psf: (1, 1 or C, H, W), of the calibration. Each capture's own, turned and scaled, is found when first needed.
-        settings: how noise is split, and scenes are moved.
+        psf: (1, 1 or C, H, W), of the calibration. It is aligned to each capture when that is first used.
+        settings: how noise is split and scenes are moved.
         seed: of orders, noise and moves.
+        poses: of the aligned PSF, by the capture's position; filled on first use.
     """
 
     measurements: Measurement
@@ -66,45 +82,46 @@ class UnpairedCaptures:
 
     @property
     def name(self) -> str:
-        """Tells these captures from others."""
+        """Identifies the captures when a run resumes."""
         content = self.measurements.cpu().contiguous().numpy().tobytes()
         return f"{len(self):,} captures {hashlib.sha256(content).hexdigest()[:16]}"
 
     @full_precision
-    def batch(self, numbers: range | list[int]) -> Pair:
-        """Measurements of these numbers, twice, each with independent noise, and their own PSFs.
+    def batch(self, numbers: range | list[int]) -> CaptureBatch:
+        """Two measurements of each capture, with independent noise, and its aligned PSF.
 
-        In place of a scene stands what is to be explained: a measurement of the same light, whose noise knows nothing
-        of the first one's, so that whoever explains it cannot gain by explaining noise.
+        For the measurement y, the noise level sigma, a random n of unit variance and the recorruption r they are
+        y + r sigma n and y - sigma n / r. Their noise is uncorrelated: explaining the second by the first gains nothing
+        from reproducing noise.
 
         References:
             T. Pang et al., Recorrupted-to-Recorrupted: unsupervised deep learning for image denoising, CVPR (2021).
         """
         rows = [self.row(number) for number in numbers]
-        taken, uneven = self.measurements[rows], self.settings.recorruption
+        captures, r = self.measurements[rows], self.settings.recorruption
         psf = torch.cat([self._pose(row).move(self.psf) for row in rows])
-        if uneven == 0:
-            return Pair(taken, taken, psf)
-        noise = noise_level(taken) * self._normal(numbers)
-        return Pair(taken + uneven * noise, taken - noise / uneven, psf)
+        if r == 0:
+            return CaptureBatch(captures, captures, psf)
+        noise = noise_level(captures) * self._normal(numbers)
+        return CaptureBatch(captures + r * noise, captures - noise / r, psf)
 
     def row(self, number: int) -> int:
-        """Which capture a sample is of."""
+        """Position of a sample's capture."""
         epoch, place = divmod(number, len(self))
         return int(torch.randperm(len(self), generator=self._generator(epoch))[place])
 
     @full_precision
-    def again(self, scene: Scene, psf: Psf, light: Tensor, numbers: range | list[int]) -> tuple[Measurement, Scene]:
-        """Move scenes elsewhere and capture them once more.
+    def recapture(self, scene: Scene, psf: Psf, light: Tensor, numbers: range | list[int]) -> tuple[Measurement, Scene]:
+        """Move scenes at random and simulate captures of them.
 
         Args:
             scene: (B, C, H, W), of the samples of these numbers.
-            psf: (B, C, H, W), their own.
-            light: (B, C, 1, 1), even light on their sensors that is from elsewhere.
-            numbers: decide about moves and noise, as strong as that of the capture.
+            psf: (B, C, H, W), aligned to each capture.
+            light: (B, C, 1, 1), uniform stray light.
+            numbers: seed the moves and the noise, which is as strong as that of the capture.
 
         Returns:
-            The measurement, and the scene that it is of: shifted, mirrored, turned by right angles if it is square.
+            The measurement, and the moved scene: shifted, mirrored, and transposed at random if it is square.
         """
         moved = torch.stack([self._moved(one, number) for one, number in zip(scene, numbers, strict=True)])
         noise = noise_level(self.measurements[[self.row(number) for number in numbers]]) * self._normal(numbers, 1)
@@ -112,7 +129,7 @@ class UnpairedCaptures:
 
     def _moved(self, scene: Tensor, number: int) -> Tensor:
         generator = self._generator(number, 2)
-        ways = torch.randint(2, (3,), generator=generator).tolist()
+        flips = torch.randint(2, (3,), generator=generator).tolist()
         down, right = (
             int(part * length)
             for part, length in zip(
@@ -122,8 +139,8 @@ class UnpairedCaptures:
             )
         )
         scene = F.pad(scene, (right, -right, down, -down))
-        scene = scene.flip([axis for axis, way in zip((-2, -1), ways, strict=False) if way])
-        return scene.transpose(-2, -1) if ways[2] and scene.shape[-2] == scene.shape[-1] else scene
+        scene = scene.flip([axis for axis, flip in zip((-2, -1), flips, strict=False) if flip])
+        return scene.transpose(-2, -1) if flips[2] and scene.shape[-2] == scene.shape[-1] else scene
 
     def _pose(self, row: int) -> Pose:
         if row not in self.poses:
@@ -132,9 +149,9 @@ class UnpairedCaptures:
 
     def _normal(self, numbers: range | list[int], purpose: int = 0) -> Image:
         shape = self.measurements.shape[1:]
-        drawn = [torch.randn(shape, generator=self._generator(number, purpose)) for number in numbers]
-        return torch.stack(drawn).to(self.measurements)
+        noise = [torch.randn(shape, generator=self._generator(number, purpose)) for number in numbers]
+        return torch.stack(noise).to(self.measurements)
 
     def _generator(self, number: int, purpose: int = 3) -> torch.Generator:
-        """Of its own for each sample and purpose."""
+        """A generator of its own for each sample and purpose."""
         return seeded(4 * (self.seed * 1_000_003 + number) + purpose)

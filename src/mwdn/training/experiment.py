@@ -1,9 +1,10 @@
-"""What a user does with a recipe, a calibration and pictures: train, or make a file of pairs."""
+"""From a recipe, a calibration and pictures to a training run, or to a file of simulated pairs."""
 
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 from mwdn.calibration import Calibration
 from mwdn.data.cameras import CameraPairs
@@ -18,131 +19,133 @@ from mwdn.data.unpaired import UnpairedCaptures
 from mwdn.errors import ParameterError
 from mwdn.runtime import distributed
 from mwdn.training.recipe import Recipe
+from mwdn.training.selfsupervised import SelfSupervisedTask
+from mwdn.training.tasks import SupervisedTask, Task, supervised_task
 from mwdn.training.trainer import Trainer
-from mwdn.training.validation import SHOWN
-from mwdn.types import Psf
+from mwdn.training.validation import SHOWN, Validator
+from mwdn.types import Measurement, Psf
 
 FILE_START = 2 * 10**12
-"""Number of the first sample of a file: a network trained with the same seed has seen none of them."""
+"""Number of the first sample in a file of simulated pairs, beyond those of any training with the same seed."""
+
+
+class TrainingData(NamedTuple):
+    """What to learn, and how much of it there is.
+
+    Args:
+        task: to train on.
+        validation: to validate on.
+        epoch: number of training samples in an epoch.
+        validation_count: number of different validation samples; ``None`` if unlimited.
+    """
+
+    task: Task
+    validation: Task
+    epoch: int
+    validation_count: int | None = None
 
 
 def prepare(
     recipe: Recipe,
     calibration: Calibration,
-    photos: Path | None,
-    out: Path,
-    device: str | None = None,
     *,
+    out: Path,
+    photos: Path | None = None,
     pairs: Path | None = None,
-    apart: Iterable[Path | None] = (),
+    device: str | None = None,
+    exclude: Iterable[Path | None] = (),
 ) -> Trainer:
-    """Read what there is to learn from and set the run up.
+    """Read the training data and set up the run.
 
     Args:
-        recipe: the experiment.
+        recipe: the experiment. With [selfsupervised] it learns from all captures of its [sheet], and takes neither
+            ``photos`` nor ``pairs``.
         calibration: of the camera.
-        photos: folder of photographs, through which captures are simulated; every 20th is held out for validation.
         out: folder of the run.
-        device: a GPU if there is one unless given.
-        pairs: file of recorded pairs, in place of photographs. A recipe with [selfsupervised] takes neither: it
-            learns from all the captures of its [sheet].
-        apart: files that are no captures, though a folder of the recipe's [sheet] holds them: the PSF, the dark frame.
+        photos: folder of photographs to simulate captures of; every 20th is held out for validation.
+        pairs: file of recorded pairs, instead of photographs.
+        device: a GPU by default if there is one.
+        exclude: files in a folder of [sheet] that are no captures: the PSF, the dark frame.
 
     Raises:
-        ParameterError: not exactly one of photographs, pairs and captures, as the recipe needs, or not enough of them.
+        ParameterError: not exactly one of photographs, pairs and captures, or not enough of them.
         MwdnError: torch cannot use the device, a file cannot be read or does not fit the camera, or the folder holds
             another run.
     """
-    _check_one(recipe, photos, pairs)
     place = distributed.local_device(device)
-    shown, alone = recipe.sheet.captures, recipe.selfsupervised.consistency > 0
-    files = find_captures(shown, exclude=apart) if shown else []
-    real = read_captures(files if alone else files[:SHOWN], calibration) if files else None
-    training: Samples
-    validation: Samples
-    if alone and real is not None:
-        psf, seed = calibration.psf.to(place), recipe.schedule.seed
-        training = validation = UnpairedCaptures(real.to(place), psf, recipe.selfsupervised, seed)
-        count, real = len(training), None
-        recipe = _within(recipe, count)
+    psf = calibration.psf.to(place)
+    _check_one_source(recipe, photos, pairs)
+    captures = _read_captures(recipe, calibration, exclude)
+    captures = None if captures is None else captures.to(place)
+    if recipe.selfsupervised.consistency and captures is not None:
+        data = captures_alone(recipe, captures, psf)
+        captures = None  # shown as samples of the validation
     elif pairs is not None:
-        if recipe.cameras.sizes:
-            raise ParameterError("Recorded pairs, `--pairs`, are of one camera: leave [cameras] out of the recipe.")
-        if recipe.denoising.levels[1]:
-            raise ParameterError("[denoising] makes its own pairs from photographs: give `--photos`, not `--pairs`.")
-        seed = recipe.schedule.seed
-        training, validation = recorded_pairs(pairs, calibration.psf, recipe.pairs, seed=seed, device=place)
-        recipe = _within(recipe, len(validation))
-        count = len(training)
+        data = recorded_pairs_of(recipe, pairs, psf)
     elif photos is not None:
-        learned, held_out = Photographs(photos).to(place).split(HELD_OUT)
-        source = _source(recipe, learned, calibration.psf.to(place))
-        validation = replace(source, photographs=held_out)
-        across = recipe.cameras.sizes
-        training = CameraPairs(source, recipe.cameras, recipe.schedule.batch) if across else source
-        if recipe.denoising.levels[1]:
-            training, validation = (NoisyScenes(each, recipe.denoising) for each in (source, validation))
-        count = len(learned)
-    trainer = Trainer(
-        _in_steps(recipe, count), calibration, training, out, validation=validation, captures=real, device=place
-    )
-    trainer.validator.captured(trainer.average)  # a capture that does not fit the network is found now
+        data = simulated_captures(recipe, photos, psf)
+    recipe = _in_steps(recipe, data)
+    validator = Validator(recipe, data.validation, psf, captures)
+    trainer = Trainer(recipe, data.task, out=out, calibration=calibration, validator=validator, device=place)
+    validator.reconstruct_captures(trainer.average)  # reports captures that do not fit the network before training
     return trainer
 
 
-def simulate(
-    recipe: Recipe,
-    calibration: Calibration,
-    photos: Path,
-    out: Path,
-    count: int,
-    *,
-    exact: bool = False,
-    track: Callable[[list[range]], Iterable[range]] = iter,
-) -> None:
-    """Write simulated pairs to a file, which is there only once it is whole.
-
-    Args:
-        recipe: its placement, mismatch, sensor and seed are used.
-        calibration: of the camera.
-        photos: folder of photographs.
-        out: the file of pairs, ending in .h5 or .hdf5; one that exists is replaced when all has gone well.
-        count: of pairs.
-        exact: the camera is what its calibration says, whatever the recipe's mismatch.
-        track: shows the progress of an iteration.
-
-    Raises:
-        MwdnError: ``count`` is not positive, a photograph cannot be read, or the file cannot be written.
-    """
-    check_path(out)
-    if count < 1:
-        raise ParameterError(f"`count` ({count}) must be at least 1.")
-    pairs = _source(recipe, Photographs(photos), calibration.psf)
-    pairs = replace(pairs, mismatch=EXACT) if exact else pairs
-    attributes: dict[str, Attribute] = {"psf_hash": calibration.psf_hash, "seed": pairs.seed}
-    part = pairs, range(FILE_START, FILE_START + count)
-    record(out, [part], calibration.psf, batch=recipe.schedule.batch, attributes=attributes, track=track)
+def simulated_captures(recipe: Recipe, photos: Path, psf: Psf) -> TrainingData:
+    """Captures simulated from photographs, through one camera or random ones; or noisy scenes for a denoiser."""
+    photographs, held_out = Photographs(photos).to(psf.device).split(HELD_OUT)
+    training: Samples = _simulated_pairs(recipe, photographs, psf)
+    validation: Samples = _simulated_pairs(recipe, held_out, psf)
+    if recipe.denoising.levels[1]:
+        training, validation = (NoisyScenes(pairs, recipe.denoising) for pairs in (training, validation))
+    elif recipe.cameras.sizes:
+        training = CameraPairs(training, recipe.cameras, recipe.schedule.batch)
+    return TrainingData(supervised_task(training, recipe.schedule), SupervisedTask(validation), len(photographs))
 
 
-def _check_one(recipe: Recipe, photos: Path | None, pairs: Path | None) -> None:
+def recorded_pairs_of(recipe: Recipe, pairs: Path, psf: Psf) -> TrainingData:
+    """Recorded pairs of one camera."""
+    if recipe.cameras.sizes:
+        raise ParameterError("Recorded pairs, `--pairs`, are of one camera: leave [cameras] out of the recipe.")
+    if recipe.denoising.levels[1]:
+        raise ParameterError("[denoising] makes its own pairs from photographs: give `--photos`, not `--pairs`.")
+    seed = recipe.schedule.seed
+    training, validation = recorded_pairs(pairs, psf, recipe.pairs, seed=seed, device=psf.device)
+    task = supervised_task(training, recipe.schedule)
+    return TrainingData(task, SupervisedTask(validation), len(training), len(validation))
+
+
+def captures_alone(recipe: Recipe, captures: Measurement, psf: Psf) -> TrainingData:
+    """Captures without scenes, for training and validation alike."""
+    task = SelfSupervisedTask(UnpairedCaptures(captures, psf, recipe.selfsupervised, recipe.schedule.seed))
+    return TrainingData(task, task, len(captures), len(captures))
+
+
+def _check_one_source(recipe: Recipe, photos: Path | None, pairs: Path | None) -> None:
     if recipe.selfsupervised.consistency:
         if photos is not None or pairs is not None or not recipe.sheet.captures:
             raise ParameterError(
-                "A recipe with [selfsupervised] learns from captures alone: name them, `--captures FOLDER`, "
-                "and neither `--photos` nor `--pairs`."
+                "A recipe with [selfsupervised] learns from captures alone: give `--captures FOLDER`, and neither "
+                "`--photos` nor `--pairs`."
             )
     elif photos is None and pairs is None:
         raise ParameterError(
-            "Name what to learn from: photographs, `--photos FOLDER`, or pairs, `--pairs FILE`. "
-            "To learn from captures alone, take recipes/selfsupervised.toml."
+            "Give photographs to learn from, `--photos FOLDER`, or pairs, `--pairs FILE`. "
+            "To learn from captures alone, use recipes/selfsupervised.toml."
         )
     elif photos is not None and pairs is not None:
-        raise ParameterError(
-            f"`--photos` ({photos}) and `--pairs` ({pairs}) exclude each other. Leave one of them out."
-        )
+        raise ParameterError(f"`--photos` ({photos}) and `--pairs` ({pairs}) exclude each other. Leave one out.")
 
 
-def _source(recipe: Recipe, photographs: Photographs, psf: Psf) -> SimulatedPairs:
+def _read_captures(recipe: Recipe, calibration: Calibration, exclude: Iterable[Path | None]) -> Measurement | None:
+    """Captures of [sheet]: all to learn from them, otherwise as many as a contact sheet shows."""
+    if not recipe.sheet.captures:
+        return None
+    files = find_captures(recipe.sheet.captures, apart=exclude)
+    return read_captures(files if recipe.selfsupervised.consistency else files[:SHOWN], calibration)
+
+
+def _simulated_pairs(recipe: Recipe, photographs: Photographs, psf: Psf) -> SimulatedPairs:
     return SimulatedPairs(
         photographs,
         psf,
@@ -153,15 +156,46 @@ def _source(recipe: Recipe, photographs: Photographs, psf: Psf) -> SimulatedPair
     )
 
 
-def _within(recipe: Recipe, most: int) -> Recipe:
-    """No recorded pair counts twice in a validation."""
-    return replace(recipe, schedule=replace(recipe.schedule, validation=min(recipe.schedule.validation, most)))
-
-
-def _in_steps(recipe: Recipe, count: int) -> Recipe:
-    """Epochs of so many samples become steps: as many of them as hold an epoch, and a validation after each."""
+def _in_steps(recipe: Recipe, data: TrainingData) -> Recipe:
+    """Epochs as steps, with a validation after each; and no validation sample twice."""
     schedule = recipe.schedule
-    if schedule.epochs == 0:
-        return recipe
-    steps = math.ceil(count / schedule.batch)
-    return replace(recipe, schedule=replace(schedule, steps=schedule.epochs * steps, validate_every=steps))
+    if data.validation_count is not None:
+        schedule = replace(schedule, validation=min(schedule.validation, data.validation_count))
+    if schedule.epochs:
+        steps = math.ceil(data.epoch / schedule.batch)
+        schedule = replace(schedule, steps=schedule.epochs * steps, validate_every=steps)
+    return replace(recipe, schedule=schedule)
+
+
+def simulate(
+    recipe: Recipe,
+    calibration: Calibration,
+    *,
+    photos: Path,
+    out: Path,
+    count: int,
+    exact: bool = False,
+    track: Callable[[list[range]], Iterable[range]] = iter,
+) -> None:
+    """Write simulated pairs to a file, which appears when it is complete.
+
+    Args:
+        recipe: its placement, mismatch, sensor and seed are used.
+        calibration: of the camera.
+        photos: folder of photographs.
+        out: the file of pairs, ending in .h5 or .hdf5; an existing one is replaced on success.
+        count: number of pairs.
+        exact: simulate the calibrated camera itself, without the recipe's mismatch.
+        track: wraps the batches to show progress.
+
+    Raises:
+        MwdnError: ``count`` is not positive, a photograph cannot be read, or the file cannot be written.
+    """
+    check_path(out)
+    if count < 1:
+        raise ParameterError(f"`count` ({count}) must be at least 1.")
+    pairs = _simulated_pairs(recipe, Photographs(photos), calibration.psf)
+    pairs = replace(pairs, mismatch=EXACT) if exact else pairs
+    attributes: dict[str, Attribute] = {"psf_hash": calibration.psf_hash, "seed": pairs.seed}
+    numbers = range(FILE_START, FILE_START + count)
+    record(out, [(pairs, numbers)], calibration.psf, batch=recipe.schedule.batch, attributes=attributes, track=track)

@@ -1,4 +1,4 @@
-"""The training loss: a weighted sum of distances between pictures."""
+"""The training loss: a weighted sum of distances between images."""
 
 import math
 from collections.abc import Mapping
@@ -14,47 +14,48 @@ from mwdn.evaluation.distances import feature_mse, l1, log_mse, lpips, mse, ssim
 from mwdn.types import Image
 
 NAMES = ("feature_mse", "l1", "log_mse", "lpips", "mse", "ssim")
-"""What a `Loss` can be made of."""
+"""Parts of a `Loss`."""
 
 
 class Loss(nn.Module):
     """A weighted sum of distances, averaged over the batch.
 
-    AlexNet and the heads of LPIPS are loaded only if a part needs them; move them with ``.to(device)``.
+    AlexNet and the linear heads of LPIPS are loaded only if a part needs them; move them with ``.to(device)``.
 
     Args:
-        weights: of each part by its name in `NAMES`; ``{"mse": 1.0, "feature_mse": 0.05}`` ends the training of
-            the MWDN paper. Similarity enters as 1 - SSIM. A part of weight 0 is reported, not trained on.
+        weights: of each part by its name in `NAMES`; the last phase of the MWDN paper's training has
+            ``{"mse": 1.0, "feature_mse": 0.05}``. "ssim" is 1 - SSIM. A part of weight 0 is reported, not trained on.
         alexnet: file of AlexNet's weights; see `mwdn.evaluation.alexnet.load_alexnet`.
-        heads: file of LPIPS's heads; see `mwdn.evaluation.alexnet.load_heads`.
+        heads: file of LPIPS's linear heads; see `mwdn.evaluation.alexnet.load_heads`.
 
     Raises:
         UnknownNameError: no such part.
         ParameterError: no part, or a weight that is negative or not finite.
-        CheckpointError: a network is needed and cannot be had.
+        CheckpointError: the weights of a needed network cannot be loaded.
     """
 
     def __init__(
         self, weights: Mapping[str, float], *, alexnet: str | Path | None = None, heads: str | Path | None = None
     ) -> None:
         super().__init__()
-        self.weights = checked_weights(weights)
-        """May be changed while training: a weight, not a name."""
+        self.initial_weights = checked_weights(weights)
+        self.weights = self.initial_weights
+        """Current weights, which a schedule may replace by others of the same names."""
         self.alexnet = load_alexnet(alexnet) if {"feature_mse", "lpips"} & set(weights) else None
         self.heads = load_heads(heads, alexnet=alexnet) if "lpips" in weights else None
 
     def forward(self, reconstruction: Image, scene: Image) -> tuple[Tensor, dict[str, Tensor]]:
-        """Compare a batch.
+        """Compare a batch of reconstructions with their scenes.
 
         Args:
             reconstruction: (B, C, H, W), nominally in [0, 1].
             scene: of the same shape.
 
         Returns:
-            The weighted sum, a scalar to be minimised, and each part before its weight, a scalar without gradient.
+            The weighted sum to be minimised, and each part without its weight: scalars without gradient.
 
         Raises:
-            ShapeError: the shapes differ or do not suit a part.
+            ShapeError: the shapes differ, or a part cannot be computed for them.
         """
         total, parts = reconstruction.new_zeros((), dtype=torch.float32), {}
         for name, weight in self.weights.items():
@@ -75,7 +76,7 @@ class Loss(nn.Module):
 
 
 def checked_weights(weights: Mapping[str, Any]) -> dict[str, float]:
-    """Copy of the weights of a `Loss`, for which its errors are raised."""
+    """Check the weights of a `Loss`; raises its errors."""
     if not weights:
         raise ParameterError(f'`weights` must name at least one of {", ".join(NAMES)}, for example {{"mse": 1.0}}.')
     for name, weight in weights.items():

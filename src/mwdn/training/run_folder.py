@@ -1,4 +1,4 @@
-"""The folder of a run: whose it is, what it remembers, what it tells."""
+"""The folder of a run: its files, and which run they belong to."""
 
 import json
 import os
@@ -13,21 +13,38 @@ from torch import Tensor
 from mwdn.errors import CheckpointError, ParameterError
 from mwdn.io.files import as_parameter_error, check_folder, write_text
 from mwdn.runtime import distributed
-from mwdn.training.recipe import with_current_names
+from mwdn.training.recipe import Recipe, with_current_names
 from mwdn.training.training_state import Header, read_state
 
-MAKE_ROOM = "Make room and give the same command again: it goes on from the last saved state."
+MAKE_ROOM = "Make room and give the same command again: it resumes from the last saved state."
 WEIGHTS = ("last", "best")
 
 
-class RunFolder:
-    """Files of one run, which no other run replaces: ``state.safetensors``, ``recipe.json``, ``log.jsonl``, weights.
-
-    The first process alone reads and writes.
+def run_identity(recipe: Recipe, psf_hash: str, samples: str) -> dict[str, Any]:
+    """What must be the same for a run to be resumed; it is also stored in the checkpoints.
 
     Args:
-        path: of the folder; it need not be there.
-        identity: what a run must agree with to be gone on with; JSON can hold it.
+        recipe: the experiment. What does not change the weights is left out.
+        psf_hash: of the calibration.
+        samples: name of the task's samples.
+    """
+    tables = recipe.as_dict()
+    del tables["schedule"]["checkpointing"]  # changes memory and time only
+    del tables["sheet"]
+    if not recipe.selfsupervised.consistency:
+        del tables["selfsupervised"]
+    # With random cameras the PSF is used for the validation only.
+    return {"recipe": tables, "psf_hash": None if recipe.cameras.sizes else psf_hash, "pairs": samples}
+
+
+class RunFolder:
+    """Files of one run, protected from other runs: ``state.safetensors``, ``recipe.json``, ``log.jsonl``, weights.
+
+    Only the first process reads and writes them.
+
+    Args:
+        path: of the folder, which is made if it is missing.
+        identity: see `run_identity`.
     """
 
     def __init__(self, path: Path, identity: dict[str, Any]) -> None:
@@ -35,34 +52,34 @@ class RunFolder:
 
     @property
     def state(self) -> Path:
-        """All that a stopped run needs."""
+        """File with the state from which a run resumes."""
         return self.path / "state.safetensors"
 
     def weights(self, name: str) -> Path:
-        """Those of the last validation, or of the best one."""
+        """File with the weights of the "last" or the "best" validation."""
         return self.path / f"{name}.safetensors"
 
-    def saved(self) -> tuple[dict[str, Tensor], Header] | None:
-        """The state of this run, where it was stopped, on all processes; ``None`` where it has not begun.
+    def read(self) -> tuple[dict[str, Tensor], Header] | None:
+        """The saved state of this run, on all processes; ``None`` if there is none.
 
         Raises:
             CheckpointError: the state is damaged, or the folder holds another run.
         """
-        content = distributed.broadcast(self._state)
+        content = distributed.broadcast(self._read_state)
         if content:
             state, header = read_state(self.state, content)
             self._check(header.get("identity", "null"))
             return state, header
-        owner = distributed.broadcast(self._owner)
+        owner = distributed.broadcast(self._read_owner)
         if owner:
             self._check(owner.decode(errors="replace"))
         return None
 
-    def _state(self) -> bytes:
+    def _read_state(self) -> bytes:
         return (self.state.read_bytes() or b"empty") if self.state.exists() else b""
 
-    def _owner(self) -> bytes:
-        """Identity of the run whose weights lie here, if there are any."""
+    def _read_owner(self) -> bytes:
+        """Identity of the run whose weights are in the folder; empty without weights."""
         recipe = self.path / "recipe.json"
         if not any(self.weights(name).exists() for name in WEIGHTS):
             return b""
@@ -70,21 +87,21 @@ class RunFolder:
 
     def _check(self, owner: str) -> None:
         try:
-            own = _with_current_names(json.loads(owner)) == json.loads(json.dumps(self.identity))
+            same = _with_current_names(json.loads(owner)) == json.loads(json.dumps(self.identity))
         except ValueError:
-            own = False
-        if not own:
+            same = False
+        if not same:
             raise CheckpointError(
                 f"`{self.path}` holds a run of another recipe or PSF, or on other pairs. "
                 "Choose another folder, `--out`, or remove it."
             )
 
     @contextmanager
-    def alone(self) -> Iterator[None]:
-        """Keep other runs out meanwhile; where this process is killed they may come in.
+    def lock(self) -> Iterator[None]:
+        """Keep other runs out of the folder; the lock ends with the process at the latest.
 
         Raises:
-            ParameterError: another run is here, or the folder refuses.
+            ParameterError: another run is using the folder, or it cannot be written to.
         """
         if distributed.rank() or sys.platform == "win32":
             yield
@@ -92,47 +109,47 @@ class RunFolder:
         import fcntl
 
         check_folder(self.path)
-        # The folder itself: a file to be locked would stay behind.
-        handle = os.open(self.path, os.O_RDONLY)
+        handle = os.open(self.path, os.O_RDONLY)  # the folder itself: a lock file would stay behind
         try:
-            with suppress(OSError):  # of file systems that lock nothing
+            with suppress(OSError):  # of file systems without locks
                 try:
                     fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except BlockingIOError as error:
                     raise ParameterError(
-                        f"Another run is at work in `{self.path}`. Wait until it has ended, or choose another folder: "
-                        "`--out`."
+                        f"Another run is using `{self.path}`. Wait until it has ended, or choose another folder: `--out`."
                     ) from error
             yield
         finally:
             os.close(handle)
 
     def claim(self, step: int) -> None:
-        """Write once, so that a folder that refuses is found now and not after an hour; the log ends at the step.
+        """Write the run's identity, and cut the log off after ``step``.
+
+        An unwritable folder is thus reported before training, not at the first validation.
 
         Raises:
-            ParameterError: another run is at work in it.
-            MwdnError: it refuses.
+            ParameterError: another run is using the folder.
+            MwdnError: it cannot be written to.
         """
         log = self.path / "log.jsonl"
-        with self.alone():
+        with self.lock():
             write_text(self.path / "recipe.json", json.dumps(self.identity, indent=2))
-            # One line a step; those after the saved step will be written again.
+            # One line per step; those after the saved step will be written again.
             lines = log.read_text(encoding="utf-8").splitlines(keepends=True) if log.exists() else []
             write_text(log, "".join(lines[:step]))
 
     def log(self, line: dict[str, Any]) -> None:
-        """Add a line to the log.
+        """Append a line to the log.
 
         Raises:
-            ParameterError: the disk is full, or refuses otherwise.
+            ParameterError: the folder cannot be written to, for example because the disk is full.
         """
         with as_parameter_error(self.path, MAKE_ROOM), (self.path / "log.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
 
 
 def _with_current_names(identity: Any) -> Any:  # noqa: ANN401
-    """Identity of a run of an earlier version, whose recipe may have former names of keys."""
+    """Identity of a run, which an earlier version may have written with former names of the recipe's keys."""
     if not (isinstance(identity, dict) and isinstance(identity.get("recipe"), dict)):
         return identity
     return {**identity, "recipe": with_current_names(identity["recipe"])}

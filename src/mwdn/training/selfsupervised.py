@@ -1,7 +1,22 @@
-"""What a network's reconstructions of real captures are worth, although nobody knows the scenes."""
+"""Learning from real captures without their scenes.
+
+Many scenes explain a measurement y: the sensor crops the pattern, and the PSF suppresses some frequencies. The loss has
+two parts. Consistency: the reconstruction x = f(y), convolved with the PSF, must explain y. Equivariance: x is moved
+(shifted, mirrored, transposed) to T x and captured again in simulation; the network must reconstruct T x from it. What
+the network invents or omits where the camera sees nothing does not survive this. T x is held fixed in the comparison
+(the papers propagate gradients through it): the network learns to find scenes, not to make scenes easy to find.
+
+Alignment: each capture has its aligned PSF (`UnpairedCaptures.batch`), used to explain it and to capture again. In
+training and validation alike the network gets this PSF if it is used with an aligned one (``network.align``), otherwise
+the PSF of the calibration.
+
+References:
+    D. Chen, J. Tachella, M. Davies, Equivariant imaging: learning beyond the range space, ICCV (2021).
+    D. Chen, J. Tachella, M. Davies, Robust equivariant imaging, CVPR (2022).
+"""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -10,17 +25,17 @@ from mwdn.data.unpaired import UnpairedCaptures
 from mwdn.fourier.convolution import convolve
 from mwdn.networks import Network
 from mwdn.training.losses import Loss
-from mwdn.training.validation import START, Judged, Validator, reconstruct
+from mwdn.training.tasks import Scores
 from mwdn.types import Image, Measurement
 
 
-class Blind(NamedTuple):
-    """What was found without a scene.
+class SelfSupervisedLoss(NamedTuple):
+    """Loss without scenes.
 
     Args:
         loss: to be minimised, a scalar.
-        parts: of it before their weights, scalars without gradient.
-        pictures: measurement, reconstruction, and the reconstruction seen through the camera.
+        parts: before their weights, scalars without gradient.
+        pictures: measurement, reconstruction, and the reconstruction convolved with the PSF.
     """
 
     loss: Tensor
@@ -28,71 +43,79 @@ class Blind(NamedTuple):
     pictures: tuple[Tensor, Tensor, Tensor]
 
 
-def judge(captures: UnpairedCaptures, network: nn.Module, loss: Loss, numbers: range | list[int]) -> Blind:
-    """Let the network reconstruct captures, and see whether its pictures explain them and stand a second capture.
-
-    Many scenes explain a measurement: the sensor crops the pattern, and a PSF passes hardly anything of some
-    frequencies. What a network invents or leaves out there shows when its picture is moved and captured again: if the
-    picture was possible, so is the moved one, and the network should find it. That picture is held fixed for the
-    comparison (the papers let it move too): the network learns to find scenes, not to make scenes that are found.
+def selfsupervised_loss(
+    captures: UnpairedCaptures, network: nn.Module, distance: Loss, numbers: range | list[int]
+) -> SelfSupervisedLoss:
+    """Consistency and equivariance of a network's reconstructions, see the top of this file.
 
     Args:
-        captures: and how the parts are weighted.
+        captures: with the weights of both parts.
         network: measurement and PSF in, scene out.
-        loss: distance of two scenes in [0, 1].
+        distance: of two scenes in [0, 1].
         numbers: of the samples.
-
-    References:
-        D. Chen, J. Tachella, M. Davies, Equivariant imaging: learning beyond the range space, ICCV (2021).
-        D. Chen, J. Tachella, M. Davies, Robust equivariant imaging, CVPR (2022).
     """
-    measurement, other, psf = captures.batch(numbers)
-    assert psf is not None
-    # A network whose PSF is aligned at inference is trained on the PSF that fits the capture.
-    told = psf if isinstance(network, Network) and network.align else captures.psf
-    found = network(measurement.contiguous(memory_format=torch.channels_last), told).float()
-    seen = convolve(found, psf)
-    light = (other - seen).mean((-2, -1), keepdim=True).detach()
-    left = unexplained(seen, other).mean()
-    captured, scene = captures.again(found.detach().clamp(min=0), psf, light, numbers)
-    again = network(captured.contiguous(memory_format=torch.channels_last), told).float()
+    measurement, target, psf = captures.batch(numbers)
+    network_psf = psf if isinstance(network, Network) and network.align else captures.psf
+    reconstruction = network(measurement.contiguous(memory_format=torch.channels_last), network_psf).float()
+    explained = convolve(reconstruction, psf)
+    light = (target - explained).mean((-2, -1), keepdim=True).detach()
+    inconsistency = unexplained(explained, target).mean()
+    recaptured, scene = captures.recapture(reconstruction.detach().clamp(min=0), psf, light, numbers)
+    again = network(recaptured.contiguous(memory_format=torch.channels_last), network_psf).float()
     brightest = scene.amax((1, 2, 3), keepdim=True).clamp(min=1e-6)
-    distance, parts = loss(again / brightest, scene / brightest)
-    total = captures.settings.consistency * left + captures.settings.equivariance * distance
-    return Blind(total, {"unexplained": left.detach(), **parts}, (measurement, found.detach(), seen.detach()))
+    equivariance, parts = distance(again / brightest, scene / brightest)
+    total = captures.settings.consistency * inconsistency + captures.settings.equivariance * equivariance
+    pictures = measurement, reconstruction.detach(), explained.detach()
+    return SelfSupervisedLoss(total, {"unexplained": inconsistency.detach(), **parts}, pictures)
 
 
-def unexplained(seen: Image, measurement: Measurement) -> Tensor:
-    """Part of a measurement's variation that stays unexplained, (B,): 0 at best, 1 for a picture of nothing.
+def unexplained(explained: Image, measurement: Measurement) -> Tensor:
+    """Unexplained fraction of a measurement's variance, (B,): 0 is best, 1 that of a black reconstruction.
 
-    Even light of each colour is free: on a sensor without a lens it falls from everywhere.
+    A constant offset per colour does not count: stray light reaches a sensor without a lens from everywhere.
 
     Args:
-        seen: (B, C, H, W), a reconstruction through the camera.
+        explained: (B, C, H, W), a reconstruction convolved with the PSF.
         measurement: of the same shape.
     """
-    left, all_of_it = (picture - picture.mean((-2, -1), keepdim=True) for picture in (measurement - seen, measurement))
-    power = all_of_it.square().sum((1, 2, 3)).clamp(min=torch.finfo(torch.float32).tiny)
-    return left.square().sum((1, 2, 3)) / power
+    residual, signal = (
+        picture - picture.mean((-2, -1), keepdim=True) for picture in (measurement - explained, measurement)
+    )
+    power = signal.square().sum((1, 2, 3)).clamp(min=torch.finfo(torch.float32).tiny)
+    return residual.square().sum((1, 2, 3)) / power
 
 
 @dataclass(frozen=True, eq=False)
-class BlindValidator(Validator):
-    """Validates a network on captures alone; the sheet shows its pictures seen through the camera again.
+class SelfSupervisedTask:
+    """Learn from captures alone.
 
-    In place of the PSNR stands the loss in dB below 1.
+    Validation reports the loss in dB below 1 in place of a PSNR, on the same captures.
     """
 
-    columns = ("measurement", "through the camera")
+    captures: UnpairedCaptures
 
-    def judged(self, network: nn.Module, loss: Loss, numbers: range) -> Judged:
-        """The loss has the weights that [loss] has at the moment."""
-        assert isinstance(self.pairs, UnpairedCaptures)
-        found = judge(self.pairs, network, loss, numbers)
-        return Judged(-10 * torch.log10(found.loss).expand(len(numbers)), float(found.loss), found.pictures)
+    columns: ClassVar[tuple[str, str]] = "measurement", "through the camera"
+
+    @property
+    def name(self) -> str:
+        """The name of the captures."""
+        return self.captures.name
 
     @torch.no_grad()
-    def captured(self, network: nn.Module) -> list[list[Tensor]]:
-        """The first capture and its reconstruction: whether it fits the network is found before training."""
-        measurement, _, _ = self.pairs.batch([START])
-        return [[measurement.cpu(), reconstruct(network, measurement, self.psf).cpu()]]
+    def check(self, network: nn.Module) -> None:
+        """Reconstruct the first capture: one that does not fit the network is reported before training."""
+        network(self.captures.measurements[:1], self.captures.psf)
+
+    def loss(self, network: nn.Module, distance: Loss, numbers: range) -> tuple[Tensor, dict[str, Tensor]]:
+        """The self-supervised loss of the captures of these numbers, and its parts."""
+        result = selfsupervised_loss(self.captures, network, distance, numbers)
+        return result.loss, result.parts
+
+    def score(self, network: nn.Module, distance: Loss, numbers: range) -> Scores:
+        """The same loss; its distance has the weights of the training's current phase."""
+        result = selfsupervised_loss(self.captures, network, distance, numbers)
+        return Scores(-10 * torch.log10(result.loss).expand(len(numbers)), float(result.loss), result.pictures)
+
+    def describe(self, numbers: range) -> str:
+        """Names the samples in an error message."""
+        return f"samples {numbers.start} to {numbers.stop - 1}"

@@ -1,4 +1,4 @@
-"""A run's progress for TensorBoard, which is an extra."""
+"""Progress of a run in TensorBoard, an optional dependency."""
 
 from pathlib import Path
 from types import TracebackType
@@ -10,12 +10,12 @@ from mwdn.io.images import srgb_encode
 from mwdn.training.trainer import Report
 
 
-class Board:
-    """Writes event files; use it in a ``with`` statement, and call it with each report.
+class TensorBoard:
+    """Writes event files: a callback for `Trainer.run`, to be used in a ``with`` statement.
 
     Args:
-        folder: of the event files, which ``tensorboard --logdir`` shows; missing folders are created.
-        step: what is already written of later steps will be hidden: a resumed run repeats them.
+        folder: for the event files, to be shown by ``tensorboard --logdir``; it is made if it is missing.
+        step: of the saved state. Events of later steps are hidden: a resumed run repeats them.
 
     Raises:
         ParameterError: TensorBoard is not installed, or the folder cannot be written to.
@@ -30,7 +30,7 @@ class Board:
             self._writer: Any = SummaryWriter(str(folder), purge_step=step + 1)
 
     def __call__(self, report: Report) -> None:
-        """Write a step's numbers, and after a validation its numbers and the contact sheet."""
+        """Write the numbers of a step, and those and the contact sheet of a validation."""
         scalars = {f"loss/{name}": value for name, value in {"total": report.loss, **report.parts}.items()}
         scalars |= {"learning_rate": report.learning_rate, "pictures_per_s": report.pictures_per_s}
         if report.validation is not None:
@@ -40,7 +40,7 @@ class Board:
         for name, value in scalars.items():
             self._writer.add_scalar(name, value, report.step)
 
-    def __enter__(self) -> "Board":
+    def __enter__(self) -> "TensorBoard":
         return self
 
     def __exit__(

@@ -1,4 +1,4 @@
-"""What a stopped run needs to go on as if nothing had happened: every tensor of it, in one safetensors file."""
+"""The state from which a run resumes exactly: all its tensors in one safetensors file."""
 
 import json
 from pathlib import Path
@@ -12,17 +12,17 @@ from mwdn.errors import CheckpointError
 from mwdn.io.files import atomic
 
 Header = dict[str, str]
-"""Texts that stand in the file beside the tensors."""
+"""Strings stored in the file beside the tensors."""
 
 
 def write_state(
     path: Path, header: Header, *, network: nn.Module, average: nn.Module, optimiser: torch.optim.Optimizer
 ) -> None:
-    """Write weights, their running mean and the optimiser's moments, atomically.
+    """Write weights, their moving average and the optimiser's moments, atomically.
 
     Raises:
         OSError: as for `mwdn.io.files.atomic`.
-        SafetensorError: the disk refuses.
+        SafetensorError: the file cannot be written.
     """
     state = {
         f"{prefix}.{name}": value.contiguous()
@@ -37,35 +37,35 @@ def write_state(
 
 
 def read_state(path: Path, content: bytes) -> tuple[dict[str, Tensor], Header]:
-    """Tensors and header of the bytes of a file.
+    """Tensors and header of a file, from its bytes.
 
     Raises:
-        CheckpointError: they are damaged.
+        CheckpointError: the file is damaged.
     """
     try:
         state = load(content)
     except SafetensorError as error:
         raise damaged(path, error) from error
-    length = int.from_bytes(content[:8], "little")  # of a header in JSON, which follows
+    length = int.from_bytes(content[:8], "little")  # of the JSON header that follows
     return state, json.loads(content[8 : 8 + length]).get("__metadata__", {})
 
 
 def damaged(path: Path, reason: object) -> CheckpointError:
-    """What is raised of a state from which nothing can go on."""
-    return CheckpointError(f"`{path}` is damaged: {reason}. Remove it to begin again.")
+    """The error for a state that cannot be used."""
+    return CheckpointError(f"`{path}` is damaged: {reason}. Remove it to start again.")
 
 
 def restore(
     state: dict[str, Tensor], *, network: nn.Module, average: nn.Module, optimiser: torch.optim.Optimizer
 ) -> None:
-    """Put the tensors of `write_state` back to where they were."""
+    """Load the tensors of `write_state` into a network, its average and its optimiser."""
     for prefix, module in (("network.", network), ("average.", average)):
         module.load_state_dict({key.removeprefix(prefix): v for key, v in state.items() if key.startswith(prefix)})
     for name, parameter in network.named_parameters():
         if f"optimiser.{name}.step" not in state:
-            continue  # never had a gradient
+            continue  # a parameter without a gradient
         moments = {key: state[f"optimiser.{name}.{key}"].to(parameter.device) for key in ("exp_avg", "exp_avg_sq")}
-        # Adam keeps its moments in the layout of the weights.
-        form = torch.channels_last if parameter.ndim == 4 else torch.contiguous_format
-        moments = {key: value.contiguous(memory_format=form) for key, value in moments.items()}
+        # Adam keeps its moments in the memory format of the weights.
+        memory_format = torch.channels_last if parameter.ndim == 4 else torch.contiguous_format
+        moments = {key: value.contiguous(memory_format=memory_format) for key, value in moments.items()}
         optimiser.state[parameter] = {"step": state[f"optimiser.{name}.step"].cpu(), **moments}

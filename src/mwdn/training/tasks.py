@@ -1,0 +1,118 @@
+"""What a network learns: a loss of numbered samples. Here from pairs; `selfsupervised` has the task without scenes."""
+
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from mwdn.data.simulated import Samples
+from mwdn.networks import Network
+from mwdn.solvers import align
+from mwdn.training.losses import Loss
+from mwdn.training.recipe import Schedule
+from mwdn.training.sample_cache import SampleCache
+from mwdn.types import Image, Measurement, Psf, Scene
+
+
+class Scores(NamedTuple):
+    """Validation of a batch.
+
+    Args:
+        psnr: (B,), in dB.
+        loss: mean over the batch.
+        pictures: three (B, C, H, W): measurement, reconstruction, and what to compare that with.
+    """
+
+    psnr: Tensor
+    loss: float
+    pictures: tuple[Tensor, Tensor, Tensor]
+
+
+class Task(Protocol):
+    """A task for the `mwdn.training.trainer.Trainer`. Samples are numbered without end."""
+
+    columns: ClassVar[tuple[str, str]]
+    """Titles on the contact sheet, left and right of the reconstruction."""
+
+    @property
+    def name(self) -> str:
+        """Identifies the source of the samples when a run resumes."""
+
+    def check(self, network: nn.Module) -> None:
+        """Raise an `MwdnError` if the network cannot learn the task."""
+
+    def loss(self, network: nn.Module, distance: Loss, numbers: range) -> tuple[Tensor, dict[str, Tensor]]:
+        """Loss of the samples of these numbers, and its parts without their weights."""
+
+    def score(self, network: nn.Module, distance: Loss, numbers: range) -> Scores:
+        """Validate a network in evaluation mode on the samples of these numbers."""
+
+    def describe(self, numbers: range) -> str:
+        """Names the samples in an error message."""
+
+
+@dataclass(frozen=True, eq=False)
+class SupervisedTask:
+    """Learn from pairs: the loss is the distance of reconstruction and scene.
+
+    Training does not align the PSF, validation does if the network is used with an aligned one (``network.align``).
+
+    Args:
+        pairs: measurement, scene and PSF of each sample.
+        cache: of these pairs, to train on it instead.
+    """
+
+    pairs: Samples
+    cache: SampleCache | None = None
+
+    columns: ClassVar[tuple[str, str]] = "measurement", "scene"
+
+    @property
+    def name(self) -> str:
+        """The name of the pairs."""
+        return self.pairs.name
+
+    def check(self, network: nn.Module) -> None:
+        """Check that the network can use the cache."""
+        if self.cache is not None:
+            self.cache.check(network)
+
+    def loss(self, network: nn.Module, distance: Loss, numbers: range) -> tuple[Tensor, dict[str, Tensor]]:
+        """Distance of the reconstructions and the scenes of these numbers, and its parts."""
+        source = self if self.cache is None else self.cache
+        reconstruction, scene = source.reconstruct(network, numbers)
+        return distance(reconstruction.float(), scene)
+
+    def reconstruct(self, network: nn.Module, numbers: range) -> tuple[Image, Scene]:
+        """Reconstructions of the samples of these numbers, and their scenes."""
+        measurement, scene, psf = self.pairs.batch(numbers)
+        return network(measurement.contiguous(memory_format=torch.channels_last), psf), scene
+
+    def score(self, network: nn.Module, distance: Loss, numbers: range) -> Scores:
+        """PSNR and loss of the reconstructions; the loss has its initial weights, in whichever phase the training is."""
+        measurement, scene, psf = self.pairs.batch(numbers)
+        reconstruction = reconstruct_aligned(network, measurement, psf)
+        psnr = -10 * torch.log10((reconstruction.clamp(0, 1) - scene).square().mean((1, 2, 3)))
+        parts = distance(reconstruction, scene)[1]
+        loss = sum(weight * parts[name].item() for name, weight in distance.initial_weights.items())
+        return Scores(psnr, loss, (measurement, reconstruction, scene))
+
+    def describe(self, numbers: range) -> str:
+        """Names the samples in an error message."""
+        return self.pairs.describe(numbers)
+
+
+def supervised_task(pairs: Samples, schedule: Schedule) -> SupervisedTask:
+    """The task of learning from pairs: cached as the schedule says, or else prefetched."""
+    if schedule.pool == 0:
+        return SupervisedTask(pairs.prefetched(schedule.batch))
+    size, batch, crop, seed = schedule.pool, schedule.batch, schedule.crop, schedule.seed
+    return SupervisedTask(pairs, SampleCache(pairs, size=size, batch=batch, crop=crop, seed=seed))
+
+
+def reconstruct_aligned(network: nn.Module, measurement: Measurement, psf: Psf) -> Scene:
+    """Reconstruct as `mwdn.Reconstructor` does: with the PSF aligned to each capture if ``network.align``."""
+    if isinstance(network, Network) and network.align:
+        psf = align(measurement, psf).move(psf)
+    return network(measurement, psf)
