@@ -50,7 +50,7 @@ def learned(part, data, steps):
             psnr[report.step] = round(report.validation.psnr, 2)
 
     with TemporaryDirectory() as folder, patch.object(wiener_bank, "BOUNDARY", boundary):
-        trainer = prepare(recipe, calibration, data / "photos" / "train", Path(folder) / "run", "cpu")
+        trainer = prepare(recipe, calibration, photos=data / "photos" / "train", out=Path(folder) / "run", device="cpu")
         trainer.run(note)
         number = sum(p.numel() for p in trainer.network.parameters() if p.requires_grad)
     return {"learnable": number, "psnr": psnr}

@@ -20,6 +20,7 @@ import mwdn
 from mwdn.data.photographs import Photographs
 from mwdn.data.unpaired import UnpairedCaptures
 from mwdn.training.recipe import read_recipe
+from mwdn.training.selfsupervised import SelfSupervisedTask
 from mwdn.training.trainer import Trainer
 from universal import METRICS, MISMATCHED, camera, captures, gain, keep, measured
 
@@ -60,7 +61,7 @@ def main():
         recipe.schedule.seed,
     )
     run = Path(f"runs/selfsupervised-{'exact' if arguments.exact else 'mismatched'}-{arguments.electrons:.0f}")
-    Trainer(recipe, calibration, own, run).run(tell)
+    Trainer(recipe, SelfSupervisedTask(own), out=run, calibration=calibration).run(tell)
     methods = {"before": "universal", "after": str(run / "best.safetensors")}
     values = measured(methods, made, calibration)
     for name, each in values.items():

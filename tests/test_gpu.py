@@ -20,6 +20,7 @@ from mwdn.inference.batch import Batch
 from mwdn.networks import build
 from mwdn.runtime.transfers import to_device, to_host
 from mwdn.training.recipe import Recipe, Schedule
+from mwdn.training.tasks import supervised_task
 from mwdn.training.trainer import Trainer
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU here")
@@ -104,9 +105,11 @@ def test_training(calibration, photographs, tmp_path):
 
     def losses(device, folder, *, bfloat16):
         own = replace(recipe, schedule=replace(recipe.schedule, bfloat16=bfloat16))
-        pairs, found = RecordedPairs(PairFile(tmp_path / "pairs.h5"), range(8), device=device), []
-        Trainer(own, calibration, pairs, tmp_path / folder, device=device).run(lambda report: found.append(report.loss))
-        return found
+        pairs = RecordedPairs(PairFile(tmp_path / "pairs.h5"), range(8), calibration.psf.to(device))
+        task, result = supervised_task(pairs, own.schedule), []
+        trainer = Trainer(own, task, out=tmp_path / folder, calibration=calibration, device=device)
+        trainer.run(lambda report: result.append(report.loss))
+        return result
 
     expected = losses(CPU, "here", bfloat16=False)
     assert losses(GPU, "there", bfloat16=False) == pytest.approx(expected, rel=0.02)

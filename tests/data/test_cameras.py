@@ -24,7 +24,7 @@ def pairs(tmp_path_factory):
     cv2.imwrite(str(folder / "0.png"), cv2.resize(smooth, (24, 24), interpolation=cv2.INTER_CUBIC))
     photographs = Photographs(folder, side=24)
     source = SimulatedPairs(photographs, torch.ones(1, 3, 32, 32), placement=DARK, mismatch=EXACT, sensor=CLEAN)
-    return CameraPairs(source, Cameras(("32x40", "48x32")), together=2)
+    return CameraPairs(source, Cameras(("32x40", "48x32")), batch_size=2)
 
 
 def test_each_measurement_went_through_its_own_psf(pairs):

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from mwdn.data.pairs import PairFile
-from mwdn.data.recorded import Division, ReadAhead, RecordedPairs, recorded_pairs
+from mwdn.data.recorded import Division, PrefetchedPairs, RecordedPairs, recorded_pairs
 from mwdn.data.simulated import Samples
 from mwdn.errors import ImageError, ParameterError, ShapeError, UnknownNameError
 
@@ -44,6 +44,7 @@ def test_parts_are_the_papers(pairs):
     """8:1:1 by position, test first: of 30, 3 for test, then 3 for validation, then 24 for training."""
     train, validation = recorded_pairs(pairs(), psf(), Division())
     assert isinstance(train, Samples)
+    assert torch.equal(train.batch([0]).psf, psf())
     assert len(train) == 24
     assert sorted(drawn(train, range(24))) == list(range(6, 30))
     assert sorted(drawn(validation, range(10**12, 10**12 + 3))) == [3, 4, 5]
@@ -60,11 +61,11 @@ def test_a_batch_ahead(pairs):
             readers.append((numbers, threading.current_thread()))
             return super().batch(numbers)
 
-    watched = Watched(train.file, train.rows, train.seed)
-    following = ReadAhead(watched, 4)
+    watched = Watched(train.file, train.rows, train.psf, train.seed)
+    following = PrefetchedPairs(watched, 4)
     for start in (0, 4, 8, 24, 28, 8):
         assert drawn(following, range(start, start + 2)) == drawn(train, range(start, start + 2))
-    here = [numbers.start for numbers, thread in readers if thread is threading.main_thread()]
+    here = [numbers[0] for numbers, thread in readers if thread is threading.main_thread()]
     assert here == [0, 24, 8]  # where the last one does not tell the next
 
 
@@ -78,7 +79,7 @@ def test_a_damaged_pair_ahead_is_of_the_batch_that_takes_it(pairs, monkeypatch):
         return read(file, number)
 
     monkeypatch.setattr(PairFile, "__getitem__", refuse)
-    following = ReadAhead(train, 4)
+    following = train.prefetched(4)
     assert drawn(following, range(4)) == drawn(train, range(4))
     for _ in range(2):
         with pytest.raises(ImageError, match="damaged"):
@@ -125,7 +126,7 @@ def test_a_split_without_validation_holds_some_training_pairs_out():
 @pytest.mark.parametrize(
     ("division", "count", "said"),
     [
-        (Division("diffusercam"), 1010, "of 1,010 pairs leaves 10 for training and 0 for validation; both need some"),
+        (Division("diffusercam"), 1010, "of 1,010 pairs leaves 10 for training and 0 for validation"),
         (Division("random", (0.0, 0.5, 0.5)), 10, "leaves 0 for training and 5 for validation"),
         (Division("paper"), 9, "`count` (9) must be at least 10 for the split 'paper'"),
     ],
@@ -144,8 +145,8 @@ def test_unknown_split():
     ("file", "own", "said"),
     [
         ({}, psf((8, 12)), "`psf` (8 x 12) and the measurements of"),
-        ({}, psf((8, 12)), "The PSF is 2 times as large: bin it by 2 times as much, `--psf-bin`."),
-        ({}, psf((8, 8)), "Use the PSF of the camera that took them"),
+        ({}, psf((8, 12)), "The PSF is 2 times as large"),
+        ({}, psf((8, 8)), "`--psf-bin`"),
         ({}, psf((3, 6)), "(4 x 6) must match"),
         ({"channels": 1}, psf(), "`psf` (3 channels) must be grey, or have the channels of the measurements of"),
         ({"scene": (8, 12, 3)}, psf(), "The scenes of"),
@@ -169,4 +170,4 @@ def test_no_such_file(tmp_path):
 
 def test_pairs_are_put_on_a_device(pairs):
     file = PairFile(pairs())
-    assert RecordedPairs(file, [0], device=torch.device("meta")).batch([0]).scene.device.type == "meta"
+    assert RecordedPairs(file, [0], psf().to("meta")).batch([0]).scene.device.type == "meta"

@@ -87,7 +87,9 @@ def finish(process):
 def alone(folder, out):
     """The run of one process."""
     calibration = Calibration.from_file(folder / "psf.npy", background=0.0)
-    return prepare(read_recipe(folder / "r.toml"), calibration, folder / "photos", folder / out, "cpu")
+    return prepare(
+        read_recipe(folder / "r.toml"), calibration, photos=folder / "photos", out=folder / out, device="cpu"
+    )
 
 
 @pytest.mark.parametrize(
@@ -274,12 +276,12 @@ def test_refusals_of_two_processes(worked):
     assert first[0] == second[0]
     assert first[0].startswith("ParameterError: `batch` (1) must be at least the number of processes (2)")
     assert first[1] == second[1]
-    assert first[1].startswith("ParameterError: `device` (cuda:0) must be `cuda`: each of 2 processes takes a GPU")
+    assert first[1].startswith("ParameterError: `device` (cuda:0) must be `cuda`")
     assert first[2] == second[2]
     assert first[2].startswith("DivergenceError: The loss of step 0 (samples 0 to 2) is not finite.")
-    assert second[3].startswith("ParameterError: Process 1 must be given the recipe and PSF that process 0 was given.")
+    assert second[3].startswith("ParameterError: Process 1 must have the same recipe and PSF as process 0.")
     assert first[3].startswith("ProcessError: Process 0 of 2 lost the others: ")
-    assert first[3].endswith("The same command given again goes on from the last saved state.")
+    assert first[3].endswith("The same command resumes from the last saved state.")
     assert len(first) == len(second) == 4
 
 

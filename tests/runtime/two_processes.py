@@ -17,6 +17,7 @@ from mwdn.runtime import distributed
 from mwdn.training.batch_norm import synchronise
 from mwdn.training.experiment import prepare
 from mwdn.training.recipe import read_recipe
+from mwdn.training.tasks import SupervisedTask
 
 
 def batch_norm():
@@ -77,7 +78,7 @@ def main():
     number = os.environ["RANK"]
 
     def start(folder, recipe=recipe, calibration=calibration):
-        return prepare(recipe, calibration, Path("photos"), Path(folder), "cpu")
+        return prepare(recipe, calibration, photos=Path("photos"), out=Path(folder), device="cpu")
 
     def attempt(action):
         with Path(f"said-{number}.txt").open("a") as file:
@@ -98,7 +99,7 @@ def main():
         attempt(lambda: start("small", replace(recipe, schedule=replace(recipe.schedule, batch=1))))
         attempt(lambda: distributed.local_device("cuda:0"))
         lame = start("lame")
-        lame.pairs = Lame(**vars(lame.pairs))
+        lame.task = SupervisedTask(Lame(**vars(lame.task.pairs)))
         attempt(lame.run)
         # The second is given another recipe and ends; the first finds itself alone.
         odd = replace(recipe, schedule=replace(recipe.schedule, seed=int(number)))

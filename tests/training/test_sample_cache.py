@@ -1,16 +1,16 @@
-"""Kept samples: computed once, used as often as an epoch comes round, mirrored, and the same after a stop."""
+"""Cached samples: computed once, used again in each epoch, mirrored, and the same after a resume."""
 
 import pytest
 import torch
 from torch import nn
 
-from mwdn.data.simulated import Pair
+from mwdn.data.simulated import Batch, Samples
 from mwdn.errors import ParameterError
 from mwdn.networks import build
-from mwdn.training.sample_cache import Pool
+from mwdn.training.sample_cache import SampleCache
 
 
-class Counted:
+class Counted(Samples):
     """A source whose sample n is the number n, in one corner twice that."""
 
     name = "counted"
@@ -22,7 +22,7 @@ class Counted:
         self.asked += numbers
         picture = torch.stack([torch.full((1, *self.size), float(number)) for number in numbers])
         picture[..., 0, 0] *= 2
-        return Pair(picture, picture + 100)
+        return Batch(picture, picture + 100, torch.ones(1, 1, *self.size))
 
 
 class Same(nn.Module):
@@ -36,15 +36,17 @@ class Same(nn.Module):
         return estimates
 
 
-def pool(pairs, size=6, batch=2, crop=0):
-    return Pool(pairs, Same(), torch.ones(1, 1, *pairs.size), size=size, batch=batch, crop=crop, seed=0)
+def cached(pairs, size=6, batch=2, crop=0):
+    """A function of numbers: the batch of a cache."""
+    cache = SampleCache(pairs, size=size, batch=batch, crop=crop, seed=0)
+    return lambda numbers: cache.batch(Same(), numbers)
 
 
 def test_each_epoch_has_each_sample_once_and_computes_none_twice():
     pairs = Counted()
-    kept = pool(pairs)
+    batch = cached(pairs)
     for epoch in range(4):
-        estimates, units, scenes = kept.batch(range(6 * epoch, 6 * epoch + 6))
+        estimates, units, scenes = batch(range(6 * epoch, 6 * epoch + 6))
         assert sorted(estimates.amin((1, 2, 3)).tolist()) == [0, 1, 2, 3, 4, 5]
         torch.testing.assert_close(scenes, estimates + 100)
         torch.testing.assert_close(units, estimates.amax((1, 2, 3), keepdim=True))
@@ -52,48 +54,48 @@ def test_each_epoch_has_each_sample_once_and_computes_none_twice():
 
 
 def test_a_sample_comes_in_all_ways_a_square_can_lie():
-    kept = pool(Counted(), size=1, batch=1)
     marked = Counted()
-    marked.batch = lambda numbers: Pair(*2 * (torch.arange(16.0).view(1, 1, 4, 4),))
-    kept.pairs = marked
-    ways = {tuple(kept.batch([number])[0].flatten().tolist()) for number in range(8)}
+    marked.batch = lambda numbers: Batch(*3 * (torch.arange(16.0).view(1, 1, 4, 4),))
+    batch = cached(marked, size=1, batch=1)
+    ways = {tuple(batch([number])[0].flatten().tolist()) for number in range(8)}
     assert len(ways) == 8
 
 
 def test_a_frame_of_two_lengths_keeps_them():
-    kept = pool(Counted((4, 6)), size=1, batch=1)
-    assert {tuple(kept.batch([number])[0].shape) for number in range(8)} == {(1, 1, 4, 6)}
+    batch = cached(Counted((4, 6)), size=1, batch=1)
+    assert {tuple(batch([number])[0].shape) for number in range(8)} == {(1, 1, 4, 6)}
 
 
 def test_a_crop_is_cut_at_all_places_and_alike_from_both():
-    kept = pool(Counted((5, 4)), size=1, batch=1, crop=3)
-    kept.pairs.batch = lambda numbers: Pair(*2 * (torch.arange(20.0).view(1, 1, 5, 4),))
-    found = [kept.batch([number]) for number in range(60)]
-    assert all(torch.equal(estimates, scenes) and estimates.shape[-2:] == (3, 3) for estimates, _, scenes in found)
-    assert all(unit.item() == 19 for _, unit, _ in found)  # of the whole frame
-    assert {value for estimates, _, _ in found for value in estimates.flatten().tolist()} == set(map(float, range(20)))
+    marked = Counted((5, 4))
+    marked.batch = lambda numbers: Batch(*3 * (torch.arange(20.0).view(1, 1, 5, 4),))
+    batch = cached(marked, size=1, batch=1, crop=3)
+    crops = [batch([number]) for number in range(60)]
+    assert all(torch.equal(estimates, scenes) and estimates.shape[-2:] == (3, 3) for estimates, _, scenes in crops)
+    assert all(unit.item() == 19 for _, unit, _ in crops)  # of the whole frame
+    assert {value for estimates, _, _ in crops for value in estimates.flatten().tolist()} == set(map(float, range(20)))
 
 
 def test_a_number_is_the_same_sample_whatever_came_before():
-    one, other = pool(Counted()), pool(Counted())
-    other.batch(range(7))
-    torch.testing.assert_close(one.batch([7])[0], other.batch([7])[0])
+    one, other = cached(Counted()), cached(Counted())
+    other(range(7))
+    torch.testing.assert_close(one([7])[0], other([7])[0])
 
 
 def test_a_place_in_the_batch_has_samples_of_its_own():
     """So a process, which always has the same places, computes no sample of another."""
     pairs = Counted()
-    kept = pool(pairs)
+    batch = cached(pairs)
     for number in range(0, 24, 2):
-        kept.batch([number])
+        batch([number])
     assert sorted(pairs.asked) == [0, 2, 4]
 
 
 def test_a_network_that_learns_from_the_first_step_on_is_refused():
-    with pytest.raises(ParameterError, match=r"`pool` \(5\) keeps .*UNet learns from the first step on"):
-        Pool(Counted(), build("unet", width=2), torch.ones(1, 1, 4, 4), size=5, batch=1, crop=0, seed=0)
+    with pytest.raises(ParameterError, match=r"`pool` \(5\) .*UNet .*`pool = 0`"):
+        SampleCache(Counted(), size=5, batch=1, crop=0, seed=0).check(build("unet", width=2))
     with pytest.raises(ParameterError, match=r"`pool` \(5\) must be a multiple of `batch` \(2\)"):
-        pool(Counted(), size=5)
+        cached(Counted(), size=5)
 
 
 @pytest.mark.parametrize("rounds", [0, 1])

@@ -20,7 +20,7 @@ from mwdn.solvers.alignment import Pose
 from mwdn.training.experiment import prepare
 from mwdn.training.losses import Loss
 from mwdn.training.recipe import Recipe, Schedule, Sheet
-from mwdn.training.selfsupervised import judge, unexplained
+from mwdn.training.selfsupervised import selfsupervised_loss, unexplained
 from mwdn.weights import bundled
 
 RECIPE = Recipe(
@@ -88,7 +88,7 @@ def test_a_moved_scene_is_captured_as_it_stands_in_all_ways(scenes, generator):
     captures = captures_of(scenes, psf, shift=0.2)
     numbers = range(40)
     first, light = scenes[:1].expand(40, -1, -1, -1), torch.full((40, 3, 1, 1), 0.25)
-    measurement, moved = captures.again(first, psf.expand(40, -1, -1, -1), light, numbers)
+    measurement, moved = captures.recapture(first, psf.expand(40, -1, -1, -1), light, numbers)
     noise = measurement - convolve(moved, psf) - 0.25
     level = noise_level(captures.measurements)[[captures.row(number) for number in numbers]]
     assert (noise / level).std() == pytest.approx(1, rel=0.02)
@@ -103,7 +103,7 @@ def test_a_moved_scene_is_captured_as_it_stands_in_all_ways(scenes, generator):
 def test_a_long_frame_is_not_turned_on_its_side(generator):
     psf = contour_psf((24, 32), cell=8, generator=generator)
     captures = captures_of(torch.rand(1, 3, 24, 32, generator=generator), psf)
-    _, moved = captures.again(captures.measurements.expand(9, -1, -1, -1), psf, torch.zeros(9, 3, 1, 1), range(9))
+    _, moved = captures.recapture(captures.measurements.expand(9, -1, -1, -1), psf, torch.zeros(9, 3, 1, 1), range(9))
     assert moved.shape == (9, 3, 24, 32)
 
 
@@ -128,9 +128,9 @@ def test_the_truth_beats_every_trivial_and_wrong_answer(scenes, generator):
         "too dark": lambda b, psf: truth(b, psf) / 2,
     }
     loss = Loss({"mse": 1.0})
-    right = judge(captures, Answer(truth), loss, range(4))
+    right = selfsupervised_loss(captures, Answer(truth), loss, range(4))
     for name, answer in wrong.items():
-        assert judge(captures, Answer(answer), loss, range(4)).loss > 3 * right.loss, name
+        assert selfsupervised_loss(captures, Answer(answer), loss, range(4)).loss > 3 * right.loss, name
     assert right.parts["unexplained"] < 0.01
 
 
@@ -144,7 +144,7 @@ def test_equivariance_finds_what_the_camera_cannot_see(scenes, generator):
     clean = Answer(lambda b, psf: wiener(b, psf, 1e-2, boundary="zero"))
     ghost = Answer(lambda b, psf: wiener(b, psf, 1e-2, boundary="zero") + stripes)
     loss = Loss({"mse": 1.0})
-    one, other = (judge(captures, network, loss, range(4)).parts for network in (clean, ghost))
+    one, other = (selfsupervised_loss(captures, network, loss, range(4)).parts for network in (clean, ghost))
     assert other["unexplained"] == pytest.approx(float(one["unexplained"]), abs=0.02)
     assert other["mse"] > 3 * one["mse"]
 
@@ -174,7 +174,7 @@ def run(scenes, calibration, tmp_path):
     shown = Sheet((str(tmp_path / "captures"),))
 
     def make(recipe=RECIPE, folder="run", **named):
-        return prepare(replace(recipe, sheet=shown), calibration, None, tmp_path / folder, "cpu", **named)
+        return prepare(replace(recipe, sheet=shown), calibration, out=tmp_path / folder, device="cpu", **named)
 
     return make
 
@@ -220,9 +220,9 @@ def test_a_stopped_run_ends_as_one_that_was_not(run, calibration, tmp_path):
 
 def test_what_is_missing_or_does_not_fit(run, calibration, tmp_path):
     out = tmp_path / "run"
-    with pytest.raises(ParameterError, match="learns from captures alone: name them, `--captures FOLDER`"):
-        prepare(RECIPE, calibration, None, out, "cpu")
-    with pytest.raises(ParameterError, match="learns from captures alone"):
+    with pytest.raises(ParameterError, match="`--captures FOLDER`"):
+        prepare(RECIPE, calibration, out=out, device="cpu")
+    with pytest.raises(ParameterError, match=r"\[selfsupervised\]"):
         run(pairs=tmp_path / "pairs.h5")
     with pytest.raises(ParameterError, match="leave `pool` of"):
         replace(RECIPE, schedule=replace(RECIPE.schedule, pool=4))

@@ -12,7 +12,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from mwdn.errors import ParameterError
 from mwdn.io.images import srgb_decode
-from mwdn.training.tensorboard import Board
+from mwdn.training.tensorboard import TensorBoard
 from mwdn.training.trainer import Report
 from mwdn.training.validation import Validation
 
@@ -34,7 +34,7 @@ def report(step, validation=None):
 def test_numbers_and_sheet(tmp_path):
     encoded = np.random.default_rng(0).integers(0, 256, (20, 30, 3), np.uint8)
     sheet = srgb_decode(torch.from_numpy(encoded / np.float32(255))).movedim(-1, 0)[None]
-    with Board(tmp_path / "deep" / "board") as write:
+    with TensorBoard(tmp_path / "deep" / "board") as write:
         write(report(1))
         write(report(2, Validation(21.5, 0.25, sheet)))
     events = read(tmp_path / "deep" / "board")
@@ -56,7 +56,7 @@ def test_numbers_and_sheet(tmp_path):
 
 def test_steps_that_a_resumed_run_repeats_are_shown_once(tmp_path):
     for start, end in ((0, 6), (3, 8)):
-        with Board(tmp_path, start) as write:
+        with TensorBoard(tmp_path, start) as write:
             for step in range(start + 1, end):
                 write(report(step))
     assert list(scalars(read(tmp_path))["loss/total"]) == [1, 2, 3, 4, 5, 6, 7]
@@ -69,10 +69,10 @@ def test_without_the_package(tmp_path, monkeypatch):
         monkeypatch.delitem(sys.modules, name)
     said = "`tensorboard` must be installed: `pip install 'mwdn[tensorboard]'`."
     with pytest.raises(ParameterError, match=re.escape(said)):
-        Board(tmp_path)
+        TensorBoard(tmp_path)
 
 
 def test_folder_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ParameterError, match=r"must be a folder that can be written to"):
-        Board(tmp_path / "file")
+        TensorBoard(tmp_path / "file")

@@ -30,6 +30,7 @@ from mwdn.training.experiment import prepare, simulate
 from mwdn.training.recipe import Plateau, Recipe, Schedule, Sheet
 from mwdn.training.run_folder import RunFolder
 from mwdn.training.schedule import learning_rate
+from mwdn.training.tasks import SupervisedTask
 from mwdn.training.trainer import Trainer
 from mwdn.training.training_state import read_state
 from mwdn.training.validation import Validation
@@ -68,7 +69,7 @@ def trainer(photos, calibration, tmp_path):
     """``trainer(recipe, folder)``"""
 
     def make(recipe=RECIPE, folder="run"):
-        return prepare(recipe, calibration, photos, tmp_path / folder, "cpu")
+        return prepare(recipe, calibration, photos=photos, out=tmp_path / folder, device="cpu")
 
     return make
 
@@ -88,7 +89,8 @@ def test_overfits_four_pairs(photos, calibration, tmp_path):
     recipe = replace(recipe, network={**RECIPE.network, "finest": 0})  # may change all, the mean light too
     pairs = FourPairs(Photographs(photos, side=24), calibration.psf)
     losses = []
-    best = Trainer(recipe, calibration, pairs, tmp_path / "run").run(lambda report: losses.append(report.loss))
+    trainer = Trainer(recipe, SupervisedTask(pairs), out=tmp_path / "run", calibration=calibration)
+    best = trainer.run(lambda report: losses.append(report.loss))
     assert sum(losses[-5:]) < 0.3 * sum(losses[:5])
     scenes = pairs.batch(range(4)).scene
     assert best > -10 * torch.log10(scenes.square().mean())  # better than black
@@ -282,15 +284,15 @@ def test_two_runs_do_not_share_a_folder(photos, calibration, tmp_path):
         written = (folder / "log.jsonl").read_text(encoding="utf-8")
         second = subprocess.run([*line, "1000000", "--device", "cpu", "--out", "run"], **options, timeout=60)
         assert second.returncode == 2
-        assert b"Another run is at work in `run`." in second.stderr
+        assert b"Another run is using `run`." in second.stderr
         assert (folder / "log.jsonl").read_text(encoding="utf-8").startswith(written)
         first.send_signal(signal.SIGSTOP)  # it holds the folder, whatever it does
-        with pytest.raises(ParameterError, match="Another run is at work"), RunFolder(folder, {}).alone():
+        with pytest.raises(ParameterError, match="Another run is using"), RunFolder(folder, {}).lock():
             pytest.fail("came in")
     finally:
         first.kill()
         first.communicate(timeout=60)
-    with RunFolder(folder, {}).alone():  # a killed one holds nothing
+    with RunFolder(folder, {}).lock():  # a killed one holds nothing
         pass
 
 
@@ -414,13 +416,13 @@ def test_gradients_are_clipped_or_left(trainer, clip):
 @pytest.fixture
 def pairs(photos, calibration, tmp_path):
     path = tmp_path / "pairs.h5"
-    simulate(RECIPE, calibration, photos, path, 23)
+    simulate(RECIPE, calibration, photos=photos, out=path, count=23)
     return path
 
 
 def test_epochs_of_recorded_pairs(pairs, calibration, tmp_path):
     """23 pairs: 2 for test, 2 for validation, 19 for training, which are 5 steps of 4."""
-    run = prepare(few(epochs=2, batch=4), calibration, None, tmp_path / "run", "cpu", pairs=pairs)
+    run = prepare(few(epochs=2, batch=4), calibration, pairs=pairs, out=tmp_path / "run", device="cpu")
     assert (run.schedule.steps, run.schedule.validate_every, run.schedule.validation) == (10, 5, 2)
     seen = []
     read = PairFile.__getitem__
@@ -436,7 +438,7 @@ def test_epochs_of_recorded_pairs(pairs, calibration, tmp_path):
 def test_run_on_photographs_does_not_go_on_with_pairs(trainer, pairs, calibration, tmp_path):
     trainer().run()
     with pytest.raises(CheckpointError, match="or on other pairs"):
-        prepare(few(validation=3), calibration, None, tmp_path / "run", "cpu", pairs=pairs)
+        prepare(few(validation=3), calibration, pairs=pairs, out=tmp_path / "run", device="cpu")
 
 
 def test_epochs_of_photographs(trainer):
@@ -445,7 +447,7 @@ def test_epochs_of_photographs(trainer):
 
 def test_resumed_run_on_recorded_pairs_ends_bit_identical(pairs, calibration, tmp_path):
     def make(folder):
-        return prepare(few(steps=14), calibration, None, tmp_path / folder, "cpu", pairs=pairs)
+        return prepare(few(steps=14), calibration, pairs=pairs, out=tmp_path / folder, device="cpu")
 
     make("whole").run()
 
@@ -468,7 +470,7 @@ def test_captures_on_the_sheet_change_nothing_else(trainer, photos, calibration,
     np.save(tmp_path / "folder" / "a.npy", np.full((32, 32, 3), 0.5, np.float32))
     for name, capture in (("one", "capture.npy"), ("other", "folder")):
         recipe, out = replace(RECIPE, sheet=Sheet((str(tmp_path / capture),))), tmp_path / name
-        prepare(recipe, calibration, photos, out, "cpu").run()
+        prepare(recipe, calibration, photos=photos, out=out, device="cpu").run()
         assert same(tmp_path / "without" / "state.safetensors", out / "state.safetensors")
         assert read_metadata(out / "best.safetensors") == read_metadata(tmp_path / "without" / "best.safetensors")
     sheets = [cv2.imread(str(tmp_path / name / "validation.png")) for name in ("without", "one", "other")]
@@ -480,7 +482,7 @@ def test_capture_that_does_not_fit_is_found_before_training(calibration, photos,
     np.save(tmp_path / "small.npy", np.ones((30, 32, 3), np.float32))
     recipe = replace(RECIPE, sheet=Sheet((str(tmp_path / "small.npy"),)))
     with pytest.raises(ShapeError, match="same height and width"):
-        prepare(recipe, calibration, photos, tmp_path / "run", "cpu")
+        prepare(recipe, calibration, photos=photos, out=tmp_path / "run", device="cpu")
 
 
 # --- What is refused ----------------------------------------------------------------------------------
@@ -492,7 +494,7 @@ def test_another_recipe_or_psf_in_the_same_folder(trainer, photos, calibration, 
     other = Calibration(calibration.psf.flip(-1))
     for again in (
         lambda: trainer(few(learning_rate=1e-4)),
-        lambda: prepare(RECIPE, other, photos, tmp_path / "run", "cpu"),
+        lambda: prepare(RECIPE, other, photos=photos, out=tmp_path / "run", device="cpu"),
     ):
         with pytest.raises(
             CheckpointError, match=r"holds a run of another recipe or PSF, or on other pairs\. Choose another folder"
@@ -521,7 +523,7 @@ def test_damaged_or_foreign_state(trainer, tmp_path):
     state = tmp_path / "run" / "state.safetensors"
     whole = state.read_bytes()
     state.write_bytes(whole[:1000])
-    with pytest.raises(CheckpointError, match=r"state\.safetensors` is damaged: .* Remove it to begin again"):
+    with pytest.raises(CheckpointError, match=r"state\.safetensors` is damaged: .* Remove it"):
         trainer()
     state.write_bytes(b"")
     with pytest.raises(CheckpointError, match=r"state\.safetensors` is damaged"):
@@ -603,8 +605,8 @@ def test_any_seed(trainer, seed):
 
 
 def test_divergence_names_recorded_rows_and_the_way_out(pairs, calibration, tmp_path):
-    run = prepare(few(seed=1), calibration, None, tmp_path / "run", "cpu", pairs=pairs)
-    rows = [run.pairs.row(number) for number in range(2)]
+    run = prepare(few(seed=1), calibration, pairs=pairs, out=tmp_path / "run", device="cpu")
+    rows = [run.task.pairs.pairs.row(number) for number in range(2)]
     with torch.no_grad():
         next(run.network.parameters()).fill_(float("nan"))
     said = rf"samples 0 to 1, rows {re.escape(str(rows))} of the file\) is not finite\. .* another folder, `--out`\.$"
@@ -622,7 +624,7 @@ def test_a_network_that_cannot_learn_from_the_samples(photos, tmp_path):
     with pytest.raises(
         ParameterError, match=r"\[network\] .* cannot learn from a batch of 1 of these samples: Expected"
     ):
-        prepare(recipe, tiny, photos, tmp_path / "run", "cpu").advance()
+        prepare(recipe, tiny, photos=photos, out=tmp_path / "run", device="cpu").advance()
 
 
 # --- Across cameras, and from known weights -----------------------------------------------------------
@@ -683,4 +685,4 @@ def test_a_denoiser_is_trained_alone_and_then_stays(trainer, tmp_path):
 def test_a_denoiser_does_not_learn_from_recorded_pairs(calibration, tmp_path):
     recipe = replace(few(), network=DRUNET, denoising=Denoising((0.05, 0.1)))
     with pytest.raises(ParameterError, match="makes its own pairs from photographs: give `--photos`"):
-        prepare(recipe, calibration, None, tmp_path / "run", "cpu", pairs=tmp_path / "none.h5")
+        prepare(recipe, calibration, pairs=tmp_path / "none.h5", out=tmp_path / "run", device="cpu")

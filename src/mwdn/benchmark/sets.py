@@ -272,7 +272,8 @@ def _training(
     rows: dict[str, range | list[int]],
     device: torch.device,
 ) -> tuple[Samples, RecordedPairs]:
-    validation = RecordedPairs(file, rows["validation"], recipe.seed, False, device)
+    psf = calibration.psf.to(device)
+    validation = RecordedPairs(file, rows["validation"], psf, recipe.seed, shuffled=False)
     if not recipe.pairs and not recipe.train:
         return simulated_pairs(recipe, calibration, Photographs(recipe.photos).split(HELD_OUT)[0], device), validation
-    return RecordedPairs(file, rows["train"], recipe.seed, device=device), validation
+    return RecordedPairs(file, rows["train"], psf, recipe.seed), validation

@@ -17,7 +17,9 @@ from mwdn.errors import ParameterError
 from mwdn.io.files import write_text
 from mwdn.networks import NETWORKS
 from mwdn.training.recipe import OPTIMISERS, Recipe, Schedule
+from mwdn.training.tasks import SupervisedTask, supervised_task
 from mwdn.training.trainer import Report, Trainer
+from mwdn.training.validation import Validator
 from mwdn.types import Size
 
 CLOCK = "clock.json"
@@ -92,10 +94,10 @@ def train(
     recipe = Recipe({"name": method.name, **options(method, dataset.calibration.size)}, schedule, benchmark.loss)
     trainer = Trainer(
         recipe,
-        dataset.calibration,
-        training,
-        folder,
-        validation=validation,
+        supervised_task(training, schedule),
+        out=folder,
+        calibration=dataset.calibration,
+        validator=Validator(recipe, SupervisedTask(validation), dataset.calibration.psf.to(device)),
         device=device,
         alexnet=Path(benchmark.alexnet) if benchmark.alexnet else None,
     )

@@ -1,4 +1,4 @@
-"""`mwdn train` and `mwdn simulate`: what is learned, and what can be learned from."""
+"""`mwdn train` and `mwdn simulate`."""
 
 from contextlib import ExitStack
 from dataclasses import replace
@@ -15,15 +15,15 @@ from mwdn.io.toml import parse_value
 from mwdn.runtime import distributed
 from mwdn.training import experiment
 from mwdn.training.recipe import Sheet, read_recipe
-from mwdn.training.tensorboard import Board
+from mwdn.training.tensorboard import TensorBoard
 from mwdn.training.trainer import Report
 
 
-def _as_recipe(given: Any) -> Any:  # noqa: ANN401
-    """What a command line says by ``--key value`` and ``--table.key value``, as a recipe has it."""
-    if isinstance(given, dict):
-        return {key.replace("-", "_"): _as_recipe(each) for key, each in given.items()}
-    return parse_value(given[-1].value)
+def _recipe_changes(tokens: Any) -> Any:  # noqa: ANN401
+    """Changes of a recipe, from the tokens of ``--key value`` and ``--table.key value``."""
+    if isinstance(tokens, dict):
+        return {key.replace("-", "_"): _recipe_changes(value) for key, value in tokens.items()}
+    return parse_value(tokens[-1].value)
 
 
 RecipeKeys = Annotated[Any, Parameter(converter=lambda _, tokens: tokens, show=False)]
@@ -41,52 +41,61 @@ def train(  # noqa: PLR0913
     tensorboard: Annotated[bool, Parameter(negative=())] = False,
     **changes: RecipeKeys,
 ) -> None:
-    """Train a network for one camera: on captures simulated through its PSF, on recorded pairs, or on captures alone.
+    """Train a network for one camera, on simulated captures, on recorded pairs, or on captures without scenes.
 
-    Give either --photos or --pairs, or --captures alone with a recipe that has [selfsupervised].
-    Run again, it goes on where it stopped.
+    Give either --photos or --pairs; or only --captures, with a recipe that has [selfsupervised]. The same command
+    resumes an interrupted run.
 
-    Any key of the recipe can be given another value: --steps 500 or --learning-rate 1e-4 of [schedule], and of the
-    other tables --mismatch.blur-px 0.5, --network.width 32, --placement.extent "[0.3, 0.7]".
+    Options override keys of the recipe: --steps 500 and --learning-rate 1e-4 those of [schedule], --mismatch.blur-px
+    0.5, --network.width 32 and --placement.extent "[0.3, 0.7]" those of other tables.
 
-    Several GPUs or machines: torchrun --nproc-per-node 4 -m mwdn train ...
+    On several GPUs or machines: torchrun --nproc-per-node 4 -m mwdn train ...
 
     Args:
         recipe: TOML file, see recipes/.
         camera: calibration of the camera.
-        photos: folder of photographs, the more the better: captures of them are simulated.
-        pairs: HDF5 file of recorded pairs, from `mwdn import`; the recipe's [pairs] says which are for what.
-        captures: real captures, files or folders: to be shown on the contact sheet instead of the recipe's, or, with
-            [selfsupervised], to be learned from.
-        out: folder of the run: best.safetensors is what `mwdn reconstruct --method` takes, validation.png shows the
-            pictures of the latest validation.
-        device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
+        photos: folder of photographs, the more the better, to simulate captures of.
+        pairs: HDF5 file of recorded pairs, from `mwdn import`; [pairs] of the recipe splits it.
+        captures: files or folders of real captures: to learn from, with [selfsupervised]; otherwise to show on the
+            contact sheet instead of the recipe's.
+        out: folder of the run: best.safetensors for `mwdn reconstruct --method`, validation.png with the images of the
+            latest validation.
+        device: cpu, cuda, cuda:1 ...; by default a GPU if there is one.
         tensorboard: write progress to the folder tensorboard in --out, for `tensorboard --logdir`.
         **changes: any key of the recipe.
     """
-    chosen = read_recipe(recipe, **_as_recipe(changes))
+    experiment_recipe = read_recipe(recipe, **_recipe_changes(changes))
     if captures:
-        chosen = replace(chosen, sheet=Sheet(tuple(map(str, captures))))
-    columns: list[str | ProgressColumn] = [*Progress.get_default_columns(), "{task.fields[now]}"]
+        experiment_recipe = replace(experiment_recipe, sheet=Sheet(tuple(map(str, captures))))
+    columns: list[str | ProgressColumn] = [*Progress.get_default_columns(), "{task.fields[status]}"]
     with distributed.process_group(), ExitStack() as stack:
-        apart = camera.psf, camera.dark
-        trainer = experiment.prepare(chosen, camera.load(), photos, out, device, pairs=pairs, apart=apart)
-        first = distributed.rank() == 0
-        write = stack.enter_context(Board(out / "tensorboard", trainer.step)) if tensorboard and first else None
-        bars = stack.enter_context(Progress(*columns, console=errors, disable=not first))
-        bar = bars.add_task("Training", total=trainer.schedule.steps, completed=trainer.step, now="")
+        trainer = experiment.prepare(
+            experiment_recipe,
+            camera.load(),
+            out=out,
+            photos=photos,
+            pairs=pairs,
+            device=device,
+            exclude=(camera.psf, camera.dark),
+        )
+        is_first = distributed.rank() == 0
+        board = (
+            stack.enter_context(TensorBoard(out / "tensorboard", trainer.step)) if tensorboard and is_first else None
+        )
+        bars = stack.enter_context(Progress(*columns, console=errors, disable=not is_first))
+        bar = bars.add_task("Training", total=trainer.schedule.steps, completed=trainer.step, status="")
 
         def show(report: Report) -> None:
-            now = f"{report.pictures_per_s:.1f} pictures/s, loss {report.loss:.4f}"
-            bars.update(bar, completed=report.step, now=now)
+            status = f"{report.pictures_per_s:.1f} pictures/s, loss {report.loss:.4f}"
+            bars.update(bar, completed=report.step, status=status)
             if report.validation is not None:
                 psnr = report.validation.psnr
                 bars.print(f"step {report.step}: validation {psnr:.2f} dB, best {trainer.best:.2f} dB")
-            if write is not None:
-                write(report)
+            if board is not None:
+                board(report)
 
         trainer.run(show)
-    if first:
+    if is_first:
         console.print(f"Weights in {out / 'best.safetensors'}", highlight=False, markup=False, soft_wrap=True)
 
 
@@ -100,21 +109,22 @@ def simulate(
     exact: bool = False,
     **changes: RecipeKeys,
 ) -> None:
-    """Write a file of pairs: photographs as scenes, and what the camera would capture of them.
+    """Write a file of pairs: photographs as scenes, and simulated captures of them.
 
-    Any key of the recipe can be given another value: --seed 1, --sensor.full-well 2000, --mismatch.blur-px 0.5.
+    Options override keys of the recipe: --seed 1, --sensor.full-well 2000, --mismatch.blur-px 0.5.
 
     Args:
         photos: folder of photographs.
         camera: calibration of the camera.
-        out: the file of pairs, ending in .h5 or .hdf5; one that exists is replaced when all has gone well.
-        count: of pairs.
-        recipe: TOML file whose placement, mismatch, sensor and seed are used, see recipes/; defaults unless given.
-        exact: simulate a camera that is exactly what its calibration says.
+        out: file of pairs, ending in .h5 or .hdf5; an existing one is replaced on success.
+        count: number of pairs.
+        recipe: TOML file with placement, mismatch, sensor and seed, see recipes/; by default their default values.
+        exact: simulate the calibrated camera itself, without mismatch.
         **changes: any key of the recipe.
     """
     refuse_overwrite(out, camera.psf, camera.dark, recipe)
-    chosen = read_recipe(recipe, **_as_recipe(changes))
+    simulation = read_recipe(recipe, **_recipe_changes(changes))
     progress = partial(track, description="Simulating", console=errors, transient=True)
-    experiment.simulate(chosen, camera.load(), photos, out, count, exact=exact, track=progress)
+    calibration = camera.load()
+    experiment.simulate(simulation, calibration, photos=photos, out=out, count=count, exact=exact, track=progress)
     console.print(f"{count:,} pairs written to {out}", markup=False, highlight=False, soft_wrap=True)

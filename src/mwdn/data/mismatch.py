@@ -53,7 +53,9 @@ class Mismatch:
             raise ParameterError(f"`exact` ({self.exact}) must be in [0, 1]: it is a fraction of the samples.")
         for part in fields(self):
             if not getattr(self, part.name) >= 0:
-                raise ParameterError(f"`{part.name}` ({getattr(self, part.name)}) must not be negative: it is a magnitude.")
+                raise ParameterError(
+                    f"`{part.name}` ({getattr(self, part.name)}) must not be negative: it is a magnitude."
+                )
         for name in ("scale", "background", "vignetting", "tilt"):
             if not getattr(self, name) < 1:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) must be below 1.")

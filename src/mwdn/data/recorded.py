@@ -196,9 +196,9 @@ def other_camera(file: PairFile, psf_hash: str) -> str | None:
     if own_hash in (None, psf_hash):
         return None
     return (
-        f"`{file.path}` holds pairs of PSF {own_hash}, but the PSF given is {psf_hash}. Expect blur, ghosts and low "
-        "scores, unless both belong to one camera: another crop, binning or background of the same PSF file also gives "
-        "another hash."
+        f"`{file.path}` holds pairs of the camera of PSF {own_hash}, but the PSF given is {psf_hash}. Expect blur, "
+        "ghosts and low scores, unless both belong to one camera: another crop, binning or background of the same PSF "
+        "file also gives another hash."
     )
 
 

@@ -61,7 +61,9 @@ class Placement:
         for name in ("extent", "ambient", "exposure", "backdrop"):
             low, high = getattr(self, name)
             if not 0 <= low <= high:
-                raise ParameterError(f"`{name}` ({low}, {high}) must be a range: not negative, the smaller value first.")
+                raise ParameterError(
+                    f"`{name}` ({low}, {high}) must be a range: not negative, the smaller value first."
+                )
         for name, whole in (("extent", "the sensor's shorter side"), ("exposure", "saturation")):
             if not getattr(self, name)[0] > 0:
                 raise ParameterError(f"`{name}` {getattr(self, name)} must be positive: it is a fraction of {whole}.")

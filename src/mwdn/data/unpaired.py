@@ -24,8 +24,8 @@ class SelfSupervised:
     Args:
         consistency: weight of the part of a measurement that its reconstruction, convolved with the PSF, does not
             explain; 0 for a recipe that learns from pairs.
-        equivariance: weight of the [loss] between a moved reconstruction and the network's reconstruction of a simulated
-            capture of it. Without it, nothing constrains what the camera does not see.
+        equivariance: weight of the [loss] between a moved reconstruction and the network's reconstruction of its
+            simulated capture. Without it, nothing constrains what the camera does not see.
         recorruption: r, which splits the noise between the measurement to reconstruct, whose noise is multiplied by
             sqrt(1 + r^2), and the one to explain, sqrt(1 + 1 / r^2). At 0 both are the measurement itself, and the
             network learns to explain its noise too.

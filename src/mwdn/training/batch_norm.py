@@ -1,4 +1,4 @@
-"""BatchNorm of a batch whose parts several processes hold, and the biases that it cancels."""
+"""BatchNorm over a batch that is shared by several processes, and the biases that BatchNorm cancels."""
 
 import itertools
 from typing import Any
@@ -10,14 +10,14 @@ from torch.nn import functional as F
 from mwdn.runtime import distributed
 
 PSF_ENCODER = "psf_encoder"
-"""Child of a network that sees the PSF alone, which all processes have whole."""
+"""Name of the submodule that processes the PSF only, of which every process has the whole batch."""
 
 
 def freeze_cancelled(network: nn.Module) -> None:
-    """Stop learning each bias that stands before a BatchNorm, which subtracts it again.
+    """Freeze each bias in front of a BatchNorm, which subtracts it again.
 
-    Its gradient is 0, but for rounding. Adam, which divides a gradient by its size, would make steps of that noise,
-    others on each machine and for each number of processes.
+    Its gradient is 0 except for rounding. Adam normalises gradients and would turn this noise into full steps, which
+    differ between machines and numbers of processes.
     """
     for module in network.modules():
         if isinstance(module, nn.Sequential):
@@ -27,13 +27,13 @@ def freeze_cancelled(network: nn.Module) -> None:
 
 
 def synchronise(network: nn.Module, device: torch.device) -> None:
-    """Let every BatchNorm of the network normalise by the whole batch instead of this process's part.
+    """Make every BatchNorm normalise over the batch of all processes instead of this process's share.
 
-    The encoder of the PSF stays as it is: its batch is one PSF, which no process shares with another.
+    The PSF encoder stays as it is: its batch is one PSF, the same on all processes.
 
     Args:
-        network: its layers are replaced; their parameters, and so the checkpoint, stay.
-        device: where it computes. On GPUs torch's own layer is taken, which the CPU does not have.
+        network: changed in place; its parameters, and so the checkpoint, stay.
+        device: where it computes. GPUs use torch's `SyncBatchNorm`, which does not support the CPU.
     """
     if distributed.world_size() == 1:
         return
@@ -49,10 +49,10 @@ def synchronise(network: nn.Module, device: torch.device) -> None:
 
 
 class GlobalBatchNorm2d(nn.BatchNorm2d):
-    """BatchNorm over the parts of a batch that all processes hold, which may be of different sizes."""
+    """BatchNorm over the shares of a batch on all processes, which may have different sizes."""
 
     def forward(self, input: Tensor) -> Tensor:
-        """Normalise (B, C, H, W); while training by the mean and variance over every process's B, H and W."""
+        """Normalise (B, C, H, W); in training by the mean and variance over all processes."""
         if not self.training:
             return super().forward(input)
         mean, variance, count = _moments(input)
@@ -65,16 +65,16 @@ class GlobalBatchNorm2d(nn.BatchNorm2d):
 
 
 AXES = (0, 2, 3)
-"""All but the channels."""
+"""All axes but the channels."""
 
 
 @torch.no_grad()
 def _moments(features: Tensor) -> tuple[Tensor, Tensor, float]:
-    """Mean and variance (C,) over all processes, float64, and of how many numbers."""
+    """Mean and variance (C,) over all processes in float64, and the number of values per channel."""
     own_variance, own_mean = torch.var_mean(_precise(features), AXES, correction=0)
     own_count = torch.full_like(own_mean, features.numel() // features.shape[1])
-    # Every process's row of one table, as a sum with the zeros of all others. Moments of parts, unlike sums of
-    # squares, lose no digits where the mean is large.
+    # Gather by summing: each process fills its row of a table of zeros. Means and variances of the shares are combined
+    # exactly; sums of squares would lose digits where the mean is large.
     table = own_mean.new_zeros(distributed.world_size(), 3, len(own_mean), dtype=torch.float64)
     table[distributed.rank()] = torch.stack([own_count, own_mean, own_variance])
     counts, means, variances = distributed.all_reduce_sum(table).unbind(1)
@@ -89,9 +89,10 @@ def _precise(features: Tensor) -> Tensor:
 
 
 class _Normalise(torch.autograd.Function):
-    """y = w (x - m) s + b with s = 1 / sqrt(v + eps), where m and v depend on the x of every process.
+    """y = w z + b with z = (x - m) s and s = 1 / sqrt(v + eps), where m and v depend on the x of all processes.
 
-    For the gradient g of y, that of x is w s (g - mean(g) - z mean(g z)), z = (x - m) s, means over all processes.
+    With g = dL/dy, the gradient is dL/dx = w s (g - mean(g) - z mean(g z)), with means over all processes;
+    dL/dw = sum(g z) and dL/db = sum(g).
     """
 
     @staticmethod
@@ -119,5 +120,5 @@ class _Normalise(torch.autograd.Function):
         mean_g, mean_gz = (distributed.all_reduce_sum(own.to(torch.float64, copy=True)) / ctx.count).to(g)[
             ..., None, None
         ]
-        # The parameters' gradients are of this process's part: `distributed.all_reduce_gradients` sums them.
+        # Gradients of w and b cover this process's share: `distributed.all_reduce_gradients` sums them.
         return (w_s * (g - mean_g - z * mean_gz)).to(x.dtype), own[1].to(w), own[0].to(w), None, None, None, None

@@ -94,12 +94,13 @@ def prepare(
 def simulated_captures(recipe: Recipe, photos: Path, psf: Psf) -> TrainingData:
     """Captures simulated from photographs, through one camera or random ones; or noisy scenes for a denoiser."""
     photographs, held_out = Photographs(photos).to(psf.device).split(HELD_OUT)
-    training: Samples = _simulated_pairs(recipe, photographs, psf)
-    validation: Samples = _simulated_pairs(recipe, held_out, psf)
+    pairs, held_out_pairs = (_simulated_pairs(recipe, part, psf) for part in (photographs, held_out))
+    training: Samples = pairs
+    validation: Samples = held_out_pairs
     if recipe.denoising.levels[1]:
-        training, validation = (NoisyScenes(pairs, recipe.denoising) for pairs in (training, validation))
+        training, validation = NoisyScenes(pairs, recipe.denoising), NoisyScenes(held_out_pairs, recipe.denoising)
     elif recipe.cameras.sizes:
-        training = CameraPairs(training, recipe.cameras, recipe.schedule.batch)
+        training = CameraPairs(pairs, recipe.cameras, recipe.schedule.batch)
     return TrainingData(supervised_task(training, recipe.schedule), SupervisedTask(validation), len(photographs))
 
 

@@ -116,7 +116,7 @@ class RunFolder:
                     fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except BlockingIOError as error:
                     raise ParameterError(
-                        f"Another run is using `{self.path}`. Wait until it has ended, or choose another folder: `--out`."
+                        f"Another run is using `{self.path}`. Wait for its end, or choose another folder: `--out`."
                     ) from error
             yield
         finally:

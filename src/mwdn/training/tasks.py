@@ -1,7 +1,7 @@
 """What a network learns: a loss of numbered samples. Here from pairs; `selfsupervised` has the task without scenes."""
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -29,6 +29,7 @@ class Scores(NamedTuple):
     pictures: tuple[Tensor, Tensor, Tensor]
 
 
+@runtime_checkable
 class Task(Protocol):
     """A task for the `mwdn.training.trainer.Trainer`. Samples are numbered without end."""
 
@@ -90,7 +91,7 @@ class SupervisedTask:
         return network(measurement.contiguous(memory_format=torch.channels_last), psf), scene
 
     def score(self, network: nn.Module, distance: Loss, numbers: range) -> Scores:
-        """PSNR and loss of the reconstructions; the loss has its initial weights, in whichever phase the training is."""
+        """PSNR and loss of the reconstructions; the loss always has its initial weights."""
         measurement, scene, psf = self.pairs.batch(numbers)
         reconstruction = reconstruct_aligned(network, measurement, psf)
         psnr = -10 * torch.log10((reconstruction.clamp(0, 1) - scene).square().mean((1, 2, 3)))
