@@ -142,7 +142,7 @@ def _read_captures(recipe: Recipe, calibration: Calibration, exclude: Iterable[P
     """Captures of [sheet]: all to learn from them, otherwise as many as a contact sheet shows."""
     if not recipe.sheet.captures:
         return None
-    files = find_captures(recipe.sheet.captures, apart=exclude)
+    files = find_captures(recipe.sheet.captures, exclude=exclude)
     return read_captures(files if recipe.selfsupervised.consistency else files[:SHOWN], calibration)
 
 
