@@ -14,7 +14,7 @@ from mwdn.data.unpaired import SelfSupervised, UnpairedCaptures
 from mwdn.errors import CheckpointError, ParameterError, ShapeError
 from mwdn.fourier.convolution import convolve
 from mwdn.fourier.wiener import wiener
-from mwdn.networks.recomputed import norms
+from mwdn.networks.activation_checkpointing import batch_norms
 from mwdn.optics.noise import noise_level
 from mwdn.solvers.alignment import Pose
 from mwdn.training.experiment import prepare
@@ -195,7 +195,7 @@ def test_the_loss_falls(run):
 @pytest.mark.parametrize("fixed", [False, True])
 def test_statistics_of_a_few_captures_can_be_left_out(fixed, run):
     trainer = run(replace(RECIPE, schedule=replace(RECIPE.schedule, fixed_norms=fixed)))
-    found = norms(trainer.network)
+    found = batch_norms(trainer.network)
     before = [(norm.running_mean.clone(), norm.weight.detach().clone()) for norm in found]
     trainer.advance()
     pairs = list(zip(found, before, strict=True))

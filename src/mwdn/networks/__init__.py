@@ -1,4 +1,4 @@
-"""Learned reconstruction, one file a method. Each is called as ``network(measurement, psf)``."""
+"""Reconstruction networks, one file per method. Each is called as ``network(measurement, psf)``."""
 
 from typing import Any
 
@@ -37,22 +37,22 @@ NETWORKS: dict[str, type[Network[Any]]] = {
     "svdeconv": SvDeconv,
     "ifin": Ifin,
 }
-"""Every network by the name that recipes and the command line use."""
+"""Networks by the names used in recipes and on the command line."""
 
 DENOISERS: dict[str, type[nn.Module]] = {"drunet": Drunet}
-"""Parts of networks that are trained alone: a picture and its noise level in, the picture out."""
+"""Denoisers, trained on their own as parts of networks: ``clean = denoiser(picture, level)``."""
 
 
 def build(name: str, **options: Any) -> nn.Module:  # noqa: ANN401
-    """Make a fresh network.
+    """Build an untrained network.
 
     Args:
         name: one of `NETWORKS` or `DENOISERS`.
-        **options: keyword arguments of that network, for example ``width=32``.
+        **options: keyword arguments of the network, for example ``width=32``.
 
     Raises:
-        UnknownNameError: there is no such network, or it has no such option.
-        ParameterError: the name is a solver's.
+        UnknownNameError: no such network, or it has no such option.
+        ParameterError: ``name`` is a solver.
     """
     kind = NETWORKS.get(name) or DENOISERS.get(name)
     if kind is None and name in SOLVERS:
@@ -60,7 +60,7 @@ def build(name: str, **options: Any) -> nn.Module:  # noqa: ANN401
     if kind is None:
         raise UnknownNameError("network", name, NETWORKS)
     check_options(kind, f"the network '{name}'", options)
-    # JSON and TOML, where options come from, have lists alone.
+    # JSON and TOML have lists, not tuples.
     return kind(**{key: tuple(v) if isinstance(v, list) else v for key, v in options.items()})
 
 

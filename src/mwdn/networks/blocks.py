@@ -1,4 +1,4 @@
-"""The parts that the paper's networks share: convolution block, encoder, decoder, learned Wiener filter."""
+"""Shared blocks: double convolution, U-Net encoder and decoder, learned Wiener filter, PSF normalisation."""
 
 import math
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ from mwdn.fourier.filtering import filter_image
 from mwdn.fourier.memory_format import chunked
 from mwdn.fourier.padding import Boundary
 from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
-from mwdn.networks.recomputed import Stages
+from mwdn.networks.activation_checkpointing import CheckpointedModule
 from mwdn.types import Image, Psf, Size
 
 Pooling = Literal["max", "average"]
@@ -22,16 +22,16 @@ Pooling = Literal["max", "average"]
 Normalisation = Literal["batch", "group"]
 
 
-def halve(kind: Pooling) -> nn.Module:
-    """Halve height and width, rounding down."""
+def pooling_layer(kind: Pooling) -> nn.Module:
+    """2 x 2 pooling; an odd last row or column is dropped."""
     kinds = {"max": nn.MaxPool2d, "average": nn.AvgPool2d}
     if kind not in kinds:
         raise ParameterError(f"`pooling` must be max or average, not {kind!r}.")
     return kinds[kind](2)
 
 
-def normalisation(kind: Normalisation, channels: int) -> nn.Module:
-    """Normalise features over the batch, or over groups of channels of each sample (8 groups, of 2 or more)."""
+def normalisation_layer(kind: Normalisation, channels: int) -> nn.Module:
+    """BatchNorm, or GroupNorm of up to 8 groups with 2 or more channels each."""
     if kind == "batch":
         return nn.BatchNorm2d(channels)
     if kind != "group":
@@ -40,16 +40,16 @@ def normalisation(kind: Normalisation, channels: int) -> nn.Module:
 
 
 def convolutions(*widths: int, bias: bool = True, norm: Normalisation = "batch") -> nn.Sequential:
-    """(3x3 convolution, normalisation, ReLU) from each of ``widths`` to the next."""
+    """A 3x3 convolution, normalisation and ReLU from each of ``widths`` to the next."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):
-        layers += [nn.Conv2d(inputs, outputs, 3, padding=1, bias=bias), normalisation(norm, outputs)]
+        layers += [nn.Conv2d(inputs, outputs, 3, padding=1, bias=bias), normalisation_layer(norm, outputs)]
         layers.append(nn.ReLU(inplace=True))
     return nn.Sequential(*layers)
 
 
 def check_channels(picture: Image, channels: int) -> None:
-    """Raise a `ShapeError` unless a measurement or PSF has as many channels as the network."""
+    """Raise a `ShapeError` unless a measurement or PSF has the network's number of channels."""
     if picture.shape[1] != channels:
         raise ShapeError(
             f"A picture or PSF {tuple(picture.shape)} must have {channels} channels for this network. "
@@ -57,14 +57,14 @@ def check_channels(picture: Image, channels: int) -> None:
         )
 
 
-class Encoder(Stages):
-    """Left half of a U-Net: features at scales 1, 1/2, 1/4, ..., each a double convolution of the one before.
+class Encoder(CheckpointedModule):
+    """U-Net encoder: a double convolution at each of the scales 1, 1/2, 1/4, ..., with pooling between them.
 
     Args:
         channels: of the picture.
         widths: feature channels at each scale, (64, 128, 256, 512, 512) in the paper.
-        pooling: between the scales; the paper's figure shows max-pooling, the authors' code averages.
-        norm: what follows each convolution.
+        pooling: max in the paper's figure, average in the authors' code.
+        norm: normalisation after each convolution.
     """
 
     def __init__(
@@ -72,61 +72,60 @@ class Encoder(Stages):
     ) -> None:
         super().__init__()
         self.channels = channels
-        self.pool = halve(pooling)
+        self.pool = pooling_layer(pooling)
         self.scales = nn.ModuleList(
             convolutions(inputs, width, width, norm=norm)
             for inputs, width in zip((channels, *widths), widths, strict=False)
         )
 
     def forward(self, picture: Image) -> list[Tensor]:
-        """Features, finest first.
+        """Features of each scale, finest first.
 
         Raises:
-            ShapeError: the picture has another number of channels.
+            ShapeError: the picture does not have ``channels`` channels.
         """
         check_channels(picture, self.channels)
-        features = [self.stage(self.scales[0], picture)]
+        features = [self.checkpointed(self.scales[0], picture)]
         for scale in self.scales[1:]:
-            features.append(self.stage(self._halved, scale, features[-1]))
+            features.append(self.checkpointed(self._pool_and_convolve, scale, features[-1]))
         return features
 
-    def _halved(self, scale: nn.Module, features: Tensor) -> Tensor:
+    def _pool_and_convolve(self, scale: nn.Module, features: Tensor) -> Tensor:
         return scale(self.pool(features))
 
 
-class Decoder(Stages):
-    """Right half of a U-Net: up-sample, join the skip connection, double convolution; then a 1x1 head.
+class Decoder(CheckpointedModule):
+    """U-Net decoder: at each scale upsample, concatenate the skip connection, double convolution; then a 1x1 head.
 
     Args:
         channels: of the reconstruction.
-        widths: those of the encoder.
-        norm: what follows each convolution.
+        widths: as in the encoder.
+        norm: normalisation after each convolution.
     """
 
     def __init__(self, channels: int, widths: tuple[int, ...], *, norm: Normalisation = "batch") -> None:
         super().__init__()
         first, *skips = widths[::-1]
-        # 512 + 512 -> 256, 256 + 256 -> 128, 128 + 128 -> 64, 64 + 64 -> 64: what comes up has the skip's width.
-        following = (*skips[1:], skips[-1])
-        joined = [a + b for a, b in zip((first, *following), skips, strict=False)]
+        # 512 + 512 -> 256, 256 + 256 -> 128, 128 + 128 -> 64, 64 + 64 -> 64.
+        outputs = (*skips[1:], skips[-1])
+        inputs = [skip + upsampled for skip, upsampled in zip(skips, (first, *outputs), strict=False)]
         self.scales = nn.ModuleList(
-            convolutions(inputs, inputs // 2, outputs, norm=norm)
-            for inputs, outputs in zip(joined, following, strict=True)
+            convolutions(before, before // 2, after, norm=norm) for before, after in zip(inputs, outputs, strict=True)
         )
-        self.head = nn.Conv2d(following[-1], channels, 1)
+        self.head = nn.Conv2d(outputs[-1], channels, 1)
 
     def forward(self, features: list[Tensor]) -> Image:
-        """Picture of the finest feature's size, from features, finest first.
+        """Reconstruction at the finest scale, from features ordered finest first.
 
-        The list is emptied on the way: each feature is needed once, and of a large picture there is no room to spare.
+        The list is emptied to free memory: each feature is needed only once.
         """
         x = features.pop()
         for scale in self.scales:
-            x = self.stage(self._joined, scale, features.pop(), x)
+            x = self.checkpointed(self._upsample_and_convolve, scale, features.pop(), x)
         return self.head(x)
 
     @staticmethod
-    def _joined(scale: nn.Module, skip: Tensor, x: Tensor) -> Tensor:
+    def _upsample_and_convolve(scale: nn.Module, skip: Tensor, x: Tensor) -> Tensor:
         x = F.interpolate(x, size=skip.shape[-2:], mode="bilinear", align_corners=True)
         return scale(torch.cat([skip, x], dim=1))
 
@@ -136,22 +135,23 @@ def paper_widths(width: int) -> tuple[int, ...]:
     return (width, 2 * width, 4 * width, 8 * width, 8 * width)
 
 
-LARGEST = 2**28
-"""Grid pixels, over all channels, up to which transfer functions are kept: half spectra of 2^27 complex numbers, 1 GB.
-
-MWDN-CPSF has more at 1080 x 1920."""
-
-
 class Wiener(nn.Module):
-    """A Wiener filter, eq. (2), whose weight w and regularisation lambda are learned.
+    """Wiener filter, eq. (2), with a learned weight w and regularisation lambda.
 
-    Both are stored as logarithms, so that no gradient step can make them negative.
+    Both are stored as logarithms, so that they stay positive during training.
 
     Args:
         weight: start value of w; ``None`` leaves w out (MWDN-CPSF, whose PSF is learned).
         regularisation: start value of lambda.
         boundary: see `mwdn.fourier.padding.Boundary`.
+
+    Attributes:
+        max_grid_pixels: transfer functions with more grid pixels than this, over all channels, are not stored but
+            computed when needed. The default is 2^27 complex numbers of half spectra, 1 GB; MWDN-CPSF exceeds it at
+            1080 x 1920.
     """
+
+    max_grid_pixels = 2**28
 
     def __init__(
         self, *, weight: float | None = 1e-3, regularisation: float = 1e-2, boundary: Boundary = "taper"
@@ -159,22 +159,22 @@ class Wiener(nn.Module):
         super().__init__()
         for name, value in (("weight", weight), ("regularisation", regularisation)):
             if value is not None and not value > 0:
-                raise ParameterError(f"`{name}` ({value}) must be positive: its logarithm is what is learned.")
+                raise ParameterError(f"`{name}` ({value}) must be positive: its logarithm is learned.")
         self.log_regularisation = nn.Parameter(torch.tensor(math.log(regularisation)))
         if weight is not None:
             self.log_weight = nn.Parameter(torch.tensor(math.log(weight)))
         self.boundary = boundary
 
     def forward(self, features: Tensor, psf: Psf) -> Tensor:
-        """Deconvolve each channel with the PSF, or with its own PSF where there is one for each channel."""
+        """Deconvolve features (B, C, H, W) with a PSF of 1 or C channels."""
         return self.deconvolve(features, self.prepare(psf))
 
     def prepare(self, psf: Psf) -> Tensor:
-        """Transfer function of the filter; the PSF itself where the transfer function would exceed `LARGEST`."""
+        """Transfer function of the filter; the PSF itself where that would exceed `max_grid_pixels`."""
         grid = self.grid(psf)
-        if psf[:, :, 0, 0].numel() * grid[0] * grid[1] > LARGEST:
+        if psf[:, :, 0, 0].numel() * grid[0] * grid[1] > self.max_grid_pixels:
             return psf.contiguous()
-        step = _channels_per_chunk(grid)
+        step = self._channels_per_chunk(grid)
         parts = [self.transfer(psf[:, i : i + step]) for i in range(0, psf.shape[1], step)]
         return parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
 
@@ -185,47 +185,46 @@ class Wiener(nn.Module):
         return wiener_transfer(psf, self.log_regularisation.exp(), self.grid(psf))
 
     def deconvolve(self, features: Tensor, prepared: Tensor) -> Tensor:
-        """The same as `forward`, from the result of `prepare`."""
+        """Deconvolve features with the result of `prepare`."""
         grid = self.grid(features)
         if prepared.is_complex():
             return filter_image(features, prepared, grid, self.boundary)
 
-        def deconvolve_few(features: Tensor, psf: Tensor) -> Tensor:
+        def deconvolve_chunk(features: Tensor, psf: Tensor) -> Tensor:
             return filter_image(features, self.transfer(psf), grid, self.boundary)
 
-        return chunked(deconvolve_few, features, prepared, _channels_per_chunk(grid))
+        return chunked(deconvolve_chunk, features, prepared, self._channels_per_chunk(grid))
 
     def grid(self, image: Tensor) -> Size:
-        """Grid of the Fourier transforms for features or a PSF of this size."""
+        """Size of the Fourier transforms for features or a PSF of this size."""
         return deconvolution_grid((image.shape[-2], image.shape[-1]), self.boundary)
+
+    def _channels_per_chunk(self, grid: Size) -> int:
+        """Channels whose transfer functions are computed at once: intermediate arrays take ten times their memory."""
+        return max(1, self.max_grid_pixels // (32 * grid[0] * grid[1]))
 
 
 class WienerFilters(nn.ModuleList):
-    """Wiener filters, one a scale, finest first."""
+    """One Wiener filter for each scale, finest first."""
 
     def __iter__(self) -> Iterator[Wiener]:
         return cast(Iterator[Wiener], super().__iter__())
 
 
-def _channels_per_chunk(grid: Size) -> int:
-    """Channels whose transfer functions are computed at once: the intermediate arrays take ten times their memory."""
-    return max(1, LARGEST // (32 * grid[0] * grid[1]))
+def normalise_psf(psf: Psf, size: Size, channels: int | None = None) -> Tensor:
+    """Scale each PSF to a peak of 1, as the paper's PSFs have.
 
-
-def peak_one(psf: Psf, size: Size) -> Psf:
-    """Scale each PSF so that its largest value is 1, the range that the paper's PSFs have.
+    Args:
+        psf: (1 or B, 1 or C, H, W).
+        size: height and width of the measurement.
+        channels: number of channels to which a grey PSF is expanded; ``None`` keeps it grey.
 
     Raises:
         ShapeError: the PSF does not have the height and width of the measurement.
     """
     check_size(psf, size)
-    return psf / psf.amax(dim=(1, 2, 3), keepdim=True)
-
-
-def peak_one_in_colour(psf: Psf, size: Size, channels: int) -> Tensor:
-    """`peak_one`, and a grey PSF repeated for each colour: all colours then cast the same pattern."""
-    psf = peak_one(psf, size)
-    return psf.expand(-1, channels, -1, -1) if psf.shape[1] == 1 else psf
+    psf = psf / psf.amax(dim=(1, 2, 3), keepdim=True)
+    return psf if channels is None or psf.shape[1] != 1 else psf.expand(-1, channels, -1, -1)
 
 
 def check_size(psf: Psf, size: Size) -> None:
@@ -237,14 +236,14 @@ def check_size(psf: Psf, size: Size) -> None:
         )
 
 
-def at_least(picture: Tensor, side: int) -> Tensor:
-    """Continue a picture smaller than ``side`` to that height or width, by its last row or column."""
+def pad_to_minimum(picture: Tensor, side: int) -> Tensor:
+    """Pad height and width to at least ``side`` by repeating the last row and column."""
     height, width = picture.shape[-2:]
     return F.pad(picture, (0, max(0, side - width), 0, max(0, side - height)), mode="replicate")
 
 
-def resized(image: Tensor, size: Size) -> Tensor:
-    """The image at another size: what was learned at one serves at another, as a binned PSF does a binned capture."""
+def resize(image: Tensor, size: Size) -> Tensor:
+    """Resample an image, such as learned corrections of a PSF, to another size (bilinear, anti-aliased)."""
     if tuple(image.shape[-2:]) == tuple(size):
         return image
     return F.interpolate(image, size=size, mode="bilinear", align_corners=False, antialias=True)

@@ -1,4 +1,4 @@
-"""A network that takes noise of a known level out of a picture: what scenes look like, without any camera."""
+"""DRUNet: a denoiser for a given noise level, trained without any camera."""
 
 from itertools import pairwise
 
@@ -11,19 +11,19 @@ from mwdn.types import Image
 
 
 def convolution(inputs: int, outputs: int, size: int) -> nn.Conv2d:
-    """Without a bias, as everywhere here: brighter light and noise give a brighter result."""
+    """Convolution without bias, so that scaling picture and noise scales the result."""
     return nn.Conv2d(inputs, outputs, size, padding=size // 2, bias=False)
 
 
-class Residual(nn.Module):
-    """Two convolutions whose result is added to what they see."""
+class ResidualBlock(nn.Module):
+    """Two convolutions with a skip connection."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
         first, last = (convolution(channels, channels, 3) for _ in range(2))
         self.layers = nn.Sequential(first, nn.ReLU(inplace=True), last)
         with torch.no_grad():
-            last.weight.mul_(0.3)  # begin near the identity
+            last.weight.mul_(0.3)  # start near the identity
 
     def forward(self, features: Tensor) -> Tensor:
         """Features of the same shape."""
@@ -31,20 +31,20 @@ class Residual(nn.Module):
 
 
 def _scale(width: int, blocks: int) -> nn.Sequential:
-    return nn.Sequential(*(Residual(width) for _ in range(blocks)))
+    return nn.Sequential(*(ResidualBlock(width) for _ in range(blocks)))
 
 
 class Drunet(nn.Module):
-    """DRUNet at a quarter of its widths, on 2 x 2 pixels at once as in FFDNet: 1,793,920 learnable numbers.
+    """U-Net of residual blocks whose input is a picture and a map of its noise level. 1,793,920 learnable numbers.
 
-    A U-Net of residual blocks that sees the picture and a plane of the noise level. Halving and doubling, in the
-    reference convolutions of stride 2, are convolutions of 1 x 1 pixels between folded ones: the same maps.
+    Different from DRUNet: a quarter to a half of its widths; pixel-unshuffled input of 2 x 2 blocks, as in FFDNet.
+    Strided and transposed convolutions are written as 1x1 convolutions with pixel (un)shuffling, which is equivalent.
 
     Args:
         channels: colours of the picture.
         widths: feature channels at each scale, finest first; the reference has 64, 128, 256, 512.
-        blocks: residual blocks of each scale on either side; the reference has 4.
-        fold: pixels along each side of those that are one pixel of more channels at the finest scale.
+        blocks: residual blocks at each scale of encoder and decoder; the reference has 4.
+        fold: block size of the pixel unshuffling at the input.
 
     References:
         K. Zhang et al., "Plug-and-play image restoration with deep denoiser prior", TPAMI 44 (2022); K. Zhang et al.,
@@ -67,11 +67,11 @@ class Drunet(nn.Module):
             self.tail.weight.mul_(0.1)
 
     def forward(self, picture: Image, level: Tensor) -> Image:
-        """The picture (B, C, H, W) without its noise.
+        """Denoised picture (B, C, H, W).
 
         Args:
-            picture: its brightest pixel is about 1.
-            level: standard deviation of its noise, (1 or B, 1, 1, 1).
+            picture: brightest pixel about 1.
+            level: standard deviation of the noise, (1 or B, 1, 1, 1).
         """
         height, width = picture.shape[-2:]
         step = self.fold * 2 ** len(self.down)

@@ -1,4 +1,4 @@
-"""After IFIN: two streams, of the sensor and of the scene, that exchange through the camera's model at every scale."""
+"""IFIN-like network: sensor and scene features coupled by forward and inverse operators at every scale."""
 
 import math
 from typing import NamedTuple
@@ -16,20 +16,20 @@ from mwdn.networks.blocks import (
     Wiener,
     check_channels,
     convolutions,
+    normalise_psf,
     paper_widths,
-    peak_one_in_colour,
 )
 from mwdn.networks.network import Network
 from mwdn.types import Measurement, Psf, Scene, Size
 
 
 class Exchange(nn.Module):
-    """One scale: each stream is encoded, then told what the other one says of it.
+    """One scale: both streams are encoded, then exchange features through convolution and Wiener filter.
 
     Args:
-        inputs: channels of each stream at the scale before.
+        inputs: channels of each stream at the previous scale.
         width: channels at this scale.
-        regularisation: start value of the Wiener filter's lambda, one a channel.
+        regularisation: start value of the Wiener filter's lambda, learned for each channel.
         boundary: see `mwdn.fourier.padding.Boundary`.
     """
 
@@ -43,42 +43,46 @@ class Exchange(nn.Module):
         self.log_regularisation = nn.Parameter(torch.full((width, 1, 1), math.log(regularisation)))
 
     def forward(self, sensor: Tensor, scene: Tensor, kernels: Tensor) -> tuple[Tensor, Tensor]:
-        """Both streams (B, width, H, W), from those of the scale before and one kernel a channel."""
+        """Both streams (B, width, H, W), from those of the previous scale and one kernel per channel."""
         sensor, scene = self.sensor(sensor), self.scene(scene)
-        cast = convolve(scene, kernels)
-        seen = wiener(sensor, kernels, self.log_regularisation.exp(), boundary=self.boundary)
+        pattern = convolve(scene, kernels)
+        estimate = wiener(sensor, kernels, self.log_regularisation.exp(), boundary=self.boundary)
         return (
-            sensor + self.from_scene(torch.cat([sensor, cast], dim=1)),
-            scene + self.from_sensor(torch.cat([scene, seen], dim=1)),
+            sensor + self.from_scene(torch.cat([sensor, pattern], dim=1)),
+            scene + self.from_sensor(torch.cat([scene, estimate], dim=1)),
         )
 
 
 class IfinPsfs(NamedTuple):
-    """The measured PSF at unit sum, and the kernels of each scale, one a channel."""
+    """The measured PSF at unit sum, and the kernels of each scale, one per channel."""
 
     measured: Tensor
     kernels: list[Tensor]
 
 
 class Ifin(Network[IfinPsfs]):
-    """IFIN-like: forward and inverse operators interleaved at each of four scales, with kernels adapted to the camera.
+    """U-Net with forward and inverse operators at each of four scales, and kernels adapted from the measured PSF.
 
-    From the source's abstract: differentiable forward operators and learned inverse modules at every stage, which share
-    what the measurement's domain and the scene's domain know; a physics-guided adaptation of the PSF. From the facts
-    that are known of the better methods: the border is continued before a Wiener step; GroupNorm.
+    7,608,456 learnable numbers at width 32. No source gives a count.
 
-    Inferred, which is all else, so this is *like* IFIN and its figures are not IFIN's: a stream of the measurement and
-    one of its Wiener estimate, double convolutions and max-pooling; at each scale the scene stream convolved with the
-    kernels joins the measurement's, and the latter deconvolved joins the scene's, by 1x1 convolutions; both meet at the
-    bottleneck; the decoder takes the scene stream. Kernels: the measured PSF, averaged to each scale, plus what a
-    second encoder sees in it, not negative, of unit sum, one a channel; they begin near the measured PSF.
-    7,608,456 learnable numbers at width 32; a count that no source gives.
+    From the source's abstract: differentiable forward operators and learned inverse modules at every stage, which
+    exchange features of the measurement and of the scene; physics-guided adaptation of the PSF. From other successful
+    methods: padding before a Wiener filter; GroupNorm.
+
+    Inferred, so the results are not IFIN's:
+
+    - two streams, of the measurement and of its Wiener estimate, with double convolutions and max-pooling;
+    - at each scale a 1x1 convolution merges the scene features, convolved with the kernels, into the sensor stream, and
+      another merges the deconvolved sensor features into the scene stream;
+    - the streams are concatenated at the bottleneck; skip connections come from the scene stream;
+    - a kernel per channel: the measured PSF, averaged to the scale, plus features of a second encoder, non-negative and
+      of unit sum, initially near the measured PSF.
 
     Args:
         channels: colours of the measurement and the PSF.
         width: feature channels at full resolution.
         regularisation: start value of every lambda.
-        boundary: what stands beyond the measurement in Wiener filters, see `mwdn.fourier.padding.Boundary`.
+        boundary: of the Wiener filters, see `mwdn.fourier.padding.Boundary`.
 
     References:
         Integrated forward-inverse network, openreview.net/forum?id=q1TpQ6guwX (ECCV 2026).
@@ -97,17 +101,17 @@ class Ifin(Network[IfinPsfs]):
         *widths, last = paper_widths(width)
         self.first = Wiener(weight=None, regularisation=regularisation, boundary=boundary)
         self.psf_encoder = Encoder(channels, tuple(widths), norm="group")
-        # How much of what the encoder sees is added to the PSF, whose peak is 1 at each scale.
+        # Gain of the encoder's features, which are added to the PSF at a peak of 1.
         self.log_gain = nn.Parameter(torch.full((len(widths),), math.log(0.01)))
         self.scales = nn.ModuleList(
-            Exchange(inputs, own, regularisation=regularisation, boundary=boundary)
-            for inputs, own in zip((channels, *widths), widths, strict=False)
+            Exchange(before, after, regularisation=regularisation, boundary=boundary)
+            for before, after in zip((channels, *widths), widths, strict=False)
         )
         self.bottleneck = convolutions(2 * widths[-1], last, last, norm="group")
         self.decoder = Decoder(channels, (*widths, last), norm="group")
 
     def kernels(self, psf: Tensor) -> list[Tensor]:
-        """One PSF of unit sum for each channel at scales 1, 1/2, 1/4, 1/8, from one of peak 1."""
+        """Kernels of unit sum, one per channel, at scales 1, 1/2, 1/4, 1/8, from a PSF of peak 1."""
         result, grey = [], psf.mean(1, keepdim=True)
         for gain, features in zip(self.log_gain.exp(), self.psf_encoder(psf), strict=True):
             kernels = grey / grey.amax((-2, -1), keepdim=True) + gain * features.float()
@@ -116,8 +120,8 @@ class Ifin(Network[IfinPsfs]):
         return result
 
     def prepare(self, psf: Psf, size: Size) -> IfinPsfs:
-        """The PSF for the first Wiener filter, and the kernels of each scale."""
-        psf = peak_one_in_colour(psf, size, self.channels)
+        """PSF for the first Wiener filter, and kernels of each scale."""
+        psf = normalise_psf(psf, size, self.channels)
         return IfinPsfs(psf / psf.sum((-2, -1), keepdim=True), self.kernels(psf))
 
     def reconstruct(self, measurement: Measurement, prepared: IfinPsfs) -> Scene:

@@ -1,4 +1,4 @@
-"""Learned ADMM: a few unrolled iterations whose constants are trained."""
+"""Le-ADMM: unrolled ADMM with learned penalties and thresholds."""
 
 import math
 
@@ -15,26 +15,29 @@ from mwdn.types import Measurement, Psf, Scene, Size, Transfer
 
 
 class LeAdmm(Network[Tensor]):
-    """Five iterations of ADMM with total variation, each with its own mu1, mu2, mu3 and tau: 20 learnable numbers.
+    """Unrolled ADMM with total variation; each iteration learns mu1, mu2, mu3 and tau. 20 learnable numbers.
 
     From the source: five iterations from a zero scene; a grey PSF, the sum of the colours at unit L2 norm, shared by
-    all colours; a grid of twice the sensor; mu start at 1e-4; the result is divided by its maximum, so brightness is
-    not recovered. Its paper shrinks the gradient by tau / mu2; its code, followed here, learns that quotient as one
-    number, which starts at 2e-4 (1000 times as much in its notebook). Both are the same family of iterations.
+    all colours; a grid of twice the sensor; mu initialised at 1e-4; the result is divided by its maximum, so absolute
+    brightness is lost. The paper's gradient threshold is tau / mu2. As in the source's code, this ratio is learned as
+    one number, initialised at 2e-4 (1000 times as much in its notebook); the family of iterations is the same.
 
-    Different here: the measurement is divided by its maximum first, so that the start values mean the same at every
-    exposure (the source's data come so); all four are stored as logarithms, which keeps them positive. Calibration has
-    subtracted the PSF's background already. The source cannot train with tau: the length of a zero gradient, which
-    the first iteration has everywhere, has an infinite derivative. `mwdn.solvers.proximal.dual_projection` has none.
+    Different here:
+
+    - The measurement is divided by its maximum, as the source's data are, so start values fit every exposure.
+    - All constants are stored as logarithms, which keeps them positive.
+    - The PSF's background is not subtracted: calibration has done so.
+    - tau can be trained. The source's gradient is infinite where the scene's gradient is zero, which is everywhere in
+      the first iteration; that of `mwdn.solvers.proximal.dual_projection` is finite.
 
     Args:
-        iterations: how many; each adds 4 learnable numbers.
+        iterations: number of iterations; each adds 4 learnable numbers.
         penalty: start value of mu1, mu2 and mu3.
         threshold: start value of tau / mu2, in brightness of the scene for a PSF of unit L2 norm.
-        variation: which total variation; the source's is isotropic.
+        variation: kind of total variation, see `mwdn.solvers.proximal.Variation`; the source's is isotropic.
 
     Raises:
-        ParameterError: a start value is not positive, or no iteration is asked for.
+        ParameterError: a start value is not positive, or ``iterations`` is below 1.
 
     References:
         K. Monakhova et al., Learned reconstructions for practical mask-based lensless imaging, Optics Express 27,
@@ -54,7 +57,7 @@ class LeAdmm(Network[Tensor]):
             raise ParameterError(f"`iterations` ({iterations}) must be at least 1.")
         for name, value in (("penalty", penalty), ("threshold", threshold)):
             if not value > 0:
-                raise ParameterError(f"`{name}` ({value}) must be positive: its logarithm is what is learned.")
+                raise ParameterError(f"`{name}` ({value}) must be positive: its logarithm is learned.")
         self.variation = variation
         self.log_data, self.log_gradient, self.log_sign = (
             nn.Parameter(torch.full((iterations,), math.log(penalty))) for _ in range(3)
@@ -69,19 +72,19 @@ class LeAdmm(Network[Tensor]):
         return transfer_function(grey, (fast_length(2 * size[0]), fast_length(2 * size[1])))
 
     def reconstruct(self, measurement: Measurement, prepared: Transfer) -> Scene:
-        """Scene (B, C, H, W), its brightest pixel 1."""
-        return brightest_one(self.iterates(measurement, prepared)[-1])
+        """Scene (B, C, H, W) with maximum 1."""
+        return divide_by_maximum(self.iterates(measurement, prepared)[-1])
 
     def iterates(self, measurement: Measurement, prepared: Transfer) -> list[Tensor]:
-        """The scene after each iteration, (B, C, H, W), for a measurement of peak 1 and a PSF of unit L2 norm.
+        """Scene (B, C, H, W) after each iteration, for a measurement of peak 1 and a PSF of unit L2 norm.
 
-        Not yet clipped: as in any ADMM, single pixels are negative before it has converged.
+        Pixels can be negative, as in any ADMM before convergence.
         """
-        problem = Problem.from_transfer(brightest_one(measurement.float()), prepared)
+        problem = Problem.from_transfer(divide_by_maximum(measurement.float()), prepared)
         height, width = problem.sensor
         state, scenes, previous = initial_state(problem), [], None
         constants = (self.log_data, self.log_gradient, self.log_sign, self.log_threshold)
-        for data, gradient, sign, threshold in zip(*(each.exp() for each in constants), strict=True):
+        for data, gradient, sign, threshold in zip(*(logarithm.exp() for logarithm in constants), strict=True):
             mu = Penalties(data, gradient, sign)
             state = state if previous is None else rescale(state, previous, mu)
             state = update_copies(state, problem, mu, threshold * gradient, self.variation)
@@ -91,6 +94,6 @@ class LeAdmm(Network[Tensor]):
         return scenes
 
 
-def brightest_one(picture: Tensor) -> Tensor:
+def divide_by_maximum(picture: Tensor) -> Tensor:
     """Divide each picture by its largest value."""
     return picture / picture.amax((1, 2, 3), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)

@@ -1,24 +1,23 @@
-"""Learned ADMM followed by a U-Net, trained together."""
+"""Le-ADMM-U: Le-ADMM followed by a denoising U-Net, trained end to end."""
 
 from torch import Tensor
 
-from mwdn.networks.blocks import at_least
-from mwdn.networks.denoiser import SMALLEST, Denoiser
+from mwdn.networks.blocks import pad_to_minimum
+from mwdn.networks.denoising_unet import MINIMUM_SIDE, DenoisingUNet
 from mwdn.networks.le_admm import LeAdmm
 from mwdn.networks.network import Network
 from mwdn.types import Measurement, Psf, Scene, Size
 
 
 class LeAdmmU(Network[Tensor]):
-    """`LeAdmm`, then a U-Net that denoises what it leaves: 20 + 11,772,307 = 11,772,327 learnable numbers.
+    """`LeAdmm`, then a denoising U-Net. 20 + 11,772,307 = 11,772,327 learnable numbers.
 
-    All from the source but: BatchNorm's epsilon is torch's, and pictures below 64 pixels are continued by their border
-    inside the U-Net.
+    Different from the source: BatchNorm has torch's epsilon; pictures below 64 pixels are padded for the U-Net.
 
     Args:
         channels: colours of the measurement.
         width: feature channels of the U-Net at full resolution.
-        iterations: of ADMM.
+        iterations: number of ADMM iterations.
         threshold: start value of tau / mu2, see `LeAdmm`.
 
     References:
@@ -30,7 +29,7 @@ class LeAdmmU(Network[Tensor]):
         super().__init__()
         self.channels = channels
         self.admm = LeAdmm(iterations=iterations, threshold=threshold)
-        self.denoiser = Denoiser(channels, width=width)
+        self.denoiser = DenoisingUNet(channels, width=width)
 
     def prepare(self, psf: Psf, size: Size) -> Tensor:
         """Transfer function of the PSF, see `LeAdmm`."""
@@ -40,4 +39,4 @@ class LeAdmmU(Network[Tensor]):
         """Scene (B, C, H, W)."""
         height, width = measurement.shape[-2:]
         scene = self.admm.reconstruct(measurement, prepared)
-        return self.denoiser(at_least(scene, SMALLEST))[..., :height, :width]
+        return self.denoiser(pad_to_minimum(scene, MINIMUM_SIDE))[..., :height, :width]

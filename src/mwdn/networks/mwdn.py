@@ -9,9 +9,9 @@ from mwdn.networks.blocks import (
     Pooling,
     Wiener,
     WienerFilters,
-    halve,
+    normalise_psf,
     paper_widths,
-    peak_one_in_colour,
+    pooling_layer,
 )
 from mwdn.networks.network import Network
 from mwdn.types import Measurement, Psf, Scene, Size
@@ -52,7 +52,7 @@ class Mwdn(Network[list[Tensor]]):
         self.filters = WienerFilters(
             Wiener(weight=weight, regularisation=regularisation, boundary=boundary) for _ in widths[:-1]
         )
-        self.pool_psf = halve(psf_pooling)
+        self.pool_psf = pooling_layer(psf_pooling)
         self.decoder = Decoder(channels, widths)
 
     def pyramid(self, psf: Psf) -> list[Tensor]:
@@ -64,7 +64,7 @@ class Mwdn(Network[list[Tensor]]):
 
     def prepare(self, psf: Psf, size: Size) -> list[Tensor]:
         """Transfer function of each scale's filter."""
-        psfs = self.pyramid(peak_one_in_colour(psf, size, self.channels))
+        psfs = self.pyramid(normalise_psf(psf, size, self.channels))
         return [wiener.prepare(h) for wiener, h in zip(self.filters, psfs, strict=True)]
 
     def reconstruct(self, measurement: Measurement, prepared: list[Tensor]) -> Scene:

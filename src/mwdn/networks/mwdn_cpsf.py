@@ -4,25 +4,25 @@ import torch
 from torch import Tensor, nn
 
 from mwdn.fourier.padding import Boundary
-from mwdn.networks.blocks import Decoder, Encoder, Pooling, Wiener, WienerFilters, paper_widths, peak_one_in_colour
+from mwdn.networks.blocks import Decoder, Encoder, Pooling, Wiener, WienerFilters, normalise_psf, paper_widths
 from mwdn.networks.network import Network
 from mwdn.types import Measurement, Psf, Scene, Size
 
 
 class MwdnCpsf(Network[list[Tensor]]):
-    """MWDN with a second encoder, which turns the PSF into one corrected PSF for each feature channel.
+    """MWDN with a second encoder that computes a corrected PSF for each feature channel.
 
-    21,956,743 learnable numbers at the paper's width: the U-Net's, those of a second encoder of four scales, and
-    lambda_1..4. No w: the second encoder sets the energy of each PSF.
+    21,956,743 learnable numbers at the paper's width: the U-Net's, the second encoder's of four scales, and
+    lambda_1..4. There is no w: the second encoder sets the energy of each PSF.
 
     Args:
         channels: colours of the measurement and of the PSF.
         width: feature channels at full resolution.
-        pooling: between the scales of both encoders; the authors' code averages.
+        pooling: of both encoders; max in the paper, average in the authors' code.
         regularisation: start value of lambda (the value of the authors' code).
         boundary: see `mwdn.fourier.padding.Boundary`. The paper writes linear convolutions; its code is circular.
-        authors_scalars: also keep what the authors' code has and the paper has not: a learned weight of the PSF
-            before its encoder, and a fifth lambda that nothing uses. 21,956,745 learnable numbers.
+        authors_scalars: add two scalars of the authors' code that are not in the paper: a learned weight of the PSF
+            before its encoder, and an unused fifth lambda. 21,956,745 learnable numbers.
     """
 
     def __init__(
@@ -49,12 +49,12 @@ class MwdnCpsf(Network[list[Tensor]]):
             self.unused_regularisation = nn.Parameter(torch.tensor(regularisation))
 
     def pyramid(self, psf: Psf) -> list[Tensor]:
-        """One corrected PSF for each feature channel at scales 1, 1/2, 1/4, 1/8."""
+        """Corrected PSFs, one per feature channel, at scales 1, 1/2, 1/4, 1/8."""
         return self.psf_encoder(self.weight * psf if hasattr(self, "weight") else psf)
 
     def prepare(self, psf: Psf, size: Size) -> list[Tensor]:
-        """Transfer functions of each scale's filter, one a feature channel."""
-        psfs = self.pyramid(peak_one_in_colour(psf, size, self.channels))
+        """Transfer functions of each scale's filter, one per feature channel."""
+        psfs = self.pyramid(normalise_psf(psf, size, self.channels))
         return [wiener.prepare(psfs.pop(0)) for wiener in self.filters]
 
     def reconstruct(self, measurement: Measurement, prepared: list[Tensor]) -> Scene:

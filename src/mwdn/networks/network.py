@@ -1,4 +1,4 @@
-"""What every network of this package is: a function of a measurement and a PSF, in two steps."""
+"""The common base of all networks: a function of measurement and PSF, in two steps."""
 
 from typing import Generic, TypeVar
 
@@ -13,13 +13,13 @@ Prepared = TypeVar("Prepared")
 class Network(nn.Module, Generic[Prepared]):
     """Reconstruct a scene from a measurement and a PSF: ``scene = network(measurement, psf)``.
 
-    The PSF is an input, so one network can serve many cameras. `prepare` does all that needs the PSF only;
-    `reconstruct` does the rest. A camera's PSF is prepared once, its measurements are reconstructed one by one.
+    The PSF is an input, so one network can serve many cameras. `prepare` computes everything that depends on the PSF
+    only, once per camera; `reconstruct` computes the rest for each measurement.
 
     Attributes:
         channels: colours of the measurement; 0 for any number.
         align: whether `mwdn.Reconstructor` aligns the PSF to each capture by default, because the network was trained
-            on PSFs that fit. A network itself takes every PSF as it is.
+            with accurate PSFs. The network itself never aligns.
     """
 
     channels: int = 0

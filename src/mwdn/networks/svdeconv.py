@@ -1,4 +1,4 @@
-"""Deconvolution with a PSF that varies over the field, the first stage of PhoCoLens."""
+"""SVDeconv: deconvolution with a spatially varying PSF, the first stage of PhoCoLens."""
 
 import math
 
@@ -9,48 +9,51 @@ from mwdn.errors import ParameterError
 from mwdn.fourier.padding import Boundary, pad
 from mwdn.fourier.transforms import inverse_spectrum, spectrum, transfer_function
 from mwdn.fourier.wiener import deconvolution_grid
-from mwdn.networks.blocks import check_channels, peak_one_in_colour, resized
-from mwdn.networks.generator import Generator
+from mwdn.networks.blocks import check_channels, normalise_psf, resize
+from mwdn.networks.flatnet_unet import FlatNetUNet
 from mwdn.networks.network import Network
 from mwdn.types import Measurement, Psf, Scene, Size
 
 
 def field_weights(side: int, size: Size, device: torch.device) -> Tensor:
-    """How much each of ``side`` x ``side`` places of the field counts at each pixel, (side^2, H, W); they sum to 1.
+    """Blending weights (side^2, H, W) of ``side`` x ``side`` tiles of the field; they sum to 1 at each pixel.
 
-    In inverse proportion to the distance, as a part of the field, from the middle of the place's tile.
+    Inversely proportional to the distance from the tile's centre, with the field's height and width as units.
     """
-    middles = (torch.arange(side, device=device) + 0.5) / side
+    centres = (torch.arange(side, device=device) + 0.5) / side
     rows, columns = ((torch.arange(n, device=device) + 0.5) / n for n in size)
-    down = (rows - middles[:, None]).square()[:, None, :, None]
-    along = (columns - middles[:, None]).square()[None, :, None, :]
-    # A thousandth of the field: at the middle itself its own estimate counts all but alone.
-    weights = 1 / ((down + along).sqrt() + 1e-3)
+    vertical = (rows - centres[:, None]).square()[:, None, :, None]
+    horizontal = (columns - centres[:, None]).square()[None, :, None, :]
+    # 1e-3 keeps the weights finite; at a tile's centre the tile's own weight is then nearly 1.
+    weights = 1 / ((vertical + horizontal).sqrt() + 1e-3)
     return (weights / weights.sum((0, 1))).flatten(0, 1)
 
 
 class SvDeconv(Network[Tensor]):
     """Wiener filters with a 3 x 3 field of learned PSFs, blended over the picture, then a U-Net.
 
-    From the source: K x K PSFs and one more for all of the field, each beginning as the measured one, each with its own
-    learned lambda; every one deconvolves the whole measurement, continued by its border; the K x K estimates are
-    blended in inverse proportion to the distance from where each belongs; blend and single estimate go into the U-Net
-    of FlatNet; no adversarial part. PSFs are shared by the colours.
+    35,849,494 learnable numbers; 1,296,000 of them are the PSFs' at 270 x 480. No source gives a count.
 
-    Different here: learned is each PSF's difference from the measured one, which is an input, in units of its peak. The
-    differences belong to one size of sensor, ``size``, and are stretched to any other. Left out: the U-Net that the
-    code can put before the filters, and the diffusion model that is the second stage. Inferred: the U-Net's parts, see
-    `mwdn.networks.flatnet.FlatNet`; lambda starts at 1e-3 for a PSF of unit sum (the code's 100 has other units); the
-    output is a sigmoid's. 35,849,494 learnable numbers, of which 1,296,000 are the PSFs' at 270 x 480; a count that no
-    source gives.
+    From the source: K x K local PSFs and a global one, all initialised as the measured PSF and shared by the colours,
+    each with a learned lambda; each deconvolves the whole measurement with replicate padding; the K x K estimates are
+    blended with weights inversely proportional to the distance from each PSF's place; the blend and the global estimate
+    enter FlatNet's U-Net; no adversarial training.
+
+    Different here: each PSF is learned as a correction of the measured one, which is an input, in units of its peak.
+    Corrections are stored for one sensor size, ``size``, and resampled to any other.
+
+    Left out: the code's optional U-Net before the filters, and the second stage, a diffusion model.
+
+    Inferred: the U-Net's blocks, see `mwdn.networks.flatnet.FlatNet`; lambda starts at 1e-3 for a PSF of unit sum (the
+    code's 100 has other units); a sigmoid at the output.
 
     Args:
         channels: colours of the measurement.
         width: feature channels at the U-Net's finest scale.
-        field: K, places along each side of the field.
-        size: height and width of the sensor whose PSFs are learned.
+        field: K, local PSFs along each side of the field.
+        size: height and width for which the corrections are stored.
         regularisation: start value of each lambda.
-        boundary: what stands beyond the measurement, see `mwdn.fourier.padding.Boundary`.
+        boundary: see `mwdn.fourier.padding.Boundary`.
 
     References:
         X. Cai et al., PhoCoLens: photorealistic and consistent reconstruction in lensless imaging, NeurIPS (2024);
@@ -73,31 +76,31 @@ class SvDeconv(Network[Tensor]):
         self.channels, self.field, self.boundary = channels, field, boundary
         self.correction = nn.Parameter(torch.zeros(1, field**2 + 1, *size))
         self.log_regularisation = nn.Parameter(torch.full((field**2 + 1,), math.log(regularisation)))
-        self.generator = Generator(2 * channels, channels, width=width)
+        self.generator = FlatNetUNet(2 * channels, channels, width=width)
 
     def prepare(self, psf: Psf, size: Size) -> Tensor:
-        """The PSF at peak 1, one for each colour. Transfer functions are not kept: K^2 + 1 of them would be needed."""
-        return peak_one_in_colour(psf, size, self.channels)
+        """PSF of each colour at peak 1. The K^2 + 1 transfer functions are not stored: they need too much memory."""
+        return normalise_psf(psf, size, self.channels)
 
     def deconvolve(self, measurement: Measurement, prepared: Tensor) -> tuple[Tensor, Tensor]:
-        """Estimates (B, C, H, W) by the PSF for the whole field, and by the field of PSFs.
+        """Estimates (B, C, H, W) with the global PSF, and with the field of local PSFs.
 
         Raises:
-            ShapeError: the measurement has other channels than the network.
+            ShapeError: the measurement does not have the network's number of channels.
         """
         check_channels(measurement, self.channels)
         total = prepared.sum((-2, -1), keepdim=True)
         size = measurement.shape[-2], measurement.shape[-1]
         grid = deconvolution_grid(size, self.boundary)
         B = spectrum(pad(measurement.float(), grid, self.boundary), grid)
-        corrections = torch.split(resized(self.correction, size), 1, dim=1)
+        corrections = torch.split(resize(self.correction, size), 1, dim=1)
         estimates = []
         for correction, regularisation in zip(corrections, self.log_regularisation.exp(), strict=True):
             H = transfer_function((prepared + correction) / total, grid)
             estimates.append(inverse_spectrum(H.conj() * B / (H.abs().square() + regularisation), grid, size))
-        single, *places = estimates
+        single, *tiles = estimates
         weights = field_weights(self.field, size, measurement.device)
-        return single, sum((weight * place for weight, place in zip(weights, places, strict=True)), start=0 * single)
+        return single, sum((weight * tile for weight, tile in zip(weights, tiles, strict=True)), start=0 * single)
 
     def reconstruct(self, measurement: Measurement, prepared: Tensor) -> Scene:
         """Scene (B, C, H, W), between 0 and 1."""

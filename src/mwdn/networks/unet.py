@@ -6,7 +6,7 @@ from mwdn.types import Measurement, Psf, Scene, Size
 
 
 class UNet(Network[None]):
-    """Measurement to scene directly. 17,267,523 learnable numbers at the paper's width.
+    """U-Net from measurement to scene. 17,267,523 learnable numbers at the paper's width.
 
     Args:
         channels: colours of the measurement.
@@ -21,7 +21,7 @@ class UNet(Network[None]):
         self.decoder = Decoder(channels, paper_widths(width))
 
     def prepare(self, psf: Psf, size: Size) -> None:
-        """Nothing: the PSF is not used."""
+        """Unused: the network does not depend on the PSF."""
 
     def reconstruct(self, measurement: Measurement, prepared: None = None) -> Scene:
         """Scene (B, C, H, W)."""

@@ -1,4 +1,4 @@
-"""Unrolled primal-dual network with learned PSFs."""
+"""UPDN: unrolled primal-dual network with learned PSFs."""
 
 from itertools import pairwise
 
@@ -7,13 +7,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mwdn.fourier.convolution import Convolution
-from mwdn.networks.blocks import check_channels, peak_one_in_colour, resized
+from mwdn.networks.blocks import check_channels, normalise_psf, resize
 from mwdn.networks.network import Network
 from mwdn.types import Measurement, Psf, Scene, Size, Transfer
 
 
 def _rectified(*widths: int) -> nn.Sequential:
-    """(3x3 convolution without bias, ReLU) from each of ``widths`` to the next."""
+    """A 3x3 convolution without bias and a ReLU from each of ``widths`` to the next."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):
         layers += [nn.Conv2d(inputs, outputs, 3, padding=1, bias=False), nn.ReLU(inplace=True)]
@@ -21,7 +21,7 @@ def _rectified(*widths: int) -> nn.Sequential:
 
 
 class SmallUNet(nn.Module):
-    """U-Net of UPDN: five scales, no normalisation, transposed convolutions upwards.
+    """U-Net of UPDN: five scales, no normalisation, upsampling by transposed convolutions.
 
     Args:
         inputs: channels of the pictures.
@@ -32,30 +32,30 @@ class SmallUNet(nn.Module):
         super().__init__()
         widths = [width * 2**scale for scale in range(5)]
         self.encoders = nn.ModuleList(
-            _rectified(before, own, own) for before, own in zip((inputs, *widths), widths, strict=False)
+            _rectified(before, after, after) for before, after in zip((inputs, *widths), widths, strict=False)
         )
-        self.ups = nn.ModuleList(nn.ConvTranspose2d(2 * own, own, 2, stride=2) for own in widths[-2::-1])
-        self.decoders = nn.ModuleList(_rectified(2 * own, own, own) for own in widths[-2::-1])
+        self.ups = nn.ModuleList(nn.ConvTranspose2d(2 * after, after, 2, stride=2) for after in widths[-2::-1])
+        self.decoders = nn.ModuleList(_rectified(2 * after, after, after) for after in widths[-2::-1])
         self.head = nn.Conv2d(width, 1, 1)
 
     def forward(self, pictures: Tensor) -> Tensor:
-        """One channel (B, 1, H, W) of at least 16 pixels along each side."""
+        """One channel (B, 1, H, W); height and width must be at least 16."""
         x, skips = self.encoders[0](pictures), []
         for encoder in self.encoders[1:]:
             skips.append(x)
             x = encoder(F.max_pool2d(x, 2))
         for up, decoder, skip in zip(self.ups, self.decoders, reversed(skips), strict=True):
-            # An odd row or column, which pooling dropped, is filled with the bias.
+            # The odd row or column that pooling dropped gets the bias only.
             x = up(x, output_size=skip.shape[-2:])
             x = decoder(torch.cat([x, skip], dim=1))
         return self.head(x)
 
 
 class PrimalDual(nn.Module):
-    """One iteration: the dual, on the sensor, moves by what the scenes cast there; then the scenes by the dual.
+    """One iteration: a CNN updates the dual (sensor) from ``H primal``, another the primal (scene) from ``H^T dual``.
 
     Args:
-        width: scenes, and PSFs, side by side.
+        width: number of scenes and PSFs.
     """
 
     def __init__(self, width: int) -> None:
@@ -69,36 +69,38 @@ class PrimalDual(nn.Module):
         )
 
     def forward(self, primal: Tensor, dual: Tensor, b: Tensor, camera: Convolution) -> tuple[Tensor, Tensor]:
-        """The next scenes and duals, (B * colours, width, ...)."""
-        # The camera has the colours beside the scenes: (B, colours * width, ...).
+        """Updated scenes and duals, (B * colours, width, ...)."""
+        # The camera expects colours and scenes in one dimension: (B, colours * width, ...).
         batch, width = b.shape[0] * dual.shape[1] // camera.transfer.shape[1], dual.shape[1]
-        cast = camera.forward(primal.reshape(batch, -1, *camera.scene)).reshape(-1, width, *camera.sensor)
-        dual = dual + self.dual(torch.cat([cast, dual, b], dim=1))
+        pattern = camera.forward(primal.reshape(batch, -1, *camera.scene)).reshape(-1, width, *camera.sensor)
+        dual = dual + self.dual(torch.cat([pattern, dual, b], dim=1))
         back = camera.adjoint(dual.reshape(batch, -1, *camera.sensor)).reshape(-1, width, *camera.scene)
         return primal + self.primal(torch.cat([back, primal], dim=1)), dual
 
 
 class Updn(Network[Tensor]):
-    """Ten learned primal-dual steps through five learned PSFs, then a small U-Net.
+    """Ten unrolled primal-dual iterations with five learned PSFs, then a small U-Net.
 
-    2,744,411 learnable numbers at 270 x 480: 5 x 3 x 270 x 480 = 1,944,000 of the PSFs, 42,400 of the steps, 758,011 of
-    the U-Net.
+    2,744,411 learnable numbers at 270 x 480: 5 x 3 x 270 x 480 = 1,944,000 of the PSFs, 42,400 of the iterations,
+    758,011 of the U-Net.
 
-    From the source: five scenes, each with its own PSF, all of which begin as the measured one; steps that share
-    nothing; scenes on a grid of twice the sensor, both they and the duals from zero; colours treated alike, as samples
-    of the batch; output the sigmoid of the first scene plus what the U-Net makes of all five.
+    From the source: five scenes, each with its own PSF, initialised as the measured one; iterations do not share
+    weights; scenes on a grid of twice the sensor; scenes and duals start at zero; colours are treated as samples of the
+    batch; the output is the sigmoid of the first scene plus the U-Net's output for all five.
 
-    Different here: what is learned of a PSF is its difference from the measured one, which is an input. With one camera
-    that is the same; the measured PSF can be exchanged. The differences belong to one size of sensor, ``size``, and are
-    stretched to any other. PSFs are scaled to a peak of 1, where the differences are learned, and then to a mean sum of
-    1, so that the steps see the same gain at every size (the source leaves it to orthonormal transforms). A row or
-    column that the U-Net's pooling drops is added wherever the size is odd, not only as 270 x 480 needs it.
+    Different here:
+
+    - Each PSF is learned as a correction of the measured one, which is an input. For one camera this is equivalent.
+      Corrections are stored for one sensor size, ``size``, and resampled to any other.
+    - Corrections are added at a PSF peak of 1. The PSFs are then scaled to a mean sum of 1, so that the gain does not
+      depend on the size (the source relies on orthonormal transforms).
+    - Rows and columns dropped by the U-Net's pooling are filled at every odd size, not only for 270 x 480.
 
     Args:
         channels: colours of the measurement.
-        width: scenes side by side; half the U-Net's channels at full resolution.
-        depth: steps.
-        size: height and width of the sensor whose PSFs are learned; ``None`` keeps the measured one.
+        width: number of scenes; half the U-Net's channels at full resolution.
+        depth: number of iterations.
+        size: height and width for which the corrections are stored; ``None`` for none.
 
     References:
         O. Kingshott et al., Unrolled primal-dual networks for lensless cameras, Optics Express 30, 46324 (2022);
@@ -113,11 +115,11 @@ class Updn(Network[Tensor]):
         self.unet = SmallUNet(width, 2 * width)
 
     def psfs(self, psf: Psf, size: Size) -> Tensor:
-        """Learned PSFs, (1 or B, C * width, H, W), of mean sum 1 before their correction."""
-        psf = peak_one_in_colour(psf, size, self.channels)[:, :, None]
+        """Learned PSFs, (1 or B, C * width, H, W), of mean sum 1 before correction."""
+        psf = normalise_psf(psf, size, self.channels)[:, :, None]
         total = psf.sum((-2, -1), keepdim=True).mean(1, keepdim=True)
         if self.correction is not None:
-            psf = psf + resized(self.correction, size)
+            psf = psf + resize(self.correction, size)
         return (psf / total).expand(-1, -1, self.width, -1, -1).flatten(1, 2)
 
     def prepare(self, psf: Psf, size: Size) -> Transfer:
@@ -134,7 +136,7 @@ class Updn(Network[Tensor]):
         primal = b.new_zeros(b.shape[0], self.width, 2 * height, 2 * width)
         for step in self.steps:
             primal, dual = step(primal, dual, b, camera)
-        # Scene and sensor share their centre.
+        # The sensor faces the centre of the scene.
         top, left = height - height // 2, width - width // 2
         scenes = primal[..., top : top + height, left : left + width]
         return torch.sigmoid(scenes[:, :1] + self.unet(scenes)).reshape(measurement.shape)

@@ -3,13 +3,13 @@
 from torch import Tensor
 
 from mwdn.fourier.padding import Boundary
-from mwdn.networks.blocks import Wiener, peak_one
+from mwdn.networks.blocks import Wiener, normalise_psf
 from mwdn.networks.network import Network
 from mwdn.types import Measurement, Psf, Scene, Size
 
 
 class WienerNetwork(Network[Tensor]):
-    """Pure physics: eq. (2) with a learned weight w and regularisation lambda. 2 learnable numbers.
+    """Wiener filter, eq. (2), with a learned weight w and regularisation lambda. 2 learnable numbers.
 
     Args:
         weight: start value of w, for a PSF whose peak is 1.
@@ -23,7 +23,7 @@ class WienerNetwork(Network[Tensor]):
 
     def prepare(self, psf: Psf, size: Size) -> Tensor:
         """Transfer function of the filter."""
-        return self.filter.prepare(peak_one(psf, size))
+        return self.filter.prepare(normalise_psf(psf, size))
 
     def reconstruct(self, measurement: Measurement, prepared: Tensor) -> Scene:
         """Scene (B, C, H, W), each colour deconvolved with its own PSF."""

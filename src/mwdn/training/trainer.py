@@ -16,7 +16,7 @@ from mwdn.errors import CheckpointError, DivergenceError, MwdnError, ParameterEr
 from mwdn.io.files import as_parameter_error
 from mwdn.io.images import write_picture
 from mwdn.networks import build
-from mwdn.networks.recomputed import norms, recompute
+from mwdn.networks.activation_checkpointing import batch_norms, checkpoint_activations
 from mwdn.runtime import distributed
 from mwdn.runtime.devices import has_bfloat16
 from mwdn.training.batch_norm import freeze_cancelled, synchronise
@@ -93,7 +93,7 @@ class Trainer:
         freeze_cancelled(self.network)
         synchronise(self.network, self.device)
         if self.schedule.checkpointing:
-            recompute(self.network)
+            checkpoint_activations(self.network)
         self.distance = Loss(recipe.loss, alexnet=alexnet).to(self.device)
         self.optimiser = make_optimiser(self.network, self.schedule)
         self.lr_schedule = make_lr_schedule(recipe)
@@ -177,7 +177,7 @@ class Trainer:
         self.distance.weights = self.lr_schedule.loss_weights
         self.network.train()
         if self.schedule.fixed_norms:
-            for norm in norms(self.network):
+            for norm in batch_norms(self.network):
                 norm.eval()
         try:
             with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):

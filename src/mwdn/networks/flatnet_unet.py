@@ -1,13 +1,15 @@
-"""The U-Net that FlatNet and SVDeconv put behind their inverse."""
+"""U-Net of FlatNet and SVDeconv."""
 
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from mwdn.networks.blocks import Decoder, Encoder, at_least, check_channels
+from mwdn.networks.blocks import Decoder, Encoder, check_channels, pad_to_minimum
 
 
-class Generator(nn.Module):
-    """U-Net over blocks of 2 x 2 pixels with GroupNorm: six scales of 1, 1, 1, 2, 4 and 8 times ``width`` channels.
+class FlatNetUNet(nn.Module):
+    """U-Net with GroupNorm on 2 x 2 pixel-unshuffled input.
+
+    Its six scales have 1, 1, 1, 2, 4 and 8 times ``width`` channels.
 
     Args:
         channels: of the pictures.
@@ -23,11 +25,11 @@ class Generator(nn.Module):
         self.decoder = Decoder(4 * colours, widths, norm="group")
 
     def forward(self, pictures: Tensor) -> Tensor:
-        """Picture (B, colours, H, W), not limited to any range."""
+        """Picture (B, colours, H, W), of unlimited range."""
         check_channels(pictures, self.channels)
         height, width = pictures.shape[-2:]
-        # 64 pixels are 64 / 2 / 2^5 = 1 at the coarsest scale; the folding needs even sides.
-        wide = at_least(pictures, 64)
-        wide = F.pad(wide, (0, wide.shape[-1] % 2, 0, wide.shape[-2] % 2), mode="replicate")
-        features = self.encoder(F.pixel_unshuffle(wide, 2))
+        # 64 pixels are 64 / 2 / 2^5 = 1 at the coarsest scale; pixel unshuffling needs even sides.
+        padded = pad_to_minimum(pictures, 64)
+        padded = F.pad(padded, (0, padded.shape[-1] % 2, 0, padded.shape[-2] % 2), mode="replicate")
+        features = self.encoder(F.pixel_unshuffle(padded, 2))
         return F.pixel_shuffle(self.decoder(features), 2)[..., :height, :width]
