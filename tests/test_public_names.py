@@ -126,3 +126,18 @@ def test_options_belong_to_a_method_given_by_its_name(psf):
         Reconstructor(mwdn.solvers.Admm(), calibration, iterations=3)
     with pytest.raises(ParameterError, match="'universal'"):
         Reconstructor("universal", calibration, regularisation=1e-3)
+
+
+def test_a_network_is_trained_in_one_call_and_reconstructs(psf, capture, tmp_path):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for number in range(3):
+        mwdn.write_picture(photos / f"{number}.png", np.roll(capture, 5 * number, 1))
+    recipe = mwdn.training.Recipe(
+        {"name": "mwdn", "width": 2}, mwdn.training.Schedule(steps=2, batch=2, validate_every=1, validation=2)
+    )
+    calibration = Calibration.from_array(psf)
+    steps = []
+    path = mwdn.train(recipe, calibration, photos=photos, out=tmp_path / "run", device="cpu", callback=steps.append)
+    assert [report.step for report in steps] == [1, 2]
+    assert Reconstructor(path, calibration, device="cpu")(capture).shape == (*SIZE, 3)

@@ -25,12 +25,13 @@ SMALLEST = 15
 of 15 pixels for 7 or 8."""
 
 
-def reconstruct(
+def reconstruct(  # noqa: PLR0913
     *captures: Path,
     camera: CameraOptions,
     method: str = "universal",
     out: Path = Path("results/reconstruct"),
     format: Format = "png",
+    align: bool | None = None,
     trust: bool = True,
     resume: bool | None = None,
     device: str | None = None,
@@ -50,6 +51,8 @@ def reconstruct(
         out: folder for the pictures. Beside each, a .json says how well it explains its capture; summary.png shows
             the first twelve pictures and their captures.
         format: png and png16 are sRGB for viewing, tiff and npy hold the linear float32 values.
+        align: turn, scale and haze the PSF until it explains each capture, for a camera that has changed since its
+            calibration; by default for universal, and not for solvers.
         trust: check how well each picture explains its capture; takes a second or two for a small one.
         resume: skip each capture whose picture is there, made from the same file in the same way; the default for
             several processes.
@@ -62,7 +65,7 @@ def reconstruct(
         # Listed by the first process: files may be added to a folder meanwhile.
         files: list[str] = distributed.broadcast_json(lambda: _list_files(captures, camera, out, format))
         local_device = distributed.local_device(device)
-        reconstructor = Reconstructor(method, calibration, device=local_device, **method_options)
+        reconstructor = Reconstructor(method, calibration, align=align, device=local_device, **method_options)
         if is_first:
             warn(reconstructor.warning)
             background = ", ".join(f"{level:.4f}" for level in calibration.background)

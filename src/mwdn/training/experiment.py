@@ -18,10 +18,10 @@ from mwdn.data.simulated import Samples, SimulatedPairs
 from mwdn.data.unpaired import UnpairedCaptures
 from mwdn.errors import ParameterError
 from mwdn.runtime import distributed
-from mwdn.training.recipe import Recipe
+from mwdn.training.recipe import Recipe, read_recipe
 from mwdn.training.selfsupervised import SelfSupervisedTask
 from mwdn.training.tasks import SupervisedTask, Task, supervised_task
-from mwdn.training.trainer import Trainer
+from mwdn.training.trainer import Report, Trainer
 from mwdn.training.validation import SHOWN, Validator
 from mwdn.types import Measurement, Psf
 
@@ -43,6 +43,39 @@ class TrainingData(NamedTuple):
     validation: Task
     epoch: int
     validation_count: int | None = None
+
+
+def train(
+    recipe: Recipe | str | Path,
+    calibration: Calibration,
+    *,
+    out: Path,
+    photos: Path | None = None,
+    pairs: Path | None = None,
+    device: str | None = None,
+    callback: Callable[[Report], None] = lambda report: None,
+) -> Path:
+    """Train a network for a camera; called again on the same folder, it continues a stopped run.
+
+    Args:
+        recipe: the experiment, or its TOML file.
+        calibration: of the camera.
+        out: folder of the run.
+        photos: folder of photographs to simulate captures of.
+        pairs: file of recorded pairs, instead of photographs.
+        device: a GPU by default if there is one.
+        callback: called after each step.
+
+    Returns:
+        The checkpoint of the best validation, for `mwdn.Reconstructor`.
+
+    Raises:
+        MwdnError: as for `prepare` and `mwdn.training.trainer.Trainer.run`.
+    """
+    recipe = recipe if isinstance(recipe, Recipe) else read_recipe(recipe)
+    trainer = prepare(recipe, calibration, out=out, photos=photos, pairs=pairs, device=device)
+    trainer.run(callback)
+    return trainer.folder.weights("best")
 
 
 def prepare(
