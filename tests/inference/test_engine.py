@@ -10,9 +10,8 @@ from torch.nn import functional as F
 from conftest import trained
 from mwdn import Calibration, Camera, Reconstructor, read_frame
 from mwdn.errors import ParameterError
-from mwdn.inference import fusion
 from mwdn.inference.engine import Engine
-from mwdn.inference.fusion import Convolution, fuse
+from mwdn.inference.fusion import FusedConvolution, fuse
 from mwdn.networks import NETWORKS, build
 
 SIZE = 33, 47
@@ -51,12 +50,10 @@ def test_plug_and_play_too(generator):
     assert psnr(Engine(network, psf)(batch), expected) > 50
 
 
-@pytest.mark.parametrize("fused", [True, False])
+@pytest.mark.parametrize("packed", [True, False])
 @pytest.mark.parametrize("dtype", [None, torch.bfloat16])
-def test_folded_convolution(fused, dtype, generator, monkeypatch):
-    """Also where torch cannot fuse: another version, another processor."""
-    if not fused:
-        monkeypatch.setattr(fusion, "_packed", lambda weight, padding: None)
+def test_fused_convolution(packed, dtype, generator):
+    """With packed weights, and as where torch or the processor has no fused operation."""
     layers = nn.Sequential(
         nn.Conv2d(20, 17, 3, padding=1, bias=False), nn.BatchNorm2d(17), nn.ReLU(), nn.Conv2d(17, 18, 1)
     )
@@ -65,7 +62,7 @@ def test_folded_convolution(fused, dtype, generator, monkeypatch):
     image = torch.randn(2, 20, 9, 11, generator=generator)
     with torch.no_grad():
         expected = layers.eval()(image)
-        found = fuse(copy.deepcopy(layers), dtype)(image)
+        found = fuse(copy.deepcopy(layers), dtype, pack=packed)(image)
     assert found.dtype == (dtype or torch.float32)
     tolerance = 1e-5 if dtype is None else 0.03
     torch.testing.assert_close(found.float(), expected, rtol=tolerance, atol=tolerance)
@@ -85,7 +82,7 @@ def test_other_convolutions_are_left_alone(generator):
     layers = nn.Sequential(strided, nn.BatchNorm2d(4), nn.ReLU(), grouped)
     folded = fuse(layers, None)
     assert [getattr(module, "layer", module) for module in folded] == list(layers)
-    assert not any(isinstance(module, Convolution) for module in folded.modules())
+    assert not any(isinstance(module, FusedConvolution) for module in folded.modules())
 
 
 def test_psf_branch_is_computed_once(generator):

@@ -24,7 +24,7 @@ from torch.utils._pytree import tree_flatten, tree_unflatten
 from mwdn.calibration import Calibration
 from mwdn.errors import ExportError, ParameterError
 from mwdn.export.onnx_program import to_onnx
-from mwdn.inference.fusion import Convolution, fuse
+from mwdn.inference.fusion import fuse
 from mwdn.inference.reconstructor import Method, Reconstructor, find_method
 from mwdn.io.files import atomic
 from mwdn.io.pictures import dark_scene
@@ -86,10 +86,7 @@ class Bound(nn.Module):
         self.names = [f"prepared_{index}" for index in range(len(tensors))]
         for name, tensor in zip(self.names, tensors, strict=True):
             self.register_buffer(name, tensor)
-        self.method = fuse(network, dtype)
-        for module in self.method.modules():
-            if isinstance(module, Convolution):
-                module.packed = None  # an order of this machine
+        self.method = fuse(network, dtype, pack=False)
 
     def forward(self, measurement: Measurement) -> Scene:
         """Scene (B, C, H, W), float32, from a measurement of the PSF's size."""

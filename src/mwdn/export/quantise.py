@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from mwdn.inference.fusion import FEW
+from mwdn.inference.fusion import MIN_HALF_CHANNELS
 from mwdn.types import Measurement
 
 
@@ -36,7 +36,9 @@ def quantise(file: Path, measurements: Measurement) -> None:
     model = onnx.load(str(file))
     shapes = {constant.name: constant.dims for constant in model.graph.initializer}
     convolutions = [node for node in model.graph.node if node.op_type == "Conv"]
-    kept = [node.name for node in convolutions if shapes[node.input[1]][1] < FEW or node is convolutions[-1]]
+    kept = [
+        node.name for node in convolutions if shapes[node.input[1]][1] < MIN_HALF_CHANNELS or node is convolutions[-1]
+    ]
     level = logging.root.level
     logging.root.setLevel(logging.ERROR)  # advice about preparing models that are not ours
     try:

@@ -1,7 +1,7 @@
-"""U-Nets on pictures too large to be in memory many times over: a strip of rows at a time.
+"""U-Nets in strips of rows, to bound the memory that large pictures need.
 
-A strip is computed from so many rows more above and below as its convolutions see. So the result is that of the whole
-picture, but for the order of additions; what is kept whole is each scale's input and result.
+Each strip is computed with a halo of the convolutions' receptive field, so the result is that of the whole picture up
+to the order of additions. Only the input and the result of each scale are stored whole.
 """
 
 from collections.abc import Callable
@@ -15,15 +15,16 @@ from mwdn.networks.blocks import Decoder, Encoder, check_channels
 from mwdn.types import Size
 
 Rows = Callable[[int, int], Tensor]
-"""(first, last) to these rows of a picture, (B, C, last - first, W)."""
+"""Rows ``first`` to ``last`` of a picture, (B, C, last - first, W), as a function of both."""
 
-
-LARGEST = 2**25
-"""Numbers that a strip may have where its features are widest: 64 MB in bfloat16. A GPU has room for 16 times that."""
+MAX_STRIP_NUMBERS = 2**25
+"""Limit of a strip's widest features: 64 MB in bfloat16. On a GPU the limit is 16 times as large."""
 
 
 class StripEncoder(nn.Module):
-    """An `Encoder` of nothing but `mwdn.inference.fusion.Convolution`."""
+    """An `Encoder` that consists of `mwdn.inference.fusion.FusedConvolution` only."""
+
+    max_strip_numbers = MAX_STRIP_NUMBERS
 
     def __init__(self, encoder: Encoder) -> None:
         super().__init__()
@@ -33,17 +34,20 @@ class StripEncoder(nn.Module):
         """Features, finest first."""
         check_channels(picture, self.channels)
         size = picture.shape[-2], picture.shape[-1]
-        features = [in_strips(self.scales[0], size, lambda first, last: picture[..., first:last, :])]
+        limit = self.max_strip_numbers
+        features = [apply_in_strips(self.scales[0], size, lambda first, last: picture[..., first:last, :], limit)]
         for scale in self.scales[1:]:
             size = size[0] // 2, size[1] // 2
             finer = features[-1]
-            halved = lambda first, last, finer=finer: self.pool(finer[..., 2 * first : 2 * last, :])  # noqa: E731
-            features.append(in_strips(scale, size, halved))
+            pooled = lambda first, last, finer=finer: self.pool(finer[..., 2 * first : 2 * last, :])  # noqa: E731
+            features.append(apply_in_strips(scale, size, pooled, limit))
         return features
 
 
 class StripDecoder(nn.Module):
-    """A `Decoder` of nothing but `mwdn.inference.fusion.Convolution`. Its head belongs to its last scale."""
+    """A `Decoder` that consists of `mwdn.inference.fusion.FusedConvolution` only. Its last scale includes the head."""
+
+    max_strip_numbers = MAX_STRIP_NUMBERS
 
     def __init__(self, decoder: Decoder) -> None:
         super().__init__()
@@ -51,53 +55,60 @@ class StripDecoder(nn.Module):
         self.scales = nn.ModuleList([*coarse, nn.Sequential(*finest, decoder.head)])  # type: ignore[misc]
 
     def forward(self, features: list[Tensor]) -> Tensor:
-        """Picture of the finest feature's size. The list is emptied on the way."""
+        """Reconstruction at the finest scale. The list of features is emptied to free memory."""
         x = features.pop()
         for scale in self.scales:
             skip = features.pop()
             size = skip.shape[-2], skip.shape[-1]
 
             def joined(first: int, last: int, skip: Tensor = skip, x: Tensor = x, size: Size = size) -> Tensor:
-                return torch.cat([skip[..., first:last, :], enlarged(x, size, first, last)], dim=1)
+                return torch.cat([skip[..., first:last, :], upsample_rows(x, size, first, last)], dim=1)
 
-            x = in_strips(scale, size, joined)
+            x = apply_in_strips(scale, size, joined, self.max_strip_numbers)
             del skip, joined
         return x
 
 
-def in_strips(layers: nn.Module, size: Size, rows: Rows) -> Tensor:
-    """What convolutions, one after the other, make of a picture of ``size`` that ``rows`` gives a part of."""
+def apply_in_strips(layers: nn.Module, size: Size, rows: Rows, max_numbers: int) -> Tensor:
+    """Apply a sequence of convolutions strip by strip.
+
+    Args:
+        layers: the convolutions.
+        size: height and width of the input.
+        rows: the input.
+        max_numbers: limit of a strip's widest features on a CPU.
+    """
     height, width = size
-    each: list[Any] = list(layers.children())
-    halo = sum(layer.padding[0] for layer in each)
-    widest = max(channels for layer in each for channels in layer.weight.shape[:2])
-    largest = 16 * LARGEST if each[0].weight.is_cuda else LARGEST
-    step = max(1, largest // (width * widest))
+    convolutions: list[Any] = list(layers.children())
+    halo = sum(layer.padding[0] for layer in convolutions)
+    widest = max(channels for layer in convolutions for channels in layer.weight.shape[:2])
+    limit = 16 * max_numbers if convolutions[0].weight.is_cuda else max_numbers
+    step = max(1, limit // (width * widest))
     if step >= height:
         return layers(rows(0, height))
     result = torch.empty(0)
     for first in range(0, height, step):
         last = min(first + step, height)
         start, stop = max(0, first - halo), min(height, last + halo)
-        part = layers(rows(start, stop))[..., first - start : last - start, :]
+        strip = layers(rows(start, stop))[..., first - start : last - start, :]
         if first == 0:
-            shape = (*part.shape[:2], height, width)
-            result = torch.empty(shape, dtype=part.dtype, device=part.device, memory_format=torch.channels_last)
-        result[..., first:last, :] = part
+            shape = (*strip.shape[:2], height, width)
+            result = torch.empty(shape, dtype=strip.dtype, device=strip.device, memory_format=torch.channels_last)
+        result[..., first:last, :] = strip
     return result
 
 
-def enlarged(picture: Tensor, size: Size, first: int, last: int) -> Tensor:
-    """Rows of ``F.interpolate(picture, size, mode="bilinear", align_corners=True)``."""
+def upsample_rows(picture: Tensor, size: Size, first: int, last: int) -> Tensor:
+    """Rows ``first`` to ``last`` of ``F.interpolate(picture, size, mode="bilinear", align_corners=True)``."""
     if last - first == size[0]:
         return F.interpolate(picture, size=size, mode="bilinear", align_corners=True)
     height = picture.shape[-2]
-    # In float32, as torch computes where it looks.
+    # Positions in float32, as in torch.
     position = torch.arange(first, last, dtype=torch.float32, device=picture.device)
     position = position * (torch.tensor(height - 1.0) / (size[0] - 1)).item()
     above = position.long().clamp(max=height - 1)
     below = (above + 1).clamp(max=height - 1)
-    pixels = picture.movedim(1, -1)  # channels-last stays so
+    pixels = picture.movedim(1, -1)  # keeps channels-last
     weight = (position - above)[:, None, None]
     rows = torch.lerp(pixels[:, above].float(), pixels[:, below].float(), weight).to(picture.dtype)
     return F.interpolate(rows.movedim(-1, 1), size=(last - first, size[1]), mode="bilinear", align_corners=True)
