@@ -1,4 +1,4 @@
-"""`mwdn train` and `mwdn simulate` as a user types them, and what becomes of their files."""
+"""The commands `mwdn train` and `mwdn simulate`, and their files."""
 
 import json
 import re
@@ -44,7 +44,7 @@ def camera(tmp_path, monkeypatch, generator):
 
 @pytest.fixture
 def run(capsys):
-    """``run("train r.toml ...")`` gives exit code, standard output, standard error."""
+    """``run("train r.toml ...")`` returns the exit code, standard output and standard error."""
 
     def call(line):
         with pytest.raises(SystemExit) as caught:
@@ -198,7 +198,7 @@ def test_tensorboard_and_captures(run, camera):
     assert sheet.shape[1] == 5 * (300 + 6)  # measurement, reconstruction, scene; capture, reconstruction
 
 
-def test_captures_of_the_recipe_leave_the_psf_out(run, camera):
+def test_captures_of_the_recipe_exclude_the_psf(run, camera):
     (camera / "frames").mkdir()
     for name in ("psf.npy", "capture.npy"):
         (camera / name).rename(camera / "frames" / name)
@@ -220,8 +220,8 @@ def test_tensorboard_that_is_not_installed(run, camera, monkeypatch):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit on the size of a file")
-def test_disk_that_refuses_is_one_message_and_leaves_the_last_state(run, camera):
-    """A file may not become as large as a state, as if the disk were full: the kernel refuses to write more."""
+def test_full_disk_is_one_message_and_leaves_the_last_state(run, camera):
+    """A limit on the size of files, below that of a state, stands for a full disk."""
     import resource
 
     line = TRAIN.replace("--steps 4", "--steps 2")

@@ -109,7 +109,7 @@ def test_bad_files_are_named(tmp_path):
         Photographs(tmp_path)
     (tmp_path / "half.png").unlink()
     store(tmp_path / "deep.png", noise(8, 8, 3).astype(np.uint16) * 257)
-    with pytest.raises(ImageError, match=r"deep\.png` holds uint16; photographs for training have 8 bits"):
+    with pytest.raises(ImageError, match=r"deep\.png` holds uint16; photographs for training must have 8 bits"):
         Photographs(tmp_path)
 
 

@@ -1,4 +1,4 @@
-"""Recorded pairs as numbered samples: each once an epoch, and only those that are for training."""
+"""Recorded pairs as numbered samples: each training pair once per epoch."""
 
 import itertools
 import re
@@ -34,25 +34,26 @@ def psf(size=(4, 6), channels=3):
     return torch.ones(1, channels, *size) / (size[0] * size[1])
 
 
-def drawn(source, numbers):
+def rows(source, numbers):
+    """Positions in the file of the samples of these numbers."""
     measurement, scene, _ = source.batch(numbers)
-    torch.testing.assert_close(measurement + scene, torch.ones_like(scene))  # still a pair
+    torch.testing.assert_close(measurement + scene, torch.ones_like(scene))  # they belong together
     return (measurement[:, 0, 0, 0] * 255).round().int().tolist()
 
 
-def test_parts_are_the_papers(pairs):
-    """8:1:1 by position, test first: of 30, 3 for test, then 3 for validation, then 24 for training."""
+def test_split_of_the_paper(pairs):
+    """8:1:1 by position: of 30 pairs the first 3 are for test, the next 3 for validation, 24 for training."""
     train, validation = recorded_pairs(pairs(), psf(), Division())
     assert isinstance(train, Samples)
     assert torch.equal(train.batch([0]).psf, psf())
     assert len(train) == 24
-    assert sorted(drawn(train, range(24))) == list(range(6, 30))
-    assert sorted(drawn(validation, range(10**12, 10**12 + 3))) == [3, 4, 5]
-    assert drawn(validation, range(10**12, 10**12 + 3)) == drawn(validation, range(10**12 + 3, 10**12 + 6))
+    assert sorted(rows(train, range(24))) == list(range(6, 30))
+    assert sorted(rows(validation, range(10**12, 10**12 + 3))) == [3, 4, 5]
+    assert rows(validation, range(10**12, 10**12 + 3)) == rows(validation, range(10**12 + 3, 10**12 + 6))
 
 
-def test_a_batch_ahead(pairs):
-    """The same batches, in any order; the next one has been read before it is asked for, in another thread."""
+def test_prefetched_batches(pairs):
+    """They are the same in any order; consecutive ones are read by another thread."""
     train, _ = recorded_pairs(pairs(), psf(), Division(), seed=4)
     readers = []
 
@@ -62,14 +63,14 @@ def test_a_batch_ahead(pairs):
             return super().batch(numbers)
 
     watched = Watched(train.file, train.rows, train.psf, train.seed)
-    following = PrefetchedPairs(watched, 4)
+    prefetched = PrefetchedPairs(watched, 4)
     for start in (0, 4, 8, 24, 28, 8):
-        assert drawn(following, range(start, start + 2)) == drawn(train, range(start, start + 2))
-    here = [numbers[0] for numbers, thread in readers if thread is threading.main_thread()]
-    assert here == [0, 24, 8]  # where the last one does not tell the next
+        assert rows(prefetched, range(start, start + 2)) == rows(train, range(start, start + 2))
+    not_prefetched = [numbers[0] for numbers, thread in readers if thread is threading.main_thread()]
+    assert not_prefetched == [0, 24, 8]  # the first of each run of consecutive batches
 
 
-def test_a_damaged_pair_ahead_is_of_the_batch_that_takes_it(pairs, monkeypatch):
+def test_the_error_of_a_prefetched_pair_is_raised_with_its_batch(pairs, monkeypatch):
     train, _ = recorded_pairs(pairs(), psf(), Division())
     read = PairFile.__getitem__
 
@@ -79,31 +80,31 @@ def test_a_damaged_pair_ahead_is_of_the_batch_that_takes_it(pairs, monkeypatch):
         return read(file, number)
 
     monkeypatch.setattr(PairFile, "__getitem__", refuse)
-    following = train.prefetched(4)
-    assert drawn(following, range(4)) == drawn(train, range(4))
+    prefetched = train.prefetched(4)
+    assert rows(prefetched, range(4)) == rows(train, range(4))
     for _ in range(2):
         with pytest.raises(ImageError, match="damaged"):
-            following.batch(range(4, 8))
+            prefetched.batch(range(4, 8))
 
 
-def test_each_epoch_has_each_pair_once_in_an_order_of_its_own(pairs):
+def test_each_epoch_has_each_pair_once_in_a_new_order(pairs):
     train, _ = recorded_pairs(pairs(), psf(), Division(), seed=4)
-    epochs = [drawn(train, range(start, start + 24)) for start in range(0, 96, 24)]
+    epochs = [rows(train, range(start, start + 24)) for start in range(0, 96, 24)]
     assert all(sorted(epoch) == list(range(6, 30)) for epoch in epochs)
     assert all(one != other for one, other in itertools.combinations([*epochs, list(range(6, 30))], 2))
     other, _ = recorded_pairs(pairs(), psf(), Division(), seed=5)
-    assert drawn(other, range(24)) != epochs[0]
+    assert rows(other, range(24)) != epochs[0]
     negative, _ = recorded_pairs(pairs(), psf(), Division(), seed=-1)
-    assert sorted(drawn(negative, range(24))) == list(range(6, 30))
+    assert sorted(rows(negative, range(24))) == list(range(6, 30))
 
 
-def test_a_number_is_the_same_pair_in_whatever_batch_and_process(pairs):
+def test_a_number_is_the_same_pair_in_any_batch_and_process(pairs):
     path = pairs()
     once, again = (recorded_pairs(path, psf(), Division(), seed=1)[0] for _ in range(2))
-    whole = drawn(once, range(60))
-    assert drawn(again, [50, 7, 23, 24]) == [whole[n] for n in (50, 7, 23, 24)]
-    assert [drawn(again, [n])[0] for n in range(20, 30)] == whole[20:30]
-    # A fixed answer, so that no update changes the order in the middle of somebody's run.
+    whole = rows(once, range(60))
+    assert rows(again, [50, 7, 23, 24]) == [whole[n] for n in (50, 7, 23, 24)]
+    assert [rows(again, [n])[0] for n in range(20, 30)] == whole[20:30]
+    # Literal values: an update must not change the order in the middle of a run.
     assert [once.row(n) for n in range(5)] == [7, 27, 13, 23, 22]
 
 
@@ -114,7 +115,7 @@ def test_the_file_is_opened_when_the_first_pair_is_read(pairs):
     assert train.file._file is not None
 
 
-def test_a_split_without_validation_holds_some_training_pairs_out():
+def test_a_split_without_validation_holds_out_training_pairs():
     train, validation = Division("diffusercam").of(1100)
     assert list(validation) == [1019, 1039, 1059, 1079, 1099]
     assert sorted([*train, *validation]) == list(range(1000, 1100))
@@ -168,6 +169,6 @@ def test_no_such_file(tmp_path):
         recorded_pairs(tmp_path / "none.h5", psf(), Division())
 
 
-def test_pairs_are_put_on_a_device(pairs):
+def test_pairs_are_put_on_the_device_of_the_psf(pairs):
     file = PairFile(pairs())
     assert RecordedPairs(file, [0], psf().to("meta")).batch([0]).scene.device.type == "meta"

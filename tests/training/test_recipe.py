@@ -1,4 +1,4 @@
-"""Recipes: what they hold, and what is said about mistakes in them."""
+"""Recipes: their values, and the messages for mistakes in them."""
 
 import json
 import re
@@ -42,7 +42,7 @@ def test_network_alone_takes_defaults(read):
     assert read(NETWORK) == Recipe({"name": "wiener-bank", "width": 4})
 
 
-def test_values_and_their_kinds(read):
+def test_values_and_their_types(read):
     recipe = read(NETWORK + "[placement]\nextent = [0.2, 1]\nturn_degrees = 3\n[mismatch]\nshift_px = 0\n")
     assert recipe.placement == Placement(extent=(0.2, 1.0), turn_degrees=3.0)
     assert type(recipe.placement.turn_degrees) is float
@@ -195,7 +195,7 @@ def test_no_such_file(tmp_path):
         read_recipe(tmp_path / "none.toml")
 
 
-def test_kept_samples_of_several_sizes_need_a_crop():
+def test_cached_samples_of_several_sizes_need_a_crop():
     several = Cameras(("32x32", "48x32"))
     with pytest.raises(ParameterError, match="Set `crop`"):
         Recipe(schedule=Schedule(pool=4), cameras=several)

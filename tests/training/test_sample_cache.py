@@ -11,7 +11,7 @@ from mwdn.training.sample_cache import SampleCache
 
 
 class Counted(Samples):
-    """A source whose sample n is the number n, in one corner twice that."""
+    """Sample n has the value n everywhere but in one corner, 2 n; records the requested numbers."""
 
     name = "counted"
 
@@ -53,7 +53,7 @@ def test_each_epoch_has_each_sample_once_and_computes_none_twice():
     assert sorted(pairs.asked) == [0, 1, 2, 3, 4, 5]
 
 
-def test_a_sample_comes_in_all_ways_a_square_can_lie():
+def test_a_sample_comes_in_all_symmetries_of_a_square():
     marked = Counted()
     marked.batch = lambda numbers: Batch(*3 * (torch.arange(16.0).view(1, 1, 4, 4),))
     batch = cached(marked, size=1, batch=1)
@@ -61,12 +61,12 @@ def test_a_sample_comes_in_all_ways_a_square_can_lie():
     assert len(ways) == 8
 
 
-def test_a_frame_of_two_lengths_keeps_them():
+def test_a_frame_that_is_not_square_keeps_its_shape():
     batch = cached(Counted((4, 6)), size=1, batch=1)
     assert {tuple(batch([number])[0].shape) for number in range(8)} == {(1, 1, 4, 6)}
 
 
-def test_a_crop_is_cut_at_all_places_and_alike_from_both():
+def test_crops_cover_the_frame_and_match():
     marked = Counted((5, 4))
     marked.batch = lambda numbers: Batch(*3 * (torch.arange(20.0).view(1, 1, 5, 4),))
     batch = cached(marked, size=1, batch=1, crop=3)
@@ -76,14 +76,14 @@ def test_a_crop_is_cut_at_all_places_and_alike_from_both():
     assert {value for estimates, _, _ in crops for value in estimates.flatten().tolist()} == set(map(float, range(20)))
 
 
-def test_a_number_is_the_same_sample_whatever_came_before():
+def test_a_number_is_the_same_sample_after_any_history():
     one, other = cached(Counted()), cached(Counted())
     other(range(7))
     torch.testing.assert_close(one([7])[0], other([7])[0])
 
 
-def test_a_place_in_the_batch_has_samples_of_its_own():
-    """So a process, which always has the same places, computes no sample of another."""
+def test_each_place_in_the_batch_has_its_own_samples():
+    """A process always has the same places, so it computes no sample of another process."""
     pairs = Counted()
     batch = cached(pairs)
     for number in range(0, 24, 2):
@@ -91,7 +91,7 @@ def test_a_place_in_the_batch_has_samples_of_its_own():
     assert sorted(pairs.asked) == [0, 2, 4]
 
 
-def test_a_network_that_learns_from_the_first_step_on_is_refused():
+def test_a_network_without_a_fixed_first_part_is_refused():
     with pytest.raises(ParameterError, match=r"`pool` \(5\) .*UNet .*`pool = 0`"):
         SampleCache(Counted(), size=5, batch=1, crop=0, seed=0).check(build("unet", width=2))
     with pytest.raises(ParameterError, match=r"`pool` \(5\) must be a multiple of `batch` \(2\)"):

@@ -18,7 +18,7 @@ FIRST, LATER = {"mse": 1.0, "feature_mse": 1.0}, {"mse": 1.0, "feature_mse": 0.0
 PAPER = Recipe({"name": "mwdn"}, Schedule(lr_schedule="plateau", learning_rate=1e-4), FIRST, later_loss=LATER)
 
 
-# --- Ours ---------------------------------------------------------------------------------------------
+# --- Cosine -------------------------------------------------------------------------------------------
 
 
 def test_learning_rate_rises_then_falls_as_half_a_cosine():
@@ -33,7 +33,7 @@ def test_learning_rate_rises_then_falls_as_half_a_cosine():
     assert learning_rate(0, Schedule(warmup=0, learning_rate=2.0)) == 2.0
 
 
-def test_cosine_does_not_look_at_the_validation():
+def test_cosine_is_independent_of_the_validation():
     lr = make_lr_schedule(replace(PAPER, schedule=Schedule(), later_loss={}))
     assert isinstance(lr, Cosine)
     assert lr.after(1.0) == lr
@@ -41,11 +41,11 @@ def test_cosine_does_not_look_at_the_validation():
     assert lr.rate(7) == learning_rate(7, Schedule())
 
 
-# --- The paper's --------------------------------------------------------------------------------------
+# --- Plateau -----------------------------------------------------------------------------------------
 
 
 def losses(seed):
-    """Falls, stays, jitters about torch's threshold of 1e-4, is sometimes NaN."""
+    """Losses that fall, stay, jitter about torch's threshold of 1e-4, and are sometimes NaN."""
     drawn = random.Random(seed)
     loss = 1.0
     while True:
@@ -73,7 +73,7 @@ def test_learning_rate_falls_when_torchs_does(seed, plateau):
 
 
 def test_phases_of_the_paper():
-    """A loss that never falls: the first validation is the lowest, then each sixth lowers the rate."""
+    """A loss that never falls: the first validation is the lowest, then every sixth reduces the rate."""
     lr, phases = make_lr_schedule(PAPER), []
     for validation in range(1, 40):
         lr = lr.after(1.0)
@@ -91,8 +91,8 @@ def test_one_weighting_throughout():
     assert lr.loss_weights == FIRST
 
 
-def test_the_watched_rate_is_at_the_limit():
-    """Rounding must not decide: 1e-4 x 0.1 x 0.1 is a little more than 1e-6."""
+def test_limits_allow_for_rounding():
+    """1e-4 x 0.1 x 0.1 is a little more than 1e-6."""
     assert 1e-4 * 0.1 * 0.1 > 1e-6
     assert ReduceLROnPlateau(PAPER, 1e-4 * 0.1 * 0.1).loss_weights == LATER
     assert not ReduceLROnPlateau(PAPER, 2e-8 * (1 - 1e-15)).finished
@@ -113,7 +113,7 @@ def test_state_goes_through_json_to_the_last_bit():
 
 @pytest.mark.parametrize(("name", "physical"), [("mwdn", 8), ("mwdn-cpsf", 4), ("wiener-unet", 2), ("unet", 0)])
 def test_adam_decays_all_but_w_and_lambda(name, physical):
-    """With gradients of 0 Adam moves what is decayed, by its learning rate, towards 0; and nothing else."""
+    """With zero gradients, Adam moves only decayed parameters, towards 0."""
     network = build(name, width=4)
     before = {key: value.detach().clone() for key, value in network.named_parameters()}
     optim = make_optimiser(network, Schedule(optimiser="adam", learning_rate=1e-6, weight_decay=1e-2))

@@ -1,4 +1,4 @@
-"""Learning from captures alone: what the loss prefers, that it falls, and that a stopped run goes on."""
+"""Self-supervised training: what its loss prefers, that it falls, and that a run resumes."""
 
 import json
 from dataclasses import replace
@@ -24,7 +24,7 @@ from mwdn.training.selfsupervised import selfsupervised_loss, unexplained
 from mwdn.weights import bundled
 
 RECIPE = Recipe(
-    {"name": "wiener-bank", "width": 4, "regularisations": (1e-2, 1e-4)},
+    {"name": "wiener-bank", "width": 4, "regularisations": (1e-2, 1e-4), "finest": 0},
     Schedule(steps=6, batch=2, learning_rate=2e-3, warmup=0, ema=0.5, validate_every=3, validation=3, bfloat16=False),
     selfsupervised=SelfSupervised(consistency=1.0),
 )
@@ -32,7 +32,7 @@ NO_POSE = Pose(torch.zeros(1), torch.zeros(1))
 
 
 def captures_of(scenes, psf, noise=0.0, **settings):
-    """Captures of scenes by a camera that stands as it was calibrated."""
+    """Captures of scenes by a camera whose PSF is already aligned."""
     seen = convolve(scenes, psf)
     seen = seen + noise * torch.randn(seen.shape, generator=torch.Generator().manual_seed(5))
     poses = dict.fromkeys(range(len(seen)), NO_POSE)
@@ -40,7 +40,7 @@ def captures_of(scenes, psf, noise=0.0, **settings):
 
 
 class Answer(nn.Module):
-    """A network that is a function."""
+    """A network that computes a given function."""
 
     def __init__(self, of):
         super().__init__()
@@ -52,15 +52,15 @@ class Answer(nn.Module):
 
 @pytest.fixture
 def scenes(generator):
-    """Blocks of light in the middle of the dark."""
+    """Bright blocks in the middle of a dark frame."""
     blocks = torch.rand(4, 3, 6, 6, generator=generator).repeat_interleave(4, -1).repeat_interleave(4, -2)
     return nn.functional.pad(blocks, (20, 20, 20, 20))
 
 
-# --- What is compared ---------------------------------------------------------------------------------
+# --- The samples --------------------------------------------------------------------------------------
 
 
-def test_noise_is_split_into_two_that_know_nothing_of_each_other():
+def test_noise_is_split_into_two_uncorrelated_parts():
     flat = torch.full((2, 3, 128, 128), 0.5)
     delta = torch.zeros(1, 1, 128, 128)
     delta[..., 64, 64] = 1
@@ -83,7 +83,7 @@ def test_an_epoch_has_each_capture_once(scenes, generator):
         assert sorted(captures.row(4 * epoch + place) for place in range(4)) == [0, 1, 2, 3]
 
 
-def test_a_moved_scene_is_captured_as_it_stands_in_all_ways(scenes, generator):
+def test_moved_scenes_are_captured_in_all_symmetries(scenes, generator):
     psf = contour_psf((64, 64), cell=10, generator=generator)
     captures = captures_of(scenes, psf, shift=0.2)
     numbers = range(40)
@@ -100,7 +100,7 @@ def test_a_moved_scene_is_captured_as_it_stands_in_all_ways(scenes, generator):
     assert len({tuple(one.flatten().tolist()) for one in square}) == 8
 
 
-def test_a_long_frame_is_not_turned_on_its_side(generator):
+def test_a_frame_that_is_not_square_is_not_transposed(generator):
     psf = contour_psf((24, 32), cell=8, generator=generator)
     captures = captures_of(torch.rand(1, 3, 24, 32, generator=generator), psf)
     _, moved = captures.recapture(captures.measurements.expand(9, -1, -1, -1), psf, torch.zeros(9, 3, 1, 1), range(9))
@@ -111,7 +111,7 @@ def test_a_long_frame_is_not_turned_on_its_side(generator):
 
 
 def test_the_truth_beats_every_trivial_and_wrong_answer(scenes, generator):
-    small = contour_psf((32, 32), cell=8, generator=generator)  # no light leaves the sensor: it can be inverted
+    small = contour_psf((32, 32), cell=8, generator=generator)  # no light leaves the sensor: it is invertible
     psf = nn.functional.pad(small, (16, 16, 16, 16))
     captures = captures_of(scenes, psf, recorruption=0.0, shift=0.05)
 
@@ -134,8 +134,8 @@ def test_the_truth_beats_every_trivial_and_wrong_answer(scenes, generator):
     assert right.parts["unexplained"] < 0.01
 
 
-def test_equivariance_finds_what_the_camera_cannot_see(scenes, generator):
-    """Stripes of one pixel through a PSF of two: they explain nothing, and stand still when the scene moves."""
+def test_equivariance_penalises_what_the_camera_cannot_see(scenes, generator):
+    """Stripes of one pixel vanish in a PSF of two pixels: they are consistent, but do not move with the scene."""
     psf = torch.zeros(1, 1, 64, 64)
     psf[..., 32, 31:33] = 0.5
     height = torch.rand(64, 1, generator=generator).mul(0.3) * (torch.arange(64) % 2 * 2 - 1.0)
@@ -149,7 +149,7 @@ def test_equivariance_finds_what_the_camera_cannot_see(scenes, generator):
     assert other["mse"] > 3 * one["mse"]
 
 
-def test_even_light_is_free_and_nothing_explains_nothing(scenes):
+def test_uniform_light_does_not_count_and_black_explains_nothing(scenes):
     light = torch.tensor([0.1, 0.5, -0.2])[:, None, None]
     torch.testing.assert_close(unexplained(scenes, scenes + light), torch.zeros(4), atol=1e-6, rtol=0)
     torch.testing.assert_close(unexplained(torch.zeros_like(scenes), scenes + light), torch.ones(4))
@@ -193,17 +193,17 @@ def test_the_loss_falls(run):
 
 
 @pytest.mark.parametrize("fixed", [False, True])
-def test_statistics_of_a_few_captures_can_be_left_out(fixed, run):
+def test_fixed_norms_keep_their_statistics(fixed, run):
     trainer = run(replace(RECIPE, schedule=replace(RECIPE.schedule, fixed_norms=fixed)))
-    found = batch_norms(trainer.network)
-    before = [(norm.running_mean.clone(), norm.weight.detach().clone()) for norm in found]
+    layers = batch_norms(trainer.network)
+    before = [(norm.running_mean.clone(), norm.weight.detach().clone()) for norm in layers]
     trainer.advance()
-    pairs = list(zip(found, before, strict=True))
+    pairs = list(zip(layers, before, strict=True))
     assert {torch.equal(norm.running_mean, mean) for norm, (mean, _) in pairs} == {fixed}
     assert any(not torch.equal(norm.weight, weight) for norm, (_, weight) in pairs)
 
 
-def test_a_stopped_run_ends_as_one_that_was_not(run, calibration, tmp_path):
+def test_a_resumed_run_ends_as_an_unbroken_one(run, calibration, tmp_path):
     run(folder="whole").run()
     stopped = run(folder="stopped")
     while stopped.step < 3:

@@ -38,16 +38,16 @@ def test_numbers_and_sheet(tmp_path):
         write(report(1))
         write(report(2, Validation(21.5, 0.25, sheet)))
     events = read(tmp_path / "deep" / "board")
-    found = scalars(events)
-    assert found.keys() == {
+    values = scalars(events)
+    assert values.keys() == {
         *("loss/total", "loss/mse", "loss/l1", "learning_rate", "pictures_per_s"),
         *("validation/psnr", "validation/loss"),
     }
-    assert found["loss/total"] == {1: 4.0, 2: 5.0}
-    assert found["loss/l1"] == {1: 1.0, 2: 1.0}
-    assert found["learning_rate"] == pytest.approx({1: 1e-3, 2: 5e-4})
-    assert found["pictures_per_s"][2] == 8.5
-    assert (found["validation/psnr"], found["validation/loss"]) == ({2: 21.5}, {2: 0.25})
+    assert values["loss/total"] == {1: 4.0, 2: 5.0}
+    assert values["loss/l1"] == {1: 1.0, 2: 1.0}
+    assert values["learning_rate"] == pytest.approx({1: 1e-3, 2: 5e-4})
+    assert values["pictures_per_s"][2] == 8.5
+    assert (values["validation/psnr"], values["validation/loss"]) == ({2: 21.5}, {2: 0.25})
     (image,) = events.Images("validation")
     assert image.step == 2
     decoded = cv2.imdecode(np.frombuffer(io.BytesIO(image.encoded_image_string).read(), np.uint8), cv2.IMREAD_COLOR_RGB)

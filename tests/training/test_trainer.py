@@ -1,4 +1,4 @@
-"""The training loop: it learns, and a run that is stopped anywhere ends as one that was not."""
+"""The training loop: it learns, and a run that is interrupted anywhere ends as an unbroken one."""
 
 import errno
 import json
@@ -37,8 +37,10 @@ from mwdn.training.validation import Validation
 from mwdn.weights.checkpoint import load_network, read_metadata
 from runs import log, same
 
+# Without iterations and alignment, which learn nothing and take most of the time.
+FAST = {"finest": 0, "align": False}
 RECIPE = Recipe(
-    {"name": "wiener-bank", "width": 4, "regularisations": (1e-2, 1e-4)},
+    {"name": "wiener-bank", "width": 4, "regularisations": (1e-2, 1e-4), **FAST},
     Schedule(steps=6, batch=2, learning_rate=2e-3, warmup=2, ema=0.9, validate_every=3, validation=3),
 )
 DRUNET = {"name": "drunet"}  # of the size that wiener-bank has
@@ -86,7 +88,6 @@ class FourPairs(SimulatedPairs):
 
 def test_overfits_four_pairs(photos, calibration, tmp_path):
     recipe = few(steps=40, batch=4, warmup=5, learning_rate=5e-3, validate_every=40, validation=4, bfloat16=False)
-    recipe = replace(recipe, network={**RECIPE.network, "finest": 0})  # may change all, the mean light too
     pairs = FourPairs(Photographs(photos, side=24), calibration.psf)
     losses = []
     trainer = Trainer(recipe, SupervisedTask(pairs), out=tmp_path / "run", calibration=calibration)
@@ -97,7 +98,7 @@ def test_overfits_four_pairs(photos, calibration, tmp_path):
 
 
 def test_checkpointing_is_the_same_run(trainer, tmp_path):
-    """It may begin without and go on with it, where memory turns out too short."""
+    """It may be switched on in the middle of a run, if memory is too short."""
     trainer(few(bfloat16=False), "kept").run()
     first = trainer(few(bfloat16=False), "changed")
     for _ in range(3):
@@ -119,7 +120,7 @@ def test_each_step_has_its_learning_rate(trainer):
         assert {group["lr"] for group in run.optimiser.param_groups} == {learning_rate(step, run.schedule)}
 
 
-def test_running_mean_of_the_weights(trainer):
+def test_moving_average_of_the_weights(trainer):
     """Decay min(ema, n / (n + 10)) after step n, from the initial weights on; counters are copied."""
     run = trainer(few(ema=0.15))
     mean = {key: value.clone() for key, value in run.network.state_dict().items()}
@@ -132,14 +133,14 @@ def test_running_mean_of_the_weights(trainer):
         torch.testing.assert_close(value, mean[key], rtol=1e-5, atol=1e-7)
 
 
-def test_without_ema_the_last_weights_count(trainer):
+def test_without_ema_the_last_weights_are_used(trainer):
     run = trainer(few(ema=0.0))
     run.advance()
     for mean, value in zip(run.average.state_dict().values(), run.network.state_dict().values(), strict=True):
         assert torch.equal(mean, value)
 
 
-# --- What is written ----------------------------------------------------------------------------------
+# --- Files --------------------------------------------------------------------------------------------
 
 
 def test_files_of_a_run(trainer, calibration, tmp_path):
@@ -162,8 +163,8 @@ def test_files_of_a_run(trainer, calibration, tmp_path):
     assert load_network(out / "best.safetensors")(torch.rand(1, 3, 32, 32), calibration.psf).shape == (1, 3, 32, 32)
 
 
-def test_network_with_an_unused_number_is_resumed(trainer, tmp_path):
-    """The authors' fifth lambda, which never has a gradient."""
+def test_network_with_an_unused_parameter_is_resumed(trainer, tmp_path):
+    """The authors' fifth lambda never has a gradient."""
     network = {"name": "mwdn-cpsf", "width": 2, "authors_scalars": True}
     recipe = replace(few(steps=2, validate_every=1), network=network)
     trainer(recipe, "whole").run()
@@ -193,7 +194,7 @@ def test_resumed_run_ends_bit_identical(trainer, recipe, tmp_path):
 
 
 def test_log_has_one_line_a_step_after_a_resume(trainer, tmp_path):
-    """Stopped after step 5, in the middle of a line, resumed from step 3."""
+    """Interrupted after step 5, in the middle of a line; resumed from step 3."""
     first = trainer()
 
     def stop(report):
@@ -213,7 +214,7 @@ def test_log_has_one_line_a_step_after_a_resume(trainer, tmp_path):
     assert log(tmp_path / "run") == after
 
 
-def test_log_of_a_run_that_never_saved_begins_again(trainer, tmp_path):
+def test_log_of_a_run_without_a_state_starts_again(trainer, tmp_path):
     run = trainer()
     with pytest.raises(KeyboardInterrupt):
         run.run(lambda report: (_ for _ in ()).throw(KeyboardInterrupt))
@@ -232,13 +233,13 @@ def test_killed_between_log_and_state_repeats_the_step(trainer, tmp_path, monkey
 
 
 TOML = """
-network = { name = "wiener-bank", width = 4, regularisations = [1e-2, 1e-4] }
+network = { name = "wiener-bank", width = 4, regularisations = [1e-2, 1e-4], finest = 0, align = false }
 schedule = { steps = 60, batch = 1, warmup = 2, ema = 0.9, validate_every = 7, validation = 2 }
 """
 
 
-def test_killed_runs_end_as_one_that_was_not(photos, calibration, tmp_path):
-    """SIGKILL twice, after some number of further steps, wherever the process then is; then left alone."""
+def test_killed_runs_end_as_an_unbroken_one(photos, calibration, tmp_path):
+    """SIGKILL twice, each time after a random number of steps, then undisturbed."""
     (tmp_path / "r.toml").write_text(TOML, encoding="utf-8")
     np.save(tmp_path / "psf.npy", calibration.psf[0].movedim(0, -1).numpy() / calibration.psf.max().item())
     line = [sys.executable, "-m", "mwdn", "train", "r.toml", "--psf", "psf.npy", "--photos", str(photos)]
@@ -271,7 +272,7 @@ def test_killed_runs_end_as_one_that_was_not(photos, calibration, tmp_path):
 
 
 def test_two_runs_do_not_share_a_folder(photos, calibration, tmp_path):
-    """A process of its own is at work; here, a second one may neither begin nor touch what the first writes."""
+    """While one process trains, a second run may neither start nor change the files."""
     (tmp_path / "r.toml").write_text(TOML, encoding="utf-8")
     np.save(tmp_path / "psf.npy", calibration.psf[0].movedim(0, -1).numpy() / calibration.psf.max().item())
     line = [sys.executable, "-m", "mwdn", "train", "r.toml", "--psf", "psf.npy", "--photos", str(photos), "--steps"]
@@ -286,19 +287,19 @@ def test_two_runs_do_not_share_a_folder(photos, calibration, tmp_path):
         assert second.returncode == 2
         assert b"Another run is using `run`." in second.stderr
         assert (folder / "log.jsonl").read_text(encoding="utf-8").startswith(written)
-        first.send_signal(signal.SIGSTOP)  # it holds the folder, whatever it does
+        first.send_signal(signal.SIGSTOP)  # a stopped process still holds the lock
         with pytest.raises(ParameterError, match="Another run is using"), RunFolder(folder, {}).lock():
             pytest.fail("came in")
     finally:
         first.kill()
         first.communicate(timeout=60)
-    with RunFolder(folder, {}).lock():  # a killed one holds nothing
+    with RunFolder(folder, {}).lock():  # the killed process holds no lock
         pass
 
 
 # --- The paper's schedule ------------------------------------------------------------------------------
 
-# It learns too fast to go on falling, so that each phase is reached soon.
+# The learning rate is too high for the loss to keep falling, so that each phase is reached soon.
 PAPER = Recipe(
     {"name": "wiener"},
     Schedule(
@@ -341,7 +342,7 @@ def test_plateau_switches_phase_and_stops_when_torchs_scheduler_does(trainer, tm
 
 
 @pytest.mark.parametrize("stop", [2, 8, 15, 20])
-def test_plateau_goes_on_where_it_was(trainer, tmp_path, stop):
+def test_plateau_resumes(trainer, tmp_path, stop):
     trainer(PAPER, "whole").run()
 
     def interrupt(report):
@@ -395,7 +396,7 @@ def test_a_run_of_an_earlier_version_goes_on(trainer, tmp_path, recipe):
 
 
 def test_weights_of_an_earlier_version_belong_to_the_same_run(trainer, tmp_path):
-    """Without a state, recipe.json tells whose they are."""
+    """Without a state, recipe.json identifies the run."""
     trainer().run()
     as_of_an_earlier_version(tmp_path / "run")
     (tmp_path / "run" / "state.safetensors").unlink()
@@ -435,7 +436,7 @@ def test_epochs_of_recorded_pairs(pairs, calibration, tmp_path):
     assert [line["step"] for line in log(tmp_path / "run") if line["psnr"] is not None] == [5, 10]
 
 
-def test_run_on_photographs_does_not_go_on_with_pairs(trainer, pairs, calibration, tmp_path):
+def test_run_on_photographs_is_not_resumed_with_pairs(trainer, pairs, calibration, tmp_path):
     trainer().run()
     with pytest.raises(CheckpointError, match="or on other pairs"):
         prepare(few(validation=3), calibration, pairs=pairs, out=tmp_path / "run", device="cpu")
@@ -478,14 +479,14 @@ def test_captures_on_the_sheet_change_nothing_else(trainer, photos, calibration,
     assert (sheets[1] != sheets[2]).any()
 
 
-def test_capture_that_does_not_fit_is_found_before_training(calibration, photos, tmp_path):
+def test_capture_that_does_not_fit_is_reported_before_training(calibration, photos, tmp_path):
     np.save(tmp_path / "small.npy", np.ones((30, 32, 3), np.float32))
     recipe = replace(RECIPE, sheet=Sheet((str(tmp_path / "small.npy"),)))
     with pytest.raises(ShapeError, match="same height and width"):
         prepare(recipe, calibration, photos=photos, out=tmp_path / "run", device="cpu")
 
 
-# --- What is refused ----------------------------------------------------------------------------------
+# --- Errors -------------------------------------------------------------------------------------------
 
 
 def test_another_recipe_or_psf_in_the_same_folder(trainer, photos, calibration, tmp_path):
@@ -504,7 +505,7 @@ def test_another_recipe_or_psf_in_the_same_folder(trainer, photos, calibration, 
 
 
 def test_weights_of_another_run_are_not_replaced(trainer, tmp_path):
-    """Without its state too, which is large and may have been removed; where no weights are, nothing can be lost."""
+    """Not even if its large state was removed. Without weights, nothing can be lost."""
     trainer().run()
     folder = tmp_path / "run"
     (folder / "state.safetensors").unlink()
@@ -538,7 +539,7 @@ def test_damaged_or_foreign_state(trainer, tmp_path):
         trainer()
 
 
-def test_folder_that_cannot_be_written_is_found_before_training(trainer, tmp_path):
+def test_folder_that_cannot_be_written_is_reported_before_training(trainer, tmp_path):
     (tmp_path / "run").write_text("a file")
     with pytest.raises(ParameterError, match=r"`.*run` must be a folder that can be written to: .*`--out`"):
         trainer()
@@ -549,7 +550,7 @@ def test_folder_that_cannot_be_written_is_found_before_training(trainer, tmp_pat
 
 @pytest.mark.parametrize("refused", ["last.safetensors", "best.safetensors", "state.safetensors"])
 def test_full_disk_leaves_the_state(trainer, tmp_path, monkeypatch, refused):
-    """As soon as one of the three files of a checkpoint cannot be finished."""
+    """Whichever of the three files of a checkpoint cannot be written."""
     run, folder = trainer(), tmp_path / "run"
     for _ in range(3):
         run.advance()
@@ -589,8 +590,8 @@ def test_divergence_leaves_the_state(trainer, tmp_path):
     assert trainer(few(steps=9)).step == 3
 
 
-def test_divergence_that_the_validation_meets(trainer, tmp_path):
-    """Before it writes a picture or weights."""
+def test_divergence_in_the_validation(trainer, tmp_path):
+    """It is reported before a picture or weights are written."""
     run = trainer(few(steps=1, validate_every=1, warmup=0, learning_rate=1e30, clip=0.0, bfloat16=False))
     with pytest.raises(DivergenceError, match="The loss of the validation after step 1 is not finite"):
         run.run()
@@ -630,25 +631,27 @@ def test_a_network_that_cannot_learn_from_the_samples(photos, tmp_path):
 # --- Across cameras, and from known weights -----------------------------------------------------------
 
 
-def test_a_network_of_all_cameras_belongs_to_none(trainer, tmp_path):
+def test_a_network_for_all_cameras_has_no_psf_hash(trainer, tmp_path):
     recipe = replace(few(steps=3), cameras=Cameras(("32x32", "32x48")))
     trainer(recipe).run()
     assert read_metadata(tmp_path / "run" / "last.safetensors")["psf_hash"] is None
 
 
-def test_a_run_begins_with_the_weights_it_is_given(trainer, tmp_path):
+def test_a_run_starts_from_given_weights(trainer, tmp_path):
     trainer(few(steps=3)).run()
     start = str(tmp_path / "run" / "last.safetensors")
     first = trainer(few(start=start), "second").network
-    known = load_network(start)
-    assert all(torch.equal(a, b) for a, b in zip(first.state_dict().values(), known.state_dict().values(), strict=True))
+    weights = load_network(start)
+    assert all(
+        torch.equal(a, b) for a, b in zip(first.state_dict().values(), weights.state_dict().values(), strict=True)
+    )
     wider = replace(few(start=start), network={**RECIPE.network, "width": 8})
     with pytest.raises(CheckpointError, match="must hold the network of the recipe") as error:
         trainer(wider, "third")
     assert len(str(error.value).splitlines()) == 1
 
 
-def test_a_run_with_a_pool_that_is_stopped_ends_as_one_that_was_not(trainer, tmp_path):
+def test_a_resumed_run_with_a_cache_ends_as_an_unbroken_one(trainer, tmp_path):
     pooled = few(pool=4)
     trainer(pooled, "whole").run()
     stopped = trainer(pooled, "stopped")
@@ -659,22 +662,22 @@ def test_a_run_with_a_pool_that_is_stopped_ends_as_one_that_was_not(trainer, tmp
     assert same(tmp_path / "whole" / "last.safetensors", tmp_path / "stopped" / "last.safetensors")
 
 
-def test_a_denoiser_is_trained_alone_and_then_stays(trainer, tmp_path):
-    """From noisy scenes; then it is part of a network whose U-Net learns, by a pool or without."""
+def test_a_denoiser_is_trained_alone_and_then_frozen(trainer, tmp_path):
+    """Trained on noisy scenes, then part of a network whose U-Net learns, with a cache or without."""
     learned = trainer(replace(few(steps=40, learning_rate=5e-3), network=DRUNET, denoising=Denoising((0.05, 0.1))), "a")
     losses = []
     learned.run(lambda report: losses.append(report.loss))
     assert sum(losses[-10:]) < 0.7 * sum(losses[:10])
 
-    known = load_network(tmp_path / "a" / "best.safetensors").state_dict()
+    denoiser = load_network(tmp_path / "a" / "best.safetensors").state_dict()
     for name, pool in (("kept", 4), ("new", 0)):
         recipe = few(steps=2, denoiser=str(tmp_path / "a" / "best.safetensors"), pool=pool)
-        second = trainer(replace(recipe, network={**RECIPE.network, "rounds": 2}), name)
+        second = trainer(replace(recipe, network={**RECIPE.network, "finest": 1, "rounds": 2}), name)
         head = second.network.decoder.head.weight.clone()
         second.run()
         assert not torch.equal(second.network.decoder.head.weight, head)
         for key, value in load_network(tmp_path / name / "last.safetensors").denoiser.state_dict().items():
-            torch.testing.assert_close(value, known[key])
+            torch.testing.assert_close(value, denoiser[key])
 
     with pytest.raises(CheckpointError, match=r"`denoiser` \('.*best.safetensors'\) its denoiser, if it has one"):
         trainer(few(denoiser=str(tmp_path / "a" / "best.safetensors")), "none")

@@ -1,4 +1,4 @@
-"""Validation: its numbers by their definition, and what its sheet shows."""
+"""Validation: its scores by their definition, and the contact sheet."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ RECIPE = Recipe({"name": "unet"}, Schedule(batch=2, validation=5), {"mse": 1.0, 
 
 
 class Numbered(Samples):
-    """Pair n is drawn from a generator seeded by n; remembers what was asked for."""
+    """Pair n is random with seed n; records the requested numbers."""
 
     name = "numbered"
 
@@ -32,7 +32,7 @@ class Numbered(Samples):
 
 
 class Darker(nn.Module):
-    """Leaves [0, 1]: it must be clipped for the PSNR and not for the loss."""
+    """Its output exceeds [0, 1]: it must be clipped for the PSNR, but not for the loss."""
 
     def forward(self, measurement, psf):
         return 1.5 * measurement - 0.2
@@ -59,7 +59,7 @@ def test_means_over_the_samples_whatever_the_batch(batch):
 
 @pytest.mark.parametrize("shown", [1, 3, 6, 8])
 def test_captures_stand_beside_the_pairs(shown):
-    """Five pairs, and six captures at most; white where one has more than the other."""
+    """Five pairs, and at most six captures; white where rows are missing."""
     captures = torch.rand(shown, 3, *SIZE)
     network = Darker()
     sheet = Validator(RECIPE, SupervisedTask(Numbered()), PSF, captures)(network, Loss(RECIPE.loss), "step 3").sheet

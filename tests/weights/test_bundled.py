@@ -1,4 +1,4 @@
-"""The networks in the package, and those of a hub: a server of files on this machine."""
+"""Bundled networks, and networks of a hub, here a file server on this machine."""
 
 import hashlib
 import json
@@ -21,7 +21,7 @@ CARD = files("mwdn") / "weights" / "README.md"
 
 
 @pytest.mark.parametrize(("name", "most"), list(zip(BUNDLED, (5e6, 2e6), strict=True)))
-def test_bundled_networks_are_whole_and_for_any_camera(name, most):
+def test_bundled_networks_are_intact_and_for_any_camera(name, most):
     path = find_weights(name)
     assert hashlib.sha256(path.read_bytes()).hexdigest() in CARD.read_text(encoding="utf-8")
     network, header = load_network(path), read_metadata(path)
@@ -52,7 +52,7 @@ def test_bundling_rounds_and_remembers(tmp_path):
 
 
 def test_bundling_with_another_denoiser(tmp_path):
-    """What a user trains on scenes of his kind."""
+    """For example one trained on a user's own kind of scenes."""
     whole, denoiser, other, out = (tmp_path / f"{name}.safetensors" for name in ("whole", "denoiser", "other", "out"))
     networks = {}
     for path, name, options in (
@@ -63,12 +63,12 @@ def test_bundling_with_another_denoiser(tmp_path):
         networks[path] = build(name, **options)
         save_network(path, networks[path], name, options)
     for network, part in ((whole, other), (other, denoiser)):
-        with pytest.raises(CheckpointError, match=f"{network.name}` has no denoiser that .*{part.name}` fits"):
+        with pytest.raises(CheckpointError, match=f"{network.name}` has no denoiser .*{part.name}`"):
             bundle(network, out, part)
     assert not out.exists()
     bundle(whole, out, denoiser)
-    found = load_network(out)
-    for module, expected in ((found.denoiser, networks[denoiser]), (found.encoder, networks[whole].encoder)):
+    bundled = load_network(out)
+    for module, expected in ((bundled.denoiser, networks[denoiser]), (bundled.encoder, networks[whole].encoder)):
         for one, another in zip(module.parameters(), expected.parameters(), strict=True):
             torch.testing.assert_close(one, another, rtol=1e-3, atol=1e-6)
 
@@ -84,18 +84,18 @@ FETCH = "import sys; from mwdn.weights.bundled import find_weights; print(find_w
 
 @pytest.fixture
 def hub(tmp_path):
-    """``hub(name)`` fetches from a server that has one file, in the way of `huggingface_hub`."""
+    """``hub(name)`` downloads with `huggingface_hub` from a server that has one file."""
     pytest.importorskip("huggingface_hub", reason="needs `pip install 'mwdn[hub]'`")
     content = find_weights("universal-small").read_bytes()
 
     class Files(BaseHTTPRequestHandler):
         def do_HEAD(self):
-            found = self.path == "/some/camera/resolve/main/model.safetensors"
-            self.send_response(200 if found else 404)
-            self.send_header("Content-Length", str(len(content) if found else 0))
+            exists = self.path == "/some/camera/resolve/main/model.safetensors"
+            self.send_response(200 if exists else 404)
+            self.send_header("Content-Length", str(len(content) if exists else 0))
             self.send_header("ETag", '"1234"')
             self.send_header("X-Repo-Commit", "0" * 40)
-            if not found:
+            if not exists:
                 self.send_header("X-Error-Code", "EntryNotFound")
             self.end_headers()
 
@@ -126,7 +126,7 @@ def hub(tmp_path):
     server.server_close()
 
 
-def test_a_network_of_the_hub_is_fetched_once(hub):
+def test_a_network_of_the_hub_is_downloaded_once(hub):
     first = hub("hub:some/camera")
     assert first.returncode == 0, first.stderr
     path = Path(first.stdout.strip())
@@ -134,7 +134,7 @@ def test_a_network_of_the_hub_is_fetched_once(hub):
     assert hub("hub:some/camera").stdout == first.stdout
 
 
-def test_what_the_hub_does_not_have_is_named(hub):
+def test_the_error_names_what_the_hub_does_not_have(hub):
     missing = hub("hub:some/camera/other.safetensors")
     assert missing.returncode != 0
     assert "CheckpointError: `hub:some/camera/other.safetensors` cannot be fetched" in missing.stderr

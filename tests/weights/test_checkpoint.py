@@ -1,4 +1,4 @@
-"""Networks in files of this package and of the paper's authors; files that are neither."""
+"""Checkpoints of this package and of the paper's authors; and other files."""
 
 import inspect
 import json
@@ -17,8 +17,10 @@ from mwdn.weights.checkpoint import load_network, read_metadata, save_network
 
 
 def small(name):
-    wanted = {"width": 4, "pooling": "average", "size": (9, 9), **({"weight": 0.02} if name == "wiener" else {})}
-    options = {key: wanted[key] for key in wanted.keys() & inspect.signature(NETWORKS[name]).parameters.keys()}
+    small_options = {"width": 4, "pooling": "average", "size": (9, 9), **({"weight": 0.02} if name == "wiener" else {})}
+    options = {
+        key: small_options[key] for key in small_options.keys() & inspect.signature(NETWORKS[name]).parameters.keys()
+    }
     return build(name, **options), options
 
 
@@ -26,12 +28,12 @@ def pair(generator, size=(32, 48)):
     return torch.rand(1, 3, *size, generator=generator), torch.rand(1, 3, *size, generator=generator) ** 4
 
 
-# --- This package's own -------------------------------------------------------------------------------
+# --- This package -------------------------------------------------------------------------------------
 
 
 @torch.no_grad()
 @pytest.mark.parametrize("name", NETWORKS)
-def test_what_is_saved_is_what_is_loaded(tmp_path, name, generator):
+def test_a_saved_network_is_loaded_unchanged(tmp_path, name, generator):
     network, options = small(name)
     b, h = pair(generator)
     network.train()(b, h)  # moves the running means
@@ -48,9 +50,9 @@ def test_what_is_saved_is_what_is_loaded(tmp_path, name, generator):
 def test_metadata(tmp_path):
     network, options = small("mwdn")
     save_network(tmp_path / "a.safetensors", network, "mwdn", options, psf_hash="00ff", recipe={"lr": 1e-4})
-    found = read_metadata(tmp_path / "a.safetensors")
-    assert found.pop("version").count(".") == 2
-    assert found == {"name": "mwdn", "options": options, "psf_hash": "00ff", "recipe": {"lr": 1e-4}}
+    header = read_metadata(tmp_path / "a.safetensors")
+    assert header.pop("version").count(".") == 2
+    assert header == {"name": "mwdn", "options": options, "psf_hash": "00ff", "recipe": {"lr": 1e-4}}
 
 
 def test_saving_replaces_and_a_failed_save_does_not(tmp_path):
@@ -65,7 +67,7 @@ def test_saving_replaces_and_a_failed_save_does_not(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["net.pt", "net"])
-def test_saved_under_a_name_that_would_not_load(tmp_path, name):
+def test_only_safetensors_are_saved(tmp_path, name):
     network, options = small("unet")
     with pytest.raises(CheckpointError, match=rf"`.*{name}` must end in \.safetensors"):
         save_network(tmp_path / name, network, "unet", options)
@@ -105,7 +107,7 @@ def test_weights_of_another_shape(tmp_path):
     assert "\n" not in str(caught.value)
 
 
-def test_weights_that_are_no_numbers(tmp_path):
+def test_weights_that_are_not_finite(tmp_path):
     network, options = small("mwdn")
     with torch.no_grad():
         next(network.parameters())[0] = torch.nan
@@ -114,7 +116,7 @@ def test_weights_that_are_no_numbers(tmp_path):
         load_network(tmp_path / "a.safetensors")
 
 
-def test_others_may_read_weights_as_any_new_file(tmp_path):
+def test_weights_have_the_permissions_of_any_new_file(tmp_path):
     network, options = small("mwdn")
     save_network(tmp_path / "a.safetensors", network, "mwdn", options)
     (tmp_path / "new").touch()
@@ -147,11 +149,11 @@ def test_missing_file(tmp_path, name):
         load_network(tmp_path / name)
 
 
-# --- The authors' -------------------------------------------------------------------------------------
+# --- The authors --------------------------------------------------------------------------------------
 
 
 def double(state, name, inputs, outputs, inner, generator):
-    """(3x3 convolution, BatchNorm, ReLU) twice, by the authors' names 0 to 5."""
+    """Random weights of a double (3x3 convolution, BatchNorm, ReLU), under the authors' names 0 to 5."""
     for index, (a, b) in ((0, (inputs, inner)), (3, (inner, outputs))):
         state[f"{name}.double_conv.{index}.weight"] = torch.randn(b, a, 3, 3, generator=generator) / (3 * a**0.5)
         state[f"{name}.double_conv.{index}.bias"] = 0.1 * torch.randn(b, generator=generator)
@@ -164,7 +166,7 @@ def double(state, name, inputs, outputs, inner, generator):
 
 
 def authors(generator, *, cpsf, width=4):
-    """State of the authors' network at any width, all its numbers random."""
+    """State of the authors' network at any width, with random weights."""
     state = {"w": 1e-3 * (1 + torch.rand(1 if cpsf else 4, generator=generator))}
     state["delta"] = 1e-2 * (0.5 + torch.rand(5 if cpsf else 4, generator=generator))
     widths = (3, width, 2 * width, 4 * width, 8 * width, 8 * width)
@@ -197,21 +199,21 @@ def blocks(state, name, x):
 
 
 def features(state, names, x):
-    found = [blocks(state, names[0], x)]
+    scales = [blocks(state, names[0], x)]
     for name in names[1:]:
-        found.append(blocks(state, f"{name}.avgpool_conv.1", F.avg_pool2d(found[-1], 2)))
-    return found
+        scales.append(blocks(state, f"{name}.avgpool_conv.1", F.avg_pool2d(scales[-1], 2)))
+    return scales
 
 
 def circular_wiener(b, h, constant):
-    """Eq. (2) on a circle with the PSF's centre where it is; the result is moved by half of the picture."""
+    """Eq. (2) with circular boundaries and an unshifted PSF; the result is shifted by half the frame instead."""
     H = torch.fft.rfft2(h)
     v = torch.fft.irfft2(H.conj() / (H.abs() ** 2 + constant) * torch.fft.rfft2(b), s=b.shape[-2:])
     return v.roll((b.shape[-2] // 2, b.shape[-1] // 2), (-2, -1))
 
 
-def as_authors_would(state, b, h, *, cpsf):
-    """Their networks' output, as methods.md describes them, for a PSF whose peak is 1."""
+def authors_output(state, b, h, *, cpsf):
+    """Output of the authors' network for a PSF with a peak of 1."""
     *skips, x = features(state, ["inc", "down1", "down2", "down3", "down4"], b)
     if cpsf:
         psfs = features(state, ["inc0", "down11", "down22", "down33"], state["w"] * h)
@@ -227,14 +229,14 @@ def as_authors_would(state, b, h, *, cpsf):
 @torch.no_grad()
 @pytest.mark.parametrize("prefix", ["", "module."])
 @pytest.mark.parametrize("cpsf", [False, True], ids=["mwdn", "mwdn-cpsf"])
-def test_authors_checkpoint_computes_what_theirs_does(tmp_path, cpsf, prefix, generator):
+def test_authors_checkpoint_gives_their_output(tmp_path, cpsf, prefix, generator):
     state = authors(generator, cpsf=cpsf)
     wrapped = {"net_state_dict": {prefix + key: value for key, value in state.items()}, "epoch": 299}
     torch.save(wrapped, tmp_path / "best.tar")
     network = load_network(tmp_path / "best.tar")
     b, h = pair(generator, (32, 48))
     h = h / h.max()
-    expected = as_authors_would(state, b, h, cpsf=cpsf)
+    expected = authors_output(state, b, h, cpsf=cpsf)
     assert expected.std() > 0.01
     torch.testing.assert_close(network(b, h), expected, rtol=1e-3, atol=1e-3 * expected.abs().max().item())
 
@@ -254,7 +256,7 @@ def test_negative_constants_are_refused(tmp_path, key, index, generator):
         load_network(tmp_path / "a.pt")
 
 
-def test_lambda_that_nothing_uses_may_be_anything(generator):
+def test_the_unused_lambda_may_be_negative(generator):
     state = authors(generator, cpsf=True)
     state["delta"][4] = -1
     assert load_authors(state).unused_regularisation.item() == -1
@@ -274,7 +276,7 @@ def test_lambda_that_nothing_uses_may_be_anything(generator):
         ("w", None, "is neither a checkpoint of mwdn"),
     ],
 )
-def test_authors_names_with_other_tensors(tmp_path, cpsf, key, value, message, generator):
+def test_wrong_tensors_under_the_authors_names(tmp_path, cpsf, key, value, message, generator):
     state = authors(generator, cpsf=cpsf)
     if value is None:
         del state[key]
@@ -285,7 +287,7 @@ def test_authors_names_with_other_tensors(tmp_path, cpsf, key, value, message, g
         load_network(tmp_path / "a.tar")
 
 
-# --- Neither ------------------------------------------------------------------------------------------
+# --- Others -------------------------------------------------------------------------------------------
 
 
 class Bomb:

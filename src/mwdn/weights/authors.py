@@ -1,4 +1,4 @@
-"""Checkpoints of the MWDN authors' public code (github.com/IOE8AILab/MWDNs), read into this package's networks."""
+"""Load checkpoints of the MWDN authors' public code (github.com/IOE8AILab/MWDNs)."""
 
 from typing import Any
 
@@ -9,9 +9,9 @@ from mwdn.errors import CheckpointError
 from mwdn.networks import build
 
 OPTIONS: dict[str, Any] = {"pooling": "average", "boundary": "circular"}
-"""What their code does otherwise than their paper, for both networks."""
+"""Where their code differs from their paper, for both networks."""
 
-# Their module names, beside ours. Each scale is a double convolution, in theirs wrapped once more.
+# Their module names and ours. Each scale is a double convolution, which theirs wraps in one more module.
 _ENCODER = {"inc": "0", "down1.avgpool_conv.1": "1", "down2.avgpool_conv.1": "2", "down3.avgpool_conv.1": "3"}
 _MODULES = {f"{theirs}.double_conv": f"encoder.scales.{ours}" for theirs, ours in _ENCODER.items()}
 _MODULES |= {"down4.avgpool_conv.1.double_conv": "encoder.scales.4", "outc.conv": "decoder.head"}
@@ -23,20 +23,20 @@ _MODULES |= {
 
 
 def is_authors(state: dict[str, Tensor]) -> bool:
-    """Whether these weights have the authors' names."""
+    """Whether the tensors have the authors' names."""
     return {"w", "delta", "inc.double_conv.0.weight", "outc.conv.weight"} <= state.keys()
 
 
 def load_authors(state: dict[str, Tensor]) -> nn.Module:
-    """MWDN or MWDN-CPSF, in the form of the authors' code, with these weights.
+    """Build MWDN or MWDN-CPSF as in the authors' code, with their weights.
 
-    Their networks take the PSF as stored, in [0, 1] with its background: calibrate with ``background=0``.
+    These networks take the PSF as stored, in [0, 1] with its background: calibrate with ``background=0``.
 
     Args:
-        state: tensors by the authors' names.
+        state: tensors under the authors' names.
 
     Raises:
-        CheckpointError: a tensor is missing, superfluous or of another shape, or a w or lambda is not positive.
+        CheckpointError: a tensor is missing, unexpected or of another shape, or a w or lambda is not positive.
     """
     name = "mwdn-cpsf" if "inc0.double_conv.0.weight" in state else "mwdn"
     extra = {"authors_scalars": True} if name == "mwdn-cpsf" else {"psf_pooling": "average"}
@@ -74,7 +74,7 @@ def _renamed(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:
 def _logarithm(name: str, values: Tensor) -> Tensor:
     if not (values > 0).all():
         raise CheckpointError(
-            f"`{name}` ({values.tolist()}) must be positive: its logarithm is what this package learns, and a filter "
-            "with a negative lambda has poles. Train longer, or take another checkpoint."
+            f"`{name}` ({values.tolist()}) must be positive: this package stores its logarithm, and a filter with a "
+            "negative lambda has poles. Train longer, or take another checkpoint."
         )
     return torch.log(values)

@@ -1,4 +1,4 @@
-"""Trained networks by name: those that come with the package, and those on the Hugging Face hub."""
+"""Trained networks by name: bundled with the package, or on the Hugging Face hub."""
 
 from importlib.resources import files
 from pathlib import Path
@@ -9,19 +9,19 @@ from mwdn.errors import CheckpointError
 from mwdn.weights.checkpoint import load_network, read_metadata, save_network
 
 BUNDLED = ("universal", "universal-small")
-"""Networks for any camera. Their model card is `mwdn/weights/README.md`."""
+"""Bundled networks, for any camera. Model card: `mwdn/weights/README.md`."""
 
 HUB = "hub:"
-"""``hub:owner/name`` is the file model.safetensors of that repository, ``hub:owner/name/file`` another one."""
+"""Prefix: ``hub:owner/name`` is model.safetensors of that repository, ``hub:owner/name/file`` another file."""
 
 _FOLDER = Path(str(files("mwdn") / "weights"))
 
 
 def find_weights(name: str) -> Path | None:
-    """The file of a bundled network, or of one on the hub, which is downloaded once; ``None`` for any other name.
+    """File of a bundled network, or of one on the hub, downloaded once; ``None`` for any other name.
 
     Raises:
-        CheckpointError: the hub does not have it, or cannot be reached.
+        CheckpointError: it is not on the hub, or the hub cannot be reached.
     """
     if name in BUNDLED:
         return _FOLDER / f"{name}.safetensors"
@@ -48,15 +48,15 @@ def _download(name: str) -> Path:
 
 
 def bundle(checkpoint: Path, out: Path, denoiser: Path | None = None) -> None:
-    """Write a checkpoint's weights as float16, with all that it says of itself.
+    """Write a checkpoint with float16 weights and its whole metadata.
 
     Args:
         checkpoint: of a network.
         out: the file to write.
-        denoiser: checkpoint of the one that takes the place of the network's own.
+        denoiser: checkpoint of a denoiser to replace the network's own.
 
     Raises:
-        CheckpointError: a checkpoint cannot be used, or a weight does not fit float16.
+        CheckpointError: a checkpoint cannot be used, or a weight exceeds the range of float16.
     """
     header = read_metadata(checkpoint)
     network = load_network(checkpoint)
@@ -64,7 +64,7 @@ def bundle(checkpoint: Path, out: Path, denoiser: Path | None = None) -> None:
         try:
             network.get_submodule("denoiser").load_state_dict(load_network(denoiser).state_dict())
         except (AttributeError, RuntimeError) as error:
-            raise CheckpointError(f"`{checkpoint}` has no denoiser that `{denoiser}` fits: {error}") from error
+            raise CheckpointError(f"`{checkpoint}` has no denoiser like that of `{denoiser}`: {error}") from error
     network = network.half()
     if not all(torch.isfinite(value).all() for value in network.state_dict().values()):
         raise CheckpointError(f"`{checkpoint}` holds weights beyond the range of float16, 65504.")

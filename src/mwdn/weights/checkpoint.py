@@ -1,4 +1,4 @@
-"""Networks in files: safetensors with what it takes to build them again. Nothing is pickled."""
+"""Checkpoints: safetensors with the name and options to build the network again. Nothing is pickled."""
 
 import json
 from pathlib import Path
@@ -18,7 +18,7 @@ from mwdn.version import __version__
 from mwdn.weights.authors import is_authors, load_authors
 
 SUFFIXES = frozenset({".safetensors", ".pt", ".pth", ".tar", ".ckpt"})
-"""Suffixes of files that hold weights."""
+"""Suffixes of weight files."""
 
 
 def save_network(
@@ -34,11 +34,11 @@ def save_network(
         path: ends in ``.safetensors``.
         network: as built by ``build(name, **options)``.
         name: of the network.
-        options: it was built with; plain values that JSON can hold.
-        **metadata: more to remember, for example the recipe, the PSF's hash, metrics, the version that trained it.
+        options: of the network; plain values that JSON can hold.
+        **metadata: further entries, for example the recipe, the PSF's hash, metrics.
 
     Raises:
-        CheckpointError: another suffix.
+        CheckpointError: the path has another suffix.
     """
     if Path(path).suffix != ".safetensors":
         raise CheckpointError(f"`{path}` must end in .safetensors, not '{Path(path).suffix}'. Rename it.")
@@ -49,10 +49,10 @@ def save_network(
 
 
 def read_metadata(path: str | Path) -> dict[str, Any]:
-    """What `save_network` stored beside the weights: name, options, version and more.
+    """The metadata that `save_network` stored: name, options, version and more.
 
     Raises:
-        CheckpointError: not a checkpoint of this package.
+        CheckpointError: the file is no checkpoint of this package.
     """
     try:
         with safe_open(path, framework="pt") as file:
@@ -60,7 +60,7 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
     except (SafetensorError, OSError) as error:
         raise CheckpointError(f"`{path}` cannot be read as safetensors: {error}.") from error
     if text is None:
-        raise CheckpointError(f"`{path}` was not written by mwdn: it does not say which network it belongs to.")
+        raise CheckpointError(f"`{path}` was not written by mwdn: its metadata names no network. Use `save_network`.")
     try:
         header = json.loads(text)
     except json.JSONDecodeError as error:
@@ -75,14 +75,14 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
 
 
 def load_network(path: str | Path) -> nn.Module:
-    """Build the network that a file describes, with its weights, on the CPU, in evaluation mode.
+    """Load a network from a checkpoint, on the CPU, in evaluation mode.
 
     Args:
-        path: a checkpoint of this package (``.safetensors``), or one of the MWDN authors (``.tar`` and the like,
-            read without unpickling code).
+        path: a checkpoint of this package (``.safetensors``), or of the MWDN authors (``.tar`` and the like, read
+            without unpickling code).
 
     Raises:
-        CheckpointError: damaged, of unknown layout, or its weights do not fit its network.
+        CheckpointError: the file is damaged, has an unknown layout, or its weights do not fit its network.
     """
     path = Path(path)
     if not path.is_file():
@@ -96,41 +96,41 @@ def load_network(path: str | Path) -> nn.Module:
     except (TypeError, ParameterError) as error:
         version = header.get("version", "unknown")
         raise CheckpointError(
-            f"`{path}`, of mwdn {version}, names a network that cannot be built: {error} Update mwdn."
+            f"`{path}`, of mwdn {version}, has a network that cannot be built: {error} Update mwdn."
         ) from error
     with safe_open(path, framework="pt") as file:
         state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     try:
-        network.load_state_dict(state)  # float16 in files that come with the package, float32 here
+        network.load_state_dict(state)  # converts the bundled float16 weights to float32
     except RuntimeError as error:
         raise CheckpointError(
             f"`{path}` does not fit the network '{header['name']}' it names: {first_difference(error)}. Copy it again."
         ) from error
-    broken = [key for key, value in network.state_dict().items() if not value.isfinite().all()]
-    if broken:
-        raise CheckpointError(f"`{path}` holds NaN or infinity, `{broken[0]}` first. Take weights from before that.")
+    not_finite = [key for key, value in network.state_dict().items() if not value.isfinite().all()]
+    if not_finite:
+        raise CheckpointError(f"`{path}` holds NaN or infinity, `{not_finite[0]}` first. Use an earlier checkpoint.")
     return network.eval()
 
 
 def read_plain(path: Path) -> Any:  # noqa: ANN401
-    """What `torch.save` wrote, on the CPU, without running code from the file.
+    """Read a file of `torch.save`, on the CPU, without running code from it.
 
     Raises:
-        CheckpointError: damaged, or it holds more than plain values.
+        CheckpointError: the file is damaged, or holds more than plain values.
     """
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many kinds for damaged files
-        # Of torch's own words none: they go on for ten lines, and advise to unpickle the file all the same.
+        # Without torch's message, which is ten lines long and suggests unpickling the file nevertheless.
         objects = isinstance(error, UnpicklingError) and "Unsupported operand" not in str(error)
-        why = "it holds objects, whose code is not run" if objects else "it is damaged, or something else"
+        why = "it holds objects, whose code is not run" if objects else "it is damaged, or of another format"
         raise CheckpointError(
             f"`{path}` cannot be read as plain weights: {why}. Copy it again, or save its `state_dict()` alone."
         ) from error
 
 
 def first_difference(error: Exception) -> str:
-    """What `load_state_dict` complains of first, on one line: it names every key on lines of their own."""
+    """The first difference in an error of `load_state_dict`, which lists every key, in one line."""
     return shorten(str(error).partition(":\n")[2] or str(error), 200, placeholder=" ...").rstrip(".")
 
 
