@@ -160,7 +160,7 @@ def test_it_runs_without_torch(exported, tmp_path):
     told = subprocess.run(call, capture_output=True, text=True, check=False, timeout=120)
     assert told.returncode == 0, told.stderr
     assert camera().psf_hash in told.stdout
-    taken = Calibration(camera().psf, bit_depth=12, dark=torch.full((1, 3, *SIZE), 100 / 4095))
+    taken = replace(camera(), dark=torch.full((1, 3, *SIZE), 100 / 4095))
     scene = Reconstructor(mwdn, taken, device="cpu", precision="exact")(taken.correct(read_frame(names[0])))
     expected = srgb_encode(to_display(scene))[0].movedim(0, -1).numpy() * 255
     assert np.abs(read_frame(names[1]) - expected).max() <= 1
@@ -332,19 +332,10 @@ class Cumulative(nn.Module):
 
 
 class Careless(nn.Module):
-    """It remembers its first call: what is exported is another function."""
-
-    def __init__(self):
-        super().__init__()
-        self.calls = 0
-
-    def __deepcopy__(self, memo):
-        copy = Careless()
-        copy.calls = self.calls + 1
-        return copy
+    """It computes something else while it is exported."""
 
     def forward(self, measurement, psf):
-        return measurement * self.calls
+        return measurement * (2 if torch.compiler.is_compiling() else 1)
 
 
 @pytest.mark.parametrize(
