@@ -15,7 +15,7 @@ import mwdn
 from cameras import contour_psf
 from mwdn import Camera, read_frame
 from mwdn.cli.app import main
-from mwdn.cli.demo import METHODS
+from mwdn.cli.demo import METHODS, PICTURES
 
 SIZE = 32, 40
 
@@ -330,15 +330,18 @@ def test_without_trust(run, camera):
 # --- The others ---------------------------------------------------------------------------------------
 
 
-def test_demo(run, tmp_path):
-    code, out, err = run("demo", "--out", tmp_path / "demo")
+@pytest.mark.parametrize("pictures", [PICTURES[-1:], pytest.param(PICTURES, marks=pytest.mark.acceptance)])
+def test_demo(run, tmp_path, pictures):
+    """With one picture here; each takes ten seconds."""
+    options = [word for name in pictures for word in ("--pictures", name)]
+    code, out, err = run("demo", "--out", tmp_path / "demo", *options)
     assert (code, err) == (0, "")
     assert names(tmp_path / "demo") == ["comparison.png", "index.html", "psf.png"]
     rows = {
         words[0]: dict(zip(METHODS, map(float, words[1:]), strict=True))
         for words in (re.findall(r"[\w.]+", line) for line in out.splitlines() if line.startswith("│"))
     }
-    assert set(rows) == {"astronaut", "coffee", "cat"}
+    assert set(rows) == set(pictures)
     assert all(row["universal"] > 24.5 for row in rows.values()), rows
     assert all(row["admm"] > 24 for row in rows.values()), rows
     assert all(row["admm"] > row["fista"] > row["wiener"] > 15 for row in rows.values()), rows
@@ -348,7 +351,7 @@ def test_demo(run, tmp_path):
     assert 'src="psf.png"' in page
     assert 'src="comparison.png"' in page
     assert str(tmp_path / "demo" / "index.html") in out  # on one line, to be clicked or copied
-    assert read_frame(tmp_path / "demo" / "comparison.png").shape == (26 + 3 * 246, 7 * 246, 3)
+    assert read_frame(tmp_path / "demo" / "comparison.png").shape == (26 + len(pictures) * 246, 7 * 246, 3)
 
 
 def test_doctor(run):

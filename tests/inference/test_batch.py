@@ -491,13 +491,15 @@ def test_a_machine_goes_on_without_another(shop, single, free_port):
 
 @linux
 def test_killed_work_goes_on_where_it_was(shop, single):
-    process = two(shop, "killed")
-    kill_one(process, shop / "killed", goal=4)
+    process, folder = start(shop, "killed"), shop / "killed"
+    while len(list(folder.glob("??.json"))) < 4:
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(0.02)
+    process.send_signal(signal.SIGKILL)
     first, _ = process.communicate(timeout=300)
-    assert process.returncode == 1
-    before = whole(shop / "killed")
-    process = two(shop, "killed")
-    second, err = process.communicate(timeout=300)
+    assert process.returncode == -signal.SIGKILL
+    before = whole(folder)
+    second, err = start(shop, "killed").communicate(timeout=300)
     assert f"{COUNT} of {COUNT + 1} captures reconstructed into killed, {len(before) // 2} of them before" in second, (
         err
     )

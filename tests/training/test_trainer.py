@@ -19,6 +19,7 @@ from safetensors.torch import load_file, save_file
 
 from cameras import contour_psf
 from mwdn.calibration import Calibration
+from mwdn.cli.app import main
 from mwdn.data.cameras import Cameras
 from mwdn.data.noisy import Denoising
 from mwdn.data.pairs import PairFile
@@ -50,20 +51,29 @@ def few(**schedule):
     return replace(RECIPE, schedule=replace(RECIPE.schedule, **schedule))
 
 
-@pytest.fixture
-def photos(tmp_path):
-    """A few smooth pictures in a folder."""
-    (tmp_path / "photos").mkdir()
+def smooth_photos(folder):
+    """Three pictures in a new folder."""
+    folder.mkdir()
     drawn = np.random.default_rng(2)
     for number in range(3):
         smooth = cv2.resize(drawn.integers(0, 256, (4, 4, 3), np.uint8), (24, 24), interpolation=cv2.INTER_CUBIC)
-        cv2.imwrite(str(tmp_path / "photos" / f"{number}.png"), smooth)
-    return tmp_path / "photos"
+        cv2.imwrite(str(folder / f"{number}.png"), smooth)
+    return folder
+
+
+def small_camera():
+    generator = torch.Generator().manual_seed(20230731)
+    return Calibration(contour_psf((32, 32), cell=10, generator=generator).expand(1, 3, -1, -1).contiguous())
 
 
 @pytest.fixture
-def calibration(generator):
-    return Calibration(contour_psf((32, 32), cell=10, generator=generator).expand(1, 3, -1, -1).contiguous())
+def photos(tmp_path):
+    return smooth_photos(tmp_path / "photos")
+
+
+@pytest.fixture
+def calibration():
+    return small_camera()
 
 
 @pytest.fixture
@@ -74,6 +84,14 @@ def trainer(photos, calibration, tmp_path):
         return prepare(recipe, calibration, photos=photos, out=tmp_path / folder, device="cpu")
 
     return make
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Folder of a run of `RECIPE` that nothing stopped."""
+    folder = tmp_path_factory.mktemp("whole")
+    prepare(RECIPE, small_camera(), photos=smooth_photos(folder / "photos"), out=folder / "run", device="cpu").run()
+    return folder / "run"
 
 
 # --- Learning -----------------------------------------------------------------------------------------
@@ -234,12 +252,12 @@ def test_killed_between_log_and_state_repeats_the_step(trainer, tmp_path, monkey
 
 TOML = """
 network = { name = "wiener-bank", width = 4, regularisations = [1e-2, 1e-4], finest = 0, align = false }
-schedule = { steps = 60, batch = 1, warmup = 2, ema = 0.9, validate_every = 7, validation = 2 }
+schedule = { steps = 30, batch = 1, warmup = 2, ema = 0.9, validate_every = 7, validation = 2 }
 """
 
 
 def test_killed_runs_end_as_an_unbroken_one(photos, calibration, tmp_path):
-    """SIGKILL twice, each time after a random number of steps, then undisturbed."""
+    """SIGKILL after a random number of steps, then undisturbed."""
     (tmp_path / "r.toml").write_text(TOML, encoding="utf-8")
     np.save(tmp_path / "psf.npy", calibration.psf[0].movedim(0, -1).numpy() / calibration.psf.max().item())
     line = [sys.executable, "-m", "mwdn", "train", "r.toml", "--psf", "psf.npy", "--photos", str(photos)]
@@ -253,39 +271,39 @@ def test_killed_runs_end_as_an_unbroken_one(photos, calibration, tmp_path):
         return path.read_bytes().count(b"\n") if path.exists() else 0
 
     whole = start("whole")
-    for _ in range(2):
-        process, goal = start("killed"), lines() + random.randint(3, 20)
-        while process.poll() is None and lines() < goal:
-            with pytest.raises(subprocess.TimeoutExpired):
-                process.wait(0.02)
-        process.send_signal(signal.SIGKILL)
-        process.communicate(timeout=60)
-        assert process.returncode == -signal.SIGKILL
-    last = start("killed")
-    for process in (whole, last):
+    process, goal = start("killed"), random.randint(3, 20)
+    while process.poll() is None and lines() < goal:
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.communicate(timeout=60)
+    assert process.returncode == -signal.SIGKILL
+    for process in (whole, start("killed")):
         _, err = process.communicate(timeout=300)
         assert process.returncode == 0, err
     for name in ("best", "last", "state"):
         assert same(tmp_path / "whole" / f"{name}.safetensors", tmp_path / "killed" / f"{name}.safetensors")
-    assert [line["step"] for line in log(tmp_path / "killed")] == list(range(1, 61))
+    assert [line["step"] for line in log(tmp_path / "killed")] == list(range(1, 31))
     assert log(tmp_path / "killed") == log(tmp_path / "whole")
 
 
-def test_two_runs_do_not_share_a_folder(photos, calibration, tmp_path):
+def test_two_runs_do_not_share_a_folder(photos, calibration, tmp_path, monkeypatch, capsys):
     """While one process trains, a second run may neither start nor change the files."""
     (tmp_path / "r.toml").write_text(TOML, encoding="utf-8")
     np.save(tmp_path / "psf.npy", calibration.psf[0].movedim(0, -1).numpy() / calibration.psf.max().item())
-    line = [sys.executable, "-m", "mwdn", "train", "r.toml", "--psf", "psf.npy", "--photos", str(photos), "--steps"]
-    folder, options = tmp_path / "run", {"cwd": tmp_path, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
-    first = subprocess.Popen([*line, "1000000", "--device", "cpu", "--out", "run"], **options)
+    monkeypatch.chdir(tmp_path)
+    line = ["train", "r.toml", "--psf", "psf.npy", "--photos", str(photos), "--steps", "1000000", "--device", "cpu"]
+    folder, options = tmp_path / "run", {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    first = subprocess.Popen([sys.executable, "-m", "mwdn", *line, "--out", "run"], **options)
     try:
         while not (folder / "state.safetensors").exists():
             with pytest.raises(subprocess.TimeoutExpired):
                 first.wait(0.05)
         written = (folder / "log.jsonl").read_text(encoding="utf-8")
-        second = subprocess.run([*line, "1000000", "--device", "cpu", "--out", "run"], **options, timeout=60)
-        assert second.returncode == 2
-        assert b"Another run is using `run`." in second.stderr
+        with pytest.raises(SystemExit) as second:
+            main([*line, "--out", "run"])
+        assert second.value.code == 2
+        assert "Another run is using `run`." in capsys.readouterr().err
         assert (folder / "log.jsonl").read_text(encoding="utf-8").startswith(written)
         first.send_signal(signal.SIGSTOP)  # a stopped process still holds the lock
         with pytest.raises(ParameterError, match="Another run is using"), RunFolder(folder, {}).lock():
@@ -341,28 +359,28 @@ def test_plateau_switches_phase_and_stops_when_torchs_scheduler_does(trainer, tm
     assert read_metadata(tmp_path / "run" / "last.safetensors")["step"] == len(lines)
 
 
-@pytest.mark.parametrize("stop", [2, 8, 15, 20])
-def test_plateau_resumes(trainer, tmp_path, stop):
+def test_plateau_resumes(trainer, tmp_path):
+    """Stopped four times: in each phase, right after a validation and in between."""
     trainer(PAPER, "whole").run()
+    for stop in (2, 8, 15, 20):
 
-    def interrupt(report):
-        if report.step == stop:
-            raise KeyboardInterrupt
+        def interrupt(report, stop=stop):
+            if report.step == stop:
+                raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        trainer(PAPER, "halves").run(interrupt)
-    second = trainer(PAPER, "halves")
-    assert second.step == stop - stop % 2
-    second.run()
-    assert log(tmp_path / "whole") == log(tmp_path / "halves")
+        with pytest.raises(KeyboardInterrupt):
+            trainer(PAPER, "parts").run(interrupt)
+        assert trainer(PAPER, "parts").step == stop - stop % 2
+    last = trainer(PAPER, "parts")
+    last.run()
+    assert log(tmp_path / "whole") == log(tmp_path / "parts")
     for name in ("last", "best", "state"):
-        assert same(tmp_path / "whole" / f"{name}.safetensors", tmp_path / "halves" / f"{name}.safetensors")
-    steps = second.step
-    third = trainer(PAPER, "halves")
-    assert third.lr_schedule == second.lr_schedule
-    assert third.lr_schedule.finished
-    third.run()
-    assert third.step == steps  # it has ended, though not by the number of steps
+        assert same(tmp_path / "whole" / f"{name}.safetensors", tmp_path / "parts" / f"{name}.safetensors")
+    again = trainer(PAPER, "parts")
+    assert again.lr_schedule == last.lr_schedule
+    assert again.lr_schedule.finished
+    again.run()
+    assert again.step == last.step  # it has ended, though not by the number of steps
 
 
 def as_of_an_earlier_version(folder):
@@ -464,17 +482,16 @@ def test_resumed_run_on_recorded_pairs_ends_bit_identical(pairs, calibration, tm
     assert log(tmp_path / "whole") == log(tmp_path / "halves")
 
 
-def test_captures_on_the_sheet_change_nothing_else(trainer, photos, calibration, tmp_path):
-    trainer(folder="without").run()
+def test_captures_on_the_sheet_change_nothing_else(whole, photos, calibration, tmp_path):
     np.save(tmp_path / "capture.npy", np.random.default_rng(0).random((32, 32, 3), np.float32))
     (tmp_path / "folder").mkdir()
     np.save(tmp_path / "folder" / "a.npy", np.full((32, 32, 3), 0.5, np.float32))
     for name, capture in (("one", "capture.npy"), ("other", "folder")):
         recipe, out = replace(RECIPE, sheet=Sheet((str(tmp_path / capture),))), tmp_path / name
         prepare(recipe, calibration, photos=photos, out=out, device="cpu").run()
-        assert same(tmp_path / "without" / "state.safetensors", out / "state.safetensors")
-        assert read_metadata(out / "best.safetensors") == read_metadata(tmp_path / "without" / "best.safetensors")
-    sheets = [cv2.imread(str(tmp_path / name / "validation.png")) for name in ("without", "one", "other")]
+        assert same(whole / "state.safetensors", out / "state.safetensors")
+        assert read_metadata(out / "best.safetensors") == read_metadata(whole / "best.safetensors")
+    sheets = [cv2.imread(str(run / "validation.png")) for run in (whole, tmp_path / "one", tmp_path / "other")]
     assert sheets[1].shape == sheets[2].shape != sheets[0].shape
     assert (sheets[1] != sheets[2]).any()
 
@@ -549,7 +566,7 @@ def test_folder_that_cannot_be_written_is_reported_before_training(trainer, tmp_
 
 
 @pytest.mark.parametrize("refused", ["last.safetensors", "best.safetensors", "state.safetensors"])
-def test_full_disk_leaves_the_state(trainer, tmp_path, monkeypatch, refused):
+def test_full_disk_leaves_the_state(trainer, whole, tmp_path, monkeypatch, refused):
     """Whichever of the three files of a checkpoint cannot be written."""
     run, folder = trainer(), tmp_path / "run"
     for _ in range(3):
@@ -572,8 +589,7 @@ def test_full_disk_leaves_the_state(trainer, tmp_path, monkeypatch, refused):
     for name in ("last", "best"):
         load_network(folder / f"{name}.safetensors")
     trainer().run()
-    trainer(folder="whole").run()
-    assert same(folder / "state.safetensors", tmp_path / "whole" / "state.safetensors")
+    assert same(folder / "state.safetensors", whole / "state.safetensors")
 
 
 def test_divergence_leaves_the_state(trainer, tmp_path):

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import torch
 from rich.table import Table
@@ -25,14 +26,17 @@ MASK = Contour(size_mm=(3.0, 2.5), pitch_um=4.0)
 """The open part of the paper's mask, with squares twice as large: takes a second to simulate."""
 
 METHODS = ("universal", "pyramid", "admm", "fista", "wiener")
+Picture = Literal["astronaut", "coffee", "cat"]
+PICTURES: tuple[Picture, ...] = ("astronaut", "coffee", "cat")
 
 
-def demo(*, out: Path = Path("results/demo"), seed: int = 0) -> None:
+def demo(*, out: Path = Path("results/demo"), seed: int = 0, pictures: tuple[Picture, ...] = PICTURES) -> None:
     """Simulate a small lensless camera and reconstruct its captures with every method that needs no training.
 
     Args:
         out: folder for the comparison picture and the page.
         seed: of the camera's mask and of its noise.
+        pictures: names of the scenes.
     """
     generator = torch.Generator().manual_seed(seed)
     camera = Camera(design_camera("contour", replace(MASK, seed=seed), SETUP).psf)
@@ -42,7 +46,7 @@ def demo(*, out: Path = Path("results/demo"), seed: int = 0) -> None:
     for name in METHODS:
         table.add_column(name, justify="right")
     rows = []
-    for name in ("astronaut", "coffee", "cat"):
+    for name in pictures:
         scene = dark_scene(name, SETUP.size, side=200)
         measurement = camera.simulate(scene, generator=generator)
         results = [reconstruct(measurement) for reconstruct in reconstructors.values()]

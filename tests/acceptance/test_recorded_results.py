@@ -1,0 +1,71 @@
+"""Results on real captures are those that were recorded in November 2026: a change of any method shows here."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from mwdn import Calibration, Reconstructor, read_frame
+from mwdn.calibration import FrameFormat
+from mwdn.solvers import SOLVERS
+from mwdn.weights.bundled import BUNDLED
+
+pytestmark = pytest.mark.acceptance
+
+# PSF, capture, format of the frames, background of the PSF.
+CAMERAS = {
+    "mwdn": ("mwdn-camera/psf_320.png", "mwdn-camera/real-objects/object_0.png", FrameFormat(), "estimate"),
+    "diffusercam": (
+        "diffusercam/psf_recovered_270x480.npy",
+        "diffusercam/diffuser_images/im10.npy",
+        FrameFormat(upside_down=True, bgr=True),
+        0.0,
+    ),
+}
+
+# Root mean square, mean absolute difference of horizontal neighbours (detail and noise), mean of each quarter.
+RECORDED = """
+admm            mwdn        1.44589 0.02692626 0.324431 0.292643 0.707842 0.617391
+admm            diffusercam 0.2218837 0.005917798 0.150171 0.114205 0.22831 0.189785
+fista           mwdn        1.227476 0.02926601 0.284824 0.233129 0.782442 0.688094
+fista           diffusercam 0.2230823 0.01892217 0.150106 0.118242 0.229128 0.189599
+pyramid         mwdn        1.439485 0.04191706 0.269596 0.258634 0.797125 0.690497
+pyramid         diffusercam 0.2285195 0.01452772 0.146132 0.114466 0.232271 0.190898
+wiener          mwdn        1.295445 0.02621401 0.503396 0.396707 0.989653 0.784999
+wiener          diffusercam 0.2312952 0.003411995 0.196999 0.162456 0.198107 0.162022
+universal       mwdn        1.485306 0.04484401 0.271292 0.254409 0.813991 0.67594
+universal       diffusercam 0.2274369 0.01636033 0.144974 0.113978 0.229054 0.189215
+universal-small mwdn        1.410936 0.05098378 0.268408 0.263969 0.804365 0.702008
+universal-small diffusercam 0.230587 0.01893247 0.150932 0.118074 0.229216 0.189441
+"""
+
+
+def measures(scene: torch.Tensor) -> list[float]:
+    middle, centre = (side // 2 for side in scene.shape[-2:])
+    quarters = [scene[..., rows, columns] for rows in halves(middle) for columns in halves(centre)]
+    return [
+        float(value)
+        for value in (
+            scene.square().mean().sqrt(),
+            scene.diff(dim=-1).abs().mean(),
+            *(quarter.mean() for quarter in quarters),
+        )
+    ]
+
+
+def halves(middle: int) -> tuple[slice, slice]:
+    return slice(middle), slice(middle, None)
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.parametrize("method", [*SOLVERS, *BUNDLED])
+def test_results_are_the_recorded_ones(method: str, camera: str, data: Path) -> None:
+    lines = (line.split() for line in RECORDED.strip().splitlines())
+    recorded = {(name, used): [float(value) for value in values] for name, used, *values in lines}
+    assert (method, camera) in recorded, "a new method: record what it gives"
+    psf, capture, frames, background = CAMERAS[camera]
+    calibration = Calibration.from_file(data / psf, frames, background=background)
+    measurement = calibration.correct(read_frame(data / capture, bgr=frames.bgr))
+    scene = Reconstructor(method, calibration, device="cpu", precision="exact")(measurement)
+    # Another processor rounds differently, which a hundred iterations amplify.
+    assert measures(scene) == pytest.approx(recorded[method, camera], rel=1e-3)
