@@ -18,7 +18,7 @@ Mosaic = Literal["rggb", "bggr", "grbg", "gbrg"]
 
 @dataclass(frozen=True, kw_only=True)
 class FrameFormat:
-    """What the numbers in a raw frame mean. The fields are in the order of the steps in `to_measurement`.
+    """What the numbers in a raw frame mean. The fields are in the order of the steps: `read`, then `to_measurement`.
 
     Args:
         bgr: the file's channels are blue, green, red (DiffuserCam's .npy).
