@@ -1,4 +1,4 @@
-"""Training by two processes: the same as by one, to rounding, and exact after any interruption."""
+"""Training with two processes: equal to one up to rounding, and exact after any interruption."""
 
 import json
 import os
@@ -66,7 +66,7 @@ def folder(tmp_path_factory):
 
 
 def torchrun(folder, *command, machines="--standalone --nproc-per-node 2"):
-    """Start a command twice, on one machine unless told otherwise."""
+    """Start a command in two processes, by default on one machine."""
     options = {"cwd": folder, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     here = {"PYTHONFAULTHANDLER": "1"} | ({"GLOO_SOCKET_IFNAME": "lo"} if sys.platform == "linux" else {})
     launch = [sys.executable, "-m", "torch.distributed.run", *machines.split()]
@@ -85,7 +85,7 @@ def finish(process):
 
 
 def alone(folder, out):
-    """The run of one process."""
+    """The run with one process."""
     calibration = Calibration.from_file(folder / "psf.npy", background=0.0)
     return prepare(
         read_recipe(folder / "r.toml"), calibration, photos=folder / "photos", out=folder / out, device="cpu"
@@ -95,13 +95,13 @@ def alone(folder, out):
 @pytest.mark.parametrize(
     ("environment", "message"),
     [
-        ({"WORLD_SIZE": "abc"}, r"`WORLD_SIZE` \(abc\) must be set as torchrun sets it .* `unset WORLD_SIZE`"),
+        ({"WORLD_SIZE": "abc"}, r"`WORLD_SIZE` \(abc\) .*`unset WORLD_SIZE`"),
         ({"WORLD_SIZE": "2"}, r"`RANK` \(not set\) must be set"),
         ({"WORLD_SIZE": "2", "RANK": "0", "LOCAL_RANK": "x"}, r"`LOCAL_RANK` \(x\) must be set"),
         ({"WORLD_SIZE": "2", "RANK": "0", "LOCAL_RANK": "0"}, r"`MASTER_ADDR` \(not set\) must be set"),
     ],
 )
-def test_environment_of_no_torchrun(monkeypatch, environment, message):
+def test_environment_without_torchrun(monkeypatch, environment, message):
     for name in ("WORLD_SIZE", "RANK", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT"):
         monkeypatch.delenv(name, raising=False)
     for name, value in environment.items():
@@ -119,14 +119,14 @@ def one(folder):
 @pytest.fixture(scope="module")
 def two(folder):
     out, err = finish(training(folder, "two"))
-    assert out.split() == ["Weights", "in", "two/best.safetensors"]  # said once
+    assert out.split() == ["Weights", "in", "two/best.safetensors"]  # printed once
     assert err.count(f"step {STEPS}: validation") == 1
     return folder / "two"
 
 
 @pytest.fixture(scope="module")
 def worked(folder):
-    """What `two_processes.py` has left."""
+    """Folder with the results of `two_processes.py`."""
     stop = InterruptedError
 
     def after_four(report):
@@ -140,7 +140,7 @@ def worked(folder):
 
 
 def assert_alike(found, expected):
-    """Learned numbers moved from their start by the same, but for 1 %; BatchNorm's moments to rounding."""
+    """Parameters moved from their initial values alike, within 1 %; BatchNorm's moments are equal up to rounding."""
     found, expected = load_file(found / "state.safetensors"), load_file(expected / "state.safetensors")
     assert found.keys() == expected.keys()
     torch.manual_seed(0)
@@ -155,7 +155,7 @@ def assert_alike(found, expected):
             torch.testing.assert_close(found[key], expected[key], rtol=1e-3, atol=1e-4)
 
 
-# --- One result -----------------------------------------------------------------------------------------
+# --- Results --------------------------------------------------------------------------------------------
 
 
 def test_two_processes_end_as_one(one, two):
@@ -170,7 +170,7 @@ def test_two_processes_end_as_one(one, two):
 
 
 def test_two_machines_end_as_one_with_two_processes(folder, two, free_port):
-    """Each with a torchrun of its own, the first one's address told to both; the folder is one."""
+    """Each has its own torchrun with the address of the first; they share the folder."""
     where = f"--nnodes 2 --nproc-per-node 1 --master-addr 127.0.0.1 --master-port {free_port} --node-rank"
     machines = [training(folder, "machines", machines=f"{where} {rank}") for rank in range(2)]
     said = [finish(machine) for machine in machines]
@@ -180,7 +180,7 @@ def test_two_machines_end_as_one_with_two_processes(folder, two, free_port):
 
 
 def test_two_processes_end_as_one_in_float64(worked):
-    """Nothing is left of the difference; `mwdn-cpsf` also encodes the PSF, of which each process has a whole batch."""
+    """The difference vanishes. `mwdn-cpsf` also encodes the PSF, of which each process has the whole batch."""
     states = [load_file(worked / "double" / name / "state.safetensors") for name in ("one-0", "two")]
     assert states[0].keys() == states[1].keys()
     assert states[0]["network.decoder.head.weight"].dtype == torch.float64
@@ -189,21 +189,21 @@ def test_two_processes_end_as_one_in_float64(worked):
 
 
 def test_both_processes_have_the_lr_schedule_of_the_first(worked):
-    """Only the first validates."""
+    """Only the first process validates."""
     schedules = [json.loads((worked / f"lr_schedule-{rank}.json").read_text()) for rank in (0, 1)]
     assert schedules[0] == schedules[1]
     losses = [line["validation_loss"] for line in log(worked / "double" / "two")]
     assert schedules[0]["best"] == min(loss for loss in losses if loss is not None)
 
 
-def test_run_begun_by_one_process_goes_on_with_two(one, worked):
+def test_run_of_one_process_resumes_with_two(one, worked):
     assert_alike(worked / "mixed", one)
     assert [line["step"] for line in log(worked / "mixed")] == list(range(1, STEPS + 1))
     assert log(worked / "mixed")[:4] == log(one)[:4]  # not begun again
 
 
 def test_bias_before_batch_norm_is_not_learned(one):
-    """Its gradient is rounding noise, of which Adam would make steps as large as any."""
+    """Its gradient is rounding noise, which Adam would turn into full steps."""
     torch.manual_seed(0)
     network = build("wiener-bank", width=4, fold=1, finest=0)
     freeze_cancelled(network)
@@ -216,7 +216,7 @@ def test_bias_before_batch_norm_is_not_learned(one):
 
 
 def test_gradient_of_a_bias_before_batch_norm_is_zero(generator):
-    """In float64 nothing is left of it."""
+    """In float64 it vanishes."""
     network = build("mwdn", width=2).double()
     freeze_cancelled(network)
     frozen = {name for name, parameter in network.named_parameters() if not parameter.requires_grad}
@@ -234,7 +234,7 @@ def test_gradient_of_a_bias_before_batch_norm_is_zero(generator):
 @pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-10), ("float32", 2e-4)])
 @pytest.mark.parametrize("rank", [0, 1])
 def test_batch_norm_over_two_processes(worked, rank, dtype, tolerance):
-    """Output, gradients, running moments after two steps: those of torch's own layer for the whole batch."""
+    """Output, gradients and running moments after two steps equal those of torch's layer for the whole batch."""
     found = load_file(worked / f"{dtype}-{rank}.safetensors")
     for key in ("y", "x.grad", "w.grad", "b.grad", "mean", "var", "count", "eval"):
         torch.testing.assert_close(found[f"two.{key}"], found[f"one.{key}"], rtol=tolerance, atol=tolerance)
@@ -245,8 +245,8 @@ def test_batch_norm_over_two_processes(worked, rank, dtype, tolerance):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends a process with its parent")
-def test_killed_and_resumed_run_ends_as_one_that_was_not(folder, two):
-    """SIGKILL of torchrun alone, after some steps: its processes end with it, and the next run finds a whole state."""
+def test_killed_and_resumed_run_ends_as_an_unbroken_one(folder, two):
+    """SIGKILL of torchrun only, after some steps: its processes end with it, and the next run resumes."""
     process, path = training(folder, "killed"), folder / "killed" / "log.jsonl"
     goal = random.randint(2, STEPS - 2)
     while process.poll() is None and not (path.exists() and path.read_bytes().count(b"\n") >= goal):
@@ -268,10 +268,10 @@ def test_killed_and_resumed_run_ends_as_one_that_was_not(folder, two):
     assert log(folder / "killed") == log(two)
 
 
-# --- What is refused ------------------------------------------------------------------------------------
+# --- Errors ---------------------------------------------------------------------------------------------
 
 
-def test_refusals_of_two_processes(worked):
+def test_errors_of_two_processes(worked):
     first, second = ((worked / f"said-{rank}.txt").read_text().splitlines() for rank in (0, 1))
     assert first[0] == second[0]
     assert first[0].startswith("ParameterError: `batch` (1) must be at least the number of processes (2)")

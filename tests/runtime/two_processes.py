@@ -1,4 +1,4 @@
-"""What one of two processes does; `test_distributed.py` starts them by torchrun and judges the files they leave."""
+"""Run by two processes, which `test_distributed.py` starts by torchrun; it checks the files they write."""
 
 import json
 import os
@@ -21,7 +21,7 @@ from mwdn.training.tasks import SupervisedTask
 
 
 def batch_norm():
-    """Features (5, 3, 4, 6) with means of 0, 10 and 1000, normalised as parts of 2 and 3."""
+    """Normalise features (5, 3, 4, 6) with means of 0, 10 and 1000, in shares of 2 and 3."""
     for dtype in (torch.float64, torch.float32):
         whole = nn.BatchNorm2d(3).to(dtype)
         layer = nn.Sequential(nn.BatchNorm2d(3)).to(dtype)
@@ -33,7 +33,7 @@ def batch_norm():
         for one in (whole, layer[0]):
             one.load_state_dict(one.state_dict() | {"weight": weights[0], "bias": weights[1]})
         synchronise(layer, torch.device("cpu"))
-        found = {}
+        results = {}
         for name, one, mine in (("one", whole, range(5)), ("two", layer, distributed.shard(range(5)))):
             mine = slice(mine.start, mine.stop)
             part = x[mine].clone().requires_grad_()
@@ -49,12 +49,12 @@ def batch_norm():
             parts = {"y": outputs, "x.grad": inputs, "w.grad": norm.weight.grad, "b.grad": norm.bias.grad}
             parts |= {"mean": norm.running_mean, "var": norm.running_var, "count": norm.num_batches_tracked}
             parts |= {"eval": norm.eval()(x).detach()}
-            found |= {f"{name}.{key}": value for key, value in parts.items()}
-        save_file(found, f"{dtype}-{distributed.rank()}.safetensors".removeprefix("torch."))
+            results |= {f"{name}.{key}": value for key, value in parts.items()}
+        save_file(results, f"{dtype}-{distributed.rank()}.safetensors".removeprefix("torch."))
 
 
-class Lame(SimulatedPairs):
-    """Scenes of the second process are not finite."""
+class NotFinite(SimulatedPairs):
+    """Pairs whose scenes are not finite on the second process."""
 
     def batch(self, numbers):
         pair = super().batch(numbers)
@@ -63,7 +63,7 @@ class Lame(SimulatedPairs):
 
 @contextmanager
 def double_precision():
-    """Everything in float64, also what asks for float32 by name."""
+    """Compute everything in float64, also after `Tensor.float`."""
     single = torch.Tensor.float
     torch.Tensor.float = torch.Tensor.double
     torch.set_default_dtype(torch.float64)
@@ -87,7 +87,7 @@ def main():
             except MwdnError as error:
                 file.write(f"{type(error).__name__}: {error}\n")
 
-    with double_precision():  # before the two meet, each is one
+    with double_precision():  # outside the group: each process trains alone
         start(f"double/one-{number}", read_recipe("cpsf.toml"), precise).run()
     with distributed.process_group():
         batch_norm()
@@ -95,13 +95,13 @@ def main():
             run = start("double/two", read_recipe("cpsf.toml"), precise)
             run.run()
         Path(f"lr_schedule-{number}.json").write_text(json.dumps(run.lr_schedule.state()))
-        start("mixed").run()  # begun by one process
+        start("mixed").run()  # started by one process
         attempt(lambda: start("small", replace(recipe, schedule=replace(recipe.schedule, batch=1))))
         attempt(lambda: distributed.local_device("cuda:0"))
-        lame = start("lame")
-        lame.task = SupervisedTask(Lame(**vars(lame.task.pairs)))
-        attempt(lame.run)
-        # The second is given another recipe and ends; the first finds itself alone.
+        trainer = start("not-finite")
+        trainer.task = SupervisedTask(NotFinite(**vars(trainer.task.pairs)))
+        attempt(trainer.run)
+        # The second has another recipe and ends; the first loses its connection.
         odd = replace(recipe, schedule=replace(recipe.schedule, seed=int(number)))
         attempt(lambda: start("odd", odd).run())
         os._exit(0)

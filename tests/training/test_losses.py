@@ -22,7 +22,7 @@ def test_loss_is_the_weighted_sum_of_its_parts(noisy_pair, lpips_files):
     torch.testing.assert_close(parts["feature_mse"], feature_mse(*noisy_pair, loss.alexnet).mean())
 
 
-def test_loss_trains_pictures_and_not_its_networks(noisy_pair, lpips_files):
+def test_loss_has_gradients_for_the_reconstruction_only(noisy_pair, lpips_files):
     loss = Loss({"mse": 1.0, "feature_mse": 0.05, "lpips": 0.0}, **lpips_files)
     image = noisy_pair[0].clone().requires_grad_()
     total, parts = loss.train()(image, noisy_pair[1])

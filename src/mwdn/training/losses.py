@@ -39,7 +39,7 @@ class Loss(nn.Module):
     ) -> None:
         super().__init__()
         self.initial_weights = checked_weights(weights)
-        self.weights = self.initial_weights
+        self.weights = dict(self.initial_weights)
         """Current weights, which a schedule may replace by others of the same names."""
         self.alexnet = load_alexnet(alexnet) if {"feature_mse", "lpips"} & set(weights) else None
         self.heads = load_heads(heads, alexnet=alexnet) if "lpips" in weights else None
@@ -52,7 +52,7 @@ class Loss(nn.Module):
             scene: of the same shape.
 
         Returns:
-            The weighted sum to be minimised, and each part without its weight: scalars without gradient.
+            The weighted sum to be minimised, a scalar; and each part without its weight, scalars without gradient.
 
         Raises:
             ShapeError: the shapes differ, or a part cannot be computed for them.
