@@ -1,4 +1,4 @@
-"""From the caustic pattern of a lensless camera to a picture.
+"""Lensless imaging: reconstruct pictures from the caustic patterns that lensless cameras record.
 
 >>> from mwdn import Calibration, Reconstructor, read_frame, to_display, write_picture
 >>> calibration = Calibration.from_file("psf.png")
@@ -6,7 +6,7 @@
 >>> scene = reconstruct(read_frame("capture.png"))
 >>> write_picture("scene.png", to_display(scene))
 
-The folders are rooms of their own: `mwdn.solvers` (ADMM, FISTA, ...), `mwdn.networks` (MWDN, MWDN-CPSF, ...),
+Subpackages: `mwdn.solvers` (ADMM, FISTA, ...), `mwdn.networks` (MWDN, MWDN-CPSF, ...),
 `mwdn.optics` (masks, PSFs, forward models), `mwdn.data` (pairs), `mwdn.training`, `mwdn.evaluation`, `mwdn.export`.
 """
 

@@ -156,7 +156,7 @@ def test_psf_of_another_size(run, camera):
     [
         ("captures --psf none.png", "`none.png` does not exist"),
         ("captures --psf psf.png --method admn", "No method named 'admn'. Did you mean 'admm'?"),
-        ("captures --psf psf.png --method mwdn", "`mwdn` is a network, which has to be trained first: `mwdn train"),
+        ("captures --psf psf.png --method mwdn", "`mwdn` is a network"),
         ("captures --psf psf.png --method no.safetensors", "`no.safetensors`"),
         ("captures --psf psf.png --device gpu", "`device` (gpu) must be one that torch can use here"),
         ("captures --psf psf.png --bit-depth 40", "`bit_depth` (40) must be 1 to 16."),

@@ -11,8 +11,8 @@ from cameras import contour_psf
 from conftest import touch
 from mwdn import Camera, solvers
 from mwdn.calibration import Calibration
-from mwdn.errors import CheckpointError, ParameterError, ShapeError, UnknownNameError
-from mwdn.inference.reconstructor import PIXELS_PER_CHUNK, Reconstructor, find_method
+from mwdn.errors import CheckpointError, ImageError, ParameterError, ShapeError, UnknownNameError
+from mwdn.inference.reconstructor import Reconstructor, find_method
 from mwdn.networks import NETWORKS, build
 from mwdn.solvers import SOLVERS, Admm, Wiener
 from mwdn.weights.checkpoint import save_network
@@ -84,7 +84,7 @@ def test_network_without_weights(name, tmp_path, monkeypatch):
     if name in SOLVERS:
         assert isinstance(find_method(name), SOLVERS[name])
         return
-    with pytest.raises(ParameterError, match=rf"`{name}` is a network, which has to be trained first: `mwdn train "):
+    with pytest.raises(ParameterError, match=rf"`{name}` is a network .*`mwdn train "):
         find_method(name)
     save_network(tmp_path / "w.safetensors", build("wiener"), "wiener", {})
     (tmp_path / "w.safetensors").rename(tmp_path / name)
@@ -111,7 +111,7 @@ def test_measurement_of_another_size(psf):
 @pytest.mark.parametrize("method", [*SOLVERS, "universal-small"])
 @pytest.mark.parametrize("shape", [(0, 3, *SIZE), (1, 0, *SIZE), (3, *SIZE), SIZE, (1, 1, 3, *SIZE)])
 def test_measurement_that_is_no_batch(method, shape, psf):
-    with pytest.raises(ShapeError, match=re.escape(f"`measurement` {shape} must be a batch (B, C, H, W)")):
+    with pytest.raises(ShapeError, match=re.escape(f"`measurement` {shape} must be a")):
         Reconstructor(method, Calibration(psf), device="cpu")(torch.rand(shape))
 
 
@@ -227,34 +227,19 @@ def test_stream_goes_on_where_it_was(solver, psf, frames, aligned):
     assert aligned == []
 
 
-def broken(frame):
-    """With one pixel that is no number."""
-    frame = (frame / 65535).astype(np.float32)
+def test_stream_refuses_a_frame_that_is_not_finite(psf, frames):
+    frame = (frames[1] / 65535).astype(np.float32)
     frame[3, 4] = np.nan
-    return frame
+    stream = Reconstructor("admm", Calibration(psf), device="cpu").stream([frames[0], frame])
+    assert next(stream)[1].isfinite().all()
+    with pytest.raises(ImageError, match="NaN"):
+        next(stream)
 
 
-@pytest.mark.parametrize("solver", [Admm(iterations=20), solvers.Fista(iterations=20)], ids=["admm", "fista"])
-def test_stream_forgets_a_frame_that_is_not_finite(solver, psf, frames):
-    stream = Reconstructor(solver, Calibration(psf), device="cpu").stream([frames[0], broken(frames[1]), *frames[2:]])
-    assert [bool(scene.isfinite().all()) for _, scene in stream] == [True, False, True, True, True]
-
-
-def test_stream_finds_the_pose_on_the_first_frame_that_is_finite(bank, psf, frames, aligned):
-    reconstruct = Reconstructor(bank, Calibration(psf), device="cpu", precision="exact")
-    for refresh, at in ((0, [1]), (2, [1, 3, 4])):
-        broken_ones = [broken(frames[n]) if n in (0, 2) else frames[n] for n in range(5)]
-        stream = reconstruct.stream(broken_ones, refresh=refresh)
-        seen = [measurement for measurement, _ in stream]
-        asked = [each for each in aligned if each.isfinite().all()]
-        assert len(asked) == len(at)
-        assert all(torch.equal(each, seen[n]) for each, n in zip(asked, at, strict=True))
-        aligned.clear()
-
-
-def test_stream_checks_the_channels(bank, psf):
-    stream = Reconstructor(bank, Calibration(psf[:, :1])).stream([np.zeros((*SIZE, 2), np.uint8)])
-    with pytest.raises(ShapeError, match="must have 3 channels for this network"):
+def test_stream_checks_the_channels(psf):
+    network = build("unet", width=2, channels=1)
+    stream = Reconstructor(network, Calibration(psf), device="cpu").stream([np.zeros((*SIZE, 3), np.uint8)])
+    with pytest.raises(ShapeError, match="must have 1 channels for this network"):
         next(stream)
 
 
@@ -281,31 +266,34 @@ def test_stream_refuses(psf):
 
 
 @pytest.mark.parametrize("method", [build("wiener"), Wiener(1e-3)])
-def test_a_batch_is_taken_a_few_at_a_time(method, generator, monkeypatch):
+def test_a_batch_is_taken_a_few_at_a_time(method, generator):
     """A batch of 3 pictures of 256 x 256 is 2 and 1."""
     psf = torch.rand(1, 3, 256, 256, generator=generator)
-    reconstruct = Reconstructor(method, Calibration(psf / psf.sum()), device="cpu", precision="exact")
-    seen, whole = [], Reconstructor._reconstruct
-    monkeypatch.setattr(
-        Reconstructor, "_reconstruct", lambda self, batch: seen.append(len(batch)) or whole(self, batch)
-    )
+    sizes = []
+
+    def counting(measurement, psf):
+        sizes.append(len(measurement))
+        return method(measurement, psf)
+
+    reconstruct = Reconstructor(counting, Calibration(psf / psf.sum()), device="cpu")
     batch = torch.rand(3, 3, 256, 256, generator=generator)
-    found = reconstruct(batch)
-    assert seen == [2, 1]
-    torch.testing.assert_close(found[2:], reconstruct(batch[2:]))
+    scene = reconstruct(batch)
+    assert sizes == [2, 1]
+    torch.testing.assert_close(scene[2:], reconstruct(batch[2:]))
 
 
 @torch.no_grad()
-def test_what_belongs_to_each_sample_keeps_a_batch_together(generator, monkeypatch):
+def test_what_belongs_to_each_sample_keeps_a_batch_together(generator):
     """Where the iterations for the last frame ended, and the pose of the PSF."""
-    monkeypatch.setitem(PIXELS_PER_CHUNK, "cpu", 1)
     psf = torch.rand(1, 3, 24, 32, generator=generator)
     calibration, batch = Calibration(psf / psf.sum()), torch.rand(3, 3, 24, 32, generator=generator)
     warm, whole = solvers.WarmStart(solvers.Admm(iterations=5)), solvers.WarmStart(solvers.Admm(iterations=5))
     stream = Reconstructor(warm, calibration, device="cpu")
+    stream.pixels_per_chunk = 1
     for _ in range(2):
         torch.testing.assert_close(stream(batch), whole(batch, stream.psf))
     network = Reconstructor(build("wiener-bank", width=4).eval(), calibration, device="cpu", precision="exact")
+    network.pixels_per_chunk = 1
     pose = solvers.Pose(torch.tensor([0.0, 2.0, -3.0]), torch.tensor([0.0, 0.01, 0.02]))
     found = network.at(pose)(batch)
     for i in range(3):

@@ -697,7 +697,7 @@ def test_a_denoiser_is_trained_alone_and_then_frozen(trainer, tmp_path):
 
     with pytest.raises(CheckpointError, match=r"`denoiser` \('.*best.safetensors'\) its denoiser, if it has one"):
         trainer(few(denoiser=str(tmp_path / "a" / "best.safetensors")), "none")
-    with pytest.raises(CheckpointError, match="holds a denoiser, which reconstructs nothing alone"):
+    with pytest.raises(CheckpointError, match="holds a denoiser"):
         find_method(tmp_path / "a" / "best.safetensors")
 
 

@@ -1,4 +1,4 @@
-"""Reconstruction: a method bound to a camera, a stream of frames, a folder of captures."""
+"""Reconstruction of measurements, streams of frames and folders of captures."""
 
 from mwdn.inference.reconstructor import Reconstructor
 

@@ -1,4 +1,4 @@
-"""CUDA graphs: a calculation on a GPU is recorded once and replayed."""
+"""CUDA graphs: record a computation on a GPU once and replay it."""
 
 from collections.abc import Callable
 
@@ -7,7 +7,10 @@ from torch import Tensor
 
 
 class CudaGraph:
-    """A calculation on a GPU, recorded for one shape and replayed: its hundreds of kernels start as one."""
+    """A computation recorded for one shape; a replay launches its hundreds of kernels at once.
+
+    A computation that cannot be recorded runs normally.
+    """
 
     def __init__(self, calculate: Callable[[Tensor], Tensor], measurement: Tensor) -> None:
         self.calculate = calculate
@@ -16,17 +19,17 @@ class CudaGraph:
         stream = torch.cuda.Stream()  # type: ignore[no-untyped-call]
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):
-            for _ in range(3):  # libraries choose their algorithms and plan their transforms
+            for _ in range(3):  # warm-up: libraries choose algorithms and plan transforms
                 calculate(self.measurement)
         current = torch.cuda.current_stream()
         current.wait_stream(stream)
         graph = torch.cuda.CUDAGraph()
         try:
-            # torch's own stream for this is of whichever GPU recorded first. Other threads may read or judge meanwhile.
+            # torch's default capture stream belongs to the first GPU used. Other threads may use the GPU meanwhile.
             with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
                 self.result = calculate(self.measurement)
-        except RuntimeError:  # something that cannot be recorded: calculate each time
-            torch.cuda.set_stream(current)  # a recording that fails leaves its own
+        except RuntimeError:  # cannot be recorded
+            torch.cuda.set_stream(current)  # a failed capture leaves its stream current
             return
         self.graph = graph
 

@@ -1,4 +1,4 @@
-"""A network bound to one PSF and one device: whatever does not depend on the measurement is computed once."""
+"""Fast inference with one network, PSF and device: PSF preparation, fused layers, half precision, CUDA graphs."""
 
 import copy
 from typing import Generic, Literal, cast, get_args
@@ -14,27 +14,27 @@ from mwdn.runtime.devices import has_bfloat16, without_tf32
 from mwdn.types import Measurement, Psf, Scene
 
 Precision = Literal["fast", "exact"]
-"""How a network computes. Fourier transforms are float32 in both.
+"""Precision of a network's convolutions. Fourier transforms are float32 in both.
 
-- ``fast``: convolutions in half precision where the hardware has it (bfloat16 on a CPU, float16 on a GPU), else as
-  ``exact``. Trained networks differ from it by 50 dB PSNR or more, their brightest pixel taken as 1 (``universal`` on
-  real captures: 72 to 80 dB); one that amplifies rounding, such as a hardly trained MWDN-CPSF, by as little as 40 dB.
-- ``exact``: float32, the network's own result but for the order of additions.
+- ``fast``: half precision where the hardware has it (bfloat16 on a CPU, float16 on a GPU), else as ``exact``. The PSNR
+  against ``exact``, for a brightest pixel of 1, is 50 dB or more for trained networks (``universal`` on real captures:
+  72 to 80 dB), and can be as low as 40 dB for one that amplifies rounding, such as a hardly trained MWDN-CPSF.
+- ``exact``: float32; the network's result up to the order of additions.
 """
 
 
 class Engine(Generic[Prepared]):
-    """A network bound to one PSF: a function of the measurement alone, as fast as the machine allows.
+    """A network optimised for inference with one PSF; it is called with a measurement only.
 
-    BatchNorm is fused into the convolutions, which take channels-last features. The PSF is prepared once, in float32.
-    On a GPU the calculation for each shape of a batch is recorded at its second call and replayed from then on.
+    BatchNorm is fused into the convolutions, which use channels-last features. The PSF is prepared once, in float32.
+    On a GPU the computation for each batch shape is recorded as a CUDA graph at its second call and replayed later.
 
-    Memory is bounded: the U-Net's convolutions take a large picture a strip of rows at a time, see
-    `mwdn.inference.tiling`; `mwdn.Reconstructor` takes a large batch a few pictures at a time.
+    Memory is bounded: U-Nets process large pictures in strips (`mwdn.inference.tiling`), and `mwdn.Reconstructor`
+    divides large batches.
 
     Args:
-        network: as trained; a copy is taken.
-        psf: (1 or B, C, H, W), of the camera.
+        network: the trained network, which is copied.
+        psf: (1 or B, C, H, W).
         precision: see `Precision`.
 
     Raises:
@@ -48,19 +48,19 @@ class Engine(Generic[Prepared]):
         exact = copy.deepcopy(network).to(psf.device).eval().requires_grad_(False)
         half = half_precision(psf.device) if precision == "fast" else None
         self.network = cast(Network[Prepared], fuse(copy.deepcopy(exact), half))
-        # Prepares the PSF: spectra and regularisation need float32.
+        # Prepares the PSF, because spectra and regularisation need float32.
         self.exact = self.network if half is None else cast(Network[Prepared], fuse(exact, None))
-        self._bind(psf)
+        self._set_psf(psf)
 
-    def _bind(self, psf: Psf) -> None:
+    def _set_psf(self, psf: Psf) -> None:
         self.psf = psf
         self.prepared: Prepared | None = None
         self.graphs: dict[torch.Size, CudaGraph | None] = {}
 
     def with_psf(self, psf: Psf) -> "Engine[Prepared]":
-        """The same network, sharing its weights, bound to another PSF."""
+        """An engine with another PSF that shares the network and its weights."""
         other = copy.copy(self)
-        other._bind(psf)
+        other._set_psf(psf)
         return other
 
     @torch.inference_mode()
@@ -68,13 +68,13 @@ class Engine(Generic[Prepared]):
         """Reconstruct a batch, (B, C, H, W), on the device of the PSF."""
         if measurement.device.type != "cuda":
             return self._reconstruct(measurement)
-        # CUDA streams belong to the current device. Without TF32, what stays float32 keeps its 23 bits.
+        # CUDA streams belong to the current device. Without TF32, float32 operations keep 23 bits.
         with torch.cuda.device(measurement.device), without_tf32():
             return self._replay(measurement)
 
     def _replay(self, measurement: Tensor) -> Tensor:
         if measurement.shape not in self.graphs:
-            if len(self.graphs) >= 4:  # each holds the memory of a whole reconstruction
+            if len(self.graphs) >= 4:  # each graph keeps the memory of a whole reconstruction
                 self.graphs.clear()
             self.graphs[measurement.shape] = None
             return self._reconstruct(measurement)
@@ -90,7 +90,7 @@ class Engine(Generic[Prepared]):
 
 
 def half_precision(device: torch.device) -> torch.dtype | None:
-    """Half-precision type that the device multiplies faster than float32, if there is one."""
+    """Half-precision type that is faster than float32 on the device, or ``None``."""
     if device.type == "cuda":
         return torch.float16
     return torch.bfloat16 if has_bfloat16(device) else None

@@ -1,4 +1,4 @@
-"""A method bound to one calibrated camera: measurement in, picture out."""
+"""Reconstruction of one camera's measurements and raw frames by any method."""
 
 import copy
 from collections.abc import Callable, Iterable, Iterator
@@ -23,11 +23,11 @@ from mwdn.weights.bundled import BUNDLED, find_weights
 from mwdn.weights.checkpoint import SUFFIXES, load_network, read_metadata
 
 PIXELS_PER_CHUNK = {"cpu": 2**17, "cuda": 2**24}
-"""Pixels of a batch that are reconstructed together. A GPU needs many to be busy. On a CPU more than one picture of
-320 x 320 falls out of the caches: in a batch each takes 15 % longer than alone with MWDN, 50 % with ADMM."""
+"""Default of `Reconstructor.pixels_per_chunk` on each type of device. A GPU needs many pixels for full load. On a CPU,
+batches of 320 x 320 pictures are 15 % (MWDN) or 50 % (ADMM) slower than single pictures because of cache misses."""
 
 Method = Callable[[Measurement, Psf], Scene]
-"""Anything that is called as ``method(measurement, psf)``: a solver or a network."""
+"""A solver or a network, called as ``method(measurement, psf)``."""
 
 
 def find_method(name: str | Path, **options: Any) -> Method:  # noqa: ANN401
@@ -35,12 +35,12 @@ def find_method(name: str | Path, **options: Any) -> Method:  # noqa: ANN401
 
     Args:
         name: the name or the path; ``hub:owner/name`` for a network on the Hugging Face hub.
-        **options: of a solver, for example ``regularisation=1e-4``; the options of a network are in its checkpoint.
+        **options: of a solver, for example ``regularisation=1e-4``. A network's options are in its checkpoint.
 
     Raises:
         UnknownNameError: neither a solver nor a file, or the solver has no such option.
         CheckpointError: the file holds no usable weights.
-        ParameterError: an option is out of range, or is given for a network; or the network has no weights.
+        ParameterError: an option is out of range, a network is given options, or a network needs training first.
     """
     if str(name) in solvers.SOLVERS:
         return solvers.build(str(name), **options)
@@ -55,21 +55,21 @@ def find_method(name: str | Path, **options: Any) -> Method:  # noqa: ANN401
         network = load_network(path)
         if isinstance(network, tuple(DENOISERS.values())):
             raise CheckpointError(
-                f"`{name}` holds a denoiser, which reconstructs nothing alone: it is the `denoiser` in [schedule] of a "
-                "recipe such as recipes/universal-plug.toml."
+                f"`{name}` holds a denoiser, which cannot reconstruct on its own. Use it as `denoiser` in [schedule] "
+                "of a recipe such as recipes/universal-plug.toml."
             )
         return network
     if str(name) in NETWORKS:
         raise ParameterError(
-            f"`{name}` is a network, which has to be trained first: `mwdn train RECIPE.toml --psf psf.png --photos "
-            f'photos/ --out runs/{name}`, with `name = "{name}"` in [network] of the recipe. Its method is then '
+            f'`{name}` is a network without weights. Train it with `name = "{name}"` in [network] of the recipe: '
+            f"`mwdn train RECIPE.toml --psf psf.png --photos photos/ --out runs/{name}`. The method is then "
             f"`runs/{name}/best.safetensors`. `universal` needs no training."
         )
     raise UnknownNameError("method", str(name), [*BUNDLED, *solvers.SOLVERS, "PATH/OF/CHECKPOINT.safetensors"])
 
 
-def _other_camera(method: str | Path, calibration: Calibration) -> str | None:
-    """Say so, if a network was trained for another PSF than the calibration's."""
+def _psf_warning(method: str | Path, calibration: Calibration) -> str | None:
+    """Warning if the network was trained for another PSF than the calibration's."""
     path = find_weights(str(method)) or Path(method)
     if path.suffix != ".safetensors":
         return None
@@ -77,30 +77,31 @@ def _other_camera(method: str | Path, calibration: Calibration) -> str | None:
     if trained in (None, calibration.psf_hash):
         return None
     return (
-        f"`{method}` was trained for the camera of PSF {trained}, but the PSF given is {calibration.psf_hash}. "
-        "Expect blur, ghosts and invented detail, unless both are of one camera; another crop, binning or background "
-        "of one PSF file counts as another PSF. Use the PSF it was trained for, or train for this one: `mwdn train`."
+        f"`{method}` was trained for PSF {trained}, but the calibration has PSF {calibration.psf_hash}. "
+        "Expect blur, ghosts and invented detail, unless both are from the same camera: another crop, binning or "
+        "background counts as another PSF. Use the PSF of the training, or train for this one: `mwdn train`."
     )
 
 
 class Reconstructor:
-    """Reconstructs the measurements of one camera.
+    """Reconstruct the measurements of one camera.
 
-    Large pictures on a CPU take 0.4 to 0.7 of the time once `mwdn.keep_memory` has been called.
+    On a CPU, calling `mwdn.keep_memory` first reduces the time for large pictures to 0.4 to 0.7.
 
     Args:
         method: a solver, a network, the name of a solver or of a bundled network, or the path of a checkpoint.
-        calibration: of the camera that took the measurements.
-        align: turn, scale and haze the PSF first until it explains the measurement (`mwdn.align`), for a camera that
-            has changed since its calibration. Unless given, as the network was trained: ``universal`` aligns,
+        calibration: of the camera.
+        align: whether to fit rotation, scale and haze of the PSF to each measurement first (`mwdn.align`), for a camera
+            that has changed since its calibration. ``None`` does as the network was trained: ``universal`` aligns;
             ``universal-small`` and solvers do not.
-        device: where to compute; a GPU if there is one, unless given.
+        device: a GPU if there is one, unless given.
         precision: of a network, see `mwdn.inference.engine.Precision`; solvers are always exact.
         **options: of a solver given by its name, for example ``regularisation=1e-4``.
 
     Attributes:
-        method: the solver or network. A network is copied: later changes of it do not matter here.
-        warning: why not to trust the result, or ``None``.
+        method: the solver or network. Later changes of a network have no effect: a copy reconstructs.
+        warning: why the result may be wrong, or ``None``.
+        pixels_per_chunk: pixels of a batch that are reconstructed together.
 
     Raises:
         UnknownNameError: no such method, or it has no such option.
@@ -119,25 +120,26 @@ class Reconstructor:
         **options: Any,  # noqa: ANN401
     ) -> None:
         self.device = select_device(device)
+        self.pixels_per_chunk = PIXELS_PER_CHUNK.get(self.device.type, PIXELS_PER_CHUNK["cpu"])
         self.calibration = calibration
         self.warning = None
         if isinstance(method, str | Path):
-            self.warning = _other_camera(method, calibration)
+            self.warning = _psf_warning(method, calibration)
             method = find_method(method, **options)
         elif options:
-            raise ParameterError(f"Options ({', '.join(options)}) belong to a method that is given by its name.")
+            raise ParameterError(f"Options ({', '.join(options)}) need a method given by its name, not an object.")
         self.method: Method = method
         self.align = method.align if align is None and isinstance(method, Network) else bool(align)
         self.psf = calibration.psf.to(self.device)
         self.engine = Engine(method, self.psf, precision=precision) if isinstance(method, Network) else None
 
     def at(self, pose: solvers.Pose) -> "Reconstructor":
-        """The same with the PSF in a known pose, instead of one found for each measurement.
+        """A `Reconstructor` with a fixed pose of the PSF, instead of one estimated for each measurement.
 
-        A `Reconstructor` that does not align keeps its PSF and is returned as it is.
+        Without alignment, returns this `Reconstructor` unchanged.
 
         Args:
-            pose: result of `mwdn.align`, of one capture, or with an entry for each sample of a batch.
+            pose: result of `mwdn.align` for one capture, or with an entry for each sample of a batch.
         """
         if not self.align:
             return self
@@ -147,39 +149,38 @@ class Reconstructor:
         return fixed
 
     def stream(self, frames: Iterable[Frame], *, refresh: int = 100) -> Iterator[tuple[Measurement, Scene]]:
-        """Reconstruct frames of a video, each faster than alone: a frame resembles the one before.
+        """Reconstruct the frames of a video, faster than one by one because successive frames are similar.
 
-        Where the PSF is aligned, the pose found on the first frame is kept. ADMM and FISTA start from the result for
-        the last frame (`mwdn.solvers.WarmStart`). Other methods take each frame by itself.
+        With alignment, the pose of the first frame is reused. ADMM and FISTA start from the previous result
+        (`mwdn.solvers.WarmStart`). Other methods treat frames independently.
 
-        Every frame is reconstructed; of a live camera take the newest: ``stream(mwdn.runtime.streams.latest(camera))``.
+        All frames are reconstructed. To skip to the newest frame of a live camera:
+        ``stream(mwdn.runtime.streams.latest(camera))``.
 
         Args:
             frames: raw frames.
-            refresh: align again every so many frames; 0 for never.
+            refresh: align again after this number of frames; 0 for never.
 
         Yields:
-            The measurement and the scene, as `__call__` gives it.
+            Measurement and scene, as `__call__` returns it.
 
         Raises:
             ParameterError: ``refresh`` is negative.
-            MwdnError: a frame does not fit the camera.
+            MwdnError: a frame does not fit the camera, or holds NaN or infinity.
         """
         if refresh < 0:
-            raise ParameterError(f"`refresh` ({refresh}) must be a number of frames, or 0.")
+            raise ParameterError(f"`refresh` ({refresh}) must be a number of frames, or 0 for never.")
         return self._stream(frames, refresh)
 
     def _stream(self, frames: Iterable[Frame], refresh: int) -> Iterator[tuple[Measurement, Scene]]:
         aligning = copy.copy(self)
         if isinstance(self.method, solvers.Admm | solvers.Fista):
             aligning.method = solvers.WarmStart(self.method)
-        reconstruct, due = aligning, self.align
+        reconstruct = aligning
         for number, frame in enumerate(frames):
             measurement = self.calibration.correct(frame)
-            due |= self.align and refresh > 0 and number % refresh == 0
-            if due and measurement.isfinite().all():
-                pose = solvers.align(to_device(measurement, self.device), self.psf)
-                reconstruct, due = aligning.at(pose), False
+            if self.align and (number == 0 or (refresh and number % refresh == 0)):
+                reconstruct = aligning.at(solvers.align(to_device(measurement, self.device), self.psf))
             yield measurement, reconstruct(measurement)
 
     def _reconstruct(self, measurement: Measurement) -> Scene:
@@ -190,15 +191,14 @@ class Reconstructor:
     def _pictures_per_chunk(self, measurement: Measurement) -> int:
         """Pictures of a batch that are reconstructed together."""
         if isinstance(self.method, solvers.WarmStart) or len(self.psf) > 1:
-            return len(measurement)  # each has a last frame, or a pose, of its own
-        pixels = PIXELS_PER_CHUNK.get(self.device.type, PIXELS_PER_CHUNK["cpu"])
-        return max(1, pixels // (measurement.shape[-2] * measurement.shape[-1]))
+            return len(measurement)  # each picture has its own previous result or pose
+        return max(1, self.pixels_per_chunk // (measurement.shape[-2] * measurement.shape[-1]))
 
     def _check(self, measurement: Measurement) -> None:
         shape = tuple(measurement.shape)
         if len(shape) != 4 or 0 in shape:
             raise ShapeError(
-                f"`measurement` {shape} must be a batch (B, C, H, W) that is not empty. One alone: `measurement[None]`."
+                f"`measurement` {shape} must be a non-empty batch (B, C, H, W). For one picture: `measurement[None]`."
             )
         if shape[-2:] != self.psf.shape[-2:]:
             raise ShapeError(
@@ -207,7 +207,7 @@ class Reconstructor:
             )
         check_fit(measurement, self.psf, "measurement")
         channels = self.method.channels if isinstance(self.method, Network) else 0
-        if channels and shape[1] > 1:  # the universal networks take a grey measurement too
+        if channels and shape[1] > 1:  # the universal networks accept grey measurements too
             check_channels(measurement, channels)
 
     @overload
@@ -220,18 +220,17 @@ class Reconstructor:
         """Reconstruct a batch of measurements, or one raw frame.
 
         Args:
-            measurement: tensor (B, C, H, W), as `Calibration.correct` gives it; or a raw frame as numpy array or PIL
+            measurement: tensor (B, C, H, W), as `Calibration.correct` returns it; or a raw frame as numpy array or PIL
                 picture, (H, W) or (H, W, C), which is corrected first.
 
         Returns:
-            In linear light: (B, C, H, W) on the CPU for a tensor, (H, W, C) float32 for a raw frame. Solvers give
-            non-negative values; networks may leave [0, 1]. `mwdn.to_display` scales either for display.
+            Scene in linear light: (B, C, H, W) on the CPU for a tensor, (H, W, C) float32 for a raw frame. Solvers
+            return non-negative values; networks may exceed [0, 1]. `mwdn.to_display` scales it for display.
 
         Raises:
-            ShapeError: the measurement is no batch, does not have the size of the PSF, or has other channels than the
-                PSF or the network.
-            ImageError: the raw frame has other axes or numbers than a frame.
-            ParameterError: the device has not enough memory for pictures of this size.
+            ShapeError: the measurement is not a batch, or its size or channels do not fit the PSF or the network.
+            ImageError: the array or picture is not a frame.
+            ParameterError: the device does not have enough memory for pictures of this size.
         """
         if isinstance(measurement, Tensor):
             return self._to_host(measurement)
@@ -243,7 +242,7 @@ class Reconstructor:
 
     @torch.inference_mode()
     def on_device(self, measurement: Measurement) -> Scene:
-        """Reconstruct a batch, as a call does, and leave it on `device`, for what goes on there.
+        """Reconstruct a batch and leave the result on `device`, for further processing there.
 
         Raises:
             ShapeError: as for a call.
@@ -255,9 +254,9 @@ class Reconstructor:
             scenes = [self._reconstruct(to_device(part, self.device)) for part in parts]
             return scenes[0] if len(scenes) == 1 else torch.cat(scenes)
         except (MemoryError, RuntimeError) as error:
-            # On a CPU torch has no type of its own for this.
-            short = isinstance(error, MemoryError | torch.OutOfMemoryError) or "can't allocate memory" in str(error)
-            if not short:
+            out_of_memory = isinstance(error, MemoryError | torch.OutOfMemoryError)
+            out_of_memory |= "can't allocate memory" in str(error)  # torch has no error type for this on a CPU
+            if not out_of_memory:
                 raise
             raise ParameterError(
                 f"`measurement` {tuple(measurement.shape)} needs more memory than {self.device} has free. Bin or crop "

@@ -1,4 +1,4 @@
-"""The pictures included in the package."""
+"""Photographs included in the package."""
 
 from importlib.resources import files
 
@@ -11,12 +11,12 @@ __all__ = ["dark_scene"]
 
 
 def dark_scene(name: str, size: Size, side: int) -> Scene:
-    """A picture in the centre of a dark scene, (1, 3, *size), linear light.
+    """A photograph in the centre of a dark scene, (1, 3, *size), in linear light.
 
     Args:
-        name: of a file in this folder, without ``.jpg``.
+        name: of the file in this folder, without ``.jpg``.
         size: height and width of the scene.
-        side: height and width of the picture in it.
+        side: height and width of the photograph.
     """
     picture = F.interpolate(read_picture(str(files("mwdn.io.pictures") / f"{name}.jpg")), (side, side), mode="area")
     (height, width), top, left = size, (size[0] - side) // 2, (size[1] - side) // 2
