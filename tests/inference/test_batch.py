@@ -376,9 +376,10 @@ def shop(tmp_path_factory):
     return folder
 
 
-def start(folder, out, *launch):
+def start(folder, out, *launch, resume=False):
     """``python`` with the command, or with torchrun and the command."""
     line = f"-m mwdn reconstruct in --psf psf.npy --method admm --format npy --device cpu --out {out}"
+    line += " --resume" if resume else ""
     here = {"PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"}
     here |= {"GLOO_SOCKET_IFNAME": "lo"} if sys.platform == "linux" else {}
     options = {"cwd": folder, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
@@ -499,7 +500,7 @@ def test_killed_work_goes_on_where_it_was(shop, single):
     first, _ = process.communicate(timeout=300)
     assert process.returncode == -signal.SIGKILL
     before = whole(folder)
-    second, err = start(shop, "killed").communicate(timeout=300)
+    second, err = start(shop, "killed", resume=True).communicate(timeout=300)
     assert f"{COUNT} of {COUNT + 1} captures reconstructed into killed, {len(before) // 2} of them before" in second, (
         err
     )
