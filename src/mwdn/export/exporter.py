@@ -28,7 +28,7 @@ from mwdn.inference.fusion import fuse
 from mwdn.inference.reconstructor import Method, Reconstructor, find_method
 from mwdn.io.files import atomic
 from mwdn.io.pictures import dark_scene
-from mwdn.networks.network import Network
+from mwdn.networks.network import Network, as_network
 from mwdn.optics import Camera, Sensor
 from mwdn.types import Measurement, Psf, Scene
 from mwdn.version import __version__
@@ -79,9 +79,9 @@ class Bound(nn.Module):
         self.method: Method = method
         self.psf: Tensor
         self.register_buffer("psf", psf)
-        if not isinstance(method, Network):
+        if not isinstance(method, nn.Module):
             return
-        network = copy.deepcopy(method).cpu().eval().requires_grad_(False)
+        network = as_network(copy.deepcopy(method)).cpu().eval().requires_grad_(False)
         tensors, self.layout = tree_flatten(network.prepare(psf, (psf.shape[-2], psf.shape[-1])))
         self.names = [f"prepared_{index}" for index in range(len(tensors))]
         for name, tensor in zip(self.names, tensors, strict=True):

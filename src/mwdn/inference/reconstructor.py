@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, overload
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mwdn import solvers
 from mwdn.calibration import Calibration
@@ -15,7 +15,7 @@ from mwdn.fourier.convolution import check_fit
 from mwdn.inference.engine import Engine, Precision
 from mwdn.networks import DENOISERS, NETWORKS
 from mwdn.networks.blocks import check_channels
-from mwdn.networks.network import Network
+from mwdn.networks.network import Network, as_network
 from mwdn.runtime.devices import select_device
 from mwdn.runtime.transfers import to_device, to_host
 from mwdn.types import ArrayPicture, FloatFrame, Frame, Measurement, Psf, Scene
@@ -131,7 +131,9 @@ class Reconstructor:
         self.method: Method = method
         self.align = method.align if align is None and isinstance(method, Network) else bool(align)
         self.psf = calibration.psf.to(self.device)
-        self.engine = Engine(method, self.psf, precision=precision) if isinstance(method, Network) else None
+        self.engine = None
+        if isinstance(method, nn.Module):
+            self.engine = Engine(as_network(method), self.psf, precision=precision)
 
     def at(self, pose: solvers.Pose) -> "Reconstructor":
         """A `Reconstructor` with a fixed pose of the PSF, instead of one estimated for each measurement.

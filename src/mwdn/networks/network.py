@@ -1,8 +1,8 @@
 """The common base of all networks: a function of measurement and PSF, in two steps."""
 
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
-from torch import nn
+from torch import Tensor, nn
 
 from mwdn.types import Measurement, Psf, Scene, Size
 
@@ -55,3 +55,24 @@ class Network(nn.Module, Generic[Prepared]):
     def forward(self, measurement: Measurement, psf: Psf) -> Scene:
         """Scene (B, C, H, W): `prepare`, then `reconstruct`."""
         return self.reconstruct(measurement, self.prepare(psf, (measurement.shape[-2], measurement.shape[-1])))
+
+
+class OtherNetwork(Network[Tensor]):
+    """A module of another package, called as ``module(measurement, psf)``; its preparation is the PSF itself."""
+
+    def __init__(self, module: nn.Module) -> None:
+        super().__init__()
+        self.module = module
+
+    def prepare(self, psf: Psf, size: Size) -> Tensor:
+        """The PSF."""
+        return psf
+
+    def reconstruct(self, measurement: Measurement, prepared: Tensor) -> Scene:
+        """Result of the module."""
+        return self.module(measurement, prepared)
+
+
+def as_network(module: nn.Module) -> Network[Any]:
+    """The module, as a `Network`."""
+    return module if isinstance(module, Network) else OtherNetwork(module)
