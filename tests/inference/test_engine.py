@@ -1,4 +1,4 @@
-"""A network made ready to run fast is the same function."""
+"""An engine computes the same function as its network."""
 
 import copy
 
@@ -26,8 +26,8 @@ def psf_and_batch(generator, batch=2):
     return psf / psf.sum(), torch.rand(batch, 3, *SIZE, generator=generator)
 
 
-def psnr(found, expected):
-    return -10 * ((found - expected).square().mean() / expected.abs().max().square()).log10().item()
+def psnr(result, expected):
+    return -10 * ((result - expected).square().mean() / expected.abs().max().square()).log10().item()
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -62,10 +62,10 @@ def test_fused_convolution(packed, dtype, generator):
     image = torch.randn(2, 20, 9, 11, generator=generator)
     with torch.no_grad():
         expected = layers.eval()(image)
-        found = fuse(copy.deepcopy(layers), dtype, pack=packed)(image)
-    assert found.dtype == (dtype or torch.float32)
+        result = fuse(copy.deepcopy(layers), dtype, pack=packed)(image)
+    assert result.dtype == (dtype or torch.float32)
     tolerance = 1e-5 if dtype is None else 0.03
-    torch.testing.assert_close(found.float(), expected, rtol=tolerance, atol=tolerance)
+    torch.testing.assert_close(result.float(), expected, rtol=tolerance, atol=tolerance)
 
 
 @pytest.mark.parametrize("channels", [(3, 20), (20, 3)])
@@ -80,9 +80,9 @@ def test_other_convolutions_are_left_alone(generator):
     strided = nn.Conv2d(4, 4, 3, stride=2, padding=1)
     grouped = nn.Conv2d(4, 4, 3, groups=2, padding="same")
     layers = nn.Sequential(strided, nn.BatchNorm2d(4), nn.ReLU(), grouped)
-    folded = fuse(layers, None)
-    assert [getattr(module, "layer", module) for module in folded] == list(layers)
-    assert not any(isinstance(module, FusedConvolution) for module in folded.modules())
+    fused = fuse(layers, None)
+    assert [getattr(module, "layer", module) for module in fused] == list(layers)
+    assert not any(isinstance(module, FusedConvolution) for module in fused.modules())
 
 
 def test_psf_branch_is_computed_once(generator):
@@ -101,14 +101,14 @@ def test_callers_network_is_left_alone_and_later_changes_do_not_matter(generator
     network = trained(small("mwdn"), generator).train()
     before = copy.deepcopy(network.state_dict())
     bound = Engine(network, psf)
-    found = bound(batch)
+    result = bound(batch)
     assert network.training
     assert all(parameter.requires_grad for parameter in network.parameters())
     assert all(torch.equal(value, before[key]) for key, value in network.state_dict().items())
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.zero_()
-    assert torch.equal(bound(batch), found)
+    assert torch.equal(bound(batch), result)
 
 
 def test_batches_of_any_size_and_order(generator):

@@ -166,13 +166,13 @@ def bank():
 @pytest.fixture
 def frames(psf, generator):
     """Raw 16-bit frames of a square that goes to the right."""
-    found = []
+    result = []
     for number in range(5):
         scene = torch.zeros(1, 3, *SIZE)
         scene[..., 10:20, 12 + number : 22 + number] = torch.tensor([0.9, 0.5, 0.2])[:, None, None]
         seen = Camera(psf).simulate(scene, generator=generator)[0].movedim(0, -1)
-        found.append((seen.clamp(0, 1) * 65535).round().numpy().astype(np.uint16))
-    return found
+        result.append((seen.clamp(0, 1) * 65535).round().numpy().astype(np.uint16))
+    return result
 
 
 @pytest.fixture
@@ -187,10 +187,10 @@ def aligned(monkeypatch):
 def test_pose_given_is_the_pose_found(precision, bank, psf, measurement):
     reconstruct = Reconstructor(bank, Calibration(psf), device="cpu", precision=precision)
     both = torch.cat([measurement, measurement.roll(3, -1)])
-    found = reconstruct.at(solvers.align(both, psf))(both)
-    torch.testing.assert_close(found, reconstruct(both), rtol=1e-4, atol=1e-5)
+    result = reconstruct.at(solvers.align(both, psf))(both)
+    torch.testing.assert_close(result, reconstruct(both), rtol=1e-4, atol=1e-5)
     turned = reconstruct.at(solvers.Pose(torch.tensor([5.0]), torch.tensor([0.0])))
-    assert (turned(measurement) - found[:1]).norm() > 0.02 * found[:1].norm()
+    assert (turned(measurement) - result[:1]).norm() > 0.02 * result[:1].norm()
     assert torch.equal(reconstruct(both), Reconstructor(bank, Calibration(psf), precision=precision)(both))
 
 
@@ -295,7 +295,7 @@ def test_what_belongs_to_each_sample_keeps_a_batch_together(generator):
     network = Reconstructor(build("wiener-bank", width=4).eval(), calibration, device="cpu", precision="exact")
     network.pixels_per_chunk = 1
     pose = solvers.Pose(torch.tensor([0.0, 2.0, -3.0]), torch.tensor([0.0, 0.01, 0.02]))
-    found = network.at(pose)(batch)
+    result = network.at(pose)(batch)
     for i in range(3):
         one = solvers.Pose(pose.turn_degrees[i : i + 1], pose.scale[i : i + 1])
-        torch.testing.assert_close(found[i : i + 1], network.at(one)(batch[i : i + 1]), rtol=1e-3, atol=1e-4)
+        torch.testing.assert_close(result[i : i + 1], network.at(one)(batch[i : i + 1]), rtol=1e-3, atol=1e-4)

@@ -1,4 +1,4 @@
-"""A U-Net in strips of rows is the U-Net of the whole picture."""
+"""A U-Net in strips of rows gives the result for the whole picture."""
 
 import copy
 
@@ -34,14 +34,14 @@ def test_strips_are_the_whole_picture(size, pooling, generator):
     unet = trained(build("unet", width=16, pooling=pooling), generator)
     picture = torch.rand(2, 3, *size, generator=generator)
     expected = unet(picture, picture[:1])
-    folded = fuse(copy.deepcopy(unet), None)
-    assert isinstance(folded.encoder, StripEncoder)
-    assert isinstance(folded.decoder, StripDecoder)
-    heights = limit_strips(folded)
-    found = folded(picture, picture[:1])
+    fused = fuse(copy.deepcopy(unet), None)
+    assert isinstance(fused.encoder, StripEncoder)
+    assert isinstance(fused.decoder, StripDecoder)
+    heights = limit_strips(fused)
+    result = fused(picture, picture[:1])
     assert len(heights) > 20
     assert max(heights) < size[0]
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(result, expected, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["mwdn", "mwdn-cpsf"])
@@ -55,11 +55,11 @@ def test_large_pictures_in_parts_everywhere(name, monkeypatch, generator):
     monkeypatch.setattr(Wiener, "max_grid_pixels", 8 * 96 * 70)
     engine = Engine(network, psf, precision="exact")
     heights = limit_strips(engine.network)
-    found = engine(measurement)
+    result = engine(measurement)
     kept = [tensor.is_complex() for tensor in engine.prepared]
     assert kept == ([True] * 4 if name == "mwdn" else [False] * 2 + [True] * 2)
     assert len(heights) > 20
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(result, expected, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("size", [(23, 31), (22, 9), (40, 16)])
@@ -67,8 +67,8 @@ def test_upsampled_rows(size, generator):
     picture = torch.rand(2, 3, 11, 16, generator=generator)
     expected = F.interpolate(picture, size=size, mode="bilinear", align_corners=True)
     for first, last in ((0, 5), (5, 6), (6, size[0]), (0, size[0])):
-        found = upsample_rows(picture, size, first, last)
-        torch.testing.assert_close(found, expected[..., first:last, :], rtol=1e-6, atol=1e-6)
+        result = upsample_rows(picture, size, first, last)
+        torch.testing.assert_close(result, expected[..., first:last, :], rtol=1e-6, atol=1e-6)
 
 
 def test_normalisation_over_the_picture_is_not_cut(generator):

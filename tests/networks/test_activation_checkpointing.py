@@ -1,4 +1,4 @@
-"""Gradients with the features of each scale computed again are those with all of them kept."""
+"""Activation checkpointing changes neither gradients nor BatchNorm statistics."""
 
 import copy
 
@@ -13,7 +13,7 @@ from mwdn.training.batch_norm import GlobalBatchNorm2d
 
 
 def learned_once(network, measurement, psf):
-    """Gradients of one step, the statistics after it, and the numbers that the step kept for the gradient."""
+    """Gradients of one step, BatchNorm statistics after it, and the count of numbers saved for the backward pass."""
     kept = {}
 
     def count(tensor):
@@ -21,8 +21,8 @@ def learned_once(network, measurement, psf):
         return tensor
 
     with torch.autograd.graph.saved_tensors_hooks(count, lambda tensor: tensor):
-        found = network(measurement, psf)
-    found.square().sum().backward()
+        result = network(measurement, psf)
+    result.square().sum().backward()
     gradients = {name: parameter.grad for name, parameter in network.named_parameters()}
     return gradients, dict(network.named_buffers()), sum(kept.values())
 
@@ -40,10 +40,10 @@ def test_gradients_and_statistics_are_the_same(name, synchronised, generator):
     checkpoint_activations(other)
     gradients, statistics, kept = learned_once(network, measurement, psf)
     same_gradients, same_statistics, kept_less = learned_once(other, measurement, psf)
-    for known, found in ((gradients, same_gradients), (statistics, same_statistics)):
-        assert known.keys() == found.keys()
-        for key in known:
-            torch.testing.assert_close(found[key], known[key], msg=lambda text, key=key: f"{key}: {text}")
+    for expected, result in ((gradients, same_gradients), (statistics, same_statistics)):
+        assert expected.keys() == result.keys()
+        for key in expected:
+            torch.testing.assert_close(result[key], expected[key], msg=lambda text, key=key: f"{key}: {text}")
     counts = [value for key, value in statistics.items() if key.endswith("num_batches_tracked")]
     assert counts
     assert set(map(int, counts)) == {1}

@@ -41,7 +41,7 @@ def test_each_sample_has_its_own_level(network, generator):
 
 
 def test_halving_and_doubling_are_convolutions_of_stride_2(network, generator):
-    """The reference has those; here they are 1 x 1 convolutions between folded pixels."""
+    """The reference has those; here they are 1 x 1 convolutions after pixel unshuffling."""
     features = torch.randn(1, 4, 8, 6, generator=generator)
     down, up = network.down[0], network.up[0]
     strided = F.conv2d(features, down.weight.reshape(6, 4, 2, 2), stride=2)

@@ -106,12 +106,12 @@ def stretched(picture, size):
 
 def deconvolved(features, psf, constant, boundary):
     """Each channel of each sample with its PSF: numpy's Wiener filter."""
-    found = np.zeros(features.shape)
+    result = np.zeros(features.shape)
     for b in range(features.shape[0]):
         for c in range(features.shape[1]):
             own = psf[b % psf.shape[0], c % psf.shape[1]]
-            found[b, c] = oracles.wiener(features[b, c].double().numpy(), own, constant, boundary)
-    return torch.from_numpy(found).float()
+            result[b, c] = oracles.wiener(features[b, c].double().numpy(), own, constant, boundary)
+    return torch.from_numpy(result).float()
 
 
 FORMS = [

@@ -68,7 +68,7 @@ def le_admm(b, h, constants):
     laplacian = laplacian + 4 * np.sin(np.pi * np.fft.fftfreq(grid[1])) ** 2
     v = np.zeros_like(data)
     xi, rho, eta = np.zeros_like(v), np.zeros_like(v), np.zeros((2, *v.shape))
-    found = []
+    result = []
     for mu1, mu2, mu3, threshold in constants:
         g = forward(v) + eta / mu2
         length = np.sqrt((g**2).sum(0))
@@ -80,8 +80,8 @@ def le_admm(b, h, constants):
         xi = xi + mu1 * (inverse(H * fourier(v)) - x)
         eta = eta + mu2 * (forward(v) - u)
         rho = rho + mu3 * (v - w)
-        found.append(v[:, :height, :width])
-    return found
+        result.append(v[:, :height, :width])
+    return result
 
 
 def constants_of(network):
@@ -89,10 +89,10 @@ def constants_of(network):
     return np.stack([getattr(network, name).detach().double().exp().numpy() for name in names], axis=1)
 
 
-def close(found, expected, part=2e-3):
+def close(result, expected, part=2e-3):
     """Within a part of the expected picture's largest value: single precision, 5 divisions by small numbers."""
     expected = torch.as_tensor(np.asarray(expected)).float()
-    torch.testing.assert_close(found, expected, rtol=0, atol=part * expected.abs().max().item())
+    torch.testing.assert_close(result, expected, rtol=0, atol=part * expected.abs().max().item())
 
 
 @torch.no_grad()
@@ -104,8 +104,8 @@ def test_le_admm_is_its_equations(size, generator):
     assert len(iterates) == 5
     for sample in range(2):
         expected = le_admm(b[sample].double().numpy(), h[0].double().numpy(), constants_of(network))
-        for found, one in zip(iterates, expected, strict=True):
-            close(found[sample], one)
+        for result, one in zip(iterates, expected, strict=True):
+            close(result[sample], one)
         close(scenes[sample], expected[-1] / expected[-1].max())
 
 
@@ -118,8 +118,8 @@ def test_le_admm_with_fixed_numbers_is_the_solver(generator):
     h = h.mean(1, keepdim=True)
     tau = threshold * penalty * (b.max() / b.norm()).item()
     expected = Admm(tau, Penalties(penalty, penalty, penalty), iterations=7, variation="isotropic")(b, h)
-    found = network.iterates(b, network.prepare(h, b.shape[-2:]))[-1].clamp(min=0) * b.max() / h.norm()
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5 * expected.max().item())
+    result = network.iterates(b, network.prepare(h, b.shape[-2:]))[-1].clamp(min=0) * b.max() / h.norm()
+    torch.testing.assert_close(result, expected, rtol=1e-4, atol=1e-5 * expected.max().item())
 
 
 def train(network, b, h, scene, *, steps):
@@ -246,8 +246,8 @@ def test_mmcn_sees_every_iterate(generator):
     for module in network.branch:
         module.register_forward_hook(lambda _, inputs, output: shapes.append((inputs[0].shape[1:], output.shape[1])))
     network(b, h)
-    for found, iterate in zip(seen, network.admm.iterates(b, network.prepare(h, b.shape[-2:]))[:4], strict=True):
-        close(found[..., :20, :33], iterate / iterate.amax((1, 2, 3), keepdim=True), part=1e-5)
+    for result, iterate in zip(seen, network.admm.iterates(b, network.prepare(h, b.shape[-2:]))[:4], strict=True):
+        close(result[..., :20, :33], iterate / iterate.amax((1, 2, 3), keepdim=True), part=1e-5)
     sizes = [tuple(shape[1:]) for shape, _ in shapes]
     assert sizes == [(64, 64), (32, 32), (16, 16), (8, 8), (4, 4)]
     widths = [width for _, width in shapes]
@@ -310,9 +310,9 @@ def test_updn_is_its_equations(size, generator):
     network = build("updn", width=3, depth=3, size=size).eval()
     network.correction.copy_(0.1 * torch.randn(network.correction.shape, generator=generator))
     b, h = pair(generator, size)
-    found = network(b, h)
+    result = network(b, h)
     for sample in range(2):
-        close(found[sample], updn(network, b[sample].double().numpy(), h[0].double().numpy()), part=1e-4)
+        close(result[sample], updn(network, b[sample].double().numpy(), h[0].double().numpy()), part=1e-4)
 
 
 @torch.no_grad()

@@ -36,8 +36,8 @@ def test_gain_does_not_matter(generator, gain):
     network = build("wiener-bank", width=2, block=8).eval()
     psf, measurement = torch.rand(1, 3, 64, 72, generator=generator) ** 8, torch.rand(1, 3, 64, 72, generator=generator)
     with torch.no_grad():
-        expected, found = network(measurement, psf), network(gain * measurement, psf) / gain
-    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-3 * float(expected.max()))
+        expected, result = network(measurement, psf), network(gain * measurement, psf) / gain
+    torch.testing.assert_close(result, expected, rtol=1e-3, atol=1e-3 * float(expected.max()))
 
 
 @pytest.mark.parametrize("options", [{"rounds": -1}, {"fold": 0}, {"width": 0}])

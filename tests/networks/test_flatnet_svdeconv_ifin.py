@@ -15,9 +15,9 @@ COUNTS = {"flatnet": 34_669_260, "svdeconv": 35_849_494, "ifin": 7_608_456}
 def test_learnable_numbers_are_those_of_the_docstring(name):
     with torch.device("meta"):
         network = build(name)
-    found = sum(parameter.numel() for parameter in network.parameters())
-    assert found == COUNTS[name]
-    assert f"{found:,}" in " ".join(type(network).__doc__.split())
+    result = sum(parameter.numel() for parameter in network.parameters())
+    assert result == COUNTS[name]
+    assert f"{result:,}" in " ".join(type(network).__doc__.split())
 
 
 def pair(generator, size=(15, 18)):
@@ -27,12 +27,12 @@ def pair(generator, size=(15, 18)):
 def wiener(b, psf, constant):
     """Each colour of each sample, the border repeated, a PSF of unit sum."""
     b, psf = b.double().numpy(), psf.double().numpy()
-    found = [[oracles.wiener(x, h, constant, "replicate") for x, h in zip(one, psf, strict=True)] for one in b]
-    return torch.from_numpy(np.stack(found)).float()
+    result = [[oracles.wiener(x, h, constant, "replicate") for x, h in zip(one, psf, strict=True)] for one in b]
+    return torch.from_numpy(np.stack(result)).float()
 
 
-def close(found, expected, part=1e-4):
-    torch.testing.assert_close(found, expected, rtol=0, atol=part * expected.abs().max().item())
+def close(result, expected, part=1e-4):
+    torch.testing.assert_close(result, expected, rtol=0, atol=part * expected.abs().max().item())
 
 
 # --- FlatNet ------------------------------------------------------------------------------------------
@@ -89,8 +89,8 @@ def test_field_weights_add_up_and_favour_the_nearest():
 def test_svdeconv_blends_one_wiener_estimate_a_place(generator):
     network = build("svdeconv", width=2, field=2, size=(15, 18), regularisation=3e-3)
     b, h = pair(generator)
-    for found in network.deconvolve(b, network.prepare(h, b.shape[-2:])):
-        close(found, wiener(b, (h / h.sum((-2, -1), keepdim=True))[0], 3e-3))
+    for result in network.deconvolve(b, network.prepare(h, b.shape[-2:])):
+        close(result, wiener(b, (h / h.sum((-2, -1), keepdim=True))[0], 3e-3))
     network.correction.copy_(0.05 * torch.rand(network.correction.shape, generator=generator))
     network.log_regularisation.add_(torch.randn(5, generator=generator))
     peak = h / h.max()
@@ -130,17 +130,17 @@ def test_ifin_streams_meet_through_both_operators(generator):
     b, scene = (torch.rand(1, 3, 15, 18, generator=generator) for _ in range(2))
     kernels = torch.rand(1, 4, 15, 18, generator=generator) ** 6
     kernels = kernels / kernels.sum((-2, -1), keepdim=True)
-    found = exchange(b, scene, kernels)
-    own = exchange.sensor(b), exchange.scene(scene)
+    result = exchange(b, scene, kernels)
+    sensor_features, scene_features = exchange.sensor(b), exchange.scene(scene)
     constants = exchange.log_regularisation.exp().flatten().tolist()
-    cast, seen = [], []
+    patterns, estimates = [], []
     for c in range(4):
         kernel = kernels[0, c].double().numpy()
-        cast.append(oracles.convolve(own[1][0, c].double().numpy(), kernel))
-        seen.append(oracles.wiener(own[0][0, c].double().numpy(), kernel, constants[c], "replicate"))
-    for stream, other, mixing, result in (
-        (own[0], cast, exchange.from_scene, found[0]),
-        (own[1], seen, exchange.from_sensor, found[1]),
+        patterns.append(oracles.convolve(scene_features[0, c].double().numpy(), kernel))
+        estimates.append(oracles.wiener(sensor_features[0, c].double().numpy(), kernel, constants[c], "replicate"))
+    for stream, exchanged, mixing, output in (
+        (sensor_features, patterns, exchange.from_scene, result[0]),
+        (scene_features, estimates, exchange.from_sensor, result[1]),
     ):
-        told = torch.from_numpy(np.stack(other)[None]).float()
-        close(result, stream + mixing(torch.cat([stream, told], dim=1)), part=1e-3)
+        other = torch.from_numpy(np.stack(exchanged)[None]).float()
+        close(output, stream + mixing(torch.cat([stream, other], dim=1)), part=1e-3)
