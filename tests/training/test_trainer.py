@@ -125,7 +125,7 @@ def test_checkpointing_is_the_same_run(trainer, tmp_path):
     second = trainer(few(bfloat16=False, checkpointing=True), "changed")
     assert second.step == 3
     second.run()
-    assert second.network.encoder.recompute
+    assert second.network.encoder.checkpoints_activations
     kept, changed = (load_file(tmp_path / name / "last.safetensors") for name in ("kept", "changed"))
     for key, value in kept.items():
         torch.testing.assert_close(changed[key], value, rtol=1e-3, atol=1e-5)
