@@ -18,9 +18,9 @@ from mwdn import Calibration, Reconstructor, read_frame, to_display
 from mwdn.calibration import FrameFormat
 from mwdn.cli.app import main
 from mwdn.errors import ExportError, ParameterError
-from mwdn.export import exporter as exporting
+from mwdn.export import export, read_about, run_file
 from mwdn.export.dft import column_matrices, inverse_row_matrix, row_matrix
-from mwdn.export.exporter import LEAST, agreement, export, read_about, run_file, simulated
+from mwdn.export.exporter import MIN_AGREEMENT, agreement, simulate_captures
 from mwdn.export.onnx_operations import REAL
 from mwdn.fourier.filtering import filter_image
 from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
@@ -148,7 +148,7 @@ def test_it_runs_without_torch(exported, tmp_path):
     import cv2
 
     done, mwdn = exported
-    measurement = simulated(camera(), ("cat",), 3)[:1]
+    measurement = simulate_captures(camera(), ("cat",), 3)[:1]
     dark = np.full((*SIZE, 3), 100, np.uint16)
     counts = (measurement[0].movedim(0, -1).numpy() * 3800).round().clip(0) + 100
     cv2.imwrite(str(tmp_path / "capture.png"), counts.astype(np.uint16)[..., ::-1])
@@ -262,7 +262,7 @@ def test_alignment_is_off_in_the_file_alone(tmp_path):
     done = export(bank, camera(), tmp_path / "camera.onnx", least=100)
     assert read_about(done.path)["alignment"].startswith("off")
     assert bank.align
-    seen = simulated(camera(), ("coffee",), 3)
+    seen = simulate_captures(camera(), ("coffee",), 3)
     expected = Reconstructor(bank, camera(), align=False, device="cpu", precision="exact")(seen)
     assert agreement(run_file(done.path, seen), expected) >= 100
 
@@ -294,7 +294,7 @@ def test_lower_precisions(precision, share, tmp_path):
 
     unet = network("unet", width=16)
     done = export(unet, camera(), tmp_path / "camera.onnx", precision=precision)
-    assert LEAST[precision] <= done.agreement < 100
+    assert MIN_AGREEMENT[precision] <= done.agreement < 100
     numbers = sum(parameter.numel() for parameter in unet.parameters())
     assert done.path.stat().st_size < 1.1 * 4 * numbers / share
     graph = onnx.load(done.path).graph
@@ -308,7 +308,7 @@ def test_float16_of_group_norm_and_mixed_precisions(name, tmp_path):
     options = {"size": SIZE} if name == "svdeconv" else {}
     unet = network(name, width=16, **options)
     done = export(unet, camera(), tmp_path / "camera.onnx", precision="float16")
-    assert LEAST["float16"] <= done.agreement < 100
+    assert MIN_AGREEMENT["float16"] <= done.agreement < 100
 
 
 def test_torchs_own_format(tmp_path, generator):
@@ -388,7 +388,7 @@ def test_a_foreign_file_is_not_run(suffix, tmp_path):
     ("out", "options", "message"),
     [
         ("camera.pt", {}, r"must end in .onnx or .pt2, not '.pt'"),
-        ("camera.pt2", {"precision": "int8"}, r"`precision` int8 exists in ONNX alone"),
+        ("camera.pt2", {"precision": "int8"}, r"`precision` int8 .*\.onnx"),
         ("camera.onnx", {"precision": "half"}, r"`precision` must be float32, float16 or int8, not 'half'"),
         ("camera.onnx", {"channels": 2}, r"`channels` \(2\) must be 1 or 3"),
     ],
@@ -410,7 +410,7 @@ def test_the_file_says_how_raw_frames_become_measurements(tmp_path):
 
 
 def test_the_extra_is_named(monkeypatch, tmp_path):
-    monkeypatch.setattr(exporting, "find_spec", lambda name: None)
+    monkeypatch.setattr("mwdn.export.model_file.find_spec", lambda name: None)
     with pytest.raises(ExportError, match=r"needs the package onnx and onnxruntime: `pip install 'mwdn\[export\]'`"):
         export(network("wiener"), camera(), tmp_path / "camera.onnx")
 

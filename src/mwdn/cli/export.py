@@ -7,7 +7,7 @@ from cyclopts import Parameter
 
 from mwdn.cli.camera import CameraOptions, console
 from mwdn.cli.method_options import MethodOptions, read_options
-from mwdn.export.exporter import LEAST, Precision
+from mwdn.export.exporter import MIN_AGREEMENT, Precision
 
 
 def export(
@@ -42,7 +42,7 @@ def export(
     exported = exporting.export(
         method, camera.load(), out, precision=precision, channels=channels, least=least, **method_options
     )
-    required = LEAST[precision] if least is None else least
+    required = MIN_AGREEMENT[precision] if least is None else least
     size = out.stat().st_size / 1e6
     line = f"{out} ({size:.1f} MB) agrees to {exported.agreement:.1f} dB (at least {required:.0f})"
     console.print(line, highlight=False, markup=False, soft_wrap=True)

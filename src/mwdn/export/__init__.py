@@ -1,5 +1,6 @@
-"""Networks written for other runtimes: ONNX and torch.export."""
+"""Export of methods to other runtimes: ONNX and torch.export."""
 
-from mwdn.export.exporter import Exported, export, read_about, run_file
+from mwdn.export.exporter import Exported, export
+from mwdn.export.model_file import read_about, run_file
 
 __all__ = ["Exported", "export", "read_about", "run_file"]

@@ -1,11 +1,10 @@
-"""Matrices of Fourier transforms, in real numbers: for programs that know neither transforms nor complex numbers.
+"""Fourier transforms as products with real matrices, for runtimes without fast transforms or complex numbers.
 
 onnxruntime's own transform takes 20 to 50 times as long as `mwdn.fourier`, and loses two digits unless the length is a
-power of two. A product with a matrix of cosines and sines takes 2 to 3 times as long, and loses none. Rows take one
-product, which knows that they are real; columns two small ones (N = N1 N2, after Cooley and Tukey), a tenth of the
-arithmetic.
+power of two. A product with a matrix of cosines and sines takes 2 to 3 times as long, and loses none. Rows are real and
+take one product. Columns take two smaller ones (N = N1 N2, after Cooley and Tukey), with a tenth of the arithmetic.
 
-Scaled as `mwdn.fourier` does. The angles are float64, the matrices float32.
+Scaling is that of `mwdn.fourier`. The angles are float64, the matrices float32.
 
 References:
     J. W. Cooley and J. W. Tukey, An algorithm for the machine calculation of complex Fourier series, Mathematics of
@@ -21,11 +20,16 @@ from torch import Tensor
 
 
 class Columns(NamedTuple):
-    """What transforms columns of N1 N2 points: point n = n1 N2 + n2 to frequency k = k1 + N1 k2.
+    """Two matrices that transform columns of N1 N2 points, from point n = n1 N2 + n2 to frequency k = k1 + N1 k2.
 
-    ``first``, (2 N1, 2 rows), is multiplied with the values of n1, real ones before imaginary ones, for all n2; it
-    gives N1 times a real and an imaginary row. ``second``, (N1, 2 k2, 2 N2), is multiplied with these, and gives N1
-    times the real ones of k2 before the imaginary ones.
+    exp(-2 pi i n k / N) = exp(-2 pi i n1 k1 / N1) exp(-2 pi i n2 k / N), as n1 N2 N1 k2 is a multiple of N. ``first``
+    sums over n1 for each k1 and n2, ``second`` sums over n2 for each k.
+
+    Attributes:
+        first: (2 N1, 2 rows); its columns are the real, then the imaginary values of n1, its rows the real and the
+            imaginary sum of each k1.
+        second: (N1, 2 k2, 2 N2), one matrix for each k1; its columns are the real, then the imaginary sums of n2, its
+            rows the real, then the imaginary frequencies of k2.
     """
 
     first: Tensor
@@ -43,13 +47,13 @@ class Columns(NamedTuple):
 
     @property
     def rows(self) -> int:
-        """How many values of n1 there are; beyond them all is zero."""
+        """Number of values of n1; the points beyond are zero."""
         return self.first.shape[1] // 2
 
 
 @cache
 def row_matrix(given: int, length: int) -> Tensor:
-    """Half the spectrum of rows of ``given`` points, continued with zeros: (given, 2 (length // 2 + 1))."""
+    """From ``given`` points, zero-padded to ``length``, to half their spectrum: (given, 2 (length // 2 + 1))."""
     angle = _angle(torch.arange(given)[:, None] * torch.arange(length // 2 + 1), length)
     return torch.cat([angle.cos(), -angle.sin()], dim=1).float()
 
@@ -57,7 +61,7 @@ def row_matrix(given: int, length: int) -> Tensor:
 @cache
 def inverse_row_matrix(length: int, kept: int) -> Tensor:
     """From half a spectrum to the first ``kept`` of ``length`` points: (2 (length // 2 + 1), kept)."""
-    # A frequency stands for itself and its mirror image, but for the first and, of an even length, the last.
+    # Each frequency also stands for its mirror image, except the first and, for an even length, the last.
     half = torch.arange(length // 2 + 1)[:, None]
     weight = torch.where((half == 0) | (2 * half == length), 1.0, 2.0).double() / length
     angle = _angle(half * torch.arange(kept), length)
@@ -66,13 +70,13 @@ def inverse_row_matrix(length: int, kept: int) -> Tensor:
 
 @cache
 def column_matrices(length: int, given: int, kept: int, *, inverse: bool) -> Columns:
-    """For columns of ``given`` points, continued with zeros to ``length``, and the first ``kept`` frequencies.
+    """Matrices for columns of ``given`` points, zero-padded to ``length``, and their first ``kept`` frequencies.
 
     Args:
-        length: any; a prime one takes a single product of its size.
-        given: at most ``length``.
-        kept: at most ``length``.
-        inverse: the inverse transform, divided by ``length``.
+        length: of the transform; a prime length has no factors and takes one full product.
+        given: number of points, at most ``length``.
+        kept: number of frequencies, at most ``length``.
+        inverse: make the inverse transform, divided by ``length``.
     """
     parts = _factor(length, given, kept)
     points, sign = length // parts, 1 if inverse else -1
@@ -85,23 +89,23 @@ def column_matrices(length: int, given: int, kept: int, *, inverse: bool) -> Col
 
 
 def _factor(length: int, given: int, kept: int) -> int:
-    """N1 that costs least: about 100 multiplications take as long as a number that is copied."""
+    """The cheapest N1. Copying a number takes as long as about 100 multiplications."""
 
     def cost(parts: int) -> int:
         points = length // parts
-        rows, found = -(-given // points), -(-kept // parts)
-        copied = (rows * points > given) * given + (found * parts > kept) * kept
-        return 4 * parts * points * (rows + found) + 100 * copied
+        rows, frequencies = -(-given // points), -(-kept // parts)
+        copied = (rows * points > given) * given + (frequencies * parts > kept) * kept
+        return 4 * parts * points * (rows + frequencies) + 100 * copied
 
     return min((n for n in range(1, length + 1) if length % n == 0), key=cost)
 
 
 def _angle(steps: Tensor, length: int) -> Tensor:
-    """2 pi steps / length; whole turns are left out before they cost digits."""
+    """2 pi steps / length, without whole turns, which would cost digits."""
     return (steps % length).double() * (2 * math.pi / length)
 
 
 def _complex(angle: Tensor) -> Tensor:
-    """What multiplies pairs with exp(i angle): (..., rows, columns) to (..., rows, 2, 2, columns), out before in."""
+    """Multiplication by exp(i angle) as real 2 x 2 matrices: (..., rows, columns) to (..., rows, 2, 2, columns)."""
     c, s = angle.cos(), angle.sin()
     return torch.stack([torch.stack([c, -s], dim=-2), torch.stack([s, c], dim=-2)], dim=-3)

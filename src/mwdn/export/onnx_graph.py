@@ -1,4 +1,4 @@
-"""A graph of ONNX that is written operation by operation."""
+"""Builder of ONNX graphs."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     import onnx
 
 OPSET = 18
-"""Version of the operations; onnxruntime has had it since 1.14 (2023)."""
+"""Version of the operations; onnxruntime supports it since 1.14 (2023)."""
 
 
 class Pair(NamedTuple):
@@ -22,7 +22,7 @@ class Pair(NamedTuple):
 
 
 class OnnxGraph:
-    """Nodes and constants; what is calculated is a name, what is known a tensor or a number."""
+    """An ONNX graph under construction: computed values are names, constants are tensors or numbers."""
 
     def __init__(self) -> None:
         self.nodes: list[onnx.NodeProto] = []
@@ -30,28 +30,28 @@ class OnnxGraph:
         self.count = 0
 
     def __call__(self, operation: str, *inputs: Any, **attributes: Any) -> str:  # noqa: ANN401
-        """Add an operation of one result, and name that; ``None`` for an input that is left out."""
+        """Add an operation with one result and return its name; ``None`` stands for a missing input."""
         return self.several(operation, 1, *inputs, **attributes)[0]
 
     def several(self, operation: str, results: int, *inputs: Any, **attributes: Any) -> list[str]:  # noqa: ANN401
-        """Add an operation, and name its results."""
+        """Add an operation with several results and return their names."""
         from onnx import helper
 
         self.count += 1
         names = [f"{operation.lower()}_{self.count}_{index}" for index in range(results)]
-        given = ["" if value is None else self.name(value) for value in inputs]
-        self.nodes.append(helper.make_node(operation, given, names, name=names[0], **attributes))
+        input_names = ["" if value is None else self.name(value) for value in inputs]
+        self.nodes.append(helper.make_node(operation, input_names, names, name=names[0], **attributes))
         return names
 
     def name(self, value: str | Tensor | float) -> str:
-        """The name of a result, or of a constant, which is kept once."""
+        """Name of a computed value, or of a constant; equal constants are stored once."""
         if isinstance(value, str):
             return value
-        found = value.detach().cpu() if isinstance(value, Tensor) else torch.tensor(value, dtype=torch.float32)
-        return self._constant(found.contiguous().numpy())
+        tensor = value.detach().cpu() if isinstance(value, Tensor) else torch.tensor(value, dtype=torch.float32)
+        return self._constant(tensor.contiguous().numpy())
 
     def integers(self, values: Sequence[int]) -> str:
-        """The name of a constant list of integers."""
+        """Name of a constant list of integers."""
         return self._constant(np.array(list(values), np.int64))
 
     def _constant(self, array: Any) -> str:  # noqa: ANN401
@@ -63,15 +63,15 @@ class OnnxGraph:
         return self.constants[key].name
 
     def model(self, result: str, shapes: Mapping[str, Sequence[int | str]]) -> "onnx.ModelProto":
-        """The whole, of one input and one output of float32.
+        """The finished model, with one input and one output of float32.
 
         Args:
-            result: name of what is to be the output.
-            shapes: of input and output by their names, in this order; a string is an axis of any length.
+            result: name of the value to output.
+            shapes: of input and output by name, in this order; a string is an axis of any length.
         """
         from onnx import TensorProto, helper
 
-        given, found = (helper.make_tensor_value_info(n, TensorProto.FLOAT, s) for n, s in shapes.items())
-        last = helper.make_node("Identity", [result], [found.name])
-        graph = helper.make_graph([*self.nodes, last], "mwdn", [given], [found], list(self.constants.values()))
+        source, target = (helper.make_tensor_value_info(n, TensorProto.FLOAT, s) for n, s in shapes.items())
+        last = helper.make_node("Identity", [result], [target.name])
+        graph = helper.make_graph([*self.nodes, last], "mwdn", [source], [target], list(self.constants.values()))
         return helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=8)

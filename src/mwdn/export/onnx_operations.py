@@ -1,7 +1,7 @@
-"""What torch calls an operation, in the words of ONNX: those that networks and solvers of this package use.
+"""Conversion of torch's real operations to ONNX, as far as this package's networks and solvers use them.
 
-Each function is given the graph to add to, the operation of torch, and its arguments: names of what is calculated,
-tensors and numbers of what is known.
+A handler takes the graph, the node of torch and its arguments: names for computed values, tensors and numbers for
+constants. It adds operations to the graph and returns the name of the result.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,36 +19,36 @@ Handler = Callable[..., Any]
 
 
 def value(node: fx.Node) -> Any:  # noqa: ANN401
-    """What an operation gives, without its numbers: shape and type."""
+    """Result of an operation without its data: shape and type."""
     return node.meta["val"]
 
 
 def source(node: fx.Node) -> Tensor:
-    """The same of the first argument."""
+    """First argument without its data."""
     return value(node.args[0])  # type: ignore[arg-type]
 
 
-def filled(given: Sequence[Any], *defaults: Any) -> tuple[Any, ...]:  # noqa: ANN401
-    """Arguments by their places; the last ones are left out where they have their defaults."""
-    return (*given, *defaults[len(given) :])
+def filled(arguments: Sequence[Any], *defaults: Any) -> tuple[Any, ...]:  # noqa: ANN401
+    """Positional arguments, completed with defaults."""
+    return (*arguments, *defaults[len(arguments) :])
 
 
-def _known(shape: Sequence[Any]) -> list[int]:
-    """A shape whose batch, where it is open, is -1: what a Reshape finds out by itself."""
+def _reshape_target(shape: Sequence[Any]) -> list[int]:
+    """Shape for a Reshape, with -1 for a free batch size."""
     return [length if isinstance(length, int) else -1 for length in shape]
 
 
 def _shape(g: OnnxGraph, shape: Sequence[Any]) -> str:
-    """The name of a shape whose first axis may be that of the measurement."""
+    """Name of a shape whose first axis may depend on the batch size."""
     if all(isinstance(length, int) for length in shape):
         return g.integers(shape)
-    times = int(shape[0].node.expr.as_coeff_Mul()[0])  # colours that have moved into the batch
+    times = int(shape[0].node.expr.as_coeff_Mul()[0])  # colours moved into the batch
     batch = g("Mul", g("Shape", "measurement", start=0, end=1), g.integers([times]))
-    return g("Concat", batch, g.integers(_known(shape)[1:]), axis=0)
+    return g("Concat", batch, g.integers(_reshape_target(shape)[1:]), axis=0)
 
 
 def _plain(operation: str) -> Handler:
-    """An operation that ONNX has as well; of two precisions torch takes the higher one."""
+    """An operation with the same meaning in ONNX; mixed precisions are promoted as in torch."""
 
     def handler(g: OnnxGraph, node: fx.Node, *arguments: Any) -> str:  # noqa: ANN401
         return g(operation, *(_as(g, value(node).dtype, *each) for each in zip(arguments, node.args, strict=True)))
@@ -57,7 +57,7 @@ def _plain(operation: str) -> Handler:
 
 
 def _sum(operation: str) -> Handler:
-    """The same of a sum or difference, whose second part torch may weight."""
+    """A sum or difference, whose second argument torch may multiply by ``alpha``."""
     plain = _plain(operation)
 
     def handler(g: OnnxGraph, node: fx.Node, a: Any, b: Any, *, alpha: float = 1) -> str:  # noqa: ANN401
@@ -66,14 +66,14 @@ def _sum(operation: str) -> Handler:
     return handler
 
 
-def _as(g: OnnxGraph, dtype: torch.dtype, x: Any, given: Any) -> Any:  # noqa: ANN401
-    """A number or result in a precision."""
-    if not isinstance(given, fx.Node):
+def _as(g: OnnxGraph, dtype: torch.dtype, x: Any, argument: Any) -> Any:  # noqa: ANN401
+    """A number or result, cast to a precision."""
+    if not isinstance(argument, fx.Node):
         return torch.tensor(x, dtype=dtype)
-    return x if value(given).dtype == dtype else g("Cast", x, to=_TYPES[dtype])
+    return x if value(argument).dtype == dtype else g("Cast", x, to=_TYPES[dtype])
 
 
-def _same(g: OnnxGraph, node: fx.Node, x: Any, **_: Any) -> Any:  # noqa: ANN401
+def _identity(g: OnnxGraph, node: fx.Node, x: Any, **_: Any) -> Any:  # noqa: ANN401
     return x
 
 
@@ -98,8 +98,8 @@ def _deviation(g: OnnxGraph, node: fx.Node, x: str, axes: list[int], correction:
 
 
 def _concatenation(g: OnnxGraph, node: fx.Node, parts: list[Any], axis: int = 0) -> str:
-    given: Any = node.args[0]
-    return g("Concat", *(_as(g, value(node).dtype, *each) for each in zip(parts, given, strict=True)), axis=axis)
+    arguments: Any = node.args[0]
+    return g("Concat", *(_as(g, value(node).dtype, *each) for each in zip(parts, arguments, strict=True)), axis=axis)
 
 
 def _stack(g: OnnxGraph, node: fx.Node, parts: list[str], axis: int = 0) -> str:
@@ -111,12 +111,12 @@ def _full(g: OnnxGraph, node: fx.Node, x: str, fill: float, **_: Any) -> str:  #
 
 
 def _median(g: OnnxGraph, node: fx.Node, x: str, axis: int, keep: bool = False) -> tuple[str, str]:
-    """The lower of two middle values, as torch takes it: the largest of the smaller half."""
+    """The lower of the two middle values, as in torch: the largest of the smaller half."""
     smaller = g.integers([(source(node).shape[axis] + 1) // 2])
     values, places = g.several("TopK", 2, x, smaller, axis=axis, largest=0)
     last, axes = (g.integers([-1]), g.integers([torch.iinfo(torch.int64).max])), g.integers([axis])
-    found = [g("Slice", each, *last, axes) for each in (values, places)]
-    return tuple(each if keep else g("Squeeze", each, axes) for each in found)  # type: ignore[return-value]
+    median = [g("Slice", each, *last, axes) for each in (values, places)]
+    return tuple(each if keep else g("Squeeze", each, axes) for each in median)  # type: ignore[return-value]
 
 
 def _clamp(g: OnnxGraph, node: fx.Node, x: str, min: float | None = None, max: float | None = None) -> str:
@@ -164,7 +164,7 @@ def _flip(g: OnnxGraph, node: fx.Node, x: str, axes: list[int]) -> str:
 
 
 def _reshape(g: OnnxGraph, node: fx.Node, x: str, *_: Any) -> str:  # noqa: ANN401
-    return g("Reshape", x, g.integers(_known(value(node).shape)))
+    return g("Reshape", x, g.integers(_reshape_target(value(node).shape)))
 
 
 def _expand(g: OnnxGraph, node: fx.Node, x: str, *_: Any, **__: Any) -> str:  # noqa: ANN401
@@ -201,30 +201,30 @@ def _pool(operation: str) -> Handler:
 
 
 def _group_norm(g: OnnxGraph, node: fx.Node, x: str, groups: int, weight: Any, bias: Any, *rest: Any) -> str:  # noqa: ANN401
-    # In float32, as torch calculates it: squares summed over a picture leave the range of float16.
+    # In float32, as in torch: squares summed over a picture exceed the range of float16.
     one, epsilon, dtype = torch.ones(groups), (*rest, 1e-5)[0], value(node).dtype
     grouped = g("Reshape", _as(g, torch.float32, x, node.args[0]), g.integers([0, groups, -1]))
     normal = g("InstanceNormalization", grouped, one, torch.zeros(groups), epsilon=epsilon)
-    spread = g("Reshape", normal, g.integers(_known(value(node).shape)))
-    found = g("Add", g("Mul", spread, weight.float()[:, None, None]), bias.float()[:, None, None])
-    return found if dtype == torch.float32 else g("Cast", found, to=_TYPES[dtype])
+    spread = g("Reshape", normal, g.integers(_reshape_target(value(node).shape)))
+    result = g("Add", g("Mul", spread, weight.float()[:, None, None]), bias.float()[:, None, None])
+    return result if dtype == torch.float32 else g("Cast", result, to=_TYPES[dtype])
 
 
-def _enlarge(g: OnnxGraph, node: fx.Node, x: str, size: Any, corners: bool, *_: Any) -> str:  # noqa: ANN401
-    # All four lengths: onnxruntime 1.31 forgets which axes are meant where it moves a Resize (to NHWC, for int8).
+def _upsample(g: OnnxGraph, node: fx.Node, x: str, size: Any, corners: bool, *_: Any) -> str:  # noqa: ANN401
+    # All four lengths: onnxruntime 1.31 loses the axes of a Resize when it moves it (to NHWC, for int8).
     mode = "align_corners" if corners else "half_pixel"
     wanted = _shape(g, value(node).shape)
     return g("Resize", x, None, None, wanted, mode="linear", coordinate_transformation_mode=mode)
 
 
 def _unshuffle(g: OnnxGraph, node: fx.Node, x: str, block: int) -> str:
-    # SpaceToDepth orders channels otherwise.
+    # SpaceToDepth has another order of channels.
     _, channels, height, width = source(node).shape
     split = g("Reshape", x, g.integers([-1, channels, height // block, block, width // block, block]))
     return _reshape(g, node, g("Transpose", split, perm=[0, 1, 3, 5, 2, 4]))
 
 
-def _swapped(g: OnnxGraph, node: fx.Node, x: str, one: int, other: int) -> str:
+def _transpose(g: OnnxGraph, node: fx.Node, x: str, one: int, other: int) -> str:
     axes = list(range(source(node).ndim))
     axes[one], axes[other] = axes[other], axes[one]
     return g("Transpose", x, perm=axes)
@@ -241,7 +241,7 @@ def _split(g: OnnxGraph, node: fx.Node, x: str, size: int, axis: int = 0) -> lis
 
 
 REAL: dict[Any, Handler] = {
-    **dict.fromkeys((_aten.alias.default, _aten.clone.default, _aten.detach.default), _same),
+    **dict.fromkeys((_aten.alias.default, _aten.clone.default, _aten.detach.default), _identity),
     **dict.fromkeys((_aten.view.default, _aten._unsafe_view.default, _aten.reshape.default), _reshape),
     _aten.unsqueeze.default: _reshape,
     **dict.fromkeys((_aten.new_zeros.default, _aten.zeros_like.default), _zeros),
@@ -285,9 +285,9 @@ REAL: dict[Any, Handler] = {
     _aten.std.correction: _deviation,
     _aten.sub.Tensor: _sum("Sub"),
     _aten.sum.dim_IntList: _reduce("ReduceSum"),
-    _aten.transpose.int: _swapped,
+    _aten.transpose.int: _transpose,
     _aten.unbind.int: _unbind,
-    _aten.upsample_bilinear2d.vec: _enlarge,
+    _aten.upsample_bilinear2d.vec: _upsample,
     _aten.where.self: lambda g, node, *given: g("Where", *given),
 }
-"""Operations of real numbers."""
+"""Handlers of real operations."""

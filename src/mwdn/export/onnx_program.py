@@ -1,7 +1,7 @@
-"""From an exported program of torch to ONNX: without complex numbers, and with products for Fourier transforms.
+"""Conversion of a program of torch.export to ONNX, with real numbers only and Fourier transforms as matrix products.
 
-What depends on no input is computed here, once. torch's own exporter is not used: of complex numbers it knows little,
-it leaves transforms to the runtime, and for the thousand operations of an iterative method it takes minutes.
+Values that depend on no input are computed here, once. torch's own ONNX exporter is not used: it supports few complex
+operations, leaves transforms to the runtime, and takes minutes for the thousand operations of an iterative method.
 """
 
 import operator
@@ -24,46 +24,46 @@ _aten = torch.ops.aten
 _ROWS, _COLUMNS = _aten.fft_rfft.default, _aten.fft_fft.default
 _TO_ROWS, _TO_COLUMNS = _aten.fft_irfft.default, _aten.fft_ifft.default
 _AXIS: dict[Any, int] = {_ROWS: -1, _COLUMNS: -2, _TO_ROWS: -1, _TO_COLUMNS: -2}
-"""The transforms that `mwdn.fourier.convolution` uses, and the axis of each."""
+"""The transforms used by `mwdn.fourier`, and the axis of each."""
 
 
 def to_onnx(program: ExportedProgram) -> "onnx.ModelProto":
-    """The same function as an exported program, of the input ``measurement`` and the output ``scene``.
+    """Convert a program to a model with the input ``measurement`` and the output ``scene``.
 
     Args:
-        program: of one picture to one picture, as `torch.export.export` gives it; its batch may be open.
+        program: from `torch.export.export`, with one input and one output; its batch size may be free.
 
     Raises:
-        ExportError: it does something that has no form here.
+        ExportError: an operation is not supported.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # torch's own, of how it copies a program
+        warnings.simplefilter("ignore", FutureWarning)  # from torch's copying of programs
         module = program.run_decompositions({}).module()
-    found, steps = _divided(module)
+    values, steps = _fold_constants(module)
     g = OnnxGraph()
     shapes = {}
     for step in steps:
         if step.op == "placeholder":
-            found[step] = "measurement"
+            values[step] = "measurement"
             shapes["measurement"] = _axes(value(step))
         elif step.op == "call_function":
-            arguments, options = fx.map_arg((step.args, step.kwargs), found.get)
-            found[step] = _written(g, step, arguments, options)
+            arguments, options = fx.map_arg((step.args, step.kwargs), values.get)
+            values[step] = _convert(g, step, arguments, options)
         elif step.op == "output":
             result = step.all_input_nodes[0]
             shapes["scene"] = _axes(value(result))
-            return g.model(found[result], shapes)
+            return g.model(values[result], shapes)
     raise AssertionError("A program has an output.")
 
 
-def _divided(module: fx.GraphModule) -> tuple[dict[fx.Node, Any], list[fx.Node]]:
-    """Values of what depends on no input, complex ones as pairs; and the other operations."""
+def _fold_constants(module: fx.GraphModule) -> tuple[dict[fx.Node, Any], list[fx.Node]]:
+    """Values of all operations that depend on no input, complex ones as pairs, and the remaining operations."""
     values: dict[fx.Node, Any] = {}
     steps = []
     for node in module.graph.nodes:
         if node.op == "get_attr":
             values[node] = operator.attrgetter(str(node.target))(module)
-        elif node.op == "call_function" and all(given in values for given in node.all_input_nodes):
+        elif node.op == "call_function" and all(source in values for source in node.all_input_nodes):
             arguments, options = fx.map_arg((node.args, node.kwargs), values.__getitem__)
             values[node] = node.target(*arguments, **options)
         elif node.op != "call_module" and node.target is not _aten._assert_tensor_metadata.default:  # only checks
@@ -76,14 +76,14 @@ def _axes(image: Tensor) -> list[int | str]:
     return [length if isinstance(length, int) else "batch" for length in image.shape]
 
 
-def _written(g: OnnxGraph, step: fx.Node, arguments: Any, options: Any) -> Any:  # noqa: ANN401
-    """Add an operation to the graph; what it gives."""
+def _convert(g: OnnxGraph, step: fx.Node, arguments: Any, options: Any) -> Any:  # noqa: ANN401
+    """Add an operation to the graph; returns its result."""
     if not isinstance(value(step), Tensor | tuple | list):
-        return None  # the length of the batch: shapes say it
+        return None  # the batch size, which the shapes hold
     if step.target is operator.getitem:
         return arguments[0][arguments[1]]
     handlers = _TRANSFORMS if step.target in _AXIS else REAL
-    if step.target not in _AXIS and any(_is_complex(given) for given in step.all_input_nodes):
+    if step.target not in _AXIS and any(_is_complex(source) for source in step.all_input_nodes):
         handlers = _ON_PAIRS
     if step.target not in handlers:
         kind = "of complex numbers " if handlers is _ON_PAIRS else ""
@@ -96,7 +96,7 @@ def _is_complex(node: fx.Node) -> bool:
 
 
 def _length(node: fx.Node) -> int:
-    """Of a transform; checked to be along the axis that is expected."""
+    """Length of a transform along the axis of `_AXIS`."""
     axis, dimensions = _AXIS[node.target], source(node).ndim
     _, n, along, norm = filled(node.args, None, None, -1, None)
     if along % dimensions != axis % dimensions or norm or node.kwargs:
@@ -105,7 +105,7 @@ def _length(node: fx.Node) -> int:
 
 
 def _kept(node: fx.Node) -> int:
-    """How many numbers along its axis are used, where all next operations cut the rest off."""
+    """Number of frequencies or points along its axis that are used: all users may slice off the others."""
     axis, ends = _AXIS[node.target], []
     whole = value(node).shape[axis]
     for user in node.users:
@@ -139,23 +139,23 @@ def _columns(g: OnnxGraph, node: fx.Node, columns: Pair, *_: Any) -> Pair:  # no
     sums = g("MatMul", matrices.second, g("Reshape", sums, g.integers([0, 0, parts, 2 * points, width])))
     sums = g("Reshape", sums, g.integers([0, 0, parts, 2, -1, width]))
     both = g("Reshape", g("Transpose", sums, perm=[0, 1, 3, 4, 2, 5]), g.integers([0, 0, -1, width]))
-    found = matrices.second.shape[1] // 2 * parts
-    if found == kept:
+    computed = matrices.second.shape[1] // 2 * parts  # kept, rounded up to a multiple of N1
+    if computed == kept:
         return Pair(*g.several("Split", 2, both, axis=2, num_outputs=2))
-    parts_of = [g("Slice", both, g.integers([s]), g.integers([s + kept]), g.integers([2])) for s in (0, found)]
-    return Pair(*parts_of)
+    starts = 0, computed  # of the real and the imaginary frequencies
+    return Pair(*(g("Slice", both, g.integers([s]), g.integers([s + kept]), g.integers([2])) for s in starts))
 
 
 _TRANSFORMS: dict[Any, Handler] = {_ROWS: _rows, _TO_ROWS: _to_rows, _COLUMNS: _columns, _TO_COLUMNS: _columns}
 
 
-def _on_each(target: Any) -> Handler:  # noqa: ANN401
+def _on_both(target: Any) -> Handler:  # noqa: ANN401
     return lambda g, node, pair, *arguments, **options: Pair(
         *(REAL[target](g, node, part, *arguments, **options) for part in pair)
     )
 
 
-def _multiplied(g: OnnxGraph, node: fx.Node, a: Any, b: Any) -> Pair:  # noqa: ANN401
+def _multiply(g: OnnxGraph, node: fx.Node, a: Any, b: Any) -> Pair:  # noqa: ANN401
     if not (isinstance(a, Pair) and isinstance(b, Pair)):
         pair, factor = (a, b) if isinstance(a, Pair) else (b, a)
         return Pair(g("Mul", pair.real, factor), g("Mul", pair.imaginary, factor))
@@ -163,17 +163,17 @@ def _multiplied(g: OnnxGraph, node: fx.Node, a: Any, b: Any) -> Pair:  # noqa: A
     return Pair(real, g("Add", g("Mul", a.real, b.imaginary), g("Mul", a.imaginary, b.real)))
 
 
-def _added(g: OnnxGraph, node: fx.Node, a: Pair, b: Pair) -> Pair:
+def _add(g: OnnxGraph, node: fx.Node, a: Pair, b: Pair) -> Pair:
     return Pair(*(g("Add", *each) for each in zip(a, b, strict=True)))
 
 
 _ON_PAIRS: dict[Any, Handler] = {
-    **{each: _on_each(each) for each in (_aten.alias.default, _aten.clone.default, _aten.slice.Tensor)},
+    **{each: _on_both(each) for each in (_aten.alias.default, _aten.clone.default, _aten.slice.Tensor)},
     _aten._conj.default: lambda g, node, a: Pair(a.real, g("Neg", a.imaginary)),
     _aten.abs.default: lambda g, node, a: g("Sqrt", g("Add", g("Mul", a[0], a[0]), g("Mul", a[1], a[1]))),
-    _aten.add.Tensor: _added,
-    _aten.addcmul.default: lambda g, node, a, b, c: _added(g, node, a, _multiplied(g, node, b, c)),
+    _aten.add.Tensor: _add,
+    _aten.addcmul.default: lambda g, node, a, b, c: _add(g, node, a, _multiply(g, node, b, c)),
     _aten.div.Tensor: lambda g, node, a, b: Pair(*(g("Div", part, b) for part in a)),
-    _aten.mul.Tensor: _multiplied,
+    _aten.mul.Tensor: _multiply,
 }
-"""Operations of complex numbers."""
+"""Handlers of complex operations."""

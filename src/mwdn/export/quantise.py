@@ -1,4 +1,4 @@
-"""Convolutions of an ONNX file in eight bits."""
+"""Quantisation of an ONNX file's convolutions to eight bits."""
 
 import logging
 from collections.abc import Iterator
@@ -10,25 +10,25 @@ from mwdn.types import Measurement
 
 
 class _Captures:
-    """What onnxruntime's calibration asks for: one input after the other, then ``None``."""
+    """Measurements in the form of onnxruntime's calibration: one input after the other, then ``None``."""
 
     def __init__(self, measurements: Measurement) -> None:
-        self.left: Iterator[Measurement] = iter(measurements[:, None])
+        self.remaining: Iterator[Measurement] = iter(measurements[:, None])
 
     def get_next(self) -> dict[str, Any] | None:
-        one = next(self.left, None)
-        return None if one is None else {"measurement": one.numpy()}
+        measurement = next(self.remaining, None)
+        return None if measurement is None else {"measurement": measurement.numpy()}
 
 
 def quantise(file: Path, measurements: Measurement) -> None:
-    """Replace a file by one whose convolutions take and give eight bits, their ranges found with measurements.
+    """Replace a file by one whose convolutions have eight-bit inputs and outputs.
 
-    Left in float32 are convolutions of few channels, which see the picture itself, and the last one, which makes the
-    picture: eight bits would show there.
+    Convolutions with few input channels, which see the picture itself, and the last one, which makes the picture, stay
+    float32: eight bits would be visible there.
 
     Args:
-        file: ONNX, as `mwdn.export` writes it.
-        measurements: (B, C, H, W), like those that the file will meet.
+        file: ONNX, from `mwdn.export`.
+        measurements: (B, C, H, W), typical captures, which give the range of each layer.
     """
     import onnx
     from onnxruntime import quantization
@@ -40,7 +40,7 @@ def quantise(file: Path, measurements: Measurement) -> None:
         node.name for node in convolutions if shapes[node.input[1]][1] < MIN_HALF_CHANNELS or node is convolutions[-1]
     ]
     level = logging.root.level
-    logging.root.setLevel(logging.ERROR)  # advice about preparing models that are not ours
+    logging.root.setLevel(logging.ERROR)  # hides advice on preparing other kinds of models
     try:
         quantization.quantize_static(
             model,

@@ -1,0 +1,106 @@
+"""Exported files: write, run and describe them; ONNX or torch's ``.pt2``."""
+
+import json
+import shutil
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+
+import torch
+from torch.export import ExportedProgram
+
+from mwdn.errors import ExportError
+from mwdn.export.onnx_program import to_onnx
+from mwdn.io.files import atomic
+from mwdn.types import Measurement, Scene
+
+ABOUT = "mwdn.json"
+"""Name of the description inside a ``.pt2`` file; an ONNX file holds it as its metadata."""
+
+
+def write_file(file: Path, program: ExportedProgram, about: dict[str, str]) -> None:
+    """Write a program in the format of the file's suffix.
+
+    Raises:
+        ExportError: an operation has no ONNX form, or the file would exceed 2 GB, the maximum of ONNX.
+    """
+    if file.suffix == ".pt2":
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torch warns about channels-last weights
+            torch.export.save(program, file, extra_files={ABOUT: json.dumps(about)})
+        return
+    import onnx
+
+    model = to_onnx(program)
+    onnx.helper.set_model_props(model, about)
+    model.producer_name, model.producer_version = "mwdn", about["version"]
+    if model.ByteSize() >= onnx.checker.MAXIMUM_PROTOBUF:
+        size = model.ByteSize() / 2**30
+        raise ExportError(f"The file would have {size:.1f} GB; ONNX files hold 2. Export to .pt2, or `--bin 2`.")
+    onnx.checker.check_model(model)
+    onnx.save(model, str(file))
+
+
+def run_file(file: Path, measurement: Measurement) -> Scene:
+    """Reconstruct a batch with an exported file, on the CPU.
+
+    Raises:
+        ExportError: onnxruntime is not installed, or the file cannot be read or run.
+    """
+    if file.suffix == ".pt2":
+        with as_export_error(file), torch.no_grad():
+            return torch.export.load(file).module()(measurement)
+    require_packages("onnxruntime")
+    import onnxruntime
+
+    with as_export_error(file):
+        session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+        return torch.from_numpy(session.run(["scene"], {"measurement": measurement.numpy()})[0])
+
+
+def read_about(file: Path) -> dict[str, str]:
+    """Description stored in an exported file: method, version, PSF, size, units."""
+    if file.suffix == ".pt2":
+        extra = {ABOUT: ""}
+        torch.export.load(file, extra_files=extra)
+        return json.loads(extra[ABOUT])
+    import onnx
+
+    return {entry.key: entry.value for entry in onnx.load(str(file)).metadata_props}
+
+
+def publish(file: Path, out: Path) -> None:
+    """Copy a finished file to its place, atomically.
+
+    Raises:
+        ExportError: the place cannot be written to.
+    """
+    try:
+        with atomic(out) as temporary:
+            shutil.copyfile(file, temporary)
+    except OSError as error:
+        raise ExportError(f"`{out}` cannot be written: {error.strerror or error}. Choose another folder.") from error
+
+
+def require_packages(*packages: str) -> None:
+    """Check that packages of the extra ``export`` are installed.
+
+    Raises:
+        ExportError: one is missing.
+    """
+    missing = [package for package in packages if find_spec(package) is None]
+    if missing:
+        raise ExportError(f"ONNX needs the package {' and '.join(missing)}: `pip install 'mwdn[export]'`.")
+
+
+@contextmanager
+def as_export_error(file: Path) -> Iterator[None]:
+    """Turn the many kinds of errors of onnxruntime and torch into an `ExportError`."""
+    try:
+        yield
+    except Exception as error:
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        advice = "Export it again: as .onnx, as .pt2, or with another `--precision`."
+        raise ExportError(f"`{file.name}` cannot be run: {reason.rstrip('.')}. {advice}") from error
