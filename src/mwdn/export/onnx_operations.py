@@ -179,30 +179,30 @@ def _cast(g: OnnxGraph, node: fx.Node, x: str, *_: Any, **__: Any) -> str:  # no
     return _as(g, value(node).dtype, x, node.args[0])
 
 
-def _convolution(g: OnnxGraph, node: fx.Node, x: str, *rest: Any) -> str:  # noqa: ANN401
-    weight, bias, stride, padding, dilation, groups = filled(rest, None, None, (1, 1), (0, 0), (1, 1), 1)
+def _convolution(g: OnnxGraph, node: fx.Node, x: str, *others: Any) -> str:  # noqa: ANN401
+    weight, bias, stride, padding, dilation, groups = filled(others, None, None, (1, 1), (0, 0), (1, 1), 1)
     return g("Conv", x, weight, bias, strides=stride, pads=[*padding, *padding], dilations=dilation, group=groups)
 
 
-def _transposed(g: OnnxGraph, node: fx.Node, x: str, *rest: Any) -> str:  # noqa: ANN401
+def _convolution_transpose(g: OnnxGraph, node: fx.Node, x: str, *others: Any) -> str:  # noqa: ANN401
     defaults = None, None, (1, 1), (0, 0), (0, 0), 1, (1, 1)
-    weight, bias, stride, padding, more, groups, dilation = filled(rest, *defaults)
+    weight, bias, stride, padding, more, groups, dilation = filled(others, *defaults)
     shape = {"strides": stride, "pads": [*padding, *padding], "output_padding": more, "dilations": dilation}
     return g("ConvTranspose", x, weight, bias, group=groups, **shape)
 
 
 def _pool(operation: str) -> Handler:
-    def handler(g: OnnxGraph, node: fx.Node, x: str, size: list[int], stride: Any = (), *rest: Any) -> str:  # noqa: ANN401
-        if any(each not in ([0, 0], [1, 1], False) for each in rest):
+    def handler(g: OnnxGraph, node: fx.Node, x: str, size: list[int], stride: Any = (), *others: Any) -> str:  # noqa: ANN401
+        if any(each not in ([0, 0], [1, 1], False) for each in others):
             raise ExportError(f"`{node.target}` with padding cannot be written as ONNX. Export to .pt2 instead.")
         return g(operation, x, kernel_shape=size, strides=stride or size)
 
     return handler
 
 
-def _group_norm(g: OnnxGraph, node: fx.Node, x: str, groups: int, weight: Any, bias: Any, *rest: Any) -> str:  # noqa: ANN401
+def _group_norm(g: OnnxGraph, node: fx.Node, x: str, groups: int, weight: Any, bias: Any, *others: Any) -> str:  # noqa: ANN401
     # In float32, as in torch: squares summed over a picture exceed the range of float16.
-    one, epsilon, dtype = torch.ones(groups), (*rest, 1e-5)[0], value(node).dtype
+    one, epsilon, dtype = torch.ones(groups), (*others, 1e-5)[0], value(node).dtype
     grouped = g("Reshape", _as(g, torch.float32, x, node.args[0]), g.integers([0, groups, -1]))
     normal = g("InstanceNormalization", grouped, one, torch.zeros(groups), epsilon=epsilon)
     spread = g("Reshape", normal, g.integers(_reshape_target(value(node).shape)))
@@ -253,7 +253,7 @@ REAL: dict[Any, Handler] = {
     _aten.cat.default: _concatenation,
     _aten.clamp.default: _clamp,
     _aten.conv2d.default: _convolution,
-    _aten.conv_transpose2d.input: _transposed,
+    _aten.conv_transpose2d.input: _convolution_transpose,
     _aten.div.Tensor: _plain("Div"),
     _aten.exp.default: _plain("Exp"),
     _aten.expand.default: _expand,
