@@ -1,4 +1,4 @@
-"""What a GPU computes is what the processor does; skipped where there is none.
+"""A GPU computes the same as the processor; skipped without a GPU.
 
 python -m pytest -n 0 tests/test_gpu.py
 """
@@ -51,8 +51,8 @@ def photographs(tmp_path):
     return Photographs(tmp_path / "photos", side=24)
 
 
-def psnr(found, expected):
-    return -10 * ((found - expected).square().mean() / expected.abs().max().square()).log10().item()
+def psnr(result, expected):
+    return -10 * ((result - expected).square().mean() / expected.abs().max().square()).log10().item()
 
 
 @pytest.mark.parametrize("shape", [(1,), (2, 3, 5, 7), (4, 3, 1000, 1200)])
@@ -77,7 +77,7 @@ def test_there_and_back(shape, generator):
 @pytest.mark.parametrize("precision", ["exact", "fast"])
 @pytest.mark.parametrize("method", ["mwdn", "mwdn-cpsf", "unet", "universal", "universal-small", *solvers.SOLVERS])
 def test_reconstructions(method, precision, calibration, batches):
-    """The first of a shape is calculated, the second recorded, those after it are replayed."""
+    """Of each shape, the first batch is computed, the second recorded as a CUDA graph, the others replayed."""
     if method in ("mwdn", "mwdn-cpsf", "unet"):
         method = build(method, width=8).eval()
     here = Reconstructor(method, calibration, device=CPU, precision="exact")
@@ -87,7 +87,7 @@ def test_reconstructions(method, precision, calibration, batches):
 
 
 def test_samples(calibration, photographs):
-    """The same scenes and PSFs; noise that is drawn there is another."""
+    """The same scenes and PSFs; the noise differs, as each device has its own generator."""
     here, there = (
         SimulatedPairs(photographs.to(device), calibration.psf.to(device)).batch(range(4)) for device in (CPU, GPU)
     )
@@ -104,12 +104,12 @@ def test_training(calibration, photographs, tmp_path):
     )
 
     def losses(device, folder, *, bfloat16):
-        own = replace(recipe, schedule=replace(recipe.schedule, bfloat16=bfloat16))
+        changed = replace(recipe, schedule=replace(recipe.schedule, bfloat16=bfloat16))
         pairs = RecordedPairs(PairFile(tmp_path / "pairs.h5"), range(8), calibration.psf.to(device))
-        task, result = supervised_task(pairs, own.schedule), []
-        trainer = Trainer(own, task, out=tmp_path / folder, calibration=calibration, device=device)
-        trainer.run(lambda report: result.append(report.loss))
-        return result
+        task, values = supervised_task(pairs, changed.schedule), []
+        trainer = Trainer(changed, task, out=tmp_path / folder, calibration=calibration, device=device)
+        trainer.run(lambda report: values.append(report.loss))
+        return values
 
     expected = losses(CPU, "here", bfloat16=False)
     assert losses(GPU, "there", bfloat16=False) == pytest.approx(expected, rel=0.02)
@@ -122,11 +122,11 @@ def test_a_folder(calibration, batches, tmp_path):
     for number, measurement in enumerate(torch.cat(batches)):
         captures.append(tmp_path / f"{number}.tif")
         cv2.imwrite(str(captures[-1]), (measurement.clamp(0, 1) * 65535).movedim(0, -1).numpy().astype(np.uint16))
-    found = {}
+    jobs = {}
     for device in (CPU, GPU):
         reconstruct = Reconstructor("universal-small", calibration, device=device, precision="exact")
-        found[device] = list(Batch(reconstruct, "name", tmp_path / device.type, "npy").run(captures))
-    for here, there in zip(found[CPU], found[GPU], strict=True):
+        jobs[device] = list(Batch(reconstruct, "name", tmp_path / device.type, "npy").run(captures))
+    for here, there in zip(jobs[CPU], jobs[GPU], strict=True):
         assert there.error is None
         assert there.consistency.explained == pytest.approx(here.consistency.explained, rel=1e-3)
         pictures = (torch.from_numpy(np.load(job.output)) for job in (there, here))

@@ -75,14 +75,14 @@ def test_right_psfs_are_trusted(data: Path, tmp_path: Path, captures: str, psf: 
     with pytest.raises(SystemExit) as ended:
         main([*map(str, ("reconstruct", *files, "--psf", data / psf, *options, "--method", method, "--out", tmp_path))])
     assert ended.value.code == 0
-    told = {path.stem: json.loads(path.read_text()) for path in tmp_path.glob("*.json")}
-    assert len(told) == len(files)
-    assert not [name for name, each in told.items() if each["doubtful"]]
+    reports = {path.stem: json.loads(path.read_text()) for path in tmp_path.glob("*.json")}
+    assert len(reports) == len(files)
+    assert not [name for name, report in reports.items() if report["doubtful"]]
 
 
-def best_psnr(found: np.ndarray, truth: np.ndarray) -> float:
+def best_psnr(result: np.ndarray, truth: np.ndarray) -> float:
     """PSNR in dB after one gain and one offset by least squares, rows 60:270, columns 60:440."""
-    x, y = (picture[60:270, 60:440].ravel().astype(np.float64) for picture in (found, truth))
+    x, y = (picture[60:270, 60:440].ravel().astype(np.float64) for picture in (result, truth))
     design = np.stack([x, np.ones_like(x)], axis=1)
     misfit = design @ np.linalg.lstsq(design, y, rcond=None)[0] - y
     return float(-10 * np.log10((misfit**2).mean()))
@@ -103,5 +103,5 @@ def test_diffusercam_pairs(data: Path) -> None:
     assert len(scores) == 9
     assert scores["mean"] >= 16.5
     # The right way up and with its own colours: any other orientation scores worse.
-    found, picture = np.load(out / "im326.npy"), read_frame(folder / "ground_truth_lensed/im326.npy", bgr=True)
-    assert best_psnr(found, picture[::-1]) > max(best_psnr(found, picture), best_psnr(found[..., ::-1], picture[::-1]))
+    scene, picture = np.load(out / "im326.npy"), read_frame(folder / "ground_truth_lensed/im326.npy", bgr=True)
+    assert best_psnr(scene, picture[::-1]) > max(best_psnr(scene, picture), best_psnr(scene[..., ::-1], picture[::-1]))
