@@ -11,7 +11,7 @@ from cameras import contour_psf
 from conftest import touch
 from mwdn import Camera, solvers
 from mwdn.calibration import Calibration
-from mwdn.errors import CheckpointError, ImageError, ParameterError, ShapeError, UnknownNameError
+from mwdn.errors import CheckpointError, ParameterError, ShapeError, UnknownNameError
 from mwdn.inference.reconstructor import Reconstructor, find_method
 from mwdn.networks import NETWORKS, build
 from mwdn.solvers import SOLVERS, Admm, Wiener
@@ -227,13 +227,29 @@ def test_stream_goes_on_where_it_was(solver, psf, frames, aligned):
     assert aligned == []
 
 
-def test_stream_refuses_a_frame_that_is_not_finite(psf, frames):
-    frame = (frames[1] / 65535).astype(np.float32)
+def broken(frame):
+    """With one pixel that is no number."""
+    frame = (frame / 65535).astype(np.float32)
     frame[3, 4] = np.nan
-    stream = Reconstructor("admm", Calibration(psf), device="cpu").stream([frames[0], frame])
-    assert next(stream)[1].isfinite().all()
-    with pytest.raises(ImageError, match="NaN"):
-        next(stream)
+    return frame
+
+
+@pytest.mark.parametrize("solver", [Admm(iterations=20), solvers.Fista(iterations=20)], ids=["admm", "fista"])
+def test_stream_forgets_a_frame_that_is_not_finite(solver, psf, frames):
+    stream = Reconstructor(solver, Calibration(psf), device="cpu").stream([frames[0], broken(frames[1]), *frames[2:]])
+    assert [bool(scene.isfinite().all()) for _, scene in stream] == [True, False, True, True, True]
+
+
+def test_stream_finds_the_pose_on_the_first_frame_that_is_finite(bank, psf, frames, aligned):
+    reconstruct = Reconstructor(bank, Calibration(psf), device="cpu", precision="exact")
+    for refresh, at in ((0, [1]), (2, [1, 3, 4])):
+        broken_ones = [broken(frames[n]) if n in (0, 2) else frames[n] for n in range(5)]
+        stream = reconstruct.stream(broken_ones, refresh=refresh)
+        seen = [measurement for measurement, _ in stream]
+        asked = [each for each in aligned if each.isfinite().all()]
+        assert len(asked) == len(at)
+        assert all(torch.equal(each, seen[n]) for each, n in zip(asked, at, strict=True))
+        aligned.clear()
 
 
 def test_stream_checks_the_channels(psf):

@@ -171,7 +171,7 @@ class Calibration:
             ShapeError: the frame does not fit the PSF.
             ParameterError: a number of the frame exceeds the bit depth.
         """
-        measurement = self.frames.to_measurement(as_frame(frame), self.dark)
+        measurement = self.frames.to_measurement(as_frame(frame, finite=False), self.dark)
         size = measurement.shape[-2], measurement.shape[-1]
         if size != self.size:
             raise ShapeError(

@@ -13,6 +13,7 @@ from mwdn.calibration import Calibration
 from mwdn.errors import CheckpointError, ParameterError, ShapeError, UnknownNameError
 from mwdn.fourier.convolution import check_fit
 from mwdn.inference.engine import Engine, Precision
+from mwdn.io.formats import as_frame
 from mwdn.networks import DENOISERS, NETWORKS
 from mwdn.networks.blocks import check_channels
 from mwdn.networks.network import Network, as_network
@@ -178,11 +179,13 @@ class Reconstructor:
         aligning = copy.copy(self)
         if isinstance(self.method, solvers.Admm | solvers.Fista):
             aligning.method = solvers.WarmStart(self.method)
-        reconstruct = aligning
+        reconstruct, due = aligning, self.align
         for number, frame in enumerate(frames):
             measurement = self.calibration.correct(frame)
-            if self.align and (number == 0 or (refresh and number % refresh == 0)):
+            due |= self.align and refresh > 0 and number % refresh == 0
+            if due and measurement.isfinite().all():  # else on the next frame
                 reconstruct = aligning.at(solvers.align(to_device(measurement, self.device), self.psf))
+                due = False
             yield measurement, reconstruct(measurement)
 
     def _reconstruct(self, measurement: Measurement) -> Scene:
@@ -236,7 +239,7 @@ class Reconstructor:
         """
         if isinstance(measurement, Tensor):
             return self._to_host(measurement)
-        return self._to_host(self.calibration.correct(measurement))[0].movedim(0, -1).numpy()
+        return self._to_host(self.calibration.correct(as_frame(measurement)))[0].movedim(0, -1).numpy()
 
     @torch.inference_mode()
     def _to_host(self, measurement: Measurement) -> Scene:

@@ -96,12 +96,13 @@ def _to_frame(stored: Frame, axes: tuple[int, ...], *, copy: bool = True) -> Fra
         return stored.reshape(axes)[..., :3].astype(dtype, copy=copy, subok=False)
 
 
-def as_frame(picture: ArrayPicture) -> Frame:
+def as_frame(picture: ArrayPicture, *, finite: bool = True) -> Frame:
     """Convert a numpy array or a PIL picture to a frame, without a copy where its axes and type fit.
 
     Args:
         picture: (H, W) or (H, W, C) of 1, 3 or 4 channels, RGB, row 0 at the top, uint8, uint16 or floats. Alpha is
             dropped.
+        finite: refuse NaN and infinity.
 
     Raises:
         ImageError: other axes or numbers; NaN or infinity; a PIL picture with a palette.
@@ -113,7 +114,7 @@ def as_frame(picture: ArrayPicture) -> Frame:
         frame = _to_frame(stored, _frame_shape(stored.shape, stored.dtype), copy=False)
     except ImageError as error:
         raise ImageError(f"The array {error}") from error
-    if frame.dtype.kind == "f" and not np.isfinite(frame).all():
+    if finite and frame.dtype.kind == "f" and not np.isfinite(frame).all():
         raise ImageError("The array holds NaN or infinity. Replace them: `numpy.nan_to_num`.")
     return frame
 
