@@ -82,8 +82,10 @@ def test_a_pil_picture(psf, capture):
         (lambda x: np.stack([x, x]), "2 x 32 x 40 x 3"),
         (lambda x: np.where(x == x.max(), np.nan, x).astype(np.float32), "NaN"),
         (lambda x: x[..., :2], "32 x 40 x 2"),
+        (lambda x: "capture.png", r"`capture.png` is a path, .*`mwdn.read_frame\('capture.png'\)`"),
     ],
 )
+@pytest.mark.usefixtures("unchecked")
 def test_what_is_no_frame_is_refused(change, named, psf, capture):
     with pytest.raises(ImageError, match=named):
         Reconstructor("wiener", Calibration.from_array(psf), device="cpu")(change(capture))

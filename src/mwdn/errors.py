@@ -45,8 +45,9 @@ class UnknownNameError(ParameterError):
 
     def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
         known = sorted(known)
-        nearest = difflib.get_close_matches(name, known, n=1)
-        hint = f" Did you mean '{nearest[0]}'?" if nearest else ""
+        spelling = {word.lower(): word for word in known}
+        nearest = difflib.get_close_matches(name.lower(), spelling, n=1)
+        hint = f" Did you mean '{spelling[nearest[0]]}'?" if nearest else ""
         super().__init__(f"No {kind} named '{name}'.{hint} Known: {', '.join(known)}.")
 
 

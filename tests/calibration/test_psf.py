@@ -331,7 +331,7 @@ def test_negative_or_dark_psf():
 
 def test_two_channels_in_the_file(tmp_path):
     np.save(tmp_path / "psf.npy", np.ones((8, 8, 2), np.uint8))
-    with pytest.raises(ImageError, match=r"has the axes \(8 x 8 x 2\)"):
+    with pytest.raises(ImageError, match=r"has the shape \(8 x 8 x 2\)"):
         Calibration.from_file(tmp_path / "psf.npy")
 
 

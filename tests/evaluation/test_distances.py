@@ -144,6 +144,13 @@ def test_shapes_must_agree(name, distances):
             distances[name](torch.rand(1, 3, 40, 40), torch.rand(other))
 
 
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("name", DISTANCES)
+def test_pictures_without_batch_are_refused(name, distances):
+    with pytest.raises(ShapeError, match=r"`image` \(3, 40, 40\) must be .*`image\[None\]`"):
+        distances[name](torch.rand(3, 40, 40), torch.rand(3, 40, 40))
+
+
 def test_ssim_needs_one_window():
     with pytest.raises(ShapeError, match="11 x 11"):
         ssim(torch.rand(1, 1, 10, 20), torch.rand(1, 1, 10, 20))

@@ -443,15 +443,26 @@ def test_letter_is_restored_upright_and_in_place(boundary, generator):
 @pytest.mark.parametrize("operation", OPERATIONS.values(), ids=OPERATIONS)
 @pytest.mark.parametrize(
     ("psf", "message"),
-    [((3, 1, 5, 5), r"`psf` \(3, 1, 5, 5\) must have batch 1"), ((1, 2, 5, 5), "channels 1 or that of")],
+    [
+        ((3, 1, 5, 5), r"`psf` \(3, 1, 5, 5\) has 3 samples"),
+        ((1, 2, 5, 5), "has 2 channels"),
+        ((3, 5, 5), r"`psf\[None\]`"),
+    ],
 )
 @pytest.mark.usefixtures("unchecked")
 def test_psf_that_does_not_fit_is_refused(operation, psf, message):
     with pytest.raises(ShapeError, match=message) as caught:
         operation(torch.ones(2, 3, 8, 8), torch.ones(psf))
-    assert "(2, 3, 8, 8)" in str(caught.value)
+    assert len(psf) == 3 or "(2, 3, 8, 8)" in str(caught.value)
     assert isinstance(caught.value, MwdnError)
     assert isinstance(caught.value, ValueError)
+
+
+@pytest.mark.parametrize("operation", OPERATIONS.values(), ids=OPERATIONS)
+@pytest.mark.usefixtures("unchecked")
+def test_image_without_batch_is_refused(operation):
+    with pytest.raises(ShapeError, match=r"\(3, 8, 8\) .*\[None\]`"):
+        operation(torch.ones(3, 8, 8), torch.ones(1, 1, 5, 5))
 
 
 def test_psf_larger_than_the_grid_is_refused():

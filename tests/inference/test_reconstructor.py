@@ -115,10 +115,23 @@ def test_measurement_that_is_no_batch(method, shape, psf):
         Reconstructor(method, Calibration(psf), device="cpu")(torch.rand(shape))
 
 
+@pytest.mark.usefixtures("unchecked")
+def test_measurement_of_integers(psf):
+    with pytest.raises(ParameterError, match=r"`measurement` \(torch.uint8\).*`Calibration.correct`"):
+        Reconstructor("wiener", Calibration(psf))(torch.zeros(1, 3, *SIZE, dtype=torch.uint8))
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("calibration", ["psf.png", torch.ones(1, 3, *SIZE)])
+def test_calibration_of_another_type(calibration):
+    with pytest.raises(ParameterError, match=rf"`calibration` \({type(calibration).__name__}\) must be"):
+        Reconstructor("wiener", calibration)
+
+
 @pytest.mark.parametrize("method", [*SOLVERS, "universal-small"])
 @pytest.mark.parametrize("channels", [1, 2, 4])
 def test_measurement_of_other_channels_than_the_psf(method, channels, psf):
-    message = f"`psf` (1, 3, 32, 40) must have channels 1 or that of `measurement` (1, {channels}, 32, 40)"
+    message = f"`psf` (1, 3, 32, 40) has 3 channels and `measurement` (1, {channels}, 32, 40) has {channels}"
     with pytest.raises(ShapeError, match=re.escape(message)):
         Reconstructor(method, Calibration(psf), device="cpu")(torch.rand(1, channels, *SIZE))
 

@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from conftest import trained
 from mwdn import fourier
-from mwdn.errors import MwdnError, ShapeError, UnknownNameError
+from mwdn.errors import MwdnError, ParameterError, ShapeError, UnknownNameError
 from mwdn.inference.engine import Engine
 from mwdn.networks import NETWORKS, build
 
@@ -256,9 +256,21 @@ def test_unknown_network_gets_the_nearest_name():
         build("?")
 
 
+@pytest.mark.parametrize("name", ["mwdn", "wiener-bank", "ifin"])
+def test_width_must_be_positive(name):
+    with pytest.raises(ParameterError, match=r"`width` \(0\) must be at least 1"):
+        build(name, width=0)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_measurement_without_batch_is_refused():
+    with pytest.raises(ShapeError, match=r"\(3, 32, 32\) must be \(B, C, H, W\)"):
+        build("unet", width=2)(torch.rand(3, 32, 32), torch.rand(1, 3, 32, 32))
+
+
 @pytest.mark.parametrize("option", ["pooling", "psf_pooling"])
 @pytest.mark.usefixtures("unchecked")
 def test_unknown_pooling_is_refused(option):
-    with pytest.raises(ValueError, match=r"`pooling` must be max or average, not 'min'") as caught:
+    with pytest.raises(ValueError, match=rf"`{option}` \('min'\) must be max or average") as caught:
         build("mwdn", width=2, **{option: "min"})
     assert isinstance(caught.value, MwdnError)

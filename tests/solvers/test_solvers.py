@@ -372,6 +372,17 @@ def test_impossible_constants_are_refused(options):
         Admm(**options)
 
 
+@pytest.mark.usefixtures("unchecked")
+def test_unknown_variation_is_refused():
+    with pytest.raises(ParameterError, match=r"`variation` \('tv'\) must be one of anisotropic, isotropic, colour"):
+        Admm(variation="tv")
+
+
+def test_name_in_capitals_gets_the_nearest_name():
+    with pytest.raises(UnknownNameError, match="Did you mean 'admm'"):
+        build("ADMM")
+
+
 def test_fista_needs_one_iteration():
     with pytest.raises(ParameterError, match=r"`iterations` \(0\) must be at least 1"):
         Fista(iterations=0)

@@ -148,7 +148,7 @@ def test_constant_measurements_stay_finite(measurement):
 
 @pytest.mark.usefixtures("unchecked")
 def test_psf_of_other_channels_is_refused():
-    with pytest.raises(ShapeError, match=r"`psf` .* must have channels 1 or that of `measurement`"):
+    with pytest.raises(ShapeError, match=r"`psf` .* has 3 channels and `measurement` .* has 1"):
         Wiener()(torch.rand(1, 1, 8, 8), torch.rand(1, 3, 8, 8))
 
 

@@ -88,7 +88,7 @@ class Calibration:
         psf_bin: int | None = None,
         **fields: Any,  # noqa: ANN401
     ) -> "Calibration":
-        """The same from a numpy array or a PIL picture of a point source.
+        """Calibrate from a numpy array or PIL picture of a point source.
 
         Args:
             picture: (H, W) or (H, W, 1 or 3), RGB, row 0 at the top, linear in light; uint8 and uint16 up to their

@@ -25,7 +25,9 @@ def _comparing(distance: _Distance) -> _Distance:
 
     @wraps(distance)
     def wrapped(image: Tensor, reference: Tensor, *networks: nn.Module, **named: nn.Module) -> Tensor:
-        if image.ndim != 4 or image.shape != reference.shape:
+        if image.ndim != 4 and image.shape == reference.shape:
+            raise ShapeError(f"`image` {tuple(image.shape)} must be (B, C, H, W). For one picture: `image[None]`.")
+        if image.shape != reference.shape:
             raise ShapeError(
                 f"`image` {tuple(image.shape)} and `reference` {tuple(reference.shape)} must have the same shape "
                 "(B, C, H, W). Crop or resize the larger one."

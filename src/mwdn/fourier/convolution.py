@@ -29,10 +29,18 @@ def _operator(psf: Tensor, scene: Size, sensor: Size, *, circular: bool) -> tupl
 
 def check_fit(image: Tensor, psf: Tensor, name: str) -> None:
     """Raise a `ShapeError` unless the PSF's batch and channels are 1 or those of the image called ``name``."""
-    shape = tuple(image.shape)
-    for axis, dimension in ((0, "batch"), (1, "channels")):
+    for label, array in ((name, image), ("psf", psf)):
+        if array.ndim != 4:
+            raise ShapeError(f"`{label}` {tuple(array.shape)} must be (B, C, H, W). For one picture: `{label}[None]`.")
+    for axis, dimension, way_out in (
+        (0, "samples", "For one PSF: `psf[:1]`."),
+        (1, "channels", "Average it: `psf.mean(1, keepdim=True)`."),
+    ):
         if psf.shape[axis] not in (1, image.shape[axis]):
-            raise ShapeError(f"`psf` {tuple(psf.shape)} must have {dimension} 1 or that of `{name}` {shape}.")
+            raise ShapeError(
+                f"`psf` {tuple(psf.shape)} has {psf.shape[axis]} {dimension} and `{name}` {tuple(image.shape)} has "
+                f"{image.shape[axis]}: they must be equal, or the PSF must have 1. {way_out}"
+            )
 
 
 def convolve(scene: Scene, psf: Psf, *, size: Size | None = None, circular: bool = False) -> Image:

@@ -107,7 +107,8 @@ class Reconstructor:
     Raises:
         UnknownNameError: no such method, or it has no such option.
         CheckpointError: the checkpoint cannot be used.
-        ParameterError: no such device or precision, an option is out of range, or the network has no weights.
+        ParameterError: ``calibration`` is no `Calibration`, no such device or precision, an option is out of range, or
+            the network has no weights.
     """
 
     def __init__(
@@ -120,6 +121,11 @@ class Reconstructor:
         precision: Precision = "fast",
         **options: Any,  # noqa: ANN401
     ) -> None:
+        if not isinstance(calibration, Calibration):
+            raise ParameterError(
+                f"`calibration` ({type(calibration).__name__}) must be a `Calibration`: "
+                "`Calibration.from_file('psf.png')`."
+            )
         self.device = select_device(device)
         self.pixels_per_chunk = PIXELS_PER_CHUNK.get(self.device.type, PIXELS_PER_CHUNK["cpu"])
         self.calibration = calibration
@@ -200,6 +206,11 @@ class Reconstructor:
         return max(1, self.pixels_per_chunk // (measurement.shape[-2] * measurement.shape[-1]))
 
     def _check(self, measurement: Measurement) -> None:
+        if not measurement.is_floating_point():
+            raise ParameterError(
+                f"`measurement` ({measurement.dtype}) must be floats in linear light; raw frames go through "
+                "`Calibration.correct`."
+            )
         shape = tuple(measurement.shape)
         if len(shape) != 4 or 0 in shape:
             raise ShapeError(
@@ -235,7 +246,8 @@ class Reconstructor:
         Raises:
             ShapeError: the measurement is not a batch, or its size or channels do not fit the PSF or the network.
             ImageError: the array or picture is not a frame.
-            ParameterError: the device does not have enough memory for pictures of this size.
+            ParameterError: the measurement is a tensor of integers, or the device does not have enough memory for
+                pictures of this size.
         """
         if isinstance(measurement, Tensor):
             return self._to_host(measurement)

@@ -76,14 +76,19 @@ def _kind(path: Path) -> str:
 def _frame_shape(shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, ...]:
     """(H, W, C) of a stored array; its header is checked before memory is allocated."""
     if dtype.kind != "f" and dtype.str[1:] not in ("u1", "u2"):
-        raise ImageError(f"holds {dtype}; a frame has uint8, uint16 or floats. Convert it with `astype`.")
+        raise ImageError(
+            f"holds {dtype}; a frame has uint8, uint16 or floats. Convert it: "
+            "`frame.astype('uint16')`; integers are divided by their type's maximum, floats are taken as they are."
+        )
     axes = shape
     while axes[:1] == (1,) and (len(axes) > 3 or (len(axes) == 3 and axes[2] not in (1, 3, 4))):
         axes = axes[1:]
     axes = (*axes, 1) if len(axes) == 2 else axes
     if len(axes) != 3 or axes[2] not in (1, 3, 4) or min(axes) < 1:
-        got, wanted = " x ".join(map(str, shape)), "(height, width) or (height, width, 1 or 3 channels)"
-        raise ImageError(f"has the axes ({got}); a frame has {wanted}. Save one frame, channels last.")
+        raise ImageError(
+            f"has the shape ({' x '.join(map(str, shape))}); one frame is (H, W) or (H, W, 1 or 3 channels). For "
+            "channels first: `array.transpose(1, 2, 0)`."
+        )
     if axes[0] * axes[1] > MAX_PIXELS:
         raise ImageError(f"claims {axes[0]:,} x {axes[1]:,} pixels; at most {MAX_PIXELS:,} are read. Crop it.")
     return axes
@@ -105,8 +110,10 @@ def as_frame(picture: ArrayPicture, *, finite: bool = True) -> Frame:
         finite: refuse NaN and infinity.
 
     Raises:
-        ImageError: other axes or numbers; NaN or infinity; a PIL picture with a palette.
+        ImageError: other axes or types; NaN or infinity; a path; a PIL picture with a palette.
     """
+    if isinstance(picture, str | Path):
+        raise ImageError(f"`{picture}` is a path, not a frame: `mwdn.read_frame('{picture}')`.")
     if getattr(picture, "mode", None) == "P":
         raise ImageError("The picture has a palette (mode P), not colours. Convert it: `picture.convert('RGB')`.")
     stored = np.asarray(picture)

@@ -22,11 +22,11 @@ Pooling = Literal["max", "average"]
 Normalisation = Literal["batch", "group"]
 
 
-def pooling_layer(kind: Pooling) -> nn.Module:
+def pooling_layer(kind: Pooling, option: str = "pooling") -> nn.Module:
     """2 x 2 pooling; an odd last row or column is dropped."""
     kinds = {"max": nn.MaxPool2d, "average": nn.AvgPool2d}
     if kind not in kinds:
-        raise ParameterError(f"`pooling` must be max or average, not {kind!r}.")
+        raise ParameterError(f"`{option}` ({kind!r}) must be max or average.")
     return kinds[kind](2)
 
 
@@ -50,6 +50,10 @@ def convolutions(*widths: int, bias: bool = True, norm: Normalisation = "batch")
 
 def check_channels(picture: Image, channels: int) -> None:
     """Raise a `ShapeError` unless a measurement or PSF has the network's number of channels."""
+    if picture.ndim != 4:
+        raise ShapeError(
+            f"A picture or PSF {tuple(picture.shape)} must be (B, C, H, W). For one picture: `picture[None]`."
+        )
     if picture.shape[1] != channels:
         raise ShapeError(
             f"A picture or PSF {tuple(picture.shape)} must have {channels} channels for this network. "

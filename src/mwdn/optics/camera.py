@@ -11,7 +11,7 @@ from mwdn.types import Image, Measurement, Psf, Scene, Size
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A thin mask in front of a sensor, shift-invariant over its field of view.
+    """Forward model of a lensless camera: convolution with the PSF, crop, sensor noise.
 
     Args:
         psf: (1 or B, 1 or C, h, w), centred; unit sum per channel keeps the energy of the scene.

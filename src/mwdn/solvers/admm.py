@@ -1,7 +1,7 @@
 """ADMM with total variation and non-negativity, the classical reconstruction of a lensless camera."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import torch
 from torch import Tensor
@@ -41,11 +41,12 @@ class Admm:
             the image is flat patches.
         penalties: mu of the data, the gradient and the sign constraint. They change the speed of convergence, not the
             limit.
-        iterations: how many.
-        variation: which total variation, see `mwdn.solvers.proximal.Variation`.
+        iterations: number of iterations.
+        variation: kind of total variation, see `mwdn.solvers.proximal.Variation`.
 
     Raises:
-        ParameterError: a penalty is not positive, ``regularisation`` is negative, or ``iterations`` is below 1.
+        ParameterError: a penalty is not positive, ``regularisation`` is negative, ``iterations`` is below 1, or there
+            is no such ``variation``.
         ShapeError: batch or channels of PSF and measurement do not fit.
 
     References:
@@ -65,6 +66,9 @@ class Admm:
             raise ParameterError(f"`iterations` ({self.iterations}) must be at least 1.")
         if not all((torch.as_tensor(mu) > 0).all() for mu in self.penalties):
             raise ParameterError(f"`penalties` {tuple(self.penalties)} must be positive.")
+        if self.variation not in get_args(Variation):
+            known = ", ".join(get_args(Variation))
+            raise ParameterError(f"`variation` ({self.variation!r}) must be one of {known}.")
 
     def __call__(self, measurement: Measurement, psf: Psf) -> Scene:
         """Reconstruct a batch."""

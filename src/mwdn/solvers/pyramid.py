@@ -69,7 +69,9 @@ changes less from pixel to pixel. `admm` does the same by scaling the whole meas
 
 @dataclass(frozen=True)
 class Pyramid:
-    """Minimise ``1/2 |crop(h * v) - b|^2 + tau |Psi v|_1`` over scenes ``v >= 0``, from coarse to fine.
+    """Coarse-to-fine ADMM with total variation, then one Wiener step on the residual.
+
+    Minimises ``1/2 |crop(h * v) - b|^2 + tau |Psi v|_1`` over scenes ``v >= 0``.
 
     The sensor crops the pattern, which loses mostly the low frequencies of the scene. They need many iterations but
     few pixels: an image of half the size holds half the band, and depends on the PSF's low frequencies alone. The
@@ -80,8 +82,9 @@ class Pyramid:
 
     Args:
         levels: the coarsest first.
-        regularisation: lambda of the last step, for a PSF of unit sum; multiplied by `smoothing_scale` where that is
-            above 1. As it grows, detail and noise fade.
+        regularisation: lambda of the Wiener step, for a PSF of unit sum; multiplied by `smoothing_scale` where that is
+            above 1. As it grows, detail and noise fade. The weight tau of the total variation is
+            `Level.regularisation`.
 
     Raises:
         ParameterError: ``regularisation`` is not positive, or the levels do not go from coarse to fine.
