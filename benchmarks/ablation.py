@@ -43,7 +43,7 @@ def parts(psf):
         "PSF not aligned": lambda b: network(b, psf),
         "haze not found": lambda b: network(b, align(b, psf)._replace(haze=0.0).move(psf)),
         "no plug and play": changed(network, rounds=0),
-        "U-Net free to change the mean light": changed(wiener_bank, mean_light=lambda picture, block: 0),
+        "U-Net free to change the mean light": changed(wiener_bank, block_means=lambda picture, block: 0),
         "no U-Net: plug and play, PSF aligned": aligned(lambda *known: network.estimates(*known)[:, :3]),
         "neither: pyramid, PSF aligned": aligned(Pyramid()),
         "neither: pyramid, PSF not aligned": lambda b: Pyramid()(b, psf),

@@ -17,7 +17,7 @@ from mwdn import Calibration, convolve, correlate
 from mwdn.data.importers import import_pairs
 from mwdn.data.pairs import PairFile
 from mwdn.evaluation.metrics import Protocol, best_gain, psnr
-from mwdn.networks.wiener_bank import mean_light
+from mwdn.networks.wiener_bank import block_means
 from mwdn.solvers import Pyramid, align
 
 PART = Protocol.parse("60:270,60:440")
@@ -41,7 +41,7 @@ def with_true_mean_light(results: Tensor, truths: Tensor, block: int) -> float:
     """The score with the true mean light of blocks."""
     results, truths = PART.crop(results), PART.crop(truths)
     results = best_gain(results, truths)
-    return float(psnr((results + mean_light(truths - results, block)).clamp(0, 1), truths).mean())
+    return float(psnr((results + block_means(truths - results, block)).clamp(0, 1), truths).mean())
 
 
 def refitted(psf: Tensor, scenes: Tensor, measurements: Tensor, weight: float, steps: int = 40) -> Tensor:
