@@ -1,4 +1,4 @@
-"""Reconstruct a capture with an exported file: numpy, onnxruntime and OpenCV, neither torch nor mwdn.
+"""Reconstruct a capture with an exported file, using numpy, onnxruntime and OpenCV, without torch and mwdn.
 
 mwdn export universal-small --psf psf.png --out camera.onnx
 python examples/onnx_only.py camera.onnx capture.png scene.png [dark.png]
@@ -12,8 +12,8 @@ import numpy as np
 import onnxruntime
 
 
-def opened(model):
-    """A session, and what the file says about itself."""
+def load(model):
+    """Session and description of a file."""
     try:
         session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime raises many kinds
@@ -25,7 +25,7 @@ def opened(model):
 
 
 def read(path, about):
-    """A frame as linear light in RGB, (H, W, C), its rows as stored; 1 is saturation."""
+    """Read a frame as linear light, RGB, (H, W, C), rows as stored; 1 is saturation."""
     try:
         frame = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
     except (OSError, cv2.error):
@@ -41,13 +41,13 @@ def read(path, about):
 
 
 def cropped(frame, height, width):
-    """The middle part; (H // 2, W // 2) stays the centre."""
+    """Crop to the middle part; (H // 2, W // 2) stays the centre."""
     top, left = (max(0, n // 2 - kept // 2) for n, kept in zip(frame.shape, (height, width), strict=False))
     return frame[top : top + height, left : left + width]
 
 
 def binned(frame, factor):
-    """Means of blocks of pixels; the block of the centre becomes the centre."""
+    """Average blocks of pixels; the block at the centre becomes the centre."""
     for axis in (0, 1):
         length, blocks = frame.shape[axis], frame.shape[axis] // factor
         start = min(length // 2 - blocks // 2 * factor, length - blocks * factor)
@@ -57,14 +57,14 @@ def binned(frame, factor):
 
 
 def demosaiced(frame, mosaic):
-    """Pixels of 2 x 2 cells of a colour filter array, whose greens are averaged."""
+    """Turn 2 x 2 cells of a colour filter array into pixels; the two greens are averaged."""
     cells = [frame[row::2, column::2, 0] for row in (0, 1) for column in (0, 1)]
     colours = [[cell for cell, letter in zip(cells, mosaic, strict=True) if letter == colour] for colour in "rgb"]
     return np.stack([sum(each) / len(each) for each in colours], axis=-1)
 
 
 def measured(capture, dark, about):
-    """What the file takes: a capture less its dark frame, cropped, binned, row 0 at the top, (1, C, H, W)."""
+    """Input of the file: a capture minus its dark frame, cropped, binned, row 0 at the top, (1, C, H, W)."""
     frame = read(capture, about)
     if dark:
         level = read(dark, about)
@@ -93,7 +93,7 @@ def to_display(scene):
 
 
 def main(model, capture, out, dark=None):
-    session, about = opened(model)
+    session, about = load(model)
     measurement = measured(capture, dark, about)
     wanted = session.get_inputs()[0].shape[1:]
     if list(measurement.shape[1:]) != wanted:

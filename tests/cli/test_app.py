@@ -243,6 +243,16 @@ def test_options_of_a_method(run, camera, line, method):
     assert np.array_equal(read_frame("out/a.npy"), scene[0].movedim(0, -1).numpy())
 
 
+def test_any_method_can_align(run, camera):
+    options = ("captures/a.png", "--psf", "psf.png", "--background", "0", "--format", "npy", "--no-trust")
+    assert run("reconstruct", *options, "--method", "wiener", "--align", "--out", "out")[0] == 0
+    calibration = mwdn.Calibration.from_file("psf.png", background=0.0)
+    scene = mwdn.Reconstructor("wiener", calibration, align=True, device="cpu")(
+        calibration.correct(read_frame("captures/a.png"))
+    )
+    assert np.array_equal(read_frame("out/a.npy"), scene[0].movedim(0, -1).numpy())
+
+
 def test_methods_lists_all_and_the_options_of_one(run):
     code, out, _ = run("methods")
     assert code == 0
