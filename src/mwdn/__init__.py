@@ -1,4 +1,4 @@
-"""Lensless imaging: reconstruct pictures from the caustic patterns that lensless cameras record.
+"""Image reconstruction for lensless cameras, in PyTorch.
 
 >>> from mwdn import Calibration, Reconstructor, read_frame, to_display, write_picture
 >>> calibration = Calibration.from_file("psf.png")

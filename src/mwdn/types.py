@@ -5,7 +5,7 @@ light, nominally in [0, 1], row 0 at the top, channels in the order R, G, B. A P
 at pixel ``(height // 2, width // 2)``, and has a batch of 1 unless each sample has its own.
 
 A *frame* is an image as a file or a sensor stores it, before any of these conventions apply: a numpy array of axes
-(height, width, channel), in the numbers of the analogue-to-digital converter.
+(height, width, channel), raw values of the analogue-to-digital converter.
 """
 
 from typing import Any, Protocol, runtime_checkable

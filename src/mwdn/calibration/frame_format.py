@@ -69,7 +69,7 @@ class FrameFormat:
             (1, C, height, width), linear light, row 0 at the top; 1 is saturation.
 
         Raises:
-            ParameterError: a number of the frame exceeds the bit depth, or the frame is smaller than ``bin``.
+            ParameterError: a pixel value exceeds the bit depth, or the frame is smaller than ``bin``.
             ShapeError: the dark frame, the crop or the mosaic does not fit the frame.
         """
         image = self.normalise(frame)

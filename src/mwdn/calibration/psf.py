@@ -161,7 +161,7 @@ class Calibration:
         """Turn a raw frame into a measurement of the PSF's size.
 
         Args:
-            frame: (H, W) or (H, W, C) numbers of the sensor, RGB: from `FrameFormat.read`, or another numpy array or
+            frame: (H, W) or (H, W, C) raw pixel values, RGB: from `FrameFormat.read`, or another numpy array or
                 PIL picture of uint8, uint16 or floats.
 
         Returns:
@@ -169,7 +169,7 @@ class Calibration:
 
         Raises:
             ShapeError: the frame does not fit the PSF.
-            ParameterError: a number of the frame exceeds the bit depth.
+            ParameterError: a pixel value exceeds the bit depth.
         """
         measurement = self.frames.to_measurement(as_frame(frame, finite=False), self.dark)
         size = measurement.shape[-2], measurement.shape[-1]

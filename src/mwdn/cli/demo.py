@@ -2,9 +2,10 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
+from cyclopts import Parameter
 from rich.table import Table
 
 from mwdn.calibration import Calibration
@@ -30,7 +31,12 @@ Picture = Literal["astronaut", "coffee", "cat"]
 PICTURES: tuple[Picture, ...] = ("astronaut", "coffee", "cat")
 
 
-def demo(*, out: Path = Path("results/demo"), seed: int = 0, pictures: tuple[Picture, ...] = PICTURES) -> None:
+def demo(
+    *,
+    out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("results/demo"),
+    seed: int = 0,
+    pictures: tuple[Picture, ...] = PICTURES,
+) -> None:
     """Simulate a small lensless camera and reconstruct its captures with every method that needs no training.
 
     Args:

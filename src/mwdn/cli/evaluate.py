@@ -1,7 +1,9 @@
 """`mwdn evaluate`: compare methods on pairs of measurements and scenes."""
 
 from pathlib import Path
+from typing import Annotated
 
+from cyclopts import Parameter
 from rich.progress import Progress
 
 from mwdn.cli.camera import CameraOptions, console, errors, warn
@@ -17,7 +19,7 @@ def evaluate(
     protocol: str = "full",
     variant: Variant | None = None,
     first: int | None = None,
-    out: Path = Path("results/evaluate"),
+    out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("results/evaluate"),
     device: str | None = None,
 ) -> None:
     """Compare methods on pairs of measurements and scenes: quality, time, memory.

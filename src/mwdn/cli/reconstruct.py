@@ -5,8 +5,10 @@ from collections import Counter
 from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
+from typing import Annotated
 
 import torch
+from cyclopts import Parameter
 from rich.markup import escape
 from rich.progress import Progress
 
@@ -29,7 +31,7 @@ def reconstruct(  # noqa: PLR0913
     *captures: Path,
     camera: CameraOptions,
     method: str = "universal",
-    out: Path = Path("results/reconstruct"),
+    out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("results/reconstruct"),
     format: Format = "png",
     align: bool | None = None,
     trust: bool = True,
@@ -51,7 +53,7 @@ def reconstruct(  # noqa: PLR0913
         out: folder for the pictures. Beside each, a .json says how well it explains its capture; summary.png shows
             the first twelve pictures and their captures.
         format: png and png16 are sRGB for viewing, tiff and npy hold the linear float32 values.
-        align: turn, scale and haze the PSF until it explains each capture, for a camera that has changed since its
+        align: estimate rotation, scale and haze of the PSF from each capture, for a camera that has changed since its
             calibration; by default for universal, and not for solvers.
         trust: check how well each picture explains its capture; takes a second or two for a small one.
         resume: skip each capture whose picture is there, made from the same file in the same way; the default for

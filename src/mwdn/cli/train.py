@@ -36,7 +36,7 @@ def train(  # noqa: PLR0913
     photos: Path | None = None,
     pairs: Path | None = None,
     captures: Annotated[list[Path] | None, Parameter(consume_multiple=True, negative=())] = None,
-    out: Path = Path("runs/train"),
+    out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("runs/train"),
     device: str | None = None,
     tensorboard: Annotated[bool, Parameter(negative=())] = False,
     **changes: RecipeKeys,

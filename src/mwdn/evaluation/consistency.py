@@ -45,7 +45,7 @@ class Consistency:
             and the contrast is mostly below 1.
         turn_degrees: rotation of the PSF that fits best.
         scale: its relative magnification; positive for objects nearer than the point of the calibration.
-        haze: estimated part of the light that is spread evenly under that PSF.
+        haze: estimated fraction of the light that is spread evenly under that PSF.
     """
 
     explained: float
@@ -82,7 +82,7 @@ class Consistency:
 def consistency(measurement: Measurement, psf: Psf, scene: Scene, *, pose: Pose | None = None) -> Consistency:
     """Compare a measurement with the forward model of its reconstruction.
 
-    The scene passes the PSF in its best pose (turn, scale and haze, `mwdn.solvers.alignment`) and the PSF as it is;
+    The scene passes the PSF in its best pose (rotation, scale and haze, `mwdn.solvers.alignment`) and the PSF as it is;
     the better one counts. The gain and an even background are free in each channel.
 
     A merely displaced PSF goes unnoticed: it displaces the reconstruction and explains the measurement as well.

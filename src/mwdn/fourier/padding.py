@@ -15,7 +15,7 @@ Boundary = Literal["circular", "zero", "replicate", "taper"]
 - ``circular``: the opposite border. No padding: the form of the MWDN authors' code.
 - ``zero``: zeros.
 - ``replicate``: the border's own values, repeated.
-- ``taper``: the same, fading to zero, so that the opposite ends of the grid meet without a step.
+- ``taper``: the same, fading to zero, so that the image is continuous across the grid's ends.
 """
 
 

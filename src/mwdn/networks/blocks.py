@@ -145,8 +145,8 @@ class Wiener(nn.Module):
     Both are stored as logarithms, so that they stay positive during training.
 
     Args:
-        weight: start value of w; ``None`` leaves w out (MWDN-CPSF, whose PSF is learned).
-        regularisation: start value of lambda.
+        weight: initial value of w; ``None`` leaves w out (MWDN-CPSF, whose PSF is learned).
+        regularisation: initial value of lambda.
         boundary: see `mwdn.fourier.padding.Boundary`.
 
     Attributes:

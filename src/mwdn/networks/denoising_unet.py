@@ -20,7 +20,7 @@ def scaled_widths(width: int) -> tuple[int, ...]:
 
 
 class DenoisingUNet(nn.Module):
-    """U-Net of five scales and a bottleneck. 11,772,307 learnable numbers.
+    """U-Net of five scales and a bottleneck. 11,772,307 learnable parameters.
 
     Each scale of the encoder has two 3x3 convolutions without bias, each with BatchNorm and ReLU, then max-pooling. The
     bottleneck has one. Each scale of the decoder upsamples bilinearly, concatenates the skip connection and has three.

@@ -35,7 +35,7 @@ def _scale(width: int, blocks: int) -> nn.Sequential:
 
 
 class Drunet(nn.Module):
-    """U-Net of residual blocks whose input is a picture and a map of its noise level. 1,793,920 learnable numbers.
+    """U-Net of residual blocks whose input is a picture and a map of its noise level. 1,793,920 learnable parameters.
 
     Different from DRUNet: a quarter to a half of its widths; pixel-unshuffled input of 2 x 2 blocks, as in FFDNet.
     Strided and transposed convolutions are written as 1x1 convolutions with pixel (un)shuffling, which is equivalent.

@@ -18,7 +18,7 @@ from mwdn.types import Measurement, Psf, Scene, Size, Transfer
 class FlatNet(Network[Tensor]):
     """FlatNet-gen without adversarial training: an inverse filter with learned taps, then a U-Net.
 
-    34,669,260 learnable numbers; 129,600 of them are the filter's at 270 x 480. No source gives a count.
+    34,669,260 learnable parameters; 129,600 of them are the filter's at 270 x 480. No source gives a count.
 
     From the source: an inverse filter of the PSF's size, initialised as the Wiener filter of the measured PSF and
     shared by all colours; replicate padding of the measurement; a U-Net with GroupNorm of 8 groups on 2 x 2

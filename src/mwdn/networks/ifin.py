@@ -29,7 +29,7 @@ class Exchange(nn.Module):
     Args:
         inputs: channels of each stream at the previous scale.
         width: channels at this scale.
-        regularisation: start value of the Wiener filter's lambda, learned for each channel.
+        regularisation: initial value of the Wiener filter's lambda, learned for each channel.
         boundary: see `mwdn.fourier.padding.Boundary`.
     """
 
@@ -63,7 +63,7 @@ class IfinPsfs(NamedTuple):
 class Ifin(Network[IfinPsfs]):
     """U-Net with forward and inverse operators at each of four scales, and kernels adapted from the measured PSF.
 
-    7,608,456 learnable numbers at width 32. No source gives a count.
+    7,608,456 learnable parameters at width 32. No source gives a count.
 
     From the source's abstract: differentiable forward operators and learned inverse modules at every stage, which
     exchange features of the measurement and of the scene; physics-guided adaptation of the PSF. From other successful
@@ -81,7 +81,7 @@ class Ifin(Network[IfinPsfs]):
     Args:
         channels: colours of the measurement and the PSF.
         width: feature channels at full resolution.
-        regularisation: start value of every lambda.
+        regularisation: initial value of every lambda.
         boundary: of the Wiener filters, see `mwdn.fourier.padding.Boundary`.
 
     References:

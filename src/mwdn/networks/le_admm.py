@@ -15,7 +15,7 @@ from mwdn.types import Measurement, Psf, Scene, Size, Transfer
 
 
 class LeAdmm(Network[Tensor]):
-    """Unrolled ADMM with total variation; each iteration learns mu1, mu2, mu3 and tau. 20 learnable numbers.
+    """Unrolled ADMM with total variation; each iteration learns mu1, mu2, mu3 and tau. 20 learnable parameters.
 
     From the source: five iterations from a zero scene; a grey PSF, the sum of the colours at unit L2 norm, shared by
     all colours; a grid of twice the sensor; mu initialised at 1e-4; the result is divided by its maximum, so absolute
@@ -24,20 +24,20 @@ class LeAdmm(Network[Tensor]):
 
     Different here:
 
-    - The measurement is divided by its maximum, as the source's data are, so start values fit every exposure.
+    - The measurement is divided by its maximum, as the source's data are, so initial values fit every exposure.
     - All constants are stored as logarithms, which keeps them positive.
     - The PSF's background is not subtracted: calibration has done so.
     - tau can be trained. The source's gradient is infinite where the scene's gradient is zero, which is everywhere in
       the first iteration; that of `mwdn.solvers.proximal.dual_projection` is finite.
 
     Args:
-        iterations: number of iterations; each adds 4 learnable numbers.
-        penalty: start value of mu1, mu2 and mu3.
-        threshold: start value of tau / mu2, in brightness of the scene for a PSF of unit L2 norm.
+        iterations: number of iterations; each adds 4 learnable parameters.
+        penalty: initial value of mu1, mu2 and mu3.
+        threshold: initial value of tau / mu2, in brightness of the scene for a PSF of unit L2 norm.
         variation: kind of total variation, see `mwdn.solvers.proximal.Variation`; the source's is isotropic.
 
     Raises:
-        ParameterError: a start value is not positive, or ``iterations`` is below 1.
+        ParameterError: an initial value is not positive, or ``iterations`` is below 1.
 
     References:
         K. Monakhova et al., Learned reconstructions for practical mask-based lensless imaging, Optics Express 27,

@@ -10,7 +10,7 @@ from mwdn.types import Measurement, Psf, Scene, Size
 
 
 class LeAdmmU(Network[Tensor]):
-    """`LeAdmm`, then a denoising U-Net. 20 + 11,772,307 = 11,772,327 learnable numbers.
+    """`LeAdmm`, then a denoising U-Net. 20 + 11,772,307 = 11,772,327 learnable parameters.
 
     Different from the source: BatchNorm has torch's epsilon; pictures below 64 pixels are padded for the U-Net.
 
@@ -18,7 +18,7 @@ class LeAdmmU(Network[Tensor]):
         channels: colours of the measurement.
         width: feature channels of the U-Net at full resolution.
         iterations: number of ADMM iterations.
-        threshold: start value of tau / mu2, see `LeAdmm`.
+        threshold: initial value of tau / mu2, see `LeAdmm`.
 
     References:
         K. Monakhova et al., Learned reconstructions for practical mask-based lensless imaging, Optics Express 27,

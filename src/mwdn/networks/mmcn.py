@@ -30,7 +30,7 @@ class ResidualBlock(nn.Module):
 class Mmcn(Network[Tensor]):
     """Le-ADMM-U with a branch that compensates model errors, from the measurement and every iterate.
 
-    18,863,559 learnable numbers. No source gives a count.
+    18,863,559 learnable parameters. No source gives a count.
 
     From the source: K = 5 iterations s^1..s^K of learned ADMM; ``h_1 = f_1(b)``, ``h_{k+1} = f_{k+1}(h_k, g_k(s^k))``.
     f is two 3x3 convolutions with BatchNorm and ReLU, then max-pooling. g is a residual block, max-pooled to the scale

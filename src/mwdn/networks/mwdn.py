@@ -18,19 +18,19 @@ from mwdn.types import Measurement, Psf, Scene, Size
 
 
 class Mwdn(Network[list[Tensor]]):
-    """A U-Net whose four skip connections each pass a Wiener filter at their own scale.
+    """A U-Net whose four skip connections each pass through a Wiener filter at their own scale.
 
-    17,267,531 learnable numbers at the paper's width: the U-Net's, w_1..4 and lambda_1..4. The bottleneck is not
-    deconvolved. The paper does not say how a PSF of three colours meets 64 feature channels; as in the authors'
-    code, its colours are summed and all channels share the sum.
+    17,267,531 learnable parameters at the paper's width: the U-Net's, w_1..4 and lambda_1..4. The bottleneck is not
+    deconvolved. The paper does not say how a PSF of three colours applies to 64 feature channels; as in the
+    authors' code, its colours are summed and all channels share the sum.
 
     Args:
         channels: colours of the measurement.
         width: feature channels at full resolution.
         pooling: between the encoder's scales; the authors' code averages.
         psf_pooling: between the PSF's scales; the paper takes the maximum, the authors' code averages.
-        weight: start value of w, for a PSF whose peak is 1 (the value of the authors' code).
-        regularisation: start value of lambda (the value of the authors' code).
+        weight: initial value of w, for a PSF whose peak is 1 (the value of the authors' code).
+        regularisation: initial value of lambda (the value of the authors' code).
         boundary: see `mwdn.fourier.padding.Boundary`. The paper writes linear convolutions; its code is circular.
     """
 

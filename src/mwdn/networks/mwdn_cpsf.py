@@ -12,17 +12,17 @@ from mwdn.types import Measurement, Psf, Scene, Size
 class MwdnCpsf(Network[list[Tensor]]):
     """MWDN with a second encoder that computes a corrected PSF for each feature channel.
 
-    21,956,743 learnable numbers at the paper's width: the U-Net's, the second encoder's of four scales, and
+    21,956,743 learnable parameters at the paper's width: the U-Net's, the second encoder's of four scales, and
     lambda_1..4. There is no w: the second encoder sets the energy of each PSF.
 
     Args:
         channels: colours of the measurement and of the PSF.
         width: feature channels at full resolution.
         pooling: of both encoders; max in the paper, average in the authors' code.
-        regularisation: start value of lambda (the value of the authors' code).
+        regularisation: initial value of lambda (the value of the authors' code).
         boundary: see `mwdn.fourier.padding.Boundary`. The paper writes linear convolutions; its code is circular.
         authors_scalars: add two scalars of the authors' code that are not in the paper: a learned weight of the PSF
-            before its encoder, and an unused fifth lambda. 21,956,745 learnable numbers.
+            before its encoder, and an unused fifth lambda. 21,956,745 learnable parameters.
     """
 
     def __init__(

@@ -32,7 +32,7 @@ def field_weights(side: int, size: Size, device: torch.device) -> Tensor:
 class SvDeconv(Network[Tensor]):
     """Wiener filters with a 3 x 3 field of learned PSFs, blended over the picture, then a U-Net.
 
-    35,849,494 learnable numbers; 1,296,000 of them are the PSFs' at 270 x 480. No source gives a count.
+    35,849,494 learnable parameters; 1,296,000 of them are the PSFs' at 270 x 480. No source gives a count.
 
     From the source: K x K local PSFs and a global one, all initialised as the measured PSF and shared by the colours,
     each with a learned lambda; each deconvolves the whole measurement with replicate padding; the K x K estimates are
@@ -52,7 +52,7 @@ class SvDeconv(Network[Tensor]):
         width: feature channels at the U-Net's finest scale.
         field: K, local PSFs along each side of the field.
         size: height and width for which the corrections are stored.
-        regularisation: start value of each lambda.
+        regularisation: initial value of each lambda.
         boundary: see `mwdn.fourier.padding.Boundary`.
 
     References:

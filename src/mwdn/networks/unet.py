@@ -6,7 +6,7 @@ from mwdn.types import Measurement, Psf, Scene, Size
 
 
 class UNet(Network[None]):
-    """U-Net from measurement to scene. 17,267,523 learnable numbers at the paper's width.
+    """U-Net from measurement to scene. 17,267,523 learnable parameters at the paper's width.
 
     Args:
         channels: colours of the measurement.

@@ -81,7 +81,7 @@ class PrimalDual(nn.Module):
 class Updn(Network[Tensor]):
     """Ten unrolled primal-dual iterations with five learned PSFs, then a small U-Net.
 
-    2,744,411 learnable numbers at 270 x 480: 5 x 3 x 270 x 480 = 1,944,000 of the PSFs, 42,400 of the iterations,
+    2,744,411 learnable parameters at 270 x 480: 5 x 3 x 270 x 480 = 1,944,000 of the PSFs, 42,400 of the iterations,
     758,011 of the U-Net.
 
     From the source: five scenes, each with its own PSF, initialised as the measured one; iterations do not share

@@ -9,11 +9,11 @@ from mwdn.types import Measurement, Psf, Scene, Size
 
 
 class WienerNetwork(Network[Tensor]):
-    """Wiener filter, eq. (2), with a learned weight w and regularisation lambda. 2 learnable numbers.
+    """Wiener filter, eq. (2), with a learned weight w and regularisation lambda. 2 learnable parameters.
 
     Args:
-        weight: start value of w, for a PSF whose peak is 1.
-        regularisation: start value of lambda.
+        weight: initial value of w, for a PSF whose peak is 1.
+        regularisation: initial value of lambda.
         boundary: see `mwdn.fourier.padding.Boundary`.
     """
 

@@ -11,14 +11,14 @@ from mwdn.types import Measurement, Psf, Scene, Size
 
 
 class WienerUNet(Network[Tensor]):
-    """Deconvolve, then denoise. 17,267,525 learnable numbers at the paper's width.
+    """Deconvolve, then denoise. 17,267,525 learnable parameters at the paper's width.
 
     Args:
         channels: colours of the measurement.
         width: feature channels of the U-Net at full resolution.
         pooling: between the encoder's scales; the authors' code averages.
-        weight: start value of w.
-        regularisation: start value of lambda.
+        weight: initial value of w.
+        regularisation: initial value of lambda.
         boundary: see `mwdn.fourier.padding.Boundary`.
     """
 

@@ -53,7 +53,7 @@ class Deviation:
 
     def __post_init__(self) -> None:
         if not 0 <= self.background < 1:
-            raise ParameterError(f"`background` ({self.background}) must be in [0, 1): a part of the light.")
+            raise ParameterError(f"`background` ({self.background}) must be in [0, 1): a fraction of the light.")
         if not self.scale > -0.9:
             raise ParameterError(f"`scale` ({self.scale}) must be above -0.9: a relative change.")
         if not self.off_axis >= 0:

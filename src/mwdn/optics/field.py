@@ -28,7 +28,7 @@ class Aberration:
         stretch: further relative magnification at the corner, in the radial direction only: oblique light.
         blur_px: standard deviation of a Gaussian blur at the corner; its variance grows with the square of the
             distance from the axis.
-        vignetting: part of the light that is lost at the corner.
+        vignetting: fraction of the light that is lost at the corner.
 
     Raises:
         ParameterError: negative `blur_px`, `vignetting` outside [0, 1], `scale` or `stretch` of -0.9 or less.
@@ -43,7 +43,7 @@ class Aberration:
         if not self.blur_px >= 0:
             raise ParameterError(f"`blur_px` ({self.blur_px}) must not be negative: it is a standard deviation.")
         if not 0 <= self.vignetting <= 1:
-            raise ParameterError(f"`vignetting` ({self.vignetting}) must be in [0, 1]: a part of the light.")
+            raise ParameterError(f"`vignetting` ({self.vignetting}) must be in [0, 1]: a fraction of the light.")
         for name in ("scale", "stretch"):
             if not getattr(self, name) > -0.9:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) must be above -0.9: a relative change.")

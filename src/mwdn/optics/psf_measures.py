@@ -117,7 +117,7 @@ class Support:
         offset: (down, right) from the PSF's centre to the light's centroid, in pixels.
         pixels: effective number of lit pixels, ``(sum h)^2 / sum h^2``.
         border: mean brightness in the outermost 2 % of the frame over that of the whole frame.
-        glow: part of the light in an even level under the pattern, see `level_between_lines`.
+        glow: fraction of the light in an even level under the pattern, see `level_between_lines`.
         contrast: (bright - dark) / (bright + dark) in the box; bright is its 99th percentile, dark that level.
     """
 

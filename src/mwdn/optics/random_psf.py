@@ -33,9 +33,9 @@ class Variety:
             shorter side.
         line_px: width of contour lines, in pixels of the frame.
         blur_px: standard deviation of a Gaussian blur.
-        halo: part of the light in a wide halo around every line.
-        glow: part of the light that fills the aperture evenly, undeflected by the mask.
-        background: part of the light that fills the frame evenly.
+        halo: fraction of the light in a wide halo around every line.
+        glow: fraction of the light that fills the aperture evenly, undeflected by the mask.
+        background: fraction of the light that fills the frame evenly.
         speckle: standard deviation of the logarithm of a random smooth brightness.
         colour_scale: largest relative magnification of red and blue over green, of opposite signs.
         colour_blur: largest relative difference of the blur of red and blue from green's, of opposite signs.
@@ -69,7 +69,7 @@ class Variety:
                 raise ParameterError(f"`{name}` {getattr(self, name)} must be positive.")
         for name, high in (("halo", self.halo[1]), ("glow", self.glow[1]), ("background", self.background[1])):
             if not high < 1:
-                raise ParameterError(f"`{name}` {getattr(self, name)} must be below 1: a part of the light.")
+                raise ParameterError(f"`{name}` {getattr(self, name)} must be below 1: a fraction of the light.")
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,7 +32,7 @@ def warp(psf: Psf, matrix: Tensor, shift: tuple[float, float] = (0.0, 0.0)) -> T
 
 
 def hazed(psf: Tensor, part: Tensor | float) -> Tensor:
-    """Spread a part of the light of PSFs (..., h, w) evenly over the frame; ``part`` is a number or broadcasts."""
+    """Spread a fraction of the light of PSFs (..., h, w) evenly over the frame; ``part`` is a number or broadcasts."""
     return psf + part * (psf.mean((-2, -1), keepdim=True) - psf)
 
 

@@ -1,4 +1,4 @@
-"""Align a PSF to a capture: the turn, scale and haze that have changed since the camera's calibration.
+"""Align a PSF to a capture: the rotation, scale and haze that have changed since the camera's calibration.
 
 The capture b is a scene v through a PSF of pose theta = (turn, scale). Variable projection eliminates the scene:
 
@@ -38,8 +38,8 @@ class Pose(NamedTuple):
     Args:
         turn_degrees: (B,), clockwise.
         scale: (B,), relative magnification, 0 for none.
-        haze: (B,), part of the light that is spread evenly under the PSF: scattered by the mask or the sensor's glass,
-            or subtracted from the PSF as if it were the sensor's black level.
+        haze: (B,), fraction of the light that is spread evenly under the PSF: scattered by the mask or the sensor's
+            glass, or subtracted from the PSF as if it were the sensor's black level.
     """
 
     turn_degrees: Tensor
@@ -82,7 +82,7 @@ two measured PSFs give no haze, and 16 others gain 95 % of the decibels that the
 
 @torch.no_grad()
 def align(measurement: Measurement, psf: Psf, *, steps: int = 2, min_gain: float = MIN_GAIN) -> Pose:
-    """Estimate the turn, scale and haze of each capture's PSF from the capture alone.
+    """Estimate rotation, scale and haze of each capture's PSF from the capture alone.
 
     Args:
         measurement: (B, C, H, W).

@@ -59,7 +59,7 @@ def plug_and_play(
     Args:
         estimate: the start, of a pyramid that reaches the full size. Only the part on the sensor is denoised.
         denoise: see `Denoiser`.
-        rounds: how many.
+        rounds: number of rounds.
         noise_levels: see `NOISE_LEVELS`.
         noise_exponent: see `NOISE_EXPONENT`.
         prior_weight: see `PRIOR_WEIGHT`.

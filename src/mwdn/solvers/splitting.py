@@ -1,7 +1,8 @@
 """One iteration of ADMM for ``1/2 |C H v - b|^2 + tau |Psi v|_1`` over ``v >= 0``.
 
-H convolves the scene v with the PSF, C crops to the sensor, Psi is the gradient. Each term gets a copy, x = H v,
-u = Psi v, w = v, with penalties mu and scaled multipliers xi, eta, rho (multiplier over penalty):
+H convolves the scene v with the PSF, C crops to the sensor, Psi is the gradient. Each term gets a splitting variable (a
+copy of H v, Psi v or v): x = H v, u = Psi v, w = v, with penalties mu and scaled multipliers xi, eta, rho (multiplier
+over penalty):
 
 1. ``x = argmin 1/2 |C x - b|^2 + mu1/2 |x - H v - xi|^2``: on the sensor ``(mu1 (H v + xi) + b) / (mu1 + 1)``
 2. ``u = prox of (tau / mu2) |.|_1 at Psi v + eta``
