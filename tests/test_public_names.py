@@ -107,6 +107,13 @@ def test_arrays_are_written_and_scaled_as_tensors_are(capture, tmp_path):
     assert (tmp_path / "array.png").read_bytes() == (tmp_path / "tensor.png").read_bytes()
 
 
+def test_networks_are_loaded_by_name_or_path(tmp_path):
+    network = mwdn.load_network("universal-small")
+    mwdn.weights.save_network(tmp_path / "net.safetensors", mwdn.build("unet", width=2), "unet", {"width": 2})
+    assert isinstance(network, mwdn.networks.WienerBank)
+    assert isinstance(mwdn.load_network(tmp_path / "net.safetensors"), mwdn.networks.UNet)
+
+
 def test_a_solver_is_no_network():
     with pytest.raises(ParameterError, match=r"mwdn\.solvers\.build\('admm'\)"):
         mwdn.build("admm")

@@ -35,7 +35,7 @@ from mwdn.training.tasks import SupervisedTask
 from mwdn.training.trainer import Trainer
 from mwdn.training.training_state import read_state
 from mwdn.training.validation import Validation
-from mwdn.weights.checkpoint import load_network, read_metadata
+from mwdn.weights.checkpoint import load_checkpoint, read_metadata
 from runs import log, same
 
 # Without iterations and alignment, which learn nothing and take most of the time.
@@ -178,7 +178,7 @@ def test_files_of_a_run(trainer, calibration, tmp_path):
     assert (header["name"], header["psf_hash"], header["psnr"]) == ("wiener-bank", calibration.psf_hash, best)
     assert header["recipe"]["schedule"]["steps"] == 6
     assert read_metadata(out / "last.safetensors")["step"] == 6
-    assert load_network(out / "best.safetensors")(torch.rand(1, 3, 32, 32), calibration.psf).shape == (1, 3, 32, 32)
+    assert load_checkpoint(out / "best.safetensors")(torch.rand(1, 3, 32, 32), calibration.psf).shape == (1, 3, 32, 32)
 
 
 def test_network_with_an_unused_parameter_is_resumed(trainer, tmp_path):
@@ -587,7 +587,7 @@ def test_full_disk_leaves_the_state(trainer, whole, tmp_path, monkeypatch, refus
     assert (folder / "state.safetensors").read_bytes() == before
     assert not list(folder.glob(".*"))
     for name in ("last", "best"):
-        load_network(folder / f"{name}.safetensors")
+        load_checkpoint(folder / f"{name}.safetensors")
     trainer().run()
     assert same(folder / "state.safetensors", whole / "state.safetensors")
 
@@ -657,7 +657,7 @@ def test_a_run_starts_from_given_weights(trainer, tmp_path):
     trainer(few(steps=3)).run()
     start = str(tmp_path / "run" / "last.safetensors")
     first = trainer(few(start=start), "second").network
-    weights = load_network(start)
+    weights = load_checkpoint(start)
     assert all(
         torch.equal(a, b) for a, b in zip(first.state_dict().values(), weights.state_dict().values(), strict=True)
     )
@@ -685,14 +685,14 @@ def test_a_denoiser_is_trained_alone_and_then_frozen(trainer, tmp_path):
     learned.run(lambda report: losses.append(report.loss))
     assert sum(losses[-10:]) < 0.7 * sum(losses[:10])
 
-    denoiser = load_network(tmp_path / "a" / "best.safetensors").state_dict()
+    denoiser = load_checkpoint(tmp_path / "a" / "best.safetensors").state_dict()
     for name, pool in (("kept", 4), ("new", 0)):
         recipe = few(steps=2, denoiser=str(tmp_path / "a" / "best.safetensors"), pool=pool)
         second = trainer(replace(recipe, network={**RECIPE.network, "finest": 1, "rounds": 2}), name)
         head = second.network.decoder.head.weight.clone()
         second.run()
         assert not torch.equal(second.network.decoder.head.weight, head)
-        for key, value in load_network(tmp_path / name / "last.safetensors").denoiser.state_dict().items():
+        for key, value in load_checkpoint(tmp_path / name / "last.safetensors").denoiser.state_dict().items():
             torch.testing.assert_close(value, denoiser[key])
 
     with pytest.raises(CheckpointError, match=r"`denoiser` \('.*best.safetensors'\) its denoiser, if it has one"):

@@ -15,7 +15,7 @@ import torch
 from mwdn.errors import CheckpointError
 from mwdn.networks import build
 from mwdn.weights.bundled import BUNDLED, bundle, find_weights
-from mwdn.weights.checkpoint import load_network, read_metadata, save_network
+from mwdn.weights.checkpoint import load_checkpoint, read_metadata, save_network
 
 CARD = files("mwdn") / "weights" / "README.md"
 
@@ -24,7 +24,7 @@ CARD = files("mwdn") / "weights" / "README.md"
 def test_bundled_networks_are_intact_and_for_any_camera(name, most):
     path = find_weights(name)
     assert hashlib.sha256(path.read_bytes()).hexdigest() in CARD.read_text(encoding="utf-8")
-    network, header = load_network(path), read_metadata(path)
+    network, header = load_checkpoint(path), read_metadata(path)
     assert header["psf_hash"] is None
     assert header["recipe"]["cameras"]["sizes"]
     assert sum(parameter.numel() for parameter in network.parameters()) < most
@@ -41,7 +41,7 @@ def test_bundling_rounds_and_remembers(tmp_path):
     bundle(tmp_path / "a.safetensors", tmp_path / "b.safetensors")
     assert (tmp_path / "b.safetensors").stat().st_size < 0.7 * (tmp_path / "a.safetensors").stat().st_size
     assert read_metadata(tmp_path / "b.safetensors") == read_metadata(tmp_path / "a.safetensors")
-    for one, other in zip(network.parameters(), load_network(tmp_path / "b.safetensors").parameters(), strict=True):
+    for one, other in zip(network.parameters(), load_checkpoint(tmp_path / "b.safetensors").parameters(), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-6)
     with torch.no_grad():
         next(network.parameters()).fill_(1e6)
@@ -67,7 +67,7 @@ def test_bundling_with_another_denoiser(tmp_path):
             bundle(network, out, part)
     assert not out.exists()
     bundle(whole, out, denoiser)
-    bundled = load_network(out)
+    bundled = load_checkpoint(out)
     for module, expected in ((bundled.denoiser, networks[denoiser]), (bundled.encoder, networks[whole].encoder)):
         for one, another in zip(module.parameters(), expected.parameters(), strict=True):
             torch.testing.assert_close(one, another, rtol=1e-3, atol=1e-6)

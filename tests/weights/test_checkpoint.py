@@ -13,7 +13,7 @@ from torch.nn import functional as F
 from mwdn.errors import CheckpointError
 from mwdn.networks import NETWORKS, build
 from mwdn.weights.authors import load_authors
-from mwdn.weights.checkpoint import load_network, read_metadata, save_network
+from mwdn.weights.checkpoint import load_checkpoint, read_metadata, save_network
 
 
 def small(name):
@@ -39,7 +39,7 @@ def test_a_saved_network_is_loaded_unchanged(tmp_path, name, generator):
     network.train()(b, h)  # moves the running means
     path = tmp_path / "folder" / "net.safetensors"
     save_network(path, network, name, options)
-    loaded = load_network(path)
+    loaded = load_checkpoint(path)
     assert type(loaded) is type(network)
     assert not loaded.training
     assert torch.equal(loaded(b, h), network.eval()(b, h))
@@ -95,7 +95,7 @@ def stored(path, header, tensors=None):
 def test_foreign_and_damaged_metadata(tmp_path, header, message):
     path = stored(tmp_path / "a.safetensors", header)
     with pytest.raises(CheckpointError, match=message) as caught:
-        load_network(path)
+        load_checkpoint(path)
     assert str(path) in str(caught.value)
 
 
@@ -103,7 +103,7 @@ def test_weights_of_another_shape(tmp_path):
     network, options = small("mwdn")
     save_network(tmp_path / "a.safetensors", network, "mwdn", options | {"width": 8})
     with pytest.raises(CheckpointError, match="does not fit the network 'mwdn' it names: size mismatch for ") as caught:
-        load_network(tmp_path / "a.safetensors")
+        load_checkpoint(tmp_path / "a.safetensors")
     assert "\n" not in str(caught.value)
 
 
@@ -113,7 +113,7 @@ def test_weights_that_are_not_finite(tmp_path):
         next(network.parameters())[0] = torch.nan
     save_network(tmp_path / "a.safetensors", network, "mwdn", options)
     with pytest.raises(CheckpointError, match=r"holds NaN or infinity, `.*weight` first"):
-        load_network(tmp_path / "a.safetensors")
+        load_checkpoint(tmp_path / "a.safetensors")
 
 
 def test_weights_have_the_permissions_of_any_new_file(tmp_path):
@@ -130,7 +130,7 @@ def test_missing_tensor(tmp_path):
     del tensors["filters.2.log_weight"]
     stored(tmp_path / "a.safetensors", json.dumps({"name": "mwdn", "options": options}), tensors)
     with pytest.raises(CheckpointError, match=r"filters\.2\.log_weight"):
-        load_network(tmp_path / "a.safetensors")
+        load_checkpoint(tmp_path / "a.safetensors")
 
 
 @pytest.mark.parametrize("kept", [0, 5, 100, -1])
@@ -140,13 +140,13 @@ def test_truncated_file(tmp_path, kept):
     save_network(path, network, "unet", options)
     path.write_bytes(path.read_bytes()[:kept])
     with pytest.raises(CheckpointError, match=r"`.*a\.safetensors` cannot be read as safetensors"):
-        load_network(path)
+        load_checkpoint(path)
 
 
 @pytest.mark.parametrize("name", ["no.safetensors", "no.tar", "."])
 def test_missing_file(tmp_path, name):
     with pytest.raises(CheckpointError, match=r"No checkpoint at .*the current folder is"):
-        load_network(tmp_path / name)
+        load_checkpoint(tmp_path / name)
 
 
 # --- The authors --------------------------------------------------------------------------------------
@@ -233,7 +233,7 @@ def test_authors_checkpoint_gives_their_output(tmp_path, cpsf, prefix, generator
     state = authors(generator, cpsf=cpsf)
     wrapped = {"net_state_dict": {prefix + key: value for key, value in state.items()}, "epoch": 299}
     torch.save(wrapped, tmp_path / "best.tar")
-    network = load_network(tmp_path / "best.tar")
+    network = load_checkpoint(tmp_path / "best.tar")
     b, h = pair(generator, (32, 48))
     h = h / h.max()
     expected = authors_output(state, b, h, cpsf=cpsf)
@@ -253,7 +253,7 @@ def test_negative_constants_are_refused(tmp_path, key, index, generator):
     state[key][index] *= -1
     torch.save(state, tmp_path / "a.pt")
     with pytest.raises(CheckpointError, match=rf"`{key}` \(\[.*-0\.0.*\]\) must be positive"):
-        load_network(tmp_path / "a.pt")
+        load_checkpoint(tmp_path / "a.pt")
 
 
 def test_the_unused_lambda_may_be_negative(generator):
@@ -284,7 +284,7 @@ def test_wrong_tensors_under_the_authors_names(tmp_path, cpsf, key, value, messa
         state[key] = value
     torch.save({"net_state_dict": state}, tmp_path / "a.tar")
     with pytest.raises(CheckpointError, match=f"(?s){message}"):
-        load_network(tmp_path / "a.tar")
+        load_checkpoint(tmp_path / "a.tar")
 
 
 # --- Others -------------------------------------------------------------------------------------------
@@ -303,7 +303,7 @@ def test_code_in_a_file_is_not_run(tmp_path, save):
     target = tmp_path / "exploded"
     save({"net_state_dict": Bomb(target)}, tmp_path / "a.pt")
     with pytest.raises(CheckpointError, match=r"`.*a\.pt` cannot be read as plain weights") as caught:
-        load_network(tmp_path / "a.pt")
+        load_checkpoint(tmp_path / "a.pt")
     assert not target.exists()
     assert "weights_only" not in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -313,11 +313,11 @@ def test_code_in_a_file_is_not_run(tmp_path, save):
 def test_other_content(tmp_path, content):
     torch.save(content, tmp_path / "a.pth")
     with pytest.raises(CheckpointError, match="is neither a checkpoint of mwdn"):
-        load_network(tmp_path / "a.pth")
+        load_checkpoint(tmp_path / "a.pth")
 
 
 @pytest.mark.parametrize("data", [b"", b"hello", b"PK\x03\x04" + bytes(50)])
 def test_no_weights_at_all(tmp_path, data):
     (tmp_path / "a.ckpt").write_bytes(data)
     with pytest.raises(CheckpointError, match="cannot be read as plain weights"):
-        load_network(tmp_path / "a.ckpt")
+        load_checkpoint(tmp_path / "a.ckpt")

@@ -9,7 +9,7 @@ from cyclopts.config import Toml
 
 from mwdn.cli.camera import console
 from mwdn.errors import ParameterError
-from mwdn.optics import CodedAperture, Contour, Diffuser, Lenslets, Pinholes, Setup, ZoneAperture
+from mwdn.optics import MASKS, Setup
 from mwdn.optics.masks import MaskDesign
 
 
@@ -79,67 +79,20 @@ Flat = Parameter(name="*")
 """Makes each field of a dataclass an option of the command."""
 
 
-@design.command
-def contour(
-    *,
-    mask: Annotated[Contour, Flat] = Contour(),
-    setup: Annotated[Setup, Flat] = Setup(),
-    output: Output = Output(),
-) -> None:
-    """Contour phase mask: light concentrated onto thin lines. The defaults are the paper's camera."""
-    output.write("contour", mask, setup)
+def _add_command(name: str, kind: type[MaskDesign]) -> None:
+    """Add the command of one kind of mask; the fields of the mask and of the setup are its options."""
+    default = kind()
+
+    def command(
+        *,
+        mask: Annotated[kind, Flat] = default,  # type: ignore[valid-type]
+        setup: Annotated[Setup, Flat] = Setup(),
+        output: Output = Output(),
+    ) -> None:
+        output.write(name, mask, setup)
+
+    design.command(command, name=name, help=(kind.__doc__ or "").partition("\n")[0])
 
 
-@design.command
-def diffuser(
-    *,
-    mask: Annotated[Diffuser, Flat] = Diffuser(),
-    setup: Annotated[Setup, Flat] = Setup(),
-    output: Output = Output(),
-) -> None:
-    """Smooth random surface whose hills focus light into a net of caustics."""
-    output.write("diffuser", mask, setup)
-
-
-@design.command
-def lenslets(
-    *,
-    mask: Annotated[Lenslets, Flat] = Lenslets(),
-    setup: Annotated[Setup, Flat] = Setup(),
-    output: Output = Output(),
-) -> None:
-    """Small lenses at random places: a PSF of dots."""
-    output.write("lenslets", mask, setup)
-
-
-@design.command
-def zone(
-    *,
-    mask: Annotated[ZoneAperture, Flat] = ZoneAperture(),
-    setup: Annotated[Setup, Flat] = Setup(),
-    output: Output = Output(),
-) -> None:
-    """Fresnel zone aperture: rings, every other one open."""
-    output.write("zone", mask, setup)
-
-
-@design.command
-def coded(
-    *,
-    mask: Annotated[CodedAperture, Flat] = CodedAperture(),
-    setup: Annotated[Setup, Flat] = Setup(),
-    output: Output = Output(),
-) -> None:
-    """Coded aperture: squares from a maximum-length sequence (MLS) or a MURA."""
-    output.write("coded", mask, setup)
-
-
-@design.command
-def pinholes(
-    *,
-    mask: Annotated[Pinholes, Flat] = Pinholes(),
-    setup: Annotated[Setup, Flat] = Setup(),
-    output: Output = Output(),
-) -> None:
-    """Pinholes at random places."""
-    output.write("pinholes", mask, setup)
+for _name, _kind in MASKS.items():
+    _add_command(_name, _kind)

@@ -21,7 +21,7 @@ from mwdn.runtime.devices import select_device
 from mwdn.runtime.transfers import to_device, to_host
 from mwdn.types import ArrayPicture, FloatFrame, Frame, Measurement, Psf, Scene
 from mwdn.weights.bundled import BUNDLED, find_weights
-from mwdn.weights.checkpoint import SUFFIXES, load_network, read_metadata
+from mwdn.weights.checkpoint import SUFFIXES, load_checkpoint, read_metadata
 
 PIXELS_PER_CHUNK = {"cpu": 2**17, "cuda": 2**24}
 """Default of `Reconstructor.pixels_per_chunk` on each type of device. A GPU needs many pixels for full load. On a CPU,
@@ -53,7 +53,7 @@ def find_method(name: str | Path, **options: Any) -> Method:  # noqa: ANN401
         )
     path = find_weights(str(name)) or Path(name)
     if path.suffix in SUFFIXES or path.is_file():
-        network = load_network(path)
+        network = load_checkpoint(path)
         if isinstance(network, tuple(DENOISERS.values())):
             raise CheckpointError(
                 f"`{name}` holds a denoiser, which cannot reconstruct on its own. Use it as `denoiser` in [schedule] "

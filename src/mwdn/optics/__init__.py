@@ -4,11 +4,21 @@ from mwdn.optics.amplitude_masks import CodedAperture, Pinholes, ZoneAperture
 from mwdn.optics.camera import Camera
 from mwdn.optics.deviation import Deviation
 from mwdn.optics.field import Aberration, FieldCamera, field_psfs
-from mwdn.optics.masks import Mask, mask_psf
+from mwdn.optics.masks import Mask, MaskDesign, mask_psf
 from mwdn.optics.phase_masks import Contour, Diffuser, Lenslets
 from mwdn.optics.random_psf import FAMILIES, Variety, sample_camera
 from mwdn.optics.sensor import Sensor
 from mwdn.optics.setup import Setup
+
+MASKS: dict[str, type[MaskDesign]] = {
+    "contour": Contour,
+    "diffuser": Diffuser,
+    "lenslets": Lenslets,
+    "zone": ZoneAperture,
+    "coded": CodedAperture,
+    "pinholes": Pinholes,
+}
+"""Every kind of mask by its name in `mwdn design`."""
 
 __all__ = [
     "Aberration",
@@ -20,6 +30,7 @@ __all__ = [
     "FAMILIES",
     "FieldCamera",
     "Lenslets",
+    "MASKS",
     "Mask",
     "Pinholes",
     "Sensor",

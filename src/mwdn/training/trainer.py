@@ -27,8 +27,8 @@ from mwdn.training.schedule import make_lr_schedule, make_optimiser
 from mwdn.training.tasks import Task
 from mwdn.training.training_state import damaged, restore, write_state
 from mwdn.training.validation import Validation, Validator
-from mwdn.weights.bundled import find_weights
-from mwdn.weights.checkpoint import first_difference, load_network, save_network
+from mwdn.weights.bundled import load_network
+from mwdn.weights.checkpoint import first_difference, load_checkpoint, save_network
 
 
 @dataclass(frozen=True)
@@ -259,9 +259,9 @@ def build_network(recipe: Recipe) -> nn.Module:
     torch.manual_seed(recipe.schedule.seed)
     network = build(**recipe.network)
     start, denoiser = recipe.schedule.start, recipe.schedule.denoiser
-    weights = (load_network(find_weights(start) or start) if start else network).state_dict()
+    weights = (load_network(start) if start else network).state_dict()
     if denoiser:
-        weights |= {f"denoiser.{key}": value for key, value in load_network(denoiser).state_dict().items()}
+        weights |= {f"denoiser.{key}": value for key, value in load_checkpoint(denoiser).state_dict().items()}
     try:
         network.load_state_dict(weights)
     except RuntimeError as error:

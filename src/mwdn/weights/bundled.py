@@ -4,9 +4,10 @@ from importlib.resources import files
 from pathlib import Path
 
 import torch
+from torch import nn
 
 from mwdn.errors import CheckpointError
-from mwdn.weights.checkpoint import load_network, read_metadata, save_network
+from mwdn.weights.checkpoint import load_checkpoint, read_metadata, save_network
 
 BUNDLED = ("universal", "universal-small")
 """Bundled networks, for any camera. Model card: `mwdn/weights/README.md`."""
@@ -26,6 +27,18 @@ def find_weights(name: str) -> Path | None:
     if name in BUNDLED:
         return _FOLDER / f"{name}.safetensors"
     return _download(name) if name.startswith(HUB) else None
+
+
+def load_network(name: str | Path) -> nn.Module:
+    """Load a network on the CPU, in evaluation mode.
+
+    Args:
+        name: ``universal`` or ``universal-small``, ``hub:owner/name``, or the path of a checkpoint.
+
+    Raises:
+        CheckpointError: no such file, a damaged one, or weights that do not fit their network.
+    """
+    return load_checkpoint(find_weights(str(name)) or name)
 
 
 def _download(name: str) -> Path:
@@ -59,10 +72,10 @@ def bundle(checkpoint: Path, out: Path, denoiser: Path | None = None) -> None:
         CheckpointError: a checkpoint cannot be used, or a weight exceeds the range of float16.
     """
     header = read_metadata(checkpoint)
-    network = load_network(checkpoint)
+    network = load_checkpoint(checkpoint)
     if denoiser is not None:
         try:
-            network.get_submodule("denoiser").load_state_dict(load_network(denoiser).state_dict())
+            network.get_submodule("denoiser").load_state_dict(load_checkpoint(denoiser).state_dict())
         except (AttributeError, RuntimeError) as error:
             raise CheckpointError(f"`{checkpoint}` has no denoiser like that of `{denoiser}`: {error}") from error
     network = network.half()

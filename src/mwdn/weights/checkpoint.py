@@ -74,7 +74,7 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
     return header
 
 
-def load_network(path: str | Path) -> nn.Module:
+def load_checkpoint(path: str | Path) -> nn.Module:
     """Load a network from a checkpoint, on the CPU, in evaluation mode.
 
     Args:
