@@ -139,7 +139,7 @@ def paper_widths(width: int) -> tuple[int, ...]:
     return (width, 2 * width, 4 * width, 8 * width, 8 * width)
 
 
-class Wiener(nn.Module):
+class WienerFilter(nn.Module):
     """Wiener filter, eq. (2), with a learned weight w and regularisation lambda.
 
     Both are stored as logarithms, so that they stay positive during training.
@@ -211,8 +211,8 @@ class Wiener(nn.Module):
 class WienerFilters(nn.ModuleList):
     """One Wiener filter for each scale, finest first."""
 
-    def __iter__(self) -> Iterator[Wiener]:
-        return cast(Iterator[Wiener], super().__iter__())
+    def __iter__(self) -> Iterator[WienerFilter]:
+        return cast(Iterator[WienerFilter], super().__iter__())
 
 
 def normalise_psf(psf: Psf, size: Size, channels: int | None = None) -> Tensor:

@@ -13,7 +13,7 @@ from mwdn.fourier.wiener import wiener
 from mwdn.networks.blocks import (
     Decoder,
     Encoder,
-    Wiener,
+    WienerFilter,
     check_channels,
     convolutions,
     normalise_psf,
@@ -99,7 +99,7 @@ class Ifin(Network[IfinPsfs]):
         super().__init__()
         self.channels = channels
         *widths, last = paper_widths(width)
-        self.first = Wiener(weight=None, regularisation=regularisation, boundary=boundary)
+        self.first = WienerFilter(weight=None, regularisation=regularisation, boundary=boundary)
         self.psf_encoder = Encoder(channels, tuple(widths), norm="group")
         # Gain of the encoder's features, which are added to the PSF at a peak of 1.
         self.log_gain = nn.Parameter(torch.full((len(widths),), math.log(0.01)))

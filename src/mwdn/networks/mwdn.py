@@ -7,7 +7,7 @@ from mwdn.networks.blocks import (
     Decoder,
     Encoder,
     Pooling,
-    Wiener,
+    WienerFilter,
     WienerFilters,
     normalise_psf,
     paper_widths,
@@ -50,7 +50,7 @@ class Mwdn(Network[list[Tensor]]):
         self.encoder = Encoder(channels, widths, pooling=pooling)
         self.channels = channels
         self.filters = WienerFilters(
-            Wiener(weight=weight, regularisation=regularisation, boundary=boundary) for _ in widths[:-1]
+            WienerFilter(weight=weight, regularisation=regularisation, boundary=boundary) for _ in widths[:-1]
         )
         self.pool_psf = pooling_layer(psf_pooling, "psf_pooling")
         self.decoder = Decoder(channels, widths)

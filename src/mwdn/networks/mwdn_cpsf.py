@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from mwdn.fourier.padding import Boundary
-from mwdn.networks.blocks import Decoder, Encoder, Pooling, Wiener, WienerFilters, normalise_psf, paper_widths
+from mwdn.networks.blocks import Decoder, Encoder, Pooling, WienerFilter, WienerFilters, normalise_psf, paper_widths
 from mwdn.networks.network import Network
 from mwdn.types import Measurement, Psf, Scene, Size
 
@@ -41,7 +41,7 @@ class MwdnCpsf(Network[list[Tensor]]):
         self.psf_encoder = Encoder(channels, widths[:-1], pooling=pooling)
         self.channels = channels
         self.filters = WienerFilters(
-            Wiener(weight=None, regularisation=regularisation, boundary=boundary) for _ in widths[:-1]
+            WienerFilter(weight=None, regularisation=regularisation, boundary=boundary) for _ in widths[:-1]
         )
         self.decoder = Decoder(channels, widths)
         if authors_scalars:

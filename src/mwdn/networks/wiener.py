@@ -3,7 +3,7 @@
 from torch import Tensor
 
 from mwdn.fourier.padding import Boundary
-from mwdn.networks.blocks import Wiener, normalise_psf
+from mwdn.networks.blocks import WienerFilter, normalise_psf
 from mwdn.networks.network import Network
 from mwdn.types import Measurement, Psf, Scene, Size
 
@@ -19,7 +19,7 @@ class WienerNetwork(Network[Tensor]):
 
     def __init__(self, *, weight: float = 1e-3, regularisation: float = 1e-2, boundary: Boundary = "taper") -> None:
         super().__init__()
-        self.filter = Wiener(weight=weight, regularisation=regularisation, boundary=boundary)
+        self.filter = WienerFilter(weight=weight, regularisation=regularisation, boundary=boundary)
 
     def prepare(self, psf: Psf, size: Size) -> Tensor:
         """Transfer function of the filter."""
