@@ -12,7 +12,7 @@ from mwdn.inference.engine import Engine
 from mwdn.inference.fusion import fuse
 from mwdn.inference.tiling import StripDecoder, StripEncoder, upsample_rows
 from mwdn.networks import build
-from mwdn.networks.blocks import Decoder, Encoder, Wiener
+from mwdn.networks.blocks import Decoder, Encoder, WienerFilter
 
 
 def limit_strips(network):
@@ -52,7 +52,7 @@ def test_large_pictures_in_parts_everywhere(name, monkeypatch, generator):
     psf, measurement = torch.rand(1, 3, 64, 45, generator=generator), torch.rand(2, 3, 64, 45, generator=generator)
     expected = network(measurement, psf)
     monkeypatch.setattr(memory_format, "LARGEST", 3 * 2 * 64 * 45)
-    monkeypatch.setattr(Wiener, "max_grid_pixels", 8 * 96 * 70)
+    monkeypatch.setattr(WienerFilter, "max_grid_pixels", 8 * 96 * 70)
     engine = Engine(network, psf, precision="exact")
     heights = limit_strips(engine.network)
     result = engine(measurement)
