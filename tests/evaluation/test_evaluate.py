@@ -276,7 +276,7 @@ def test_command_prints_before_it_writes(common, tmp_path, capsys):
     [
         (3, math.nan, 1, "The measurement of pair 1, counted from 0, holds NaN or infinity"),
         (0, 0, 1, "`pairs` must not be empty"),
-        (3, 0, 2, "The PSF is 2 times as large: bin it by 2 times as much, `--psf-bin`."),
+        (3, 0, 2, "The PSF is 2 times as large: multiply its binning by 2, `--psf-bin`."),
     ],
 )
 def test_command_on_unusable_pairs(common, tmp_path, capsys, count, value, scale, message):

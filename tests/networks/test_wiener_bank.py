@@ -42,5 +42,5 @@ def test_gain_does_not_matter(generator, gain):
 
 @pytest.mark.parametrize("options", [{"rounds": -1}, {"fold": 0}, {"width": 0}])
 def test_numbers_that_are_no_counts(options):
-    with pytest.raises(ParameterError, match=f"`{next(iter(options))}` .* must be a whole number, at least"):
+    with pytest.raises(ParameterError, match=f"`{next(iter(options))}` .* must be .*at least"):
         build("wiener-bank", **options)

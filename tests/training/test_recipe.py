@@ -122,7 +122,7 @@ def test_mistyped_names_get_the_nearest(read, text, said):
         (NETWORK + "[schedule]\nlearning_rate = inf", "`learning_rate` (inf) must be finite."),
         (NETWORK + "[schedule]\ncrop = 8", "`crop` (8) applies to cached samples: set `pool`"),
         (NETWORK + f"[schedule]\nseed = {2**63 - 1}0", "must have 63 bits at most."),
-        ('[network]\nname = "mwdn"\nwidth = 0', "has layers without channels"),
+        ('[network]\nname = "mwdn"\nwidth = 0', "`width` (0) must be at least 1"),
         (NETWORK + "[schedule]\nwarmup = -1", "`warmup` (-1) must not be negative."),
         (NETWORK + "[schedule]\nepochs = -1", "`epochs` (-1) must not be negative."),
         (NETWORK + "[plateau]\nfactor = 1", "`factor` (1.0) must be in (0, 1)"),
