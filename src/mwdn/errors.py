@@ -68,6 +68,12 @@ def check_options(of: Callable[..., Any], what: str, options: Iterable[str]) -> 
             raise UnknownNameError(f"option of {what}", option, known)
 
 
+def check_batch(image: Any, name: str) -> None:  # noqa: ANN401
+    """Raise a `ShapeError` unless the image called ``name`` has the axes (B, C, H, W)."""
+    if image.ndim != 4:
+        raise ShapeError(f"`{name}` {tuple(image.shape)} must be (B, C, H, W). For one picture: `{name}[None]`.")
+
+
 class ImageError(MwdnError, ValueError):
     """A picture or a frame cannot be read or written; the message names the file."""
 

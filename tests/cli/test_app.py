@@ -186,6 +186,11 @@ def test_wrong_call_is_one_message_and_exit_2(run, camera, line, message):
     assert before == {path: path.read_bytes() for path in camera.rglob("*.png")}
 
 
+@pytest.mark.parametrize("command", ["reconstruct", "train", "evaluate", "demo", "simulate", "export", "inspect"])
+def test_o_is_out(run, command):
+    assert re.search(r"--out,? -o\b", run(command, "--help")[1])
+
+
 def test_unknown_command(run):
     code, _, err = run("recunstruct")
     assert code == 2

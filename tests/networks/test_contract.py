@@ -262,10 +262,15 @@ def test_width_must_be_positive(name):
         build(name, width=0)
 
 
+@pytest.mark.parametrize("name", NETWORKS)
 @pytest.mark.usefixtures("unchecked")
-def test_measurement_without_batch_is_refused():
-    with pytest.raises(ShapeError, match=r"\(3, 32, 32\) must be \(B, C, H, W\)"):
-        build("unet", width=2)(torch.rand(3, 32, 32), torch.rand(1, 3, 32, 32))
+def test_picture_without_batch_is_refused(name):
+    network, picture = small(name).eval(), torch.rand(3, 32, 32)
+    with pytest.raises(ShapeError, match=r"`measurement` \(3, 32, 32\) must be \(B, C, H, W\)"):
+        network(picture, picture[None])
+    if name != "unet":  # it has no PSF
+        with pytest.raises(ShapeError, match=r"`psf` \(3, 32, 32\) must be \(B, C, H, W\)"):
+            network(picture[None], picture)
 
 
 @pytest.mark.parametrize("option", ["pooling", "psf_pooling"])

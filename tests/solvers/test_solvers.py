@@ -383,6 +383,16 @@ def test_name_in_capitals_gets_the_nearest_name():
         build("ADMM")
 
 
+@pytest.mark.parametrize("name", ["admm", "fista", "pyramid", "wiener"])
+@pytest.mark.usefixtures("unchecked")
+def test_picture_without_batch_is_refused(name):
+    picture = torch.rand(3, 16, 16)
+    with pytest.raises(ShapeError, match=r"`measurement\[None\]`"):
+        build(name)(picture, picture[None])
+    with pytest.raises(ShapeError, match=r"`psf\[None\]`"):
+        build(name)(picture[None], picture)
+
+
 def test_fista_needs_one_iteration():
     with pytest.raises(ParameterError, match=r"`iterations` \(0\) must be at least 1"):
         Fista(iterations=0)

@@ -13,7 +13,7 @@ from typing import TypeVar, cast
 import torch
 from torch import Tensor, nn
 
-from mwdn.errors import ShapeError
+from mwdn.errors import ShapeError, check_batch
 from mwdn.evaluation.alexnet import AlexNet, Heads, load_alexnet, load_heads
 from mwdn.types import Image
 
@@ -25,13 +25,12 @@ def _comparing(distance: _Distance) -> _Distance:
 
     @wraps(distance)
     def wrapped(image: Tensor, reference: Tensor, *networks: nn.Module, **named: nn.Module) -> Tensor:
-        if image.ndim != 4 and image.shape == reference.shape:
-            raise ShapeError(f"`image` {tuple(image.shape)} must be (B, C, H, W). For one picture: `image[None]`.")
         if image.shape != reference.shape:
             raise ShapeError(
                 f"`image` {tuple(image.shape)} and `reference` {tuple(reference.shape)} must have the same shape "
                 "(B, C, H, W). Crop or resize the larger one."
             )
+        check_batch(image, "image")
         with torch.autocast(image.device.type, enabled=False):
             return distance(image.float(), reference.float(), *networks, **named)
 

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from mwdn.errors import ShapeError
+from mwdn.errors import ShapeError, check_batch
 from mwdn.fourier.transforms import fast_length, inverse_spectrum, spectrum, transfer_function
 from mwdn.types import Image, Measurement, Psf, Scene, Size, Spectrum
 
@@ -29,9 +29,8 @@ def _operator(psf: Tensor, scene: Size, sensor: Size, *, circular: bool) -> tupl
 
 def check_fit(image: Tensor, psf: Tensor, name: str) -> None:
     """Raise a `ShapeError` unless the PSF's batch and channels are 1 or those of the image called ``name``."""
-    for label, array in ((name, image), ("psf", psf)):
-        if array.ndim != 4:
-            raise ShapeError(f"`{label}` {tuple(array.shape)} must be (B, C, H, W). For one picture: `{label}[None]`.")
+    check_batch(image, name)
+    check_batch(psf, "psf")
     for axis, dimension, way_out in (
         (0, "samples", "For one PSF: `psf[:1]`."),
         (1, "channels", "Average it: `psf.mean(1, keepdim=True)`."),

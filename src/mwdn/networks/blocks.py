@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from mwdn.errors import ParameterError, ShapeError
+from mwdn.errors import ParameterError, ShapeError, check_batch
 from mwdn.fourier.filtering import filter_image
 from mwdn.fourier.memory_format import chunked
 from mwdn.fourier.padding import Boundary
@@ -50,10 +50,7 @@ def convolutions(*widths: int, bias: bool = True, norm: Normalisation = "batch")
 
 def check_channels(picture: Image, channels: int) -> None:
     """Raise a `ShapeError` unless a measurement or PSF has the network's number of channels."""
-    if picture.ndim != 4:
-        raise ShapeError(
-            f"A picture or PSF {tuple(picture.shape)} must be (B, C, H, W). For one picture: `picture[None]`."
-        )
+    check_batch(picture, "picture")
     if picture.shape[1] != channels:
         raise ShapeError(
             f"A picture or PSF {tuple(picture.shape)} must have {channels} channels for this network. "
@@ -233,6 +230,7 @@ def normalise_psf(psf: Psf, size: Size, channels: int | None = None) -> Tensor:
 
 def check_size(psf: Psf, size: Size) -> None:
     """Raise a `ShapeError` unless the PSF has the height and width of the measurement."""
+    check_batch(psf, "psf")
     if tuple(psf.shape[-2:]) != tuple(size):
         raise ShapeError(
             f"`psf` ({psf.shape[-2]} x {psf.shape[-1]}) and `measurement` ({size[0]} x {size[1]}) must have the same "

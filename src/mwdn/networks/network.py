@@ -4,6 +4,7 @@ from typing import Any, Generic, TypeVar
 
 from torch import Tensor, nn
 
+from mwdn.errors import check_batch
 from mwdn.types import Measurement, Psf, Scene, Size
 
 Prepared = TypeVar("Prepared")
@@ -54,6 +55,7 @@ class Network(nn.Module, Generic[Prepared]):
 
     def forward(self, measurement: Measurement, psf: Psf) -> Scene:
         """Scene (B, C, H, W): `prepare`, then `reconstruct`."""
+        check_batch(measurement, "measurement")
         return self.reconstruct(measurement, self.prepare(psf, (measurement.shape[-2], measurement.shape[-1])))
 
 

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from mwdn.errors import ParameterError
+from mwdn.fourier.convolution import check_fit
 from mwdn.solvers.proximal import Variation
 from mwdn.solvers.splitting import (
     Penalties,
@@ -84,6 +85,7 @@ class Admm:
             start: of a measurement of this shape, through this PSF. Scene and multipliers continue, so a constant
                 measurement gives the result of all iterations so far.
         """
+        check_fit(measurement, psf, "measurement")
         b_norm = _norm(measurement).clamp(min=torch.finfo(torch.float32).tiny)
         h_norm = _norm(psf)
         b = measurement / b_norm
