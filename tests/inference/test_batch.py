@@ -469,6 +469,7 @@ def test_two_machines_share_the_captures(shop, single, free_port):
 
 
 @linux
+@pytest.mark.acceptance  # 24 s, most of it torchrun's own waiting
 def test_a_machine_goes_on_without_another(shop, single, free_port):
     """The one where all meet; the other ends at once, with its process."""
     (shop / "in" / "damaged.npy").rename(shop / "damaged.npy")  # or the status would start all once more

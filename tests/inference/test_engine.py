@@ -151,7 +151,15 @@ def learned(name, psf):
 
 # 55 to 63 dB, and 74 of the one that is trained to the end. Networks that have learned as little as MWDN-CPSF in a
 # hundred steps have between 46 and 61.
-@pytest.mark.parametrize("name", ["universal-small", "unet", "mwdn", "mwdn-cpsf"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "universal-small",
+        "mwdn-cpsf",  # has the layers of the other two
+        pytest.param("unet", marks=pytest.mark.acceptance),
+        pytest.param("mwdn", marks=pytest.mark.acceptance),
+    ],
+)
 def test_fast_against_exact_on_real_captures(name, data):
     """PSNR, the brightest pixel of the exact picture taken as 1; captures and PSF binned by 4."""
     camera = data / "mwdn-camera"
