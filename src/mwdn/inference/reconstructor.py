@@ -175,7 +175,7 @@ class Reconstructor:
 
         Raises:
             ParameterError: ``refresh`` is negative.
-            MwdnError: a frame does not fit the camera, or holds NaN or infinity.
+            MwdnError: a frame does not fit the camera. A frame with NaN gives a scene with NaN and affects no other.
         """
         if refresh < 0:
             raise ParameterError(f"`refresh` ({refresh}) must be a number of frames, or 0 for never.")
