@@ -15,7 +15,7 @@ import torch
 from mwdn import Calibration
 from mwdn.data.photographs import Photographs
 from mwdn.evaluation import Perceptual, Protocol, evaluate
-from mwdn.inference.reconstructor import find_method
+from mwdn.inference.methods import find_method
 from mwdn.networks import wiener_bank
 from mwdn.solvers import Pyramid, align
 from mwdn.training.recipe import read_recipe
@@ -56,7 +56,7 @@ def main():
     parser.add_argument("--count", type=int, default=6)
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/ablation.json"))
     arguments = parser.parse_args()
-    recipe = read_recipe(Path(__file__).parents[1] / "recipes" / "mismatched.toml")
+    recipe = read_recipe("mismatched")
     photographs, perceptual = Photographs(arguments.data / "photos" / "test"), Perceptual.load()
     psf = Calibration.from_file(arguments.data / "mwdn-camera" / "psf_320.png").psf
     scores = {name: [] for name in parts(psf)}

@@ -32,7 +32,7 @@ import torch
 import arithmetic
 from mwdn import Calibration, Reconstructor
 from mwdn.fourier.filtering import reference_filter
-from mwdn.inference.reconstructor import find_method
+from mwdn.inference.methods import find_method
 from mwdn.networks import NETWORKS, blocks, build
 from mwdn.optics import sample_camera
 from mwdn.solvers import SOLVERS

@@ -4,7 +4,7 @@
 
 One change at a time against five Wiener estimates in image space (lambda 3e-2 to 1e-5, the measurement padded and
 tapered) as input of a U-Net. All train on the same samples, each through a random camera, with the same schedule
-(recipes/universal.toml without kept samples), and are validated on the same captures through the paper's PSF, which
+(the recipe universal without kept samples), and are validated on the same captures through the paper's PSF, which
 none has seen. Two at a time, of one thread each.
 """
 
@@ -24,7 +24,6 @@ from mwdn.networks import wiener_bank
 from mwdn.training.experiment import prepare
 from mwdn.training.recipe import read_recipe
 
-RECIPE = Path(__file__).parents[1] / "recipes" / "universal.toml"
 BANK = {"name": "wiener-bank", "width": 24, "finest": 0, "regularisations": [3e-2, 3e-3, 3e-4, 5e-5, 1e-5]}
 PARTS = {
     "bank in image space, tapered": (BANK, "taper"),
@@ -40,7 +39,7 @@ def learned(part, data, steps):
     """Validation PSNR of one network by step."""
     torch.set_num_threads(1)
     changes = {"steps": steps, "validate_every": steps // 4, "warmup": 20, "pool": 0, "crop": 0}
-    recipe = read_recipe(RECIPE, **changes, cameras={"sizes": ["320x320"]}, placement={"exposure": [0.4, 0.95]})
+    recipe = read_recipe("universal", **changes, cameras={"sizes": ["320x320"]}, placement={"exposure": [0.4, 0.95]})
     network, boundary = PARTS[part]
     recipe = replace(recipe, network=network)
     calibration, psnr = Calibration.from_file(data / "mwdn-camera" / "psf_320.png"), {}

@@ -3,7 +3,7 @@
     python benchmarks/selfsupervised.py ../shared/data [--exact] [--electrons 15000] [--count 24] [--steps 100]
 
 Captures as in benchmarks/universal.py, through the paper's PSF, mismatched by default. `universal` reconstructs them,
-is trained on them by recipes/selfsupervised.toml (in a folder of runs/, where a stopped run continues), and
+is trained on them by the recipe selfsupervised (in a folder of runs/, where a stopped run continues), and
 reconstructs them again. Scored as in `mwdn evaluate` (full, clipped). Rows of earlier calls for another camera or light
 stay in the record.
 """
@@ -22,9 +22,7 @@ from mwdn.data.unpaired import UnpairedCaptures
 from mwdn.training.recipe import read_recipe
 from mwdn.training.selfsupervised import SelfSupervisedTask
 from mwdn.training.trainer import Trainer
-from universal import METRICS, MISMATCHED, camera, captures, gain, keep, measured
-
-RECIPE = MISMATCHED.with_name("selfsupervised.toml")
+from universal import METRICS, camera, captures, gain, keep, measured
 
 
 def tell(step):
@@ -47,12 +45,12 @@ def main():
     made = captures(
         calibration.psf,
         photographs,
-        read_recipe(MISMATCHED),
+        read_recipe("mismatched"),
         arguments.electrons,
         range(arguments.count),
         exact=arguments.exact,
     )
-    recipe = read_recipe(RECIPE)
+    recipe = read_recipe("selfsupervised")
     recipe = replace(recipe, schedule=replace(recipe.schedule, steps=arguments.steps))
     own = UnpairedCaptures(
         torch.stack([measurement for measurement, _ in made]),

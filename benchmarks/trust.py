@@ -1,21 +1,21 @@
-"""The consistency score with right and wrong PSFs, on real captures of two cameras.
+"""Verdicts with right and wrong PSFs, on real captures of two cameras.
 
     python benchmarks/trust.py ../shared/data [--method universal] [--count 2]
 
 Wrong PSFs: mirrored, rotated by 180, 90 and 3 degrees, displaced, and that of another camera. Prints one line each: the
 fraction of the capture's detail that is reproduced, over the fraction that is not noise; the contrast with mirrored and
-rotated PSFs; whether the score is doubtful. Then the ranges for each kind of PSF.
+rotated PSFs; the verdict on the PSF: its state, and the turn that rights it. Then the ranges for each kind of PSF.
 """
 
 import argparse
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 
 from mwdn import Calibration, Reconstructor
-from mwdn.evaluation.consistency import consistency
+from mwdn.diagnosis.trust import examine_picture
 from mwdn.io.files import atomic
 from mwdn.optics import sample_camera
 from mwdn.solvers.alignment import Pose
@@ -39,15 +39,18 @@ def wrong(psf):
 
 
 def ranges(rows):
-    """Lines of a table: for each kind of PSF the number of doubtful captures, and the ranges of the scores."""
-    yield "| PSF | captures | doubtful | explained / possible | contrast |\n| --- | --- | --- | --- | --- |"
+    """Lines of a table: for each kind of PSF the number of captures with each verdict, and the ranges of the scores."""
+    yield "| PSF | captures | good | doubt | unknown | named | explained / possible | contrast |"
+    yield "| --- | --- | --- | --- | --- | --- | --- | --- |"
     for name in dict.fromkeys(row["psf"] for row in rows):
         those = [row for row in rows if row["psf"] == name]
         shares = [row["explained"] / row["possible"] for row in those]
         contrasts = [row["contrast"] for row in those]
-        doubtful = sum(row["doubtful"] for row in those)
+        states = [row["state"] for row in those]
+        counts = " | ".join(str(states.count(state)) for state in ("good", "doubt", "unknown"))
+        named = ", ".join(dict.fromkeys(row["value"] for row in those if row["value"]))
         numbers = (f"{min(each):.2f} to {max(each):.2f}" for each in (shares, contrasts))
-        yield f"| {name} | {len(those)} | {doubtful} | {' | '.join(numbers)} |"
+        yield f"| {name} | {len(those)} | {counts} | {named} | {' | '.join(numbers)} |"
 
 
 def main():
@@ -67,18 +70,20 @@ def main():
         (recovered, sorted((diffusercam / "diffuser_images").glob("*.npy"))),
     ]
     rows = []
-    print("| capture | PSF | explained / possible | contrast | doubtful |\n| --- | --- | --- | --- | --- |")
+    print("| capture | PSF | explained / possible | contrast | PSF |\n| --- | --- | --- | --- | --- |")
     for calibration, captures in sets:
         variants = wrong(calibration.psf)
         for capture in captures[: arguments.count]:
             measurement = calibration.correct(calibration.frames.read(capture))
             for name, psf in variants.items():
                 scene = Reconstructor(arguments.method, replace(calibration, psf=psf))(measurement)
-                score = consistency(measurement, psf, scene)
-                rows.append({"capture": capture.name, "psf": name, "doubtful": score.doubtful, **asdict(score)})
-                share = score.explained / score.possible
-                line = f"| {capture.stem} | {name} | {share:.2f} | {score.contrast:.2f} |"
-                print(line, "yes |" if score.doubtful else "no |", flush=True)
+                trust = examine_picture(measurement, psf, scene)
+                verdict, content = trust.orientation.verdict, trust.content
+                found = {"state": verdict.state, "value": verdict.value}
+                rows.append({"capture": capture.name, "psf": name, **found, **content})
+                share = content["explained"] / content["possible"]
+                line = f"| {capture.stem} | {name} | {share:.2f} | {content['contrast']:.2f} |"
+                print(line, verdict.state, verdict.value, "|", flush=True)
     with atomic(arguments.out) as temporary:
         temporary.write_text(json.dumps({"method": arguments.method, "rows": rows}, indent=1) + "\n")
     print("", *ranges(rows), sep="\n")

@@ -3,13 +3,13 @@
     python benchmarks/universal.py ../shared/data [--count 32] [--methods universal universal-small admm]
                                                 [--psfs "mwdn-camera 320x320" ...]
 
-Four measured PSFs; test photographs placed and mismatched by recipes/mismatched.toml; 15,000 and 2,000 electrons at
+Four measured PSFs; test photographs placed and mismatched by the recipe mismatched; 15,000 and 2,000 electrons at
 saturation. Scored as in `mwdn evaluate` (full, clipped). Prints a table of means, with the confidence interval of the
 first method's gain over the last, and writes the numbers of each picture, a few at a time. Numbers already in the
 record are not measured again, so a stopped run continues; `--again` measures the named methods again. One process per
 core, of one thread each.
 
-The method `fine-tuned` is, for each PSF, the network in `TUNED` that recipes/finetune.toml made of `universal`.
+The method `fine-tuned` is, for each PSF, the network in `TUNED` that the recipe finetune made of `universal`.
 """
 
 import argparse
@@ -43,7 +43,6 @@ PSFS = {
 }
 TUNED = {name: f"runs/finetune-{path.partition('/')[0]}/best.safetensors" for name, (path, _) in PSFS.items()}
 FULL_WELLS = (15_000.0, 2_000.0)
-MISMATCHED = Path(__file__).parents[1] / "recipes" / "mismatched.toml"
 KEYS = ("psf", "full_well", "exact")
 METRICS = ("psnr", "ssim", "lpips")
 AT_ONCE = 8
@@ -110,7 +109,7 @@ def scores(data, which, numbers, methods):
     torch.set_num_threads(1)
     mwdn.keep_memory()
     name, full_well, exact = which
-    calibration, recipe = camera(data, name), read_recipe(MISMATCHED)
+    calibration, recipe = camera(data, name), read_recipe("mismatched")
     photographs = Photographs(data / "photos" / "test")
     made = captures(calibration.psf, photographs, recipe, full_well, numbers, exact=exact)
     return measured({each: TUNED[name] if each == "fine-tuned" else each for each in methods}, made, calibration)

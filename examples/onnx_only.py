@@ -1,7 +1,7 @@
 """Reconstruct a capture with an exported file, using numpy, onnxruntime and OpenCV, without torch and mwdn.
 
 mwdn export universal-small --psf psf.png --out camera.onnx
-python examples/onnx_only.py camera.onnx capture.png scene.png [dark.png]
+python examples/onnx_only.py camera.onnx capture.png scene.png [dark.png or ambient.png]
 """
 
 import sys
@@ -37,7 +37,15 @@ def read(path, about):
     if largest > 1 and not frame.max() <= full <= largest:
         sys.exit(f"{path} ({frame.dtype}, up to {frame.max()}) must hold numbers of {about['bit_depth']} bits.")
     frame = frame[..., :3][..., ::-1] if frame.ndim == 3 else frame[..., None]  # OpenCV gives BGR
-    return (frame[..., ::-1] if "colours" in about else frame).astype(np.float32) / full
+    frame = (frame[..., ::-1] if "colours" in about else frame).astype(np.float32) / full
+    return decoded(frame, about["gamma"]) if "gamma" in about else frame
+
+
+def decoded(frame, gamma):
+    """Decode sRGB or a power to linear light."""
+    if gamma == "srgb":
+        return np.where(frame <= 0.04045, frame / 12.92, ((frame + 0.055) / 1.055) ** np.float32(2.4))
+    return frame.clip(min=0) ** np.float32(gamma)
 
 
 def cropped(frame, height, width):
@@ -64,15 +72,15 @@ def demosaiced(frame, mosaic):
 
 
 def measured(capture, dark, about):
-    """Input of the file: a capture minus its dark frame, cropped, binned, row 0 at the top, (1, C, H, W)."""
+    """Input of the file: a capture minus its dark or ambient frame, cropped, binned, row 0 at the top, (1, C, H, W)."""
     frame = read(capture, about)
     if dark:
         level = read(dark, about)
         if level.shape[:2] != frame.shape[:2] or level.shape[2] not in (1, frame.shape[2]):
             sys.exit(f"{dark} {level.shape} must have the size of {capture} {frame.shape}.")
         frame = frame - level
-    elif "dark" in about:
-        sys.exit(f"{capture} needs a dark frame, as this camera's calibration has one: name it last.")
+    elif kind := {"dark", "ambient"} & about.keys():
+        sys.exit(f"{capture} needs a {kind.pop()} frame, as this camera's calibration has one: name it last.")
     if "mosaic" in about:
         frame = demosaiced(frame, about["mosaic"])
     if "grey" in about:

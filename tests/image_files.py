@@ -48,6 +48,30 @@ def tiff(array: np.ndarray, **options: object) -> bytes:
     return data.getvalue()
 
 
+def dng(mosaic: np.ndarray, colours: str = "rggb", *, black: int = 64, white: int = 1023, turn: int = 1) -> bytes:
+    """A raw file with the tags that LibRaw needs; a grey sensor and a linear DNG (H, W, 3) have no ``colours``."""
+    byte, ascii_, short, long = 1, 2, 3, 4
+    tags = [
+        (50706, byte, 4, bytes([1, 4, 0, 0]), True),  # version of DNG
+        (50708, ascii_, 0, "mwdn test", True),  # camera
+        (50714, long, 1, black, True),
+        (50717, long, 1, white, True),
+        (274, short, 1, turn, True),  # EXIF orientation
+    ]
+    if colours:
+        pattern = bytes("rgb".index(letter) for letter in colours)
+        side = int(len(colours) ** 0.5)
+        tags += [(33421, short, 2, (side, side), True), (33422, byte, len(colours), pattern, True)]
+    data = BytesIO()
+    mosaic_, linear = 32803, 34892
+    kind = linear if mosaic.ndim == 3 else mosaic_
+    tifffile.imwrite(data, mosaic, photometric=kind, planarconfig=None, extratags=tags, metadata=None)
+    if colours or kind == linear:
+        return data.getvalue()
+    grey = [struct.pack("<HHIHxx", 262, 3, 1, photometric) for photometric in (mosaic_, linear)]  # not in tifffile
+    return data.getvalue().replace(*grey)
+
+
 def npy(array: np.ndarray, **options: bool) -> bytes:
     data = BytesIO()
     np.save(data, array, **options)

@@ -128,6 +128,6 @@ def test_a_folder(calibration, batches, tmp_path):
         jobs[device] = list(Batch(reconstruct, "name", tmp_path / device.type, "npy").run(captures))
     for here, there in zip(jobs[CPU], jobs[GPU], strict=True):
         assert there.error is None
-        assert there.consistency.explained == pytest.approx(here.consistency.explained, rel=1e-3)
+        assert there.trust.consistency.explained == pytest.approx(here.trust.consistency.explained, rel=1e-3)
         pictures = (torch.from_numpy(np.load(job.output)) for job in (there, here))
         assert psnr(*pictures) > 60

@@ -1,5 +1,9 @@
 """What `import mwdn` offers, and arrays where people hold arrays."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -28,9 +32,18 @@ def capture(psf):
     return Camera(Calibration.from_array(psf).psf)(scene)[0].movedim(0, -1).numpy()
 
 
-@pytest.mark.parametrize("name", [*mwdn.__all__, "data", "evaluation", "export", "training"])
+PACKAGES = {path.parent.name for path in Path(mwdn.__file__).parent.glob("*/__init__.py")} - {"cli"}
+
+
+@pytest.mark.parametrize("name", [*mwdn.__all__, *sorted(PACKAGES), "errors", "types"])
 def test_every_name_is_there(name):
     assert getattr(mwdn, name) is not None
+    assert name in dir(mwdn)
+
+
+def test_folders_are_attributes_of_a_fresh_import():
+    code = f"import mwdn\nfor name in {sorted(PACKAGES)}: getattr(mwdn, name).__all__"
+    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True, timeout=60)
 
 
 def test_an_unknown_name_is_an_attribute_error():

@@ -8,25 +8,47 @@
 
 Subpackages: `mwdn.solvers` (ADMM, FISTA, ...), `mwdn.networks` (MWDN, MWDN-CPSF, ...),
 `mwdn.optics` (masks, PSFs, forward models), `mwdn.data` (pairs), `mwdn.training`, `mwdn.evaluation`, `mwdn.export`.
+
+Each name is imported at its first use: torch takes two seconds, which `mwdn --version` need not wait for.
 """
 
 import warnings
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from mwdn import networks, solvers
-from mwdn.calibration import Calibration, FrameFormat
-from mwdn.errors import MwdnError
-from mwdn.fourier import convolve, correlate, wiener
-from mwdn.inference import Reconstructor
-from mwdn.io import read_frame, read_picture, write_linear, write_picture
-from mwdn.io.contact_sheets import to_display
-from mwdn.networks import build
-from mwdn.optics import Camera, Sensor
-from mwdn.runtime.memory import keep_memory
-from mwdn.solvers import align
 from mwdn.version import __version__ as __version__
-from mwdn.weights import load_network
+
+if TYPE_CHECKING:  # the names of _MODULES and _PACKAGES, for mypy and editors
+    from mwdn import benchmark as benchmark
+    from mwdn import calibration as calibration
+    from mwdn import data as data
+    from mwdn import diagnosis as diagnosis
+    from mwdn import errors as errors
+    from mwdn import evaluation as evaluation
+    from mwdn import export as export
+    from mwdn import fourier as fourier
+    from mwdn import inference as inference
+    from mwdn import io as io
+    from mwdn import networks as networks
+    from mwdn import optics as optics
+    from mwdn import runtime as runtime
+    from mwdn import solvers as solvers
+    from mwdn import training as training
+    from mwdn import types as types
+    from mwdn import weights as weights
+    from mwdn.calibration import Calibration, FrameFormat
+    from mwdn.errors import MwdnError
+    from mwdn.evaluation import lpips, psnr, ssim
+    from mwdn.fourier import convolve, correlate, wiener
+    from mwdn.inference import Reconstructor
+    from mwdn.io import read_frame, read_picture, write_linear, write_picture
+    from mwdn.io.contact_sheets import to_display
+    from mwdn.networks import build
+    from mwdn.optics import Camera, Sensor
+    from mwdn.runtime import keep_memory
+    from mwdn.solvers import align
+    from mwdn.training.experiment import simulate, train
+    from mwdn.weights import load_network
 
 __all__ = [
     "Calibration",
@@ -56,24 +78,53 @@ __all__ = [
     "write_picture",
 ]
 
-# Imported at first use: together they take as long as everything above.
-_LATER = {
-    "lpips": "mwdn.evaluation.distances",
-    "psnr": "mwdn.evaluation.metrics",
-    "simulate": "mwdn.training.experiment",
-    "ssim": "mwdn.evaluation.distances",
-    "train": "mwdn.training.experiment",
+_PACKAGES = {
+    *("benchmark", "calibration", "data", "diagnosis", "errors", "evaluation", "export", "fourier", "inference"),
+    *("io", "networks", "optics", "runtime", "solvers", "training", "types", "weights"),
 }
-_FOLDERS = ("data", "evaluation", "export", "training")
+_MODULES = {
+    "Calibration": "calibration",
+    "Camera": "optics",
+    "FrameFormat": "calibration",
+    "MwdnError": "errors",
+    "Reconstructor": "inference",
+    "Sensor": "optics",
+    "align": "solvers",
+    "build": "networks",
+    "convolve": "fourier",
+    "correlate": "fourier",
+    "keep_memory": "runtime",
+    "load_network": "weights",
+    "lpips": "evaluation",
+    "psnr": "evaluation",
+    "read_frame": "io",
+    "read_picture": "io",
+    "simulate": "training.experiment",
+    "ssim": "evaluation",
+    "to_display": "io.contact_sheets",
+    "train": "training.experiment",
+    "wiener": "fourier",
+    "write_linear": "io",
+    "write_picture": "io",
+}
+"""Modules that hold the public names."""
+
 _RENAMED = {"for_people": "to_display"}
 
 
 def __getattr__(name: str) -> Any:  # noqa: ANN401
-    if name in _LATER:
-        return getattr(import_module(_LATER[name]), name)
-    if name in _FOLDERS:
-        return import_module(f"mwdn.{name}")
+    """Import a public name at its first use (PEP 562); Python then finds it without this function."""
     if name in _RENAMED:
-        warnings.warn(f"`mwdn.{name}` is now `mwdn.{_RENAMED[name]}`.", DeprecationWarning, stacklevel=2)
-        return globals()[_RENAMED[name]]
-    raise AttributeError(f"module 'mwdn' has no attribute '{name}'")
+        new = _RENAMED[name]
+        warnings.warn(f"`mwdn.{name}` is now `mwdn.{new}`.", DeprecationWarning, stacklevel=2)
+        return __getattr__(new)
+    if name in _PACKAGES:
+        return import_module(f"mwdn.{name}")
+    if name not in _MODULES:
+        raise AttributeError(f"module 'mwdn' has no attribute '{name}'")
+    value = globals()[name] = getattr(import_module(f"mwdn.{_MODULES[name]}"), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_MODULES, *_PACKAGES})

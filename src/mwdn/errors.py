@@ -17,9 +17,15 @@ A message states what must hold, what was got, and the way out.
 """
 
 import difflib
-from collections.abc import Callable, Iterable
-from inspect import signature
-from typing import Any
+import reprlib
+from collections.abc import Callable, Iterable, Mapping
+from functools import cache, wraps
+from inspect import Parameter, signature
+from numbers import Integral, Real
+from types import NoneType, UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+_Class = TypeVar("_Class", bound=type)
 
 
 class MwdnError(Exception):
@@ -44,34 +50,133 @@ class UnknownNameError(ParameterError):
     """
 
     def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
-        known = sorted(known)
+        name, known = str(name), sorted(known)
         spelling = {word.lower(): word for word in known}
         nearest = difflib.get_close_matches(name.lower(), spelling, n=1)
         hint = f" Did you mean '{spelling[nearest[0]]}'?" if nearest else ""
         super().__init__(f"No {kind} named '{name}'.{hint} Known: {', '.join(known)}.")
 
 
-def check_options(of: Callable[..., Any], what: str, options: Iterable[str]) -> None:
-    """Check that a function or class takes these keyword arguments.
+def check_options(of: Callable[..., Any], what: str, options: Mapping[str, Any]) -> None:
+    """Check that a function or class takes these keyword arguments, and that each is of the annotated type.
+
+    Arrays are not checked here, because the functions that take them check their axes, too.
 
     Args:
         of: the function or class.
         what: its name in the message, for example ``"network 'mwdn'"``.
-        options: names of the keyword arguments.
+        options: the keyword arguments.
 
     Raises:
-        UnknownNameError: it does not take one of them.
+        UnknownNameError: it does not take one of them, or a value is not among the names that an option allows.
+        ParameterError: a value is of another type: text for a number, 1.5 for a whole number.
     """
-    known = signature(of).parameters
-    for option in options:
-        if option not in known:
-            raise UnknownNameError(f"option of {what}", option, known)
+    types, takes_any = _annotations(of)
+    for option, value in options.items():
+        if option not in types and not takes_any:
+            raise UnknownNameError(f"option of {what}", option, types)
+        if option in types and not _fits(value, types[option]):
+            names = _names(types[option])
+            if isinstance(value, str) and names:
+                raise UnknownNameError(option, value, names)
+            raise ParameterError(f"`{option}` ({shown(value)}) of {what} must be {type_in_words(types[option])}.")
+
+
+def checked(kind: _Class) -> _Class:
+    """Decorate a class: `check_options` checks the arguments of each new object."""
+    any_kind: Any = kind
+    create = any_kind.__init__
+
+    @wraps(create)
+    def init(self: Any, *values: Any, **options: Any) -> None:  # noqa: ANN401
+        # A mistake in the number of positional arguments is Python's to report.
+        check_options(kind, f"`{kind.__name__}`", dict(zip(_annotations(kind)[0], values, strict=False)) | options)
+        create(self, *values, **options)
+
+    any_kind.__init__ = init
+    return kind
+
+
+@cache
+def _annotations(of: Callable[..., Any]) -> tuple[dict[str, Any], bool]:
+    """Annotated type of each argument, `Any` if there is none; and whether the function takes any other name."""
+    try:
+        hints = get_type_hints(vars(of)["__init__"] if isinstance(of, type) else of)
+    except NameError:  # annotations as text, of names that are local to a function
+        hints = {}
+    parameters = signature(of).parameters.values()
+    types = {each.name: hints.get(each.name, Any) for each in parameters if each.kind is not Parameter.VAR_KEYWORD}
+    return types, len(types) < len(parameters)
+
+
+def _fits(value: Any, kind: Any) -> bool:  # noqa: ANN401
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin in (Union, UnionType):
+        return any(_fits(value, part) for part in parts)
+    if origin is Literal:
+        return isinstance(value, str) and value in parts
+    if origin is tuple:  # JSON and TOML have lists
+        parts = parts[:1] * len(value) if parts[1:] == (...,) and isinstance(value, tuple | list) else parts
+        return isinstance(value, tuple | list) and len(value) == len(parts) and all(map(_fits, value, parts))
+    if origin is Callable:
+        return callable(value)
+    if kind in (int, float):
+        return isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
+    return kind is Any or not isinstance(kind, type) or hasattr(kind, "array_type") or isinstance(value, kind)
+
+
+def _names(kind: Any) -> list[str]:  # noqa: ANN401
+    """The names that a type allows if it allows nothing else: those of a `Literal`, also beside `None`."""
+    kinds = (
+        [part for part in get_args(kind) if part is not NoneType] if get_origin(kind) in (Union, UnionType) else [kind]
+    )
+    return list(get_args(kinds[0])) if len(kinds) == 1 and get_origin(kinds[0]) is Literal else []
+
+
+def type_in_words(kind: Any) -> str:  # noqa: ANN401
+    """An annotated type as a reader of a message calls it: ``a whole number or None``."""
+    origin, parts = get_origin(kind), get_args(kind)
+    words = {int: "a whole number", float: "a number", bool: "True or False", str: "text", NoneType: "None"}
+    if origin in (Union, UnionType):
+        return " or ".join(type_in_words(part) for part in parts)
+    if origin is Literal:
+        return " or ".join(map(repr, parts))
+    if origin is tuple:
+        return (
+            "two whole numbers such as (320, 320)"
+            if parts == (int, int)
+            else f"a tuple, each {type_in_words(parts[0])}"
+        )
+    if origin is Callable:
+        return "a function"
+    return words.get(kind) or f"`{getattr(kind, '__name__', kind)}`"
+
+
+def shown(value: Any) -> str:  # noqa: ANN401
+    """A value in a message: an array or tensor by its type and axes, anything else by its first characters."""
+    shape, dtype = getattr(value, "shape", ()), getattr(value, "dtype", "")
+    return f"{type(value).__name__} {tuple(shape)}, {dtype}" if shape else reprlib.repr(value)
 
 
 def check_batch(image: Any, name: str) -> None:  # noqa: ANN401
-    """Raise a `ShapeError` unless the image called ``name`` has the axes (B, C, H, W)."""
+    """Check that the image called ``name`` is a tensor of floats (B, C, H, W).
+
+    Raises:
+        ParameterError: it is no tensor, or one of integers, whose scale is unknown, or of complex numbers.
+        ShapeError: it has other axes.
+    """
+    if not hasattr(image, "is_floating_point"):  # without torch, which takes seconds to import
+        raise ParameterError(
+            f"`{name}` ({shown(image)}) must be a tensor (B, C, H, W). `Calibration.correct` makes one of a frame, "
+            "`Calibration.from_array` of the picture of a PSF."
+        )
     if image.ndim != 4:
         raise ShapeError(f"`{name}` {tuple(image.shape)} must be (B, C, H, W). For one picture: `{name}[None]`.")
+    if not image.is_floating_point():
+        raise ParameterError(
+            f"`{name}` ({image.dtype}) must be floats in linear light, 1 for saturation. Divide integers by the "
+            f"camera's largest number: `{name} / 255` for 8 bits."
+        )
 
 
 class ImageError(MwdnError, ValueError):

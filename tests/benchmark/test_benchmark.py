@@ -18,7 +18,7 @@ from mwdn.benchmark import read_benchmark, run
 from mwdn.cli.app import main
 from mwdn.data.pairs import PairFile
 from mwdn.errors import CheckpointError, ParameterError, UnknownNameError
-from mwdn.evaluation import bootstrap
+from mwdn.evaluation import alexnet, bootstrap
 
 RECIPE = """
 title = "Two networks & a solver"
@@ -266,6 +266,17 @@ def test_mistakes_of_a_recipe(tmp_path, before, after, kind, message):
         read_benchmark(tmp_path / "r.toml")
 
 
+def test_a_loss_with_alexnet_downloads_nothing_unasked(folder, monkeypatch):
+    monkeypatch.delenv("MWDN_ALEXNET", raising=False)
+    monkeypatch.setattr(alexnet, "cache_folder", lambda: folder / "cache")
+    monkeypatch.setattr(alexnet, "urlopen", lambda *_, **__: pytest.fail("nobody asked for a download"))
+    text = RECIPE.replace('alexnet = "nowhere.pth"', "loss = { mse = 1.0, feature_mse = 1.0 }")
+    (folder / "r.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(CheckpointError, match="--lpips"):
+        run(read_benchmark(folder / "r.toml"), folder / "out", device="cpu")
+    assert not (folder / "out").exists()
+
+
 def test_widths_shrink_alike(tmp_path):
     text = RECIPE.replace("shared.network = { width = 2 }", "width_factor = 0.25").replace(
         "mwdn = {} }", 'mwdn = {}, own = { name = "mwdn", width = 5 } }'
@@ -279,7 +290,7 @@ def test_widths_shrink_alike(tmp_path):
 def test_recipes_that_come_along(name, monkeypatch):
     monkeypatch.setenv("MWDN_DATA", "/data")
     monkeypatch.setenv("MWDN_PUBLIC", "/public")
-    benchmark = read_benchmark(Path(__file__).parents[2] / "recipes" / f"{name}.toml")
+    benchmark = read_benchmark(name)
     assert {"wiener", "unet", "wiener-unet", "mwdn", "mwdn-cpsf"} <= {method.label for method in benchmark.methods}
     assert benchmark.data["mwdn-sim"].psf == "/data/mwdn-camera/psf_320.png"
     assert benchmark.data["diffusercam-real"].trained_on == "diffusercam-sim"

@@ -4,9 +4,13 @@ import numpy as np
 import pytest
 import torch
 
+from cameras import gaussian_psf
+from mwdn import Camera
 from mwdn.calibration import FrameFormat
-from mwdn.calibration.frame_format import bin_pixels, crop_centre, demosaic
+from mwdn.calibration.frame_format import bin_pixels, crop_centre, demosaic, enlarge
 from mwdn.errors import ParameterError, ShapeError, UnknownNameError
+from mwdn.io.images import srgb_encode
+from mwdn.solvers import Wiener
 
 
 def delta(height, width):
@@ -103,8 +107,8 @@ def test_cells_of_a_mosaic_become_pixels(mosaic):
 
 
 def test_a_mosaic_has_one_channel_and_even_sides():
-    for shape, said in (((1, 3, 8, 8), "3 x 8 x 8"), ((1, 1, 7, 8), "1 x 7 x 8")):
-        with pytest.raises(ShapeError, match=rf"A raw mosaic \({said}\) must have one channel and even sides"):
+    for shape, said in (((1, 3, 8, 8), r"\(8 x 8\) has 3"), ((1, 1, 7, 8), "7 x 8")):
+        with pytest.raises(ShapeError, match=rf"`mosaic` \(rggb\).*{said}"):
             demosaic(torch.zeros(shape), "rggb")
 
 
@@ -120,12 +124,74 @@ def test_steps_in_their_order():
     """16 - 1 at the colours' offsets, twice as wide as the crop and binned; row 0 of the file comes last."""
     frame = np.full((16, 24, 1), 1, np.uint8)
     frame[4:8, 8:16] += 4  # row 2 to 3 and column 4 to 7 of 8 x 12 cells
-    frames = FrameFormat(bit_depth=4, mosaic="rggb", grey=True, crop=(4, 4), bin=2, upside_down=True)
+    frames = FrameFormat(bit_depth=4, mosaic="rggb", grey=True, crop=(8, 8), bin=2, upside_down=True)
     dark = torch.full((1, 1, 16, 24), 1 / 15)
     expected = torch.tensor([[[[0.0, 0.0], [4 / 15, 4 / 15]]]])
     torch.testing.assert_close(frames.to_measurement(frame, dark), expected)
 
 
+@pytest.mark.parametrize("size", [(16, 24), (18, 22)])
+@pytest.mark.parametrize("mosaic", ["rggb", "gbrg"])
+def test_crop_is_in_raw_pixels_with_and_without_a_mosaic(size, mosaic, generator):
+    frame = torch.rand(*size, 1, generator=generator).numpy()
+    cropped = FrameFormat(mosaic=mosaic, crop=(8, 12)).to_measurement(frame)
+    whole = FrameFormat(mosaic=mosaic).to_measurement(frame)
+    assert cropped.shape[-2:] == (4, 6)
+    assert torch.equal(cropped, crop_centre(whole, (4, 6)))
+    assert FrameFormat(crop=(8, 12)).to_measurement(frame).shape[-2:] == (8, 12)
+    with pytest.raises(ParameterError, match=r"`crop` \(9 x 12\) must be even.*`--crop 8 12`"):
+        FrameFormat(mosaic=mosaic, crop=(9, 12))
+
+
+def test_crop_of_a_mosaic_stays_even_at_another_resolution():
+    frames = FrameFormat(mosaic="rggb", crop=(10, 20), bin=2).with_bin(3)
+    assert frames == FrameFormat(mosaic="rggb", crop=(14, 30), bin=3)  # 7.5 cells are not
+
+
+@pytest.mark.parametrize("gamma", ["srgb", 2.2, 1.0, None])
+def test_gamma_is_decoded_to_linear_light(gamma, generator):
+    """A step of 16 bits is at most 2.4 / 65535 of the light."""
+    light = torch.rand(1, 3, 5, 6, generator=generator)
+    coded = srgb_encode(light) if gamma == "srgb" else light ** (1 / (gamma or 1))
+    frame = (coded[0].movedim(0, -1) * 65535).round().numpy().astype(np.uint16)
+    torch.testing.assert_close(FrameFormat(gamma=gamma).normalise(frame), light, atol=2.4 / 65535, rtol=0)
+
+
+@pytest.mark.parametrize("gamma", [0.9, 4.1, float("nan"), "rgb"])
+@pytest.mark.usefixtures("unchecked")
+def test_gamma_is_srgb_or_a_number(gamma):
+    with pytest.raises(ParameterError, match=rf"`gamma` \('?{gamma}'?\).* must be 'srgb',? or a number"):
+        FrameFormat(gamma=gamma)
+
+
+def test_dark_frame_of_a_gamma_coded_camera_is_decoded_too(generator):
+    """Light adds up before the encoding: dark level and scene are subtracted in linear light."""
+    light, dark = 0.7 * torch.rand(4, 6, 1, generator=generator), torch.full((4, 6, 1), 0.2)
+    frames = FrameFormat(gamma=2.2)
+    coded, coded_dark = ((image ** (1 / 2.2)).numpy() for image in (light + dark, dark))
+    measurement = frames.to_measurement(coded, frames.normalise(coded_dark))
+    torch.testing.assert_close(measurement[0].movedim(0, -1), light, atol=1e-6, rtol=0)
+
+
 def test_another_resolution_scales_the_crop():
     assert FrameFormat(bin=2, crop=(100, 60)).with_bin(4) == FrameFormat(bin=4, crop=(200, 120))
     assert FrameFormat(bin=2).with_bin(4) == FrameFormat(bin=4)
+
+
+def centroid(image):
+    """Row and column, of what is brighter than a tenth of the maximum."""
+    light = (image - 0.1 * image.max()).clamp(min=0)[0, 0]
+    return [float((light.sum(1 - axis) * torch.arange(n)).sum() / light.sum()) for axis, n in enumerate(light.shape)]
+
+
+@pytest.mark.parametrize(("size", "factor"), [((120, 130), 2), ((121, 135), 3), ((124, 133), 5)])
+def test_reconstruction_of_binned_frames_enlarges_to_its_place(size, factor):
+    """A spot through a spot, binned and deconvolved: without the shift by half a block it would lie elsewhere."""
+    spot = size[0] // 2 + 7, size[1] // 2 - 9
+    psf, scene = gaussian_psf(size, 1.5 * factor), gaussian_psf(size, 2.5 * factor, spot)
+    binned_psf, measurement = bin_pixels(psf, factor), bin_pixels(Camera(psf).forward(scene), factor)
+    small = Wiener(regularisation=1e-3)(measurement, binned_psf / binned_psf.sum())
+    full = enlarge(small, factor, size)
+    assert full.shape[-2:] == size
+    assert centroid(full) == pytest.approx(spot, abs=0.1)
+    assert small.amin() <= full.amin() <= full.amax() <= small.amax()

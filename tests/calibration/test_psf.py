@@ -1,18 +1,22 @@
 """A PSF from a file, and raw frames to measurements."""
 
 import re
+from typing import get_args
 
 import cv2
 import numpy as np
 import pytest
 import tifffile
 import torch
+from PIL import Image
 
 from cameras import contour_psf
 from mwdn.calibration import Calibration, FrameFormat
-from mwdn.calibration.psf import estimate_background, flip_rows_about_centre
+from mwdn.calibration.psf import estimate_background
 from mwdn.errors import ImageError, ParameterError, PsfError, ShapeError, UnknownNameError
 from mwdn.fourier.convolution import convolve
+from mwdn.io.images import srgb_encode
+from mwdn.optics.orientation import Orientation, turn
 
 SIZE = 48, 40
 
@@ -92,7 +96,7 @@ def test_turned_scene_through_a_turned_psf_is_the_turned_measurement(size, gener
     scene = torch.rand(1, 3, *size, generator=generator)
     psf = torch.rand(1, 1, *size, generator=generator)
     psf[..., 0, :] = 0  # the row that an even height rolls from one border to the other
-    torch.testing.assert_close(convolve(scene.flip(-2), flip_rows_about_centre(psf)), convolve(scene, psf).flip(-2))
+    torch.testing.assert_close(convolve(scene.flip(-2), turn(psf, "flip-top-bottom")), convolve(scene, psf).flip(-2))
 
 
 def test_captures_of_an_upside_down_camera_are_turned_whole(tmp_path, generator):
@@ -180,6 +184,81 @@ def test_background_is_the_5th_percentile_of_each_channel(generator):
     assert estimate_background(image).shape == (1, 2, 1, 1)
 
 
+def test_ambient_light_is_subtracted_from_captures_alone(tmp_path, caustic):
+    """The frame of the room's light holds the dark level, too."""
+    rng = np.random.default_rng(2)
+    dark, room = (rng.integers(500, 4000, (*SIZE, 1)).astype(np.uint16) for _ in "ab")
+    light = (caustic * 40000).astype(np.uint16)[..., None]
+    calibration = Calibration.from_file(
+        store(tmp_path / "psf.tif", light + dark),
+        dark=store(tmp_path / "dark.tif", dark),
+        ambient=store(tmp_path / "ambient.tif", room + dark),
+        background=0.0,
+    )
+    np.testing.assert_allclose(calibration.psf[0, 0], light[..., 0] / light.sum(), atol=1e-7)
+    measurement = calibration.correct(light + room + dark)
+    np.testing.assert_allclose(measurement[0, 0], light[..., 0] / 65535, atol=1e-6)
+    with pytest.raises(ShapeError, match=r"`ambient` \(1, 24, 40\), must have the size of the frame \(1, 48, 40\)"):
+        Calibration.from_array(light, ambient=room[:24]).correct(light)
+
+
+@pytest.mark.parametrize("gamma", ["srgb", 2.2])
+def test_psf_has_a_gamma_of_its_own(gamma, caustic):
+    linear = caustic[..., None].astype(np.float32)
+    light = torch.from_numpy(linear)
+    coded = (srgb_encode(light) if gamma == "srgb" else light ** (1 / gamma)).numpy()
+    expected = Calibration.from_array(linear, background=0.0).psf
+    psf = Calibration.from_array(coded, background=0.0, psf_gamma=gamma)
+    torch.testing.assert_close(psf.psf, expected, atol=1e-6, rtol=1e-4)
+    assert torch.equal(Calibration.from_array(linear, background=0.0, gamma=gamma).psf, expected)
+
+
+def test_light_of_the_point_source_is_kept(caustic):
+    """Its colour, which the normalised PSF has lost."""
+    red, green, blue = Calibration.from_array(coloured(caustic).astype(np.float32), background=0.0).light
+    assert (green / red, blue / red) == pytest.approx((0.5, 0.7), rel=1e-4)
+
+
+# --- Orientation --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("orientation", get_args(Orientation))
+def test_turned_psf_file_is_turned_back(orientation, generator):
+    """The file holds the inverse turn; crop and binning are those of the captures."""
+    psf = torch.zeros(1, 3, 12, 16)
+    psf[..., 4:8, 6:11] = torch.rand(1, 3, 4, 5, generator=generator)
+    inverse = {"rotate-90": "rotate-270", "rotate-270": "rotate-90"}.get(orientation, orientation)
+    expected, calibration = (
+        Calibration.from_array(image[0].movedim(0, -1).numpy(), background=0.0, crop=(8, 12), psf_orientation=name)
+        for image, name in ((psf, None), (turn(psf, inverse), orientation))
+    )
+    assert calibration.size == (8, 12)
+    torch.testing.assert_close(calibration.psf, expected.psf)
+
+
+@pytest.mark.parametrize("orientation", get_args(Orientation))
+def test_orientations_are_those_of_pillow(orientation, generator):
+    """On odd sides, where the centre is the middle."""
+    psf = torch.rand(1, 1, 5, 7, generator=generator)
+    picture = Image.fromarray(psf[0, 0].numpy()).transpose(Image.Transpose[orientation.upper().replace("-", "_")])
+    np.testing.assert_array_equal(turn(psf, orientation)[0, 0], np.asarray(picture))
+
+
+@pytest.mark.parametrize("orientation", get_args(Orientation))
+def test_centre_stays_the_centre_when_turned(orientation):
+    for height, width in ((8, 6), (7, 6), (8, 5)):
+        psf = torch.zeros(1, 1, height, width)
+        psf[..., height // 2, width // 2] = 1
+        turned = turn(psf, orientation)
+        assert turned[..., turned.shape[-2] // 2, turned.shape[-1] // 2] == 1
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_unknown_orientation_names_the_nearest(caustic):
+    with pytest.raises(UnknownNameError, match=r"'rotate90'.*'rotate-90'"):
+        Calibration.from_array(caustic.astype(np.float32), psf_orientation="rotate90")
+
+
 # --- Colours ------------------------------------------------------------------------------------------
 
 
@@ -208,7 +287,7 @@ def test_raw_mosaics_become_a_psf_and_measurements_in_colour(tmp_path, generator
     torch.testing.assert_close(measurement / measurement.sum((-2, -1), keepdim=True), expected, atol=1e-7, rtol=1e-4)
     with pytest.raises(ShapeError, match=r"`--grey`.*`--mosaic rggb`"):
         Calibration(calibration.psf).correct(np.ones((40, 40, 1), np.float32))
-    with pytest.raises(ShapeError, match="must have one channel"):
+    with pytest.raises(ShapeError, match="mosaic"):
         Calibration(calibration.psf, FrameFormat(mosaic=mosaic)).correct(np.ones((80, 80, 3), np.float32))
 
 
@@ -241,10 +320,10 @@ def test_hash_is_that_of_the_content(tmp_path, caustic):
 
 
 def test_hash_is_the_same_in_every_process_and_knows_the_shape():
-    psf = torch.arange(1, 13).reshape(1, 1, 3, 4).float()
-    assert Calibration(psf).psf_hash == "6832dbfc57f8def7"
-    assert Calibration(psf.reshape(1, 1, 4, 3)).psf_hash != "6832dbfc57f8def7"
-    assert Calibration(psf.movedim(-1, -2).contiguous().movedim(-1, -2)).psf_hash == "6832dbfc57f8def7"
+    psf = torch.tensor([1, 1, 1, 2, 1, 1, 2, 3, 1, 1, 1, 1]).reshape(1, 1, 3, 4) / 16
+    assert Calibration(psf).psf_hash == "841544b6ce2c67ae"
+    assert Calibration(psf.reshape(1, 1, 4, 3)).psf_hash != "841544b6ce2c67ae"
+    assert Calibration(psf.movedim(-1, -2).contiguous().movedim(-1, -2)).psf_hash == "841544b6ce2c67ae"
 
 
 # --- Refusals -----------------------------------------------------------------------------------------
@@ -321,7 +400,7 @@ def test_wrong_axes(shape):
 
 
 def test_negative_or_dark_psf():
-    with pytest.raises(PsfError, match=r"`psf` \(smallest value -1\) must not be negative"):
+    with pytest.raises(PsfError, match=r"`psf` \(smallest value -1, .*must not be negative"):
         Calibration(-torch.ones(1, 1, 4, 4))
     dark = torch.ones(1, 3, 4, 4)
     dark[:, 1] = 0
@@ -345,7 +424,7 @@ def test_background_out_of_range(tmp_path, caustic, background):
 def test_dark_frame_of_another_size(tmp_path, caustic):
     path = store(tmp_path / "psf.png", (caustic * 255).astype(np.uint8)[..., None])
     dark = store(tmp_path / "dark.png", np.zeros((24, 20, 1), np.uint8))
-    with pytest.raises(ShapeError, match=r"`dark` \(1, 24, 20\) must have the size of the frame \(1, 48, 40\)"):
+    with pytest.raises(ShapeError, match=r"`dark` .*\(1, 24, 20\), must have the size of the frame \(1, 48, 40\)"):
         Calibration.from_file(path, dark=dark)
 
 

@@ -158,7 +158,7 @@ def test_defocused_pinhole():
 def test_blurred_psf_can_be_binned():
     y, x = torch.arange(300.0)[:, None] - 150, torch.arange(300.0) - 150
     blurred = torch.exp(-0.5 * (y.square() + x.square()) / 5.0**2)[None, None]
-    assert said(inspect_psf(Calibration(blurred / blurred.sum())), "px wide", "Binning by")
+    assert said(inspect_psf(Calibration(blurred / blurred.sum())), "px wide", "`--bin 2`")
 
 
 def test_colours_that_differ():

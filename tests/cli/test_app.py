@@ -5,17 +5,20 @@ import json
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 import mwdn
 from cameras import contour_psf
 from mwdn import Camera, read_frame
-from mwdn.cli.app import main
+from mwdn.cli.app import COMMANDS, main
 from mwdn.cli.demo import METHODS, PICTURES
+from mwdn.io.toml import find_recipe, packaged_recipes
 
 SIZE = 32, 40
 
@@ -67,9 +70,9 @@ def test_one_file(run, camera):
     code, out, err = reconstruct(run, "captures/a.png", method="admm")
     assert (code, err) == (0, "")
     assert re.search(r"PSF [0-9a-f]{16}, background 0\.\d{4}, 0\.\d{4}, 0\.\d{4} of the full scale", out)
-    assert "1 of 1 captures reconstructed into out" in out
+    assert "\n1 capture reconstructed into out\n" in out
     assert names(camera / "out") == ["a.json", "a.png", "summary.png"]
-    assert "a.png explains" in out
+    assert "a.png: the picture reproduces" in out
     trust = json.loads((camera / "out" / "a.json").read_text())
     assert trust["explained"] > 0.8 * trust["possible"]
     assert not trust["doubtful"]
@@ -83,7 +86,7 @@ def test_one_file(run, camera):
 def test_many_files_and_a_folder(run, camera):
     code, out, _ = reconstruct(run, "captures/c.png", "captures/a.png", out="some")
     assert (code, names(camera / "some")) == (0, ["a.json", "a.png", "c.json", "c.png", "summary.png"])
-    assert "2 of 2" in out
+    assert "\n2 captures reconstructed into some\n" in out
     code, _, _ = reconstruct(run, "captures", out="all")
     assert (code, names(camera / "all")) == (
         0,
@@ -91,6 +94,29 @@ def test_many_files_and_a_folder(run, camera):
     )
     for name in ("a.png", "c.png"):
         assert (camera / "some" / name).read_bytes() == (camera / "all" / name).read_bytes()
+
+
+def test_a_pattern_that_matches_the_psf_too(run, camera):
+    (camera / "notes.txt").touch()
+    code, _, err = reconstruct(run, *sorted(camera.glob("*.png")), camera / "captures")
+    assert code == 0
+    assert "psf.png (the PSF)" in err
+    assert names(camera / "out") == ["a.json", "a.png", "b.json", "b.png", "c.json", "c.png", "summary.png"]
+    code, _, err = reconstruct(run, "psf.png")
+    assert code == 2
+    assert "psf.png (the PSF)" in err
+
+
+@pytest.mark.parametrize("turned", ["psf", "captures/b"])
+def test_an_exif_turn_is_named_once_and_doubts_no_psf_that_fits(run, camera, turned):
+    exif = Image.Exif()
+    exif[274] = 6
+    picture = Image.fromarray((read_frame(camera / f"{turned}.png") >> 8).astype(np.uint8))
+    picture.save(camera / f"{turned}.png", exif=exif)
+    code, _, err = reconstruct(run, "captures")
+    assert code == 0
+    assert err.count(f"{turned.removeprefix('captures/')}.png is to be shown turned (EXIF orientation 6)") == 1
+    assert err.count("EXIF") == 1
 
 
 def test_formats_and_checkpoint(run, camera):
@@ -139,7 +165,7 @@ def test_psf_of_another_size(run, camera):
     store("large.png", torch.from_numpy(read_frame("psf.png") / 65535).movedim(-1, 0)[None].repeat(1, 1, 2, 2))
     code, _, err = reconstruct(run, "captures/a.png", psf="large.png")
     assert code == 1
-    assert "`psf` (64 x 80) and the capture (32 x 40) must have the same height and width" in err
+    assert "`--psf` (64 x 80) and the capture (32 x 40) must have the same height and width" in err
     assert "The PSF is 2 times as large: bin it by 2, `--psf-bin 2`." in err
     line = ("reconstruct", "captures/a.png", "--method", "wiener")
     assert run(*line, "--psf", "large.png", "--psf-bin", "2")[0] == 0
@@ -158,18 +184,18 @@ def test_psf_of_another_size(run, camera):
         ("captures --psf psf.png --method admn", "No method named 'admn'. Did you mean 'admm'?"),
         ("captures --psf psf.png --method mwdn", "`mwdn` is a network"),
         ("captures --psf psf.png --method no.safetensors", "`no.safetensors`"),
-        ("captures --psf psf.png --device gpu", "`device` (gpu) must be one that torch can use here"),
-        ("captures --psf psf.png --bit-depth 40", "`bit_depth` (40) must be 1 to 16."),
-        ("captures --psf psf.png --crop 99 99", "`crop` (99 x 99) must be within the frame (32 x 40)."),
+        ("captures --psf psf.png --device gpu", "`--device` (gpu) must be one that torch can use here"),
+        ("captures --psf psf.png --bit-depth 40", "`--bit-depth` (40) must be 1 to 16."),
+        ("captures --psf psf.png --crop 99 99", "`--crop` (99 x 99) must be within the frame (32 x 40)."),
         ("captures --psf psf.png --out captures", "a.png` would overwrite an input"),
         ("captures/a.png --psf psf.png --out psf.png", "`psf.png` must be a folder, but is a file"),
         ("--psf psf.png", "Name at least one capture"),
-        ("captures", "--psf requires an argument"),
+        ("captures", "`--psf psf.png`, or its camera file, `--camera camera.toml`"),
         ("captures --psf psf.png --methud admm", "Unknown option: --methud. Did you mean --method?"),
         ("captures --psf psf.png --method admm --iteration 9", "Did you mean --iterations?"),
         ("captures --psf psf.png --method pyramid --wrong 9", "Options of the method 'pyramid': --regularisation"),
         ("captures --psf psf.png --method admm --iterations many", "`--iterations` (many) must be int"),
-        ("captures --psf psf.png --method admm --iterations 0", "`iterations` (0)"),
+        ("captures --psf psf.png --method admm --iterations 0", "`--iterations` (0)"),
         ("captures --psf psf.png --method admm --variation none", "`--variation` (none) must be anisotropic |"),
         ("captures --psf psf.png --regularisation 1", "Options of the method 'universal': none"),
         ("captures --psf psf.png --format jpeg", "jpeg"),
@@ -183,7 +209,15 @@ def test_wrong_call_is_one_message_and_exit_2(run, camera, line, message):
     flat = re.sub(r"[\s│]+", " ", err)  # cyclopts draws a box of the terminal's width
     assert message in flat
     assert "Traceback" not in out + err
+    assert not (camera / "results").exists()
     assert before == {path: path.read_bytes() for path in camera.rglob("*.png")}
+
+
+def test_list_of_commands_says_what_each_says_of_itself():
+    for name, (place, summary) in COMMANDS.items():
+        module, _, function = place.partition(":")
+        command = getattr(importlib.import_module(f"mwdn.cli.{module}"), function)
+        assert summary == (getattr(command, "help", None) or command.__doc__).partition("\n")[0], name
 
 
 @pytest.mark.parametrize("command", ["reconstruct", "train", "evaluate", "demo", "simulate", "export", "inspect"])
@@ -195,6 +229,51 @@ def test_unknown_command(run):
     code, _, err = run("recunstruct")
     assert code == 2
     assert 'Did you mean "reconstruct"?' in re.sub(r"[\s│]+", " ", err)
+
+
+def test_quiet_prints_nothing_but_errors(run, camera):
+    (camera / "captures" / "none.png").write_bytes(b"")
+    code, out, err = run("reconstruct", "captures", "--psf", "psf.png", "--out", "out", "--method", "wiener", "-q")
+    assert (code, out, len(err.splitlines())) == (1, "", 1)
+    assert "none.png" in err
+    assert run("--quiet", "methods") == run("methods")
+
+
+def test_verbose_tells_versions_and_the_time(run):
+    code, out, err = run("doctor", "-v")
+    assert (code, out) == (0, run("doctor")[1])
+    first, last = err.splitlines()
+    assert f"torch {torch.__version__}" in first
+    assert re.fullmatch(r"\d+\.\d s", last)
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_warning_is_one_line(run, camera):
+    (camera / "r.toml").write_text('[network]\nname = "mwdn"\n[schedule]\ncourse = "cosine"\n')
+    _, _, err = run("train", "r.toml", "--psf", "psf.png")
+    first, second = err.splitlines()
+    assert first == "Warning: `course` of [schedule] is now called `lr_schedule`. Rename it."
+    assert second.startswith("Error: ")
+
+
+def test_an_option_is_named_as_typed(run, camera):
+    assert "`--bin` (0)" in run("reconstruct", "captures", "--psf", "psf.png", "--bin", "0")[2]
+    code, _, err = run("reconstruct", "captures", "--psf", "psf.png", "--method", "admm", "--iterations", "-1")
+    assert (code, "`--iterations` (-1)" in err) == (2, True)
+
+
+def test_json_of_reconstruct(run, camera):
+    (camera / "captures" / "d.png").write_bytes(b"")
+    line = ("reconstruct", "captures", "--psf", "psf.png", "--out", "out", "--method", "wiener", "--json")
+    code, out, err = run(*line)
+    assert code == 1
+    assert "3 of 4 captures" in err
+    first, *_, last = json.loads(out)
+    assert first == {"capture": "captures/a.png", "picture": "out/a.png", **json.loads(Path("out/a.json").read_text())}
+    assert last["capture"] == "captures/d.png"
+    assert last["picture"] is None
+    assert "`captures/d.png`" in last["error"]
+    assert json.loads(run(*line, "--resume", "--quiet")[1])[:3] == json.loads(out)[:3]
 
 
 @pytest.mark.parametrize("place", [0, -1])
@@ -224,10 +303,10 @@ def test_resume_leaves_out_what_is_there(run, camera):
     before = (camera / "out" / "a.png").stat().st_mtime_ns
     code, out, _ = run(*line)
     assert code == 0
-    assert "3 of 3 captures reconstructed into out, 1 of them before" in out
-    assert "a.png explains" not in out
+    assert "3 captures reconstructed into out, 1 of them before" in out
+    assert "a.png: the picture reproduces" not in out
     assert (camera / "out" / "a.png").stat().st_mtime_ns == before
-    assert "3 of 3 captures reconstructed into out\n" in run(*line, "--regularisation", "1e-3")[1]
+    assert "3 captures reconstructed into out\n" in run(*line, "--regularisation", "1e-3")[1]
 
 
 @pytest.mark.parametrize(
@@ -325,21 +404,22 @@ def test_overexposed_capture_is_named_before_its_psf_is_doubted(run, camera):
     cv2.imwrite("captures/bright.png", bright[..., ::-1])
     code, out, err = reconstruct(run, "captures/bright.png")
     assert code == 0
-    told = f"Warning: bright.png is overexposed: {part:.1%} of its pixels are saturated"
-    assert told in err
-    assert (out + err).index("explains") > 0
+    assert f"Warning: bright.png: {part:.1%} of the capture's pixels are saturated" in err
+    assert "docs/troubleshooting.md#saturation" in err
+    assert (out + err).index("the picture reproduces") > 0
     beside = json.loads((camera / "out" / "bright.json").read_text(encoding="utf-8"))
-    assert beside["saturated"] == pytest.approx(part)
-    assert "overexposed" not in reconstruct(run, "captures/a.png")[2]
+    (verdict,) = [verdict for verdict in beside["verdicts"] if verdict["topic"] == "saturation"]
+    assert (verdict["subject"], verdict["state"]) == ("capture", "doubt")
+    assert "saturated" not in reconstruct(run, "captures/a.png")[2]
 
 
 def test_without_trust(run, camera):
     line = ("reconstruct", "captures/a.png", "--psf", "psf.png", "--out", "out", "--method", "wiener", "--no-trust")
     code, out, err = run(*line)
     assert (code, err) == (0, "")
-    assert "explains" not in out
+    assert "reproduces" not in out
     assert names(camera / "out") == ["a.json", "a.png", "summary.png"]
-    assert set(json.loads((camera / "out" / "a.json").read_text())) == {"method", "psf_hash", "origin"}
+    assert set(json.loads((camera / "out" / "a.json").read_text())) == {"method", "psf_hash", "origin", "bin"}
 
 
 # --- The others ---------------------------------------------------------------------------------------
@@ -369,6 +449,25 @@ def test_demo(run, tmp_path, pictures):
     assert read_frame(tmp_path / "demo" / "comparison.png").shape == (26 + len(pictures) * 246, 7 * 246, 3)
 
 
+def test_completion_knows_commands_and_options(run, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    script = tmp_path / "mwdn.sh"
+    code, out, _ = run("--install-completion", "--shell", "bash", "--output", script)
+    assert (code, str(script) in out) == (0, True)
+    words = re.findall(r"[\w-]+", script.read_text(encoding="utf-8"))
+    assert {*COMMANDS, "contour", "--psf-bin", "--pitch-um"} <= set(words)
+    subprocess.run(["bash", "-n", script], check=True)  # valid for bash
+
+
+def test_recipes_are_listed_and_printed(run):
+    code, out, _ = run("recipes")
+    assert code == 0
+    assert all(name in out for name in packaged_recipes())
+    assert run("recipes", "quick-cpu") == (0, find_recipe("quick-cpu").read_text(encoding="utf-8"), "")
+    code, _, err = run("recipes", "quick-cpo")
+    assert (code, "'quick-cpu'" in err) == (2, True)
+
+
 def test_doctor(run):
     code, out, _ = run("doctor")
     assert code == 0
@@ -376,6 +475,7 @@ def test_doctor(run):
         assert re.search(rf"{package}\s+│\s+{re.escape(importlib.metadata.version(package))}", out)
     assert sys.version.split()[0] in out
     assert "threads" in out
+    assert json.loads(run("doctor", "--json")[1])["torch"] == torch.__version__
 
 
 def test_version_and_help(run):

@@ -32,6 +32,12 @@ def test_import_writes_pairs_and_says_so(folders, capsys):
     assert shown.splitlines()[-1] == f"3 pairs written to {out}, 0 skipped"
 
 
+def test_camera_file_says_how_captures_are_stored(folders, tmp_path):
+    (tmp_path / "camera.toml").write_text('psf = "psf.png"\ncrop = [4, 6]\nbin = 2\nwhite_balance = "psf"\n')
+    assert run("folders", folders, "-o", tmp_path / "pairs.h5", "--camera", tmp_path / "camera.toml") == 0
+    assert PairFile(tmp_path / "pairs.h5").measurement_shape == (2, 3, 3)
+
+
 def test_what_is_skipped_is_named(folders, capsys):
     (folders / "scenes" / "[1].png").write_bytes(b"no picture")
     (folders / "captures" / "[2].png").unlink()
@@ -43,7 +49,7 @@ def test_what_is_skipped_is_named(folders, capsys):
     assert not out.exists()
     assert run("folders", folders, "-o", out, "--skip-damaged") == 0
     shown = capsys.readouterr()
-    assert shown.out.splitlines()[-1] == f"1 pairs written to {out}, 2 skipped: [2], [1]"
+    assert shown.out.splitlines()[-1] == f"1 pair written to {out}, 2 skipped: [2], [1]"
     assert shown.err.count("skipped:") == 2
     assert "[1].png" in shown.err
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from mwdn.calibration import FrameFormat
+from mwdn.calibration import FrameFormat, PsfFormat
 from mwdn.cli.app import main
 from mwdn.cli.camera import CameraOptions
 from mwdn.cli.inspect import at_psf_resolution
@@ -83,9 +83,11 @@ def test_json_alone_with_the_options_of_the_camera(run):
 
 def test_psf_at_its_own_resolution():
     """Captures of 32 x 36 raw pixels; the PSF was taken at twice the resolution."""
-    captures = CameraOptions(Path("psf.png"), FrameFormat(crop=(32, 36)), dark=Path("dark.png"), psf_bin=2)
+    captures = CameraOptions(
+        Path("psf.png"), FrameFormat(crop=(32, 36)), psf_format=PsfFormat(psf_bin=2), dark=Path("dark.png")
+    )
     assert at_psf_resolution(captures) == CameraOptions(Path("psf.png"), FrameFormat(crop=(64, 72), bin=2))
-    same = CameraOptions(Path("psf.png"), FrameFormat(bin=2), psf_bin=2)
+    same = CameraOptions(Path("psf.png"), FrameFormat(bin=2), psf_format=PsfFormat(psf_bin=2))
     assert at_psf_resolution(same) is same
 
 

@@ -69,7 +69,7 @@ def test_train_then_reconstruct(run, camera):
     assert re.search(r"step 4: validation \d+\.\d\d dB, best \d+\.\d\d dB", flat(err))
     code, out, err = run(f"{RECONSTRUCT} psf.npy")
     assert code == 0
-    assert "capture.npy explains" in out + err
+    assert "capture.npy: the picture reproduces" in out + err
     assert read_frame("results/reconstruct/capture.png").shape == (32, 40, 3)
     assert run(TRAIN)[0] == 0  # nothing left to do
 
@@ -110,8 +110,7 @@ def test_checkpoint_of_another_camera_is_used_with_a_warning(run, camera):
     trained, given = (Calibration.from_file(f"{name}.npy").psf_hash for name in ("psf", "other"))
     code, _, err = run(f"{RECONSTRUCT} other.npy")
     assert code == 0
-    assert err.count("Warning:") == 1
-    assert f"`runs/x/best.safetensors` was trained for PSF {trained}" in err
+    assert err.count(f"Warning: `runs/x/best.safetensors` was trained for PSF {trained}") == 1
     assert given in err
     assert "Expect blur, ghosts and invented detail" in err
     assert read_frame("results/reconstruct/capture.png").shape == (32, 40, 3)
@@ -140,15 +139,15 @@ def test_warning_of_a_reconstructor(camera):
         ),
         (TRAIN.replace("--photos photos", "--pairs p.h5"), "`p.h5` is not a file"),
         (TRAIN + " --captures runs", "`runs`"),
-        (TRAIN.replace("train r.toml", "train r.tml"), "`r.tml` cannot be read as a recipe"),
-        (TRAIN.replace("--steps 4", "--steps 0"), "`steps` (0) must be positive"),
-        (TRAIN.replace("--device cpu", "--device gpu"), "`device` (gpu) must be one that torch can use here"),
-        (TRAIN.replace("--device cpu", "--device cuda:99"), "`device` (cuda:99) must be one that torch can use here"),
-        ("simulate photos --psf psf.npy --count 0", "`count` (0) must be at least 1"),
+        (TRAIN.replace("train r.toml", "train r.tml"), "`r.tml` does not exist"),
+        (TRAIN.replace("--steps 4", "--steps 0"), "[schedule]: `--steps` (0) must be positive"),
+        (TRAIN.replace("--device cpu", "--device gpu"), "`--device` (gpu) must be one that torch can use here"),
+        (TRAIN.replace("--device cpu", "--device cuda:99"), "`--device` (cuda:99) must be one that torch can use here"),
+        ("simulate photos --psf psf.npy --count 0", "`--count` (0) must be at least 1"),
         ("simulate photos --psf psf.npy -o photos", "`photos` is a folder"),
         ("simulate photos --psf psf.npy -o photos/0.png", "`0.png` must end in .h5 or .hdf5"),
         ("simulate photos --psf psf.npy -o psf.npy", "`psf.npy` would overwrite an input"),
-        (f"simulate photos --psf psf.npy --seed {10**23}", f"`seed` ({10**23}) must have 63 bits at most"),
+        (f"simulate photos --psf psf.npy --seed {10**23}", f"`--seed` ({10**23}) must have 63 bits at most"),
         ("simulate nothing --psf psf.npy", "The folder `nothing` holds no photograph"),
     ],
 )
@@ -203,8 +202,11 @@ def test_captures_of_the_recipe_exclude_the_psf(run, camera):
     for name in ("psf.npy", "capture.npy"):
         (camera / name).rename(camera / "frames" / name)
     (camera / "r.toml").write_text(RECIPE + 'sheet = { captures = ["frames"] }', encoding="utf-8")
+    (camera / "photos" / "phone.heic").touch()
     code, _, err = run(TRAIN.replace("psf.npy", "frames/psf.npy"))
     assert code == 0, err
+    assert "psf.npy (the PSF)" in err
+    assert "phone.heic (formats that are not read" in flat(err)
     sheet = read_frame("runs/x/validation.png")
     assert (sheet[26 + 240 + 6 :, 3 * 306 :] == 255).all()  # one capture, two pairs
     assert not (sheet[26 : 26 + 240, 3 * 306 :] == 255).all()
@@ -215,7 +217,7 @@ def test_tensorboard_that_is_not_installed(run, camera, monkeypatch):
         monkeypatch.setitem(sys.modules, name, None)
     code, _, err = run(f"{TRAIN} --tensorboard")
     assert code == 2
-    assert "`tensorboard` must be installed: `pip install 'mwdn[tensorboard]'`." in flat(err)
+    assert "The package tensorboard must be installed: `pip install 'mwdn[tensorboard]'`." in flat(err)
     assert not (camera / "runs" / "x" / "log.jsonl").read_text()
 
 

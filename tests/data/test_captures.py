@@ -6,7 +6,7 @@ import torch
 
 from conftest import touch
 from mwdn.calibration import Calibration, FrameFormat
-from mwdn.data.captures import find_captures, read_capture, read_captures
+from mwdn.data.captures import find_captures, list_captures, read_capture, read_captures
 from mwdn.errors import ParameterError, ShapeError
 
 
@@ -18,17 +18,40 @@ def test_captures_are_found_in_order_and_once(tmp_path):
     assert find_captures([b, str(tmp_path / "in"), b]) == [b, a, upper]
 
 
-def test_psf_dark_frame_and_hidden_files_in_a_folder_are_no_captures(tmp_path):
+@pytest.mark.parametrize("as_folder", [True, False])
+def test_psf_and_dark_frame_are_no_captures(tmp_path, as_folder):
+    """`mwdn reconstruct *.tif` names them, too."""
     a, psf, dark, _ = touch(tmp_path, "a.png", "psf.png", "dark.npy", "._a.png")
-    assert find_captures([tmp_path], exclude=(psf, dark, None)) == [a]
-    assert find_captures([psf], exclude=(psf,)) == [psf]  # named, so wanted
+    (tmp_path / "link.png").symlink_to(psf)
+    paths = [tmp_path] if as_folder else [dark, a, psf, tmp_path / "link.png"]
+    files, skipped = list_captures(paths, exclude={"PSF": psf, "dark frame": dark})
+    assert files == [str(a)]
+    for text in ("dark.npy (the dark frame)", "psf.png (the PSF)", "link.png (the PSF)"):
+        assert text in " ".join(skipped)
+
+
+def test_every_file_of_a_folder_is_read_or_named(tmp_path):
+    touch(tmp_path, "a.png", "b.DNG", "c.webp", "camera.toml", "a.json", ".hidden.txt")
+    touch(tmp_path, "notes.txt", "phone.heic", "film.gif", *[f"film_{n}.mp4" for n in range(5)])
+    (tmp_path / "day 2").mkdir()
+    files, skipped = list_captures([tmp_path, tmp_path])
+    assert [name.removeprefix(f"{tmp_path}/") for name in files] == ["a.png", "b.DNG", "c.webp"]
+    pictures, folders, others = skipped
+    assert "film.gif and phone.heic" in pictures
+    assert "day 2/" in folders
+    assert "film_0.mp4, film_1.mp4 and 4 more" in others
 
 
 def test_nothing_to_reconstruct(tmp_path):
     with pytest.raises(ParameterError, match="Name at least one capture"):
         find_captures([])
-    with pytest.raises(ParameterError, match=r"The folder `.*` holds no capture\. Readable: \.bmp, .*\.npy"):
+    with pytest.raises(ParameterError, match=r"The folder `.*` holds no capture\. Readable: .*\.bmp, .*\.npy"):
         find_captures([tmp_path])
+    psf, _ = touch(tmp_path, "psf.png", "photo.heic")
+    with pytest.raises(ParameterError, match=r"psf\.png \(the PSF\)"):
+        find_captures([psf], exclude={"PSF": psf})
+    with pytest.raises(ParameterError, match=r"photo\.heic.*psf\.png \(the PSF\)"):
+        find_captures([tmp_path], exclude={"PSF": psf})
 
 
 def test_captures_are_corrected_by_the_calibration(tmp_path):

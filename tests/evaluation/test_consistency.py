@@ -8,7 +8,6 @@ from mwdn.errors import ShapeError
 from mwdn.evaluation.consistency import Consistency, consistency
 from mwdn.optics.camera import Camera
 from mwdn.solvers.alignment import Pose, fine_detail
-from mwdn.solvers.pyramid import Pyramid
 
 SIZE, NOISE = (128, 144), 0.004
 
@@ -30,8 +29,6 @@ def test_the_true_scene_explains_all_that_is_not_noise(capture):
     psf, scene, measurement = capture
     result = consistency(measurement, psf, scene)
     assert result.explained == pytest.approx(result.possible, abs=0.02)
-    assert result.contrast > 1.5
-    assert not result.doubtful
 
 
 def test_possible_is_what_white_noise_leaves(capture):
@@ -47,14 +44,12 @@ def test_possible_is_what_white_noise_leaves(capture):
     assert noisy.possible == pytest.approx(float(share), abs=0.1)
 
 
-def test_wrong_psfs_are_doubtful_and_a_turned_one_is_aligned(capture):
-    psf, _, measurement = capture
-    for wrong in (psf.flip(-1), psf.flip(-2), psf.flip(-1, -2)):
-        assert consistency(measurement, wrong, Pyramid()(measurement, wrong)).doubtful
+def test_turned_psf_is_aligned(capture):
+    psf, scene, measurement = capture
     turned = Pose(torch.tensor([-0.9]), torch.tensor([0.0])).move(psf)
-    result = consistency(measurement, turned, Pyramid()(measurement, psf))
-    assert not result.doubtful
+    result = consistency(measurement, turned, scene)
     assert result.turn_degrees == pytest.approx(0.9, abs=0.2)
+    assert result.explained == pytest.approx(consistency(measurement, psf, scene).explained, abs=0.05)
     assert "turned by" in result.sentence
 
 
@@ -66,14 +61,10 @@ def test_gain_and_even_light_do_not_matter(capture):
 
 
 def test_sentences():
-    assert "mirrored" in Consistency(0.9, 0.95, 0.8, 0.0, 0.0, 0.0).sentence
-    assert "little" in Consistency(0.2, 0.95, 1.2, 0.0, 0.0, 0.0).sentence
-    assert Consistency(0.9, 0.95, 1.2, 0.0, 0.0, 0.0).sentence == (
-        "explains 90.0% of the capture's detail, of 95.0% that is not noise"
-    )
-    assert Consistency(0.9, 0.95, 1.2, 0.5, 0.0, 0.07).sentence.endswith(
-        "; fits best with the PSF turned by 0.50 degrees, under 7% of haze"
-    )
+    plain = Consistency(0.84, 0.96, 0.0, 0.0, 0.0).sentence
+    assert plain == "the picture reproduces 84% of the capture's detail (96% is not noise)"
+    moved = Consistency(0.84, 0.96, 0.5, 0.0, 0.07).sentence
+    assert moved == f"{plain}; fits best with the PSF turned by 0.50 degrees, under 7% of haze"
 
 
 def test_one_capture_at_a_time(capture):

@@ -4,6 +4,7 @@ import io
 import json
 import math
 import re
+import sys
 
 import h5py
 import numpy as np
@@ -14,7 +15,8 @@ from torch import nn
 
 from cameras import contour_psf
 from mwdn.calibration import Calibration
-from mwdn.cli import app
+from mwdn.cli import app, weights
+from mwdn.cli import evaluate as command
 from mwdn.data.pairs import PairFile
 from mwdn.errors import CheckpointError, ParameterError, ShapeError, UnknownNameError
 from mwdn.evaluation import First, Perceptual, Protocol, Report, Scores, alexnet, evaluate, learnable_numbers, measure
@@ -105,7 +107,8 @@ def test_missing_metrics_are_named_and_not_averaged(pairs):
 
 
 def test_missing_weights_are_reported(pairs, monkeypatch):
-    def unreachable(path=None):
+    def unreachable(path=None, *, download):
+        assert not download
         raise CheckpointError("no network")
 
     monkeypatch.setattr("mwdn.evaluation.metrics.load_alexnet", unreachable)
@@ -226,10 +229,7 @@ def common(camera, pairs, tmp_path, monkeypatch):
     monkeypatch.setattr(alexnet, "cache_folder", lambda: tmp_path / "cache")
     monkeypatch.delenv("MWDN_ALEXNET", raising=False)
 
-    def unroutable(*_, **__):
-        raise OSError("Network is unreachable")
-
-    monkeypatch.setattr(alexnet, "urlopen", unroutable)
+    monkeypatch.setattr(alexnet, "urlopen", lambda *_, **__: pytest.fail("nobody asked for a download"))
     write_linear(tmp_path / "psf.npy", camera.psf)
     return ["--data", tmp_path / "pairs.h5", "--psf", tmp_path / "psf.npy", "--background", 0, "--device", "cpu"]
 
@@ -239,10 +239,10 @@ def test_command(common, tmp_path, capsys):
     assert run("evaluate", "wiener", "fista", *common, *options) == 0
     out = capsys.readouterr().out
     assert "Without LPIPS and feature MSE" in " ".join(out.split())
-    assert out.count("unreachable") == 1
+    assert out.count("--lpips") == 1
     content = json.loads((tmp_path / "out" / "report.json").read_text())
     assert list(content["methods"]) == ["wiener", "fista"]
-    assert "Network is unreachable" in content["missing"]["lpips"]
+    assert "`--lpips`" in content["missing"]["lpips"]
     assert (content["pictures"], content["protocol"], content["variant"]) == (2, "2:38,4:40", "best-gain")
     assert run("evaluate", *common) == 2
     assert run("evaluate", "wiener", *common, "--protocol", "centre") == 2
@@ -263,6 +263,11 @@ def test_command_checks_its_folder_first(common, tmp_path, monkeypatch, capsys, 
     assert message in capsys.readouterr().err
 
 
+def test_json_is_the_report(common, tmp_path, capsys):
+    assert run("evaluate", "wiener", *common, "--out", tmp_path / "out", "--json") == 0
+    assert json.loads(capsys.readouterr().out) == json.loads((tmp_path / "out" / "report.json").read_text())
+
+
 def test_command_prints_before_it_writes(common, tmp_path, capsys):
     (tmp_path / "out" / "report.json").mkdir(parents=True)
     assert run("evaluate", "wiener", *common, "--out", tmp_path / "out") == 2
@@ -276,7 +281,7 @@ def test_command_prints_before_it_writes(common, tmp_path, capsys):
     [
         (3, math.nan, 1, "The measurement of pair 1, counted from 0, holds NaN or infinity"),
         (0, 0, 1, "`pairs` must not be empty"),
-        (3, 0, 2, "The PSF is 2 times as large: multiply its binning by 2, `--psf-bin`."),
+        (3, 0, 2, "The PSF is 2 times as large: multiply `--psf-bin` by 2."),
     ],
 )
 def test_command_on_unusable_pairs(common, tmp_path, capsys, count, value, scale, message):
@@ -297,3 +302,47 @@ def test_command_warns_of_pairs_of_another_camera(common, tmp_path, capsys):
         assert run("evaluate", "wiener", *common, "--out", tmp_path / "out") == 0
         err = capsys.readouterr().err
         assert (psf_hash in err and own_hash in err) == (psf_hash != own_hash)
+
+
+def test_a_download_is_asked_for(common, tmp_path, monkeypatch):
+    """By --lpips, or by a yes on a terminal; --no-lpips asks nothing."""
+    line = ["evaluate", "wiener", *common, "--first", 1, "--out", tmp_path / "out"]
+
+    def unroutable(*_, **__):
+        raise OSError("Network is unreachable")
+
+    def missing(*options):
+        assert run(*line, *options) == 0
+        return json.loads((tmp_path / "out" / "report.json").read_text())["missing"]["lpips"]
+
+    asked = []
+    monkeypatch.setattr(weights.Confirm, "ask", lambda question, **_: asked.append(question))
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: True)
+    monkeypatch.setattr(weights, "notes", Console(force_terminal=True, force_interactive=True))
+    assert missing("--no-lpips") == "--no-lpips"
+    with monkeypatch.context() as connected:
+        connected.setattr(alexnet, "urlopen", unroutable)
+        assert "Network is unreachable" in missing("--lpips")
+    assert asked == []
+    assert "`--lpips`" in missing()
+    assert len(asked) == 1
+    assert "234 MiB" in asked[0]
+
+
+def test_options_go_to_the_methods_that_have_them(common, tmp_path, capsys, monkeypatch):
+    made = {}
+
+    def record(method, calibration, *, device, **options):
+        made[method] = options
+        return Reconstructor(method, calibration, device=device, **options)
+
+    monkeypatch.setattr(command, "Reconstructor", record)
+    line = ["evaluate", "admm", "wiener", "fista", *common, "--first", 1, "--no-lpips", "--out", tmp_path / "out"]
+    assert run(*line, "--iterations", 2, "--regularisation", 1e-3) == 0
+    regularisation = {"regularisation": 1e-3}
+    assert made == {"admm": {"iterations": 2, **regularisation}, "wiener": regularisation, "fista": {"iterations": 2}}
+    capsys.readouterr()
+    assert run(*line, "--regularization", 1e-3) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "Unknown option: --regularization. Did you mean --regularisation?" in said
+    assert "'admm', 'wiener', 'fista'" in said

@@ -191,9 +191,10 @@ def raw(tmp_path):
     ("capture", "options"),
     [
         ("capture.png", ["--upside-down"]),
-        ("capture.png", ["--bgr"]),
+        ("capture.png", ["--bgr", "--gamma", "srgb"]),
         ("capture.tif", []),
         ("capture.png", ["--dark", "dark.png", "--crop", "78", "99", "--bin", "2", "--upside-down", "--bgr"]),
+        ("capture.png", ["--ambient", "dark.png", "--gamma", "2.2"]),
     ],
 )
 def test_the_example_gives_the_picture_of_mwdn_reconstruct(capture, options, raw, monkeypatch):
@@ -202,18 +203,18 @@ def test_the_example_gives_the_picture_of_mwdn_reconstruct(capture, options, raw
     camera_options = ["--psf", "psf.png", "--background", "0", *options]
     command("export", "wiener", "--regularisation", "1e-3", "--out", "camera.onnx", *camera_options)
     command("reconstruct", capture, "--method", "wiener", "--regularisation", "1e-3", "--no-trust", *camera_options)
-    example(monkeypatch, "camera.onnx", capture, "scene.png", *(["dark.png"] if "--dark" in options else []))
+    example(monkeypatch, "camera.onnx", capture, "scene.png", *(["dark.png"] if "dark.png" in options else []))
     expected = read_frame("results/reconstruct/capture.png").astype(int)
     assert np.abs(read_frame("scene.png") - expected).max() <= 1
 
 
-@pytest.mark.parametrize("option", ["--mosaic=gbrg", "--grey"])
+@pytest.mark.parametrize("option", ["--mosaic=gbrg --crop 70 90", "--grey"])
 def test_the_example_knows_how_colours_are_stored(option, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     numbers, shape = np.random.default_rng(4), (84, 102, 3 if option == "--grey" else 1)
     write_frame(tmp_path / "psf.png", (numbers.random(shape) ** 40 * 60000).astype(np.uint16))
     write_frame(tmp_path / "capture.png", numbers.integers(2000, 60000, shape, np.uint16))
-    options = ["--psf", "psf.png", "--background", "0", "--regularisation", "1e-3", option]
+    options = ["--psf", "psf.png", "--background", "0", "--regularisation", "1e-3", *option.split()]
     command("export", "wiener", "--out", "camera.onnx", *options)
     command("reconstruct", "capture.png", "--method", "wiener", "--no-trust", *options)
     example(monkeypatch, "camera.onnx", "capture.png", "scene.png")
@@ -383,6 +384,11 @@ def test_a_foreign_file_is_not_run(suffix, tmp_path):
     file.write_bytes(b"something else")
     with pytest.raises(ExportError, match=rf"`camera{suffix}` cannot be run: "):
         run_file(file, torch.rand(1, 3, *SIZE))
+
+
+def test_options_of_an_object_are_refused(tmp_path):
+    with pytest.raises(ParameterError, match="regularisation"):
+        export(SOLVERS["wiener"](), camera(), tmp_path / "camera.pt2", regularisation=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -4,10 +4,12 @@ import dataclasses
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
 import sys
+import threading
 from functools import partial
 from pathlib import Path
 
@@ -22,7 +24,8 @@ from mwdn import Camera, read_frame
 from mwdn.calibration import Calibration, FrameFormat
 from mwdn.errors import ImageError, ParameterError
 from mwdn.evaluation.consistency import consistency
-from mwdn.inference.batch import Batch, check_outputs, output_name
+from mwdn.inference.batch import Batch
+from mwdn.inference.outputs import check_outputs, output_name
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.contact_sheets import to_display
 from mwdn.io.images import srgb_decode
@@ -143,13 +146,13 @@ def test_linear_formats_hold_what_the_reconstructor_returns(tmp_path, format, su
         found = read_frame(job.output)
         assert found.dtype == np.float32
         assert np.array_equal(found, scene[0].movedim(0, -1).numpy())
-        assert job.consistency == consistency(measurement, psf, scene)
+        assert job.trust.consistency == consistency(measurement, psf, scene)
         assert job.measurement is job.pose is job.scene is job.error is None  # a million jobs may be kept
         beside = json.loads(job.output.with_suffix(".json").read_text())
         assert beside["method"] == "name"
         assert beside["psf_hash"] == batch.reconstruct.calibration.psf_hash
-        assert beside["explained"] == job.consistency.explained
-        assert beside["doubtful"] == job.consistency.doubtful
+        assert beside["explained"] == job.trust.consistency.explained
+        assert beside["doubtful"] == job.trust.doubtful
 
 
 @pytest.mark.parametrize(("format", "steps"), [("png", 255), ("png16", 65535)])
@@ -162,8 +165,8 @@ def test_png_is_the_same_picture_in_srgb(tmp_path, format, steps, captures, psf)
     light = srgb_decode(torch.from_numpy(stored.astype(np.float32) / steps))
     # Half a step of the code is at most 2.275 / 1.055 ... of it in light: the steepest part is at white.
     torch.testing.assert_close(light, to_display(scene)[0].movedim(0, -1), rtol=0, atol=0.5 * 2.3 / steps + 1e-6)
-    assert job.consistency is None
-    assert set(json.loads((tmp_path / "0.json").read_text())) == {"method", "psf_hash", "origin"}
+    assert job.trust is None
+    assert set(json.loads((tmp_path / "0.json").read_text())) == {"method", "psf_hash", "origin", "bin"}
 
 
 def test_check_and_network_share_the_pose(tmp_path, captures, psf):
@@ -212,22 +215,24 @@ def bright(tmp_path, captures):
 
 
 @pytest.mark.parametrize("method", ["fista", "admm", "pyramid"])
-def test_trust_does_not_depend_on_the_brightness(tmp_path, psf, bright, method):
+def test_trust_does_not_depend_on_the_brightness(psf, captures, method):
     """Nor do squares of what a camera of many bits counts overflow."""
-    batch = make_batch(psf, tmp_path / "out", method)
-    plain, large = (next(batch.run([bright(factor)])).consistency for factor in (1, 1e15))
+    reconstruct = Reconstructor(method, Calibration(psf), device="cpu")
+    measurement = reconstruct.calibration.correct(read_frame(captures[0]))
+    plain, large = (consistency(each, psf, reconstruct(each)) for each in (measurement, 1e15 * measurement))
     assert dataclasses.astuple(large) == pytest.approx(dataclasses.astuple(plain), rel=0.01, abs=0.01)
 
 
 @pytest.mark.parametrize("check", [True, False])
 @pytest.mark.parametrize("format", ["png", "npy"])
 def test_result_that_is_not_finite_changes_nothing_and_the_others_go_on(tmp_path, psf, captures, bright, check, format):
-    batch = make_batch(psf, tmp_path / "out", Admm(iterations=2), format=format, check_consistency=check)
+    limit = 1.1 * read_frame(captures[0]).max() / 65535
+    batch = make_batch(psf, tmp_path / "out", lambda b, h: b / (b < limit), format=format, check_consistency=check)
     list(batch.run([bright(1)]))
     before = {path: path.read_bytes() for path in batch.out.iterdir()}
-    refused, done = batch.run([bright(1e37), captures[1]])
+    refused, done = batch.run([bright(1.5), captures[1]])
     assert isinstance(refused.error, ImageError)
-    assert re.search(r"nothing is written\. The capture's brightest pixel is \d\.\d+e\+36", str(refused.error))
+    assert re.search(r"nothing is written\. The capture's brightest pixel is \d", str(refused.error))
     assert done.error is None
     assert {path: path.read_bytes() for path in before} == before
 
@@ -254,12 +259,41 @@ def test_disk_that_refuses(tmp_path, psf, captures):
 
 
 def test_work_stops_with_its_user(tmp_path, psf, captures):
-    """And leaves whole files behind."""
-    jobs = make_batch(psf, tmp_path / "out").run(captures)
+    """And leaves whole files behind: of the few captures that were read ahead, not of all."""
+    many = [shutil.copy(captures[0], tmp_path / f"{number:02}.png") for number in range(12)]
+    jobs = make_batch(psf, tmp_path / "out").run(many)
     next(jobs)
     jobs.close()
     left = sorted(path.name for path in (tmp_path / "out").iterdir())
-    assert left in (["0.json", "0.png"], ["0.json", "0.png", "1.json", "1.png"])
+    done = len(left) // 2
+    assert 1 <= done < 12
+    assert left == [f"{number:02}{suffix}" for number in range(done) for suffix in (".json", ".png")]
+
+
+def test_a_picture_is_reported_while_the_next_one_is_reconstructed(tmp_path, psf, captures):
+    first, reported, reconstructed = threading.Event(), [], []
+
+    def method(measurement, psf):
+        reconstructed.append(1)
+        assert len(reconstructed) == 1 or first.wait(30)
+        return measurement
+
+    def report(job):
+        reported.append((job.number, job.output.is_file(), job.error))
+        first.set()
+
+    list(make_batch(psf, tmp_path / "out", method).run(captures, report))
+    assert reported == [(number, True, None) for number in range(3)]
+
+
+@pytest.mark.parametrize(("method", "iterations"), [(Admm(iterations=4), 4), ("pyramid", 66), ("universal-small", 0)])
+def test_progress_counts_the_iterations_of_solvers(tmp_path, psf, captures, method, iterations):
+    done = []
+    list(make_batch(psf, tmp_path / "out", method).run(captures[:2], progress=done.append))
+    assert done == sorted(done)
+    first = [part for part in done if 0 < part < 1]
+    assert len(first) == max(0, iterations - 1)
+    assert {1.0, 2.0} <= set(done)
 
 
 def test_summary_shows_the_first_twelve_that_are_there(tmp_path, psf, captures):
@@ -395,7 +429,7 @@ def two(folder, out, restarts=0):
 
 def told(output):
     """Captures of which the output says that they were done."""
-    return re.findall(r"^(\d\d\.npy) explains", output, re.MULTILINE)
+    return re.findall(r"^(\d\d\.npy): the picture", output, re.MULTILINE)
 
 
 def whole(out):
@@ -539,6 +573,6 @@ def test_torchrun_starts_killed_workers_again(shop, single):
     out, err = process.communicate(timeout=300)
     (shop / "damaged.npy").rename(shop / "in" / "damaged.npy")
     assert process.returncode == 0, err
-    assert re.search(rf"{COUNT} of {COUNT} captures reconstructed into again, \d+ of them before", out)
+    assert re.search(rf"{COUNT} captures reconstructed into again, \d+ of them before", out)
     assert len(set(told(out))) == len(told(out)) <= COUNT
     assert_finished(shop / "again", single)

@@ -9,9 +9,10 @@ from mwdn import Calibration, Reconstructor
 from mwdn.calibration import FrameFormat
 from mwdn.inference.origin import origin, settings_hash
 from mwdn.networks import NETWORKS, build
+from mwdn.optics import unit_sum
 from mwdn.solvers import Admm, Wiener
 
-PSF = (torch.arange(3 * 16 * 16) % 7).float().reshape(1, 3, 16, 16) / 10
+PSF = unit_sum((torch.arange(3 * 16 * 16) % 7).float().reshape(1, 3, 16, 16))
 
 
 @pytest.fixture
@@ -23,10 +24,10 @@ def capture(tmp_path, monkeypatch):
     return tmp_path / "capture"
 
 
-def hash_of(method, capture, format="png", calibration=None, **options):
+def hash_of(method, capture, format="png", calibration=None, full_size=False, **options):
     calibration = calibration or Calibration(PSF)
     reconstruct = Reconstructor(method, calibration, device="cpu", precision="exact", **options)
-    return origin(settings_hash(reconstruct, format), capture)
+    return origin(settings_hash(reconstruct, format, full_size=full_size), capture)
 
 
 def with_ones(name, **options):
@@ -41,12 +42,12 @@ def with_ones(name, **options):
 @pytest.mark.parametrize(
     ("method", "expected"),
     [
-        ("admm", "1412e3fe75d42a6f"),
-        ("pyramid", "8c479221e1b3b30c"),
-        ("wiener", "efd1b193d6dd5afb"),
-        ("fista", "6cb61867ba08a624"),
-        ("universal", "79c3b13f472ac3d1"),
-        ("universal-small", "9f7a0368b4f5b8c3"),
+        ("admm", "5c34e753426d88ca"),
+        ("pyramid", "d96460b3dc29312a"),
+        ("wiener", "cf039080f5e5de60"),
+        ("fista", "e077e8b3def31bac"),
+        ("universal", "216a0ac508ad3bcc"),
+        ("universal-small", "77c994ba8a8c4766"),
     ],
 )
 def test_hash_of_a_method_stays_the_same(method, expected, capture):
@@ -57,19 +58,19 @@ def test_hash_of_a_method_stays_the_same(method, expected, capture):
 @pytest.mark.parametrize(
     ("name", "options", "expected"),
     [
-        ("wiener", {}, "4d03357ce919eee8"),
-        ("unet", {"width": 4}, "ae01f88fedd4342e"),
-        ("wiener-unet", {"width": 4}, "6f6bff9b685ec993"),
-        ("mwdn", {"width": 4}, "e6b271f1d3122373"),
-        ("mwdn-cpsf", {"width": 4}, "33f313f81a082272"),
-        ("wiener-bank", {"width": 4}, "5d1fd4dddb205d9a"),
-        ("le-admm", {}, "1f0e326f4c42ef63"),
-        ("le-admm-u", {"width": 4}, "ccb8b17480318c6f"),
-        ("mmcn", {"width": 4}, "1248c17eccb9858d"),
-        ("updn", {}, "1615c4513c5cc2cf"),
-        ("flatnet", {"width": 4}, "a57afc5ae9ba9a58"),
-        ("svdeconv", {"width": 4, "size": (16, 16)}, "0d3a5492e339db83"),
-        ("ifin", {"width": 16}, "3390f25f225cfba7"),
+        ("wiener", {}, "31195200736a8df1"),
+        ("unet", {"width": 4}, "68aa006a8a5b3e9b"),
+        ("wiener-unet", {"width": 4}, "5d2c794e7bbefbd6"),
+        ("mwdn", {"width": 4}, "37974dd51bdbc6b7"),
+        ("mwdn-cpsf", {"width": 4}, "699e1056b99aadf3"),
+        ("wiener-bank", {"width": 4}, "a710d53c84168511"),
+        ("le-admm", {}, "e69e24ea3bfccbdd"),
+        ("le-admm-u", {"width": 4}, "8c31cda61d41aae5"),
+        ("mmcn", {"width": 4}, "b554593886c2f13b"),
+        ("updn", {}, "5dc74d7a003e6bd5"),
+        ("flatnet", {"width": 4}, "0373f0a3ca7b3539"),
+        ("svdeconv", {"width": 4, "size": (16, 16)}, "ebd882a9bf04c188"),
+        ("ifin", {"width": 16}, "5ab1d2a253736b6a"),
     ],
 )
 def test_hash_of_a_network_stays_the_same(name, options, expected, capture):
@@ -91,10 +92,26 @@ def test_hash_of_other_settings_differs(capture):
         hash_of(Wiener(regularisation=1e-3), capture),
         hash_of("admm", capture, calibration=Calibration(PSF.flip(-1))),
         hash_of("admm", capture, calibration=Calibration(PSF, FrameFormat(bit_depth=12))),
+        hash_of("admm", capture, calibration=Calibration(PSF, FrameFormat(gamma="srgb"))),
+        hash_of("admm", capture, calibration=Calibration(PSF, ambient=torch.zeros(1, 3, 16, 16))),
+        hash_of("admm", capture, white_balance="grey-world"),
+        hash_of("admm", capture, calibration=Calibration(PSF, white_balance=(2.0, 1.0, 1.0))),
+        hash_of("admm", capture, calibration=Calibration(PSF, FrameFormat(bin=2))),
+        hash_of("admm", capture, calibration=Calibration(PSF, FrameFormat(bin=2)), full_size=True),
         hash_of("universal-small", capture),
         hash_of("universal-small", capture, align=True),
     ]
     assert len(set(hashes)) == len(hashes)
+
+
+def test_full_size_changes_nothing_without_binning(capture):
+    assert hash_of("admm", capture, full_size=True) == hash_of("admm", capture)
+
+
+def test_crop_of_a_mosaic_is_hashed_in_cells(capture):
+    """As it was given before it was in raw pixels with a mosaic, too: 16 x 16 cells."""
+    calibration = Calibration(PSF, FrameFormat(mosaic="rggb", crop=(32, 32)))
+    assert hash_of("admm", capture, calibration=calibration) == "b968fde4e9837346"
 
 
 def test_capture_that_cannot_be_read_has_none(tmp_path):

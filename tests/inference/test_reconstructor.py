@@ -1,6 +1,8 @@
 """A method bound to one camera, for single captures and for streams."""
 
+import copy
 import inspect
+import pickle
 import re
 
 import numpy as np
@@ -10,9 +12,10 @@ import torch
 from cameras import contour_psf
 from conftest import touch
 from mwdn import Camera, solvers
-from mwdn.calibration import Calibration
+from mwdn.calibration import Calibration, FrameFormat
 from mwdn.errors import CheckpointError, ParameterError, ShapeError, UnknownNameError
-from mwdn.inference.reconstructor import Reconstructor, find_method
+from mwdn.inference.methods import find_method
+from mwdn.inference.reconstructor import Reconstructor
 from mwdn.networks import NETWORKS, build
 from mwdn.solvers import SOLVERS, Admm, Wiener
 from mwdn.weights.checkpoint import save_network
@@ -111,13 +114,13 @@ def test_measurement_of_another_size(psf):
 @pytest.mark.parametrize("method", [*SOLVERS, "universal-small"])
 @pytest.mark.parametrize("shape", [(0, 3, *SIZE), (1, 0, *SIZE), (3, *SIZE), SIZE, (1, 1, 3, *SIZE)])
 def test_measurement_that_is_no_batch(method, shape, psf):
-    with pytest.raises(ShapeError, match=re.escape(f"`measurement` {shape} must be a")):
+    with pytest.raises(ShapeError, match=re.escape(f"`measurement` {shape} must be")):
         Reconstructor(method, Calibration(psf), device="cpu")(torch.rand(shape))
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_measurement_of_integers(psf):
-    with pytest.raises(ParameterError, match=r"`measurement` \(torch.uint8\).*`Calibration.correct`"):
+    with pytest.raises(ParameterError, match=r"`measurement` \(torch.uint8\).*`measurement / 255`"):
         Reconstructor("wiener", Calibration(psf))(torch.zeros(1, 3, *SIZE, dtype=torch.uint8))
 
 
@@ -328,3 +331,34 @@ def test_what_belongs_to_each_sample_keeps_a_batch_together(generator):
     for i in range(3):
         one = solvers.Pose(pose.turn_degrees[i : i + 1], pose.scale[i : i + 1])
         torch.testing.assert_close(result[i : i + 1], network.at(one)(batch[i : i + 1]), rtol=1e-3, atol=1e-4)
+
+
+# --- Copies -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("precision", ["fast", "exact"])
+@pytest.mark.parametrize("name", [*SOLVERS, *NETWORKS])
+def test_copies_and_pickles_give_the_same_scene(name, precision, psf, measurement):
+    method = name
+    if name in NETWORKS and name not in SOLVERS:
+        options = {"width": 2} if "width" in inspect.signature(NETWORKS[name]).parameters else {}
+        method = build(name, **options).eval()
+    reconstruct = Reconstructor(method, Calibration(psf), device="cpu", precision=precision, align=False)
+    scene = reconstruct(measurement)
+    for other in (pickle.loads(pickle.dumps(reconstruct)), copy.deepcopy(reconstruct), copy.copy(reconstruct)):
+        assert torch.equal(other(measurement), scene)
+        assert repr(other) == repr(reconstruct)
+
+
+def test_representations_are_one_short_line(psf):
+    calibration = Calibration(psf, FrameFormat(bin=4))
+    reconstruct = Reconstructor("admm", calibration, device="cpu", align=True)
+    pose = solvers.Pose(torch.zeros(1), torch.zeros(1))
+    for thing in (reconstruct, calibration, calibration.frames, Camera(psf), pose):
+        again = pickle.loads(pickle.dumps(thing))
+        assert repr(again) == repr(copy.deepcopy(thing)) == repr(thing)
+        assert len(repr(thing)) < 160
+        assert "\n" not in repr(thing)
+        assert "tensor" not in repr(thing)
+    assert repr(reconstruct) == f"Reconstructor('admm', 32 x 40, PSF {calibration.psf_hash}, cpu, aligned)"
+    assert repr(calibration) == f"Calibration(32 x 40, RGB, PSF {calibration.psf_hash}, FrameFormat(bin=4))"

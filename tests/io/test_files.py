@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from image_files import put
-from mwdn.errors import ImageError
-from mwdn.io.files import atomic
+from mwdn.errors import ImageError, ParameterError
+from mwdn.io.files import atomic, check_folder
 from mwdn.io.images import read_frame, write_linear, write_picture
 
 
@@ -84,3 +84,11 @@ def test_a_read_only_folder(tmp_path: Path) -> None:
             read_frame(path)
     finally:
         tmp_path.chmod(0o700)
+
+
+def test_the_check_of_a_folder_leaves_nothing(tmp_path: Path) -> None:
+    check_folder(tmp_path / "new" / "deep")
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "file").touch()
+    with pytest.raises(ParameterError, match="file/new"):
+        check_folder(tmp_path / "file" / "new")

@@ -18,6 +18,9 @@ from mwdn.io.formats import MAX_PIXELS
 from mwdn.io.images import read_frame, read_picture
 
 RGB_OF_RGBA = noise(channels=4)[..., :3]
+OPAQUE = np.concatenate([RGB_OF_RGBA, np.full_like(RGB_OF_RGBA[..., :1], 255)], -1)
+GREY_OPAQUE = np.stack([noise()[..., 0], np.full_like(noise()[..., 0], 255)], -1)
+TWELVE_BITS = b"P5 # a comment\n51 37\n# another\n4095\n" + (noise("uint16")[..., 0] >> 4).astype(">u2").tobytes()
 
 
 @pytest.mark.parametrize(("name", "dtype"), [("a.png", "uint8"), ("a.tif", "uint8"), ("a.tif", "uint16")])
@@ -31,23 +34,29 @@ def test_what_skimage_writes_is_read_exactly(tmp_path: Path, name: str, dtype: s
     [
         ("a.bmp", encoded(noise(), "BMP"), noise()),
         ("grey.bmp", encoded(noise()[..., 0], "BMP"), noise()[..., :1]),
+        ("a.webp", encoded(noise(), "WebP", lossless=True), noise()),
+        ("alpha.webp", encoded(OPAQUE, "WebP", lossless=True, exact=True), RGB_OF_RGBA),
+        ("a.ppm", encoded(noise(), "PPM"), noise()),
+        ("a.pgm", encoded(noise("uint16")[..., 0], "PPM"), noise("uint16")[..., :1]),
+        ("12_bits.pgm", TWELVE_BITS, noise("uint16")[..., :1] >> 4),
         ("grey.png", encoded(noise()[..., 0], "PNG"), noise()[..., :1]),
         ("grey16.png", encoded(noise("uint16")[..., 0], "PNG"), noise("uint16")[..., :1]),
         ("rgb16.png", png16(noise("uint16")), noise("uint16")),
-        ("alpha.png", encoded(noise(channels=4), "PNG"), noise(channels=4)[..., :3]),
-        ("grey_alpha.png", encoded(noise(channels=2), "PNG"), noise(channels=2)[..., :1]),
+        ("alpha.png", encoded(OPAQUE, "PNG"), RGB_OF_RGBA),
+        ("grey_alpha.png", encoded(GREY_OPAQUE, "PNG"), noise()[..., :1]),
         ("named_wrongly.jpg", encoded(noise(), "PNG"), noise()),
         ("trailer.png", encoded(noise(), "PNG") + b"maker's notes", noise()),
         ("planar.tif", tiff(noise().transpose(2, 0, 1), photometric="rgb", planarconfig="separate"), noise()),
         ("imagej.tif", tiff(noise().transpose(2, 0, 1), imagej=True), noise()),
-        ("alpha.tif", tiff(noise(channels=4), photometric="rgb", extrasamples=["unassalpha"]), RGB_OF_RGBA),
+        ("alpha.tif", tiff(OPAQUE, photometric="rgb", extrasamples=["unassalpha"]), RGB_OF_RGBA),
+        ("alpha_lzw.tif", encoded(OPAQUE, "TIFF", compression="tiff_lzw"), RGB_OF_RGBA),
         ("big_endian.tif", tiff(noise(">u2"), photometric="rgb", byteorder=">"), noise("uint16")),
         ("big.tif", tiff(noise(), photometric="rgb", bigtiff=True), noise()),
         ("deflated.tif", tiff(noise(), photometric="rgb", compression="zlib", tile=(16, 16)), noise()),
         ("one_page.tif", tiff(noise("float32")[None, ..., 0]), noise("float32")[..., :1]),
         ("rows.tif", encoded(noise(), "TIFF"), noise()),
         ("grey.npy", npy(noise()[..., 0]), noise()[..., :1]),
-        ("alpha.npy", npy(noise(channels=4)), noise(channels=4)[..., :3]),
+        ("alpha.npy", npy(OPAQUE), RGB_OF_RGBA),
         ("batch.npy", npy(noise()[None]), noise()),
         ("page.npy", npy(noise()[None, ..., 0]), noise()[..., :1]),
         ("fortran.npy", npy(np.asfortranarray(noise())), noise()),
@@ -151,7 +160,7 @@ PLANES = tiff(noise().transpose(2, 0, 1), imagej=True)
 BAD = {
     "empty.png": (b"", "is empty"),
     "text.png": (b"version https://git-lfs.github.com/spec/v1\n", "starts with b'version '"),
-    "text.npy": (b"1 2 3\n", "must be PNG, JPEG, BMP, TIFF or NPY"),
+    "text.npy": (b"1 2 3\n", "must be PNG.* raw file"),
     "pickle.npy": (b"\x80\x04\x95\x05\x00\x00\x00\x00\x00\x00\x00]\x94.", "must be PNG"),
     "half.png": (half(encoded(noise(), "PNG")), "is cut off.* no end"),
     "tail.png": (encoded(noise(), "PNG")[:-12], "is cut off.* no end"),
@@ -164,6 +173,11 @@ BAD = {
     "half.bmp": (half(encoded(noise(), "BMP")), "is cut off: this BMP has"),
     "header.bmp": (encoded(noise(), "BMP")[:20], "is cut off"),
     "text.bmp": (b"BM is also how a text may begin, so that this reads as a picture.", "is cut off|shape"),
+    "half.webp": (half(encoded(noise(), "WebP")), "is cut off: this WebP has"),
+    "header.webp": (encoded(noise(), "WebP")[:20], "is cut off"),
+    "half.ppm": (half(encoded(noise(), "PPM")), "is cut off: this PGM or PPM has"),
+    "header.pgm": (b"P5\n51", "is damaged"),
+    "huge.pgm": (b"P5 32768 32768 255\n", "claims 32,768 x 32,768 pixels"),
     "half.tif": (half(tiff(noise(), photometric="rgb")), "cannot be read as TIFF"),
     "deflated.tif": (half(tiff(noise(), photometric="rgb", compression="zlib")), "cannot be read as TIFF"),
     "header.tif": (tiff(noise()[..., 0])[:8], "is cut off"),
@@ -212,6 +226,24 @@ def test_a_bad_file_is_named_with_its_fault(
     assert capfd.readouterr() == ("", "")
 
 
+TRANSPARENT = {
+    "a.png": encoded(noise(channels=4), "PNG"),
+    "grey.png": encoded(noise(channels=2), "PNG"),
+    "a.webp": encoded(noise(channels=4), "WebP", lossless=True, exact=True),
+    "a.tif": tiff(noise(channels=4), photometric="rgb", extrasamples=["unassalpha"]),
+    "lzw.tif": encoded(noise(channels=4), "TIFF", compression="tiff_lzw"),
+    "a.npy": npy(noise(channels=4)),
+}
+
+
+@pytest.mark.parametrize("name", TRANSPARENT)
+def test_transparent_pixels_are_refused_in_frames_and_dropped_in_photographs(tmp_path: Path, name: str) -> None:
+    path = put(tmp_path / name, TRANSPARENT[name])
+    with pytest.raises(ImageError, match=r"is transparent in \d.*% of its pixels"):
+        read_frame(path)
+    assert read_picture(path).shape == (1, 3, *noise().shape[:2])
+
+
 def test_a_huge_npy_that_is_whole(tmp_path: Path) -> None:
     path = put(tmp_path / "a.npy", huge_npy())
     os.truncate(path, path.stat().st_size + 2**30)  # sparse: no disk is used
@@ -232,6 +264,8 @@ def test_every_cut_of_a_file_is_noticed(tmp_path: Path) -> None:
         "a.png": encoded(noise(), "PNG"),
         "a.jpg": encoded(noise(), "JPEG"),
         "a.bmp": encoded(noise(), "BMP"),
+        "a.webp": encoded(noise(), "WebP"),
+        "a.ppm": encoded(noise(), "PPM"),
     }
     files |= {"a.npy": npy(noise()), "a.tif": tiff(noise(), photometric="rgb"), "b.tif": PLANES}
     for name, data in files.items():

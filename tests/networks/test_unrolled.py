@@ -9,6 +9,7 @@ import oracles
 from conftest import trained
 from mwdn.benchmark.published import PUBLISHED
 from mwdn.networks import NETWORKS, build
+from mwdn.optics import unit_sum
 from mwdn.solvers import Admm, Penalties
 from mwdn.solvers.proximal import dual_projection
 
@@ -44,7 +45,7 @@ def test_published_settings_are_of_known_networks():
 
 def pair(generator, size, *, batch=2):
     scene = F.interpolate(torch.rand(batch, 3, 5, 5, generator=generator), size=size, mode="bicubic").clamp(0, 1)
-    h = torch.rand(1, 3, *size, generator=generator) ** 8
+    h = unit_sum(torch.rand(1, 3, *size, generator=generator) ** 8)
     b = np.stack([[oracles.convolve(v, k) for v, k in zip(one, h[0], strict=True)] for one in scene.numpy()])
     return torch.from_numpy(b / b.max()).float(), h
 

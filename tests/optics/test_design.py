@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -13,7 +12,6 @@ from mwdn.optics import Contour, Diffuser, Setup, mask_psf
 from mwdn.optics.design import design_camera
 from mwdn.optics.mask_files import read_mask
 
-RECIPES = Path(__file__).resolve().parents[2] / "recipes"
 SMALL = ["--aperture-mm", "0.4", "0.4", "--pixels", "200", "240", "--wavelengths", "2", "-o", "cam"]
 
 
@@ -109,26 +107,28 @@ def test_recipe_stands_behind_the_command_line(run, tmp_path):
 @pytest.mark.parametrize(("recipe", "mask"), [("mwdn", "contour"), ("diffuser", "diffuser"), ("coded", "coded")])
 def test_recipes_of_the_project_are_understood(run, recipe, mask):
     """Every key of the recipe is read; the only error is the wrong number on the command line."""
-    code, _, err = run(mask, "--recipe", RECIPES / f"camera-{recipe}.toml", "--pitch-um", "-1")
-    assert (code, err) == (2, "Error: `pitch_um` (-1) must be positive.\n")
+    code, _, err = run(mask, "--recipe", f"camera-{recipe}", "--pitch-um", "-1")
+    assert (code, err) == (2, "Error: `--pitch-um` (-1) must be positive.\n")
 
 
 def test_recipe_of_the_paper_is_the_default(run, monkeypatch):
     calls = []
     monkeypatch.setattr("mwdn.cli.design.Output.write", lambda self, *arguments: calls.append(arguments))
-    assert run("contour", "--recipe", RECIPES / "camera-mwdn.toml")[0] == 0
+    assert run("contour", "--recipe", "camera-mwdn")[0] == 0
     assert calls == [("contour", Contour(), Setup())]
 
 
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("contour --levels 0", "Error: `levels` (0) must be 2 to 65,536."),
-        ("contour --distance-mm -2", "Error: `distance_mm` (-2) must be positive."),
-        ("diffuser --pitch-um 9", "Error: `pitch_um` (9) cannot sample"),
-        ("contour --recipe none.toml", "Error: `recipe` (none.toml) must be a TOML file"),
+        ("contour --levels 0", "Error: `--levels` (0) must be 2 to 65,536."),
+        ("contour --distance-mm -2", "Error: `--distance-mm` (-2) must be positive."),
+        ("diffuser --pitch-um 9", "Error: `--pitch-um` (9) cannot sample"),
+        ("contour --recipe none.toml", "Error: The recipe `none.toml` does not exist."),
         ("contour --levls 3", "Did you mean --levels?"),
-        ("kontour", 'Did you mean "contour"?'),
+        ("kontour", "Did you mean 'contour'?"),
+        ("--mask none.npy", "`none.npy` does not exist"),
+        ("--mask a.npy --levls 3", "Did you mean --levels?"),
         ("pinholes --stl --size-mm 0.4 0.4 --count 2", "no heights for an STL"),
     ],
 )
@@ -137,6 +137,19 @@ def test_wrong_call_is_one_message_and_exit_2(run, line, message):
     assert code == 2
     assert message in " ".join(err.split())
     assert "Traceback" not in out + err
+
+
+def test_a_mask_from_a_file(run, tmp_path):
+    """The mask.tif of a design gives the same PSF; `mwdn design --mask` is short for `mwdn design array --mask`."""
+    assert run("pinholes", "--size-mm", "0.4", "0.4", "--count", "3", *SMALL)[0] == 0
+    for name, line in (("one", ["array", "--mask", "cam/mask.tif"]), ("two", ["--mask=cam/mask.tif"])):
+        code, _, err = run(*line, *SMALL[:-1], name)
+        assert (code, err) == (0, "")
+        about = json.loads((tmp_path / name / "camera.json").read_text())
+        assert about["mask"]["mask"] == "cam/mask.tif"
+        assert about["made"] == json.loads((tmp_path / "cam/camera.json").read_text())["made"]
+    code, _, err = run("--mask", "cam/mask.tif", *SMALL)
+    assert (code, "would overwrite an input" in err) == (2, True)
 
 
 def test_designed_camera_keeps_its_light():

@@ -36,6 +36,22 @@ def test_autocorrelation_of_a_spot(sigma):
     assert result.lobe < 0.05
 
 
+def test_width_and_coarsest_bin_of_lines_do_not_depend_on_noise(generator):
+    """Gaussian lines of standard deviation s are 3.33 s wide in the autocorrelation; a third of the energy is noise."""
+    psf = gaussian_psf((330, 330), 6.0)
+    noise = (psf.square().sum() / 2 / psf.numel()).sqrt() * torch.randn(psf.shape, generator=generator)
+    noisy = (psf + noise - (psf + noise).quantile(0.05)).clamp(min=0)
+    widths = [psf_measures.autocorrelation(picture).width for picture in (psf, noisy)]
+    assert widths[1] == pytest.approx(widths[0], rel=0.1)
+    assert [psf_measures.coarsest_bin(picture) for picture in (psf, noisy)] == [3, 3]
+    assert psf_measures.coarsest_bin(psf[..., :200, :]) == 2  # a side of 100 pixels remains
+
+
+def test_sharp_patterns_are_not_binned(generator):
+    white = torch.rand(1, 1, 320, 320, generator=generator)
+    assert psf_measures.coarsest_bin(white) == psf_measures.coarsest_bin((white > 0.99).float()) == 1
+
+
 def test_autocorrelation_finds_where_a_pattern_repeats(generator):
     """Two copies 30 rows and 12 columns apart: at that displacement half of the light overlaps with the other half."""
     spots = (torch.rand(60, 60, generator=generator) < 0.01).float()

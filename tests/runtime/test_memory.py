@@ -17,11 +17,12 @@ def work():
     for size in (2**20, 2**24, 2**22):  # 4 to 64 MB
         torch.ones(size)
 
-for _ in range(3):  # until the heap has its final size
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
     work()
-before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-work()
-print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+print(min(faults() for _ in range(10)))  # the heap reaches its final size after a few rounds
 """
 
 

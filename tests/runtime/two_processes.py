@@ -90,6 +90,7 @@ def main():
     with double_precision():  # outside the group: each process trains alone
         start(f"double/one-{number}", read_recipe("cpsf.toml"), precise).run()
     with distributed.process_group():
+        assert distributed.gather_json([distributed.rank()]) == [[0], [1]]
         batch_norm()
         with double_precision():
             run = start("double/two", read_recipe("cpsf.toml"), precise)

@@ -5,11 +5,11 @@ import re
 
 import pytest
 
-from conftest import ROOT
 from mwdn.data.cameras import Cameras
 from mwdn.data.mismatch import Mismatch
 from mwdn.data.simulated import Placement
 from mwdn.errors import ParameterError, UnknownNameError
+from mwdn.io.toml import packaged_recipes
 from mwdn.networks import build
 from mwdn.optics import Sensor
 from mwdn.training.recipe import Recipe, Schedule, read_recipe
@@ -28,12 +28,12 @@ def read(tmp_path):
 
 
 OTHERS = ("camera-", "benchmark-")
-TRAININGS = [path for path in sorted((ROOT / "recipes").glob("*.toml")) if not path.stem.startswith(OTHERS)]
+TRAININGS = [name for name in packaged_recipes() if not name.startswith(OTHERS)]
 
 
-@pytest.mark.parametrize("path", TRAININGS, ids=lambda path: path.stem)
-def test_each_recipe_of_the_repository(path):
-    recipe = read_recipe(path)
+@pytest.mark.parametrize("name", TRAININGS)
+def test_each_recipe_of_the_package(name):
+    recipe = read_recipe(name)
     assert build(**recipe.network)
     assert json.loads(json.dumps(recipe.as_dict()))["network"]["name"] == recipe.network["name"]
 
@@ -122,7 +122,7 @@ def test_mistyped_names_get_the_nearest(read, text, said):
         (NETWORK + "[schedule]\nlearning_rate = inf", "`learning_rate` (inf) must be finite."),
         (NETWORK + "[schedule]\ncrop = 8", "`crop` (8) applies to cached samples: set `pool`"),
         (NETWORK + f"[schedule]\nseed = {2**63 - 1}0", "must have 63 bits at most."),
-        ('[network]\nname = "mwdn"\nwidth = 0', "`width` (0) must be at least 1"),
+        ('[network]\nname = "mwdn"\nwidth = 0', "[network]: `width` (0) must be at least 1"),
         (NETWORK + "[schedule]\nwarmup = -1", "`warmup` (-1) must not be negative."),
         (NETWORK + "[schedule]\nepochs = -1", "`epochs` (-1) must not be negative."),
         (NETWORK + "[plateau]\nfactor = 1", "`factor` (1.0) must be in (0, 1)"),
@@ -146,7 +146,7 @@ def test_mistyped_names_get_the_nearest(read, text, said):
         (NETWORK + "[sensor]\nbit_depth = 99", "`bit_depth` (99) must be 1 to 16."),
         (NETWORK + "[loss]\nmse = -1", "The weight of `mse` (-1) must be finite and not negative"),
         (NETWORK + '[loss]\nmse = "much"', "The weight of `mse` ('much') must be finite and not negative"),
-        ('[network]\nname = "mwdn"\nwidth = "wide"', "cannot be built"),
+        ('[network]\nname = "mwdn"\nwidth = "wide"', "[network]: `width` ('wide') of the network 'mwdn' must be"),
         (DENOISER, "[denoising] and a denoising network (drunet)"),
         (NETWORK + "[denoising]\nlevels = [0.01, 0.1]", "[denoising] and a denoising network (drunet)"),
         (DENOISER + "[denoising]\nlevels = [0.1, 0.01]", "`levels` of [denoising] (0.1, 0.01) must rise from above 0"),
@@ -174,7 +174,7 @@ def test_steps_replace_epochs(read):
 
 def test_recipe_of_the_paper():
     """Training in section 4 of the paper and in its public code; its camera in section 4."""
-    recipe = read_recipe(ROOT / "recipes" / "paper.toml")
+    recipe = read_recipe("paper")
     schedule, plateau = recipe.schedule, recipe.plateau
     assert sum(p.numel() for p in build(**recipe.network).parameters()) == 17_267_531
     assert (schedule.optimiser, schedule.learning_rate, schedule.weight_decay) == ("adam", 1e-4, 1e-4)
@@ -191,7 +191,7 @@ def test_recipe_of_the_paper():
 
 
 def test_no_such_file(tmp_path):
-    with pytest.raises(ParameterError, match=r"`.*none\.toml` cannot be read as a recipe"):
+    with pytest.raises(ParameterError, match=r"`.*none\.toml` does not exist"):
         read_recipe(tmp_path / "none.toml")
 
 

@@ -67,7 +67,7 @@ def test_without_the_package(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorboard", None)
     for name in [name for name in sys.modules if name.startswith("torch.utils.tensorboard")]:
         monkeypatch.delitem(sys.modules, name)
-    said = "`tensorboard` must be installed: `pip install 'mwdn[tensorboard]'`."
+    said = "The package tensorboard must be installed: `pip install 'mwdn[tensorboard]'`."
     with pytest.raises(ParameterError, match=re.escape(said)):
         TensorBoard(tmp_path)
 

@@ -5,6 +5,7 @@ import json
 import os
 import random
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -26,7 +27,8 @@ from mwdn.data.pairs import PairFile
 from mwdn.data.photographs import Photographs
 from mwdn.data.simulated import SimulatedPairs
 from mwdn.errors import CheckpointError, DivergenceError, ParameterError, ShapeError
-from mwdn.inference.reconstructor import find_method
+from mwdn.inference.methods import find_method
+from mwdn.optics.sensor import Sensor
 from mwdn.training.experiment import prepare, simulate
 from mwdn.training.recipe import Plateau, Recipe, Schedule, Sheet
 from mwdn.training.run_folder import RunFolder
@@ -209,6 +211,34 @@ def test_resumed_run_ends_bit_identical(trainer, recipe, tmp_path):
     second.run()
     for name in ("last", "best", "state"):
         assert same(tmp_path / "whole" / f"{name}.safetensors", tmp_path / "halves" / f"{name}.safetensors")
+
+
+def test_ctrl_c_ends_after_the_step_and_saves_it(trainer, whole, tmp_path):
+    first = trainer()
+
+    def press(report):
+        if report.step == 2:  # no validation is due
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt, match=r"after step 2\."):
+        first.run(press)
+    second = trainer()
+    assert second.step == 2
+    second.run()
+    for name in ("last", "best", "state"):
+        assert same(whole / f"{name}.safetensors", tmp_path / "run" / f"{name}.safetensors")
+    assert log(tmp_path / "run") == log(whole)
+
+
+def test_second_ctrl_c_ends_at_once(trainer, tmp_path):
+    def press_twice(report):
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt, match=r"^$"):
+        trainer().run(press_twice)
+    assert trainer().step == 0
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_log_has_one_line_a_step_after_a_resume(trainer, tmp_path):
@@ -678,12 +708,76 @@ def test_a_resumed_run_with_a_cache_ends_as_an_unbroken_one(trainer, tmp_path):
     assert same(tmp_path / "whole" / "last.safetensors", tmp_path / "stopped" / "last.safetensors")
 
 
+def stop_after(samples):
+    """A callback that presses Ctrl-C after so many samples."""
+
+    def show(done, total):
+        if done == samples:
+            signal.raise_signal(signal.SIGINT)
+
+    return show
+
+
+def computed(run):
+    """Numbers of the samples that a run computes."""
+    first, numbers = [], []
+    run.run(samples=lambda done, total: numbers.append(done) or first.append(total - done))
+    return first[0], numbers
+
+
+def test_interrupted_samples_are_kept_until_the_run_ends(trainer, tmp_path):
+    pooled = few(pool=8, steps=5)
+    trainer(pooled, "whole").run()
+    with pytest.raises(KeyboardInterrupt, match=r"after 3 of 8 samples\."):
+        trainer(pooled, "stopped").run(samples=stop_after(3))
+    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "stopped" / "samples").glob("*/*")}
+    assert len(kept) == 3
+    with pytest.raises(KeyboardInterrupt, match=r"after step 1\."):
+        trainer(pooled, "stopped").run(lambda report: signal.raise_signal(signal.SIGINT))
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+    assert computed(trainer(pooled, "stopped"))[0] == 0
+    for name in ("last", "state"):
+        assert same(tmp_path / "whole" / f"{name}.safetensors", tmp_path / "stopped" / f"{name}.safetensors")
+    assert not (tmp_path / "stopped" / "samples").exists()
+
+
+def test_only_samples_that_the_steps_use_are_computed(trainer):
+    assert computed(trainer(few(pool=8, steps=3))) == (6, [0, 1, 2, 3, 4, 5, 6])
+
+
+@pytest.mark.parametrize("changed", ["photographs", "recipe"])
+def test_samples_of_others_are_not_used(trainer, photos, tmp_path, changed):
+    pooled = few(pool=4, steps=2)
+    with pytest.raises(KeyboardInterrupt):
+        trainer(pooled).run(samples=stop_after(3))
+    other = replace(pooled, sensor=Sensor(full_well=99.0)) if changed == "recipe" else pooled
+    if changed == "photographs":
+        cv2.imwrite(str(photos / "3.png"), np.full((24, 24, 3), 99, np.uint8))
+    with pytest.raises(KeyboardInterrupt, match="after 1 of 4"):
+        trainer(other).run(samples=stop_after(1))
+    assert len(list((tmp_path / "run" / "samples").glob("*/*"))) == 1
+
+
+def test_samples_are_not_kept_on_a_disk_without_room(trainer, tmp_path, monkeypatch):
+    free = shutil.disk_usage(tmp_path)._replace(free=10_000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: free)
+    with pytest.raises(KeyboardInterrupt):
+        trainer(few(pool=4, steps=2)).run(samples=stop_after(3))
+    assert not (tmp_path / "run" / "samples").exists()
+
+
 def test_a_denoiser_is_trained_alone_and_then_frozen(trainer, tmp_path):
     """Trained on noisy scenes, then part of a network whose U-Net learns, with a cache or without."""
-    learned = trainer(replace(few(steps=40, learning_rate=5e-3), network=DRUNET, denoising=Denoising((0.05, 0.1))), "a")
-    losses = []
-    learned.run(lambda report: losses.append(report.loss))
-    assert sum(losses[-10:]) < 0.7 * sum(losses[:10])
+    learned = trainer(replace(few(steps=40, learning_rate=1e-3), network=DRUNET, denoising=Denoising((0.05, 0.1))), "a")
+    noisy, scene, level = learned.task.pairs.batch(range(10**6, 10**6 + 8))  # not trained on
+
+    def error(denoiser):
+        with torch.no_grad():
+            return (denoiser(noisy, level) - scene).square().mean()
+
+    untrained = error(learned.network)
+    learned.run()
+    assert error(load_checkpoint(tmp_path / "a" / "best.safetensors")) < 0.8 * untrained
 
     denoiser = load_checkpoint(tmp_path / "a" / "best.safetensors").state_dict()
     for name, pool in (("kept", 4), ("new", 0)):

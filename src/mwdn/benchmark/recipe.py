@@ -10,7 +10,7 @@ from typing import Any
 
 from mwdn.benchmark.sets import PRESETS, DatasetRecipe
 from mwdn.errors import ParameterError, UnknownNameError, check_options
-from mwdn.io.toml import read_toml, to_dataclass
+from mwdn.io.toml import find_recipe, read_toml, to_dataclass
 from mwdn.networks import NETWORKS
 from mwdn.optics import Deviation
 from mwdn.solvers import SOLVERS
@@ -96,14 +96,15 @@ def read_benchmark(path: str | Path) -> Benchmark:
     """Read a recipe.
 
     Args:
-        path: TOML with the tables [networks], [solvers], [data], [schedule], [loss], [shared.network],
-            [shared.data], [robustness], and the other fields of `Benchmark`. Paths in it are relative to its folder or
-            start with an environment variable, as in ``$MWDN_DATA/photos``.
+        path: name of a recipe of the package, or TOML file with the tables [networks], [solvers], [data], [schedule],
+            [loss], [shared.network], [shared.data], [robustness], and the other fields of `Benchmark`. Paths in it are
+            relative to its folder or start with an environment variable, as in ``$MWDN_DATA/photos``.
 
     Raises:
         ParameterError: the file cannot be read, has no methods or data, or a value is outside its range.
         UnknownNameError: an unknown name, table or key.
     """
+    path = find_recipe(path)
     content = read_toml(path)
     keys = {f.name for f in fields(Benchmark)} - {"methods", "path"} | {"networks", "solvers", "shared"}
     for key in content:

@@ -21,9 +21,10 @@ from mwdn.benchmark.sets import Dataset, open_dataset
 from mwdn.benchmark.training import train
 from mwdn.data.photographs import Photographs
 from mwdn.evaluation import Perceptual
-from mwdn.evaluation.alexnet import SMALLEST
+from mwdn.evaluation.alexnet import SMALLEST, load_alexnet
 from mwdn.io.files import write_text
 from mwdn.runtime.distributed import local_device
+from mwdn.training.losses import NEED_ALEXNET
 from mwdn.training.trainer import Report
 
 PAGE = "index.html"
@@ -44,6 +45,7 @@ class Watch:
     def track(self, title: str, rows: list[range]) -> Iterator[range]:
         """Iterate over rows as one stage."""
         self.stage(title, len(rows))
+        self.done(0, "")
         for number, row in enumerate(rows):
             yield row
             self.done(number + 1, "")
@@ -55,7 +57,13 @@ class Watch:
 
 
 def run(
-    benchmark: Benchmark, out: Path, *, device: str | None = None, command: str = "", watch: Watch = Watch()
+    benchmark: Benchmark,
+    out: Path,
+    *,
+    device: str | None = None,
+    lpips: bool | None = None,
+    command: str = "",
+    watch: Watch = Watch(),
 ) -> Results:
     """Make the data, train, score, measure robustness, and write the page.
 
@@ -67,6 +75,8 @@ def run(
         out: folder for ``index.html``, ``benchmark.md``, ``benchmark.json`` and ``benchmark.csv``, and for what they
             are made from: the folders ``data``, ``runs``, ``scores`` and ``robustness``.
         device: where to compute; a GPU if there is one unless given.
+        lpips: LPIPS and feature MSE: with or without them; ``None`` for them if their public weights are there, or
+            True to download the weights otherwise.
         command: command line, for the page.
         watch: shows the progress.
 
@@ -74,13 +84,20 @@ def run(
         MwdnError: a file cannot be read, a method does not fit, training diverges, or ``out`` holds another benchmark.
     """
     torch_device = local_device(device)
+    if NEED_ALEXNET & benchmark.loss.keys():
+        load_alexnet(benchmark.alexnet or None, download=lpips is True)  # an error now instead of after the data
     with lock(out, "data"):
         datasets = {
             name: open_dataset(name, recipe, out / "data", torch_device, watch.track)
             for name, recipe in benchmark.data.items()
         }
     _train_all(benchmark, datasets, out, torch_device, watch)
-    load_perceptual = cache(partial(Perceptual.load, benchmark.alexnet or None, benchmark.heads or None))
+    files = benchmark.alexnet or None, benchmark.heads or None
+
+    @cache
+    def load_perceptual() -> Perceptual:
+        return Perceptual.none() if lpips is False else Perceptual.load(*files, download=lpips is True)
+
     with lock(out, "scores"):  # one process at a time: run times are measured
         methods = {
             name: _score_all(benchmark, dataset, out, torch_device, watch, load_perceptual)
@@ -148,9 +165,9 @@ def _score_all(
         return load_perceptual()
 
     results = {}
+    watch.stage(f"{dataset.name}: scoring", len(benchmark.methods))
     for number, method in enumerate(benchmark.methods):
-        watch.stage(f"{dataset.name}: scoring {method.label}", len(benchmark.methods))
-        watch.done(number, "")
+        watch.done(number, method.label)
         results[method.label] = score(
             method,
             _checkpoint(method, dataset, out),

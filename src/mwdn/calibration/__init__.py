@@ -2,5 +2,6 @@
 
 from mwdn.calibration.frame_format import FrameFormat
 from mwdn.calibration.psf import Calibration
+from mwdn.calibration.psf_format import PsfFormat
 
-__all__ = ["Calibration", "FrameFormat"]
+__all__ = ["Calibration", "FrameFormat", "PsfFormat"]

@@ -1,21 +1,31 @@
 """How to turn the numbers of a raw frame into a measurement."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, cast
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
-from mwdn.errors import ParameterError, ShapeError, UnknownNameError
-from mwdn.io.images import read_frame
+from mwdn.errors import ParameterError, ShapeError, checked
+from mwdn.io.formats import as_frame
+from mwdn.io.images import read_frame, srgb_decode
+from mwdn.io.raw import RawFrame, is_raw, read_raw
 from mwdn.types import Frame, Image, Measurement, Size
 
 Mosaic = Literal["rggb", "bggr", "grbg", "gbrg"]
 """Colour filter arrays: the colours of a 2 x 2 cell, row by row."""
 
+Gamma = Literal["srgb"] | float
+"""Encoding of a file: sRGB, or light raised to the power of 1 / gamma, where 1 is linear."""
 
+MAX_GAMMA = 4.0
+"""Cameras and displays use 1.8 to 2.6."""
+
+
+@checked
 @dataclass(frozen=True, kw_only=True)
 class FrameFormat:
     """What the numbers in a raw frame mean. The fields are in the order of the steps: `read`, then `to_measurement`.
@@ -23,39 +33,65 @@ class FrameFormat:
     Args:
         bgr: the file's channels are blue, green, red (DiffuserCam's .npy).
         bit_depth: bits of the sensor, if its numbers do not fill the file's type.
-        mosaic: raw frames of a colour filter array with this order: each 2 x 2 cell becomes one pixel.
+        gamma: encoding of the files, decoded to linear light: ``"srgb"`` for a camera's JPEG or another picture for
+            viewing, or a power such as 2.2; without it numbers are linear in light, as in raw frames. The PSF's
+            file has its own: ``psf_gamma``.
+        crop: height and width of the central part to use, in raw pixels of the frame; even with a mosaic. A camera's
+            raw file is read as one pixel per cell, unless ``mosaic`` is given.
+        mosaic: raw frames of a colour filter array with this order: each 2 x 2 cell becomes one pixel. A camera's raw
+            file (.dng, .nef ...) says its own order, unless one is given.
         grey: average the colours.
-        crop: height and width of the central part to use, in raw pixels; with a mosaic, in 2 x 2 cells.
-        bin: average blocks of this many pixels along each axis, after the crop.
+        bin: average blocks of this many pixels along each axis.
         upside_down: the file's first row is the bottom of the picture (DiffuserCam's .npy).
 
     Raises:
-        ParameterError: ``bit_depth`` is not 1 to 16, or ``bin`` is less than 1.
+        ParameterError: ``bit_depth`` is not 1 to 16, ``gamma`` not 1 to 4, ``bin`` less than 1, ``crop`` odd with a
+            mosaic, or a field is of another type.
         UnknownNameError: no such mosaic.
     """
 
     bgr: bool = False
     bit_depth: int | None = None
+    gamma: Gamma | None = None
+    crop: Size | None = None
     mosaic: Mosaic | None = None
     grey: bool = False
-    crop: Size | None = None
     bin: int = 1
     upside_down: bool = False
 
     def __post_init__(self) -> None:
         if self.bit_depth is not None and not 1 <= self.bit_depth <= 16:
             raise ParameterError(f"`bit_depth` ({self.bit_depth}) must be 1 to 16.")
-        if self.mosaic is not None and self.mosaic not in get_args(Mosaic):
-            raise UnknownNameError("mosaic", self.mosaic, get_args(Mosaic))
+        check_gamma("gamma", self.gamma)
         if self.bin < 1:
             raise ParameterError(f"`bin` ({self.bin}) must be at least 1.")
+        if self.crop is not None and any(length % self.cell for length in self.crop):
+            height, width = self.crop
+            raise ParameterError(
+                f"`crop` ({height} x {width}) must be even with a mosaic, whose cells are 2 x 2 pixels: "
+                f"`--crop {height // 2 * 2} {width // 2 * 2}`."
+            )
+
+    def __repr__(self) -> str:
+        values = ((field.name, getattr(self, field.name), field.default) for field in fields(self))
+        return f"FrameFormat({', '.join(f'{name}={value!r}' for name, value, default in values if value != default)})"
+
+    @property
+    def cell(self) -> int:
+        """Raw pixels of the frame, along each axis, that make one pixel before binning: 2 with a mosaic, else 1."""
+        return 1 if self.mosaic is None else 2
 
     def read(self, path: str | Path) -> Frame:
         """Read a raw frame as (H, W, C), its numbers as stored and its channels in the order RGB.
 
+        A camera's raw file becomes uint16, from 0 at its black level to 65,535 at its white level; each 2 x 2 cell of
+        its mosaic becomes one RGB pixel, unless ``mosaic`` is given.
+
         Raises:
             ImageError: the file cannot be read.
         """
+        if is_raw(path) and self.mosaic is None:
+            return _cells(read_raw(path))
         return read_frame(path, bgr=self.bgr)
 
     def to_measurement(self, frame: Frame, dark: Tensor | None = None) -> Measurement:
@@ -63,7 +99,7 @@ class FrameFormat:
 
         Args:
             frame: (H, W, C), from `read`.
-            dark: frame taken without light, from `normalise`.
+            dark: frame to subtract, from `normalise`: taken without light, or with the room's light alone.
 
         Returns:
             (1, C, height, width), linear light, row 0 at the top; 1 is saturation.
@@ -75,18 +111,22 @@ class FrameFormat:
         image = self.normalise(frame)
         if dark is not None:
             image = subtract_dark(image, dark)
+        if self.crop is not None:
+            image = crop_centre(image, self.crop, self.cell)
         if self.mosaic is not None:
             image = demosaic(image, self.mosaic)
         if self.grey:
             image = image.mean(1, keepdim=True)
-        if self.crop is not None:
-            image = crop_centre(image, self.crop)
         image = bin_pixels(image, self.bin)
         return image.flip(-2) if self.upside_down else image
 
     def normalise(self, frame: Frame) -> Image:
-        """Divide a frame (H, W, C) by its full scale: (1, C, H, W), 1 is saturation."""
-        return torch.from_numpy(frame.astype(np.float32)).movedim(-1, 0)[None].contiguous() / self.full_scale(frame)
+        """Divide a frame (H, W, C) by its full scale and decode its gamma: (1, C, H, W), 1 is saturation."""
+        frame = as_frame(frame, finite=False)
+        image = torch.from_numpy(frame.astype(np.float32)).movedim(-1, 0)[None].contiguous() / self.full_scale(frame)
+        if self.gamma is None:
+            return image
+        return srgb_decode(image) if self.gamma == "srgb" else image.clamp(min=0) ** self.gamma
 
     def full_scale(self, frame: Frame) -> float:
         """Largest number of the sensor: ``2^bit_depth - 1``; without a bit depth the file type's maximum, 1 for floats.
@@ -94,6 +134,7 @@ class FrameFormat:
         Raises:
             ParameterError: the frame holds a larger number, or the file's type has fewer bits.
         """
+        frame = as_frame(frame, finite=False)
         if self.bit_depth is None:
             return 1.0 if frame.dtype.kind == "f" else float(np.iinfo(frame.dtype).max)
         if frame.dtype.kind != "f" and self.bit_depth > 8 * frame.dtype.itemsize:
@@ -112,6 +153,7 @@ class FrameFormat:
 
     def saturated(self, frame: Frame) -> tuple[int, int]:
         """Number of saturated pixels, and the number at which the sensor saturates; (0, 1) for floats."""
+        frame = as_frame(frame, finite=False)
         if frame.dtype.kind == "f":
             return 0, 1
         maximum, largest = int(self.full_scale(frame)), int(frame.max())
@@ -122,22 +164,42 @@ class FrameFormat:
             maximum = largest
         return int((frame.max(axis=-1) >= maximum).sum()), maximum
 
+    def full_size(self, frame: Frame) -> Size:
+        """Height and width of a raw frame's measurement before binning."""
+        height, width = self.crop or frame.shape[:2]
+        return height // self.cell, width // self.cell
+
     def with_bin(self, bin: int) -> "FrameFormat":
         """The format of frames of the same view at another resolution: ``crop`` is scaled with ``bin``."""
-        crop = self.crop and (self.crop[0] * bin // self.bin, self.crop[1] * bin // self.bin)
-        return replace(self, bin=bin, crop=crop)
+        height, width = (length // self.cell * bin // self.bin * self.cell for length in self.crop or (0, 0))
+        return replace(self, bin=bin, crop=self.crop and (height, width))
+
+
+def check_gamma(name: str, gamma: Gamma | None) -> None:
+    """Raise a `ParameterError` unless the option called ``name`` is a gamma."""
+    if gamma not in (None, "srgb") and not (isinstance(gamma, int | float) and 1 <= gamma <= MAX_GAMMA):
+        raise ParameterError(f"`{name}` ({gamma}) must be 'srgb', or a number from 1 (linear) to {MAX_GAMMA:g}.")
+
+
+def _cells(raw: RawFrame) -> Frame:
+    """One RGB pixel per cell of a raw file's mosaic; a frame without mosaic as it is."""
+    if raw.mosaic is None:
+        return raw.frame
+    mosaic = torch.from_numpy(raw.frame.astype(np.float32)).movedim(-1, 0)[None]
+    colours = demosaic(mosaic, cast(Mosaic, raw.mosaic))[0].movedim(0, -1)
+    return colours.round().numpy().astype(np.uint16, order="C")
 
 
 def subtract_dark(image: Image, dark: Tensor) -> Image:
-    """Subtract a dark frame (1, C or 1, H, W).
+    """Subtract a dark or ambient frame (1, C or 1, H, W).
 
     Raises:
         ShapeError: it has another size.
     """
     if dark.shape[-2:] != image.shape[-2:] or dark.shape[1] not in (1, image.shape[1]):
         raise ShapeError(
-            f"`dark` {tuple(dark.shape[1:])} must have the size of the frame {tuple(image.shape[1:])}. "
-            "Take it with the same camera settings."
+            f"The frame to subtract, `dark` or `ambient` {tuple(dark.shape[1:])}, must have the size of the frame "
+            f"{tuple(image.shape[1:])}. Take it with the same camera settings."
         )
     return image - dark
 
@@ -159,15 +221,25 @@ def demosaic(image: Tensor, mosaic: Mosaic) -> Tensor:
         ShapeError: more than one channel, or an odd height or width.
     """
     channels, height, width = image.shape[1:]
-    if channels != 1 or height % 2 or width % 2:
-        raise ShapeError(f"A raw mosaic ({channels} x {height} x {width}) must have one channel and even sides.")
+    if channels != 1:
+        raise ShapeError(
+            f"`mosaic` ({mosaic}) is for raw frames of one channel, but a frame ({height} x {width}) has {channels}. "
+            "Use the raw frames of both the PSF and the captures; or, if all have colours, leave it out."
+        )
+    if height % 2 or width % 2:
+        raise ShapeError(f"`mosaic` ({mosaic}) needs frames of even sides, not {height} x {width}. Crop them.")
     samples = [image[..., row::2, column::2] for row in (0, 1) for column in (0, 1)]
     colours = [[sample for sample, letter in zip(samples, mosaic, strict=True) if letter == c] for c in "rgb"]
     return torch.cat([sum(same[1:], same[0]) / len(same) for same in colours], dim=1)
 
 
-def crop_centre(image: Tensor, size: Size) -> Tensor:
+def crop_centre(image: Tensor, size: Size, cell: int = 1) -> Tensor:
     """Crop to the central ``size``; the centre ``(H // 2, W // 2)`` stays the centre.
+
+    Args:
+        image: (..., H, W).
+        size: height and width in pixels, multiples of ``cell``.
+        cell: keep cells of a mosaic, of this many pixels along each axis, whole; the central cell stays the centre.
 
     Raises:
         ShapeError: the image is smaller.
@@ -175,7 +247,8 @@ def crop_centre(image: Tensor, size: Size) -> Tensor:
     height, width = image.shape[-2:]
     if size[0] > height or size[1] > width or min(size) < 1:
         raise ShapeError(f"`crop` ({size[0]} x {size[1]}) must be within the frame ({height} x {width}).")
-    top, left = height // 2 - size[0] // 2, width // 2 - size[1] // 2
+    top = (height // cell // 2 - size[0] // cell // 2) * cell
+    left = (width // cell // 2 - size[1] // cell // 2) * cell
     return image[..., top : top + size[0], left : left + size[1]]
 
 
@@ -195,4 +268,25 @@ def bin_pixels(image: Tensor, factor: int) -> Tensor:
         min(max(n // 2 - (m // 2) * factor, 0), n - m * factor) for n, m in zip(image.shape[-2:], blocks, strict=True)
     ]
     image = image[..., start[0] : start[0] + blocks[0] * factor, start[1] : start[1] + blocks[1] * factor]
-    return torch.nn.functional.avg_pool2d(image, factor)
+    return F.avg_pool2d(image, factor)
+
+
+def enlarge(image: Tensor, factor: int, size: Size) -> Tensor:
+    """Interpolate a reconstruction of binned frames at the pixels before binning, bicubic and without overshoot.
+
+    The centre ``(H // 2, W // 2)`` stays the centre, for the PSF's displacements count from there. At the border, where
+    `bin_pixels` has cut rows and columns, the outermost values are repeated.
+
+    Args:
+        image: (B, C, H, W), linear light.
+        factor: of `bin_pixels`.
+        size: height and width before binning.
+    """
+    places = [
+        (2 * ((torch.arange(length) - length // 2) / factor + blocks // 2) + 1) / blocks - 1
+        for length, blocks in zip(size, image.shape[-2:], strict=True)
+    ]
+    rows, columns = torch.meshgrid(*places, indexing="ij")
+    grid = torch.stack([columns, rows], -1)[None].expand(len(image), -1, -1, -1).to(image)
+    enlarged = F.grid_sample(image, grid, mode="bicubic", padding_mode="border", align_corners=False)
+    return enlarged.clamp(image.amin(), image.amax())

@@ -1,38 +1,47 @@
 """The calibration of a camera: its PSF, and the format of its raw frames."""
 
-import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from mwdn.calibration.camera_file import check_psf_file, read_camera
+from mwdn.calibration.float_scale import check_float_scale
 from mwdn.calibration.frame_format import FrameFormat
-from mwdn.errors import ParameterError, PsfError, ShapeError, check_options
+from mwdn.calibration.psf_format import Background, PsfFormat, with_options
+from mwdn.calibration.white_balance import WhiteBalance, check_white_balance
+from mwdn.errors import ParameterError, PsfError, ShapeError, check_batch, checked, shown
 from mwdn.io.formats import as_frame
-from mwdn.optics.psf import psf_hash
+from mwdn.optics.psf import checked_psf, psf_hash
 from mwdn.types import ArrayPicture, Frame, Image, Measurement, Psf, Size
-
-Background = float | Literal["estimate"]
-"""A level as a fraction of the full scale, or ``"estimate"``."""
 
 SATURATED_PART = 1e-3
 """Largest fraction of saturated pixels in a PSF: a few hot pixels do no harm, saturated lines do. 102 of 320 x 320."""
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """A PSF, and how raw frames of its camera become measurements.
 
     Args:
-        psf: (1, C, H, W), not negative, each channel of unit sum, centred at ``(H // 2, W // 2)``.
+        psf: (1, C, H, W), not negative, centred at ``(H // 2, W // 2)``. Each channel is scaled to unit sum.
         frames: format of raw frames.
         dark: (1, C or 1, h, w), raw frame taken without light, as a fraction of the full scale.
         background: level that was subtracted from each channel of the PSF, as a fraction of the full scale.
         pitch_um: distance between pixels after binning.
         distance_mm: distance from the point source to the camera.
+        ambient: (1, C or 1, h, w), raw frame taken with the room's light alone, as a fraction of the full scale.
+        psf_format: where the PSF's file differed from the captures.
+        light: sum of each channel of the PSF before it was normalised: the colour of the point source.
+        white_balance: of the camera's pictures; `mwdn.Reconstructor` applies it.
+
+    Raises:
+        PsfError: the PSF has other axes, or is negative, not finite, or dark.
+        ParameterError: an argument is of another type or outside its range.
     """
 
     psf: Psf
@@ -41,6 +50,30 @@ class Calibration:
     background: tuple[float, ...] = ()
     pitch_um: float | None = None
     distance_mm: float | None = None
+    ambient: Tensor | None = None
+    psf_format: PsfFormat = PsfFormat()
+    light: tuple[float, ...] = ()
+    white_balance: WhiteBalance | None = None
+
+    @classmethod
+    def load(cls, path: str | Path, **options: Any) -> "Calibration":  # noqa: ANN401
+        """Read a camera file, as `mwdn calibrate` writes it.
+
+        Args:
+            path: the camera file, see `mwdn.calibration.camera_file`.
+            **options: values that replace those of the file: ``bin=4``, ``psf="other.png"``.
+
+        Raises:
+            PsfError: as for `from_file`; or the PSF's file has changed since the camera file was written.
+            MwdnError: as for `from_file`, and for a camera file with wrong keys or values.
+        """
+        camera = read_camera(path)
+        sha256, own_psf = camera.pop("psf_sha256", ""), camera["psf"]
+        camera |= options
+        if camera["psf"] == own_psf:
+            check_psf_file(path, sha256, own_psf)
+        extra = {name: camera.pop(name, None) for name in ("white_balance", "pitch_um", "distance_mm")}
+        return replace(cls.from_file(camera.pop("psf"), **camera), **extra)
 
     @classmethod
     def from_file(
@@ -48,34 +81,40 @@ class Calibration:
         path: str | Path,
         frames: FrameFormat = FrameFormat(),
         *,
+        psf_format: PsfFormat = PsfFormat(),
         dark: str | Path | None = None,
-        background: Background = "estimate",
-        psf_bin: int | None = None,
-        **fields: Any,  # noqa: ANN401
+        ambient: str | Path | None = None,
+        **options: Any,  # noqa: ANN401
     ) -> "Calibration":
-        """Read the picture of a point source.
+        """Read the picture of a point source, or a camera file.
 
         Args:
-            path: PNG, TIFF or NPY of 8 to 16 bits or floats, grey or colour, linear in light.
+            path: PNG, TIFF or NPY of 8 to 16 bits or floats, grey or colour; or a ``.toml`` for `load`, where only
+                options that differ are given.
             frames: format of the PSF, the dark frame and the captures.
+            psf_format: where the PSF's file differs from it.
             dark: frame taken with the same exposure and no light; subtracted from the PSF and from captures.
-            background: uniform light under the PSF in addition to the dark frame: a fraction of the full scale, or
-                ``"estimate"`` (see `estimate_background`). 0 for a PSF without background.
-            psf_bin: ``bin`` of the PSF, if it was taken at another resolution than the captures. The crop is scaled
-                to cover the same part of the view, and the dark frame is not subtracted from the PSF.
-            **fields: fields of `FrameFormat`, which replace those of ``frames``: ``bin=4, bit_depth=12``.
+            ambient: frame taken with the room's light alone and the exposure of the captures; subtracted from captures,
+                not from the PSF.
+            **options: fields of `FrameFormat` and `PsfFormat`, which replace those of ``frames`` and ``psf_format``:
+                ``bin=4, bit_depth=12, gamma="srgb", background=0.0, psf_bin=8``.
 
         Raises:
             ImageError: a file cannot be read.
             PsfError: the PSF is saturated, empty, or has neither 1 nor 3 channels.
             ShapeError: the dark frame does not fit, or a mosaic has colours or odd sides.
-            ParameterError: a number is outside its range, or a field has another name.
+            ParameterError: a number is outside its range.
+            UnknownNameError: an option has another name.
         """
-        if "psf_binning" in fields:
-            psf_bin = _renamed("psf_binning", "psf_bin", fields.pop("psf_binning"))
-        frames = _with_fields(frames, fields)
+        if Path(path).suffix.lower() == ".toml":
+            if (frames, psf_format) != (FrameFormat(), PsfFormat()):
+                raise ParameterError(f"`{path}` has its own `frames` and `psf_format`. Give what differs: `bin=4`.")
+            frame_files = {"dark": dark, "ambient": ambient}
+            return cls.load(path, **options, **{name: file for name, file in frame_files.items() if file is not None})
+        frames, psf_format = with_options(frames, psf_format, options)
         dark_frame = None if dark is None else frames.read(dark)
-        return cls._from_frame(frames.read(path), frames, dark_frame, background, psf_bin)
+        ambient_frame = None if ambient is None else frames.read(ambient)
+        return cls._from_frame(frames.read(path), frames, psf_format=psf_format, dark=dark_frame, ambient=ambient_frame)
 
     @classmethod
     def from_array(
@@ -83,65 +122,71 @@ class Calibration:
         picture: ArrayPicture,
         frames: FrameFormat = FrameFormat(),
         *,
+        psf_format: PsfFormat = PsfFormat(),
         dark: ArrayPicture | None = None,
-        background: Background = "estimate",
-        psf_bin: int | None = None,
-        **fields: Any,  # noqa: ANN401
+        ambient: ArrayPicture | None = None,
+        **options: Any,  # noqa: ANN401
     ) -> "Calibration":
         """Calibrate from a numpy array or PIL picture of a point source.
 
         Args:
-            picture: (H, W) or (H, W, 1 or 3), RGB, row 0 at the top, linear in light; uint8 and uint16 up to their
-                type's maximum unless ``bit_depth`` is given, floats up to 1.
+            picture: (H, W) or (H, W, 1 or 3), RGB, row 0 at the top, linear in light unless ``psf_gamma`` is given.
+                uint8 and uint16 saturate at their type's maximum unless ``bit_depth`` is given; floats have any scale.
             frames: as for `from_file`, as are the other arguments.
+            psf_format: where the PSF's picture differs from it.
             dark: frame taken with the same exposure and no light.
-            background: uniform light under the PSF.
-            psf_bin: ``bin`` of the PSF.
-            **fields: fields of `FrameFormat`.
+            ambient: frame taken with the room's light alone.
+            **options: fields of `FrameFormat` and `PsfFormat`.
 
         Raises:
             ImageError: the array has other axes or numbers.
             MwdnError: as for `from_file`.
         """
-        frames = _with_fields(frames, fields)
+        frames, psf_format = with_options(frames, psf_format, options)
         dark_frame = None if dark is None else as_frame(dark)
-        return cls._from_frame(as_frame(picture), frames, dark_frame, background, psf_bin)
+        ambient_frame = None if ambient is None else as_frame(ambient)
+        return cls._from_frame(as_frame(picture), frames, psf_format=psf_format, dark=dark_frame, ambient=ambient_frame)
 
     @classmethod
     def _from_frame(
-        cls, frame: Frame, frames: FrameFormat, dark: Frame | None, background: Background, psf_bin: int | None
+        cls, frame: Frame, frames: FrameFormat, *, psf_format: PsfFormat, dark: Frame | None, ambient: Frame | None
     ) -> "Calibration":
         _refuse_saturated(frames, frame)
         dark_image = None if dark is None else frames.normalise(dark)
-        # The PSF is flipped last, about its centre.
-        psf_frames, psf_dark = replace(frames, upside_down=False), dark_image
-        if psf_bin is not None and psf_bin != frames.bin:
-            psf_frames, psf_dark = psf_frames.with_bin(psf_bin), None
-        psf = psf_frames.to_measurement(frame, psf_dark)
-
-        level = _background_level(psf, background)
+        psf_dark = dark_image if psf_format.shares_pixels(frames) else None
+        psf = psf_format.own_frames(frames).to_measurement(frame, psf_dark)
+        level = _background_level(psf, psf_format.background)
         psf = (psf - level).clamp(min=0)
         total = psf.sum((-2, -1), keepdim=True)
         if not (total > 0).all():
             raise PsfError(_empty(total.flatten() > 0, level.flatten(), with_dark=dark is not None))
-        psf = psf / total
         return cls(
-            flip_rows_about_centre(psf) if frames.upside_down else psf,
+            psf_format.turn(psf / total, frames),
             frames,
             dark_image,
             background=tuple(round(float(value), 6) for value in level.flatten()),
+            ambient=None if ambient is None else frames.normalise(ambient),
+            psf_format=psf_format,
+            light=tuple(total.flatten().tolist()),
         )
 
     def __post_init__(self) -> None:
-        if self.psf.ndim != 4 or self.psf.shape[0] != 1 or self.psf.shape[1] not in (1, 3):
-            raise PsfError(f"`psf` {tuple(self.psf.shape)} must be (1, 1 or 3, H, W): grey or RGB.")
-        if not self.psf.isfinite().all():
-            raise PsfError("`psf` holds NaN or infinity. Capture it again.")
-        if self.psf.min() < 0 or not (self.psf.sum((-2, -1)) > 0).all():
-            raise PsfError(
-                f"`psf` (smallest value {self.psf.min():.3g}) must not be negative, and must hold light in each "
-                "channel. Subtract its background and clip it: `psf.clamp(min=0)`."
+        if not isinstance(self.psf, Tensor):
+            raise ParameterError(
+                f"`psf` ({shown(self.psf)}) must be a tensor (1, C, H, W). `Calibration.from_array(picture)` takes a "
+                "numpy array or PIL picture of a point source, `Calibration.from_file('psf.png')` a file."
             )
+        if self.psf.ndim != 4 or self.psf.shape[0] != 1 or self.psf.shape[1] not in (1, 3) or 0 in self.psf.shape:
+            raise PsfError(f"`psf` {tuple(self.psf.shape)} must be (1, 1 or 3, H, W): grey or RGB.")
+        object.__setattr__(self, "psf", checked_psf(self.psf))
+        for name in ("dark", "ambient"):
+            if getattr(self, name) is not None:
+                check_batch(getattr(self, name), name)
+        check_white_balance(self.white_balance, self.light)
+
+    def __repr__(self) -> str:
+        colours = "RGB" if self.psf.shape[1] == 3 else "grey"
+        return f"Calibration({self.size[0]} x {self.size[1]}, {colours}, PSF {self.psf_hash}, {self.frames})"
 
     @cached_property
     def psf_hash(self) -> str:
@@ -161,29 +206,43 @@ class Calibration:
         """Turn a raw frame into a measurement of the PSF's size.
 
         Args:
-            frame: (H, W) or (H, W, C) raw pixel values, RGB: from `FrameFormat.read`, or another numpy array or
-                PIL picture of uint8, uint16 or floats.
+            frame: (H, W) or (H, W, 1 or 3) raw pixel values, RGB, row 0 at the top: from `FrameFormat.read`, or another
+                numpy array or PIL picture. Integers, uint8 or uint16, saturate at their type's maximum and floats at 1,
+                unless `FrameFormat.bit_depth` is given. They are linear in light unless ``gamma`` is given.
 
         Returns:
             (1, C, *size), linear light; 1 is saturation.
 
         Raises:
             ShapeError: the frame does not fit the PSF.
-            ParameterError: a pixel value exceeds the bit depth.
+            ImageError: the array has other axes or types.
+            ParameterError: a pixel value exceeds the bit depth, or floats exceed 1 by far.
         """
-        measurement = self.frames.to_measurement(as_frame(frame, finite=False), self.dark)
+        measurement = self.to_measurement(frame)
+        self.check_fit(measurement)
+        return measurement
+
+    def to_measurement(self, frame: ArrayPicture) -> Measurement:
+        """Turn a raw frame into a measurement of the frame's own size: `correct` without `check_fit`."""
+        # The ambient frame has the dark level, too: (capture - dark) - (ambient - dark) = capture - ambient.
+        offset = self.dark if self.ambient is None else self.ambient
+        frame = as_frame(frame, finite=False)
+        check_float_scale(frame, self.frames.bit_depth)
+        return self.frames.to_measurement(frame, offset)
+
+    def check_fit(self, measurement: Measurement) -> None:
+        """Raise a `ShapeError` unless the measurement (1, C, H, W) has the PSF's size, and colours if the PSF has."""
         size = measurement.shape[-2], measurement.shape[-1]
         if size != self.size:
             raise ShapeError(
                 f"`psf` ({self.size[0]} x {self.size[1]}) and the capture ({size[0]} x {size[1]}) must have the same "
-                f"height and width. {_advise(size, self.size, self.frames.bin)}"
+                f"height and width. {_advise(size, self.size, self.frames)}"
             )
         if measurement.shape[1] == 1 and self.psf.shape[1] == 3:
             raise ShapeError(
                 "The capture is grey, but `psf` has colours. Use both as grey: `--grey`. If the capture is the raw "
                 "frame of a colour sensor, give the order of its filters: `--mosaic rggb`."
             )
-        return measurement
 
 
 def estimate_background(image: Image) -> Tensor:
@@ -195,28 +254,6 @@ def estimate_background(image: Image) -> Tensor:
     """
     pixels = image.flatten(2).sort(dim=-1).values
     return pixels[..., int(0.05 * pixels.shape[-1])][..., None, None]
-
-
-def flip_rows_about_centre(psf: Psf) -> Psf:
-    """Reverse the rows of a PSF and keep its centre at ``H // 2``: an even height needs a shift by one row.
-
-    A capture is flipped without this shift: it has no centre to keep, and its last row would become its first.
-    """
-    flipped = psf.flip(-2)
-    return flipped.roll(1, -2) if psf.shape[-2] % 2 == 0 else flipped
-
-
-def _with_fields(frames: FrameFormat, fields: dict[str, Any]) -> FrameFormat:
-    """The format with these fields replaced; a `ParameterError` names one that it does not have."""
-    if "binning" in fields:
-        fields["bin"] = _renamed("binning", "bin", fields.pop("binning"))
-    check_options(FrameFormat, "`Calibration`", fields)
-    return replace(frames, **fields)
-
-
-def _renamed(old: str, new: str, value: int | None) -> int | None:
-    warnings.warn(f"`{old}` is now called `{new}`: `{new}={value}`.", DeprecationWarning, stacklevel=4)
-    return value
 
 
 def _refuse_saturated(frames: FrameFormat, frame: Frame) -> None:
@@ -232,8 +269,6 @@ def _refuse_saturated(frames: FrameFormat, frame: Frame) -> None:
 def _background_level(psf: Tensor, background: Background) -> Tensor:
     if background == "estimate":
         return estimate_background(psf).clamp(min=0)  # negative if the file's background was subtracted before
-    if not 0 <= background < 1:
-        raise ParameterError(f"`background` ({background}) must be in [0, 1), a fraction of the full scale.")
     return torch.full((1, psf.shape[1], 1, 1), float(background))
 
 
@@ -249,15 +284,16 @@ def _empty(has_light: Tensor, level: Tensor, *, with_dark: bool) -> str:
     )
 
 
-def _advise(capture: Size, psf: Size, bin: int) -> str:
+def _advise(capture: Size, psf: Size, frames: FrameFormat) -> str:
     for larger, smaller, name, options in (
         (psf, capture, "PSF", "--psf-bin {product}"),
         (capture, psf, "capture", "--bin {product} --psf-bin {bin}"),
     ):
         factor = larger[0] // smaller[0]
         if factor > 1 and larger == (smaller[0] * factor, smaller[1] * factor):
-            options = options.format(product=bin * factor, bin=bin)
+            options = options.format(product=frames.bin * factor, bin=frames.bin)
             return f"The {name} is {factor} times as large: bin it by {factor}, `{options}`."
     if psf[0] <= capture[0] and psf[1] <= capture[1]:
-        return f"Crop the capture around its centre: `--crop {psf[0] * bin} {psf[1] * bin}`."
+        raw = frames.bin * frames.cell
+        return f"Crop the capture around its centre: `--crop {psf[0] * raw} {psf[1] * raw}`."
     return "Use the PSF that belongs to this camera."

@@ -56,6 +56,8 @@ class PsfReport:
         levels: of the file; ``None`` without a file.
         support: region of the light.
         peak_width_px: full width of the autocorrelation's peak at half maximum; lines are narrower by about sqrt(2).
+        bin: of the file's pixels, as given.
+        coarsest_bin: largest value of ``bin`` that loses little, see `mwdn.optics.psf_measures.coarsest_bin`.
         side_lobe: highest value of the autocorrelation besides its peak, and its position (rows, columns).
         weak_part: fraction of the frequencies with less than 1/100 of their ring's power; 0.01 for any random mask.
         dark_rings: frequencies, in cycles per pixel, that have no signal in any direction.
@@ -76,6 +78,8 @@ class PsfReport:
     levels: Levels | None
     support: psf_measures.Support
     peak_width_px: float
+    bin: int
+    coarsest_bin: int
     side_lobe: tuple[float, tuple[int, int]]
     weak_part: float
     dark_rings: tuple[float, ...]
@@ -123,6 +127,8 @@ def inspect_psf(
         levels=levels,
         support=psf_measures.support(psf),
         peak_width_px=peak.width,
+        bin=calibration.frames.bin,
+        coarsest_bin=calibration.frames.bin * psf_measures.coarsest_bin(psf),
         side_lobe=(peak.lobe, peak.lobe_at),
         weak_part=weak[0],
         dark_rings=weak[1],
@@ -155,9 +161,9 @@ def _known_frequency(psf: Psf, floor: float) -> float:
 
 
 def _levels(calibration: Calibration, frame: Frame) -> Levels:
-    frames = calibration.frames
-    upright = frames.to_measurement(frame, calibration.dark)
-    image = upright.flip(-2) if frames.upside_down else upright
+    psf_format, captures = calibration.psf_format, calibration.frames
+    frames = psf_format.own_frames(captures)
+    image = frames.to_measurement(frame, calibration.dark if psf_format.shares_pixels(captures) else None)
     background = estimate_background(image)
     integers = frame.dtype.kind != "f"
     scale = frames.full_scale(frame) if integers else 1.0
@@ -168,6 +174,7 @@ def _levels(calibration: Calibration, frame: Frame) -> Levels:
     subtracted = torch.tensor(calibration.background or (0.0,) * image.shape[1])[:, None, None]
     light = (image - subtracted).clamp(min=0).sum((-2, -1), keepdim=True).clamp(min=1e-30)
     pixels = image.shape[-2] * image.shape[-1]
+    upright = psf_format.turn(image, captures).mean((0, 1))
     share = background.clamp(min=0) * pixels / image.clamp(min=0).sum((-2, -1), keepdim=True).clamp(min=1e-30)
     return Levels(
         integers=integers,
@@ -177,7 +184,7 @@ def _levels(calibration: Calibration, frame: Frame) -> Levels:
         background=tuple(background.flatten().tolist()),
         subtracted=calibration.background,
         pedestal=float(share.max()),
-        between=psf_measures.level_between_lines(upright.mean((0, 1))[psf_measures.support_box(calibration.psf)]),
+        between=psf_measures.level_between_lines(upright[psf_measures.support_box(calibration.psf)]),
         noise=float(noise.max()),
         noise_floor=float((pixels * (noise / light).square()).max()),
     )

@@ -136,10 +136,9 @@ def _detail(report: PsfReport) -> Iterator[Finding]:
         yield Finding("good", f"It does not repeat itself: the highest side lobe is {lobe:.2f} of the peak.")
     width = report.peak_width_px
     if width > 8:
-        text = (
-            f"Its lines are about {width / 2**0.5:.1f} px wide: finer detail is reconstructed faint and noisy. "
-            f"Binning by {int(width / 4)} loses little: `--bin {int(width / 4)}`."
-        )
+        text = f"Its lines are about {width / 2**0.5:.1f} px wide: finer detail is reconstructed faint and noisy."
+        if report.coarsest_bin > report.bin:
+            text += f" Binning loses little: `--bin {report.coarsest_bin}`, the default of `mwdn reconstruct`."
         yield Finding("mind", text)
     else:
         yield Finding("good", f"Sharp: its lines are about {width / 2**0.5:.1f} px wide.")

@@ -1,50 +1,141 @@
 """The command line, assembled from one file per command."""
 
+import os
 import sys
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
 from typing import NoReturn
 
 import cyclopts
 from cyclopts import App
 
-from mwdn.cli.benchmark import benchmark
-from mwdn.cli.camera import complain, errors
-from mwdn.cli.demo import demo
-from mwdn.cli.design import design
-from mwdn.cli.doctor import doctor
-from mwdn.cli.evaluate import evaluate
-from mwdn.cli.export import export
-from mwdn.cli.import_ import import_
-from mwdn.cli.inspect import inspect
-from mwdn.cli.methods import methods
-from mwdn.cli.reconstruct import reconstruct
-from mwdn.cli.train import simulate, train
+from mwdn.cli import terminal
+from mwdn.cli.as_typed import as_typed
+from mwdn.cli.camera_values import from_camera_file
+from mwdn.cli.given_options import note_given_bin
 from mwdn.errors import MwdnError
 from mwdn.runtime.memory import keep_memory
 from mwdn.version import __version__
 
-app = App(
-    name="mwdn",
-    version=__version__,
-    help="Lensless imaging: reconstruct the scene from the pattern that a thin mask casts on a sensor. Add --debug to "
-    "any command for the traceback of an error.",
-)
-for command in (reconstruct, methods, design, inspect, simulate, train, export, benchmark, evaluate, demo, doctor):
-    app.command(command)
-app.command(import_, name="import")
+COMMANDS = {
+    "reconstruct": ("reconstruct:reconstruct", "Reconstruct captures: files, or folders of them."),
+    "calibrate": (
+        "calibrate:calibrate",
+        "Write a camera file: the PSF, and everything else that other commands need to know about the camera.",
+    ),
+    "methods": ("methods:methods", "List the reconstruction methods, or the options of one."),
+    "design": ("design:design", "Design a mask and compute the PSF of a camera with it."),
+    "inspect": (
+        "inspect:inspect",
+        "Report the quality of a PSF: exposure, background, sharpness, spectrum, noise gain, resolution.",
+    ),
+    "simulate": ("train:simulate", "Write a file of pairs: photographs as scenes, and simulated captures of them."),
+    "train": (
+        "train:train",
+        "Train a network for one camera, on simulated captures, on recorded pairs, or on captures without scenes.",
+    ),
+    "recipes": (
+        "recipes:recipes",
+        "List the recipes of the package, or print one: `mwdn recipes quick-cpu > mine.toml`.",
+    ),
+    "export": ("export:export", "Write a method for one camera as a file for other programs: ONNX, or torch's .pt2."),
+    "benchmark": (
+        "benchmark:benchmark",
+        "Train and score every method of a recipe under one protocol, and write one page.",
+    ),
+    "evaluate": ("evaluate:evaluate", "Compare methods on pairs of measurements and scenes: quality, time, memory."),
+    "demo": (
+        "demo:demo",
+        "Simulate a small lensless camera and reconstruct its captures with every method that needs no training.",
+    ),
+    "doctor": ("doctor:doctor", "Print versions, devices, supported precisions and threads."),
+    "import": (
+        "import_:import_",
+        "Convert a public data set, or two folders of pictures, to one file of pairs.",
+    ),
+}
+"""Module in `mwdn.cli` and function of each command, and the first line of its docstring."""
+
+
+GLOBAL = {"--quiet": "-q", "--verbose": "-v", "--debug": "--debug"}
+"""Options of all commands, and their short forms."""
+
+
+def make_app(command: str | None = None) -> App:
+    """The command line. Only the one command that runs is imported: most import torch, which takes two seconds."""
+    app = App(
+        name="mwdn",
+        version=__version__,
+        config=(from_camera_file, note_given_bin),
+        help="Lensless imaging: reconstruct the scene from the pattern that a thin mask casts on a sensor.",
+        help_epilogue="Every command takes --quiet (-q) for errors and what was asked for alone, --verbose (-v) for "
+        "versions, times and what was assumed, and --debug for the traceback of an error.",
+        suppress_keyboard_interrupt=False,  # `main` says how to go on
+    )
+    for name, (place, summary) in COMMANDS.items():
+        module, _, function = place.partition(":")
+        if name == command:
+            app.command(getattr(import_module(f"mwdn.cli.{module}"), function), name=name)
+        else:
+            app.command(f"mwdn.cli.{place}", name=name, help=summary)
+    app.register_install_completion_command(
+        help="Let the shell (bash, zsh, fish, PowerShell) complete commands and options."
+    )
+    return app
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
-    """Run the command line and exit: 0 on success, 1 if some captures failed, 2 for a wrong call."""
+    """Run the command line and exit: 0 on success, 1 if some captures failed, 2 for a wrong call, 130 for Ctrl-C."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    debug = "--debug" in arguments
+    chosen = {name: not {name, short}.isdisjoint(arguments) for name, short in GLOBAL.items()}
+    arguments = [argument for argument in arguments if argument not in {*GLOBAL, *GLOBAL.values()}]
+    command = next((argument for argument in arguments if argument in COMMANDS), None)
     keep_memory()
+    app = make_app(command)
+    terminal.set_up(
+        quiet=chosen["--quiet"],
+        verbose=chosen["--verbose"],
+        json="--json" in arguments,
+        spell=lambda message: as_typed(message, _options(app, arguments), arguments),
+    )
     try:
-        result = app([a for a in arguments if a != "--debug"], exit_on_error=False, print_error=True)
+        with warnings.catch_warnings(), _timed(verbose=chosen["--verbose"]):
+            warnings.showwarning = lambda message, *_, **__: terminal.warn(str(message))
+            result = app(arguments, exit_on_error=False, print_error=True)
     except cyclopts.CycloptsError:
         sys.exit(2)
     except MwdnError as error:
-        if debug:
-            errors.print_exception()
-        complain("[bold red]Error:[/]", error)
+        if chosen["--debug"]:
+            terminal.errors.print_exception()
+        terminal.complain("[bold red]Error:[/]", error)
         sys.exit(2)
+    except KeyboardInterrupt as interrupt:
+        if os.environ.get("RANK", "0") == "0":  # one of several processes speaks
+            terminal.errors.print(str(interrupt) or "Interrupted.", highlight=False, markup=False, soft_wrap=True)
+        sys.exit(130)  # 128 + SIGINT, as shells report it
     sys.exit(result if isinstance(result, int) else 0)
+
+
+def _options(app: App, arguments: list[str]) -> set[str]:
+    """Options of the command that runs."""
+    _, apps, _ = app.parse_commands(arguments)
+    return {name for argument in apps[-1].assemble_argument_collection() for name in argument.names}
+
+
+@contextmanager
+def _timed(*, verbose: bool) -> Iterator[None]:
+    """Print the versions before a command and its time after it, if they are wanted."""
+    if not verbose:
+        yield
+        return
+    from mwdn.runtime.environment import describe_environment
+
+    terminal.detail(", ".join(f"{name} {value}" for name, value in describe_environment().items()))
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        terminal.detail(f"{time.perf_counter() - start:.1f} s")

@@ -7,16 +7,20 @@ from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
-from rich.progress import Progress, ProgressColumn
 
-from mwdn.cli.camera import console, errors
+from mwdn.cli.folders import no_empty_folder
+from mwdn.cli.progress import show_progress
+from mwdn.cli.terminal import console, if_interrupted
+from mwdn.cli.weights import ask_for_lpips
 
 
+@no_empty_folder
 def benchmark(
     recipe: Path,
     *,
     out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("runs/benchmark"),
     device: str | None = None,
+    lpips: bool | None = None,
 ) -> None:
     """Train and score every method of a recipe under one protocol, and write one page.
 
@@ -24,22 +28,21 @@ def benchmark(
     folder, started by hand or by torchrun, share the networks.
 
     Args:
-        recipe: TOML file, see recipes/benchmark-*.toml. A method or a data set is one line of it.
+        recipe: benchmark-small, benchmark-paper, or a TOML file like those (`mwdn recipes`).
+            A method or a data set is one line of it.
         out: folder; index.html is the page, benchmark.md, .json and .csv hold the same results.
         device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
+        lpips: LPIPS and feature MSE: download their public weights (234 MiB, once) if they are missing, or leave both
+            metrics out. By default they are used if they are there; a terminal asks before a download.
     """
     from mwdn.benchmark import Watch, read_benchmark, run
     from mwdn.benchmark.run import PAGE
 
     contents = read_benchmark(recipe)
-    columns: list[str | ProgressColumn] = [*Progress.get_default_columns(), "{task.fields[note]}"]
-    with Progress(*columns, console=errors, disable=os.environ.get("RANK", "0") != "0") as bars:
-        bar = bars.add_task("Starting", total=None, note="")
-
-        def stage(title: str, parts: int) -> None:
-            bars.print(title, markup=False, highlight=False)
-            bars.reset(bar, description=title, total=parts or None, note="")
-
-        watch = Watch(stage, lambda parts, note: bars.update(bar, completed=parts, note=note))
-        run(contents, out, device=device, command=shlex.join(["mwdn", *sys.argv[1:]]), watch=watch)
+    lpips = ask_for_lpips(lpips, contents.alexnet, contents.heads)
+    is_first = os.environ.get("RANK", "0") == "0"
+    go_on = "Interrupted. The same command resumes: finished networks and scores are kept."
+    with if_interrupted(lambda: go_on), show_progress(enabled=is_first, titles=True) as progress:
+        watch = Watch(lambda title, parts: progress.start(title, parts or None, first=None), progress.update)
+        run(contents, out, device=device, lpips=lpips, command=shlex.join(["mwdn", *sys.argv[1:]]), watch=watch)
     console.print(f"Look at {out / PAGE}", highlight=False, markup=False, soft_wrap=True)

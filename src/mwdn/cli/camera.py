@@ -1,57 +1,64 @@
-"""Options of the camera, and output to the terminal: shared by most commands."""
+"""Options of the camera, shared by most commands."""
 
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
-from rich.console import Console
-from rich.markup import escape
 
-from mwdn.calibration import Calibration, FrameFormat
-from mwdn.errors import MwdnError
-
-console = Console()
-errors = Console(stderr=True)
+from mwdn.calibration import Calibration, FrameFormat, PsfFormat
+from mwdn.cli.terminal import detail
+from mwdn.errors import ParameterError
 
 
 @Parameter(name="*")
 @dataclass(frozen=True)
 class CameraOptions:
-    """The camera's PSF and the format of its raw frames.
+    """The camera's PSF and the format of its raw frames, or the file that holds them.
 
     Args:
-        psf: picture of a point source: PNG, TIFF or NPY, linear in light.
+        psf: picture of a point source: PNG, TIFF, NPY or a camera's raw file.
         frames: format of the PSF, the dark frame and the captures.
-        psf_bin: the value of --bin for the PSF, if it was taken at another resolution than the captures.
+        psf_format: where the PSF's file differs from it.
         dark: frame taken without light, subtracted from the PSF and the captures.
-        background: uniform light under the PSF, as a fraction of the full scale; estimated if not given.
+        ambient: frame taken with the room's light alone, subtracted from the captures.
+        camera: camera file of `mwdn calibrate`, with all of these; options on the command line take precedence.
     """
 
-    psf: Path
+    psf: Path | None = None
     frames: Annotated[FrameFormat, Parameter(name="*")] = FrameFormat()
     _: KW_ONLY
-    psf_bin: int | None = None
+    psf_format: Annotated[PsfFormat, Parameter(name="*")] = PsfFormat()
     dark: Path | None = None
-    background: float | None = None
+    ambient: Path | None = None
+    camera: Path | None = None
+
+    @property
+    def roles(self) -> dict[str, Path]:
+        """Files that describe the camera, by what they are."""
+        files = {"PSF": self.psf, "dark frame": self.dark, "ambient frame": self.ambient, "camera file": self.camera}
+        return {role: path for role, path in files.items() if path is not None}
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Files that describe the camera: never captures, never overwritten."""
+        return tuple(self.roles.values())
+
+    @property
+    def psf_file(self) -> Path:
+        """The PSF's file, from the command line or the camera file.
+
+        Raises:
+            ParameterError: neither was given.
+        """
+        if self.psf is None:
+            raise ParameterError("Give the camera's PSF, `--psf psf.png`, or its camera file, `--camera camera.toml`.")
+        return self.psf
 
     def load(self) -> Calibration:
         """Read the calibration."""
-        return Calibration.from_file(
-            self.psf,
-            self.frames,
-            dark=self.dark,
-            background="estimate" if self.background is None else self.background,
-            psf_bin=self.psf_bin,
-        )
-
-
-def warn(*warnings: str | None) -> None:
-    """Print each warning that is not ``None``."""
-    for warning in filter(None, warnings):
-        errors.print(f"[yellow]Warning:[/] {escape(warning)}", highlight=False, soft_wrap=True)
-
-
-def complain(start: str, error: MwdnError) -> None:
-    """Print an error on one line: brackets are not markup, and paths are not wrapped at the terminal's width."""
-    errors.print(f"{start} {escape(str(error))}", highlight=False, soft_wrap=True)
+        formats = {**vars(self.frames), **vars(self.psf_format)}
+        detail(f"{self.psf_file}: {', '.join(f'{name} {value}' for name, value in formats.items())}")
+        if self.camera is None:
+            return Calibration.from_file(self.psf_file, dark=self.dark, ambient=self.ambient, **formats)
+        return Calibration.load(self.camera, psf=self.psf_file, dark=self.dark, ambient=self.ambient, **formats)

@@ -9,7 +9,7 @@ from cyclopts import Parameter
 from rich.table import Table
 
 from mwdn.calibration import Calibration
-from mwdn.cli.camera import console
+from mwdn.cli.terminal import console
 from mwdn.evaluation import psnr
 from mwdn.evaluation.tables import html_table
 from mwdn.inference.reconstructor import Reconstructor

@@ -7,9 +7,11 @@ from typing import Annotated, Any
 from cyclopts import App, Parameter
 from cyclopts.config import Toml
 
-from mwdn.cli.camera import console
-from mwdn.errors import ParameterError
-from mwdn.optics import MASKS, Setup
+from mwdn.cli.terminal import console
+from mwdn.errors import UnknownNameError
+from mwdn.io.files import refuse_overwrite
+from mwdn.io.toml import find_recipe
+from mwdn.optics import MASKS, ArrayMask, Setup
 from mwdn.optics.masks import MaskDesign
 
 
@@ -17,10 +19,7 @@ def _recipe(app: App, commands: tuple[str, ...], arguments: Any) -> None:  # noq
     """Read options that the command line does not set from the file of ``--recipe``."""
     for argument in arguments:
         if argument.name == "--recipe" and argument.tokens:
-            path = Path(argument.tokens[0].value)
-            if not path.is_file():
-                raise ParameterError(f"`recipe` ({path}) must be a TOML file, such as recipes/camera-mwdn.toml.")
-            Toml(path, use_commands_as_keys=False)(app, commands, arguments)
+            Toml(find_recipe(argument.tokens[0].value), use_commands_as_keys=False)(app, commands, arguments)
             return
 
 
@@ -40,7 +39,8 @@ class Output:
     out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("camera")
     """Folder for mask.tif, psf.tif, camera.json and preview.png."""
     recipe: Path | None = None
-    """TOML file with options of this command; options on the command line take precedence."""
+    """TOML file with options of this command, or a recipe of the package, such as camera-mwdn; options on the command
+    line take precedence."""
     sensitivity: bool = False
     """Compare the PSFs of nearer, farther and off-axis points with this one. Takes several times as long."""
     gds: bool = False
@@ -96,3 +96,26 @@ def _add_command(name: str, kind: type[MaskDesign]) -> None:
 
 for _name, _kind in MASKS.items():
     _add_command(_name, _kind)
+
+
+@design.command
+def array(
+    *,
+    mask: Annotated[ArrayMask, Flat],
+    setup: Annotated[Setup, Flat] = Setup(),
+    output: Output = Output(),
+) -> None:
+    """The PSF of a mask from a file: heights, phases, amplitudes or transmissions."""
+    refuse_overwrite(output.out / "mask.tif", mask.mask)
+    output.write("array", mask, setup)
+
+
+@design.default
+def default(*tokens: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)]) -> None:
+    """`mwdn design --mask FILE` is short for `mwdn design array --mask FILE`."""
+    if any(token.partition("=")[0] == "--mask" for token in tokens):
+        design(("array", *tokens), exit_on_error=False, print_error=True)
+    elif tokens:
+        raise UnknownNameError("mask", tokens[0], [*MASKS, "array"])
+    else:
+        design.help_print()

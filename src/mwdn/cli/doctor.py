@@ -1,10 +1,23 @@
 """`mwdn doctor`: the environment, for bug reports."""
 
-from mwdn.cli.camera import console
+from rich.table import Table
+
+from mwdn.cli.terminal import Json, print_json, results
 
 
-def doctor() -> None:
-    """Print versions, devices, supported precisions and threads."""
-    from mwdn.runtime.environment import print_environment
+def doctor(*, json: Json = False) -> None:
+    """Print versions, devices, supported precisions and threads.
 
-    print_environment(console)
+    Args:
+        json: print them as JSON instead of a table.
+    """
+    from mwdn.runtime.environment import describe_environment
+
+    facts = describe_environment()
+    if json:
+        print_json(facts)
+        return
+    table = Table(show_header=False)
+    for name, value in facts.items():
+        table.add_row(name, value)
+    results.print(table)

@@ -1,28 +1,42 @@
 """`mwdn evaluate`: compare methods on pairs of measurements and scenes."""
 
+from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
-from rich.progress import Progress
 
-from mwdn.cli.camera import CameraOptions, console, errors, warn
-from mwdn.evaluation import Variant
+from mwdn.cli.camera import CameraOptions
+from mwdn.cli.folders import no_empty_folder
+from mwdn.cli.method_options import MethodOptions, read_options
+from mwdn.cli.progress import show_progress
+from mwdn.cli.terminal import Json, console, if_interrupted, results, warn
+from mwdn.cli.weights import ask_for_lpips
+from mwdn.evaluation import Perceptual, Variant
+from mwdn.evaluation.alexnet import SMALLEST
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import check_folder, refuse_overwrite
 
 
-def evaluate(
+@no_empty_folder
+def evaluate(  # noqa: PLR0913
     *methods: str,
     data: Path,
-    camera: CameraOptions,
+    camera: CameraOptions = CameraOptions(),
     protocol: str = "full",
     variant: Variant | None = None,
     first: int | None = None,
+    lpips: bool | None = None,
     out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("results/evaluate"),
     device: str | None = None,
+    json: Json = False,
+    **options: MethodOptions,
 ) -> None:
     """Compare methods on pairs of measurements and scenes: quality, time, memory.
+
+    Options of solvers: --regularisation 1e-4, --iterations 50 ... apply to each of the methods that has them; `mwdn
+    methods admm` lists those of admm.
 
     Args:
         methods: names of solvers or bundled networks, see `mwdn methods`, or paths of checkpoints.
@@ -32,32 +46,48 @@ def evaluate(
         variant: raw, clipped to [0, 1], or best-gain (one gain and offset per picture). The default is raw for
             centre-128 and clipped otherwise.
         first: use only this many pairs.
+        lpips: LPIPS and feature MSE: download their public weights (234 MiB, once) if they are missing, or leave both
+            metrics out. By default they are used if they are there; a terminal asks before a download.
         out: folder for report.json and comparison.png.
         device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
+        json: print the content of report.json instead of a table.
+        **options: options of the methods.
     """
     from mwdn import evaluation
     from mwdn.data.pairs import PairFile
     from mwdn.data.recorded import check_pairs, other_camera
 
-    part, calibration, file = evaluation.Protocol.parse(protocol), camera.load(), PairFile(data)
+    method_options = read_options(methods, options, evaluate)
+    part, file = evaluation.Protocol.parse(protocol), PairFile(data)
+    calibration = replace(camera.load(), white_balance=None)  # scenes of pairs are in the camera's own colours
     check_pairs(file, calibration.psf)
     pairs = file if first is None else evaluation.First(file, first)
-    reconstructors = {method: Reconstructor(method, calibration, device=device) for method in methods}
+    reconstructors = {
+        method: Reconstructor(method, calibration, device=device, **own) for method, own in method_options.items()
+    }
     warnings = [reconstruct.warning for reconstruct in reconstructors.values()]
     warn(*warnings, other_camera(file, calibration.psf_hash))
-    refuse_overwrite(out / evaluation.SHEET, camera.psf, camera.dark)
+    refuse_overwrite(out / evaluation.SHEET, *camera.files)
+    if min(part.crop(calibration.psf).shape[-2:]) >= SMALLEST:
+        lpips = ask_for_lpips(lpips)
+    perceptual = Perceptual.none("--no-lpips") if lpips is False else Perceptual.load(download=lpips is True)
     check_folder(out)
-    with Progress(console=errors, transient=True) as bars:
-        bar = bars.add_task("Evaluating", total=len(reconstructors) * len(pairs))
+    with if_interrupted(lambda: "Interrupted. Nothing is written."), show_progress() as progress:
+        progress.start("Evaluating", len(reconstructors) * len(pairs))
+        done = count(1)
         report = evaluation.evaluate(
             reconstructors,
             pairs,
             part,
             variant=variant,
-            progress=lambda name, _: bars.update(bar, advance=1, description=name),
+            perceptual=perceptual,
+            progress=lambda name, _: progress.update(next(done), name),
         )
-    table = report.table()
-    width = console.measure(table, options=console.options.update(width=1000)).maximum
-    console.print(report.table(narrow=True) if width > console.width else table)
+    if json:
+        results.out(report.json(), highlight=False)
+    else:
+        table = report.table()
+        width = results.measure(table, options=results.options.update(width=1000)).maximum
+        results.print(report.table(narrow=True) if width > results.width else table)
     report.write(out)
     console.print(f"Look at {out}", highlight=False, markup=False, soft_wrap=True)

@@ -5,15 +5,16 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from mwdn.cli.camera import CameraOptions, console
+from mwdn.cli.camera import CameraOptions
 from mwdn.cli.method_options import MethodOptions, read_options
+from mwdn.cli.terminal import console
 from mwdn.export.exporter import MIN_AGREEMENT, Precision
 
 
 def export(
     method: str,
     *,
-    camera: CameraOptions,
+    camera: CameraOptions = CameraOptions(),
     out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("camera.onnx"),
     precision: Precision = "float32",
     channels: int | None = None,
@@ -38,7 +39,7 @@ def export(
     """
     from mwdn.export import exporter as exporting
 
-    method_options = read_options(method, options, export)
+    method_options = read_options([method], options, export)[method]
     exported = exporting.export(
         method, camera.load(), out, precision=precision, channels=channels, least=least, **method_options
     )

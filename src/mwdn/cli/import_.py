@@ -6,13 +6,15 @@ from typing import Annotated
 
 from cyclopts import Parameter
 from rich.markup import escape
-from rich.progress import track
 
 from mwdn.calibration import FrameFormat
-from mwdn.cli.camera import console, errors
+from mwdn.cli.folders import no_empty_folder
+from mwdn.cli.progress import track
+from mwdn.cli.terminal import console, counted, if_interrupted, notes
 from mwdn.data.importers import Layout, import_pairs
 
 
+@no_empty_folder
 def import_(
     kind: str,
     path: Path,
@@ -21,6 +23,7 @@ def import_(
     skip_damaged: bool = False,
     layout: Annotated[Layout, Parameter(name="*")] = Layout(),
     frames: Annotated[FrameFormat, Parameter(name="*")] = FrameFormat(),
+    camera: Path | None = None,  # its values are in `frames`, see `from_camera_file`
 ) -> None:
     """Convert a public data set, or two folders of pictures, to one file of pairs.
 
@@ -31,11 +34,13 @@ def import_(
         skip_damaged: skip pairs with a damaged or missing picture, and list them.
         layout: where this copy of the data set differs from the usual layout.
         frames: format of the captures, where it differs from the usual one.
+        camera: camera file with this format; its dark and ambient frames are not subtracted.
     """
-    progress = partial(track, description="Importing")
-    result = import_pairs(kind, path, out, layout=layout, frames=frames, skip_damaged=skip_damaged, track=progress)
+    progress = partial(track, title="Importing")
+    with if_interrupted(lambda: f"Interrupted. Nothing is kept: {out} is written when all pairs are done."):
+        result = import_pairs(kind, path, out, layout=layout, frames=frames, skip_damaged=skip_damaged, track=progress)
     for reason in result.skipped.values():
-        errors.print(f"[yellow]skipped:[/] {escape(reason)}", highlight=False, soft_wrap=True)
+        notes.print(f"[yellow]skipped:[/] {escape(reason)}", highlight=False, soft_wrap=True)
     names = f": {', '.join(result.skipped)}" if result.skipped else ""
-    summary = f"{result.count:,} pairs written to {out}, {len(result.skipped):,} skipped{names}"
+    summary = f"{counted(result.count, 'pair')} written to {out}, {len(result.skipped):,} skipped{names}"
     console.print(summary, markup=False, highlight=False, soft_wrap=True)

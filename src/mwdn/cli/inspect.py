@@ -1,6 +1,5 @@
 """`mwdn inspect`: measure the quality of a PSF."""
 
-import json as format_json
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -10,16 +9,19 @@ from rich.markup import escape
 
 from mwdn.calibration.report import inspect_psf
 from mwdn.calibration.verdict import headline, verdict
-from mwdn.cli.camera import CameraOptions, console
+from mwdn.cli.camera import CameraOptions
+from mwdn.cli.folders import no_empty_folder
+from mwdn.cli.terminal import Json, console, print_json, results
 from mwdn.io.files import check_folder, refuse_overwrite, write_json
 
 _STYLES = {"bad": "bold red", "mind": "yellow", "good": "green"}
 
 
+@no_empty_folder
 def inspect(
-    camera: CameraOptions,
+    camera: CameraOptions = CameraOptions(),
     *,
-    json: Annotated[bool, Parameter(negative=())] = False,
+    json: Json = False,
     out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("results/inspect"),
 ) -> None:
     """Report the quality of a PSF: exposure, background, sharpness, spectrum, noise gain, resolution.
@@ -32,33 +34,36 @@ def inspect(
     # matplotlib takes a second to load, and no other command needs it.
     from mwdn.calibration.report_page import write_page
 
-    page = out / f"{camera.psf.stem}.png"
+    psf = camera.psf_file
+    page = out / f"{psf.stem}.png"
     json_file = page.with_suffix(".json")
     for output in (page, json_file):
-        refuse_overwrite(output, camera.psf, camera.dark)
+        refuse_overwrite(output, *camera.files)
     calibration = at_psf_resolution(camera).load()
     check_folder(out)
-    report = inspect_psf(calibration, camera.frames.read(camera.psf))
+    report = inspect_psf(calibration, camera.frames.read(psf))
     findings = verdict(report)
     content = {
-        "file": str(camera.psf),
+        "file": str(psf),
         "headline": headline(report),
         "verdict": [finding._asdict() for finding in findings],
         **report.content(),
     }
-    write_page(page, report, calibration.psf, camera.psf.name)
+    write_page(page, report, calibration.psf, psf.name)
     write_json(json_file, content)
     if json:
-        console.print(format_json.dumps(content, indent=2), highlight=False, markup=False, soft_wrap=True)
+        print_json(content)
         return
-    console.print(f"[bold]{escape(headline(report))}[/]", highlight=False, soft_wrap=True)
+    results.print(f"[bold]{escape(headline(report))}[/]", highlight=False, soft_wrap=True)
     for weight, text in findings:
-        console.print(f"[{_STYLES[weight]}]{weight:4}[/] {escape(text)}", highlight=False, soft_wrap=True)
+        results.print(f"[{_STYLES[weight]}]{weight:4}[/] {escape(text)}", highlight=False, soft_wrap=True)
     console.print(f"Look at {page}", highlight=False, markup=False, soft_wrap=True)
 
 
 def at_psf_resolution(camera: CameraOptions) -> CameraOptions:
     """The options for frames at the PSF's resolution, if the captures have another; their dark frame is left out."""
-    if camera.psf_bin is None or camera.psf_bin == camera.frames.bin:
+    psf_bin = camera.psf_format.psf_bin
+    if psf_bin is None or psf_bin == camera.frames.bin:
         return camera
-    return replace(camera, frames=camera.frames.with_bin(camera.psf_bin), psf_bin=None, dark=None)
+    psf_format = replace(camera.psf_format, psf_bin=None)
+    return replace(camera, frames=camera.frames.with_bin(psf_bin), psf_format=psf_format, dark=None)

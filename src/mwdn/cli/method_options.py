@@ -3,13 +3,15 @@
 import difflib
 import inspect
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields
+from itertools import chain
 from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
 from cyclopts import Parameter
 
+from mwdn.calibration import FrameFormat, PsfFormat
 from mwdn.cli.camera import CameraOptions
 from mwdn.errors import ParameterError
 from mwdn.solvers import SOLVERS
@@ -55,34 +57,47 @@ def summary(method: Callable[..., Any]) -> str:
     return (inspect.getdoc(method) or "").partition("\n")[0]
 
 
-def read_options(method: str, tokens: Mapping[str, Any], command: Callable[..., object]) -> dict[str, Any]:
-    """Convert the options of a method from the command line.
+def read_options(
+    methods: Sequence[str], tokens: Mapping[str, Any], command: Callable[..., object]
+) -> dict[str, dict[str, Any]]:
+    """Convert the options of methods from the command line.
 
     Args:
-        method: as given by the user.
+        methods: as given by the user. Each option goes to all methods that have it.
         tokens: of `MethodOptions`.
         command: the command, whose own options are suggested for a mistyped one.
 
+    Returns:
+        The options of each method.
+
     Raises:
-        ParameterError: the method has no such option, or the value does not fit its type.
+        ParameterError: none of the methods has such an option, or the value does not fit its type.
     """
-    options = {option.name: option for option in (list_options(SOLVERS[method]) if method in SOLVERS else [])}
-    values = {}
+    known = {
+        method: {option.name: option for option in (list_options(SOLVERS[method]) if method in SOLVERS else [])}
+        for method in methods
+    }
+    values: dict[str, dict[str, Any]] = {method: {} for method in methods}
     for key, given in tokens.items():
         name = key.replace("-", "_")
-        if name not in options:
-            raise ParameterError(_unknown(method, name, list(options), command))
-        values[name] = _convert(options[name], given)
+        owners = [method for method in methods if name in known[method]]
+        if not owners:
+            raise ParameterError(_unknown(name, known, command))
+        for method in owners:
+            values[method][name] = _convert(known[method][name], given)
     return values
 
 
-def _unknown(method: str, name: str, options: list[str], command: Callable[..., object]) -> str:
+def _unknown(name: str, known: Mapping[str, Iterable[str]], command: Callable[..., object]) -> str:
+    options = list(dict.fromkeys(chain.from_iterable(known.values())))
     parameters = inspect.signature(command).parameters.values()
     names = [parameter.name for parameter in parameters if parameter.kind == inspect.Parameter.KEYWORD_ONLY]
-    nearest = difflib.get_close_matches(name, [*options, *names, *(field.name for field in fields(CameraOptions))], n=1)
+    names += [field.name for kind in (CameraOptions, FrameFormat, PsfFormat) for field in fields(kind)]
+    nearest = difflib.get_close_matches(name, [*options, *names], n=1)
     hint = f" Did you mean {_flag(nearest[0])}?" if nearest else ""
-    known = ", ".join(map(_flag, options)) or f"none; solvers ({', '.join(SOLVERS)}) have some"
-    return f"Unknown option: {_flag(name)}.{hint} Options of the method '{method}': {known}. See `mwdn methods`."
+    methods = f"method{'s' * (len(known) != 1)} {', '.join(map(repr, known))}"
+    listed = ", ".join(map(_flag, options)) or f"none; solvers ({', '.join(SOLVERS)}) have some"
+    return f"Unknown option: {_flag(name)}.{hint} Options of the {methods}: {listed}. See `mwdn methods`."
 
 
 def _flag(name: str) -> str:

@@ -6,8 +6,8 @@ from rich.markup import escape
 from rich.padding import Padding
 from rich.table import Table
 
-from mwdn.cli.camera import console
 from mwdn.cli.method_options import Option, list_options, summary, type_name
+from mwdn.cli.terminal import results
 from mwdn.errors import UnknownNameError
 from mwdn.networks import NETWORKS
 from mwdn.solvers import SOLVERS
@@ -27,7 +27,7 @@ def methods(name: str | None = None, /) -> None:
         name: of a solver, a bundled network or a network type; all methods are listed unless given.
     """
     if name is None:
-        console.print(_overview())
+        results.print(_overview())
         return
     if name not in {*SOLVERS, *BUNDLED, *NETWORKS}:
         raise UnknownNameError("method", name, {*SOLVERS, *BUNDLED, *NETWORKS})
@@ -56,11 +56,11 @@ def _overview() -> Table:
 
 
 def _print(title: str, options: list[Option]) -> None:
-    console.print(title, style="bold", markup=False, highlight=False)
+    results.print(title, style="bold", markup=False, highlight=False)
     for name, annotation, default, meaning in options:
         line = f"[bold cyan]{name}[/]: {escape(type_name(annotation))} = {escape(_short(default))}"
-        console.print(Padding(line, (0, 2)), highlight=False)
-        console.print(Padding(escape(meaning), (0, 6)), highlight=False)
+        results.print(Padding(line, (0, 2)), highlight=False)
+        results.print(Padding(escape(meaning), (0, 6)), highlight=False)
 
 
 def _short(value: Any, length: int = 60) -> str:  # noqa: ANN401

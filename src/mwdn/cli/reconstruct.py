@@ -1,24 +1,29 @@
 """`mwdn reconstruct`: captures to pictures, in one process or several."""
 
-import os
-from collections import Counter
-from collections.abc import Iterable
+from collections import ChainMap
+from collections.abc import Iterable, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Annotated
 
-import torch
 from cyclopts import Parameter
 from rich.markup import escape
-from rich.progress import Progress
 
 from mwdn.calibration import Calibration
-from mwdn.cli.camera import CameraOptions, complain, console, errors, warn
+from mwdn.calibration.white_balance import WhiteBalance
+from mwdn.cli.automatic_bin import binned
+from mwdn.cli.camera import CameraOptions
+from mwdn.cli.doubts import Doubts
+from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.method_options import MethodOptions, read_options
+from mwdn.cli.progress import show_progress
+from mwdn.cli.terminal import Json, complain, console, counted, detail, if_interrupted, note, print_json, warn
 from mwdn.data.captures import list_captures
 from mwdn.errors import ParameterError, PsfError
-from mwdn.inference.batch import Batch, Format, Job, check_outputs
+from mwdn.inference.batch import SHOWN, Batch, Job
+from mwdn.inference.outputs import Format, check_outputs, output_name, read_sidecar
 from mwdn.inference.reconstructor import Reconstructor
+from mwdn.io.exif import orientation
 from mwdn.io.files import check_folder
 from mwdn.runtime import distributed
 
@@ -27,16 +32,22 @@ SMALLEST = 15
 of 15 pixels for 7 or 8."""
 
 
+@no_empty_folder
 def reconstruct(  # noqa: PLR0913
     *captures: Path,
-    camera: CameraOptions,
+    camera: CameraOptions = CameraOptions(),
     method: str = "universal",
     out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("results/reconstruct"),
     format: Format = "png",
+    full_size: bool = False,
     align: bool | None = None,
+    white_balance: WhiteBalance | None = None,
     trust: bool = True,
+    map: Annotated[bool, Parameter(negative=())] = False,
     resume: bool | None = None,
     device: str | None = None,
+    json: Json = False,
+    auto_bin: Annotated[bool, Parameter(show=False)] = True,
     **options: MethodOptions,
 ) -> int:
     """Reconstruct captures: files, or folders of them.
@@ -53,91 +64,151 @@ def reconstruct(  # noqa: PLR0913
         out: folder for the pictures. Beside each, a .json says how well it explains its capture; summary.png shows
             the first twelve pictures and their captures.
         format: png and png16 are sRGB for viewing, tiff and npy hold the linear float32 values.
+        full_size: interpolate the pictures of binned captures to the captures' size before binning. Without --bin,
+            PSF and captures are binned as far as that loses little; --bin 1 refuses.
         align: estimate rotation, scale and haze of the PSF from each capture, for a camera that has changed since its
             calibration; by default for universal, and not for solvers.
+        white_balance: of the pictures: grey-world, psf (the point source is white), or gains of red, green and blue.
         trust: check how well each picture explains its capture; takes a second or two for a small one.
+        map: also draw which parts of each picture its capture supports, as NAME.support.png.
         resume: skip each capture whose picture is there, made from the same file in the same way; the default for
             several processes.
         device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
+        json: print a list with the content of each picture's .json to standard output, all else to standard error.
+        auto_bin: whether --bin is not given.
         **options: options of the method.
     """
-    method_options = read_options(method, options, reconstruct)
+    method_options = read_options([method], options, reconstruct)[method]
     with distributed.process_group():
-        is_first, calibration = distributed.rank() == 0, _load(camera)
+        is_first = distributed.rank() == 0
+        calibration, is_binned = camera.load(), ""
+        _check_size(calibration)
         # Listed by the first process: files may be added to a folder meanwhile.
         files: list[str] = distributed.broadcast_json(lambda: _list_files(captures, camera, out, format))
+        if auto_bin:
+            calibration, is_binned = binned(calibration, camera, method, files)
         local_device = distributed.local_device(device)
-        reconstructor = Reconstructor(method, calibration, align=align, device=local_device, **method_options)
+        reconstructor = Reconstructor(
+            method, calibration, align=align, device=local_device, white_balance=white_balance, **method_options
+        )
         if is_first:
             warn(reconstructor.warning)
+            detail(f"{method} on {reconstructor.device}")
+            note(*filter(None, [is_binned]))
             background = ", ".join(f"{level:.4f}" for level in calibration.background)
             console.print(
                 f"PSF {calibration.psf_hash}, background {background} of the full scale subtracted", soft_wrap=True
             )
         resume = distributed.world_size() > 1 if resume is None else resume
-        batch = Batch(reconstructor, method, out, format, check_consistency=trust, resume=resume)
+        psf_exif = orientation(camera.psf_file) if camera.psf_format.psf_orientation is None else None
+        if is_first:
+            _name_turn((camera.psf_file, *files[:SHOWN]))
+        batch = Batch(
+            reconstructor,
+            method,
+            out,
+            format,
+            check_consistency=trust,
+            map=map,
+            resume=resume,
+            psf_exif=psf_exif,
+            full_size=full_size,
+        )
         failed, existing = _run(batch, files)
         if is_first:
             batch.summarise(files)
+            if json:
+                print_json([_entry(batch, file, failed.get(file)) for file in files])
             before = f", {existing} of them before" if existing else ""
-            line = f"{len(files) - failed} of {len(files)} captures reconstructed into {out}{before}"
+            done = f"{len(files) - len(failed):,} of " if failed else ""
+            line = f"{done}{counted(len(files), 'capture')} reconstructed into {out}{before}"
             console.print(line, highlight=False, markup=False, soft_wrap=True)
     status = 1 if failed else 0
     distributed.set_exit_status(status)
     return status
 
 
-def _load(camera: CameraOptions) -> Calibration:
-    """Load the calibration; a `PsfError` if the PSF is too small for a reliable result."""
-    calibration = camera.load()
+def _check_size(calibration: Calibration) -> None:
+    """Raise a `PsfError` if the PSF is too small for a reliable result."""
     height, width = calibration.size
     if min(height, width) < SMALLEST:
         raise PsfError(
             f"The PSF ({height} x {width}) must have at least {SMALLEST} pixels along each side. Take the whole frame "
             "of the sensor, or crop and bin it less: `--crop`, `--bin`, `--psf-bin`."
         )
-    return calibration
+
+
+def _name_turn(files: Iterable[str | Path]) -> None:
+    """Name the first file with an EXIF orientation: a phone shows it turned, unlike the picture."""
+    for file in files:
+        if (number := orientation(file)) != 1:
+            note(
+                f"{Path(file).name} is to be shown turned (EXIF orientation {number}). Frames are not turned: pictures "
+                "are in the orientation of the sensor."
+            )
+            return
 
 
 def _list_files(captures: Iterable[Path], camera: CameraOptions, out: Path, format: Format) -> list[str]:
     """List the captures and check that their pictures can be written to ``out``."""
-    calibration_files = camera.psf, camera.dark
-    files = list_captures(captures, exclude=calibration_files)
-    check_outputs(files, out, format, protected=calibration_files)
+    files, skipped = list_captures(captures, exclude=camera.roles)
+    note(*skipped)
+    check_outputs(files, out, format, protected=camera.files)
     if out.resolve() in [path.resolve() for path in captures]:
         raise ParameterError(
             f"`{out}` holds the captures: the next run would take the pictures for captures. Choose another folder: "
             "`--out`."
         )
-    if any(map(os.path.exists, files)):  # else no folder is made
-        check_folder(out)
+    check_folder(out)
     return files
 
 
-def _run(batch: Batch, files: list[str]) -> tuple[int, int]:
-    """Reconstruct all captures; numbers of failed and of already existing ones, over all processes."""
-    states: Counter[str] = Counter()
-    show_progress = len(files) > 1 and distributed.rank() == 0
-    with closing(batch.run(files)) as jobs, Progress(console=console, disable=not show_progress) as bars:
-        bar = bars.add_task("Reconstructing", total=len(files))
-        for job in jobs:
-            bars.update(bar, completed=job.number + 1)  # counts the captures of other processes, too
-            states[_report(job)] += 1
-    failed, existing = distributed.all_reduce_sum(torch.tensor([states["failed"], states["existing"]])).tolist()
-    return failed, existing
+def _entry(batch: Batch, capture: str, error: str | None) -> dict[str, object]:
+    """What --json says of one capture."""
+    if error is not None:
+        return {"capture": capture, "picture": None, "error": error}
+    picture = batch.out / output_name(capture, batch.format)
+    return {"capture": capture, "picture": str(picture), **read_sidecar(picture.with_suffix(".json"))}
 
 
-def _report(job: Job) -> str:
-    """Print the outcome of a job; returns its state."""
+def _run(batch: Batch, files: list[str]) -> tuple[Mapping[str, str], int]:
+    """Reconstruct all captures; errors by capture, and the number of already existing pictures, over all processes."""
+    failed: dict[str, str] = {}
+    done = existing = 0
+    doubts = Doubts()
+
+    def go_on() -> str:
+        verb = "is" if done == 1 else "are"
+        of = counted(len(files), "capture")
+        return f"Interrupted: {done:,} of {of} {verb} done. The same command with --resume goes on."
+
+    def show(job: Job) -> None:
+        nonlocal done, existing
+        if job.error:
+            failed[files[job.number]] = str(job.error)
+        done, existing = done + (job.error is None), existing + job.existing
+        _report(job)
+        doubts.add(job.capture.name, job.verdicts)
+
+    def show_part(done: float) -> None:
+        checking = batch.check_consistency and done == len(files)
+        progress.update(done, "checking" if checking else "", len(files) if done else None)
+
+    with if_interrupted(go_on), show_progress(enabled=distributed.rank() == 0) as progress:
+        progress.start("Reconstructing", len(files) if len(files) > 1 else None)
+        with closing(batch.run(files, show, progress=show_part)) as jobs:
+            for _ in jobs:
+                pass
+        progress.update(len(files))
+    doubts.summarise()
+    shares = distributed.gather_json((failed, existing))
+    return ChainMap(*(share for share, _ in shares)), sum(count for _, count in shares)
+
+
+def _report(job: Job) -> None:
+    """Print the outcome of a job."""
     if job.error:
         complain(f"[red]{escape(str(job.capture))}:[/]", job.error)
-        return "failed"
-    if job.overexposed:
-        warn(
-            f"{job.capture.name} is overexposed: {job.saturated:.1%} of its pixels are saturated, and no PSF explains "
-            "them. Lower the exposure."
-        )
-    if job.consistency:
-        line = f"{job.capture.name} {job.consistency.sentence}"
-        (errors if job.consistency.doubtful else console).print(line, highlight=False, markup=False, soft_wrap=True)
-    return "existing" if job.existing else "done"
+    elif job.trust:
+        line = f"{job.capture.name}: {job.trust.sentence}"
+        console.print(line, highlight=False, markup=False, soft_wrap=True)

@@ -7,16 +7,20 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from cyclopts import Parameter
-from rich.progress import Progress, ProgressColumn, track
 
-from mwdn.cli.camera import CameraOptions, console, errors
+from mwdn.cli.camera import CameraOptions
+from mwdn.cli.folders import no_empty_folder
+from mwdn.cli.progress import Progressing, show_progress, track
+from mwdn.cli.terminal import console, counted, if_interrupted, note, notes
+from mwdn.data.captures import list_captures
 from mwdn.io.files import refuse_overwrite
+from mwdn.io.listing import unused_photographs
 from mwdn.io.toml import parse_value
 from mwdn.runtime import distributed
 from mwdn.training import experiment
 from mwdn.training.recipe import Sheet, read_recipe
 from mwdn.training.tensorboard import TensorBoard
-from mwdn.training.trainer import Report
+from mwdn.training.trainer import Report, Trainer
 
 
 def _recipe_changes(tokens: Any) -> Any:  # noqa: ANN401
@@ -29,10 +33,11 @@ def _recipe_changes(tokens: Any) -> Any:  # noqa: ANN401
 RecipeKeys = Annotated[Any, Parameter(converter=lambda _, tokens: tokens, show=False)]
 
 
+@no_empty_folder
 def train(  # noqa: PLR0913
     recipe: Path,
     *,
-    camera: CameraOptions,
+    camera: CameraOptions = CameraOptions(),
     photos: Path | None = None,
     pairs: Path | None = None,
     captures: Annotated[list[Path] | None, Parameter(consume_multiple=True, negative=())] = None,
@@ -52,7 +57,7 @@ def train(  # noqa: PLR0913
     On several GPUs or machines: torchrun --nproc-per-node 4 -m mwdn train ...
 
     Args:
-        recipe: TOML file, see recipes/.
+        recipe: name of a recipe of the package, see `mwdn recipes`, or a TOML file.
         camera: calibration of the camera.
         photos: folder of photographs, the more the better, to simulate captures of.
         pairs: HDF5 file of recorded pairs, from `mwdn import`; [pairs] of the recipe splits it.
@@ -67,42 +72,70 @@ def train(  # noqa: PLR0913
     experiment_recipe = read_recipe(recipe, **_recipe_changes(changes))
     if captures:
         experiment_recipe = replace(experiment_recipe, sheet=Sheet(tuple(map(str, captures))))
-    columns: list[str | ProgressColumn] = [*Progress.get_default_columns(), "{task.fields[status]}"]
     with distributed.process_group(), ExitStack() as stack:
-        trainer = experiment.prepare(
-            experiment_recipe,
-            camera.load(),
-            out=out,
-            photos=photos,
-            pairs=pairs,
-            device=device,
-            exclude=(camera.psf, camera.dark),
-        )
         is_first = distributed.rank() == 0
+        if is_first and experiment_recipe.sheet.captures:
+            note(*list_captures(experiment_recipe.sheet.captures, exclude=camera.roles).skipped)
+        if is_first and photos is not None:
+            note(*unused_photographs(photos))
+        with notes.status("Reading photographs, pairs or captures"):
+            trainer = experiment.prepare(
+                experiment_recipe,
+                camera.load(),
+                out=out,
+                photos=photos,
+                pairs=pairs,
+                device=device,
+                exclude=camera.roles,
+            )
         board = (
             stack.enter_context(TensorBoard(out / "tensorboard", trainer.step)) if tensorboard and is_first else None
         )
-        bars = stack.enter_context(Progress(*columns, console=errors, disable=not is_first))
-        bar = bars.add_task("Training", total=trainer.schedule.steps, completed=trainer.step, status="")
-
-        def show(report: Report) -> None:
-            status = f"{report.pictures_per_s:.1f} pictures/s, loss {report.loss:.4f}"
-            bars.update(bar, completed=report.step, status=status)
-            if report.validation is not None:
-                psnr = report.validation.psnr
-                bars.print(f"step {report.step}: validation {psnr:.2f} dB, best {trainer.best:.2f} dB")
-            if board is not None:
-                board(report)
-
-        trainer.run(show)
+        _train(trainer, stack.enter_context(show_progress(enabled=is_first, titles=True)), board)
     if is_first:
         console.print(f"Weights in {out / 'best.safetensors'}", highlight=False, markup=False, soft_wrap=True)
 
 
+def _train(trainer: Trainer, progress: Progressing, board: TensorBoard | None) -> None:
+    """Train, and show both phases: samples, if the recipe caches them, and steps."""
+
+    def start_training() -> None:
+        progress.start("Training", trainer.schedule.steps, trainer.step)
+
+    def show_samples(done: int, total: int) -> None:
+        if progress.phase is None:
+            progress.start("Simulating samples", total, done)
+        progress.update(done, f"{done:,} of {counted(total, 'sample')}")
+        if done == total:
+            progress.print(_kept(trainer))
+            start_training()
+
+    def show_step(report: Report) -> None:
+        speed = f"{report.pictures_per_s:.1f} pictures/s"
+        progress.update(report.step, f"step {report.step:,}, {speed}, loss {report.loss:.4f}")
+        if report.validation is not None:
+            psnr = report.validation.psnr
+            progress.print(f"step {report.step}: validation {psnr:.2f} dB, best {trainer.best:.2f} dB")
+        if board is not None:
+            board(report)
+
+    if trainer.task.cache is None:
+        start_training()
+    trainer.run(show_step, samples=show_samples)
+
+
+def _kept(trainer: Trainer) -> str:
+    size = trainer.folder.samples_size()
+    if size == 0:
+        return "The disk has no room for the samples: an interrupted run simulates them again."
+    return f"The samples are kept in {trainer.out / 'samples'} until the run ends: {size / 1e6:,.0f} MB"
+
+
+@no_empty_folder
 def simulate(
     photos: Path,
     *,
-    camera: CameraOptions,
+    camera: CameraOptions = CameraOptions(),
     out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("pairs.h5"),
     count: int = 100,
     recipe: Path | None = None,
@@ -118,13 +151,15 @@ def simulate(
         camera: calibration of the camera.
         out: file of pairs, ending in .h5 or .hdf5; an existing one is replaced on success.
         count: number of pairs.
-        recipe: TOML file with placement, mismatch, sensor and seed, see recipes/; by default their default values.
+        recipe: placement, mismatch, sensor and seed, as for `mwdn train`; by default their default values.
         exact: simulate the calibrated camera itself, without mismatch.
         **changes: any key of the recipe.
     """
-    refuse_overwrite(out, camera.psf, camera.dark, recipe)
+    refuse_overwrite(out, *camera.files, recipe)
     simulation = read_recipe(recipe, **_recipe_changes(changes))
-    progress = partial(track, description="Simulating", console=errors, transient=True)
+    progress = partial(track, title="Simulating")
+    note(*unused_photographs(photos))
     calibration = camera.load()
-    experiment.simulate(simulation, calibration, photos=photos, out=out, count=count, exact=exact, track=progress)
-    console.print(f"{count:,} pairs written to {out}", markup=False, highlight=False, soft_wrap=True)
+    with if_interrupted(lambda: f"Interrupted. Nothing is kept: {out} is written when all pairs are done."):
+        experiment.simulate(simulation, calibration, photos=photos, out=out, count=count, exact=exact, track=progress)
+    console.print(f"{counted(count, 'pair')} written to {out}", markup=False, highlight=False, soft_wrap=True)

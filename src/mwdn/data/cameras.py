@@ -61,6 +61,11 @@ class CameraPairs(Samples):
         """Independent of the photographs, so that a run may resume with more of them."""
         return "simulated across cameras"
 
+    @property
+    def content(self) -> str:
+        """Hash of the photographs."""
+        return self.pairs.content
+
     @full_precision
     def batch(self, numbers: range | list[int]) -> Batch:
         """Simulate the samples of these numbers, which must belong to one batch."""

@@ -1,58 +1,64 @@
 """List captures, and read them as measurements."""
 
-import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 
 from mwdn.calibration import Calibration
 from mwdn.errors import ParameterError, ShapeError
-from mwdn.io.images import READABLE
+from mwdn.io.files import path_resolver
+from mwdn.io.listing import FRAMES, enumerate_names, list_folder
 from mwdn.types import Measurement
 
 
-def list_captures(paths: Iterable[str | Path], *, exclude: Iterable[Path | None] = ()) -> list[str]:
-    """List files, and the readable files of folders in alphabetical order, without duplicates.
+class CaptureList(NamedTuple):
+    """Captures, and what was left out.
 
-    Strings instead of paths save memory: a million of them take about 0.2 GB.
+    Args:
+        files: strings instead of paths: a million of them take about 0.2 GB.
+        skipped: a sentence for each kind of file that was left out, with its reason.
+    """
+
+    files: list[str]
+    skipped: list[str]
+
+
+def list_captures(paths: Iterable[str | Path], *, exclude: Mapping[str, Path] | None = None) -> CaptureList:
+    """List files, and the frames in folders in alphabetical order, without duplicates.
 
     Args:
         paths: files and folders.
-        exclude: files in these folders that are not captures: the PSF, the dark frame. Hidden files are excluded too.
+        exclude: files that are no captures, by what they are: ``{"PSF": psf, "dark frame": dark}``. Hidden files in
+            folders are excluded, too.
 
     Raises:
-        ParameterError: ``paths`` is empty, or a folder holds no capture.
+        ParameterError: no capture is left, or a folder holds none.
     """
-    captures: list[str] = []
-    excluded = {path.resolve() for path in exclude if path is not None}
+    real = path_resolver()  # the same file may have two names
+    others = {real(str(path)): name for name, path in (exclude or {}).items()}
+    files: dict[str, None] = {}
+    skipped: dict[str, None] = {}
     for path in map(Path, paths):
-        files = _list_folder(path, excluded) if path.is_dir() else [str(path)]
-        if not files:
-            raise ParameterError(f"The folder `{path}` holds no capture. Readable: {', '.join(sorted(READABLE))}.")
-        captures += files
-    if not captures:
-        raise ParameterError("Name at least one capture, or a folder of captures.")
-    return list(dict.fromkeys(captures))
+        listed, notes = list_folder(path) if path.is_dir() else ([str(path)], [])
+        kinds = [others.get(real(name)) for name in listed]
+        captures = [name for name, kind in zip(listed, kinds, strict=True) if not kind]
+        excluded = [f"{Path(name).name} (the {kind})" for name, kind in zip(listed, kinds, strict=True) if kind]
+        notes += [f"Skipped {enumerate_names(excluded)}."] if excluded else []
+        if not captures and path.is_dir():
+            readable = ", ".join(sorted(FRAMES))
+            raise ParameterError(" ".join([f"The folder `{path}` holds no capture. Readable: {readable}.", *notes]))
+        files |= dict.fromkeys(captures)
+        skipped |= dict.fromkeys(notes)
+    if not files:
+        raise ParameterError(" ".join(["Name at least one capture, or a folder of captures.", *skipped]))
+    return CaptureList(list(files), list(skipped))
 
 
-def _list_folder(folder: Path, excluded: set[Path]) -> list[str]:
-    """The captures in a folder; only links are resolved, as that takes a system call per file."""
-    excluded_names = {path.name for path in excluded if path.parent == folder.resolve()}
-
-    def is_capture(entry: os.DirEntry[str]) -> bool:
-        if entry.name.startswith(".") or Path(entry.name).suffix.lower() not in READABLE or not entry.is_file():
-            return False
-        return Path(entry.path).resolve() not in excluded if entry.is_symlink() else entry.name not in excluded_names
-
-    start = str(folder / "x").removesuffix("x")
-    with os.scandir(folder) as entries:
-        return [start + name for name in sorted(entry.name for entry in entries if is_capture(entry))]
-
-
-def find_captures(paths: Iterable[str | Path], *, exclude: Iterable[Path | None] = ()) -> list[Path]:
-    """`list_captures` as paths."""
-    return [Path(path) for path in list_captures(paths, exclude=exclude)]
+def find_captures(paths: Iterable[str | Path], *, exclude: Mapping[str, Path] | None = None) -> list[Path]:
+    """The files of `list_captures` as paths."""
+    return [Path(path) for path in list_captures(paths, exclude=exclude).files]
 
 
 def read_capture(path: Path, calibration: Calibration) -> Measurement:

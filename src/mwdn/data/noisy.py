@@ -43,6 +43,11 @@ class NoisyScenes(Samples):
         """Independent of the photographs, so that a run may resume with more of them."""
         return "noisy scenes"
 
+    @property
+    def content(self) -> str:
+        """Hash of the photographs."""
+        return self.pairs.content
+
     @full_precision
     def batch(self, numbers: range | list[int]) -> Batch:
         """Simulate the samples of these numbers.

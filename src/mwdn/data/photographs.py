@@ -1,6 +1,7 @@
 """A folder of photographs in memory, cropped and scaled for training."""
 
 import copy
+import hashlib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -39,6 +40,11 @@ class Photographs:
 
     def __len__(self) -> int:
         return len(self._pixels)
+
+    @property
+    def content(self) -> str:
+        """Hash of all pixels, and of their order."""
+        return hashlib.sha256(self._pixels.cpu().numpy().data).hexdigest()
 
     def light(self, index: Tensor) -> Tensor:
         """Linear light (B, 3, side, side) of the photographs at ``index`` (B,)."""

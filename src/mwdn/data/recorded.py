@@ -82,6 +82,12 @@ class RecordedPairs(Samples):
         """States the number of pairs, which determines their order."""
         return f"{len(self):,} of {len(self.file):,} recorded"
 
+    @property
+    def content(self) -> str:
+        """Size and time of modification of the file."""
+        status = self.file.path.stat()
+        return f"{status.st_size} {status.st_mtime_ns}"
+
     def batch(self, numbers: range | list[int]) -> Batch:
         """Read the samples of these numbers.
 
@@ -175,7 +181,7 @@ def check_pairs(file: PairFile, psf: Psf) -> None:
         factor = H // h
         way_out = "Use the PSF of their camera, cropped and binned as they are: `--crop`, `--psf-bin`."
         if factor > 1 and (h * factor, w * factor) == (H, W):
-            way_out = f"The PSF is {factor} times as large: multiply its binning by {factor}, `--psf-bin`."
+            way_out = f"The PSF is {factor} times as large: multiply `--psf-bin` by {factor}."
         raise ShapeError(f"`psf` ({H} x {W}) and the measurements of `{file.path}` ({h} x {w}) must match. {way_out}")
     if colours not in (1, channels):
         raise ShapeError(
@@ -197,7 +203,7 @@ def other_camera(file: PairFile, psf_hash: str) -> str | None:
         return None
     return (
         f"`{file.path}` holds pairs of the camera of PSF {own_hash}, but the PSF given is {psf_hash}. Expect blur, "
-        "ghosts and low scores, unless both belong to one camera: another crop, binning or background of the same PSF "
+        "ghosts and low scores, unless both belong to one camera: another crop, bin or background of the same PSF "
         "file also gives another hash."
     )
 

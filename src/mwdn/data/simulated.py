@@ -18,7 +18,7 @@ from mwdn.data.mismatch import Mismatch, perturb, shading
 from mwdn.data.photographs import Photographs
 from mwdn.data.random import seeded, uniform
 from mwdn.errors import ParameterError
-from mwdn.optics.camera import Camera
+from mwdn.fourier.convolution import convolve
 from mwdn.optics.field import FieldCamera
 from mwdn.optics.sensor import Sensor
 from mwdn.optics.warp import affine
@@ -97,6 +97,11 @@ class Samples(Protocol):
     def name(self) -> str:
         """Identifies the source when a run resumes."""
 
+    @property
+    def content(self) -> str:
+        """Hash of the files that the samples are made from; empty without files."""
+        return ""
+
     def batch(self, numbers: range | list[int]) -> Batch:
         """The samples of these numbers, on one device."""
 
@@ -154,6 +159,11 @@ class SimulatedPairs(Samples):
         """Independent of the photographs, so that a run may resume with more of them."""
         return "simulated"
 
+    @property
+    def content(self) -> str:
+        """Hash of the photographs."""
+        return self.photographs.content
+
     @full_precision
     def batch(self, numbers: range | list[int]) -> Batch:
         """Simulate the samples of these numbers.
@@ -170,7 +180,7 @@ class SimulatedPairs(Samples):
         if self.mismatch.exact:
             exact = (uniform(generators, 0.0, 1.0)[..., None, None] < self.mismatch.exact).to(psf.device)
             true, factors = torch.where(exact, psf, true), torch.where(exact, 1.0, factors)
-        light = (self.camera or Camera(true)).forward(scene) * factors
+        light = (self.camera.forward(scene) if self.camera else convolve(scene, true)) * factors
         ambient = uniform(generators, *self.placement.ambient)[..., None, None].to(light)
         light = light + ambient * light.mean((1, 2, 3), keepdim=True)
         brightest = light.amax((1, 2, 3), keepdim=True).clamp(min=1e-6)

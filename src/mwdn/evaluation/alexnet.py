@@ -136,21 +136,22 @@ def cache_folder() -> Path:
     return Path.home() / ".cache" / "mwdn"
 
 
-def load_alexnet(path: str | Path | None = None) -> AlexNet:
+def load_alexnet(path: str | Path | None = None, *, download: bool = True) -> AlexNet:
     """Load AlexNet with its ImageNet weights, frozen, in evaluation mode, on the CPU.
 
     Args:
         path: a state dict with torchvision's keys, of the whole AlexNet or of its convolutions. Unless given, the file
             named by the environment variable ``MWDN_ALEXNET``, else ``~/.cache/mwdn/alexnet-owt-7be5be79.pth``, which
             is downloaded once (233 MiB) and checked.
+        download: whether a missing file may be downloaded.
 
     Raises:
-        CheckpointError: the file is missing and cannot be downloaded, or holds other weights.
+        CheckpointError: the file is missing and cannot or may not be downloaded, or holds other weights.
     """
-    return _load_weights(AlexNet(), _locate(_ALEXNET, path), "features.")
+    return _load_weights(AlexNet(), _locate(_ALEXNET, path, download=download), "features.")
 
 
-def load_heads(path: str | Path | None = None, *, alexnet: str | Path | None = None) -> Heads:
+def load_heads(path: str | Path | None = None, *, alexnet: str | Path | None = None, download: bool = True) -> Heads:
     """Load the calibrated heads of LPIPS 0.1 for AlexNet, frozen, in evaluation mode, on the CPU.
 
     Args:
@@ -158,18 +159,29 @@ def load_heads(path: str | Path | None = None, *, alexnet: str | Path | None = N
             ``MWDN_LPIPS``, else ``lin_v0.1_alex.pth`` beside AlexNet's file, else the one in ``~/.cache/mwdn``, which
             is downloaded once (6 kB) and checked.
         alexnet: the path given to `load_alexnet`, if any.
+        download: whether a missing file may be downloaded.
 
     Raises:
-        CheckpointError: the file is missing and cannot be downloaded, or holds other weights.
+        CheckpointError: the file is missing and cannot or may not be downloaded, or holds other weights.
     """
+    return _load_weights(Heads(), _locate(_HEADS, path or _beside(alexnet), download=download), "lin")
+
+
+def download_mebibytes(alexnet: str | Path = "", heads: str | Path = "") -> int:
+    """Size of the files that `load_alexnet` and `load_heads` would download for these arguments; 0 for none."""
+    files = (_ALEXNET, alexnet), (_HEADS, heads or _beside(alexnet))
+    searched = [public for public, path in files if not (path or os.environ.get(public.variable))]
+    return sum(public.mebibytes for public in searched if not (cache_folder() / public.file).is_file())
+
+
+def _beside(alexnet: str | Path | None) -> Path | None:
+    """The heads beside AlexNet's file, if they are there and no others are named."""
     neighbour = alexnet or os.environ.get(_ALEXNET.variable)
     beside = Path(neighbour).with_name(_HEADS.file) if neighbour else None
-    if path is None and _HEADS.variable not in os.environ and beside and beside.is_file():
-        path = beside
-    return _load_weights(Heads(), _locate(_HEADS, path), "lin")
+    return beside if beside and beside.is_file() and _HEADS.variable not in os.environ else None
 
 
-def _locate(public: _Public, path: str | Path | None) -> Path:
+def _locate(public: _Public, path: str | Path | None, *, download: bool) -> Path:
     chosen = path or os.environ.get(public.variable)
     if chosen:
         if not Path(chosen).is_file():
@@ -180,6 +192,11 @@ def _locate(public: _Public, path: str | Path | None) -> Path:
         return Path(chosen)
     cached = cache_folder() / public.file
     if not cached.is_file():
+        if not download:
+            raise CheckpointError(
+                f"The public weights of {public.what} ({public.mebibytes} MiB) are not at `{cached}`. Allow the "
+                f"download, `--lpips`, in Python `download=True`; or name the file: `export {public.variable}=FILE`."
+            )
         _download(public, cached)
     return cached
 

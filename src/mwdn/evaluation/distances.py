@@ -1,5 +1,8 @@
 """Distances between pictures, one number per sample.
 
+All take two batches (B, C, H, W) of floats and return (B,) numbers, or two numpy arrays or PIL pictures and return one
+float: see `comparing`.
+
 All are computed in float32, also inside autocast, on the device of the pictures. All are differentiable, with finite
 gradients even between identical pictures. (On a GPU, AlexNet's convolutions follow torch's TF32 setting, which costs
 the third digit.)
@@ -8,42 +11,77 @@ the third digit.)
 import math
 from collections.abc import Callable
 from functools import cache, wraps
-from typing import TypeVar, cast
+from typing import Any, Protocol, cast, overload, runtime_checkable
 
+import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from mwdn.errors import ShapeError, check_batch
+from mwdn.errors import ParameterError, ShapeError, check_batch
 from mwdn.evaluation.alexnet import AlexNet, Heads, load_alexnet, load_heads
-from mwdn.types import Image
+from mwdn.io.formats import as_frame
+from mwdn.types import ArrayPicture, Image
 
-_Distance = TypeVar("_Distance", bound=Callable[..., Tensor])
+
+@runtime_checkable
+class Distance(Protocol):
+    """A number for each sample of two batches, or one for two arrays or PIL pictures."""
+
+    @overload
+    def __call__(self, image: Tensor, reference: Tensor, *networks: Any, **named: Any) -> Tensor: ...  # noqa: ANN401
+
+    @overload
+    def __call__(
+        self,
+        image: ArrayPicture,
+        reference: ArrayPicture,
+        *networks: Any,  # noqa: ANN401
+        **named: Any,  # noqa: ANN401
+    ) -> float: ...
 
 
-def _comparing(distance: _Distance) -> _Distance:
-    """Check that the shapes agree, and compute in float32 outside autocast."""
+def comparing(distance: Callable[..., Tensor]) -> Distance:
+    """Decorate a distance: check that the shapes agree, and compute in float32 outside autocast.
+
+    Two numpy arrays or PIL pictures, (H, W) or (H, W, 1 or 3), are compared as tensors (1, C, H, W) of their numbers:
+    uint8 and uint16 divided by their type's maximum, floats as they are. The result is then a float.
+    """
 
     @wraps(distance)
-    def wrapped(image: Tensor, reference: Tensor, *networks: nn.Module, **named: nn.Module) -> Tensor:
+    def wrapped(image: Any, reference: Any, *networks: Any, **named: Any) -> Tensor | float:  # noqa: ANN401
+        if isinstance(image, Tensor) != isinstance(reference, Tensor):
+            raise ParameterError(
+                f"`image` ({type(image).__name__}) and `reference` ({type(reference).__name__}) must both be tensors "
+                "(B, C, H, W), or both arrays or PIL pictures (H, W, C)."
+            )
+        if not isinstance(image, Tensor):
+            return float(wrapped(_as_batch(image), _as_batch(reference), *networks, **named))
         if image.shape != reference.shape:
             raise ShapeError(
                 f"`image` {tuple(image.shape)} and `reference` {tuple(reference.shape)} must have the same shape "
                 "(B, C, H, W). Crop or resize the larger one."
             )
         check_batch(image, "image")
+        check_batch(reference, "reference")
         with torch.autocast(image.device.type, enabled=False):
             return distance(image.float(), reference.float(), *networks, **named)
 
-    return cast(_Distance, wrapped)
+    return cast(Distance, wrapped)
 
 
-@_comparing
+def _as_batch(picture: ArrayPicture) -> Image:
+    frame = as_frame(picture)
+    image = torch.from_numpy(frame.astype(np.float32)).movedim(-1, 0)[None]
+    return image if frame.dtype.kind == "f" else image / np.iinfo(frame.dtype).max
+
+
+@comparing
 def mse(image: Image, reference: Image) -> Tensor:
     """Mean squared error of each sample.
 
     Args:
-        image: (B, C, H, W), any range.
-        reference: of the same shape.
+        image: (B, C, H, W), any range; or an array or PIL picture, see `comparing`.
+        reference: of the same shape and kind.
 
     Returns:
         (B,), 0 for identical pictures.
@@ -54,13 +92,13 @@ def mse(image: Image, reference: Image) -> Tensor:
     return (image - reference).square().mean((1, 2, 3))
 
 
-@_comparing
+@comparing
 def l1(image: Image, reference: Image) -> Tensor:
     """Mean absolute error of each sample.
 
     Args:
-        image: (B, C, H, W), any range.
-        reference: of the same shape.
+        image: (B, C, H, W), any range; or an array or PIL picture, see `comparing`.
+        reference: of the same shape and kind.
 
     Returns:
         (B,), 0 for identical pictures.
@@ -71,15 +109,15 @@ def l1(image: Image, reference: Image) -> Tensor:
     return (image - reference).abs().mean((1, 2, 3))
 
 
-@_comparing
+@comparing
 def log_mse(image: Image, reference: Image) -> Tensor:
     """Logarithm to base 10 of each sample's mean squared error: minus a tenth of its PSNR in dB.
 
     The worst samples dominate a mean of `mse`; here a decibel counts the same in every sample.
 
     Args:
-        image: (B, C, H, W), any range.
-        reference: of the same shape.
+        image: (B, C, H, W), any range; or an array or PIL picture, see `comparing`.
+        reference: of the same shape and kind.
 
     Returns:
         (B,), -8 for identical pictures.
@@ -97,7 +135,7 @@ WINDOW = 11
 """Pixels along each side of the window of `ssim`."""
 
 
-@_comparing
+@comparing
 def ssim(image: Image, reference: Image) -> Tensor:
     """Structural similarity of each sample, in a Gaussian window of 11 x 11 pixels, sigma 1.5, for a range of 1.
 
@@ -106,8 +144,8 @@ def ssim(image: Image, reference: Image) -> Tensor:
     counts windows that reach into a reflected border, which changes the second decimal place of small pictures.
 
     Args:
-        image: (B, C, H, W), nominally in [0, 1].
-        reference: of the same shape.
+        image: (B, C, H, W), nominally in [0, 1]; or an array or PIL picture, see `comparing`.
+        reference: of the same shape and kind.
 
     Returns:
         (B,), at most 1, for identical pictures; larger is more similar. The loss is 1 - SSIM.
@@ -144,7 +182,7 @@ def _blurred(planes: Tensor) -> Tensor:
     return planes
 
 
-@_comparing
+@comparing
 def feature_mse(image: Image, reference: Image, alexnet: AlexNet) -> Tensor:
     """Mean squared error of AlexNet's relu2 features plus that of relu4, of each sample.
 
@@ -171,14 +209,14 @@ def feature_mse(image: Image, reference: Image, alexnet: AlexNet) -> Tensor:
     return relu[1] + relu[3]
 
 
-@_comparing
+@comparing
 def lpips(image: Image, reference: Image, alexnet: AlexNet | None = None, heads: Heads | None = None) -> Tensor:
     """LPIPS 0.1 of each sample: calibrated distance between AlexNet's features.
 
     Args:
         image: (B, 1 or 3, H, W) in [0, 1], at least 31 x 31 pixels; grey is repeated. LPIPS was calibrated on
-            sRGB values, not on linear light.
-        reference: of the same shape.
+            sRGB values, not on linear light. Or an array or PIL picture, see `comparing`.
+        reference: of the same shape and kind.
         alexnet: from `mwdn.evaluation.alexnet.load_alexnet`, on the device of the pictures; loaded unless given.
         heads: from `mwdn.evaluation.alexnet.load_heads`, on the same device; loaded unless given.
 

@@ -75,8 +75,8 @@ def evaluate(
         pairs: measurements and scenes; scenes in [0, 1], of the size of the reconstructions.
         protocol: the part of each picture that is compared.
         variant: adjustment of a reconstruction before the comparison; the protocol's unless given.
-        perceptual: networks for `lpips` and `feature_mse`; loaded or downloaded unless given. Metrics without weights,
-            or with too small pictures, are reported as missing.
+        perceptual: networks for `lpips` and `feature_mse`; unless given, loaded if their files are there, see
+            `Perceptual.load`. Metrics without weights, or with too small pictures, are reported as missing.
         shown: number of pictures that the report keeps for its contact sheet.
         progress: called with the method's name and the picture's index after each picture.
 

@@ -10,7 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from mwdn.errors import CheckpointError, ParameterError, ShapeError
+from mwdn.errors import CheckpointError, ParameterError, ShapeError, check_batch
 from mwdn.evaluation import distances
 from mwdn.evaluation.alexnet import AlexNet, Heads, load_alexnet, load_heads
 from mwdn.types import Image
@@ -112,19 +112,22 @@ class Perceptual:
     missing: dict[str, str]
 
     @classmethod
-    def load(cls, alexnet: str | Path | None = None, heads: str | Path | None = None) -> "Perceptual":
-        """Load the weights, downloading them if necessary; metrics without weights go to ``missing``.
+    def load(
+        cls, alexnet: str | Path | None = None, heads: str | Path | None = None, *, download: bool = False
+    ) -> "Perceptual":
+        """Load the weights; metrics without weights go to ``missing``.
 
         Args:
             alexnet: file of AlexNet's weights; see `mwdn.evaluation.alexnet.load_alexnet`.
             heads: file of LPIPS's heads; see `mwdn.evaluation.alexnet.load_heads`.
+            download: download missing files, 234 MiB, once.
         """
         try:
-            features = load_alexnet(alexnet)
+            features = load_alexnet(alexnet, download=download)
         except CheckpointError as error:
             return cls.none(str(error))
         try:
-            return cls(features, load_heads(heads, alexnet=alexnet), {})
+            return cls(features, load_heads(heads, alexnet=alexnet, download=download), {})
         except CheckpointError as error:
             return cls(features, None, {"lpips": str(error)})
 
@@ -134,18 +137,22 @@ class Perceptual:
         return cls(None, None, dict.fromkeys(("lpips", "feature_mse"), reason))
 
 
+@distances.comparing
 def psnr(image: Image, reference: Image) -> Tensor:
     """Peak signal-to-noise ratio of each sample in dB, for a peak of 1.
 
     Args:
-        image: (B, C, H, W), any range.
-        reference: of the same shape.
+        image: (B, C, H, W), any range; or a numpy array or PIL picture, (H, W) or (H, W, 1 or 3): floats as they are,
+            uint8 and uint16 divided by their type's maximum.
+        reference: of the same shape and kind.
 
     Returns:
-        (B,), ``-10 log10(mse)``: half the error is 6.02 dB more; infinite for identical pictures.
+        (B,), a float for arrays, ``-10 log10(mse)``: half the error is 6.02 dB more; infinite for identical pictures.
 
     Raises:
         ShapeError: the shapes differ.
+        ParameterError: integer tensors, or a tensor with an array.
+        ImageError: an array has other axes or types.
     """
     return -10 * torch.log10(distances.mse(image, reference))
 
@@ -194,11 +201,13 @@ def measure(
 
     Raises:
         ShapeError: the shapes differ, the part exceeds the picture, or is too small for a metric.
-        ParameterError: unknown variant.
+        ParameterError: unknown variant, or no tensors of floats.
     """
     variant = variant or protocol.variant
     if variant not in VARIANTS:
         raise ParameterError(f"`variant` ('{variant}') must be one of {', '.join(VARIANTS)}.")
+    check_batch(reconstruction, "reconstruction")
+    check_batch(scene, "scene")
     if reconstruction.shape != scene.shape:
         raise ShapeError(
             f"`reconstruction` {tuple(reconstruction.shape)} and `scene` {tuple(scene.shape)} must have the same "

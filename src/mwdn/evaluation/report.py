@@ -107,7 +107,8 @@ class Report:
             narrow: one number per line, for a terminal of 80 columns.
         """
         more = more or {}
-        title = f"{self.pictures} pictures, protocol {self.protocol}, {self.variant}: mean [95 % confidence]"
+        noun = "picture" if self.pictures == 1 else "pictures"
+        title = f"{self.pictures:,} {noun}, protocol {self.protocol}, {self.variant}: mean [95 % confidence]"
         style: dict[str, Any] = {"box": box.SIMPLE_HEAD, "padding": 0, "show_edge": False, "leading": 1}
         caption = self._missing() or None
         table = Table(title=title, caption=caption, caption_justify="left", **(style if narrow else {}))

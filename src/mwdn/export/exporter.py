@@ -19,7 +19,8 @@ from mwdn.calibration import Calibration
 from mwdn.errors import ExportError, ParameterError
 from mwdn.export.model_file import as_export_error, publish, require_packages, run_file, write_file
 from mwdn.inference.fusion import fuse
-from mwdn.inference.reconstructor import Method, Reconstructor, find_method
+from mwdn.inference.methods import Method, as_method
+from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.pictures import dark_scene
 from mwdn.networks.network import Network, as_network
 from mwdn.optics import Camera, Sensor
@@ -87,7 +88,7 @@ class FixedPsf(nn.Module):
 def export(
     method: Method | str | Path,
     calibration: Calibration,
-    out: Path,
+    out: str | Path,
     *,
     precision: Precision = "float32",
     channels: int | None = None,
@@ -111,21 +112,22 @@ def export(
     Raises:
         ExportError: the method cannot be written in this format, the file's results agree too little, onnx or
             onnxruntime is not installed, or the file cannot be written.
-        ParameterError: another suffix or precision.
+        ParameterError: another suffix or precision, or options of a method that is not given by its name.
         UnknownNameError: no such method or option.
         CheckpointError: the checkpoint cannot be used.
         ShapeError: the network takes another number of channels.
     """
+    out = Path(out)
     _check(out, precision, channels)
     name = str(method) if isinstance(method, str | Path) else type(method).__name__
-    if isinstance(method, str | Path):
-        method = find_method(method, **options)
+    method = as_method(method, **options)
     channels = channels or calibration.psf.shape[1]
     about = _about(name, calibration, channels, precision)
     if isinstance(method, Network) and method.align:
         about["alignment"] = "off: the PSF is taken as it is"
     measurement = simulate_captures(calibration, ("astronaut",), channels)
-    expected = Reconstructor(method, calibration, align=False, device="cpu", precision="exact")(measurement)
+    exact = Reconstructor(method, calibration, align=False, device="cpu", precision="exact")
+    expected = exact.on_device(measurement)
     with torch.no_grad(), tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / out.name
         module = FixedPsf(method, calibration.psf, dtype=torch.float16 if precision == "float16" else None)
@@ -200,10 +202,13 @@ def _about(name: str, calibration: Calibration, channels: int, precision: str) -
         "scene": "float32, linear light, not clipped to [0, 1]",
         "binning": str(calibration.frames.bin),
     }
+    if calibration.white_balance is not None:
+        about["white_balance"] = f"not applied to the scene: {calibration.white_balance}"
     if calibration.frames.bit_depth is not None:
         about["bit_depth"] = str(calibration.frames.bit_depth)
     if calibration.frames.crop is not None:
-        about["crop"] = f"{calibration.frames.crop[0]} x {calibration.frames.crop[1]}"
+        height, width = (length // calibration.frames.cell for length in calibration.frames.crop)
+        about["crop"] = f"{height} x {width}"  # of the colours, after the mosaic
     if calibration.frames.upside_down:
         about["rows"] = "raw frames have their first row at the bottom"
     if calibration.frames.bgr:
@@ -212,7 +217,11 @@ def _about(name: str, calibration: Calibration, channels: int, precision: str) -
         about["mosaic"] = calibration.frames.mosaic
     if calibration.frames.grey:
         about["grey"] = "the colours of raw frames must be averaged"
-    if calibration.dark is not None:
+    if calibration.frames.gamma is not None:
+        about["gamma"] = str(calibration.frames.gamma)
+    if calibration.ambient is not None:
+        about["ambient"] = "a frame taken with the room's light alone must be subtracted from raw frames"
+    elif calibration.dark is not None:
         about["dark"] = "a frame taken without light must be subtracted from raw frames"
     return about
 

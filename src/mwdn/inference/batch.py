@@ -1,83 +1,39 @@
 """Reconstruct a folder of captures: read, reconstruct, check and write in parallel, in one process or several."""
 
-import json
-import math
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, astuple, dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from mwdn.calibration.psf import SATURATED_PART
+from mwdn.calibration.frame_format import enlarge
 from mwdn.data.captures import read_capture
-from mwdn.errors import ImageError, MwdnError, ParameterError
-from mwdn.evaluation.consistency import Consistency, consistency
+from mwdn.diagnosis import Verdict
+from mwdn.diagnosis.captures import examine_capture
+from mwdn.diagnosis.exif import exif_turn, settle_exif
+from mwdn.diagnosis.sizes import mismatch
+from mwdn.diagnosis.trust import Trust, examine_picture
+from mwdn.errors import ImageError, MwdnError, ShapeError
 from mwdn.inference.origin import origin, settings_hash
+from mwdn.inference.outputs import SUMMARY, Format, output_name, read_sidecar, support_name
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.contact_sheets import contact_sheet, thumbnail, to_display
-from mwdn.io.files import as_image_error, path_resolver, write_json
+from mwdn.io.exif import orientation
+from mwdn.io.files import as_image_error, write_json
 from mwdn.io.images import read_frame, read_picture, write_linear, write_picture
+from mwdn.io.support_picture import support_picture
 from mwdn.runtime import distributed
+from mwdn.runtime.iterations import watch_iterations
 from mwdn.runtime.streams import prefetch
 from mwdn.runtime.transfers import to_device, to_host
 from mwdn.solvers import Pose, align
-from mwdn.types import Measurement, Scene
+from mwdn.types import Measurement, Scene, Size
 
-Format = Literal["png", "png16", "tiff", "npy"]
-"""``png`` and ``png16`` are sRGB, for viewing; ``tiff`` and ``npy`` hold the linear float32 values."""
-
-_SUFFIX = {"png": ".png", "png16": ".png", "tiff": ".tif", "npy": ".npy"}
-SUMMARY = "summary.png"
 SHOWN = 12
 """Number of captures on the summary: the first ones."""
-
-
-def output_name(capture: str | Path, format: Format) -> str:
-    """File name of a capture's picture: the capture's name with the format's suffix."""
-    return Path(capture).stem + _SUFFIX[format]
-
-
-def check_outputs(
-    captures: Sequence[str | Path], out: Path, format: Format, *, protected: Iterable[Path | None] = ()
-) -> None:
-    """Check that every capture has its own file name in ``out`` and that nothing of the user's is overwritten.
-
-    Raises:
-        ParameterError: two captures have the same output, an output would overwrite an input or a ``.json`` that is
-            not of this package, or ``out`` is a file.
-    """
-    if out.exists() and not out.is_dir():
-        raise ParameterError(f"`{out}` must be a folder, but is a file. Choose another one: `--out`.")
-    real = path_resolver()
-    inputs = {real(str(path)) for path in (*captures, *protected) if path is not None}
-
-    def check(output: str) -> None:
-        if real(output) in inputs:
-            raise ParameterError(f"`{output}` would overwrite an input. Choose another folder: `--out`.")
-
-    existing = {path.name for path in out.glob("*.json")}
-    check(str(out / SUMMARY))
-    sources = {SUMMARY: "the summary picture"}
-    start = str(out / "x").removesuffix("x")  # text instead of paths: there may be a million captures
-    for capture in captures:
-        name = output_name(capture, format)
-        sidecar = name.removesuffix(_SUFFIX[format]) + ".json"
-        check(start + name)
-        check(start + sidecar)
-        if sidecar in existing and not _read_sidecar(out / sidecar):
-            raise ParameterError(
-                f"`{start}{sidecar}` was not written by mwdn and would be lost. Choose another folder: `--out`."
-            )
-        if name in sources:
-            raise ParameterError(
-                f"`{capture}` and {sources[name]} would both be written to `{start}{name}`. Reconstruct them into "
-                "two folders: `--out`."
-            )
-        sources[name] = f"`{capture}`"
 
 
 @dataclass(frozen=True)
@@ -93,8 +49,9 @@ class Job:
         pose: of the PSF, if the consistency is checked.
         scene: (1, C, H, W).
         existing: whether the picture was already there and nothing was done.
-        saturated: fraction of saturated pixels, see `Calibration.saturated_part`.
-        consistency: of the picture with the capture, if it is checked.
+        full_size: height and width of the picture, if it is to be larger than the measurement.
+        verdicts: on the capture, the PSF and the picture, if they are checked.
+        trust: in the PSF and the picture, if they are checked.
         error: why there is no picture.
     """
 
@@ -106,14 +63,10 @@ class Job:
     pose: Pose | None = None
     scene: Scene | None = None
     existing: bool = False
-    saturated: float = 0.0
-    consistency: Consistency | None = None
+    full_size: Size | None = None
+    verdicts: tuple[Verdict, ...] = ()
+    trust: Trust | None = None
     error: MwdnError | None = None
-
-    @property
-    def overexposed(self) -> bool:
-        """Whether so many pixels are saturated that even the right PSF may look wrong."""
-        return self.saturated > SATURATED_PART
 
 
 def _step(work: Callable[["Batch", Job], Job]) -> Callable[["Batch", Job], Job]:
@@ -141,8 +94,12 @@ class Batch:
         out: folder of the pictures.
         format: of the pictures.
         check_consistency: check each picture against its capture, which may take longer than the reconstruction.
+        map: also draw which parts of each picture its capture supports, into `support_name`; needs
+            ``check_consistency``.
         resume: skip each capture whose picture exists with the same hash (`mwdn.inference.origin`), and with a
-            consistency check if one is requested.
+            consistency check and a map if they are requested.
+        psf_exif: EXIF orientation of the PSF's file, to compare with the captures'; ``None`` to compare nothing.
+        full_size: interpolate the pictures of binned captures to the captures' size before binning.
     """
 
     reconstruct: Reconstructor
@@ -150,14 +107,44 @@ class Batch:
     out: Path
     format: Format = "png"
     check_consistency: bool = True
+    map: bool = False
     resume: bool = False
+    psf_exif: int | None = None
+    full_size: bool = False
 
-    def run(self, captures: Sequence[str | Path]) -> Generator[Job, None, None]:
-        """Reconstruct captures in their order; with several processes, each capture in one of them."""
+    def run(
+        self,
+        captures: Sequence[str | Path],
+        report: Callable[[Job], None] = lambda job: None,
+        *,
+        progress: Callable[[float], None] = lambda done: None,
+    ) -> Generator[Job, None, None]:
+        """Reconstruct captures in their order; with several processes, each capture in one of them.
+
+        Args:
+            captures: files.
+            report: called with each job when its picture is written, in another thread. The generator yields the job
+                later: when the next capture, or the one after it, is reconstructed.
+            progress: called with the number of captures that are reconstructed, and after each iteration of a solver
+                with the part of the current one.
+        """
+        solves = not isinstance(self.reconstruct.method, nn.Module)  # a network iterates only at its start
+
+        def reconstruct(job: Job) -> Job:
+            with watch_iterations(lambda part: progress(job.number + part * solves)):
+                job = self._reconstruct(job)
+            progress(job.number + 1.0)
+            return job
+
+        def finish(job: Job) -> Job:
+            job = self._finish(job)
+            report(job)
+            return job
+
         numbers = distributed.work_queue(len(captures))
         jobs = (Job(Path(captures[n]), self.out / output_name(captures[n], self.format), n) for n in numbers)
         # Alignment and the check take longer than most methods: on a CPU the three steps share its cores.
-        with prefetch(self._read, jobs) as read, prefetch(self._finish, map(self._reconstruct, read)) as finished:
+        with prefetch(self._read, jobs) as read, prefetch(finish, map(reconstruct, read)) as finished:
             yield from finished
 
     @_step
@@ -167,12 +154,33 @@ class Batch:
             return replace(job, existing=True)
         calibration = self.reconstruct.calibration
         frame = calibration.frames.read(job.capture)
-        measurement = calibration.correct(frame)
+        measurement = calibration.to_measurement(frame)
+        self._check_fit(measurement)
         if measurement.amax() <= 0:
             raise ImageError("The sensor saw no light: no pixel is brighter than the dark frame, or black.")
         measurement = to_device(measurement, self.reconstruct.device)
-        pose = align(measurement, self.reconstruct.psf) if self.check_consistency else None
-        return replace(job, measurement=measurement, pose=pose, saturated=calibration.saturated_part(frame))
+        full_size = calibration.frames.full_size(frame) if self.full_size else None
+        job = replace(job, measurement=measurement, full_size=full_size)
+        if not self.check_consistency:
+            return job
+        verdicts = examine_capture(frame, calibration)
+        if self.psf_exif is not None:
+            verdicts += (exif_turn(orientation(job.capture), self.psf_exif),)
+        return replace(job, pose=align(measurement, self.reconstruct.psf), verdicts=verdicts)
+
+    def _check_fit(self, measurement: Measurement) -> None:
+        """Check the size; the first capture of each wrong size is compared with the PSF at other bins."""
+        try:
+            self.reconstruct.calibration.check_fit(measurement)
+        except ShapeError as error:
+            size = tuple(measurement.shape[-2:])
+            if size not in self._mismatches:
+                self._mismatches[size] = mismatch(error, measurement, self.reconstruct.calibration)
+            raise self._mismatches[size] from None
+
+    @cached_property
+    def _mismatches(self) -> dict[tuple[int, ...], ShapeError]:
+        return {}
 
     @_step
     def _reconstruct(self, job: Job) -> Job:
@@ -185,47 +193,53 @@ class Batch:
     def _finish(self, job: Job) -> Job:
         if job.measurement is None or job.scene is None:
             return job
-        result = self._consistency(job.measurement, job.scene, job.pose)
+        trust = self._examine(job.measurement, job.scene, job.pose)
+        verdicts = settle_exif((*job.verdicts, *trust.verdicts)) if trust else ()
         content: dict[str, object] = {
             "method": self.method,
             "psf_hash": self.reconstruct.calibration.psf_hash,
             "origin": job.origin,
+            "bin": self.reconstruct.calibration.frames.bin,
         }
-        if job.overexposed:
-            content["saturated"] = job.saturated
-        if result:
-            content |= {**asdict(result), "doubtful": result.doubtful}
-        scene, sidecar = to_host(job.scene), job.output.with_suffix(".json")
+        if trust:
+            content |= {**trust.content, "verdicts": [asdict(verdict) for verdict in verdicts]}
+        scene, sidecar = to_host(self.reconstruct.balance(job.scene)), job.output.with_suffix(".json")
+        if job.full_size:
+            scene = enlarge(scene, self.reconstruct.calibration.frames.bin, job.full_size)
         with as_image_error(sidecar):
             sidecar.unlink(missing_ok=True)  # an old sidecar must not stand beside the new picture
         if self.format in ("tiff", "npy"):
             write_linear(job.output, scene)
         else:
             write_picture(job.output, to_display(scene), bits=16 if self.format == "png16" else 8)
+        if trust and self.map:
+            write_picture(support_name(job.output), support_picture(scene, trust.support.map))
         write_json(sidecar, content)
-        return replace(job, measurement=None, pose=None, scene=None, consistency=result)
+        return replace(job, measurement=None, pose=None, scene=None, trust=trust, verdicts=verdicts)
 
-    def _consistency(self, measurement: Measurement, scene: Scene, pose: Pose | None) -> Consistency | None:
+    def _examine(self, measurement: Measurement, scene: Scene, pose: Pose | None) -> Trust | None:
         """Check a scene if requested; an `ImageError` unless the scene and the result are finite."""
-        result, finite = None, bool(scene.isfinite().all())
+        trust, finite = None, bool(scene.isfinite().all())
         if finite and self.check_consistency:
-            result = consistency(measurement, self.reconstruct.psf, scene, pose=pose)
-            finite = all(map(math.isfinite, astuple(result)))
+            given = self.reconstruct.calibration.psf_format.psf_orientation
+            trust = examine_picture(measurement, self.reconstruct.psf, scene, pose=pose, given=given)
+            finite = trust.finite
         if not finite:
             raise ImageError(
                 "The reconstruction holds NaN, infinity or too large numbers: nothing is written. The capture's "
                 f"brightest pixel is {measurement.amax():.3g}, where 1 is saturation. Scale it, or use another method."
             )
-        return result
+        return trust
 
     @cached_property
     def _settings_hash(self) -> str:
-        return settings_hash(self.reconstruct, self.format)
+        return settings_hash(self.reconstruct, self.format, full_size=self.full_size)
 
     def _exists(self, job: Job) -> bool:
         """Whether a job's picture is complete, of the same origin, and checked if that is requested."""
-        content = _read_sidecar(job.output.with_suffix(".json"))
+        content = read_sidecar(job.output.with_suffix(".json"))
         checked = "doubtful" in content or not self.check_consistency
+        checked &= not self.map or support_name(job.output).is_file()
         return checked and content.get("origin") == job.origin != "" and job.output.is_file()
 
     def summarise(self, captures: Iterable[str | Path]) -> None:
@@ -246,15 +260,6 @@ class Batch:
         if rows:
             titles = ["measurement", f"reconstruction ({Path(self.method).name})"]
             write_picture(self.out / SUMMARY, contact_sheet(rows, titles))
-
-
-def _read_sidecar(path: Path) -> dict[str, object]:
-    """Content of a sidecar file; empty if it is missing or not of this package."""
-    try:
-        content = json.loads(path.read_bytes())
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) and "origin" in content else {}
 
 
 def _read_output(path: Path) -> Tensor:

@@ -1,7 +1,7 @@
 """Fast inference with one network, PSF and device: PSF preparation, fused layers, half precision, CUDA graphs."""
 
 import copy
-from typing import Generic, Literal, cast, get_args
+from typing import Any, Generic, Literal, cast, get_args
 
 import torch
 from torch import Tensor
@@ -10,6 +10,7 @@ from mwdn.errors import ParameterError
 from mwdn.inference.cuda_graph import CudaGraph
 from mwdn.inference.fusion import fuse
 from mwdn.networks.network import Network, Prepared
+from mwdn.optics.psf import checked_psf
 from mwdn.runtime.devices import has_bfloat16, without_tf32
 from mwdn.types import Measurement, Psf, Scene
 
@@ -34,7 +35,7 @@ class Engine(Generic[Prepared]):
 
     Args:
         network: the trained network, which is copied.
-        psf: (1 or B, C, H, W).
+        psf: (1 or B, C, H, W); each channel is scaled to unit sum.
         precision: see `Precision`.
 
     Raises:
@@ -44,7 +45,7 @@ class Engine(Generic[Prepared]):
     def __init__(self, network: Network[Prepared], psf: Psf, *, precision: Precision = "fast") -> None:
         if precision not in get_args(Precision):
             raise ParameterError(f"`precision` must be fast or exact, not {precision!r}.")
-        self.precision = precision
+        self.precision, psf = precision, checked_psf(psf)
         exact = copy.deepcopy(network).to(psf.device).eval().requires_grad_(False)
         half = half_precision(psf.device) if precision == "fast" else None
         self.network = cast(Network[Prepared], fuse(copy.deepcopy(exact), half))
@@ -56,6 +57,10 @@ class Engine(Generic[Prepared]):
         self.psf = psf
         self.prepared: Prepared | None = None
         self.graphs: dict[torch.Size, CudaGraph | None] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the CUDA graphs, which belong to this process, and the prepared PSF, which can be large."""
+        return {**vars(self), "graphs": {}, "prepared": None}
 
     def with_psf(self, psf: Psf) -> "Engine[Prepared]":
         """An engine with another PSF that shares the network and its weights."""

@@ -50,6 +50,14 @@ class FusedConvolution(nn.Module):
         self.bias = bias.to(self.dtype)
         self.packed = _pack(self.weight, self.padding) if pack else None
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the packed weights, which fit this machine only."""
+        return {**vars(self), "packed": self.packed is not None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)  # type: ignore[no-untyped-call]
+        self.packed = _pack(self.weight, self.padding) if state["packed"] else None
+
     def forward(self, features: Tensor) -> Tensor:
         """Features in channels-last layout and the precision of the weights."""
         features = features.to(self.dtype).contiguous(memory_format=torch.channels_last)

@@ -30,9 +30,14 @@ _FIRST_NAMES = {"downsampling": "shrink", "only_if_noisy": "poor", "min_smoothin
 """Fields of `mwdn.solvers.pyramid.Level` that have been renamed."""
 
 
-def settings_hash(reconstruct: Reconstructor, format: str) -> str:
-    """Hash of the method with its weights, the calibration, the file format and the version of this package."""
-    return _digest(__version__, format, _camera(reconstruct.calibration), *_method(reconstruct))
+def settings_hash(reconstruct: Reconstructor, format: str, *, full_size: bool = False) -> str:
+    """Hash of the method with its weights, the calibration, format and size of files and this package's version."""
+    format += " at full size" if full_size and reconstruct.calibration.frames.bin > 1 else ""
+    camera = _camera(reconstruct.calibration)
+    if reconstruct.white_balance is not None:
+        camera["white_balance"] = reconstruct.white_balance
+        camera["light"] = reconstruct.calibration.light
+    return _digest(__version__, format, camera, *_method(reconstruct))
 
 
 def origin(settings: str, capture: Path) -> str:
@@ -50,12 +55,14 @@ def origin(settings: str, capture: Path) -> str:
 
 
 def _camera(calibration: Calibration) -> dict[str, object]:
+    """Everything a measurement depends on; what was added later counts only where it is set."""
     frames = calibration.frames
+    later = {"gamma": frames.gamma, "ambient": calibration.ambient}
     return {
         "psf": calibration.psf,
         "bit_depth": frames.bit_depth,
         "dark": calibration.dark,
-        "crop": frames.crop,
+        "crop": frames.crop and tuple(length // frames.cell for length in frames.crop),
         "binning": frames.bin,
         "background": calibration.background,
         "upside_down": frames.upside_down,
@@ -64,6 +71,7 @@ def _camera(calibration: Calibration) -> dict[str, object]:
         "distance_mm": calibration.distance_mm,
         "mosaic": frames.mosaic,
         "grey": frames.grey,
+        **{name: value for name, value in later.items() if value is not None},
     }
 
 

@@ -1,7 +1,7 @@
 """Reconstruction of one camera's measurements and raw frames by any method."""
 
 import copy
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, overload
 
@@ -10,78 +10,21 @@ from torch import Tensor, nn
 
 from mwdn import solvers
 from mwdn.calibration import Calibration
-from mwdn.errors import CheckpointError, ParameterError, ShapeError, UnknownNameError
+from mwdn.calibration.white_balance import WhiteBalance, apply_white_balance, check_white_balance
+from mwdn.errors import ParameterError, ShapeError, check_batch, check_options
 from mwdn.fourier.convolution import check_fit
 from mwdn.inference.engine import Engine, Precision
+from mwdn.inference.methods import Method, as_method, psf_warning
 from mwdn.io.formats import as_frame
-from mwdn.networks import DENOISERS, NETWORKS
 from mwdn.networks.blocks import check_channels
 from mwdn.networks.network import Network, as_network
 from mwdn.runtime.devices import select_device
 from mwdn.runtime.transfers import to_device, to_host
-from mwdn.types import ArrayPicture, FloatFrame, Frame, Measurement, Psf, Scene
-from mwdn.weights.bundled import BUNDLED, find_weights
-from mwdn.weights.checkpoint import SUFFIXES, load_checkpoint, read_metadata
+from mwdn.types import ArrayPicture, FloatFrame, Frame, Measurement, Scene
 
 PIXELS_PER_CHUNK = {"cpu": 2**17, "cuda": 2**24}
 """Default of `Reconstructor.pixels_per_chunk` on each type of device. A GPU needs many pixels for full load. On a CPU,
 batches of 320 x 320 pictures are 15 % (MWDN) or 50 % (ADMM) slower than single pictures because of cache misses."""
-
-Method = Callable[[Measurement, Psf], Scene]
-"""A solver or a network, called as ``method(measurement, psf)``."""
-
-
-def find_method(name: str | Path, **options: Any) -> Method:  # noqa: ANN401
-    """Find a solver or a bundled network by its name, or a network by the path of its checkpoint.
-
-    Args:
-        name: the name or the path; ``hub:owner/name`` for a network on the Hugging Face hub.
-        **options: of a solver, for example ``regularisation=1e-4``. A network's options are in its checkpoint.
-
-    Raises:
-        UnknownNameError: neither a solver nor a file, or the solver has no such option.
-        CheckpointError: the file holds no usable weights.
-        ParameterError: an option is out of range, a network is given options, or a network needs training first.
-    """
-    if str(name) in solvers.SOLVERS:
-        return solvers.build(str(name), **options)
-    if options:
-        names = ", ".join(f"`{option}`" for option in options)
-        raise ParameterError(
-            f"{names} cannot be set for '{name}': only solvers ({', '.join(solvers.SOLVERS)}) have options. "
-            "See `mwdn methods`."
-        )
-    path = find_weights(str(name)) or Path(name)
-    if path.suffix in SUFFIXES or path.is_file():
-        network = load_checkpoint(path)
-        if isinstance(network, tuple(DENOISERS.values())):
-            raise CheckpointError(
-                f"`{name}` holds a denoiser, which cannot reconstruct on its own. Use it as `denoiser` in [schedule] "
-                "of a recipe such as recipes/universal-plug.toml."
-            )
-        return network
-    if str(name) in NETWORKS:
-        raise ParameterError(
-            f'`{name}` is a network without weights. Train it with `name = "{name}"` in [network] of the recipe: '
-            f"`mwdn train RECIPE.toml --psf psf.png --photos photos/ --out runs/{name}`. The method is then "
-            f"`runs/{name}/best.safetensors`. `universal` needs no training."
-        )
-    raise UnknownNameError("method", str(name), [*BUNDLED, *solvers.SOLVERS, "PATH/OF/CHECKPOINT.safetensors"])
-
-
-def _psf_warning(method: str | Path, calibration: Calibration) -> str | None:
-    """Warning if the network was trained for another PSF than the calibration's."""
-    path = find_weights(str(method)) or Path(method)
-    if path.suffix != ".safetensors":
-        return None
-    trained = read_metadata(path).get("psf_hash")
-    if trained in (None, calibration.psf_hash):
-        return None
-    return (
-        f"`{method}` was trained for PSF {trained}, but the calibration has PSF {calibration.psf_hash}. "
-        "Expect blur, ghosts and invented detail, unless both are from the same camera: another crop, binning or "
-        "background counts as another PSF. Use the PSF of the training, or train for this one: `mwdn train`."
-    )
 
 
 class Reconstructor:
@@ -97,9 +40,13 @@ class Reconstructor:
             ``universal-small`` and solvers do not.
         device: a GPU if there is one, unless given.
         precision: of a network, see `mwdn.inference.engine.Precision`; solvers are always exact.
+        white_balance: of the pictures, see `mwdn.calibration.white_balance`; that of the calibration unless given.
         **options: of a solver given by its name, for example ``regularisation=1e-4``.
 
+    It can be copied and pickled if its method can.
+
     Attributes:
+        name: of the method, as given or of its type.
         method: the solver or network. Later changes of a network have no effect: a copy reconstructs.
         warning: why the result may be wrong, or ``None``.
         pixels_per_chunk: pixels of a batch that are reconstructed together.
@@ -119,8 +66,11 @@ class Reconstructor:
         align: bool | None = None,
         device: str | torch.device | None = None,
         precision: Precision = "fast",
+        white_balance: WhiteBalance | None = None,
         **options: Any,  # noqa: ANN401
     ) -> None:
+        given = {"method": method, "align": align, "device": device, "precision": precision}
+        check_options(Reconstructor, "`Reconstructor`", given)
         if not isinstance(calibration, Calibration):
             raise ParameterError(
                 f"`calibration` ({type(calibration).__name__}) must be a `Calibration`: "
@@ -129,18 +79,26 @@ class Reconstructor:
         self.device = select_device(device)
         self.pixels_per_chunk = PIXELS_PER_CHUNK.get(self.device.type, PIXELS_PER_CHUNK["cpu"])
         self.calibration = calibration
+        self.white_balance = calibration.white_balance if white_balance is None else white_balance
+        check_white_balance(self.white_balance, calibration.light)
         self.warning = None
+        self.name = str(method) if isinstance(method, str | Path) else type(method).__name__
         if isinstance(method, str | Path):
-            self.warning = _psf_warning(method, calibration)
-            method = find_method(method, **options)
-        elif options:
-            raise ParameterError(f"Options ({', '.join(options)}) need a method given by its name, not an object.")
-        self.method: Method = method
+            self.warning = psf_warning(method, calibration)
+        self.method: Method = as_method(method, **options)
+        method = self.method
         self.align = method.align if align is None and isinstance(method, Network) else bool(align)
         self.psf = calibration.psf.to(self.device)
         self.engine = None
         if isinstance(method, nn.Module):
             self.engine = Engine(as_network(method), self.psf, precision=precision)
+
+    def __repr__(self) -> str:
+        height, width = self.calibration.size
+        aligned = ", aligned" if self.align else ""
+        return (
+            f"Reconstructor('{self.name}', {height} x {width}, PSF {self.calibration.psf_hash}, {self.device}{aligned})"
+        )
 
     def at(self, pose: solvers.Pose) -> "Reconstructor":
         """A `Reconstructor` with a fixed pose of the PSF, instead of one estimated for each measurement.
@@ -206,16 +164,10 @@ class Reconstructor:
         return max(1, self.pixels_per_chunk // (measurement.shape[-2] * measurement.shape[-1]))
 
     def _check(self, measurement: Measurement) -> None:
-        if not measurement.is_floating_point():
-            raise ParameterError(
-                f"`measurement` ({measurement.dtype}) must be floats in linear light; raw frames go through "
-                "`Calibration.correct`."
-            )
+        check_batch(measurement, "measurement")
         shape = tuple(measurement.shape)
-        if len(shape) != 4 or 0 in shape:
-            raise ShapeError(
-                f"`measurement` {shape} must be a non-empty batch (B, C, H, W). For one picture: `measurement[None]`."
-            )
+        if 0 in shape:
+            raise ShapeError(f"`measurement` {shape} must be a non-empty batch (B, C, H, W).")
         if shape[-2:] != self.psf.shape[-2:]:
             raise ShapeError(
                 f"`measurement` {shape} and `psf` {tuple(self.psf.shape)} must have the same height and width. Pass "
@@ -236,8 +188,9 @@ class Reconstructor:
         """Reconstruct a batch of measurements, or one raw frame.
 
         Args:
-            measurement: tensor (B, C, H, W), as `Calibration.correct` returns it; or a raw frame as numpy array or PIL
-                picture, (H, W) or (H, W, C), which is corrected first.
+            measurement: tensor (B, C, H, W) of floats, as `Calibration.correct` returns it: linear light, 1 is
+                saturation, RGB, row 0 at the top. Or a raw frame as numpy array or PIL picture, (H, W) or (H, W, 1 or
+                3), which `Calibration.correct` corrects first: uint8 or uint16 of the type's maximum, or floats of 1.
 
         Returns:
             Scene in linear light: (B, C, H, W) on the CPU for a tensor, (H, W, C) float32 for a raw frame. Solvers
@@ -246,8 +199,8 @@ class Reconstructor:
         Raises:
             ShapeError: the measurement is not a batch, or its size or channels do not fit the PSF or the network.
             ImageError: the array or picture is not a frame.
-            ParameterError: the measurement is a tensor of integers, or the device does not have enough memory for
-                pictures of this size.
+            ParameterError: the measurement is a tensor of integers, floats of an array exceed 1 by far, or the device
+                does not have enough memory for pictures of this size.
         """
         if isinstance(measurement, Tensor):
             return self._to_host(measurement)
@@ -255,11 +208,17 @@ class Reconstructor:
 
     @torch.inference_mode()
     def _to_host(self, measurement: Measurement) -> Scene:
-        return to_host(self.on_device(measurement))
+        return to_host(self.balance(self.on_device(measurement)))
+
+    def balance(self, scene: Scene) -> Scene:
+        """Apply the white balance to the result of `on_device`."""
+        if self.white_balance is None:
+            return scene
+        return apply_white_balance(scene, self.white_balance, self.calibration.light)
 
     @torch.inference_mode()
     def on_device(self, measurement: Measurement) -> Scene:
-        """Reconstruct a batch and leave the result on `device`, for further processing there.
+        """Reconstruct a batch and leave the result on `device`, in the colours of the camera: without `balance`.
 
         Raises:
             ShapeError: as for a call.

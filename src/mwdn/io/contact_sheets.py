@@ -1,28 +1,46 @@
 """Contact sheets: pictures side by side, with a title above each column."""
 
-from typing import TypeVar
+from typing import overload
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from mwdn.errors import check_batch
+from mwdn.io.formats import as_frame
 from mwdn.io.images import srgb_decode
-from mwdn.types import FloatFrame, Image
-
-_Picture = TypeVar("_Picture", Tensor, FloatFrame)
+from mwdn.types import ArrayPicture, FloatFrame, Image
 
 
-def to_display(image: _Picture) -> _Picture:
+@overload
+def to_display(image: Tensor) -> Tensor: ...
+
+
+@overload
+def to_display(image: ArrayPicture) -> FloatFrame: ...
+
+
+def to_display(image: Tensor | ArrayPicture) -> Tensor | FloatFrame:
     """Scale each image of a batch such that all but its brightest 0.3 % of values are within [0, 1], and clip it.
 
     The absolute brightness of a reconstruction depends on the exposures of the capture and of the PSF.
 
     Args:
-        image: (B, C, H, W), or one numpy array (H, W, C), linear light.
+        image: tensor (B, C, H, W), or numpy array or PIL picture (H, W) or (H, W, 1 or 3), linear light of any scale.
+
+    Returns:
+        A tensor of the same shape, or a float32 array of the same shape; `mwdn.write_picture` takes both.
+
+    Raises:
+        ImageError: an array has other axes or types, NaN or infinity.
+        ShapeError: a tensor has other axes.
+        ParameterError: a tensor of integers.
     """
     if not isinstance(image, Tensor):
-        return to_display(torch.from_numpy(image)[None])[0].numpy()
+        frame = torch.from_numpy(as_frame(image).astype(np.float32))
+        return to_display(frame.movedim(-1, 0)[None])[0].movedim(0, -1).numpy().reshape(np.asarray(image).shape)
+    check_batch(image, "image")
     pixels = image.float().flatten(1)
     brightest = pixels.kthvalue(pixels.shape[1] - int(0.003 * pixels.shape[1])).values
     return (image / brightest.clamp(min=1e-12)[:, None, None, None]).clamp(0, 1)

@@ -92,14 +92,14 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 
 
 def check_folder(folder: Path) -> None:
-    """Create a folder and check that it can be written to, before any work starts.
+    """Check that a folder can be written to, or created, before any work starts. Nothing is left behind.
 
     Raises:
         ParameterError: it cannot be created or written to.
     """
     with as_parameter_error(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
+        existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+        with tempfile.TemporaryFile(dir=existing):
             pass
 
 

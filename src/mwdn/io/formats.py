@@ -1,15 +1,15 @@
-"""Readers of PNG, JPEG, BMP, TIFF and NPY. The format is taken from the content, and the header is checked first."""
+"""Readers of pictures and arrays. The format is taken from the content, and the header is checked first."""
 
 import logging
 import re
-import struct
-import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mwdn.errors import ImageError
+from mwdn.errors import ImageError, shown
+from mwdn.io.headers import COPY_AGAIN, picture_size
+from mwdn.io.raw import is_raw, read_raw
 from mwdn.types import ArrayPicture, Frame
 
 MAX_PIXELS = 2**28
@@ -18,8 +18,10 @@ claims more is damaged, or made to exhaust the reader's memory."""
 
 _SIGNATURES = {b"\x89PNG\r\n\x1a\n": "PNG", b"\xff\xd8\xff": "JPEG", b"BM": "BMP", b"\x93NUMPY": "NPY"}
 _SIGNATURES |= dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "TIFF")  # + is BigTIFF
-_JPEG_MARKER = re.compile(rb"\xff[\x02-\xcf\xd8-\xfe]")  # FF 00 and FF D0 to D7 belong to the compressed data
-_COPY_AGAIN = "Copy it from its source again."
+_SIGNATURES |= dict.fromkeys((b"P5\n", b"P6\n", b"P5 ", b"P6 "), "PGM")
+_PGM_HEADER = re.compile(rb"P([56])" + 3 * rb"\s+(?:#[^\n]*\n\s*)*(\d+)" + rb"\s")
+
+_PIL_MODES = ("L", "RGB", "F", "I;16", "I;16L", "I;16B")
 
 # tifffile logs unusual tags. Without a handler these lines would reach the terminal.
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
@@ -32,15 +34,17 @@ def read(path: Path, *, photograph: bool) -> Frame:
 
     Args:
         path: of the file.
-        photograph: rotate it according to its EXIF orientation, and resolve palettes.
+        photograph: rotate it according to its EXIF orientation, and resolve palettes. Raw files are refused.
 
     Raises:
         ImageError: it cannot be read, or holds NaN or infinity.
     """
+    if is_raw(path):
+        return _read_raw(path, photograph)
     try:
         match _kind(path):
             case "NPY":
-                frame = _read_npy(path)
+                frame = _read_npy(path, photograph)
             case "TIFF":
                 frame = _read_tiff(path, photograph)
             case kind:
@@ -56,6 +60,8 @@ def read(path: Path, *, photograph: bool) -> Frame:
 
 def kind_of(start: bytes) -> str | None:
     """Name of the format whose files start with these bytes, or ``None``."""
+    if start[:4] == b"RIFF" and start[8:12] == b"WEBP":
+        return "WebP"
     return next((kind for signature, kind in _SIGNATURES.items() if start.startswith(signature)), None)
 
 
@@ -65,12 +71,15 @@ def _kind(path: Path) -> str:
     if not path.is_file():
         raise ImageError("must be a file, but is a folder or a device. Name one file inside it.")
     with path.open("rb") as file:
-        start = file.read(8)
+        start = file.read(12)
     if not start:
-        raise ImageError(f"is empty (0 bytes). {_COPY_AGAIN}")
+        raise ImageError(f"is empty (0 bytes). {COPY_AGAIN}")
     if kind := kind_of(start):
         return kind
-    raise ImageError(f"must be PNG, JPEG, BMP, TIFF or NPY, but starts with {start!r}. Export it as PNG.")
+    raise ImageError(
+        f"must be PNG, JPEG, WebP, BMP, PGM, PPM, TIFF, NPY or a camera's raw file, but starts with {start[:8]!r}. "
+        "Export it as PNG."
+    )
 
 
 def _frame_shape(shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, ...]:
@@ -94,30 +103,53 @@ def _frame_shape(shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, ...
     return axes
 
 
-def _to_frame(stored: Frame, axes: tuple[int, ...], *, copy: bool = True) -> Frame:
+def _without_alpha(pixels: Frame) -> Frame:
+    """The first three of four channels. Alpha must be opaque: a transparent pixel has no certain colour."""
+    opaque = 1.0 if pixels.dtype.kind == "f" else np.iinfo(pixels.dtype).max
+    transparent = float((pixels[..., 3] < opaque).mean())
+    if transparent > 0:
+        raise ImageError(f"is transparent in {transparent:.1%} of its pixels (alpha). Save it without transparency.")
+    return pixels[..., :3]
+
+
+def _to_frame(stored: Frame, axes: tuple[int, ...], *, copy: bool = True, photograph: bool = False) -> Frame:
     """Reshape to (H, W, C), drop alpha, and convert to native byte order and floats to float32."""
+    pixels = stored.reshape(axes)
+    pixels = pixels[..., :3] if photograph or axes[2] != 4 else _without_alpha(pixels)
     dtype = np.dtype(np.float32) if stored.dtype.kind == "f" else stored.dtype.newbyteorder("=")
     with np.errstate(over="ignore"):  # a float64 beyond float32's range becomes infinity, which is refused later
-        return stored.reshape(axes)[..., :3].astype(dtype, copy=copy, subok=False)
+        return pixels.astype(dtype, copy=copy, subok=False)
 
 
 def as_frame(picture: ArrayPicture, *, finite: bool = True) -> Frame:
     """Convert a numpy array or a PIL picture to a frame, without a copy where its axes and type fit.
 
     Args:
-        picture: (H, W) or (H, W, C) of 1, 3 or 4 channels, RGB, row 0 at the top, uint8, uint16 or floats. Alpha is
-            dropped.
+        picture: (H, W) or (H, W, C) of 1 or 3 channels, RGB, row 0 at the top, uint8, uint16 or floats; a PIL picture
+            of mode L, RGB, I;16 or F. Nothing is scaled, turned or decoded.
         finite: refuse NaN and infinity.
 
     Raises:
-        ImageError: other axes or types; NaN or infinity; a path; a PIL picture with a palette.
+        ImageError: other axes, for example a batch; alpha; other types, for example int32; NaN or infinity; a path; a
+            tensor; a PIL picture of another mode.
     """
     if isinstance(picture, str | Path):
         raise ImageError(f"`{picture}` is a path, not a frame: `mwdn.read_frame('{picture}')`.")
-    if getattr(picture, "mode", None) == "P":
-        raise ImageError("The picture has a palette (mode P), not colours. Convert it: `picture.convert('RGB')`.")
+    if hasattr(picture, "is_floating_point"):  # axes and scale of a tensor are others
+        raise ImageError(
+            f"A frame ({shown(picture)}) must be an array (H, W, C), not a tensor: `tensor.movedim(0, -1).numpy()` for "
+            "one (C, H, W). A tensor (B, C, H, W) of floats is a measurement already."
+        )
+    mode = getattr(picture, "mode", "L")
+    if mode not in _PIL_MODES:
+        raise ImageError(f"The picture (mode {mode}) must be grey or RGB. Convert it: `picture.convert('RGB')`.")
     stored = np.asarray(picture)
     try:
+        if stored.ndim > 3:
+            shape = " x ".join(map(str, stored.shape))
+            raise ImageError(f"has the shape ({shape}), a frame (H, W) or (H, W, C). For the first one: `array[0]`.")
+        if stored.ndim == 3 and stored.shape[2] == 4:
+            raise ImageError(f"{stored.shape} has four channels, a frame 1 or 3. Without alpha: `array[..., :3]`.")
         frame = _to_frame(stored, _frame_shape(stored.shape, stored.dtype), copy=False)
     except ImageError as error:
         raise ImageError(f"The array {error}") from error
@@ -126,12 +158,18 @@ def as_frame(picture: ArrayPicture, *, finite: bool = True) -> Frame:
     return frame
 
 
-def _read_npy(path: Path) -> Frame:
+def _read_raw(path: Path, photograph: bool) -> Frame:
+    if photograph:
+        raise ImageError(f"`{path}` is a camera's raw file, not a photograph for display. Export it as JPEG.")
+    return read_raw(path).frame
+
+
+def _read_npy(path: Path, photograph: bool) -> Frame:
     try:
         stored = np.load(path, mmap_mode="r", allow_pickle=False)
     except Exception as error:
         raise ImageError(f"is not a complete NPY file of numbers ({error}). Copy or save it again.") from error
-    return _to_frame(stored, _frame_shape(stored.shape, stored.dtype))
+    return _to_frame(stored, _frame_shape(stored.shape, stored.dtype), photograph=photograph)
 
 
 def _read_tiff(path: Path, photograph: bool) -> Frame:
@@ -147,8 +185,8 @@ def _read_tiff(path: Path, photograph: bool) -> Frame:
     except ImageError:
         raise
     except Exception as error:  # a damaged file makes tifffile raise struct.error, ValueError, KeyError ...
-        raise ImageError(f"cannot be read as TIFF: {error}. {_COPY_AGAIN}") from error
-    frame = _to_frame(np.moveaxis(stored, -3, -1) if planar else stored, axes)
+        raise ImageError(f"cannot be read as TIFF: {error}. {COPY_AGAIN}") from error
+    frame = _to_frame(np.moveaxis(stored, -3, -1) if planar else stored, axes, photograph=photograph)
     return _upright(frame, orientation) if photograph else frame
 
 
@@ -157,9 +195,9 @@ def _decode_tiff(path: Path) -> Frame:
 
     pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
-        raise ImageError(f"is damaged: OpenCV cannot decode this TIFF. {_COPY_AGAIN}")
+        raise ImageError(f"is damaged: OpenCV cannot decode this TIFF. {COPY_AGAIN}")
     pixels = np.atleast_3d(pixels)
-    return np.ascontiguousarray(pixels[..., 2::-1] if pixels.shape[2] >= 3 else pixels)
+    return np.ascontiguousarray(pixels[..., [2, 1, 0, 3][: pixels.shape[2]]] if pixels.shape[2] >= 3 else pixels)
 
 
 def _upright(frame: Frame, orientation: int) -> Frame:
@@ -172,7 +210,7 @@ def _tiff_axes(file: Any) -> tuple[tuple[int, ...], bool, int]:  # noqa: ANN401
     pages, handle = file.pages, file.filehandle
     # If the chain of pages is cut, tifffile silently returns the pages before it: only red of a planar picture.
     if len(pages) == 0 or (handle.seek(pages.next_page_offset) and any(handle.read(file.tiff.offsetsize))):
-        raise ImageError(f"is cut off: its list of pages leads past its end. {_COPY_AGAIN}")
+        raise ImageError(f"is cut off: its list of pages leads past its end. {COPY_AGAIN}")
     if pages[0].photometric not in (1, 2, 32803, 34892):  # grey, RGB, two kinds of raw mosaic
         colours = getattr(pages[0].photometric, "name", pages[0].photometric)
         raise ImageError(f"stores its colours as {colours}. Save it as RGB, or as grey with black at 0.")
@@ -182,7 +220,7 @@ def _tiff_axes(file: Any) -> tuple[tuple[int, ...], bool, int]:  # noqa: ANN401
 
 
 def decode(kind: str, data: bytes, photograph: bool) -> Frame:
-    """Read a whole PNG, JPEG or BMP.
+    """Read a whole PNG, JPEG, WebP, BMP, PGM or PPM.
 
     Args:
         kind: from `kind_of`.
@@ -194,51 +232,31 @@ def decode(kind: str, data: bytes, photograph: bool) -> Frame:
     """
     import cv2
 
-    _frame_shape({"PNG": _png_size, "JPEG": _jpeg_size, "BMP": _bmp_size}[kind](data), np.dtype(np.uint8))
+    if kind == "PGM":
+        return _read_pgm(data)
+    _frame_shape(picture_size(kind, data), np.dtype(np.uint8))
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH if photograph else cv2.IMREAD_UNCHANGED
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
-        raise ImageError(f"cannot be decoded as {kind}: {error.err}. {_COPY_AGAIN}") from error
+        raise ImageError(f"cannot be decoded as {kind}: {error.err}. {COPY_AGAIN}") from error
     if pixels is None:
-        raise ImageError(f"is damaged: OpenCV cannot decode this {kind}. {_COPY_AGAIN}")
+        raise ImageError(f"is damaged: OpenCV cannot decode this {kind}. {COPY_AGAIN}")
     pixels = np.atleast_3d(pixels)
+    pixels = _without_alpha(pixels) if pixels.shape[2] == 4 else pixels
     if pixels.shape[2] == 1 or (kind == "PNG" and data[25] in (0, 4)):  # OpenCV decodes grey with alpha as BGRA
         return pixels[..., :1]
-    return pixels[..., 2::-1]  # from BGR or BGRA
+    return pixels[..., ::-1]  # from BGR
 
 
-def _png_size(data: bytes) -> tuple[int, int]:
-    view, position, kind = memoryview(data), 8, b""
-    while kind != b"IEND":
-        end, kind = position + 12 + int.from_bytes(view[position:][:4]), bytes(view[position + 4 :][:4])
-        if end > len(data):
-            raise ImageError(f"is cut off: after {len(data):,} bytes this PNG has no end (IEND). {_COPY_AGAIN}")
-        # An upper-case first letter marks critical chunks.
-        if kind[:1].isupper() and zlib.crc32(view[position + 4 : end - 4]) != int.from_bytes(view[end - 4 : end]):
-            raise ImageError(f"is damaged: the checksum of {kind!r} at byte {position:,} is wrong. {_COPY_AGAIN}")
-        position = end
-    return int.from_bytes(data[20:24]), int.from_bytes(data[16:20])
-
-
-def _jpeg_size(data: bytes) -> tuple[int, int]:
-    position, size = 2, b""
-    while marker := _JPEG_MARKER.search(data, position):
-        code, position = marker.group()[1], marker.end()
-        if code == 0xD9:
-            return int.from_bytes(size[:2]), int.from_bytes(size[2:])
-        if 0xC0 <= code <= 0xCF and code not in (0xC4, 0xC8, 0xCC):  # the start of a frame, not a table
-            size = data[position + 3 : position + 7]
-        position += int.from_bytes(data[position : position + 2])  # skips a thumbnail, which has its own end marker
-    raise ImageError(f"is cut off: after {len(data):,} bytes this JPEG has no end (FF D9). {_COPY_AGAIN}")
-
-
-def _bmp_size(data: bytes) -> tuple[int, int]:
-    head = data[:34].ljust(34, b"\0")
-    start, header = struct.unpack_from("<II", head, 10)
-    width, height, _, bits = struct.unpack_from("<4H" if header == 12 else "<iiHH", head, 18)
-    packed = header > 12 and head[30] not in (0, 3)  # run-length encoded: only the decoder knows the size
-    needed = start + (0 if packed else (width * bits + 31) // 32 * 4 * abs(height))  # rows are padded to 4 bytes
-    if len(data) < max(needed, 26):
-        raise ImageError(f"is cut off: this BMP has {len(data):,} bytes and needs {needed:,}. {_COPY_AGAIN}")
-    return abs(height), width  # a negative height puts the top row first
+def _read_pgm(data: bytes) -> Frame:
+    """A binary PGM (grey) or PPM (RGB): a header in text, then the numbers, the high byte of 16 bits first."""
+    if not (header := _PGM_HEADER.match(data)):
+        raise ImageError(f"is damaged: this PGM or PPM has no width, height and largest number. {COPY_AGAIN}")
+    kind, width, height, largest = map(int, header.groups())
+    dtype = np.dtype(np.uint8 if largest < 256 else ">u2")
+    axes = _frame_shape((height, width, 1 if kind == 5 else 3), dtype)
+    needed = header.end() + dtype.itemsize * axes[0] * axes[1] * axes[2]
+    if len(data) < needed:
+        raise ImageError(f"is cut off: this PGM or PPM has {len(data):,} bytes and needs {needed:,}. {COPY_AGAIN}")
+    return _to_frame(np.frombuffer(data[header.end() : needed], dtype), axes)

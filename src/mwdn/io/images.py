@@ -11,22 +11,23 @@ from mwdn.io.files import atomic_write
 from mwdn.io.formats import as_frame, decode, kind_of, read
 from mwdn.types import FloatFrame, Frame, Image
 
-READABLE = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".npy"})
-"""Suffixes, in lower case, of the files in a folder that are taken for pictures and frames."""
+READABLE = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".npy"})
+"""Suffixes, in lower case, of the files in a folder that are taken for pictures; frames may be `RAW`, too."""
 
 
 def read_frame(path: str | Path, *, bgr: bool = False, upside_down: bool = False, upright: bool = False) -> Frame:
-    """Read a frame, its numbers exactly as stored: no gamma, no scaling.
+    """Read a frame, its numbers exactly as stored: no gamma, no scaling except of raw files.
 
     Args:
-        path: PNG, JPEG, BMP, TIFF (its first picture) or NPY.
+        path: PNG, JPEG, WebP, BMP, PGM, PPM, TIFF (its first picture), NPY, or a camera's raw file (`mwdn.io.raw`): the
+            mosaic of the sensor as one channel, with the black level at 0 and the white level at 65,535.
         bgr: the file's channels are blue, green, red.
         upside_down: the file's first row is the bottom of the picture. DiffuserCam's ``.npy`` files need both.
         upright: rotate a photograph according to its EXIF orientation; frames of a sensor are never rotated.
 
     Returns:
         (H, W, 1) or (H, W, 3), RGB, row 0 at the top, uint8 or uint16 as stored, any float as float32.
-        Grey has one channel, alpha is dropped, leading axes of length 1 are removed.
+        Grey has one channel, opaque alpha is dropped, leading axes of length 1 are removed.
 
     Raises:
         ImageError: no such file; damaged, cut off, or of an unknown format; other numbers or axes than these;
@@ -61,7 +62,7 @@ def read_picture(path: str | Path) -> Image:
     """Read a photograph as linear light: rotated according to its EXIF orientation, decoded from sRGB.
 
     Args:
-        path: PNG, JPEG, BMP, TIFF (its first picture) or NPY, of 8 or 16 bits.
+        path: PNG, JPEG, WebP, BMP, PGM, PPM, TIFF (its first picture) or NPY, of 8 or 16 bits.
 
     Returns:
         (1, 3, H, W), in [0, 1]; 1 is the largest number of 8 or 16 bits. Grey is repeated, alpha dropped.
@@ -82,16 +83,23 @@ def write_picture(path: str | Path, image: Tensor | FloatFrame, *, bits: int = 8
 
     Args:
         path: ends in ``.png``; missing folders are created.
-        image: tensor (1, C, H, W) or (C, H, W), or array (H, W, C), with 1 or 3 channels, linear light.
+        image: tensor (1, C, H, W) or (C, H, W), or numpy array (H, W) or (H, W, C), with 1 or 3 channels, RGB, row 0 at
+            the top. Floats in linear light, 1 is white; integers are refused, for they may be encoded already.
         bits: 8, or 16 for a picture that will be edited.
 
     Raises:
         ParameterError: ``bits`` is neither.
-        ImageError: another suffix or shape, integers, NaN or infinity, or the file cannot be written.
+        ImageError: another suffix or shape, integers, NaN or infinity, most numbers above 1, or the file cannot be
+            written.
     """
     if bits not in (8, 16):
         raise ParameterError(f"`bits` ({bits}) must be 8 or 16, the depths of a PNG in colour.")
     frame = _float_frame(Path(path), image, ".png")
+    if np.median(frame) > 1:
+        raise ImageError(
+            f"`image` (up to {frame.max():g}) must be linear light, 1 for white, but is above 1 in most pixels. Scale "
+            "it first: `mwdn.to_display(image)`."
+        )
     encoded = srgb_encode(torch.from_numpy(frame)).mul(2**bits - 1).round().numpy()
     write_frame(path, encoded.astype(f"uint{bits}"))
 
@@ -101,7 +109,8 @@ def write_linear(path: str | Path, image: Tensor | FloatFrame) -> None:
 
     Args:
         path: ends in ``.tif``, ``.tiff`` or ``.npy``; missing folders are created.
-        image: tensor (1, C, H, W) or (C, H, W), or array (H, W, C), with 1 or 3 channels; any range.
+        image: tensor (1, C, H, W) or (C, H, W), or numpy array (H, W) or (H, W, C), with 1 or 3 channels; floats of any
+            range.
 
     Raises:
         ImageError: another suffix or shape, integers, NaN or infinity, or the file cannot be written.
@@ -175,8 +184,8 @@ def _float_frame(path: Path, image: Tensor | FloatFrame, *suffixes: str) -> Floa
     fits = picture.ndim == 3 and len(picture) in (1, 3) and picture.numel() > 0
     if not (fits and picture.is_floating_point()):
         got = f"{' x '.join(map(str, image.shape))}, {image.dtype}"
-        wanted = "(C, H, W) or (1, C, H, W), floats of 1 or 3 channels"
-        raise ImageError(f"`image` ({got}) must be {wanted} for `{path}`. Pick one of the batch.")
+        wanted = "a tensor (C, H, W) or (1, C, H, W) or an array (H, W, C), floats of 1 or 3 channels"
+        raise ImageError(f"`image` ({got}) must be {wanted} for `{path}`. Pick one of a batch; divide integers.")
     picture = picture.detach().to("cpu", torch.float32)
     if not torch.isfinite(picture).all():
         raise ImageError(f"`image` holds NaN or infinity: `{path}` is not written. Use `torch.nan_to_num`.")

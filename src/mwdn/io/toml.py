@@ -11,9 +11,42 @@ from mwdn.errors import ParameterError, UnknownNameError
 
 T = TypeVar("T")
 
+RECIPES = Path(__file__).parents[1] / "recipes"
+"""Folder of the recipes that come with the package."""
 
-def read_toml(path: str | Path) -> dict[str, Any]:
+
+def packaged_recipes() -> list[str]:
+    """Names of the recipes that come with the package."""
+    return sorted(path.stem for path in RECIPES.glob("*.toml"))
+
+
+def find_recipe(recipe: str | Path) -> Path:
+    """File of a recipe.
+
+    Args:
+        recipe: path of a TOML file, or the name of a recipe of the package, such as ``quick-cpu``.
+
+    Raises:
+        ParameterError: no file has this path.
+        UnknownNameError: no recipe has this name.
+    """
+    path = Path(recipe)
+    if path.is_file():
+        return path
+    if path.name != str(path) or path.suffix:
+        hint = f" The recipe of the package is `{path.stem}`." if path.stem in packaged_recipes() else ""
+        raise ParameterError(f"The recipe `{path}` does not exist.{hint} See `mwdn recipes`.")
+    if str(path) not in packaged_recipes():
+        raise UnknownNameError("recipe", str(path), packaged_recipes())
+    return RECIPES / f"{path}.toml"
+
+
+def read_toml(path: str | Path, kind: str = "recipe") -> dict[str, Any]:
     """Read a TOML file.
+
+    Args:
+        path: of the file.
+        kind: what it should be, for the message.
 
     Raises:
         ParameterError: it cannot be read.
@@ -21,7 +54,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     try:
         return tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise ParameterError(f"`{path}` cannot be read as a recipe: {error}") from error
+        raise ParameterError(f"`{path}` cannot be read as a {kind}: {error}") from error
 
 
 def parse_value(text: str) -> Any:  # noqa: ANN401
@@ -52,7 +85,11 @@ def to_dataclass(cls: type[T], name: str, table: dict[str, Any]) -> T:
         if not _same_type(_as_tuple(value), defaults[key]):
             example = json.dumps(defaults[key])
             raise ParameterError(f"`{key}` of [{name}] ({value!r}) must be of the same kind as its default, {example}.")
-    return cls(**{key: _as_float(_as_tuple(value), defaults[key]) for key, value in table.items()})
+    try:
+        return cls(**{key: _as_float(_as_tuple(value), defaults[key]) for key, value in table.items()})
+    except ParameterError as error:
+        error.args = (f"[{name}]: {error}",)
+        raise
 
 
 def current_names(kind: type, name: str, table: dict[str, Any], *, warn: bool = True) -> dict[str, Any]:

@@ -52,7 +52,7 @@ def build(name: str, **options: Any) -> nn.Module:  # noqa: ANN401
 
     Raises:
         UnknownNameError: no such network, or it has no such option.
-        ParameterError: ``name`` is a solver, or ``width`` is below 1.
+        ParameterError: ``name`` is a solver, ``width`` is below 1, or an option is of another type.
     """
     kind = NETWORKS.get(name) or DENOISERS.get(name)
     if kind is None and name in SOLVERS:
@@ -60,9 +60,8 @@ def build(name: str, **options: Any) -> nn.Module:  # noqa: ANN401
     if kind is None:
         raise UnknownNameError("network", name, NETWORKS)
     check_options(kind, f"the network '{name}'", options)
-    width = options.get("width")
-    if isinstance(width, int) and width < 1:
-        raise ParameterError(f"`width` ({width}) must be at least 1.")
+    if options.get("width", 1) < 1:
+        raise ParameterError(f"`width` ({options['width']}) must be at least 1.")
     # JSON and TOML have lists, not tuples.
     return kind(**{key: tuple(v) if isinstance(v, list) else v for key, v in options.items()})
 

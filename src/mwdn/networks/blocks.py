@@ -22,12 +22,9 @@ Pooling = Literal["max", "average"]
 Normalisation = Literal["batch", "group"]
 
 
-def pooling_layer(kind: Pooling, option: str = "pooling") -> nn.Module:
+def pooling_layer(kind: Pooling) -> nn.Module:
     """2 x 2 pooling; an odd last row or column is dropped."""
-    kinds = {"max": nn.MaxPool2d, "average": nn.AvgPool2d}
-    if kind not in kinds:
-        raise ParameterError(f"`{option}` ({kind!r}) must be max or average.")
-    return kinds[kind](2)
+    return nn.MaxPool2d(2) if kind == "max" else nn.AvgPool2d(2)
 
 
 def normalisation_layer(kind: Normalisation, channels: int) -> nn.Module:

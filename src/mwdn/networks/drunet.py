@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from mwdn.errors import checked
 from mwdn.fourier.memory_format import pixel_unshuffle
 from mwdn.types import Image
 
@@ -34,6 +35,7 @@ def _scale(width: int, blocks: int) -> nn.Sequential:
     return nn.Sequential(*(ResidualBlock(width) for _ in range(blocks)))
 
 
+@checked
 class Drunet(nn.Module):
     """U-Net of residual blocks whose input is a picture and a map of its noise level. 1,793,920 learnable parameters.
 

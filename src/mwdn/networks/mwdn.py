@@ -52,7 +52,7 @@ class Mwdn(Network[list[Tensor]]):
         self.filters = WienerFilters(
             WienerFilter(weight=weight, regularisation=regularisation, boundary=boundary) for _ in widths[:-1]
         )
-        self.pool_psf = pooling_layer(psf_pooling, "psf_pooling")
+        self.pool_psf = pooling_layer(psf_pooling)
         self.decoder = Decoder(channels, widths)
 
     def pyramid(self, psf: Psf) -> list[Tensor]:

@@ -4,7 +4,8 @@ from typing import Any, Generic, TypeVar
 
 from torch import Tensor, nn
 
-from mwdn.errors import check_batch
+from mwdn.errors import check_batch, checked
+from mwdn.optics.psf import checked_psf
 from mwdn.types import Measurement, Psf, Scene, Size
 
 Prepared = TypeVar("Prepared")
@@ -21,10 +22,17 @@ class Network(nn.Module, Generic[Prepared]):
         channels: colours of the measurement; 0 for any number.
         align: whether `mwdn.Reconstructor` aligns the PSF to each capture by default, because the network was trained
             with accurate PSFs. The network itself never aligns.
+
+    Arguments of every subclass are checked against their annotations (`mwdn.errors.checked`).
     """
 
     channels: int = 0
     align: bool = False
+
+    def __init_subclass__(cls, **options: Any) -> None:  # noqa: ANN401
+        super().__init_subclass__(**options)
+        if "__init__" in vars(cls):
+            checked(cls)
 
     def prepare(self, psf: Psf, size: Size) -> Prepared:
         """Compute what depends on the PSF alone.
@@ -54,8 +62,19 @@ class Network(nn.Module, Generic[Prepared]):
         raise NotImplementedError
 
     def forward(self, measurement: Measurement, psf: Psf) -> Scene:
-        """Scene (B, C, H, W): `prepare`, then `reconstruct`."""
+        """Scene (B, C, H, W): `prepare`, then `reconstruct`.
+
+        Args:
+            measurement: (B, C, H, W), linear light, 1 is saturation.
+            psf: (1 or B, 1 or C, H, W), centred. Its scale does not matter: each channel counts as of unit sum.
+
+        Raises:
+            ShapeError: batch, channels or size do not fit.
+            ParameterError: no tensors of floats.
+            PsfError: the PSF is negative, not finite, or dark; not checked in training.
+        """
         check_batch(measurement, "measurement")
+        psf = checked_psf(psf, values=not self.training)
         return self.reconstruct(measurement, self.prepare(psf, (measurement.shape[-2], measurement.shape[-1])))
 
 

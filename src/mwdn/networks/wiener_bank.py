@@ -86,8 +86,8 @@ class WienerBank(Network[BankTransfers]):
             raise ParameterError(f"`rounds` ({rounds}) of plug and play need iterations at full size: `finest` 1.")
         minima = (("width", width, 1), ("fold", fold, 1), ("block", block, 1), ("rounds", rounds, 0))
         for name, value, minimum in minima:
-            if not isinstance(value, int) or value < minimum:
-                raise ParameterError(f"`{name}` ({value!r}) must be a whole number, at least {minimum}.")
+            if value < minimum:
+                raise ParameterError(f"`{name}` ({value}) must be at least {minimum}.")
         self.channels, self.fold, self.regularisations = channels, fold, regularisations
         self.finest, self.align, self.block = finest, align, block
         self.levels = pyramid_levels(finest)

@@ -4,19 +4,27 @@ from dataclasses import dataclass, field
 
 import torch
 
+from mwdn.errors import checked
 from mwdn.fourier.convolution import convolve, correlate
+from mwdn.optics.psf import checked_psf, psf_hash
 from mwdn.optics.sensor import Sensor
 from mwdn.types import Image, Measurement, Psf, Scene, Size
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Camera:
     """Forward model of a lensless camera: convolution with the PSF, crop, sensor noise.
 
     Args:
-        psf: (1 or B, 1 or C, h, w), centred; unit sum per channel keeps the energy of the scene.
+        psf: (1 or B, 1 or C, h, w), centred, not negative. Each channel is scaled to unit sum, so that the energy of
+            the scene is kept; `mwdn.convolve` uses a kernel as it is.
         size: height and width of the sensor in pixels; the PSF's unless given.
         sensor: noise, saturation and quantisation, which `simulate` applies and `forward` does not.
+
+    Raises:
+        PsfError: the PSF is negative, not finite, or dark.
+        ParameterError: an argument is of another type.
 
     References:
         Eq. (1) of the MWDN paper.
@@ -25,6 +33,13 @@ class Camera:
     psf: Psf
     size: Size | None = None
     sensor: Sensor = field(default_factory=Sensor)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "psf", checked_psf(self.psf))
+
+    def __repr__(self) -> str:
+        shape = " x ".join(map(str, self.psf.shape[-3:]))
+        return f"Camera(PSF {psf_hash(self.psf)}, {shape}, size={self.sensor_size}, {self.sensor})"
 
     @property
     def sensor_size(self) -> Size:

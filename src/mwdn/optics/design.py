@@ -155,5 +155,6 @@ def check_replaced(out: Path, *, gds: bool = False, stl: bool = False) -> None:
 
 
 def _plain(parameters: dict[str, Any]) -> dict[str, Any]:
-    """Replace infinity, which JSON does not have, by None."""
-    return {name: None if value == math.inf else value for name, value in parameters.items()}
+    """Replace what JSON does not have: infinity by None, a path by its text."""
+    known = {name: None if value == math.inf else value for name, value in parameters.items()}
+    return {name: str(value) if isinstance(value, Path) else value for name, value in known.items()}

@@ -83,7 +83,9 @@ def read_mask(path: str | Path) -> Mask:
         if about["format"] != _FORMAT or numbers.ndim != 2:
             raise KeyError("format")
         values = torch.from_numpy((numbers * about["scale"]).astype(np.float32))
-        return Mask(about["kind"], values, about["pitch_um"], about["index"], about["step_um"])
+        if step_um := about["step_um"]:
+            values = (values / step_um).round() * step_um  # exactly as a design computes them
+        return Mask(about["kind"], values, about["pitch_um"], about["index"], step_um)
     except MwdnError:
         raise
     except OSError as error:

@@ -77,12 +77,17 @@ def sample_counts(size_mm: tuple[float, float], pitch_um: float) -> Size:
     """
     check_positive(size_mm=min(size_mm), pitch_um=pitch_um)
     rows, columns = (round(side * UM_PER_MM / pitch_um) for side in size_mm)
+    check_samples(rows, columns, f"`pitch_um` ({pitch_um:g}) and `size_mm` {size_mm}")
+    return rows, columns
+
+
+def check_samples(rows: int, columns: int, cause: str = "`mask`") -> None:
+    """Check that each side of a mask has 2 to 20,000 samples: 20,000 x 20,000 complex numbers take 3 GB."""
     if not 2 <= min(rows, columns) <= max(rows, columns) <= 20_000:
         raise ParameterError(
-            f"`pitch_um` ({pitch_um:g}) makes {rows:,} x {columns:,} samples of `size_mm` {size_mm}, but a side must "
-            "have 2 to 20,000. Change the pitch or the size."
+            f"{cause} makes {rows:,} x {columns:,} samples, but a side must have 2 to 20,000. Change the pitch or the "
+            "size."
         )
-    return rows, columns
 
 
 def quantise(height_um: Plane, levels: int | None) -> tuple[Plane, float]:
@@ -165,7 +170,8 @@ def _check_slope(mask: Mask, setup: Setup, wavelength_nm: float, angle_degrees: 
         turn = math.degrees(math.asin(min(1.0, steepest)))
         raise ParameterError(
             f"`pitch_um` ({mask.pitch_um:g}) cannot sample a surface that deflects light of {wavelength_nm:g} nm by "
-            f"{turn:.2g} degrees: use at most {needed:.3g} um, or a flatter surface."
+            f"{turn:.2g} degrees: use at most {needed:.3g} um, or a flatter surface. If it has steps, such as a "
+            "wrapped phase, say how many: `--levels 256`."
         )
 
 

@@ -2,6 +2,7 @@
 
 from torch import Tensor
 
+from mwdn.errors import check_batch
 from mwdn.types import Image
 
 SAMPLED = 2**15
@@ -22,9 +23,14 @@ def noise_level(image: Image, *, parts: int = 16) -> Tensor:
         parts: number of parts along each side, at most; a part has at least 16 x 16 pixels. Use 1 for a PSF, whose
             sharp lines can fill a part.
 
+    Raises:
+        ShapeError: other axes.
+        ParameterError: no tensor of floats.
+
     References:
         D. L. Donoho and I. M. Johnstone, Biometrika 81, 425 (1994), for the median of the finest detail.
     """
+    check_batch(image, "image")
     b = image.float()
     detail = b[..., 1:, 1:] - b[..., :-1, 1:] - b[..., 1:, :-1] + b[..., :-1, :-1]
     if not detail.numel():

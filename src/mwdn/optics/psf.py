@@ -1,10 +1,15 @@
-"""Identify and normalise PSFs."""
+"""Identify, check and normalise PSFs."""
 
 import hashlib
 
+import torch
 from torch import Tensor
 
+from mwdn.errors import PsfError, check_batch
 from mwdn.types import Psf
+
+SUM_TOLERANCE = 1e-3
+"""A PSF whose channels sum to 1 within this is used as it is: 1e-3 is a tenth of the step of 8-bit brightness."""
 
 
 def psf_hash(psf: Psf) -> str:
@@ -17,3 +22,37 @@ def psf_hash(psf: Psf) -> str:
 def unit_sum(psf: Tensor) -> Tensor:
     """Divide each channel (..., h, w) by its sum: the camera then keeps the energy of the scene."""
     return psf / psf.sum((-2, -1), keepdim=True)
+
+
+def checked_psf(psf: Tensor, *, values: bool = True) -> Psf:
+    """Check a PSF and scale each channel to unit sum.
+
+    The brightness of a captured PSF depends on its exposure, so only its shape counts, for every method alike. A PSF of
+    unit sum is returned with the same numbers.
+
+    Args:
+        psf: (1 or B, C, h, w), light; of any scale.
+        values: refuse numbers that are no light. This waits for a GPU; training leaves it out.
+
+    Raises:
+        ShapeError: other axes.
+        ParameterError: no tensor of floats.
+        PsfError: NaN, infinity, a negative number, or a channel without light.
+    """
+    check_batch(psf, "psf")
+    total = psf.sum((-2, -1), keepdim=True, dtype=torch.promote_types(psf.dtype, torch.float32))
+    if values and not torch.compiler.is_compiling() and psf.numel() > 0:  # a graph cannot depend on values
+        _refuse_values(psf.detach(), total.detach())
+    return psf / torch.where((total - 1).abs() <= SUM_TOLERANCE, 1.0, total)
+
+
+def _refuse_values(psf: Tensor, total: Tensor) -> None:
+    smallest = psf.amin()
+    if bool((smallest >= 0) & (total > 0).all() & total.isfinite().all()):
+        return
+    if not psf.isfinite().all():
+        raise PsfError("`psf` holds NaN or infinity. Capture it again.")
+    raise PsfError(
+        f"`psf` (smallest value {smallest:.3g}, smallest sum of a channel {total.min():.3g}) must not be negative, and "
+        "must hold light in each channel. Subtract its background and clip it: `psf.clamp(min=0)`."
+    )

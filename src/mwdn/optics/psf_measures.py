@@ -7,9 +7,16 @@ import torch
 from torch import Tensor
 
 from mwdn.fourier.convolution import correlate
-from mwdn.fourier.transforms import fast_length, gaussian_transfer, inverse_spectrum, spectrum
+from mwdn.fourier.transforms import fast_length, frequency_grid, gaussian_transfer, inverse_spectrum, spectrum
+from mwdn.optics.noise import noise_level
 from mwdn.optics.psf_spectrum import ring_means
 from mwdn.types import Psf, Size
+
+LOSSLESS_WIDTH = 6.0
+"""Full width of the autocorrelation, in pixels, of a PSF that is binned as far as that loses little."""
+
+SMALLEST_SIDE = 100
+"""Pixels of the shorter side of a frame that is binned without being asked."""
 
 
 def effective_rank(psf: Psf) -> float:
@@ -46,12 +53,13 @@ def autocorrelation(psf: Psf) -> Autocorrelation:
     """Autocorrelation of the PSF's detail: how sharp the PSF is, and whether its pattern repeats.
 
     Structure wider than about a tenth of the frame is removed first: the shape of the aperture would hide the detail.
+    So is white noise, whose autocorrelation is a spike of one pixel on the peak.
     """
     plane = psf.mean((0, 1))
     height, width = plane.shape
     grid = fast_length(2 * height), fast_length(2 * width)
     power = _detail(plane, grid).abs().square()
-    image = inverse_spectrum(power[None, None], grid, grid)[0, 0]
+    image = inverse_spectrum((power - _noise_power(plane, power, grid))[None, None], grid, grid)[0, 0]
     image = image.roll((height, width), (0, 1))[: 2 * height, : 2 * width]
     image = image / image[height, width].clamp(min=1e-30)
     y, x = torch.arange(len(image))[:, None] - height, torch.arange(image.shape[1]) - width
@@ -65,10 +73,40 @@ def autocorrelation(psf: Psf) -> Autocorrelation:
     return Autocorrelation(middle.cpu(), peak_width, max(float(outside.max()), 0.0), lobe_at)
 
 
+def coarsest_bin(psf: Psf) -> int:
+    """Largest bin of PSF and captures that loses little; 1 for a PSF with sharp lines.
+
+    Gaussian lines whose autocorrelation has a full width of w pixels have the transfer function
+    ``exp(-1.8 (w f)^2)``. Binned by w / 6, the highest frequency is f = 3 / w, where it is 1e-7: no linear method
+    resolves anything there. Solvers and networks draw edges on finer pixels than that, but what these gain is less
+    than what the errors of a calibrated PSF and the noise of finer pixels cost. Of 30 simulated captures with such
+    errors through five PSFs, `pyramid` gains 0.3 dB on average and is 29 times as fast, `universal-small` loses 0.2 dB;
+    with 3 % noise they gain 0.8 and 0.2 dB. Binned by w / 4, they lose up to 2 dB.
+
+    The shorter side of the binned frame keeps `SMALLEST_SIDE` pixels at least.
+
+    Args:
+        psf: (1, C, H, W), at the resolution of the captures.
+    """
+    return max(1, min(round(autocorrelation(psf).width / LOSSLESS_WIDTH), min(psf.shape[-2:]) // SMALLEST_SIDE))
+
+
 def _detail(plane: Tensor, grid: Size) -> Tensor:
     """Spectrum of a picture less its Gaussian blur, whose standard deviation is 1/20 of the shorter side."""
     smooth = gaussian_transfer(grid, min(plane.shape) / 20, device=plane.device)
     return spectrum(plane[None, None], grid)[0, 0] * (1 - smooth)
+
+
+def _noise_power(plane: Tensor, power: Tensor, grid: Size) -> Tensor:
+    """White part of a PSF's power spectrum that is noise, for both lines and noise have power at high frequencies.
+
+    Lines of two pixels and more have little at the highest ones; spots of one pixel leave the dark between them without
+    noise; and a pattern that is white altogether is the PSF.
+    """
+    rows, columns = frequency_grid(grid, device=plane.device)
+    highest = power[(rows.abs() > 0.4) & (columns.abs() > 0.4)].mean()
+    in_dark = noise_level(plane[None, None], parts=1).square().sum() * plane.numel()
+    return torch.stack([highest, in_dark, power.mean() / 2]).min()
 
 
 def _full_width(image: Tensor, distance: Tensor) -> float:

@@ -4,10 +4,11 @@ from dataclasses import dataclass
 
 import torch
 
-from mwdn.errors import ParameterError
+from mwdn.errors import ParameterError, check_batch, checked
 from mwdn.types import Image
 
 
+@checked
 @dataclass(frozen=True)
 class Sensor:
     """A linear image sensor.
@@ -52,6 +53,7 @@ class Sensor:
         Returns:
             Same shape. The black level is subtracted and saturation is 1; noise makes dark pixels negative.
         """
+        check_batch(light, "light")
         electrons = torch.poisson(light.clamp(min=0) * self.full_well, generator=generator)
         electrons += self.read_noise * torch.randn(
             light.shape, generator=generator, device=light.device, dtype=light.dtype

@@ -150,17 +150,17 @@ def all_reduce_sum(value: Tensor) -> Tensor:
     return value
 
 
-def broadcast(compute: Callable[[], bytes]) -> bytes:
-    """Send what the first process computes or reads to all."""
-    content = compute() if rank() == 0 else b""
+def broadcast(compute: Callable[[], bytes], *, source: int = 0) -> bytes:
+    """Send what one process, the first by default, computes or reads to all."""
+    content = compute() if rank() == source else b""
     if world_size() == 1:
         return content
     with _communication():
         length = torch.tensor([len(content)])
-        dist.broadcast(length, 0)
+        dist.broadcast(length, source)
         # One byte longer: a tensor cannot share an empty buffer. A bytearray, as torch warns of read-only buffers.
         message = torch.frombuffer(bytearray(content.ljust(int(length) + 1)), dtype=torch.uint8)
-        dist.broadcast(message, 0)
+        dist.broadcast(message, source)
     return message[:-1].numpy().tobytes()
 
 
@@ -170,6 +170,14 @@ def broadcast_json(compute: Callable[[], Any]) -> Any:  # noqa: ANN401
     Strings may hold lone surrogates: file names that are not UTF-8.
     """
     return compute() if world_size() == 1 else json.loads(broadcast(lambda: json.dumps(compute()).encode()))
+
+
+def gather_json(value: Any) -> list[Any]:  # noqa: ANN401
+    """The values that all processes have, in the order of the processes, on all; JSON can hold each."""
+    if world_size() == 1:
+        return [value]
+    content = json.dumps(value).encode()
+    return [json.loads(broadcast(lambda: content, source=source)) for source in range(world_size())]
 
 
 def broadcast_floats(numbers: list[float]) -> list[float]:

@@ -5,12 +5,21 @@ import platform
 from importlib.metadata import PackageNotFoundError, version
 
 import torch
-from rich.console import Console
-from rich.table import Table
 
 from mwdn.runtime.devices import has_bfloat16
 
-_PACKAGES = ("mwdn", "torch", "numpy", "opencv-python-headless", "tifffile", "h5py", "safetensors", "cyclopts", "rich")
+_PACKAGES = (
+    "mwdn",
+    "torch",
+    "numpy",
+    "opencv-python-headless",
+    "tifffile",
+    "h5py",
+    "safetensors",
+    "cyclopts",
+    "rich",
+    "rawpy",
+)
 
 
 def _version(package: str) -> str:
@@ -38,11 +47,3 @@ def describe_environment() -> dict[str, str]:
         bfloat = "with" if has_bfloat16(torch.device("cuda", index)) else "without"
         facts[f"cuda:{index}"] = f"{card.name}, {card.total_memory / 2**30:.0f} GiB, {bfloat} bfloat16"
     return facts
-
-
-def print_environment(console: Console) -> None:
-    """Print `describe_environment` as a table."""
-    table = Table(show_header=False)
-    for name, value in describe_environment().items():
-        table.add_row(name, value)
-    console.print(table)

@@ -11,7 +11,7 @@ changed since its calibration.
 
 from typing import Any
 
-from mwdn.errors import UnknownNameError, check_options
+from mwdn.errors import ParameterError, UnknownNameError, check_options
 from mwdn.optics.noise import noise_level
 from mwdn.solvers.admm import Admm
 from mwdn.solvers.alignment import Pose, align
@@ -27,6 +27,13 @@ SOLVERS: dict[str, type[Solver]] = {"admm": Admm, "fista": Fista, "pyramid": Pyr
 """Every solver by its name on the command line."""
 
 
+_NETWORKS = frozenset(
+    {"drunet", "flatnet", "ifin", "le-admm", "le-admm-u", "mmcn", "mwdn", "mwdn-cpsf", "svdeconv", "unet", "updn"}
+    | {"wiener-bank", "wiener-unet"}
+)
+"""Names of networks, known here only for the message of `build`: `mwdn.networks` is above this folder."""
+
+
 def build(name: str, **options: Any) -> Solver:  # noqa: ANN401
     """Make a solver.
 
@@ -36,7 +43,13 @@ def build(name: str, **options: Any) -> Solver:  # noqa: ANN401
 
     Raises:
         UnknownNameError: there is no such solver, or it has no such option.
+        ParameterError: ``name`` is a network, or an option is of another type or out of range.
     """
+    if name in _NETWORKS:
+        raise ParameterError(
+            f"'{name}' is a network, not a solver: `mwdn.networks.build('{name}')` builds it without weights, "
+            "`mwdn.load_network(path)` loads a trained one."
+        )
     if name not in SOLVERS:
         raise UnknownNameError("solver", name, SOLVERS)
     check_options(SOLVERS[name], f"the solver '{name}'", options)

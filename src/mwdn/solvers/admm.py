@@ -1,13 +1,15 @@
 """ADMM with total variation and non-negativity, the classical reconstruction of a lensless camera."""
 
 from dataclasses import dataclass
-from typing import NamedTuple, get_args
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from mwdn.errors import ParameterError
+from mwdn.errors import ParameterError, checked
 from mwdn.fourier.convolution import check_fit
+from mwdn.optics.psf import checked_psf
+from mwdn.runtime.iterations import iterations
 from mwdn.solvers.proximal import Variation
 from mwdn.solvers.splitting import (
     Penalties,
@@ -28,14 +30,15 @@ class Iterate(NamedTuple):
     state: State
 
 
+@checked
 @dataclass(frozen=True)
 class Admm:
     """Minimise ``1/2 |crop(h * v) - b|^2 + tau |Psi v|_1`` over scenes ``v >= 0``.
 
     Called with a measurement (B, C, H, W) and a PSF, it returns the part (B, C, H, W) of the scene that faces the
-    sensor, in the units of the measurement over those of the PSF. PSF and measurement are scaled to unit L2 norm
-    first, each sample separately, so that the constants below mean the same for every camera and exposure. The
-    iteration is written out in `mwdn.solvers.splitting`.
+    sensor, in the units of the measurement; the scale of the PSF does not matter. PSF and measurement are scaled to
+    unit L2 norm first, each sample separately, so that the constants below mean the same for every camera and exposure.
+    The iteration is written out in `mwdn.solvers.splitting`.
 
     Args:
         regularisation: tau, weight of the total variation. As it grows, noise disappears first, then texture, until
@@ -46,8 +49,8 @@ class Admm:
         variation: kind of total variation, see `mwdn.solvers.proximal.Variation`.
 
     Raises:
-        ParameterError: a penalty is not positive, ``regularisation`` is negative, ``iterations`` is below 1, or there
-            is no such ``variation``.
+        ParameterError: a penalty is not positive, ``regularisation`` is negative, ``iterations`` is below 1, or an
+            option is of another type.
         ShapeError: batch or channels of PSF and measurement do not fit.
 
     References:
@@ -67,9 +70,6 @@ class Admm:
             raise ParameterError(f"`iterations` ({self.iterations}) must be at least 1.")
         if not all((torch.as_tensor(mu) > 0).all() for mu in self.penalties):
             raise ParameterError(f"`penalties` {tuple(self.penalties)} must be positive.")
-        if self.variation not in get_args(Variation):
-            known = ", ".join(get_args(Variation))
-            raise ParameterError(f"`variation` ({self.variation!r}) must be one of {known}.")
 
     def __call__(self, measurement: Measurement, psf: Psf) -> Scene:
         """Reconstruct a batch."""
@@ -86,6 +86,7 @@ class Admm:
                 measurement gives the result of all iterations so far.
         """
         check_fit(measurement, psf, "measurement")
+        psf = checked_psf(psf)
         b_norm = _norm(measurement).clamp(min=torch.finfo(torch.float32).tiny)
         h_norm = _norm(psf)
         b = measurement / b_norm
@@ -95,7 +96,7 @@ class Admm:
         else:
             problem, state = start.problem._replace(measurement=b.float()), start.state
         filters = make_filters(problem, self.penalties)
-        for _ in range(self.iterations):
+        for _ in iterations(self.iterations):
             state = update_copies(state, problem, self.penalties, self.regularisation, self.variation)
             state = update_scene(state, problem, filters)
         height, width = problem.sensor

@@ -26,6 +26,7 @@ from torch.nn import functional as F
 
 from mwdn.fourier.convolution import check_fit
 from mwdn.fourier.transforms import frequency_grid, inverse_spectrum, spectrum
+from mwdn.optics.psf import checked_psf
 from mwdn.optics.warp import hazed, warp
 from mwdn.solvers.pyramid import Level, halve, solve
 from mwdn.solvers.splitting import Penalties
@@ -46,6 +47,12 @@ class Pose(NamedTuple):
     scale: Tensor
     haze: Tensor | float = 0.0
 
+    def __repr__(self) -> str:
+        if len(self.turn_degrees) != 1:
+            return f"Pose(of {len(self.turn_degrees)} captures)"
+        haze = float(torch.as_tensor(self.haze).mean())
+        return f"Pose(turn_degrees={self.turn_degrees.item():.3g}, scale={self.scale.item():.3g}, haze={haze:.3g})"
+
     def move(self, psf: Psf) -> Tensor:
         """The PSF (1 or B, C, h, w) of each capture: (B, C, h, w), each colour of unit sum."""
         angle, size = torch.deg2rad(self.turn_degrees), 1 + self.scale
@@ -59,12 +66,13 @@ _NO_VARIATION = Penalties(0.15, 0.0, 0.6)
 
 # At half the size, where a turn by 0.5 degrees still moves the outer lines of a PSF of 320 pixels by 0.7 pixels.
 # Total variation in the last level keeps a smaller, so sharper PSF from fitting the noise.
-_LEVELS = (
+SMOOTH_LEVELS = (
     Level(4, 20, _NO_VARIATION),
     Level(2, 20, _NO_VARIATION),
     Level(1, 8, Penalties(0.1, 1.5, 1.5), 0.02, min_smoothing=0.2),
 )
 _HIGH_PASS = 0.03  # cycles per pixel: below, most of the residual is ambient light and unconverged iterations
+_REACH = 16  # pixels, three standard deviations of the Gaussian of `_HIGH_PASS`
 _PRIOR = (0.5, 0.01)  # standard deviations S of a calibration's errors: degrees and relative magnification
 _DELTA = (0.1, 0.002)  # finite differences
 _CORRELATED = 20.0  # pixels of the residual that count as one independent sample
@@ -85,20 +93,23 @@ def align(measurement: Measurement, psf: Psf, *, steps: int = 2, min_gain: float
     """Estimate rotation, scale and haze of each capture's PSF from the capture alone.
 
     Args:
-        measurement: (B, C, H, W).
-        psf: (1 or B, 1 or C, h, w), centred.
+        measurement: (B, C, H, W), a tensor as `mwdn.Calibration.correct` returns it for an array or picture.
+        psf: (1 or B, 1 or C, h, w), centred: `mwdn.Calibration.psf`. Its scale does not matter.
         steps: of Gauss-Newton; each solves three scenes of half the size. Two reach half a degree and 1 % to within a
             tenth of it. A step that increases the residual is not taken.
         min_gain: part of the residual's energy, see `MIN_GAIN`.
 
     Raises:
         ShapeError: batch or channels do not fit.
+        ParameterError: no tensors of floats.
+        PsfError: the PSF is negative, not finite, or dark.
 
     References:
         G. Golub and V. Pereyra, Separable nonlinear least squares: the variable projection method and its
         applications, Inverse Problems 19, R1 (2003).
     """
     check_fit(measurement, psf, "measurement")
+    psf = checked_psf(psf)
     half = halve(measurement.float())
     half = half / half.abs().amax((1, 2, 3), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
     delta = half.new_tensor(_DELTA)
@@ -115,7 +126,7 @@ def align(measurement: Measurement, psf: Psf, *, steps: int = 2, min_gain: float
     best, energy = _better(theta, _residual(half, psf, theta[:, None])[:, 0], best, energy)
     best = torch.where((energy < (1 - min_gain) * calibrated)[:, None], best, 0.0)
     pose = Pose(best[:, 0], best[:, 1])
-    return pose._replace(haze=_estimate_haze(halve(half), _halved(_halved(pose.move(psf)))))
+    return pose._replace(haze=_estimate_haze(halve(half), halve_psf(halve_psf(pose.move(psf)))))
 
 
 def _gauss_newton_step(A: Tensor, r: Tensor, theta: Tensor) -> Tensor:
@@ -152,23 +163,14 @@ def _estimate_haze(measurement: Measurement, psf: Psf) -> Tensor:
     return hazes[flat.sum(1)]
 
 
-@torch.no_grad()
-def misfit(measurement: Measurement, psf: Psf) -> Tensor:
-    """Part of each measurement's detail that no scene explains through this PSF, (B,): `align` minimises it.
-
-    Args:
-        measurement: (B, C, H, W).
-        psf: (1 or B, 1 or C, h, w), centred; used as it is.
-    """
-    half = halve(measurement.float())
-    energy = _residual(half, psf, half.new_zeros(len(half), 1, 2))[:, 0].square().sum(1)
-    return energy / fine_detail(half).square().sum((1, 2, 3)).clamp(min=torch.finfo(torch.float32).tiny)
-
-
 def fine_detail(image: Image) -> Image:
-    """High-pass filter: detail finer than about 30 pixels, on a periodic grid."""
-    grid = image.shape[-2], image.shape[-1]
-    return inverse_spectrum(spectrum(image, grid) * (1 - _low_pass(grid, _HIGH_PASS, image.device)), grid, grid)
+    """High-pass filter: detail finer than about 30 pixels. Beyond its border the image is mirrored."""
+    height, width = image.shape[-2:]
+    down, right = min(_REACH, height - 1), min(_REACH, width - 1)
+    wide = F.pad(image.float(), (right, right, down, down), mode="reflect")
+    grid = wide.shape[-2], wide.shape[-1] + wide.shape[-1] % 2
+    smooth = inverse_spectrum(spectrum(wide, grid) * _low_pass(grid, _HIGH_PASS, image.device), grid, grid)
+    return image - smooth[..., down : down + height, right : right + width]
 
 
 def _residual(measurement: Tensor, psf: Psf, poses: Tensor) -> Tensor:
@@ -176,13 +178,13 @@ def _residual(measurement: Tensor, psf: Psf, poses: Tensor) -> Tensor:
     count = poses.shape[1]
     psfs = psf.expand(len(measurement), -1, -1, -1).repeat_interleave(count, 0)
     moved = Pose(*poses.flatten(0, 1).unbind(-1)).move(psfs)
-    estimate = solve(measurement.repeat_interleave(count, 0), _halved(moved), _LEVELS)
+    estimate = solve(measurement.repeat_interleave(count, 0), halve_psf(moved), SMOOTH_LEVELS)
     grid = estimate.psf.bands[-1].grid
     high = 1 - _low_pass(grid, _HIGH_PASS, measurement.device)
     return inverse_spectrum(estimate.residual_spectrum * high, grid, grid).reshape(len(measurement), count, -1)
 
 
-def _halved(psf: Psf) -> Tensor:
+def halve_psf(psf: Psf) -> Tensor:
     """The PSF in pixels twice as long. Its centre may move by one of them, and shift the scene: E does not change."""
     return F.avg_pool2d(F.pad(psf, (0, psf.shape[-1] % 2, 0, psf.shape[-2] % 2)), 2)
 

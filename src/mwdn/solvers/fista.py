@@ -6,8 +6,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from mwdn.errors import ParameterError
+from mwdn.errors import ParameterError, checked
 from mwdn.fourier.transforms import inverse_spectrum, spectrum
+from mwdn.optics.psf import checked_psf
+from mwdn.runtime.iterations import iterations
 from mwdn.solvers.splitting import Problem
 from mwdn.types import Measurement, Psf, Scene
 
@@ -25,6 +27,7 @@ class Iterate(NamedTuple):
     momentum: float
 
 
+@checked
 @dataclass(frozen=True)
 class Fista:
     """Minimise ``1/2 |crop(h * v) - b|^2`` over scenes ``v >= 0`` by accelerated projected gradient steps.
@@ -65,7 +68,7 @@ class Fista:
                 `MAX_MOMENTUM`.
         """
         if start is None:
-            problem = Problem.from_psf(measurement, psf)
+            problem = Problem.from_psf(measurement, checked_psf(psf))
             v = extrapolated = problem.measurement.new_zeros((*measurement.shape[:2], *problem.grid))
             momentum = 1.0
         else:
@@ -74,7 +77,7 @@ class Fista:
         b, H = problem.measurement, problem.transfer
         # The gradient's Lipschitz constant L is at most max |H|^2; a step of 1/L cannot overshoot.
         step = 1 / H.abs().square().amax((-2, -1), keepdim=True)
-        for _ in range(self.iterations):
+        for _ in iterations(self.iterations):
             residual = inverse_spectrum(H * spectrum(extrapolated, problem.grid), problem.grid, problem.sensor) - b
             slope = inverse_spectrum(H.conj() * spectrum(residual, problem.grid), problem.grid, problem.grid)
             new_v = (extrapolated - step * slope).clamp(min=0)

@@ -9,10 +9,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from mwdn.errors import ParameterError
+from mwdn.errors import ParameterError, checked
 from mwdn.fourier.convolution import check_fit
 from mwdn.fourier.transforms import fast_length, inverse_spectrum, spectrum, transfer_function
 from mwdn.optics.noise import noise_level
+from mwdn.optics.psf import checked_psf
+from mwdn.runtime.iterations import iterations
 from mwdn.solvers.splitting import Penalties, Problem, initial_state, make_filters, update_copies, update_scene
 from mwdn.types import Measurement, Psf, Scene, Size, Spectrum
 
@@ -67,6 +69,7 @@ REFERENCE_SIDE = 320
 changes less from pixel to pixel. `admm` does the same by scaling the whole measurement to a norm of 1."""
 
 
+@checked
 @dataclass(frozen=True)
 class Pyramid:
     """Coarse-to-fine ADMM with total variation, then one Wiener step on the residual.
@@ -104,11 +107,10 @@ class Pyramid:
     @torch.no_grad()
     def __call__(self, measurement: Measurement, psf: Psf) -> Scene:
         """Reconstruct a batch."""
+        psf = checked_psf(psf)
         estimate = solve(measurement, psf, self.levels)
-        tiny = torch.finfo(torch.float32).tiny
-        total = psf.float().sum((-2, -1), keepdim=True).clamp(min=tiny)
         detail = estimate.detail(self.regularisation * smoothing_scale(estimate.noise).clamp(min=1))
-        return (estimate.scene + detail).clamp(min=0) / total
+        return (estimate.scene + detail).clamp(min=0) / psf.float().sum((-2, -1), keepdim=True)
 
 
 @dataclass(frozen=True)
@@ -221,8 +223,10 @@ class PsfPyramid:
         while max(sizes) < self.bands[0].level.downsampling:
             sizes[2 * max(sizes)] = halve(sizes[max(sizes)])
         scene: Tensor = b.new_zeros((1, 1, 1, 1))
-        for band in self.bands:
-            scene = _solve(sizes[band.level.downsampling], band, scene, scale, size_factor)
+        work = [band.level.iterations / band.level.downsampling**2 for band in self.bands]  # in proportion to time
+        for number, band in enumerate(self.bands):
+            done = [sum(work[:end]) / max(sum(work), 1e-9) for end in (number, number + 1)]
+            scene = _solve(sizes[band.level.downsampling], band, scene, scale, size_factor, done)
         return Estimate(measurement, scene.clamp(min=0) * unit, self)
 
 
@@ -279,18 +283,18 @@ def low_band(transfer: Spectrum, grid: Size, downsampling: int) -> Tensor:
     return low[..., : columns // 2 + 1].mT.contiguous().mT  # the memory layout of `spectrum`
 
 
-def _solve(measurement: Tensor, band: Band, coarser: Tensor, smoothing_scale: Tensor, size_factor: float) -> Tensor:
-    """Scene on the whole grid after the iterations of one level, started at the coarser level's scene."""
+def _solve(b: Tensor, band: Band, coarser: Tensor, scale: Tensor, size_factor: float, done: list[float]) -> Tensor:
+    """Scene on the whole grid after the iterations of one level, started at the coarser scene."""
     # The penalties are stated for a PSF whose colours have a mean square sum of 1, so the scene is times that norm.
-    problem = Problem.from_transfer(measurement, band.transfer)
+    problem = Problem.from_transfer(b, band.transfer)
     start = F.interpolate(coarser, size=band.grid, mode="bilinear").clamp(min=0) * band.norm
     level = band.level
-    mu, tau = level.smoothing(smoothing_scale)
+    mu, tau = level.smoothing(scale)
     tau = size_factor * tau
     smooth = level.regularisation > 0
     filters = make_filters(problem, mu, smooth=smooth)
-    state = initial_state(problem, start.expand(*measurement.shape[:2], *band.grid), smooth=smooth)
-    for _ in range(level.iterations):
+    state = initial_state(problem, start.expand(*b.shape[:2], *band.grid), smooth=smooth)
+    for _ in iterations(level.iterations, start=done[0], end=done[1]):
         state = update_copies(state, problem, mu, tau, "colour")
         state = update_scene(state, problem, filters)
     return state.v / band.norm

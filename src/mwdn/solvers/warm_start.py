@@ -5,12 +5,13 @@ from typing import Any
 
 import torch
 
-from mwdn.errors import ParameterError
+from mwdn.errors import ParameterError, checked
 from mwdn.solvers.admm import Admm
 from mwdn.solvers.fista import Fista
 from mwdn.types import Measurement, Psf, Scene
 
 
+@checked
 class WarmStart:
     """A solver with all its iterations for the first frame of a stream, and a few for each that follows.
 

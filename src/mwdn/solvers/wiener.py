@@ -5,15 +5,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mwdn.errors import ParameterError
+from mwdn.errors import ParameterError, checked
 from mwdn.fourier.convolution import check_fit
 from mwdn.fourier.padding import Boundary, pad
 from mwdn.fourier.transforms import inverse_spectrum, spectrum, transfer_function
 from mwdn.fourier.wiener import deconvolution_grid
 from mwdn.optics.noise import noise_level
+from mwdn.optics.psf import checked_psf
 from mwdn.types import Measurement, Psf, Scene
 
 
+@checked
 @dataclass(frozen=True)
 class Wiener:
     """Wiener deconvolution, eq. (2) of the paper, with lambda given or chosen.
@@ -48,6 +50,7 @@ class Wiener:
     def __call__(self, measurement: Measurement, psf: Psf) -> Scene:
         """Reconstruct a batch."""
         check_fit(measurement, psf, "measurement")
+        psf = checked_psf(psf)
         size = measurement.shape[-2], measurement.shape[-1]
         grid = deconvolution_grid(size, self.boundary)
         total = psf.sum((-2, -1), keepdim=True)

@@ -1,7 +1,7 @@
 """From a recipe, a calibration and pictures to a training run, or to a file of simulated pairs."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -49,16 +49,16 @@ def train(
     recipe: Recipe | str | Path,
     calibration: Calibration,
     *,
-    out: Path,
-    photos: Path | None = None,
-    pairs: Path | None = None,
+    out: str | Path,
+    photos: str | Path | None = None,
+    pairs: str | Path | None = None,
     device: str | None = None,
     callback: Callable[[Report], None] = lambda report: None,
 ) -> Path:
     """Train a network for a camera; called again on the same folder, it continues a stopped run.
 
     Args:
-        recipe: the experiment, or its TOML file.
+        recipe: the experiment, its TOML file, or the name of a recipe of the package.
         calibration: of the camera.
         out: folder of the run.
         photos: folder of photographs to simulate captures of.
@@ -73,7 +73,8 @@ def train(
         MwdnError: as for `prepare` and `mwdn.training.trainer.Trainer.run`.
     """
     recipe = recipe if isinstance(recipe, Recipe) else read_recipe(recipe)
-    trainer = prepare(recipe, calibration, out=out, photos=photos, pairs=pairs, device=device)
+    photos, pairs = (None if path is None else Path(path) for path in (photos, pairs))
+    trainer = prepare(recipe, calibration, out=Path(out), photos=photos, pairs=pairs, device=device)
     trainer.run(callback)
     return trainer.folder.weights("best")
 
@@ -86,7 +87,7 @@ def prepare(
     photos: Path | None = None,
     pairs: Path | None = None,
     device: str | None = None,
-    exclude: Iterable[Path | None] = (),
+    exclude: Mapping[str, Path] | None = None,
 ) -> Trainer:
     """Read the training data and set up the run.
 
@@ -98,7 +99,7 @@ def prepare(
         photos: folder of photographs to simulate captures of; every 20th is held out for validation.
         pairs: file of recorded pairs, instead of photographs.
         device: a GPU by default if there is one.
-        exclude: files in a folder of [sheet] that are no captures: the PSF, the dark frame.
+        exclude: files among those of [sheet] that are no captures: ``{"PSF": psf, "dark frame": dark}``.
 
     Raises:
         ParameterError: not exactly one of photographs, pairs and captures, or not enough of them.
@@ -119,9 +120,7 @@ def prepare(
         data = simulated_captures(recipe, photos, psf)
     recipe = _in_steps(recipe, data)
     validator = Validator(recipe, data.validation, psf, captures)
-    trainer = Trainer(recipe, data.task, out=out, calibration=calibration, validator=validator, device=place)
-    validator.reconstruct_captures(trainer.average)  # reports captures that do not fit the network before training
-    return trainer
+    return Trainer(recipe, data.task, out=out, calibration=calibration, validator=validator, device=place)
 
 
 def simulated_captures(recipe: Recipe, photos: Path, psf: Psf) -> TrainingData:
@@ -165,13 +164,13 @@ def _check_one_source(recipe: Recipe, photos: Path | None, pairs: Path | None) -
     elif photos is None and pairs is None:
         raise ParameterError(
             "Give photographs to learn from, `--photos FOLDER`, or pairs, `--pairs FILE`. "
-            "To learn from captures alone, use recipes/selfsupervised.toml."
+            "To learn from captures alone: `mwdn train selfsupervised --captures FOLDER`."
         )
     elif photos is not None and pairs is not None:
         raise ParameterError(f"`--photos` ({photos}) and `--pairs` ({pairs}) exclude each other. Leave one out.")
 
 
-def _read_captures(recipe: Recipe, calibration: Calibration, exclude: Iterable[Path | None]) -> Measurement | None:
+def _read_captures(recipe: Recipe, calibration: Calibration, exclude: Mapping[str, Path] | None) -> Measurement | None:
     """Captures of [sheet]: all to learn from them, otherwise as many as a contact sheet shows."""
     if not recipe.sheet.captures:
         return None

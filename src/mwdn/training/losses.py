@@ -15,6 +15,8 @@ from mwdn.types import Image
 
 NAMES = ("feature_mse", "l1", "log_mse", "lpips", "mse", "ssim")
 """Parts of a `Loss`."""
+NEED_ALEXNET = {"feature_mse", "lpips"}
+"""Parts that compare AlexNet's features."""
 
 
 class Loss(nn.Module):
@@ -41,7 +43,7 @@ class Loss(nn.Module):
         self.initial_weights = checked_weights(weights)
         self.weights = dict(self.initial_weights)
         """Current weights, which a schedule may replace by others of the same names."""
-        self.alexnet = load_alexnet(alexnet) if {"feature_mse", "lpips"} & set(weights) else None
+        self.alexnet = load_alexnet(alexnet) if NEED_ALEXNET & set(weights) else None
         self.heads = load_heads(heads, alexnet=alexnet) if "lpips" in weights else None
 
     def forward(self, reconstruction: Image, scene: Image) -> tuple[Tensor, dict[str, Tensor]]:

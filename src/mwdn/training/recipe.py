@@ -16,7 +16,7 @@ from mwdn.data.recorded import Division
 from mwdn.data.simulated import Placement
 from mwdn.data.unpaired import SelfSupervised
 from mwdn.errors import MwdnError, ParameterError, UnknownNameError
-from mwdn.io.toml import current_names, read_toml, to_dataclass
+from mwdn.io.toml import current_names, find_recipe, read_toml, to_dataclass
 from mwdn.networks import DENOISERS, build
 from mwdn.optics.sensor import Sensor
 from mwdn.training.losses import checked_weights
@@ -230,7 +230,8 @@ def read_recipe(path: str | Path | None, **changes: Any) -> Recipe:  # noqa: ANN
     """Read a recipe.
 
     Args:
-        path: TOML file with the tables of `Recipe`; ``None`` for all defaults, where nothing is trained.
+        path: TOML file with the tables of `Recipe`, or the name of a recipe of the package; ``None`` for all defaults,
+            where nothing is trained.
         **changes: replace values of the recipe: ``learning_rate=1e-4`` of [schedule], ``mismatch={"blur_px": 0.5}`` of
             any other table; ``None`` changes nothing.
 
@@ -238,6 +239,7 @@ def read_recipe(path: str | Path | None, **changes: Any) -> Recipe:  # noqa: ANN
         ParameterError: the file cannot be read, names no network, or a value is out of range.
         UnknownNameError: no such table, key, network, or option of the network.
     """
+    path = None if path is None else find_recipe(path)
     content = {} if path is None else read_toml(path)
     replaced = _by_table(changes)
     for table in content | replaced:
@@ -282,9 +284,10 @@ def _check_network(network: dict[str, Any]) -> None:
     try:
         with torch.device("meta"), warnings.catch_warnings(action="ignore"):  # torch's, of empty layers
             built = build(**network)
+    except MwdnError as error:
+        error.args = (f"[network]: {error}",)
+        raise
     except (TypeError, ValueError, RuntimeError) as error:
-        if isinstance(error, MwdnError):
-            raise
         raise ParameterError(f"[network] {network} cannot be built: {error}") from error
     empty = [name for name, parameter in built.named_parameters() if parameter.numel() == 0]
     if empty:

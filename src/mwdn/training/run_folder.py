@@ -14,6 +14,7 @@ from mwdn.errors import CheckpointError, ParameterError
 from mwdn.io.files import as_parameter_error, check_folder, write_text
 from mwdn.runtime import distributed
 from mwdn.training.recipe import Recipe, with_current_names
+from mwdn.training.sample_files import SampleFiles
 from mwdn.training.training_state import Header, read_state
 
 MAKE_ROOM = "Make room and give the same command again: it resumes from the last saved state."
@@ -40,7 +41,7 @@ def run_identity(recipe: Recipe, psf_hash: str, samples: str) -> dict[str, Any]:
 class RunFolder:
     """Files of one run, protected from other runs: ``state.safetensors``, ``recipe.json``, ``log.jsonl``, weights.
 
-    Only the first process reads and writes them.
+    Only the first process reads and writes them; cached samples are written by the process that uses them.
 
     Args:
         path: of the folder, which is made if it is missing.
@@ -58,6 +59,18 @@ class RunFolder:
     def weights(self, name: str) -> Path:
         """File with the weights of the "last" or the "best" validation."""
         return self.path / f"{name}.safetensors"
+
+    def samples(self, content: str) -> SampleFiles:
+        """Cached samples of this run, made from files with this `mwdn.data.simulated.Samples.content`."""
+        return SampleFiles(self.path, {**self.identity, "content": content})
+
+    def samples_size(self) -> int:
+        """Bytes of the cached samples on the disk."""
+        return sum(file.stat().st_size for file in self.path.glob("samples/*/*"))
+
+    def remove_samples(self) -> None:
+        """Remove the cached samples: the run needs them no more. Each process may have a disk of its own."""
+        self.samples("").remove()
 
     def read(self) -> tuple[dict[str, Tensor], Header] | None:
         """The saved state of this run, on all processes; ``None`` if there is none.
@@ -109,6 +122,7 @@ class RunFolder:
         import fcntl
 
         check_folder(self.path)
+        self.path.mkdir(parents=True, exist_ok=True)
         handle = os.open(self.path, os.O_RDONLY)  # the folder itself: a lock file would stay behind
         try:
             with suppress(OSError):  # of file systems without locks

@@ -1,5 +1,6 @@
 """A cache of samples with what a network computes of them before its learned part."""
 
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
@@ -8,15 +9,19 @@ from torch import Tensor, nn
 from mwdn.data.random import seeded
 from mwdn.data.simulated import Samples, full_precision
 from mwdn.errors import ParameterError
+from mwdn.training.sample_files import Sample, SampleFiles
 from mwdn.types import Image, Scene
+
+Progress = Callable[[int, int], None]
+"""Called with the number of samples that are done, and how many there are."""
 
 
 class SampleCache:
     """A finite number of samples, used repeatedly, each time mirrored or transposed another way.
 
     For networks whose forward pass is ``correct(estimates, unit(estimates))``, where the ``estimates`` from measurement
-    and PSF are not learned. A sample is computed when it is first needed: a run starts at once, and a resumed run
-    continues exactly.
+    and PSF are not learned. `fill` computes samples before training and keeps them on the disk; a sample that it did
+    not compute is computed when it is first needed. A resumed run continues exactly.
 
     Args:
         pairs: source of the samples; its numbers 0 to ``size`` - 1 are used.
@@ -34,7 +39,7 @@ class SampleCache:
         if size % batch:
             raise ParameterError(f"`pool` ({size}) must be a multiple of `batch` ({batch}).")
         self.pairs, self.size, self.batch_size, self.crop, self.seed = pairs, size, batch, crop, seed
-        self.samples: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
+        self.samples: dict[int, Sample] = {}
 
     def check(self, network: nn.Module) -> None:
         """Check that the network has a part to cache.
@@ -47,6 +52,39 @@ class SampleCache:
                 f"`pool` ({self.size}) caches what a network computes before its learned part; "
                 f"{type(network).__name__} learns from its first layer on. Set `pool = 0`."
             )
+
+    @full_precision
+    def fill(self, network: Any, numbers: Iterable[int], files: SampleFiles, progress: Progress) -> None:  # noqa: ANN401
+        """Compute the samples of these numbers; read those that an interrupted run left on the disk.
+
+        Args:
+            network: computes the estimates.
+            numbers: of samples, of any epochs.
+            files: to keep the samples in, if the disk has room for them.
+            progress: called before the first sample that is computed and after each.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C; its message says how many samples are done.
+            ParameterError: the disk is full all the same.
+        """
+        rows = dict.fromkeys(self._row(*divmod(number, self.size)) for number in numbers)
+        device = next(network.parameters()).device
+        for row in rows.keys() - self.samples.keys():
+            if sample := files.read(row):
+                self.samples[row] = Sample(*(value.to(device) for value in sample))
+        missing = [row for row in rows if row not in self.samples]
+        first, kept = len(rows) - len(missing), True
+        for done, row in enumerate(missing, first):
+            try:
+                progress(done, len(rows))
+                sample = self._cached(network, row)
+                kept = kept and (done > first or files.fits(len(missing) * sum(part.nbytes for part in sample)))
+                if kept:
+                    files.write(row, sample)
+            except KeyboardInterrupt as interrupt:
+                message = f"Interrupted after {done:,} of {len(rows):,} samples. The same command resumes."
+                raise KeyboardInterrupt(message) from interrupt
+        progress(len(rows), len(rows))
 
     def reconstruct(self, network: Any, numbers: range | list[int]) -> tuple[Image, Scene]:  # noqa: ANN401
         """Reconstructions of the samples of these numbers, and their scenes."""
@@ -90,9 +128,10 @@ class SampleCache:
         return ..., slice(top, top + height), slice(left, left + width)
 
     @torch.no_grad()
-    def _cached(self, network: Any, row: int) -> tuple[Tensor, Tensor, Tensor]:  # noqa: ANN401
+    def _cached(self, network: Any, row: int) -> Sample:  # noqa: ANN401
         if row not in self.samples:
             measurement, scene, psf = self.pairs.batch([row])
             estimates = network.estimates(measurement, psf)
-            self.samples[row] = estimates[0].half(), network.unit(estimates)[0], scene[0].half()
+            unit = network.unit(estimates)[0]
+            self.samples[row] = Sample(estimates[0].half().contiguous(), unit, scene[0].half().contiguous())
         return self.samples[row]

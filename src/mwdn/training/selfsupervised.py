@@ -95,6 +95,7 @@ class SelfSupervisedTask:
     captures: UnpairedCaptures
 
     columns: ClassVar[tuple[str, str]] = "measurement", "through the camera"
+    cache: ClassVar[None] = None
 
     @property
     def name(self) -> str:

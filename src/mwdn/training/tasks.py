@@ -37,6 +37,10 @@ class Task(Protocol):
     """Titles on the contact sheet, left and right of the reconstruction."""
 
     @property
+    def cache(self) -> SampleCache | None:
+        """Samples to compute before training, if they are cached."""
+
+    @property
     def name(self) -> str:
         """Identifies the source of the samples when a run resumes."""
 

@@ -25,7 +25,9 @@ class TensorBoard:
         try:
             from torch.utils.tensorboard import SummaryWriter
         except ModuleNotFoundError as error:
-            raise ParameterError("`tensorboard` must be installed: `pip install 'mwdn[tensorboard]'`.") from error
+            raise ParameterError(
+                "The package tensorboard must be installed: `pip install 'mwdn[tensorboard]'`."
+            ) from error
         with as_parameter_error(folder):
             self._writer: Any = SummaryWriter(str(folder), purge_step=step + 1)
 

@@ -6,29 +6,30 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from mwdn.calibration import Calibration
-from mwdn.errors import CheckpointError, DivergenceError, MwdnError, ParameterError
+from mwdn.errors import DivergenceError, MwdnError, ParameterError
 from mwdn.io.files import as_parameter_error
 from mwdn.io.images import write_picture
 from mwdn.networks import build
 from mwdn.networks.activation_checkpointing import batch_norms, checkpoint_activations
 from mwdn.runtime import distributed
 from mwdn.runtime.devices import has_bfloat16
+from mwdn.runtime.interrupts import deferred_interrupt
 from mwdn.training.batch_norm import freeze_cancelled, synchronise
 from mwdn.training.losses import Loss
+from mwdn.training.network import build_network, name_and_options, update_average
 from mwdn.training.recipe import Recipe
 from mwdn.training.run_folder import MAKE_ROOM, RunFolder, run_identity
+from mwdn.training.sample_cache import Progress
 from mwdn.training.schedule import make_lr_schedule, make_optimiser
 from mwdn.training.tasks import Task
 from mwdn.training.training_state import damaged, restore, write_state
 from mwdn.training.validation import Validation, Validator
-from mwdn.weights.bundled import load_network
-from mwdn.weights.checkpoint import first_difference, load_checkpoint, save_network
+from mwdn.weights.checkpoint import save_network
 
 
 @dataclass(frozen=True)
@@ -107,42 +108,78 @@ class Trainer:
         self.folder = RunFolder(out, self.identity)
         self._resume()
 
-        # 3. Claim the folder.
+        # 3. Claim the folder, unless a capture does not fit the network.
+        self.validator.reconstruct_captures(self.average)
         if distributed.rank() == 0:
             self.folder.claim(self.step)
 
-    def run(self, callback: Callable[[Report], None] = lambda report: None) -> float:
-        """Train to the end of the schedule; returns the best validation PSNR in dB.
+    def run(
+        self, callback: Callable[[Report], None] = lambda report: None, *, samples: Progress = lambda done, total: None
+    ) -> float:
+        """Compute the cached samples, if the task has some, then train to the end of the schedule.
+
+        Ctrl-C ends the run with a saved state: after the sample in progress, or after the step in progress.
 
         Args:
             callback: called after each step, on the first process.
+            samples: called after each cached sample, with those of this process that are done and their total.
+
+        Returns:
+            The best validation PSNR in dB.
 
         Raises:
+            KeyboardInterrupt: Ctrl-C; its message says how to go on.
             DivergenceError: as for `advance`.
             ParameterError: another run is using the folder, or it cannot be written to (a full disk, for example); the
                 last saved state stays as it was.
             ProcessError: another process has ended.
         """
-        is_first = distributed.rank() == 0
         with self.folder.lock():
-            last = time.perf_counter()
-            while self.step < self.schedule.steps and not self.lr_schedule.finished:
-                learning_rate = self.lr_schedule.rate(self.step)
-                loss, parts = self.advance()
-                now = time.perf_counter()
-                speed, last = self.schedule.batch / (now - last), now
-                due = self.step % self.schedule.validate_every == 0 or self.step == self.schedule.steps
-                validation = self.validate() if due else None
-                report = Report(self.step, loss, parts, learning_rate, speed, validation)
-                if is_first:
-                    # Before the state is saved: a run killed in between repeats the step and its line.
-                    self.folder.log(report.line())
-                if validation is not None:
-                    self.save(validation)
-                    last = time.perf_counter()
-                if is_first:
-                    callback(report)
+            try:
+                self._fill_cache(samples)
+                self._train(callback)
+            except DivergenceError:
+                self.folder.remove_samples()
+                raise
+            self.folder.remove_samples()
         return self.best
+
+    def _fill_cache(self, progress: Progress) -> None:
+        """Compute this process's cached samples that the rest of the run needs."""
+        cache, batch = self.task.cache, self.schedule.batch
+        # Two times the cache hold a whole epoch.
+        steps = range(self.step, self.schedule.steps)[: 2 * cache.size // batch if cache else 0]
+        if cache is None or not steps:
+            return
+        files = self.folder.samples(cache.pairs.content)
+        if distributed.rank() == 0:
+            files.remove_others()
+        numbers = (n for step in steps for n in distributed.shard(range(step * batch, (step + 1) * batch)))
+        cache.fill(self.network.train(), numbers, files, progress)
+
+    def _train(self, callback: Callable[[Report], None]) -> None:
+        with deferred_interrupt() as interrupted:
+            while self.step < self.schedule.steps and not self.lr_schedule.finished:
+                self._step(callback)
+                if distributed.all_reduce_sum(torch.tensor(int(interrupted()))):
+                    self._save_state()
+                    raise KeyboardInterrupt(f"Interrupted after step {self.step:,}. The same command resumes.")
+
+    def _step(self, callback: Callable[[Report], None]) -> None:
+        """One step with its line in the log, and the validation and saved state that are due after it."""
+        start, learning_rate = time.perf_counter(), self.lr_schedule.rate(self.step)
+        loss, parts = self.advance()
+        speed = self.schedule.batch / (time.perf_counter() - start)
+        due = self.step % self.schedule.validate_every == 0 or self.step == self.schedule.steps
+        validation = self.validate() if due else None
+        report = Report(self.step, loss, parts, learning_rate, speed, validation)
+        if distributed.rank() == 0:
+            # Before the state is saved: a run killed in between repeats the step and its line.
+            self.folder.log(report.line())
+        if validation is not None:
+            self.save(validation)
+        if distributed.rank() == 0:
+            callback(report)
 
     def advance(self) -> tuple[float, dict[str, float]]:
         """One optimiser step; returns the loss and its parts, over the batches of all processes.
@@ -227,12 +264,19 @@ class Trainer:
         if distributed.rank() > 0:
             return
         metadata = {**self.identity, "step": self.step, "psnr": validation.psnr}
-        header = {"identity": json.dumps(self.identity), "step": str(self.step), "best": repr(self.best)}
-        header["lr_schedule"] = json.dumps(self.lr_schedule.state())
-        name, options = _name_and_options(self.recipe)
+        name, options = name_and_options(self.recipe)
         with as_parameter_error(self.out, MAKE_ROOM):
             for file in ("last", *(["best"] if validation.psnr == self.best else [])):
                 save_network(self.folder.weights(file), self.average, name, options, **metadata)
+        self._save_state()
+
+    def _save_state(self) -> None:
+        """Write everything from which the run resumes, on the first process."""
+        if distributed.rank() > 0:
+            return
+        header = {"identity": json.dumps(self.identity), "step": str(self.step), "best": repr(self.best)}
+        header["lr_schedule"] = json.dumps(self.lr_schedule.state())
+        with as_parameter_error(self.out, MAKE_ROOM):
             path = self.folder.state
             write_state(path, header, network=self.network, average=self.average, optimiser=self.optimiser)
 
@@ -248,40 +292,3 @@ class Trainer:
         self.step, self.best = int(header["step"]), float(header["best"])
         saved_schedule = header.get("lr_schedule") or header["course"]  # the second is its former name
         self.lr_schedule = make_lr_schedule(self.recipe, **json.loads(saved_schedule))
-
-
-def build_network(recipe: Recipe) -> nn.Module:
-    """The network of a recipe with its initial weights: random ones, or those that the schedule names.
-
-    Raises:
-        CheckpointError: the weights do not fit the network.
-    """
-    torch.manual_seed(recipe.schedule.seed)
-    network = build(**recipe.network)
-    start, denoiser = recipe.schedule.start, recipe.schedule.denoiser
-    weights = (load_network(start) if start else network).state_dict()
-    if denoiser:
-        weights |= {f"denoiser.{key}": value for key, value in load_checkpoint(denoiser).state_dict().items()}
-    try:
-        network.load_state_dict(weights)
-    except RuntimeError as error:
-        raise CheckpointError(
-            f"`start` ('{start}') must hold the network of the recipe, {recipe.network}, and `denoiser` ('{denoiser}') "
-            f"its denoiser, if it has one: {first_difference(error)}."
-        ) from error
-    return network
-
-
-@torch.no_grad()
-def update_average(average: nn.Module, network: nn.Module, *, decay: float) -> None:
-    """Update an exponential moving average of a network's weights; integers (BatchNorm's counters) are copied."""
-    for mean, value in zip(average.state_dict().values(), network.state_dict().values(), strict=True):
-        if value.is_floating_point():
-            mean.lerp_(value, 1 - decay)
-        else:
-            mean.copy_(value)
-
-
-def _name_and_options(recipe: Recipe) -> tuple[str, dict[str, Any]]:
-    options = dict(recipe.network)
-    return options.pop("name"), options

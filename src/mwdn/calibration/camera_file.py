@@ -1,0 +1,152 @@
+"""A camera file: all that is known about a camera, in one TOML file that people can read and edit."""
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from mwdn.calibration.frame_format import FrameFormat
+from mwdn.calibration.psf_format import PsfFormat
+from mwdn.calibration.white_balance import WhiteBalance
+from mwdn.errors import ParameterError, PsfError, UnknownNameError
+from mwdn.io.files import as_parameter_error, atomic
+from mwdn.io.toml import read_toml
+
+_TYPES: dict[str, Any] = {
+    **dict.fromkeys(("psf", "psf_sha256", "dark", "ambient"), str),
+    **get_type_hints(PsfFormat),
+    **get_type_hints(FrameFormat),
+    "white_balance": WhiteBalance,
+    "pitch_um": float,
+    "distance_mm": float,
+}
+
+KEYS: dict[str, tuple[str, Any]] = {
+    "psf": ("Picture of a point source.", "psf.png"),
+    "psf_sha256": ("SHA-256 of the PSF's file: once the file has changed, it is refused.", ""),
+    "dark": ("Frame taken without light, subtracted from the PSF and the captures.", "dark.png"),
+    "ambient": ("Frame taken with the room's light alone, subtracted from the captures.", "ambient.png"),
+    "background": ('Uniform light under the PSF, as a fraction of the full scale, or "estimate".', "estimate"),
+    "psf_bin": ("`bin` of the PSF, if it was taken at another resolution than the captures.", 4),
+    "psf_gamma": ('Encoding of the PSF\'s file: "srgb", or a power such as 2.2. Linear unless given.', "srgb"),
+    "psf_orientation": ("How the PSF must be turned to fit the captures.", "rotate-180"),
+    "bgr": ("The files' channels are blue, green, red.", True),
+    "bit_depth": ("Bits of the sensor, if its numbers do not fill the files' type.", 12),
+    "gamma": ('Encoding of the captures: "srgb", or a power such as 2.2. Linear unless given.', "srgb"),
+    "crop": ("Height and width of the central part to use, in raw pixels of the frame.", [1080, 1080]),
+    "mosaic": ("Colours of the 2 x 2 cells of raw frames of a colour filter array.", "rggb"),
+    "grey": ("Average the colours.", True),
+    "bin": ("Average blocks of this many pixels along each axis. `mwdn reconstruct` chooses unless given.", 4),
+    "upside_down": ("The files' first row is the bottom of the picture.", True),
+    "white_balance": ('Of the pictures: "grey-world", "psf", or gains of red, green and blue.', "grey-world"),
+    "pitch_um": ("Distance between pixels after binning, in micrometres.", 9.6),
+    "distance_mm": ("Distance from the point source to the camera, in millimetres.", 200.0),
+}
+"""Meaning and an example of each key, in the order of the file."""
+
+_FILES = ("psf", "dark", "ambient")
+_HEAD = """\
+# A camera of mwdn: its PSF, and how its frames become measurements. Paths are relative to this file.
+# Use it in any command: mwdn reconstruct CAPTURES --camera {name}
+# Options on the command line take precedence. To set a key that is a comment, remove its #.
+"""
+
+
+def read_camera(path: str | Path) -> dict[str, Any]:
+    """Read the keys of a camera file; `mwdn.Calibration.load` makes a calibration of them.
+
+    Returns:
+        The values of the keys in the file, by the names of `KEYS`; paths include the folder of the camera file.
+
+    Raises:
+        ParameterError: the file cannot be read, names no PSF, or a value has another type.
+        UnknownNameError: a key is none of `KEYS`.
+    """
+    path = Path(path)
+    table = read_toml(path, "camera file")
+    for key, value in table.items():
+        if key not in KEYS:
+            raise UnknownNameError(f"key of the camera file `{path}`", key, KEYS)
+        if not _fits(value, _TYPES[key]):
+            meaning, example = KEYS[key]
+            raise ParameterError(
+                f"`{key}` ({value!r}) in `{path}` must be like this: `{key} = {_to_toml(example)}`. {meaning}"
+            )
+    if "psf" not in table:
+        raise ParameterError(f'`{path}` must name the camera\'s PSF: `psf = "psf.png"`.')
+    files = {key: path.parent / table[key] for key in _FILES if key in table}
+    return {**{key: tuple(value) if isinstance(value, list) else value for key, value in table.items()}, **files}
+
+
+def write_camera(path: str | Path, camera: Mapping[str, Any]) -> None:
+    """Write a camera file, atomically, with a line of explanation for each key.
+
+    Args:
+        path: ends in ``.toml``.
+        camera: values by the names of `KEYS`; paths are relative to the current folder, and stored relative to the
+            camera file. What is missing or ``None`` becomes a comment. The PSF's SHA-256 is added.
+
+    Raises:
+        ParameterError: another suffix, the file cannot be written, or it exists and is not a camera file.
+    """
+    path = Path(path)
+    check_camera_path(path)
+    values = {**camera, "psf_sha256": _sha256(camera["psf"])}
+    lines = []
+    for key, (meaning, example) in KEYS.items():
+        value = values.get(key)
+        if key in _FILES and value is not None:
+            value = _relative(Path(value), path.parent)
+        line = f"# {key} = {_to_toml(example)}" if value is None else f"{key} = {_to_toml(value)}"
+        lines += ["", f"# {meaning}", line]
+    with as_parameter_error(path.parent), atomic(path) as temporary:
+        temporary.write_text(_HEAD.format(name=path.name) + "\n".join(lines) + "\n", encoding="utf-8")
+
+
+def check_camera_path(path: Path) -> None:
+    """Raise a `ParameterError` if a camera file must not be written there: another suffix, or another kind of file."""
+    if path.suffix.lower() != ".toml":
+        raise ParameterError(f"`{path}` must end in .toml, not '{path.suffix}': `--out camera.toml`.")
+    if path.exists() and not (path.is_file() and {"psf", "psf_sha256"} <= read_toml(path, "camera file").keys()):
+        raise ParameterError(f"`{path}` is not a camera file and would be lost. Choose another name: `--out`.")
+
+
+def check_psf_file(path: str | Path, sha256: str, psf: Path) -> None:
+    """Raise a `PsfError` if the PSF of the camera file ``path`` has changed since that was written."""
+    if sha256 and psf.is_file() and _sha256(psf) != sha256:
+        raise PsfError(
+            f"`{psf}` has changed since the camera file `{path}` was written, and may not fit its other values. "
+            f"Calibrate again: `mwdn calibrate --camera {path} -o {path}`."
+        )
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _relative(path: Path, folder: Path) -> str:
+    """A path as seen from a folder, with forward slashes; absolute if it is on another drive."""
+    try:
+        return Path(os.path.relpath(path, folder)).as_posix()
+    except ValueError:
+        return path.resolve().as_posix()
+
+
+def _to_toml(value: object) -> str:
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _fits(value: object, kind: Any) -> bool:  # noqa: ANN401
+    """Whether a TOML value is of an annotated type; an integer is a float, too, and a list a tuple."""
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin is Literal:
+        return value in parts
+    if origin in (Union, UnionType):
+        return any(_fits(value, part) for part in parts)
+    if origin is tuple:
+        return isinstance(value, list) and len(value) == len(parts) and all(map(_fits, value, parts))
+    return type(value) in ((int, float) if kind is float else (kind,))

@@ -1,0 +1,69 @@
+"""White balance: gains of the colours of a finished picture."""
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from mwdn.errors import ParameterError
+from mwdn.types import Scene
+
+WhiteBalance = Literal["grey-world", "psf"] | tuple[float, float, float]
+"""``"grey-world"``: the picture's mean becomes grey. ``"psf"``: the point source of the PSF becomes white. Three
+numbers: gains of red, green and blue; ``(1, 1, 1)`` for none."""
+
+
+def check_white_balance(balance: WhiteBalance | None, light: tuple[float, ...]) -> None:
+    """Check that a white balance is possible for a camera.
+
+    Args:
+        balance: the white balance.
+        light: of the point source in each channel, see `mwdn.Calibration`.
+
+    Raises:
+        ParameterError: another name, gains that are not positive, or the colour of the point source is not known.
+    """
+    if balance is None or balance == "grey-world":
+        return
+    if balance == "psf":
+        if len(light) != 3:
+            reason = "grey" if light else "an array without its file's light"
+            raise ParameterError(
+                f"`white_balance` 'psf' needs a PSF in colour, but this one is {reason}. Use 'grey-world', or gains: "
+                "`--white-balance 1.8 1 1.5`."
+            )
+        return
+    if isinstance(balance, str) or len(balance) != 3 or not all(0 < gain < float("inf") for gain in balance):
+        raise ParameterError(
+            f"`white_balance` ({balance}) must be 'grey-world', 'psf', or three positive gains of red, green and blue: "
+            "`--white-balance 1.8 1 1.5`."
+        )
+
+
+def apply_white_balance(scene: Scene, balance: WhiteBalance, light: tuple[float, ...]) -> Scene:
+    """Multiply each colour of each picture by its gain, that of green being 1; grey pictures stay as they are.
+
+    Args:
+        scene: (B, C, H, W), linear light. Its camera's colours: never compare the result with a measurement.
+        balance: checked by `check_white_balance`.
+        light: as there.
+
+    References:
+        Grey world: G. Buchsbaum, "A spatial processor model for object colour perception", Journal of the Franklin
+        Institute 310, 1-26 (1980). Negative pixels, which only noise gives, count as 0.
+    """
+    if scene.shape[1] != 3:
+        return scene
+    if balance == "grey-world":
+        gains = _inverse(scene.clamp(min=0).mean((-2, -1)))
+    elif balance == "psf":
+        gains = _inverse(torch.tensor([light]))
+    else:
+        gains = torch.tensor([balance]) / balance[1]
+    return scene * gains.to(scene)[..., None, None]
+
+
+def _inverse(colour: Tensor) -> Tensor:
+    """Gains (B, 3) that make the colour grey; 1 where there is no light to tell."""
+    gains = colour[:, 1:2] / colour
+    return torch.where(gains.isfinite() & (gains > 0), gains, torch.ones_like(gains))

@@ -1,0 +1,26 @@
+"""Values of a camera file as options of a command; imported with the command line, so without torch."""
+
+from typing import Any
+
+from cyclopts import App
+from cyclopts.config import Dict
+
+
+def from_camera_file(app: App, commands: tuple[str, ...], arguments: Any) -> None:  # noqa: ANN401
+    """Read the options that the command line does not set from the file of ``--camera``."""
+    by_name = {argument.name: argument for argument in arguments}
+    given = by_name.get("--camera")
+    if given is None or not given.tokens:
+        return
+    from mwdn.calibration.camera_file import read_camera
+
+    path = given.tokens[0].value
+    options = {key.replace("_", "-"): value for key, value in read_camera(path).items()}
+    # Not every command has all of them, and some take unknown options for those of a method or a recipe.
+    values = {name: _plain(value) for name, value in options.items() if f"--{name}" in by_name}
+    Dict(values, source=path, use_commands_as_keys=False)(app, commands, arguments)
+
+
+def _plain(value: Any) -> Any:  # noqa: ANN401
+    """A value as in a TOML file: paths are text."""
+    return list(value) if isinstance(value, tuple) else value if isinstance(value, int | float) else str(value)

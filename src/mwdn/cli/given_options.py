@@ -1,0 +1,14 @@
+"""Options that a command must know were given; imported with the command line, so without torch."""
+
+from typing import Any
+
+from cyclopts import App
+from cyclopts.token import Token
+
+
+def note_given_bin(app: App, commands: tuple[str, ...], arguments: Any) -> None:  # noqa: ANN401
+    """Switch off the hidden option ``--auto-bin`` if ``--bin`` is given, be it the default of 1."""
+    by_name = {argument.name: argument for argument in arguments}
+    automatic, given = by_name.get("--auto-bin"), by_name.get("--bin")
+    if automatic is not None and not automatic.tokens and given is not None and given.tokens:
+        automatic.append(Token(keyword="--auto-bin", value="false", source="--bin"))

@@ -1,0 +1,94 @@
+"""Output to the terminal, by what it is: set for each command by --quiet, --verbose and --json."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+from rich.console import Console
+from rich.markup import escape
+
+from mwdn.errors import MwdnError
+
+results = Console()
+"""What the command is asked for, such as a table: always."""
+
+console = Console()
+"""What the command has done: not with --quiet; with --json on standard error."""
+
+notes = Console(stderr=True)
+"""Warnings, remarks and progress: not with --quiet."""
+
+details = Console(stderr=True, quiet=True)
+"""Versions, times, and what was assumed: only with --verbose."""
+
+errors = Console(stderr=True)
+"""Errors: always."""
+
+Json = Annotated[bool, Parameter(negative=())]
+"""Type of the option --json, see `set_up`."""
+
+_spell: Callable[[str], str] = str
+
+
+def set_up(
+    *, quiet: bool = False, verbose: bool = False, json: bool = False, spell: Callable[[str], str] = str
+) -> None:
+    """Set what is printed, and where.
+
+    Args:
+        quiet: print errors and what was asked for, nothing else.
+        verbose: print versions, times, and what was assumed, too.
+        json: keep standard output free for one JSON document.
+        spell: converts messages of the library to the words of the running command, see `mwdn.cli.as_typed`.
+    """
+    global _spell
+    console.quiet = notes.quiet = quiet
+    details.quiet = not verbose
+    console.stderr = json
+    _spell = spell
+
+
+def print_json(content: Any) -> None:  # noqa: ANN401
+    """Print a JSON document to standard output."""
+    from json import dumps
+
+    results.out(dumps(content, indent=2, allow_nan=False), highlight=False)
+
+
+def detail(*sentences: str) -> None:
+    """Print sentences for --verbose, each on one line."""
+    for sentence in sentences:
+        details.print(escape(sentence), style="dim", highlight=False, soft_wrap=True)
+
+
+def note(*sentences: str) -> None:
+    """Print sentences that are neither results nor warnings, each on one line."""
+    for sentence in sentences:
+        notes.print(escape(sentence), highlight=False, soft_wrap=True)
+
+
+def warn(*warnings: str | None) -> None:
+    """Print each warning that is not ``None``, on one line."""
+    for warning in filter(None, warnings):
+        text = escape(_spell(" ".join(warning.split())))
+        notes.print(f"[yellow]Warning:[/] {text}", highlight=False, soft_wrap=True)
+
+
+def complain(start: str, error: MwdnError) -> None:
+    """Print an error on one line: brackets are not markup, and paths are not wrapped at the terminal's width."""
+    errors.print(f"{start} {escape(_spell(str(error)))}", highlight=False, soft_wrap=True)
+
+
+def counted(count: int, noun: str, nouns: str = "") -> str:
+    """A number of things in words: "1 pair", "2,000 pairs"; ``nouns`` is the plural unless it ends in s."""
+    return f"{count:,} {noun if count == 1 else nouns or noun + 's'}"
+
+
+@contextmanager
+def if_interrupted(message: Callable[[], str]) -> Iterator[None]:
+    """Let Ctrl-C end the command with a message that says what is kept and how to go on."""
+    try:
+        yield
+    except KeyboardInterrupt as interrupt:
+        raise KeyboardInterrupt(str(interrupt) or message()) from interrupt

@@ -1,0 +1,73 @@
+"""What may be wrong with a capture: all checks of one raw frame."""
+
+import torch
+from torch.nn import functional as F
+
+from mwdn.calibration import Calibration
+from mwdn.calibration.psf import SATURATED_PART
+from mwdn.diagnosis.encoding import gamma
+from mwdn.diagnosis.mosaic import mosaic
+from mwdn.diagnosis.noise import noise
+from mwdn.diagnosis.verdict import Verdict
+from mwdn.types import Frame
+
+DIM = 0.03
+"""Fraction of the full scale that the brightest thousandth of a capture must reach."""
+
+FAINT = 0.05
+"""Fraction of the light that may be ambient without a word."""
+
+
+def examine_capture(frame: Frame, calibration: Calibration) -> tuple[Verdict, ...]:
+    """Run all checks that need nothing but a raw frame and the camera's calibration.
+
+    A new check is one more entry here: a function that returns a `Verdict`.
+
+    Args:
+        frame: (H, W, C), as `FrameFormat.read` returns it.
+        calibration: the camera's.
+    """
+    raw = mosaic(frame, calibration)
+    # Between pixels of other colours the noise of a level cannot be seen: first the mosaic, then the gamma.
+    checks = (saturation, darkness, noise, ambient_light) + (() if raw.state == "doubt" else (gamma,))
+    return (*(check(frame, calibration) for check in checks), raw)
+
+
+def saturation(frame: Frame, calibration: Calibration) -> Verdict:
+    """Whether so many pixels are saturated that even the right PSF may look wrong; floats have no known maximum."""
+    part = calibration.saturated_part(frame)
+    text = f"{part:.1%} of the capture's pixels are saturated"
+    if part > SATURATED_PART:
+        return Verdict("capture", "saturation", "doubt", f"{text}, and no PSF explains them.")
+    return Verdict("capture", "saturation", "good", f"{text}.")
+
+
+def darkness(frame: Frame, calibration: Calibration) -> Verdict:
+    """Whether the capture uses so little of the sensor's range that noise and rounding dominate; floats have none."""
+    if frame.dtype.kind == "f":
+        return Verdict("capture", "darkness", "unknown", "The file holds floats, so its full scale is not known.")
+    pixels = torch.from_numpy(frame.max(axis=-1).astype("float32")).flatten()
+    brightest = float(pixels.kthvalue(pixels.numel() - pixels.numel() // 1000).values)
+    part = brightest / calibration.frames.full_scale(frame)
+    text = f"The brightest thousandth of the capture starts at {part:.1%} of the full scale"
+    if part < DIM:
+        text = f"{text}: too dark, or in the lower bits of its file."
+        return Verdict("capture", "darkness", "doubt", text, "darkness", "--bit-depth 12")
+    return Verdict("capture", "darkness", "good", f"{text}.")
+
+
+def ambient_light(frame: Frame, calibration: Calibration) -> Verdict:
+    """How much of the light may be the room's, even or from one side: the darkest spot of the brightest half.
+
+    One capture cannot tell it from bright surroundings, so this is never a doubt.
+    """
+    measurement = calibration.correct(frame)
+    smooth = F.avg_pool2d(measurement, min(5, *measurement.shape[-2:]), 1)
+    halves = [half for axis in (-2, -1) for half in smooth.tensor_split(2, axis) if half.numel()]
+    floor = torch.stack([half.flatten(2).amin(-1).clamp(min=0).sum() for half in halves]).amax()
+    part = float(floor / measurement.mean((-2, -1)).sum().clamp(min=1e-30))
+    text = f"At most {part:.0%} of the capture's light is ambient light"
+    if part < FAINT:
+        return Verdict("capture", "ambient-light", "good", f"{text}.")
+    text = f"{text}: the room's light, or bright surroundings."
+    return Verdict("capture", "ambient-light", "unknown", text, options="--ambient FILE")

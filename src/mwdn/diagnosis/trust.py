@@ -1,0 +1,102 @@
+"""How far to trust a picture: verdicts on the PSF and on the picture, and the numbers behind them."""
+
+import math
+from dataclasses import asdict, dataclass
+
+import torch
+
+from mwdn.diagnosis.orientation import OrientationFit, fit_orientations
+from mwdn.diagnosis.support_map import Support, support_map
+from mwdn.diagnosis.verdict import Verdict
+from mwdn.evaluation.consistency import Consistency, consistency
+from mwdn.optics.orientation import Orientation
+from mwdn.solvers.alignment import Pose, align
+from mwdn.types import Measurement, Psf, Scene
+
+LEAST_EXPLAINED = 0.25
+"""Smallest trusted ``explained / possible``. On real captures the right PSF reaches 0.32 and more."""
+
+LEAST_POSSIBLE = 0.03
+"""Smallest `Consistency.possible` at which a picture can be judged."""
+
+
+@dataclass(frozen=True)
+class Trust:
+    """What PSF, capture and picture say about each other.
+
+    Args:
+        consistency: how much of the capture the picture reproduces.
+        orientation: how the PSF's mirror images and turns fit the capture.
+        support: which parts of the picture the capture supports.
+    """
+
+    consistency: Consistency
+    orientation: OrientationFit
+    support: Support
+
+    @property
+    def verdicts(self) -> tuple[Verdict, Verdict]:
+        """On the PSF and on the picture."""
+        return self.orientation.verdict, self._picture
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the PSF or the picture is in doubt."""
+        return any(verdict.state == "doubt" for verdict in self.verdicts)
+
+    @property
+    def sentence(self) -> str:
+        """A one-line summary, which says so if the PSF cannot be judged."""
+        unknown = self.orientation.verdict.state == "unknown"
+        return self.consistency.sentence + "; this capture cannot judge the PSF" * unknown
+
+    @property
+    def content(self) -> dict[str, object]:
+        """The numbers, by their names in a sidecar file."""
+        return {
+            **asdict(self.consistency),
+            "contrast": self.orientation.contrast,
+            "supported_light": self.support.light,
+            "supported_area": self.support.area,
+            "doubtful": self.doubtful,
+        }
+
+    @property
+    def finite(self) -> bool:
+        """Whether all numbers are finite."""
+        return all(math.isfinite(number) for number in self.content.values() if isinstance(number, float))
+
+    @property
+    def _picture(self) -> Verdict:
+        explained, possible = self.consistency.explained, self.consistency.possible
+        if possible < LEAST_POSSIBLE:
+            text = f"The picture cannot be judged: only {possible:.1%} of the capture's detail is not noise."
+            return Verdict("picture", "noise", "unknown", text)
+        share = f"{explained / possible:.0%} of what is not noise in the capture's detail"
+        if explained < LEAST_EXPLAINED * possible:
+            return Verdict("picture", "little-explained", "doubt", f"The picture reproduces only {share}.")
+        return Verdict("picture", "little-explained", "good", f"The picture reproduces {share}.")
+
+
+@torch.inference_mode()
+def examine_picture(
+    measurement: Measurement, psf: Psf, scene: Scene, *, pose: Pose | None = None, given: Orientation | None = None
+) -> Trust:
+    """Judge a PSF and a picture by the capture.
+
+    Args:
+        measurement: (1, C, H, W).
+        psf: (1, 1 or C, H, W), centred.
+        scene: (1, C, H, W), the reconstruction.
+        pose: the best pose of the PSF; estimated by `align` unless given.
+        given: the ``psf_orientation`` that the PSF already had.
+
+    Raises:
+        ShapeError: more than one measurement, or a scene of another shape.
+    """
+    pose = pose or align(measurement, psf)
+    return Trust(
+        consistency(measurement, psf, scene, pose=pose),
+        fit_orientations(measurement, psf, pose=pose, given=given),
+        support_map(measurement, pose.move(psf), scene),
+    )

@@ -1,0 +1,38 @@
+"""A statement about a PSF, a capture or a picture."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+Subject = Literal["psf", "capture", "picture"]
+State = Literal["good", "doubt", "unknown"]
+"""``good``: nothing to do. ``doubt``: something is probably wrong. ``unknown``: this capture cannot tell."""
+
+GUIDE = "docs/troubleshooting.md"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a check found.
+
+    Args:
+        subject: what it is about.
+        topic: section of `GUIDE` that says more, in lower case with hyphens: ``"gamma"``, ``"mosaic"``.
+        state: how sure, and whether something is wrong.
+        text: one sentence that states the fact, and the number it comes from.
+        value: what was detected, for programs: ``"srgb"``, ``"rggb"``, ``"rotate-180"``, ``"4"``; empty if nothing.
+        options: command-line options to try, ready to paste: ``"--gamma srgb"``.
+    """
+
+    subject: Subject
+    topic: str
+    state: State
+    text: str
+    value: str = ""
+    options: str = ""
+
+    @property
+    def sentence(self) -> str:
+        """The statement, the options to try, and where to read more."""
+        parts = [self.text, f"Try `{self.options}`." if self.options else ""]
+        parts.append(f"See {GUIDE}#{self.topic}." if self.state != "good" else "")
+        return " ".join(filter(None, parts))

@@ -1,0 +1,83 @@
+"""Methods by their names: solvers, bundled networks and checkpoints."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from mwdn import solvers
+from mwdn.calibration import Calibration
+from mwdn.errors import CheckpointError, ParameterError, UnknownNameError
+from mwdn.networks import DENOISERS, NETWORKS
+from mwdn.types import Measurement, Psf, Scene
+from mwdn.weights.bundled import BUNDLED, find_weights
+from mwdn.weights.checkpoint import SUFFIXES, load_checkpoint, read_metadata
+
+Method = Callable[[Measurement, Psf], Scene]
+"""A solver or a network, called as ``method(measurement, psf)``."""
+
+
+def find_method(name: str | Path, **options: Any) -> Method:  # noqa: ANN401
+    """Find a solver or a bundled network by its name, or a network by the path of its checkpoint.
+
+    Args:
+        name: the name or the path; ``hub:owner/name`` for a network on the Hugging Face hub.
+        **options: of a solver, for example ``regularisation=1e-4``. A network's options are in its checkpoint.
+
+    Raises:
+        UnknownNameError: neither a solver nor a file, or the solver has no such option.
+        CheckpointError: the file holds no usable weights.
+        ParameterError: an option is out of range, a network is given options, or a network needs training first.
+    """
+    if str(name) in solvers.SOLVERS:
+        return solvers.build(str(name), **options)
+    if options:
+        names = ", ".join(f"`{option}`" for option in options)
+        raise ParameterError(
+            f"{names} cannot be set for '{name}': only solvers ({', '.join(solvers.SOLVERS)}) have options. "
+            "See `mwdn methods`."
+        )
+    path = find_weights(str(name)) or Path(name)
+    if path.suffix in SUFFIXES or path.is_file():
+        network = load_checkpoint(path)
+        if isinstance(network, tuple(DENOISERS.values())):
+            raise CheckpointError(
+                f"`{name}` holds a denoiser, which cannot reconstruct on its own. Use it as `denoiser` in [schedule] "
+                "of a recipe such as `mwdn recipes universal-plug`."
+            )
+        return network
+    if str(name) in NETWORKS:
+        raise ParameterError(
+            f'`{name}` is a network without weights. Train it with `name = "{name}"` in [network] of the recipe: '
+            f"`mwdn train RECIPE.toml --psf psf.png --photos photos/ --out runs/{name}`. The method is then "
+            f"`runs/{name}/best.safetensors`. `universal` needs no training."
+        )
+    raise UnknownNameError("method", str(name), [*BUNDLED, *solvers.SOLVERS, "PATH/OF/CHECKPOINT.safetensors"])
+
+
+def as_method(method: Method | str | Path, **options: Any) -> Method:  # noqa: ANN401
+    """A method as it is, or `find_method` with options.
+
+    Raises:
+        ParameterError: an object is given options, or as for `find_method`.
+        MwdnError: as for `find_method`.
+    """
+    if isinstance(method, str | Path):
+        return find_method(method, **options)
+    if options:
+        raise ParameterError(f"Options ({', '.join(options)}) need a method given by its name, not an object.")
+    return method
+
+
+def psf_warning(method: str | Path, calibration: Calibration) -> str | None:
+    """Warning if the network was trained for another PSF than the calibration's."""
+    path = find_weights(str(method)) or Path(method)
+    if path.suffix != ".safetensors":
+        return None
+    trained = read_metadata(path).get("psf_hash")
+    if trained in (None, calibration.psf_hash):
+        return None
+    return (
+        f"`{method}` was trained for PSF {trained}, but the calibration has PSF {calibration.psf_hash}. "
+        "Expect blur, ghosts and invented detail, unless both are from the same camera: another crop, bin or "
+        "background counts as another PSF. Use the PSF of the training, or train for this one: `mwdn train`."
+    )

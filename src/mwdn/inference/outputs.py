@@ -1,0 +1,76 @@
+"""Files of a batch: their names, and the check that nothing of the user's is overwritten."""
+
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Literal
+
+from mwdn.errors import ParameterError
+from mwdn.io.files import path_resolver
+
+Format = Literal["png", "png16", "tiff", "npy"]
+"""``png`` and ``png16`` are sRGB, for viewing; ``tiff`` and ``npy`` hold the linear float32 values."""
+
+_SUFFIX = {"png": ".png", "png16": ".png", "tiff": ".tif", "npy": ".npy"}
+_SUPPORT = ".support.png"
+SUMMARY = "summary.png"
+"""File of the contact sheet."""
+
+
+def output_name(capture: str | Path, format: Format) -> str:
+    """File name of a capture's picture: the capture's name with the format's suffix."""
+    return Path(capture).stem + _SUFFIX[format]
+
+
+def support_name(output: Path) -> Path:
+    """File of the map of a picture's support."""
+    return output.with_name(output.stem + _SUPPORT)
+
+
+def check_outputs(
+    captures: Sequence[str | Path], out: Path, format: Format, *, protected: Iterable[Path | None] = ()
+) -> None:
+    """Check that every capture has its own file name in ``out`` and that nothing of the user's is overwritten.
+
+    Raises:
+        ParameterError: two captures have the same output, an output would overwrite an input or a ``.json`` that is
+            not of this package, or ``out`` is a file.
+    """
+    if out.exists() and not out.is_dir():
+        raise ParameterError(f"`{out}` must be a folder, but is a file. Choose another one: `--out`.")
+    real = path_resolver()
+    inputs = {real(str(path)) for path in (*captures, *protected) if path is not None}
+
+    def check(output: str) -> None:
+        if real(output) in inputs:
+            raise ParameterError(f"`{output}` would overwrite an input. Choose another folder: `--out`.")
+
+    existing = {path.name for path in out.glob("*.json")}
+    check(str(out / SUMMARY))
+    sources = {SUMMARY: "the summary picture"}
+    start = str(out / "x").removesuffix("x")  # text instead of paths: there may be a million captures
+    for capture in captures:
+        name = output_name(capture, format)
+        sidecar = name.removesuffix(_SUFFIX[format]) + ".json"
+        check(start + name)
+        check(start + sidecar)
+        check(start + name.removesuffix(_SUFFIX[format]) + _SUPPORT)
+        if sidecar in existing and not read_sidecar(out / sidecar):
+            raise ParameterError(
+                f"`{start}{sidecar}` was not written by mwdn and would be lost. Choose another folder: `--out`."
+            )
+        if name in sources:
+            raise ParameterError(
+                f"`{capture}` and {sources[name]} would both be written to `{start}{name}`. Name one of them, "
+                f"such as `*{Path(capture).suffix}`, or reconstruct them into two folders: `--out`."
+            )
+        sources[name] = f"`{capture}`"
+
+
+def read_sidecar(path: Path) -> dict[str, object]:
+    """Content of a sidecar file; empty if it is missing or not of this package."""
+    try:
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) and "origin" in content else {}

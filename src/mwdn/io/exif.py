@@ -1,0 +1,98 @@
+"""EXIF orientation: how a picture is to be turned when it is shown. The pixels stay as the sensor stored them."""
+
+import struct
+from pathlib import Path
+from typing import BinaryIO
+
+TURNS = {
+    2: "flip-left-right",
+    3: "rotate-180",
+    4: "flip-top-bottom",
+    5: "transpose",
+    6: "rotate-270",
+    7: "transverse",
+    8: "rotate-90",
+}
+"""What shows a picture of each orientation upright, as in ``PIL.Image.Transpose``: rotations are anticlockwise."""
+
+_ORIENTATION = 274
+"""Number of the tag."""
+
+
+def orientation(path: str | Path) -> int:
+    """EXIF orientation of a JPEG, PNG, WebP, TIFF, or raw file that is a TIFF inside; reads a few hundred bytes.
+
+    Returns:
+        1 to 8, see `TURNS`; 1 (upright) if the file has no such tag, or cannot be read.
+    """
+    try:
+        with Path(path).open("rb") as file:
+            start = _find_tiff(file)
+            found = 1 if start is None else _read_tag(file, start)
+    except (OSError, struct.error):  # missing, or cut off: whoever reads the pixels says so
+        return 1
+    return found if found in TURNS else 1
+
+
+def _find_tiff(file: BinaryIO) -> int | None:
+    """Position of the EXIF block, which is a small TIFF."""
+    head = file.read(12)
+    if head[:2] in (b"II", b"MM"):
+        return 0
+    if head.startswith(b"\xff\xd8"):
+        return _in_jpeg(file)
+    if head.startswith(b"\x89PNG"):
+        return _in_png(file)
+    if head[:4] == b"RIFF" and head[8:] == b"WEBP":
+        return _in_webp(file)
+    return None
+
+
+def _in_jpeg(file: BinaryIO) -> int | None:
+    position = 2
+    while True:
+        marker, length = struct.unpack(">HH", _at(file, position, 4))
+        if marker == 0xFFE1 and file.read(6) == b"Exif\0\0":
+            return position + 10
+        if marker < 0xFFC0 or marker == 0xFFDA:  # the compressed data begins
+            return None
+        position += 2 + length
+
+
+def _in_png(file: BinaryIO) -> int | None:
+    position = 8
+    while len(head := _at(file, position, 8)) == 8:
+        length, name = struct.unpack(">I4s", head)
+        if name == b"eXIf":
+            return position + 8
+        position += 12 + length  # a checksum follows the data
+    return None
+
+
+def _in_webp(file: BinaryIO) -> int | None:
+    position = 12
+    while len(head := _at(file, position, 8)) == 8:
+        name, length = struct.unpack("<4sI", head)
+        if name == b"EXIF":
+            return position + (14 if file.read(6) == b"Exif\0\0" else 8)  # some programs write JPEG's header
+        position += 8 + length + length % 2
+    return None
+
+
+def _at(file: BinaryIO, position: int, count: int) -> bytes:
+    file.seek(position)
+    return file.read(count)
+
+
+def _read_tag(file: BinaryIO, start: int) -> int:
+    """The orientation in the first directory of a TIFF."""
+    order = "<" if _at(file, start, 2) == b"II" else ">"
+    version, offset = struct.unpack(order + "HI", file.read(6))
+    if version == 43:  # BigTIFF, which no camera writes
+        return 1
+    (count,) = struct.unpack(order + "H", _at(file, start + offset, 2))
+    for _ in range(count):
+        tag, _, _, value = struct.unpack(order + "HHIH2x", file.read(12))
+        if tag == _ORIENTATION:
+            return int(value)
+    return 1

@@ -1,0 +1,72 @@
+"""Which files of a folder are frames, and which are not: named, never skipped silently."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from mwdn.io.images import READABLE
+from mwdn.io.raw import RAW
+
+FRAMES = READABLE | RAW
+"""Suffixes, in lower case, of the files in a folder that are taken for frames."""
+
+_PICTURES = frozenset({
+    ".apng", ".avif", ".bay", ".crw", ".erf", ".exr", ".fff", ".fit", ".fits", ".gif", ".hdr", ".heic",
+    ".heif", ".hif", ".iiq", ".jfif", ".jp2", ".jpe", ".jxl", ".kdc", ".mos", ".mrw", ".nrw", ".pbm",
+    ".pfm", ".pnm", ".psd", ".raw", ".rwl", ".sr2", ".srf", ".srw", ".svg", ".x3f", ".xcf",
+})  # fmt: skip
+"""Suffixes of pictures that are not read."""
+
+_COMPANIONS = frozenset({".json", ".toml", ".xmp", ".thm"})
+"""Suffixes of files that describe others: this package's, and cameras'."""
+
+_NAMED = 3
+"""Number of files that a sentence names."""
+
+
+def list_folder(folder: Path) -> tuple[list[str], list[str]]:
+    """List the frames in a folder.
+
+    Strings instead of paths save memory: a million of them take about 0.2 GB.
+
+    Args:
+        folder: not searched for subfolders. Hidden files are left out.
+
+    Returns:
+        The frames, in alphabetical order; and one sentence for each kind of entry that is left out.
+    """
+    with os.scandir(folder) as entries:
+        names = sorted(entry.name + "/" * (not entry.is_file()) for entry in entries if not entry.name.startswith("."))
+    start = str(folder / "x").removesuffix("x")
+    frames = [start + name for name in names if not name.endswith("/") and Path(name).suffix.lower() in FRAMES]
+    return frames, _left_out(folder, names, FRAMES)
+
+
+def unused_photographs(folder: Path) -> list[str]:
+    """One sentence for each kind of file in a folder of photographs, or its subfolders, that is not read."""
+    files = (path for path in folder.rglob("*") if not path.name.startswith(".") and path.is_file())
+    return _left_out(folder, sorted(path.relative_to(folder).as_posix() for path in files), READABLE)
+
+
+def _left_out(folder: Path, names: list[str], readable: frozenset[str]) -> list[str]:
+    """One sentence for each kind of file that is not read; the names of folders end in ``/``."""
+    kinds: dict[str, list[str]] = {
+        "formats that are not read: export them as PNG or 16-bit TIFF": [],
+        "subfolders are not searched: name them": [],
+        "not pictures": [],
+    }
+    pictures, folders, others = kinds.values()
+    for name in names:
+        suffix = Path(name).suffix.lower()
+        if name.endswith("/"):
+            folders.append(name)
+        elif suffix not in readable | _COMPANIONS:
+            (pictures if suffix in _PICTURES | RAW else others).append(name)
+    return [f"Skipped in {folder}: {enumerate_names(found)} ({kind})." for kind, found in kinds.items() if found]
+
+
+def enumerate_names(names: Sequence[str]) -> str:
+    """``a, b and c``; of more than three ``a, b and 5 more``."""
+    if len(names) <= _NAMED:
+        return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+    return f"{', '.join(names[: _NAMED - 1])} and {len(names) - _NAMED + 1:,} more"

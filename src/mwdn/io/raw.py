@@ -1,0 +1,89 @@
+"""Raw files of cameras, by rawpy (LibRaw): the numbers of the sensor, before any processing."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mwdn.errors import ImageError
+from mwdn.types import Frame
+
+RAW = frozenset({".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef"})
+"""Suffixes, in lower case, of raw files. Most of them are TIFFs inside, so the content does not tell."""
+
+WHITE = 65535
+"""The number at which the sensor saturates, after scaling. 14 bits become 16: a step of the sensor is 4 numbers."""
+
+MOSAICS = ("rggb", "bggr", "grbg", "gbrg")
+
+
+class RawFrame(NamedTuple):
+    """The frame of a raw file, and the order of its colours.
+
+    Args:
+        frame: (H, W, 1), uint16, the visible part of the sensor: 0 is the file's black level, `WHITE` its white level.
+            Noise below the black level becomes 0. (H, W, 3), RGB, from a linear DNG such as a phone's ProRAW.
+        mosaic: colours of a 2 x 2 cell, row by row, ``"rggb"``; H and W are then even. ``None`` for a grey sensor and
+            for a linear DNG.
+    """
+
+    frame: Frame
+    mosaic: str | None
+
+
+def is_raw(path: str | Path) -> bool:
+    """Whether a file is named like a camera's raw file."""
+    return Path(path).suffix.lower() in RAW
+
+
+def read_raw(path: str | Path) -> RawFrame:
+    """Read the numbers of the sensor from a raw file, without demosaicing, white balance or gamma.
+
+    Raises:
+        ImageError: rawpy is not installed, the file cannot be read, or its mosaic is not of 2 x 2 pixels.
+    """
+    try:
+        import rawpy
+    except ImportError as error:
+        raise ImageError(f"`{path}` is a camera's raw file, which needs rawpy: pip install 'mwdn[raw]'.") from error
+    if not Path(path).is_file():
+        raise ImageError(f"`{path}` does not exist. Check the name; the current folder is `{Path.cwd()}`.")
+    try:
+        with rawpy.imread(str(path)) as file:
+            return _scaled(file)
+    except ImageError as error:
+        raise ImageError(f"`{path}` {error}") from error
+    except (rawpy.LibRawError, rawpy.NotSupportedError) as error:
+        reason = error.args[0].decode() if error.args and isinstance(error.args[0], bytes) else str(error)
+        raise ImageError(
+            f"`{path}` cannot be read as a raw file: {reason}. Check the name, or copy it from its source again."
+        ) from error
+
+
+def _scaled(file: Any) -> RawFrame:  # noqa: ANN401
+    """The visible part of the sensor, its black level at 0 and its white level at `WHITE`."""
+    stored, black = file.raw_image_visible, np.asarray(file.black_level_per_channel, np.float32)
+    mosaic = None
+    if stored.ndim == 3:  # a linear DNG: the camera has demosaiced it, and pads RGB to four numbers
+        stored, black = stored[..., :3], black[:3]
+    elif file.raw_pattern.shape == (1, 1):
+        stored, black = stored[..., None], black[:1]
+    else:
+        mosaic = _mosaic(file)
+        height, width = (side // 2 * 2 for side in stored.shape)
+        stored = stored[:height, :width, None]
+        black = np.tile(black[file.raw_pattern], (height // 2, width // 2))[..., None]
+    if not file.white_level > black.max():
+        raise ImageError(f"has a white level ({file.white_level}) that is not above its black level ({black.max():g}).")
+    light = (stored - black) * (WHITE / (file.white_level - black))
+    return RawFrame(np.rint(light.clip(0, WHITE)).astype(np.uint16), mosaic)
+
+
+def _mosaic(file: Any) -> str:  # noqa: ANN401
+    """Colours of a 2 x 2 cell."""
+    pattern = file.raw_pattern
+    letters = "".join(chr(file.color_desc[index]) for index in pattern.flat).lower()
+    if letters not in MOSAICS:
+        side = " x ".join(map(str, pattern.shape))
+        raise ImageError(f"has a mosaic of {side} ({letters[:4]} ...), not 2 x 2 (rggb). Export it as 16-bit TIFF.")
+    return letters

@@ -1,0 +1,206 @@
+"""A mask from an array of numbers that another program computed or a microscope measured."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from mwdn.errors import ImageError, ParameterError, ShapeError, UnknownNameError
+from mwdn.io.images import read_frame
+from mwdn.optics.mask_files import read_mask
+from mwdn.optics.masks import Mask, check_index, check_samples, quantise
+from mwdn.optics.propagation import UM_PER_NM, check_positive
+from mwdn.optics.setup import Setup
+from mwdn.types import Plane
+
+Numbers = npt.NDArray[Any]
+Quantity = Literal["height", "phase", "amplitude", "transmission"]
+
+MAX_RELIEF_UM = 1000.0
+"""Largest height of a mask over its lowest place: beyond it no mask is thin, and the numbers are rather in nm."""
+
+
+@dataclass(frozen=True)
+class ArrayMask:
+    """A mask from a file: heights, phases, amplitudes or transmissions, or the mask.tif of another design.
+
+    Args:
+        mask: NPY, TIFF or PNG with one number per sample, row 0 at the top, seen from the scene; its middle is on the
+            axis. The mask.tif of `mwdn design` needs no other option.
+        values: what the numbers are. height: of the surface, in um. phase: delay of the light in radians; wrapped or
+            not, of any sign. amplitude or transmission: part of the light's amplitude or power that passes, 0 to 1.
+        pitch_um: side of a sample.
+        full_scale: height in um or phase in radians of the largest number of a file of integers: 255 or 65,535. An
+            amplitude or transmission there is 1.
+        phase_nm: wavelength for which phases are given; the middle of the light's band unless given. Heights follow
+            from it and from `index`: other colours have other phases.
+        index: refractive index of a surface; 1.46 is fused silica.
+        levels: round a surface to this many even steps; continuous unless given. A wrapped phase has steps, too.
+        subdivide: compute with this many samples along each side of a sample. Needed where the samples are so large
+            that light bends at their edges within the array's pitch: squares of 20 um need 10.
+    """
+
+    mask: Path
+    values: Quantity | None = None
+    pitch_um: float | None = None
+    full_scale: float | None = None
+    phase_nm: float | None = None
+    index: float = 1.46
+    levels: int | None = None
+    subdivide: int = 1
+
+    def build(self, setup: Setup) -> Mask:
+        """Read the array and turn it into a mask.
+
+        Raises:
+            ImageError: the file cannot be read.
+            ShapeError: it is not one picture in grey.
+            ParameterError: an option is missing or out of its range, or the numbers cannot be what `values` says.
+        """
+        if designed := _read_design(self.mask):
+            given = [name for name in ("values", "pitch_um", "full_scale", "levels") if getattr(self, name) is not None]
+            if given:
+                raise ParameterError(
+                    f"`{self.mask}` is a design and says its own pitch and heights: leave out "
+                    f"{', '.join(_option(name) for name in given)}."
+                )
+            return designed
+        frame = _grey(_read_numbers(self.mask))
+        if self.values is None or self.pitch_um is None:
+            raise ParameterError(
+                f"`{self.mask}` holds numbers without units: say what they are, `--values "
+                f"{'|'.join(get_args(Quantity))}`, and how far apart, `--pitch-um 2`."
+            )
+        return make_mask(
+            _scaled(frame, self.values, self.full_scale),
+            self.values,
+            pitch_um=self.pitch_um,
+            phase_nm=sum(setup.band_nm) / 2 if self.phase_nm is None else self.phase_nm,
+            index=self.index,
+            levels=self.levels,
+            subdivide=self.subdivide,
+        )
+
+
+def make_mask(
+    numbers: Plane,
+    values: Quantity,
+    *,
+    pitch_um: float,
+    phase_nm: float = 550.0,
+    index: float = 1.46,
+    levels: int | None = None,
+    subdivide: int = 1,
+) -> Mask:
+    """Make a mask of an array, for `mwdn.optics.mask_psf`.
+
+    Args:
+        numbers: (H, W), see `ArrayMask` for them and the other arguments.
+        values: what they are.
+        pitch_um: side of a sample.
+        phase_nm: wavelength for which phases are given.
+        index: refractive index of a surface.
+        levels: round a surface to this many even steps.
+        subdivide: samples of the mask along each side of a number.
+
+    Raises:
+        ParameterError: an argument is out of its range, NaN or infinity, an amplitude or transmission outside [0, 1],
+            or a surface higher than `MAX_RELIEF_UM`.
+        UnknownNameError: ``values`` is none of its kinds.
+    """
+    if values not in get_args(Quantity):
+        raise UnknownNameError("quantity of a mask", values, get_args(Quantity))
+    check_positive(pitch_um=pitch_um, phase_nm=phase_nm, subdivide=subdivide)
+    rows, columns = numbers.shape
+    check_samples(rows * subdivide, columns * subdivide)
+    if not numbers.isfinite().all():
+        raise ParameterError("`mask` holds NaN or infinity. Fill the gaps, for example with 0.")
+    pitch = pitch_um / subdivide
+    if values in ("amplitude", "transmission"):
+        amplitude = _amplitude(numbers, values)
+        return Mask("amplitude", _subdivided(amplitude, subdivide), pitch)
+    check_index(index)
+    # A surface of height h delays light of wavelength w by the phase 2 pi h (index - 1) / w.
+    um = phase_nm * UM_PER_NM / (2 * math.pi * (index - 1)) if values == "phase" else 1.0
+    height, step = quantise(_relief(numbers.double() * um), levels)
+    return Mask("phase", _subdivided(height.float(), subdivide), pitch, index, step)
+
+
+def _read_design(path: Path) -> Mask | None:
+    """The mask of another design; ``None`` if the file is anything else."""
+    try:
+        return read_mask(path)
+    except ImageError:
+        return None
+
+
+def _read_numbers(path: Path) -> Numbers:
+    """The array of a file; openings stored as true and false become 1 and 0."""
+    if path.suffix.lower() == ".npy" and path.is_file():
+        try:
+            stored = np.load(path, mmap_mode="r", allow_pickle=False)
+        except (OSError, ValueError) as error:
+            raise ImageError(f"`{path}` is not a complete NPY file of numbers ({error}). Save it again.") from error
+        if stored.dtype == bool:
+            return stored.astype(np.float32)
+        if stored.ndim != 2:
+            raise ShapeError(f"`mask` {stored.shape} must be (H, W), one number per sample.")
+    return read_frame(path)
+
+
+def _grey(frame: Numbers) -> Numbers:
+    """(H, W) of a frame in grey."""
+    if frame.ndim == 3 and (frame == frame[..., :1]).all():
+        frame = frame[..., 0]
+    if frame.ndim != 2:
+        raise ShapeError(f"`mask` {frame.shape} must have one number per sample, not colours. Save it as grey.")
+    return frame
+
+
+def _scaled(frame: Numbers, values: Quantity, full_scale: float | None) -> Plane:
+    """The numbers in their unit, float32; integers are fractions of `full_scale`."""
+    numbers = torch.from_numpy(np.ascontiguousarray(frame, np.float32))
+    if frame.dtype.kind == "f":
+        if full_scale is not None:
+            raise ParameterError("`full_scale` is for files of integers; this one holds floats. Leave it out.")
+        return numbers
+    largest = int(np.iinfo(frame.dtype).max)
+    if full_scale is None and values in ("height", "phase"):
+        unit = "um" if values == "height" else "radians"
+        raise ParameterError(
+            f"The file holds integers: `full_scale` must say the {values} in {unit} that {largest:,} stands for, "
+            "`--full-scale 1.2`."
+        )
+    return numbers * ((1.0 if full_scale is None else full_scale) / largest)
+
+
+def _amplitude(numbers: Plane, values: Quantity) -> Plane:
+    low, high = numbers.min().item(), numbers.max().item()
+    if low < 0 or high > 1:
+        raise ParameterError(
+            f"`mask` ({low:g} to {high:g}) must be in [0, 1] for {values}. For a surface: `--values height` or phase."
+        )
+    return numbers.float() if values == "amplitude" else numbers.float().sqrt()
+
+
+def _relief(height_um: Plane) -> Plane:
+    """Heights from 0 upwards: a constant height delays all light alike, so negative ones are raised."""
+    low, high = height_um.min().item(), height_um.max().item()
+    if high - low > MAX_RELIEF_UM:
+        raise ParameterError(
+            f"`mask` has heights from {low:g} to {high:g} um, more than {MAX_RELIEF_UM:g} um apart, but must be thin. "
+            "Numbers in nm: divide them by 1,000."
+        )
+    return height_um - min(low, 0.0)
+
+
+def _subdivided(plane: Plane, count: int) -> Plane:
+    return plane.repeat_interleave(count, 0).repeat_interleave(count, 1)
+
+
+def _option(name: str) -> str:
+    return f"`--{name.replace('_', '-')}`"

@@ -1,0 +1,50 @@
+"""The network of a run: its initial weights, and the moving average of its weights."""
+
+from typing import Any
+
+import torch
+from torch import nn
+
+from mwdn.errors import CheckpointError
+from mwdn.networks import build
+from mwdn.training.recipe import Recipe
+from mwdn.weights.bundled import load_network
+from mwdn.weights.checkpoint import first_difference, load_checkpoint
+
+
+def build_network(recipe: Recipe) -> nn.Module:
+    """The network of a recipe with its initial weights: random ones, or those that the schedule names.
+
+    Raises:
+        CheckpointError: the weights do not fit the network.
+    """
+    torch.manual_seed(recipe.schedule.seed)
+    network = build(**recipe.network)
+    start, denoiser = recipe.schedule.start, recipe.schedule.denoiser
+    weights = (load_network(start) if start else network).state_dict()
+    if denoiser:
+        weights |= {f"denoiser.{key}": value for key, value in load_checkpoint(denoiser).state_dict().items()}
+    try:
+        network.load_state_dict(weights)
+    except RuntimeError as error:
+        raise CheckpointError(
+            f"`start` ('{start}') must hold the network of the recipe, {recipe.network}, and `denoiser` ('{denoiser}') "
+            f"its denoiser, if it has one: {first_difference(error)}."
+        ) from error
+    return network
+
+
+@torch.no_grad()
+def update_average(average: nn.Module, network: nn.Module, *, decay: float) -> None:
+    """Update an exponential moving average of a network's weights; integers (BatchNorm's counters) are copied."""
+    for mean, value in zip(average.state_dict().values(), network.state_dict().values(), strict=True):
+        if value.is_floating_point():
+            mean.lerp_(value, 1 - decay)
+        else:
+            mean.copy_(value)
+
+
+def name_and_options(recipe: Recipe) -> tuple[str, dict[str, Any]]:
+    """Name and options of the network, as a checkpoint holds them."""
+    options = dict(recipe.network)
+    return options.pop("name"), options

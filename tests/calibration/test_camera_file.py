@@ -1,0 +1,151 @@
+"""Camera files: what is written is read, what is wrong is named."""
+
+import shutil
+from typing import get_args
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from cameras import contour_psf
+from mwdn import Calibration
+from mwdn.calibration import FrameFormat, PsfFormat
+from mwdn.calibration.camera_file import KEYS, read_camera, write_camera
+from mwdn.errors import ParameterError, PsfError, UnknownNameError
+from mwdn.io.toml import read_toml
+from mwdn.optics.orientation import Orientation
+
+SIZE = 32, 40
+
+
+@pytest.fixture
+def folder(tmp_path, generator):
+    """`psf.png`, a coloured source in `lab`, and `lab/dark.png`, `lab/ambient.png`."""
+    (tmp_path / "lab").mkdir()
+    psf = contour_psf(SIZE, cell=10, generator=generator)
+    light = (0.9 * psf / psf.max())[0].expand(3, -1, -1).movedim(0, -1) * torch.tensor([0.5, 1.0, 0.8])
+    for name, image in (("psf", light), ("dark", torch.full_like(light, 0.01)), ("ambient", torch.rand_like(light))):
+        assert cv2.imwrite(str(tmp_path / f"lab/{name}.png"), (image.flip(-1) * 65535).numpy().astype(np.uint16))
+    return tmp_path
+
+
+def everything(folder):
+    """A value for each key."""
+    return {
+        "psf": folder / "lab/psf.png",
+        "dark": folder / "lab/dark.png",
+        "ambient": folder / "lab/ambient.png",
+        "background": 0.01,
+        "psf_bin": 2,
+        "psf_gamma": "srgb",
+        "psf_orientation": "rotate-180",
+        "bgr": True,
+        "bit_depth": 16,
+        "gamma": 2.2,
+        "crop": (16, 20),
+        "mosaic": "rggb",
+        "grey": True,
+        "bin": 2,
+        "upside_down": True,
+        "white_balance": (1.5, 1.0, 2.0),
+        "pitch_um": 4.8,
+        "distance_mm": 200.0,
+    }
+
+
+def test_what_is_written_is_read(folder):
+    write_camera(folder / "camera.toml", everything(folder))
+    read = read_camera(folder / "camera.toml")
+    assert len(read.pop("psf_sha256")) == 64
+    assert read == everything(folder)
+
+
+def test_every_option_has_a_key_and_a_line_of_explanation(folder):
+    write_camera(folder / "camera.toml", {"psf": folder / "lab/psf.png"})
+    own = {"psf", "psf_sha256", "dark", "ambient", "white_balance", "pitch_um", "distance_mm"}
+    assert (
+        KEYS.keys()
+        == vars(FrameFormat()).keys() | vars(PsfFormat()).keys() | own
+        == everything(folder).keys() | {"psf_sha256"}
+    )
+    lines = (folder / "camera.toml").read_text().splitlines()
+    for key, (meaning, _) in KEYS.items():
+        at = lines.index(f"# {meaning}")
+        assert lines[at + 1].removeprefix("# ").startswith(f"{key} = ")
+    assert read_toml(folder / "camera.toml").keys() == {"psf", "psf_sha256"}
+
+
+def test_examples_in_the_file_can_be_used(folder):
+    """With each # of an example removed, the file still has a value of the right type for each key."""
+    write_camera(folder / "camera.toml", {"psf": folder / "lab/psf.png"})
+    lines = (folder / "camera.toml").read_text().splitlines()
+    (folder / "camera.toml").write_text("\n".join(line.removeprefix("# ") if " = " in line else line for line in lines))
+    assert read_camera(folder / "camera.toml").keys() == KEYS.keys()
+
+
+def test_calibration_of_a_camera_file(folder):
+    """Paths are relative to the file, which may move with its pictures; keywords replace its values."""
+    frames = {"crop": (24, 32), "bin": 2}
+    write_camera(
+        folder / "lab/camera.toml",
+        {"psf": folder / "lab/psf.png", "dark": folder / "lab/dark.png", **frames, "distance_mm": 200.0},
+    )
+    shutil.move(folder / "lab", folder / "field")
+    path, files = folder / "field/camera.toml", {"dark": folder / "field/dark.png"}
+    calibration = Calibration.load(path)
+    expected = Calibration.from_file(folder / "field/psf.png", **files, **frames)
+    assert (calibration.psf_hash, calibration.frames) == (expected.psf_hash, FrameFormat(**frames))
+    assert torch.equal(calibration.dark, expected.dark)
+    assert calibration.distance_mm == 200
+    other = Calibration.from_file(path, bin=4, ambient=folder / "field/ambient.png")
+    assert (other.size, other.frames.bin, other.ambient is None) == ((6, 8), 4, False)
+    with pytest.raises(ParameterError, match="`bin=4`"):
+        Calibration.from_file(path, FrameFormat(bin=4))
+
+
+def test_changed_psf_is_refused_unless_it_is_given(folder):
+    write_camera(folder / "camera.toml", {"psf": folder / "lab/psf.png"})
+    cv2.imwrite(str(folder / "lab/psf.png"), cv2.imread(str(folder / "lab/psf.png"), -1) // 2)
+    with pytest.raises(PsfError, match=r"psf.png` has changed .*`mwdn calibrate --camera .*camera.toml"):
+        Calibration.load(folder / "camera.toml")
+    shutil.copy(folder / "lab/psf.png", folder / "new.png")
+    assert Calibration.load(folder / "camera.toml", psf=folder / "new.png").size == SIZE
+
+
+@pytest.mark.parametrize(
+    ("line", "error", "message"),
+    [
+        ("gama = 2.2", UnknownNameError, "'gama'.* 'gamma'"),
+        ("psf-bin = 2", UnknownNameError, "'psf-bin'.* 'psf_bin'"),
+        ("gamma = [2.2]", ParameterError, r"`gamma` \(\[2.2\]\)"),
+        ('bit_depth = "12"', ParameterError, r"`bit_depth` \('12'\).*`bit_depth = 12`"),
+        ("bin = true", ParameterError, r"`bin` \(True\).*`bin = 4`"),
+        ("crop = [10]", ParameterError, r"`crop` \(\[10\]\)"),
+        ('psf_orientation = "rotate-45"', ParameterError, r"`psf_orientation` \('rotate-45'\)"),
+        ('white_balance = "gray"', ParameterError, r"`white_balance` \('gray'\)"),
+        ("bin = ", ParameterError, "cannot be read as a camera file"),
+    ],
+)
+def test_wrong_lines_are_named(tmp_path, line, error, message):
+    (tmp_path / "camera.toml").write_text(f'psf = "psf.png"\n{line}\n')
+    with pytest.raises(error, match=message):
+        read_camera(tmp_path / "camera.toml")
+
+
+def test_a_camera_has_a_psf(tmp_path):
+    (tmp_path / "camera.toml").write_text("bin = 2\n")
+    with pytest.raises(ParameterError, match=r'`psf = "psf\.png"`'):
+        read_camera(tmp_path / "camera.toml")
+
+
+def test_only_camera_files_are_replaced(folder):
+    for name in ("recipe.toml", "camera.txt", "lab"):
+        if name != "lab":
+            (folder / name).write_text("[network]\n")
+        with pytest.raises(ParameterError, match=r"is not a camera file|must end in \.toml"):
+            write_camera(folder / name, {"psf": folder / "lab/psf.png"})
+    assert (folder / "recipe.toml").read_text() == "[network]\n"
+    for orientation in get_args(Orientation)[:2]:
+        write_camera(folder / "camera.toml", {"psf": folder / "lab/psf.png", "psf_orientation": orientation})
+    assert read_camera(folder / "camera.toml")["psf_orientation"] == "flip-top-bottom"

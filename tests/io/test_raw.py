@@ -1,0 +1,112 @@
+"""Raw files: the sensor's numbers, scaled from black to white, and the order of its colours."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from image_files import dng, put
+from mwdn import FrameFormat
+from mwdn.errors import ImageError
+from mwdn.io.images import read_frame, read_picture
+from mwdn.io.raw import MOSAICS, read_raw
+
+BLACK, WHITE = 64, 1023
+
+
+@pytest.fixture(autouse=True)
+def _rawpy():
+    pytest.importorskip("rawpy")
+
+
+@pytest.fixture
+def mosaic():
+    """36 x 48 numbers of 10 bits."""
+    return np.random.default_rng(0).integers(0, WHITE + 1, (36, 48), dtype=np.uint16)
+
+
+def light(mosaic: np.ndarray) -> np.ndarray:
+    """0 at black, 65,535 at white."""
+    return (mosaic.astype(float) - BLACK).clip(0) * 65535 / (WHITE - BLACK)
+
+
+@pytest.mark.parametrize("colours", MOSAICS)
+def test_mosaic_is_read_exactly(tmp_path: Path, mosaic: np.ndarray, colours: str) -> None:
+    path = put(tmp_path / "a.dng", dng(mosaic, colours, turn=6))
+    raw = read_raw(path)
+    assert raw.mosaic == colours
+    np.testing.assert_allclose(raw.frame[..., 0], light(mosaic), atol=1)  # not turned
+    np.testing.assert_array_equal(read_frame(path), raw.frame)
+
+
+@pytest.mark.parametrize("colours", MOSAICS)
+def test_a_raw_file_needs_no_options(tmp_path: Path, colours: str) -> None:
+    """Red, green and blue of 100, 200 and 300 above black, in whichever order the sensor has them."""
+    levels = {"r": 100, "g": 200, "b": 300}
+    cell = np.array([levels[letter] for letter in colours], np.uint16).reshape(2, 2)
+    path = put(tmp_path / "a.dng", dng(np.tile(cell, (18, 24)) + np.uint16(BLACK), colours))
+    measurement = FrameFormat().to_measurement(FrameFormat().read(path))
+    assert measurement.shape == (1, 3, 18, 24)
+    expected = np.array([100, 200, 300]) / (WHITE - BLACK)
+    np.testing.assert_allclose(measurement.mean((0, 2, 3)), expected, atol=1e-5)
+    # A given order is preferred to that of the file.
+    other = FrameFormat(mosaic="rggb" if colours != "rggb" else "bggr")
+    assert not np.allclose(other.to_measurement(other.read(path)).mean((0, 2, 3)), expected, atol=0.01)
+
+
+def test_a_grey_sensor_has_no_cells(tmp_path: Path, mosaic: np.ndarray) -> None:
+    path = put(tmp_path / "a.dng", dng(mosaic, ""))
+    assert read_raw(path).mosaic is None
+    np.testing.assert_allclose(FrameFormat().read(path)[..., 0], light(mosaic), atol=1)
+
+
+def test_a_linear_dng_has_colours(tmp_path: Path) -> None:
+    picture = np.random.default_rng(0).integers(0, WHITE + 1, (36, 48, 3), dtype=np.uint16)
+    path = put(tmp_path / "a.dng", dng(picture, ""))
+    np.testing.assert_allclose(FrameFormat().read(path), light(picture), atol=1)
+
+
+def test_other_mosaics_are_refused(tmp_path: Path) -> None:
+    mosaic = np.zeros((36, 48), np.uint16)
+    with pytest.raises(ImageError, match=r"a\.dng` has a mosaic"):
+        read_raw(put(tmp_path / "a.dng", dng(mosaic, "rgbrgbrgb" * 4)))
+
+
+def test_saturation_is_known(tmp_path: Path, mosaic: np.ndarray) -> None:
+    mosaic[:] = 500
+    mosaic[:2, :4] = WHITE
+    frame = FrameFormat().read(put(tmp_path / "a.dng", dng(mosaic)))
+    assert FrameFormat().saturated(frame) == (2, 65535)
+
+
+def test_odd_sides_lose_a_row_and_a_column(tmp_path: Path, mosaic: np.ndarray) -> None:
+    path = put(tmp_path / "a.dng", dng(mosaic[:35, :47]))
+    assert FrameFormat().read(path).shape == (17, 23, 3)
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "message"),
+    [
+        ("text.dng", b"no raw file", "text.dng` cannot be read as a raw file"),
+        ("empty.nef", b"", "empty.nef` cannot be read as a raw file"),
+        ("white.dng", dng(np.zeros((36, 48), np.uint16), white=64), r"white level \(64\).* black level \(64\)"),
+    ],
+)
+def test_bad_files_are_named(tmp_path: Path, name: str, data: bytes, message: str) -> None:
+    with pytest.raises(ImageError, match=message):
+        read_frame(put(tmp_path / name, data))
+
+
+def test_other_files_and_uses_are_named(tmp_path: Path, mosaic: np.ndarray) -> None:
+    with pytest.raises(ImageError, match=r"none\.dng` does not exist"):
+        read_raw(tmp_path / "none.dng")
+    path = put(tmp_path / "a.dng", dng(mosaic))
+    with pytest.raises(ImageError, match=r"a\.dng` is a camera's raw file, not a photograph"):
+        read_picture(path)
+
+
+def test_without_rawpy_the_extra_is_named(tmp_path: Path, mosaic: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rawpy", None)
+    with pytest.raises(ImageError, match=r"a\.dng`.*pip install 'mwdn\[raw\]'"):
+        read_frame(put(tmp_path / "a.dng", dng(mosaic)))

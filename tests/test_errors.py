@@ -1,0 +1,102 @@
+"""Options of every method, checked against their annotations, with errors that name option and value."""
+
+import pytest
+import torch
+
+import mwdn
+from mwdn import Calibration, Camera, FrameFormat, Reconstructor, Sensor
+from mwdn.errors import MwdnError, ParameterError, UnknownNameError
+from mwdn.networks import DENOISERS, NETWORKS, FlatNet, LeAdmm, Mwdn, WienerBank
+from mwdn.solvers import _NETWORKS, SOLVERS, Admm, Fista, Pyramid, WarmStart, Wiener
+
+PSF = torch.ones(1, 3, 8, 8)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("create", "options", "wanted"),
+    [
+        (Admm, {"regularisation": "a"}, "a number"),
+        (Admm, {"iterations": 1.5}, "a whole number"),
+        (Admm, {"penalties": (1, 2, 3)}, "`Penalties`"),
+        (Fista, {"iterations": True}, "a whole number"),
+        (Pyramid, {"levels": (1, 2)}, "a tuple, each `Level`"),
+        (WarmStart, {"solver": Wiener()}, "`Admm` or `Fista`"),
+        (Mwdn, {"width": 2.0}, "a whole number"),
+        (FlatNet, {"size": 3}, "two whole numbers such as (320, 320) or None"),
+        (WienerBank, {"regularisations": (1e-3, "a")}, "a tuple, each a number"),
+        (FrameFormat, {"crop": 100}, "two whole numbers such as (320, 320) or None"),
+        (FrameFormat, {"grey": 1}, "True or False"),
+        (Sensor, {"bit_depth": "12"}, "a whole number"),
+    ],
+)
+def test_an_option_of_another_type_is_named_with_its_value(create, options, wanted):
+    (name, value) = next(iter(options.items()))
+    with pytest.raises(ParameterError) as caught:
+        create(**options)
+    assert f"`{name}` (" in str(caught.value)
+    assert str(value)[:5] in str(caught.value)
+    assert wanted in str(caught.value)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    "create",
+    [
+        lambda: Camera(PSF, size=128),
+        lambda: Calibration(PSF, 3),
+        lambda: Calibration.from_array(torch.rand(8, 8).numpy(), crop=100),
+        lambda: Calibration.from_array(torch.rand(8, 8).numpy(), background="none"),
+        lambda: Reconstructor(5, Calibration(PSF)),
+        lambda: Reconstructor("admm", Calibration(PSF), device=3),
+        lambda: Reconstructor("admm", Calibration(PSF), precision="half"),
+        lambda: mwdn.build("mwdn", width="a"),
+        lambda: mwdn.solvers.build("admm", iterations="a"),
+    ],
+)
+def test_every_border_refuses_other_types(create):
+    with pytest.raises(ParameterError):
+        create()
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("create", "options", "nearest"),
+    [
+        (Admm, {"variation": "color"}, "colour"),
+        (LeAdmm, {"variation": "color"}, "colour"),
+        (Mwdn, {"widht": 3}, "width"),
+    ],
+)
+def test_a_mistyped_name_gets_the_nearest(create, options, nearest):
+    with pytest.raises(UnknownNameError, match=f"Did you mean '{nearest}'"):
+        create(**options)
+
+
+def test_what_json_and_numpy_hold_is_accepted():
+    """Whole numbers for floats, lists for tuples, numpy's numbers for Python's."""
+    import numpy as np
+
+    assert Admm(regularisation=1, iterations=np.int64(3)).iterations == 3
+    assert FrameFormat(crop=(np.int32(4), 4)).crop == (4, 4)
+    assert mwdn.build("flatnet", size=[8, 8], width=8).correction.shape[-2:] == (8, 8)
+
+
+def test_solvers_and_networks_name_each_other():
+    """The solvers' list of networks is written by hand: networks are above solvers."""
+    assert (NETWORKS.keys() | DENOISERS.keys()) - SOLVERS.keys() == _NETWORKS
+    with pytest.raises(ParameterError, match=r"'le-admm' is a network, .*`mwdn\.networks\.build\('le-admm'\)`"):
+        mwdn.solvers.build("le-admm")
+    with pytest.raises(ParameterError, match=r"'admm' is a solver, .*`mwdn\.solvers\.build\('admm'\)`"):
+        mwdn.build("admm")
+
+
+def test_a_class_of_the_user_is_checked_too():
+    class Mine(mwdn.networks.Network[None]):
+        def __init__(self, *, width: int = 3, other=None) -> None:
+            super().__init__()
+            self.width = width
+
+    assert Mine(width=4, other="anything").width == 4
+    with pytest.raises(MwdnError, match=r"`width` \(1\.5\) of `Mine`"):
+        Mine(width=1.5)
