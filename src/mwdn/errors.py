@@ -75,7 +75,7 @@ def check_options(of: Callable[..., Any], what: str, options: Mapping[str, Any])
     for option, value in options.items():
         if option not in types and not takes_any:
             raise UnknownNameError(f"option of {what}", option, types)
-        if option in types and not _fits(value, types[option]):
+        if option in types and not fits_type(value, types[option]):
             names = _names(types[option])
             if isinstance(value, str) and names:
                 raise UnknownNameError(option, value, names)
@@ -109,15 +109,16 @@ def _annotations(of: Callable[..., Any]) -> tuple[dict[str, Any], bool]:
     return types, len(types) < len(parameters)
 
 
-def _fits(value: Any, kind: Any) -> bool:  # noqa: ANN401
+def fits_type(value: Any, kind: Any) -> bool:  # noqa: ANN401
+    """Whether a value is of an annotated type; a whole number is a float, too, and a list a tuple."""
     origin, parts = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
-        return any(_fits(value, part) for part in parts)
+        return any(fits_type(value, part) for part in parts)
     if origin is Literal:
         return isinstance(value, str) and value in parts
     if origin is tuple:  # JSON and TOML have lists
         parts = parts[:1] * len(value) if parts[1:] == (...,) and isinstance(value, tuple | list) else parts
-        return isinstance(value, tuple | list) and len(value) == len(parts) and all(map(_fits, value, parts))
+        return isinstance(value, tuple | list) and len(value) == len(parts) and all(map(fits_type, value, parts))
     if origin is Callable:
         return callable(value)
     if kind in (int, float):

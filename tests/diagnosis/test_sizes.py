@@ -6,7 +6,7 @@ from torch.nn import functional as F
 
 from cameras import contour_psf
 from mwdn import Calibration, Camera
-from mwdn.calibration.frame_format import bin_pixels, crop_centre
+from mwdn.calibration.frame_operations import bin_pixels, crop_centre
 from mwdn.diagnosis.sizes import fitting_size
 from mwdn.errors import ShapeError
 

@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from image_files import dng, put
 from mwdn import FrameFormat
 from mwdn.errors import ImageError
 from mwdn.io.images import read_frame, read_picture
-from mwdn.io.raw import MOSAICS, read_raw
+from mwdn.io.raw import Mosaic, read_raw
 
 BLACK, WHITE = 64, 1023
 
@@ -31,7 +32,7 @@ def light(mosaic: np.ndarray) -> np.ndarray:
     return (mosaic.astype(float) - BLACK).clip(0) * 65535 / (WHITE - BLACK)
 
 
-@pytest.mark.parametrize("colours", MOSAICS)
+@pytest.mark.parametrize("colours", get_args(Mosaic))
 def test_mosaic_is_read_exactly(tmp_path: Path, mosaic: np.ndarray, colours: str) -> None:
     path = put(tmp_path / "a.dng", dng(mosaic, colours, turn=6))
     raw = read_raw(path)
@@ -40,7 +41,7 @@ def test_mosaic_is_read_exactly(tmp_path: Path, mosaic: np.ndarray, colours: str
     np.testing.assert_array_equal(read_frame(path), raw.frame)
 
 
-@pytest.mark.parametrize("colours", MOSAICS)
+@pytest.mark.parametrize("colours", get_args(Mosaic))
 def test_a_raw_file_needs_no_options(tmp_path: Path, colours: str) -> None:
     """Red, green and blue of 100, 200 and 300 above black, in whichever order the sensor has them."""
     levels = {"r": 100, "g": 200, "b": 300}

@@ -5,13 +5,12 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from types import UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, get_type_hints
 
 from mwdn.calibration.frame_format import FrameFormat
 from mwdn.calibration.psf_format import PsfFormat
 from mwdn.calibration.white_balance import WhiteBalance
-from mwdn.errors import ParameterError, PsfError, UnknownNameError
+from mwdn.errors import ParameterError, PsfError, UnknownNameError, fits_type
 from mwdn.io.files import as_parameter_error, atomic
 from mwdn.io.toml import read_toml
 
@@ -70,7 +69,7 @@ def read_camera(path: str | Path) -> dict[str, Any]:
     for key, value in table.items():
         if key not in KEYS:
             raise UnknownNameError(f"key of the camera file `{path}`", key, KEYS)
-        if not _fits(value, _TYPES[key]):
+        if not fits_type(value, _TYPES[key]):
             meaning, example = KEYS[key]
             raise ParameterError(
                 f"`{key}` ({value!r}) in `{path}` must be like this: `{key} = {_to_toml(example)}`. {meaning}"
@@ -138,15 +137,3 @@ def _relative(path: Path, folder: Path) -> str:
 
 def _to_toml(value: object) -> str:
     return json.dumps(value, ensure_ascii=False)
-
-
-def _fits(value: object, kind: Any) -> bool:  # noqa: ANN401
-    """Whether a TOML value is of an annotated type; an integer is a float, too, and a list a tuple."""
-    origin, parts = get_origin(kind), get_args(kind)
-    if origin is Literal:
-        return value in parts
-    if origin in (Union, UnionType):
-        return any(_fits(value, part) for part in parts)
-    if origin is tuple:
-        return isinstance(value, list) and len(value) == len(parts) and all(map(_fits, value, parts))
-    return type(value) in ((int, float) if kind is float else (kind,))

@@ -22,8 +22,9 @@ import torch
 from torch import Tensor
 
 from mwdn.calibration import Calibration
-from mwdn.calibration.frame_format import Mosaic, bin_pixels
+from mwdn.calibration.frame_operations import bin_pixels
 from mwdn.diagnosis.verdict import Verdict
+from mwdn.io.raw import Mosaic
 from mwdn.solvers.alignment import fine_detail
 from mwdn.solvers.pyramid import Level, halve, solve
 from mwdn.solvers.splitting import Penalties

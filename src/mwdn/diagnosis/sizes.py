@@ -16,7 +16,7 @@ import torch
 from torch.nn import functional as F
 
 from mwdn.calibration import Calibration, FrameFormat
-from mwdn.calibration.frame_format import bin_pixels, crop_centre
+from mwdn.calibration.frame_operations import bin_pixels, crop_centre
 from mwdn.diagnosis.orientation import CLEAR
 from mwdn.diagnosis.verdict import Verdict
 from mwdn.errors import ShapeError

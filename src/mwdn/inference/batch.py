@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from mwdn.calibration.frame_format import enlarge
+from mwdn.calibration.frame_operations import enlarge
 from mwdn.data.captures import read_capture
 from mwdn.diagnosis import Verdict
 from mwdn.diagnosis.captures import examine_capture

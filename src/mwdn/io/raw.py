@@ -1,7 +1,7 @@
 """Raw files of cameras, by rawpy (LibRaw): the numbers of the sensor, before any processing."""
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, cast, get_args
 
 import numpy as np
 
@@ -14,7 +14,8 @@ RAW = frozenset({".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2",
 WHITE = 65535
 """The number at which the sensor saturates, after scaling. 14 bits become 16: a step of the sensor is 4 numbers."""
 
-MOSAICS = ("rggb", "bggr", "grbg", "gbrg")
+Mosaic = Literal["rggb", "bggr", "grbg", "gbrg"]
+"""Colour filter arrays: the colours of a 2 x 2 cell, row by row."""
 
 
 class RawFrame(NamedTuple):
@@ -28,7 +29,7 @@ class RawFrame(NamedTuple):
     """
 
     frame: Frame
-    mosaic: str | None
+    mosaic: Mosaic | None
 
 
 def is_raw(path: str | Path) -> bool:
@@ -79,11 +80,11 @@ def _scaled(file: Any) -> RawFrame:  # noqa: ANN401
     return RawFrame(np.rint(light.clip(0, WHITE)).astype(np.uint16), mosaic)
 
 
-def _mosaic(file: Any) -> str:  # noqa: ANN401
+def _mosaic(file: Any) -> Mosaic:  # noqa: ANN401
     """Colours of a 2 x 2 cell."""
     pattern = file.raw_pattern
     letters = "".join(chr(file.color_desc[index]) for index in pattern.flat).lower()
-    if letters not in MOSAICS:
+    if letters not in get_args(Mosaic):
         side = " x ".join(map(str, pattern.shape))
         raise ImageError(f"has a mosaic of {side} ({letters[:4]} ...), not 2 x 2 (rggb). Export it as 16-bit TIFF.")
-    return letters
+    return cast(Mosaic, letters)
