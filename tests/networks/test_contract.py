@@ -125,11 +125,16 @@ def test_each_sample_may_have_its_own_psf(name, generator):
 
 
 def test_psf_matters_but_not_its_scale(name, ready, generator):
-    """The brightness of a calibration shot is no property of a camera."""
+    """The brightness of a calibration shot is no property of a camera.
+
+    Scaling by a power of 2 is exact, so the scenes are equal bit for bit. Neither PSF has unit sum: such a one is taken
+    as it is, and differs in its last digits, which bfloat16 can turn into 0.5 %.
+    """
     b, h, _ = pair(generator)
+    h = 4 * h
     network = ready(trained(small(name), generator))
     scene = network(b, h)
-    torch.testing.assert_close(network(b, 32 * h), scene, rtol=1e-3, atol=1e-5)
+    assert torch.equal(network(b, 32 * h), scene)
     moved = network(b, h.roll(3, -1))
     assert torch.equal(moved, scene) == (name == "unet")
 
