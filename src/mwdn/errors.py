@@ -29,7 +29,10 @@ _Class = TypeVar("_Class", bound=type)
 
 
 class MwdnError(Exception):
-    """Base of the tree: catch this to catch them all."""
+    """Base of the tree: catch this to catch them all. Its message is one line that a terminal can print."""
+
+    def __str__(self) -> str:
+        return one_line(super().__str__())
 
 
 class ShapeError(MwdnError, ValueError):
@@ -50,7 +53,7 @@ class UnknownNameError(ParameterError):
     """
 
     def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
-        name, known = str(name), sorted(known)
+        name, known = _cut(str(name), 80), sorted(known)
         spelling = {word.lower(): word for word in known}
         nearest = difflib.get_close_matches(name.lower(), spelling, n=1)
         hint = f" Did you mean '{spelling[nearest[0]]}'?" if nearest else ""
@@ -151,6 +154,23 @@ def type_in_words(kind: Any) -> str:  # noqa: ANN401
     if origin is Callable:
         return "a function"
     return words.get(kind) or f"`{getattr(kind, '__name__', kind)}`"
+
+
+def one_line(text: str) -> str:
+    """Text with control characters and surrogates, which file names may hold, as escape sequences."""
+    if text.isprintable():
+        return text
+    return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
+
+
+def reason(error: BaseException) -> str:
+    """First line of another library's error, at most 120 characters; its type if it says nothing."""
+    lines = str(error).strip().splitlines()
+    return _cut(one_line(lines[0]).rstrip("."), 120) if lines else type(error).__name__
+
+
+def _cut(text: str, most: int) -> str:
+    return text if len(text) <= most else text[: most - 4] + " ..."
 
 
 def shown(value: Any) -> str:  # noqa: ANN401

@@ -17,6 +17,8 @@ from mwdn.data.captures import find_captures, read_captures
 from mwdn.evaluation import First, Perceptual, Scores, evaluate
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import atomic_write, write_text
+from mwdn.io.npy import read_array
+from mwdn.io.reading import read_json, unexpected_content
 from mwdn.version import __version__
 
 TIMED = 3
@@ -112,17 +114,19 @@ def score(
         reconstruct = make_reconstructor(method, checkpoint, dataset, device)
         record = _measure(reconstruct, dataset, path, perceptual(), shown)
         write_text(path, json.dumps({"identity": record_identity, **record}, indent=1))  # after the pictures
-    cpu = Scores.read(record["cpu"]) if record["cpu"] else None
-    pictures = {name: torch.from_numpy(np.load(_pictures_file(path, name))) for name in ("pictures", "captures")}
-    return MethodResult(Scores.read(record["scores"]), cpu, record["missing"], **pictures)
+    pictures = {name: torch.from_numpy(read_array(_pictures_file(path, name))) for name in ("pictures", "captures")}
+    with unexpected_content(path):
+        cpu = Scores.read(record["cpu"]) if record["cpu"] else None
+        return MethodResult(Scores.read(record["scores"]), cpu, record["missing"], **pictures)
 
 
 def read_record(path: Path, identity: dict[str, Any]) -> dict[str, Any] | None:
     """Content of a file of saved results; ``None`` if it is missing or has another identity."""
     if not path.is_file():
         return None
-    content = json.loads(path.read_text(encoding="utf-8"))
-    return content if content["identity"] == identity else None
+    with unexpected_content(path):
+        content: dict[str, Any] = read_json(path)
+        return content if content["identity"] == identity else None
 
 
 def _measure(

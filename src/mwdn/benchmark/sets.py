@@ -22,6 +22,7 @@ from mwdn.data.splits import split
 from mwdn.errors import ParameterError
 from mwdn.evaluation import Protocol
 from mwdn.io.files import write_text
+from mwdn.io.reading import read_json
 from mwdn.optics import Deviation, Sensor
 from mwdn.training.experiment import FILE_START
 from mwdn.training.validation import START
@@ -191,7 +192,7 @@ def open_dataset(name: str, recipe: DatasetRecipe, folder: Path, device: torch.d
     note = folder / f"{name}.json"
     own = simulates or recipe.kind  # else the user's file, of which nothing is made
     path = folder / f"{name}.h5" if own else Path(recipe.pairs)
-    made = json.loads(note.read_text(encoding="utf-8")) if own and note.is_file() and path.is_file() else None
+    made = read_json(note) if own and note.is_file() and path.is_file() else None
     if made not in (None, identity):
         raise ParameterError(
             f"`{path}` holds pairs that another recipe made. Choose another folder, `--out`, or remove it."

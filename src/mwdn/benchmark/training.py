@@ -15,6 +15,7 @@ from mwdn.benchmark.recipe import Benchmark, Method
 from mwdn.benchmark.sets import Dataset
 from mwdn.errors import ParameterError
 from mwdn.io.files import write_text
+from mwdn.io.reading import LOG_BYTES, parse_json, read_json, read_text, unexpected_content
 from mwdn.networks import NETWORKS
 from mwdn.training.recipe import OPTIMISERS, Recipe, Schedule
 from mwdn.training.tasks import SupervisedTask, supervised_task
@@ -116,11 +117,16 @@ def train(
 def seconds(folder: Path) -> float | None:
     """Training time of a run, validations included; steps lost in an interruption do not count."""
     path = folder / CLOCK
-    return float(json.loads(path.read_text(encoding="utf-8"))["seconds"]) if path.is_file() else None
+    if not path.is_file():
+        return None
+    with unexpected_content(path):
+        return float(read_json(path)["seconds"])
 
 
 def curve(folder: Path) -> tuple[list[tuple[int, float]], list[tuple[int, float]]]:
     """Loss of each step and PSNR of each validation, from a run's log."""
-    lines = [json.loads(line) for line in (folder / "log.jsonl").read_text(encoding="utf-8").splitlines()]
-    losses = [(int(line["step"]), float(line["loss"])) for line in lines]
-    return losses, [(int(line["step"]), float(line["psnr"])) for line in lines if line["psnr"] is not None]
+    path = folder / "log.jsonl"
+    with unexpected_content(path):
+        lines = [parse_json(line, path) for line in read_text(path, most=LOG_BYTES).splitlines()]
+        losses = [(int(line["step"]), float(line["loss"])) for line in lines]
+        return losses, [(int(line["step"]), float(line["psnr"])) for line in lines if line["psnr"] is not None]

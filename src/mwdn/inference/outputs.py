@@ -1,12 +1,12 @@
 """Files of a batch: their names, and the check that nothing of the user's is overwritten."""
 
-import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Literal
 
 from mwdn.errors import ParameterError
 from mwdn.io.files import path_resolver
+from mwdn.io.reading import read_json
 
 Format = Literal["png", "png16", "tiff", "npy"]
 """``png`` and ``png16`` are sRGB, for viewing; ``tiff`` and ``npy`` hold the linear float32 values."""
@@ -70,7 +70,7 @@ def check_outputs(
 def read_sidecar(path: Path) -> dict[str, object]:
     """Content of a sidecar file; empty if it is missing or not of this package."""
     try:
-        content = json.loads(path.read_bytes())
-    except (OSError, ValueError):
+        content = read_json(path)
+    except ParameterError:
         return {}
     return content if isinstance(content, dict) and "origin" in content else {}

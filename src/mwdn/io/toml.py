@@ -7,7 +7,8 @@ import warnings
 from pathlib import Path
 from typing import Any, TypeVar
 
-from mwdn.errors import ParameterError, UnknownNameError
+from mwdn.errors import ParameterError, UnknownNameError, reason, shown
+from mwdn.io.reading import read_text
 
 T = TypeVar("T")
 
@@ -51,17 +52,18 @@ def read_toml(path: str | Path, kind: str = "recipe") -> dict[str, Any]:
     Raises:
         ParameterError: it cannot be read.
     """
+    text = read_text(path)
     try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise ParameterError(f"`{path}` cannot be read as a {kind}: {error}") from error
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # ValueError also: a number of over 4,300 digits
+        raise ParameterError(f"`{path}` cannot be read as a {kind}: {reason(error)}.") from error
 
 
 def parse_value(text: str) -> Any:  # noqa: ANN401
     """Parse a TOML value. Text that is not TOML is returned as it is, so that paths need no quotes."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         return text
 
 
@@ -84,7 +86,9 @@ def to_dataclass(cls: type[T], name: str, table: dict[str, Any]) -> T:
             raise UnknownNameError(f"key of [{name}]", key, defaults)
         if not _same_type(_as_tuple(value), defaults[key]):
             example = json.dumps(defaults[key])
-            raise ParameterError(f"`{key}` of [{name}] ({value!r}) must be of the same kind as its default, {example}.")
+            raise ParameterError(
+                f"`{key}` of [{name}] ({shown(value)}) must be of the same kind as its default, {example}."
+            )
     try:
         return cls(**{key: _as_float(_as_tuple(value), defaults[key]) for key, value in table.items()})
     except ParameterError as error:

@@ -1,7 +1,6 @@
 """A designed camera: its mask and PSF, and the files that describe it."""
 
 import dataclasses
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from mwdn.errors import ParameterError
 from mwdn.io.contact_sheets import contact_sheet, thumbnail
 from mwdn.io.files import write_json
 from mwdn.io.images import write_linear, write_picture
+from mwdn.io.reading import read_json
 from mwdn.optics.mask_files import write_mask
 from mwdn.optics.masks import Mask, MaskDesign, describe_mask, mask_psf
 from mwdn.optics.psf import psf_hash, unit_sum
@@ -141,9 +141,9 @@ def check_replaced(out: Path, *, gds: bool = False, stl: bool = False) -> None:
         ParameterError: it holds such files.
     """
     try:
-        if json.loads((out / "camera.json").read_bytes())["made"]["psf_hash"]:
+        if read_json(out / "camera.json")["made"]["psf_hash"]:
             return
-    except (OSError, ValueError, LookupError, TypeError):  # missing, or not written by `Designed.write`
+    except (ParameterError, LookupError, TypeError):  # missing, or not written by `Designed.write`
         pass
     names = ["mask.tif", "psf.tif", "preview.png", *["mask.gds"] * gds, *["mask.stl"] * stl, "camera.json"]
     for path in (out / name for name in names):

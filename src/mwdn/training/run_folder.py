@@ -12,6 +12,7 @@ from torch import Tensor
 
 from mwdn.errors import CheckpointError, ParameterError
 from mwdn.io.files import as_parameter_error, check_folder, write_text
+from mwdn.io.reading import LOG_BYTES, TEXT_BYTES, read_bytes
 from mwdn.runtime import distributed
 from mwdn.training.recipe import Recipe, with_current_names
 from mwdn.training.sample_files import SampleFiles
@@ -96,12 +97,12 @@ class RunFolder:
         recipe = self.path / "recipe.json"
         if not any(self.weights(name).exists() for name in WEIGHTS):
             return b""
-        return recipe.read_bytes() if recipe.exists() else b"null"
+        return read_bytes(recipe, most=TEXT_BYTES, error=CheckpointError) if recipe.exists() else b"null"
 
     def _check(self, owner: str) -> None:
         try:
             same = _with_current_names(json.loads(owner)) == json.loads(json.dumps(self.identity))
-        except ValueError:
+        except (ValueError, RecursionError):
             same = False
         if not same:
             raise CheckpointError(
@@ -149,8 +150,9 @@ class RunFolder:
         with self.lock():
             write_text(self.path / "recipe.json", json.dumps(self.identity, indent=2))
             # One line per step; those after the saved step will be written again.
-            lines = log.read_text(encoding="utf-8").splitlines(keepends=True) if log.exists() else []
-            write_text(log, "".join(lines[:step]))
+            content = read_bytes(log, most=LOG_BYTES, error=ParameterError) if log.exists() else b""
+            # Of a line that was damaged on the disk, the bytes that are no UTF-8 are replaced.
+            write_text(log, b"".join(content.splitlines(keepends=True)[:step]).decode(errors="replace"))
 
     def log(self, line: dict[str, Any]) -> None:
         """Append a line to the log.
