@@ -10,12 +10,13 @@ from importlib import import_module
 from typing import NoReturn
 
 import cyclopts
-from cyclopts import App
+from cyclopts import App, Parameter
 
 from mwdn.cli import terminal
 from mwdn.cli.as_typed import as_typed
 from mwdn.cli.camera_values import from_camera_file
 from mwdn.cli.given_options import note_given_bin
+from mwdn.cli.wrong_calls import wrong_call
 from mwdn.errors import MwdnError
 from mwdn.runtime.memory import keep_memory
 from mwdn.version import __version__
@@ -74,6 +75,7 @@ def make_app(command: str | None = None) -> App:
         help_epilogue="Every command takes --quiet (-q) for errors and what was asked for alone, --verbose (-v) for "
         "versions, times and what was assumed, and --debug for the traceback of an error.",
         suppress_keyboard_interrupt=False,  # `main` says how to go on
+        default_parameter=Parameter(negative_iterable=()),  # no `--empty-crop`
     )
     for name, (place, summary) in COMMANDS.items():
         module, _, function = place.partition(":")
@@ -104,12 +106,12 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     try:
         with warnings.catch_warnings(), _timed(verbose=chosen["--verbose"]):
             warnings.showwarning = lambda message, *_, **__: terminal.warn(str(message))
-            result = app(arguments, exit_on_error=False, print_error=True)
-    except cyclopts.CycloptsError:
-        sys.exit(2)
-    except MwdnError as error:
+            result = app(arguments, exit_on_error=False, print_error=False)
+    except (MwdnError, cyclopts.CycloptsError) as error:
         if chosen["--debug"]:
             terminal.errors.print_exception()
+        if isinstance(error, cyclopts.CycloptsError):
+            error = wrong_call(error, COMMANDS)
         terminal.complain("[bold red]Error:[/]", error)
         sys.exit(2)
     except KeyboardInterrupt as interrupt:
@@ -122,6 +124,8 @@ def main(arguments: list[str] | None = None) -> NoReturn:
 def _options(app: App, arguments: list[str]) -> set[str]:
     """Options of the command that runs."""
     _, apps, _ = app.parse_commands(arguments)
+    if apps[-1].default_command is None:
+        return set()
     return {name for argument in apps[-1].assemble_argument_collection() for name in argument.names}
 
 

@@ -27,7 +27,6 @@ design = App(
     name="design",
     help="Design a mask and compute the PSF of a camera with it.",
     config=_recipe,
-    default_parameter=Parameter(negative_iterable=()),
 )
 
 
@@ -114,7 +113,7 @@ def array(
 def default(*tokens: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)]) -> None:
     """`mwdn design --mask FILE` is short for `mwdn design array --mask FILE`."""
     if any(token.partition("=")[0] == "--mask" for token in tokens):
-        design(("array", *tokens), exit_on_error=False, print_error=True)
+        design(("array", *tokens), exit_on_error=False, print_error=False)
     elif tokens:
         raise UnknownNameError("mask", tokens[0], [*MASKS, "array"])
     else:

@@ -13,6 +13,7 @@ from cyclopts import Parameter
 
 from mwdn.calibration import FrameFormat, PsfFormat
 from mwdn.cli.camera import CameraOptions
+from mwdn.cli.wrong_calls import in_words
 from mwdn.errors import ParameterError
 from mwdn.solvers import SOLVERS
 
@@ -120,7 +121,7 @@ def _convert(option: Option, given: Any) -> Any:  # noqa: ANN401
         if kind in (int, float):
             with suppress(ValueError):
                 return kind(text)
-    raise ParameterError(f"`{_flag(option.name)}` ({text}) must be {type_name(option.type)}.")
+    raise ParameterError(f"`{_flag(option.name)}` ({text}) must be {in_words(option.type)}.")
 
 
 def type_name(kind: Any) -> str:  # noqa: ANN401

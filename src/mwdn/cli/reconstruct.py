@@ -208,7 +208,8 @@ def _run(batch: Batch, files: list[str]) -> tuple[Mapping[str, str], int]:
 def _report(job: Job) -> None:
     """Print the outcome of a job."""
     if job.error:
-        complain(f"[red]{escape(str(job.capture))}:[/]", job.error)
+        named = f"`{job.capture}`" in str(job.error)
+        complain("[red]Error:[/]" if named else f"[red]{escape(str(job.capture))}:[/]", job.error)
     elif job.trust:
         line = f"{job.capture.name}: {job.trust.sentence}"
         console.print(line, highlight=False, markup=False, soft_wrap=True)
