@@ -1,6 +1,7 @@
 import multiprocessing
 import os
 import pickle
+import re
 
 import h5py
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
+from full_disk import full_after
 from mwdn.data import PairFile
 from mwdn.errors import ImageError, ParameterError, ShapeError
 
@@ -128,6 +130,32 @@ def test_the_file_appears_only_at_success(tmp_path, pairs):
     assert len(PairFile(path)) == 1
     with pytest.raises(ImageError, match="not open"):
         file.append(measurement, measurement)
+
+
+@pytest.mark.parametrize("attributes", [None, {"source": "x"}])
+@pytest.mark.parametrize("limit", [0, 1000, 5000, 100_000, 383_000])
+def test_a_full_disk_stops_at_its_pair_and_keeps_the_old_file(tmp_path, limit, attributes):
+    """HDF5 called such files complete, with zeros for pairs, or ended the process with a segmentation fault."""
+    path = tmp_path / "pairs.h5"
+    path.write_bytes(b"old")
+    shape, pixels = (40, 40, 3), np.full((40, 40, 3), 7, np.uint8)
+    new = PairFile.create(path, measurement_shape=shape, scene_shape=shape, dtype="uint8", attributes=attributes)
+    with (
+        full_after(limit),
+        pytest.raises(ImageError, match=r"pairs.h5` cannot be written.*: File too large\. Make") as error,
+    ):
+        write(new, pixels, 40)
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+    # 9,600 bytes a pair, and 2 to 12 kB of metadata.
+    expected = {100_000: "at pair (9|10|11):", 383_000: "at pair (39|40):"}
+    assert re.search(expected.get(limit, "at pair [12]:"), str(error.value))
+
+
+def write(file, pixels, count):
+    with file:
+        for _ in range(count):
+            file.append(pixels, pixels)
 
 
 @pytest.mark.parametrize("method", ["fork", "spawn"])

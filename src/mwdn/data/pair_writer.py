@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mwdn.data.hdf5 import CheckedFile, create_hdf5
 from mwdn.errors import ImageError, ParameterError, ShapeError
 from mwdn.io.files import as_image_error, atomic
 from mwdn.types import Frame
@@ -74,24 +75,23 @@ class PairWriter:
         self.path, self.dtype = path, np.dtype(dtype)
         self._shapes, self._attributes, self._psf = dict(zip(NAMES, shapes, strict=True)), attributes, _psf_array(psf)
         self._stack = ExitStack()
-        self._file: Any = None
+        self._data: dict[str, Any] = {}
+        self._disk: CheckedFile | None = None
         self._length = 0
 
     def __len__(self) -> int:
         return self._length
 
     def __enter__(self) -> "PairWriter":
-        import h5py
-
         with as_image_error(self.path), ExitStack() as stack:
-            self._file = stack.enter_context(h5py.File(stack.enter_context(atomic(self.path)), "w"))
-            self._file.attrs.update({VERSION_KEY: VERSION, **self._attributes})
+            file, self._disk = stack.enter_context(create_hdf5(stack.enter_context(atomic(self.path))))
+            file.attrs.update({VERSION_KEY: VERSION, **self._attributes})
             for name, shape in self._shapes.items():
-                self._file.create_dataset(
+                self._data[name] = file.create_dataset(
                     name, (0, *shape), self.dtype, maxshape=(None, *shape), chunks=(1, *shape), track_times=False
                 )
             if self._psf is not None:
-                self._file.create_dataset("psf", data=self._psf, track_times=False)
+                file.create_dataset("psf", data=self._psf, track_times=False)
             self._stack = stack.pop_all()
         return self
 
@@ -99,12 +99,12 @@ class PairWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         # The stack removes the hidden file; an exception from the body of the ``with`` statement is raised unchanged.
-        with as_image_error(self.path):
+        with as_image_error(self.path, f" at the end, after {self._length:,} pairs"):
             self._stack.__exit__(kind, error, trace)
-        self._file = None
+        self._disk, self._data = None, {}
 
     def append(self, measurement: Tensor | Frame, scene: Tensor | Frame) -> None:
-        """Add a pair, or a batch of pairs.
+        """Add a pair, or a batch of pairs. Each is on the disk before the next one is taken.
 
         Args:
             measurement: a tensor (B, C, H, W) or (C, H, W), or an array (B, H, W, C) or (H, W, C). Floats are
@@ -116,19 +116,25 @@ class PairWriter:
             ParameterError: NaN, or numbers on another scale than [0, 1].
             ImageError: the file cannot be written, or is not open.
         """
-        if self._file is None:
+        if self._disk is None:
             raise ImageError(f"`{self.path}` is not open. Append inside `with PairFile.create(...) as file:`.")
         rows = [self._rows(name, pixels) for name, pixels in zip(NAMES, (measurement, scene), strict=True)]
         if len(rows[0]) != len(rows[1]):
             raise ShapeError(
                 f"`measurement` ({len(rows[0])}) and `scene` ({len(rows[1])}) must match. Append whole pairs."
             )
-        end = self._length + len(rows[0])
-        with as_image_error(self.path):
-            for name, batch in zip(NAMES, rows, strict=True):
-                self._file[name].resize(end, axis=0)
-                self._file[name][self._length : end] = batch
-        self._length = end
+        for pair in zip(*rows, strict=True):
+            with as_image_error(self.path, f" at pair {self._length + 1:,}"):
+                self._write(dict(zip(NAMES, pair, strict=True)))
+            self._length += 1
+
+    def _write(self, pair: dict[str, Frame]) -> None:
+        for name, pixels in pair.items():
+            self._data[name].resize(self._length + 1, axis=0)
+            # Past HDF5's cache of chunks, which would write the pair some pairs later; three times as fast.
+            self._data[name].id.write_direct_chunk((self._length, 0, 0, 0), np.ascontiguousarray(pixels))
+        if self._disk is not None:
+            self._disk.check()
 
     def _rows(self, name: str, pixels: Tensor | Frame) -> Frame:
         """Convert to (B, H, W, C) in the type of the file."""

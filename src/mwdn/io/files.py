@@ -1,5 +1,6 @@
 """Atomic writing of files, and errors of the disk as errors of this package."""
 
+import errno
 import json
 import os
 import secrets
@@ -12,6 +13,9 @@ from typing import Any
 from safetensors import SafetensorError
 
 from mwdn.errors import ImageError, ParameterError
+
+FULL = {errno.ENOSPC, errno.EFBIG, errno.EDQUOT}
+"""Errors of a disk that is full, of a file that would be larger than allowed, and of a user's share that is used up."""
 
 
 @contextmanager
@@ -47,12 +51,13 @@ def atomic(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def as_image_error(path: str | Path) -> Iterator[None]:
-    """Turn an `OSError` while writing a file into an `ImageError` that names the file."""
+def as_image_error(path: str | Path, at: str = "") -> Iterator[None]:
+    """Turn an `OSError` while writing a file into an `ImageError` that names the file, and ``at`` which item it was."""
     try:
         yield
     except OSError as error:
-        raise ImageError(f"`{path}` cannot be written: {error.strerror or error}. Choose another folder.") from error
+        advice = "Make room, or choose another folder." if error.errno in FULL else "Choose another folder."
+        raise ImageError(f"`{path}` cannot be written{at}: {error.strerror or error}. {advice}") from error
 
 
 @contextmanager
