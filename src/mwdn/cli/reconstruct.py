@@ -41,6 +41,7 @@ def reconstruct(  # noqa: PLR0913
     format: Format = "png",
     full_size: bool = False,
     align: bool | None = None,
+    ensemble: Annotated[bool, Parameter(negative=())] = False,
     white_balance: WhiteBalance | None = None,
     trust: bool = True,
     map: Annotated[bool, Parameter(negative=())] = False,
@@ -68,6 +69,8 @@ def reconstruct(  # noqa: PLR0913
             PSF and captures are binned as far as that loses little; --bin 1 refuses.
         align: estimate rotation, scale and haze of the PSF from each capture, for a camera that has changed since its
             calibration; by default for universal, and not for solvers.
+        ensemble: average a network's pictures of the capture and its three mirror images: four times the time; on
+            average 0.2 dB for universal-small, 0.02 dB for universal.
         white_balance: of the pictures: grey-world, psf (the point source is white), or gains of red, green and blue.
         trust: check how well each picture explains its capture; takes a second or two for a small one.
         map: also draw which parts of each picture its capture supports, as NAME.support.png.
@@ -89,7 +92,13 @@ def reconstruct(  # noqa: PLR0913
             calibration, is_binned = binned(calibration, camera, method, files)
         local_device = distributed.local_device(device)
         reconstructor = Reconstructor(
-            method, calibration, align=align, device=local_device, white_balance=white_balance, **method_options
+            method,
+            calibration,
+            align=align,
+            device=local_device,
+            white_balance=white_balance,
+            ensemble=ensemble,
+            **method_options,
         )
         if is_first:
             warn(reconstructor.warning)

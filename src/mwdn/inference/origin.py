@@ -11,6 +11,7 @@ from pathlib import Path
 from torch import Tensor, nn
 
 from mwdn.calibration import Calibration
+from mwdn.inference.ensemble import Ensemble
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.solvers import Admm
 from mwdn.version import __version__
@@ -85,7 +86,9 @@ def _method(reconstruct: Reconstructor) -> tuple[object, ...]:
     options = {"training": method.training, **{name: getattr(method, name) for name in names}}
     if "align" in options:
         options["align"], aligned = reconstruct.align, ()
-    return kind, options, method.state_dict(), reconstruct.engine and reconstruct.engine.precision, *aligned
+    averaged = ("ensemble",) if isinstance(reconstruct.engine, Ensemble) else ()
+    precision = reconstruct.engine and reconstruct.engine.precision
+    return kind, options, method.state_dict(), precision, *aligned, *averaged
 
 
 def _digest(*parts: object) -> str:

@@ -14,6 +14,7 @@ from mwdn.calibration.white_balance import WhiteBalance, apply_white_balance, ch
 from mwdn.errors import ParameterError, ShapeError, check_batch, check_options
 from mwdn.fourier.convolution import check_fit
 from mwdn.inference.engine import Engine, Precision
+from mwdn.inference.ensemble import Ensemble
 from mwdn.inference.methods import Method, as_method, psf_warning
 from mwdn.io.formats import as_frame
 from mwdn.networks.blocks import check_channels
@@ -41,6 +42,8 @@ class Reconstructor:
         device: a GPU if there is one, unless given.
         precision: of a network, see `mwdn.inference.engine.Precision`; solvers are always exact.
         white_balance: of the pictures, see `mwdn.calibration.white_balance`; that of the calibration unless given.
+        ensemble: average a network's results for the measurement and its three mirror images, see
+            `mwdn.inference.ensemble.Ensemble`. It takes four times as long; for a network that takes any PSF.
         **options: of a solver given by its name, for example ``regularisation=1e-4``.
 
     It can be copied and pickled if its method can.
@@ -55,7 +58,7 @@ class Reconstructor:
         UnknownNameError: no such method, or it has no such option.
         CheckpointError: the checkpoint cannot be used.
         ParameterError: ``calibration`` is no `Calibration`, no such device or precision, an option is out of range, or
-            the network has no weights.
+            the network has no weights; ``ensemble`` with a solver.
     """
 
     def __init__(
@@ -67,9 +70,10 @@ class Reconstructor:
         device: str | torch.device | None = None,
         precision: Precision = "fast",
         white_balance: WhiteBalance | None = None,
+        ensemble: bool = False,
         **options: Any,  # noqa: ANN401
     ) -> None:
-        given = {"method": method, "align": align, "device": device, "precision": precision}
+        given = {"method": method, "align": align, "device": device, "precision": precision, "ensemble": ensemble}
         check_options(Reconstructor, "`Reconstructor`", given)
         if not isinstance(calibration, Calibration):
             raise ParameterError(
@@ -89,9 +93,14 @@ class Reconstructor:
         method = self.method
         self.align = method.align if align is None and isinstance(method, Network) else bool(align)
         self.psf = calibration.psf.to(self.device)
-        self.engine = None
+        self.engine: Engine[Any] | Ensemble[Any] | None = None
         if isinstance(method, nn.Module):
-            self.engine = Engine(as_network(method), self.psf, precision=precision)
+            engine = Engine(as_network(method), self.psf, precision=precision)
+            self.engine = Ensemble(engine) if ensemble else engine
+        elif ensemble:
+            raise ParameterError(
+                f"`ensemble` is for networks: {self.name} gives mirrored captures the same picture, mirrored."
+            )
 
     def __repr__(self) -> str:
         height, width = self.calibration.size
