@@ -70,7 +70,7 @@ def test_crop_is_in_raw_pixels_with_and_without_a_mosaic(size, mosaic, generator
     assert cropped.shape[-2:] == (4, 6)
     assert torch.equal(cropped, crop_centre(whole, (4, 6)))
     assert FrameFormat(crop=(8, 12)).to_measurement(frame).shape[-2:] == (8, 12)
-    with pytest.raises(ParameterError, match=r"`crop` \(9 x 12\) must be even.*`--crop 8 12`"):
+    with pytest.raises(ParameterError, match=r"`crop` \(9 x 12\) must be even.*`crop=\(8, 12\)`"):
         FrameFormat(mosaic=mosaic, crop=(9, 12))
 
 

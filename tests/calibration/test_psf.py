@@ -285,7 +285,7 @@ def test_raw_mosaics_become_a_psf_and_measurements_in_colour(tmp_path, generator
     measurement = calibration.correct((mosaicked(light.roll((4, -6), (-2, -1)), mosaic) + dark)[..., None])
     expected = calibration.psf.roll((2, -3), (-2, -1))
     torch.testing.assert_close(measurement / measurement.sum((-2, -1), keepdim=True), expected, atol=1e-7, rtol=1e-4)
-    with pytest.raises(ShapeError, match=r"`--grey`.*`--mosaic rggb`"):
+    with pytest.raises(ShapeError, match=r"`grey=True`.*`mosaic='rggb'`"):
         Calibration(calibration.psf).correct(np.ones((40, 40, 1), np.float32))
     with pytest.raises(ShapeError, match="mosaic"):
         Calibration(calibration.psf, FrameFormat(mosaic=mosaic)).correct(np.ones((80, 80, 3), np.float32))
@@ -431,10 +431,10 @@ def test_dark_frame_of_another_size(tmp_path, caustic):
 @pytest.mark.parametrize(
     ("psf", "binning", "capture", "way_out"),
     [
-        ((8, 6), 1, (16, 12), "The capture is 2 times as large: bin it by 2, `--bin 2 --psf-bin 1`."),
-        ((16, 12), 1, (4, 3), "The PSF is 4 times as large: bin it by 4, `--psf-bin 4`."),
-        ((8, 6), 1, (9, 12), "Crop the capture around its centre: `--crop 8 6`."),
-        ((8, 6), 2, (18, 14), "Crop the capture around its centre: `--crop 16 12`."),  # in raw pixels
+        ((8, 6), 1, (16, 12), "The capture is 2 times as large: bin it by 2, `bin=2, psf_bin=1`."),
+        ((16, 12), 1, (4, 3), "The PSF is 4 times as large: bin it by 4, `psf_bin=4`."),
+        ((8, 6), 1, (9, 12), "Crop the capture around its centre: `crop=(8, 6)`."),
+        ((8, 6), 2, (18, 14), "Crop the capture around its centre: `crop=(16, 12)`."),  # in raw pixels
         ((8, 6), 1, (7, 12), "Use the PSF that belongs to this camera."),
     ],
 )

@@ -72,5 +72,5 @@ def test_wrong_gains(balance):
 
 def test_colour_of_an_unknown_source():
     for psf in (torch.ones(1, 3, 4, 4) / 16, torch.ones(1, 1, 4, 4) / 16):
-        with pytest.raises(ParameterError, match=r"needs a PSF in colour.*`--white-balance 1\.8 1 1\.5`"):
+        with pytest.raises(ParameterError, match=r"needs a PSF in colour.*`white_balance=\(1\.8, 1, 1\.5\)`"):
             Reconstructor("wiener", Calibration(psf), white_balance="psf", device="cpu")

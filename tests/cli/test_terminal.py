@@ -6,7 +6,7 @@ from mwdn.cli import terminal
 from mwdn.cli.as_typed import as_typed
 from mwdn.errors import ParameterError
 
-OWN = {"--photos", "--bin", "--psf-bin", "--crop", "-o"}
+OWN = {"--photos", "--bin", "--psf-bin", "--crop", "--grey", "--mosaic", "-o"}
 TYPED = [
     "train",
     "r.toml",
@@ -34,6 +34,9 @@ TYPED = [
         ("[schedule]: `steps` (0) must be positive.", "[schedule]: `--steps` (0) must be positive."),
         ("The folder `photos` is a word of its own.", None),
         ("[data.own]: `bin` (0) must be at least 1.", None),
+        ("bin it: `bin=8, psf_bin=4`, or `crop=(8, 9)`.", "bin it: `--bin 8 --psf-bin 4`, or `--crop 8 9`."),
+        ("`grey=True` or `mosaic='rggb'`.", "`--grey` or `--mosaic rggb`."),
+        ("`bin=4, levels=3`, `bin=N` and `f(bin=4)` stay, `name == bin`, too.", None),
     ],
 )
 def test_words_of_the_library_as_the_user_types_them(message, expected):

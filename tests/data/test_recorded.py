@@ -147,7 +147,7 @@ def test_unknown_split():
     [
         ({}, psf((8, 12)), "`psf` (8 x 12) and the measurements of"),
         ({}, psf((8, 12)), "The PSF is 2 times as large"),
-        ({}, psf((8, 8)), "`--psf-bin`"),
+        ({}, psf((8, 8)), "`psf_bin`"),
         ({}, psf((3, 6)), "(4 x 6) must match"),
         ({"channels": 1}, psf(), "`psf` (3 channels) must be grey, or have the channels of the measurements of"),
         ({"scene": (8, 12, 3)}, psf(), "The scenes of"),

@@ -161,7 +161,7 @@ def test_too_large_for_the_memory(psf, measurement, error):
     def greedy(measurement, psf):
         raise error
 
-    with pytest.raises(ParameterError, match=r"needs more memory than cpu has free\. Bin or crop it: `--bin 2`"):
+    with pytest.raises(ParameterError, match=r"needs more memory than cpu has free\. Bin or crop it: `bin=2`"):
         Reconstructor(greedy, Calibration(psf), device="cpu")(measurement)
 
 

@@ -13,6 +13,7 @@ from mwdn.optics import ArrayMask, CodedAperture, Contour, Setup, mask_psf
 from mwdn.optics.amplitude_masks import separable_mls
 from mwdn.optics.array_mask import make_mask
 from mwdn.optics.mask_files import write_mask
+from mwdn.optics.psf_measures import likeness
 
 GREEN = Setup(aperture_mm=(0.3, 0.3), pixels=(160, 160), bin=1, band_nm=(532.0, 532.0), wavelengths=1, colour=False)
 
@@ -34,11 +35,41 @@ def test_a_prism_moves_the_psf():
 def test_a_wrapped_phase_is_the_same_mask():
     phase = ramp(0.01, -0.02)
     wrapped = torch.remainder(phase + math.pi, 2 * math.pi) - math.pi
-    with pytest.raises(ParameterError, match="`--levels 256`"):
+    with pytest.raises(ParameterError, match="`levels=256`"):
         mask_psf(make_mask(wrapped, "phase", pitch_um=2.0, phase_nm=532.0), GREEN)
     psf = mask_psf(make_mask(wrapped, "phase", pitch_um=2.0, phase_nm=532.0, levels=256), GREEN)
     smooth = mask_psf(make_mask(phase, "phase", pitch_um=2.0, phase_nm=532.0), GREEN)
     assert (psf - smooth).abs().max() < 0.02 * smooth.max()
+
+
+def wave(pitch_um: float, side_um: float = 400.0):
+    """Heights of a smooth surface, on samples of this pitch: slopes up to 0.25, 6.6 degrees behind the surface."""
+    position = (torch.arange(round(side_um / pitch_um)) + 0.5) * pitch_um
+    return 1.6 * torch.sin(2 * math.pi * position / 40)[:, None] * torch.ones(len(position))
+
+
+def test_a_steep_surface_is_interpolated_as_the_message_says(tmp_path):
+    """The pitch of an array is what it is: a smaller `pitch_um` would shrink the mask."""
+    np.save(tmp_path / "wave.npy", wave(4.0).numpy())
+    mask = ArrayMask(tmp_path / "wave.npy", "height", 4.0)
+    with pytest.raises(ParameterError, match=r"`mask` .* 4 um apart, .*: `subdivide=3`\.") as caught:
+        mask.build(GREEN)
+    factor = int(str(caught.value)[-3])
+    coarse = mask_psf(replace(mask, subdivide=factor).build(GREEN), GREEN)
+    fine = mask_psf(make_mask(wave(1.0), "height", pitch_um=1.0), GREEN)
+    assert likeness(coarse, fine) > 0.95
+    np.save(tmp_path / "wrapped.npy", torch.remainder(ramp(0.05, 0.05), 2 * math.pi).numpy())
+    wrapped = ArrayMask(tmp_path / "wrapped.npy", "phase", 2.0)
+    with pytest.raises(ParameterError, match="`levels=256`"):
+        wrapped.build(GREEN)
+    assert replace(wrapped, levels=256).build(GREEN).step_um > 0
+
+
+def test_a_surface_is_steep_only_where_light_passes(tmp_path):
+    heights = torch.zeros(200, 200)
+    heights[:, :20] = wave(2.0)[:200, :20]
+    np.save(tmp_path / "border.npy", heights.numpy())
+    assert ArrayMask(tmp_path / "border.npy", "height", 2.0).build(GREEN).values.shape == (200, 200)
 
 
 def test_phases_are_heights_at_their_wavelength(generator):
@@ -69,7 +100,7 @@ def test_the_mask_of_a_design_gives_the_same_psf(tmp_path):
     write_mask(tmp_path / "mask.tif", mask)
     again = ArrayMask(tmp_path / "mask.tif").build(setup)
     assert torch.equal(mask_psf(again, setup), mask_psf(mask, setup))
-    with pytest.raises(ParameterError, match="leave out `--pitch-um`"):
+    with pytest.raises(ParameterError, match="leave out `pitch_um`"):
         ArrayMask(tmp_path / "mask.tif", pitch_um=2.0).build(setup)
 
 
@@ -77,7 +108,7 @@ def test_files(tmp_path):
     """Floats are in their unit, integers parts of the full scale, true and false open and opaque."""
     numbers = np.random.default_rng(0).integers(0, 65536, (8, 9), dtype=np.uint16)
     light = torch.from_numpy(numbers / np.float32(65535))
-    np.save(tmp_path / "float.npy", numbers / 65535)
+    np.save(tmp_path / "float.npy", numbers / 131070)
     np.save(tmp_path / "open.npy", numbers > 30000)
     cv2.imwrite(str(tmp_path / "grey.png"), numbers)
     cv2.imwrite(str(tmp_path / "colour.tif"), np.stack([numbers] * 3, -1))
@@ -85,9 +116,9 @@ def test_files(tmp_path):
     def values(name, **options):
         return ArrayMask(tmp_path / name, pitch_um=2.0, **options).build(GREEN).values
 
-    torch.testing.assert_close(values("float.npy", values="height"), light)
+    torch.testing.assert_close(values("float.npy", values="height"), light / 2)
     for name in ("grey.png", "colour.tif"):
-        torch.testing.assert_close(values(name, values="height", full_scale=3.0), 3 * light)
+        torch.testing.assert_close(values(name, values="height", full_scale=0.3), 0.3 * light)
         torch.testing.assert_close(values(name, values="amplitude"), light)
     assert torch.equal(values("open.npy", values="amplitude"), torch.from_numpy(numbers > 30000).float())
 
@@ -106,8 +137,8 @@ def test_files(tmp_path):
         (np.zeros((4, 4)), {"subdivide": 6000}, ParameterError, "24,000 x 24,000"),
         (np.zeros((4, 4)), {"subdivide": 0}, ParameterError, r"`subdivide` \(0\)"),
         (np.zeros((4, 4)), {"pitch_um": -1.0}, ParameterError, r"`pitch_um` \(-1\)"),
-        (np.zeros((4, 4)), {"pitch_um": None}, ParameterError, "`--pitch-um 2`"),
-        (np.zeros((4, 4)), {"values": None}, ParameterError, r"`--values height\|phase"),
+        (np.zeros((4, 4)), {"pitch_um": None}, ParameterError, "`values='height', pitch_um=2`"),
+        (np.zeros((4, 4)), {"values": None}, ParameterError, "height, phase"),
         (np.zeros((4, 4)), {"index": 1.0}, ParameterError, r"`index` \(1\)"),
         (np.zeros((4, 4)), {"full_scale": 1.0}, ParameterError, "`full_scale`"),
         (np.zeros((4, 4), np.uint8), {}, ParameterError, "`full_scale`.* um that 255"),

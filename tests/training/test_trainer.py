@@ -588,7 +588,7 @@ def test_damaged_or_foreign_state(trainer, tmp_path):
 
 def test_folder_that_cannot_be_written_is_reported_before_training(trainer, tmp_path):
     (tmp_path / "run").write_text("a file")
-    with pytest.raises(ParameterError, match=r"`.*run` must be a folder that can be written to: .*`--out`"):
+    with pytest.raises(ParameterError, match=r"`.*run` must be a folder that can be written to: .*`out`"):
         trainer()
     with pytest.raises(ParameterError, match="must be a folder that can be written to"):
         trainer(folder="run/deeper")

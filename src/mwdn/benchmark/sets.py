@@ -195,7 +195,7 @@ def open_dataset(name: str, recipe: DatasetRecipe, folder: Path, device: torch.d
     made = read_json(note) if own and note.is_file() and path.is_file() else None
     if made not in (None, identity):
         raise ParameterError(
-            f"`{path}` holds pairs that another recipe made. Choose another folder, `--out`, or remove it."
+            f"`{path}` holds pairs that another recipe made. Choose another folder, `out`, or remove it."
         )
     if own and made is None:
         if simulates:

@@ -108,9 +108,9 @@ def write_camera(path: str | Path, camera: Mapping[str, Any]) -> None:
 def check_camera_path(path: Path) -> None:
     """Raise a `ParameterError` if a camera file must not be written there: another suffix, or another kind of file."""
     if path.suffix.lower() != ".toml":
-        raise ParameterError(f"`{path}` must end in .toml, not '{path.suffix}': `--out camera.toml`.")
+        raise ParameterError(f"`{path}` must end in .toml, not '{path.suffix}'. Rename it: `camera.toml`.")
     if path.exists() and not (path.is_file() and {"psf", "psf_sha256"} <= read_toml(path, "camera file").keys()):
-        raise ParameterError(f"`{path}` is not a camera file and would be lost. Choose another name: `--out`.")
+        raise ParameterError(f"`{path}` is not a camera file and would be lost. Choose another name.")
 
 
 def check_psf_file(path: str | Path, sha256: str, psf: Path) -> None:

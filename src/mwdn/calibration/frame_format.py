@@ -66,7 +66,7 @@ class FrameFormat:
             height, width = self.crop
             raise ParameterError(
                 f"`crop` ({height} x {width}) must be even with a mosaic, whose cells are 2 x 2 pixels: "
-                f"`--crop {height // 2 * 2} {width // 2 * 2}`."
+                f"`crop=({height // 2 * 2}, {width // 2 * 2})`."
             )
 
     def __repr__(self) -> str:
@@ -137,13 +137,13 @@ class FrameFormat:
         if frame.dtype.kind != "f" and self.bit_depth > 8 * frame.dtype.itemsize:
             raise ParameterError(
                 f"`bit_depth` ({self.bit_depth}) must be at most {8 * frame.dtype.itemsize}, the bits of the file's "
-                "numbers. Save frames with 16 bits, or leave out `--bit-depth`."
+                "numbers. Save frames with 16 bits, or leave out `bit_depth`."
             )
         maximum = 2**self.bit_depth - 1
         if frame.max() > maximum:
             raise ParameterError(
                 f"`bit_depth` ({self.bit_depth}) allows numbers up to {maximum:,}, but the frame holds "
-                f"{frame.max():,}: it has at least {int(frame.max()).bit_length()} bits. Leave out `--bit-depth` if "
+                f"{frame.max():,}: it has at least {int(frame.max()).bit_length()} bits. Leave out `bit_depth` if "
                 "the numbers fill the file's type."
             )
         return float(maximum)

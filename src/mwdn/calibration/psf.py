@@ -240,8 +240,8 @@ class Calibration:
             )
         if measurement.shape[1] == 1 and self.psf.shape[1] == 3:
             raise ShapeError(
-                "The capture is grey, but `psf` has colours. Use both as grey: `--grey`. If the capture is the raw "
-                "frame of a colour sensor, give the order of its filters: `--mosaic rggb`."
+                "The capture is grey, but `psf` has colours. Use both as grey: `grey=True`. If the capture is the raw "
+                "frame of a colour sensor, give the order of its filters: `mosaic='rggb'`."
             )
 
 
@@ -277,7 +277,7 @@ def _empty(has_light: Tensor, level: Tensor, *, with_dark: bool) -> str:
     empty = [name for name, light in zip(names, has_light.tolist(), strict=True) if not light]
     advice = ["Expose longer"]
     advice += ["take the dark frame without light"] if with_dark else []
-    advice += ["give `--background 0`"] if level.max() > 0 else []
+    advice += ["give `background=0`"] if level.max() > 0 else []
     return (
         f"PSF is empty: no light is left in {', '.join(empty)} after subtracting the background "
         f"({', '.join(f'{v:.3g}' for v in level)} of the full scale). {', or '.join(advice)}."
@@ -286,8 +286,8 @@ def _empty(has_light: Tensor, level: Tensor, *, with_dark: bool) -> str:
 
 def _advise(capture: Size, psf: Size, frames: FrameFormat) -> str:
     for larger, smaller, name, options in (
-        (psf, capture, "PSF", "--psf-bin {product}"),
-        (capture, psf, "capture", "--bin {product} --psf-bin {bin}"),
+        (psf, capture, "PSF", "psf_bin={product}"),
+        (capture, psf, "capture", "bin={product}, psf_bin={bin}"),
     ):
         factor = larger[0] // smaller[0]
         if factor > 1 and larger == (smaller[0] * factor, smaller[1] * factor):
@@ -295,5 +295,5 @@ def _advise(capture: Size, psf: Size, frames: FrameFormat) -> str:
             return f"The {name} is {factor} times as large: bin it by {factor}, `{options}`."
     if psf[0] <= capture[0] and psf[1] <= capture[1]:
         raw = frames.bin * frames.cell
-        return f"Crop the capture around its centre: `--crop {psf[0] * raw} {psf[1] * raw}`."
+        return f"Crop the capture around its centre: `crop=({psf[0] * raw}, {psf[1] * raw})`."
     return "Use the PSF that belongs to this camera."

@@ -30,13 +30,13 @@ def check_white_balance(balance: WhiteBalance | None, light: tuple[float, ...]) 
             reason = "grey" if light else "an array without its file's light"
             raise ParameterError(
                 f"`white_balance` 'psf' needs a PSF in colour, but this one is {reason}. Use 'grey-world', or gains: "
-                "`--white-balance 1.8 1 1.5`."
+                "`white_balance=(1.8, 1, 1.5)`."
             )
         return
     if isinstance(balance, str) or len(balance) != 3 or not all(0 < gain < float("inf") for gain in balance):
         raise ParameterError(
             f"`white_balance` ({balance}) must be 'grey-world', 'psf', or three positive gains of red, green and blue: "
-            "`--white-balance 1.8 1 1.5`."
+            "`white_balance=(1.8, 1, 1.5)`."
         )
 
 

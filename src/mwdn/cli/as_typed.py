@@ -1,5 +1,6 @@
-"""Messages of the library in the words of the command line: `psf_bin` is `--psf-bin`."""
+"""Messages of the library in the words of the command line: `psf_bin` is `--psf-bin`, `bin=4` is `--bin 4`."""
 
+import ast
 import re
 from collections.abc import Collection
 
@@ -14,21 +15,45 @@ def as_typed(message: str, own: Collection[str], typed: Collection[str] = ()) ->
             words are values, such as the name of a folder, and stay.
 
     Returns:
-        The message, where a word in backticks is an option if the command has it or if it was typed. If the message
+        The message, where a word in backticks is an option if the command has it or if it was typed, and so are keyword
+        arguments such as ``bin=4, crop=(8, 8)``. If the message
         starts with the table of a recipe, ``[sensor]: ``, its words are keys of this table, and the command's own
         options of the same name are not meant.
     """
     table = re.match(r"\[([^]]+)\]: ", message)
     keys = {option.split("=")[0] for option in typed if option.startswith("--")} - set(own)
 
-    def flag(match: re.Match[str]) -> str:
-        if match[1] in typed:
-            return match[0]
-        key = match[1].replace("_", "-")
+    def option(name: str) -> str | None:
+        key = name.replace("_", "-")
         if table:
             known = {f"--{table[1]}.{key}", f"--{key}"} & keys
         else:
             known = {f"--{key}"} & {*own, *keys} or {option for option in keys if option.endswith(f".{key}")}
-        return f"`{min(known)}`" if known else match[0]
+        return min(known, default=None)
 
-    return re.sub(r"`([a-z]\w*)`(?! of \[)", flag, message)
+    def word(match: re.Match[str]) -> str:
+        flag = None if match[1] in typed else option(match[1])
+        return f"`{flag}`" if flag else match[0]
+
+    def assignments(match: re.Match[str]) -> str:
+        flags = [_typed(option(name), value) for name, value in _keyword_arguments(match[1])]
+        return f"`{' '.join(flags)}`" if flags and all(flags) else match[0]
+
+    message = re.sub(r"`([a-z]\w*)`(?! of \[)", word, message)
+    return re.sub(r"`([a-z]\w*=[^`]*)`(?! of \[)", assignments, message)
+
+
+def _keyword_arguments(text: str) -> list[tuple[str, object]]:
+    """Names and values of ``bin=4, crop=(8, 8)``; empty for any other text."""
+    try:
+        call = ast.parse(f"f({text})", mode="eval").body
+        return [(each.arg or "", ast.literal_eval(each.value)) for each in getattr(call, "keywords", ())]
+    except (SyntaxError, ValueError):
+        return []
+
+
+def _typed(option: str | None, value: object) -> str:
+    """An option with its value; a switch without; empty without option."""
+    if option is None or value is True:
+        return option or ""
+    return " ".join([option, *map(str, value if isinstance(value, tuple) else (value,))])

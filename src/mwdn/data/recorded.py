@@ -179,9 +179,9 @@ def check_pairs(file: PairFile, psf: Psf) -> None:
     (h, w, channels), (H, W), colours = file.measurement_shape, psf.shape[-2:], psf.shape[1]
     if (h, w) != (H, W):
         factor = H // h
-        way_out = "Use the PSF of their camera, cropped and binned as they are: `--crop`, `--psf-bin`."
+        way_out = "Use the PSF of their camera, cropped and binned as they are: `crop`, `psf_bin`."
         if factor > 1 and (h * factor, w * factor) == (H, W):
-            way_out = f"The PSF is {factor} times as large: multiply `--psf-bin` by {factor}."
+            way_out = f"The PSF is {factor} times as large: multiply `psf_bin` by {factor}."
         raise ShapeError(f"`psf` ({H} x {W}) and the measurements of `{file.path}` ({h} x {w}) must match. {way_out}")
     if colours not in (1, channels):
         raise ShapeError(

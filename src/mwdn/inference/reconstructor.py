@@ -245,5 +245,5 @@ class Reconstructor:
                 raise
             raise ParameterError(
                 f"`measurement` {tuple(measurement.shape)} needs more memory than {self.device} has free. Bin or crop "
-                "it: `--bin 2`, `--crop 1000 1000`; or try `--device cpu`, `--method wiener`."
+                "it: `bin=2`, `crop=(1000, 1000)`; or try `device='cpu'`, `method='wiener'`."
             ) from error

@@ -61,7 +61,7 @@ def as_image_error(path: str | Path, at: str = "") -> Iterator[None]:
 
 
 @contextmanager
-def as_parameter_error(folder: Path, advice: str = "Choose another one: `--out`.") -> Iterator[None]:
+def as_parameter_error(folder: Path, advice: str = "Choose another one: `out`.") -> Iterator[None]:
     """Turn an error of the disk while writing into a folder into a `ParameterError` that names the folder."""
     try:
         yield
@@ -116,7 +116,7 @@ def refuse_overwrite(output: Path, *inputs: Path | None) -> None:
     """
     for path in filter(None, inputs):
         if output.exists() and path.exists() and output.samefile(path):
-            raise ParameterError(f"`{output}` would overwrite an input. Choose another name: `--out`.")
+            raise ParameterError(f"`{output}` would overwrite an input. Choose another name: `out`.")
 
 
 def path_resolver() -> Callable[[str], str]:

@@ -231,7 +231,7 @@ def check_size(psf: Psf, size: Size) -> None:
     if tuple(psf.shape[-2:]) != tuple(size):
         raise ShapeError(
             f"`psf` ({psf.shape[-2]} x {psf.shape[-1]}) and `measurement` ({size[0]} x {size[1]}) must have the same "
-            "height and width. Bin or crop the PSF: `--bin`, `--crop`."
+            "height and width. Bin or crop the PSF: `bin`, `crop`."
         )
 
 

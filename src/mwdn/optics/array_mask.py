@@ -8,11 +8,12 @@ from typing import Any, Literal, get_args
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch.nn import functional as F
 
 from mwdn.errors import ImageError, ParameterError, ShapeError, UnknownNameError
 from mwdn.io.images import read_frame
 from mwdn.optics.mask_files import read_mask
-from mwdn.optics.masks import Mask, check_index, check_samples, quantise
+from mwdn.optics.masks import Mask, check_index, check_samples, needed_pitch, quantise
 from mwdn.optics.propagation import UM_PER_NM, check_positive
 from mwdn.optics.setup import Setup
 from mwdn.types import Plane
@@ -41,7 +42,9 @@ class ArrayMask:
         index: refractive index of a surface; 1.46 is fused silica.
         levels: round a surface to this many even steps; continuous unless given. A wrapped phase has steps, too.
         subdivide: compute with this many samples along each side of a sample. Needed where the samples are so large
-            that light bends at their edges within the array's pitch: squares of 20 um need 10.
+            that light bends at their edges within the array's pitch: squares of 20 um need 10; and where a smooth
+            surface is so steep that the array's pitch cannot sample the light behind it. A surface without `levels` is
+            interpolated; all others consist of squares.
     """
 
     mask: Path
@@ -66,16 +69,22 @@ class ArrayMask:
             if given:
                 raise ParameterError(
                     f"`{self.mask}` is a design and says its own pitch and heights: leave out "
-                    f"{', '.join(_option(name) for name in given)}."
+                    f"{', '.join(f'`{name}`' for name in given)}."
+                )
+            needed, _ = needed_pitch(designed, setup)
+            if designed.pitch_um > needed:
+                raise ParameterError(
+                    f"`{self.mask}` has samples {designed.pitch_um:g} um apart, too far for the light of this camera. "
+                    f"Design it again for this camera: `mwdn design`, with `pitch_um={_floor(needed):g}`."
                 )
             return designed
         frame = _grey(_read_numbers(self.mask))
         if self.values is None or self.pitch_um is None:
             raise ParameterError(
-                f"`{self.mask}` holds numbers without units: say what they are, `--values "
-                f"{'|'.join(get_args(Quantity))}`, and how far apart, `--pitch-um 2`."
+                f"`{self.mask}` holds numbers without units: say what they are, "
+                f"{', '.join(get_args(Quantity))}, and how many um apart: `values='height', pitch_um=2`."
             )
-        return make_mask(
+        mask = make_mask(
             _scaled(frame, self.values, self.full_scale),
             self.values,
             pitch_um=self.pitch_um,
@@ -84,6 +93,33 @@ class ArrayMask:
             levels=self.levels,
             subdivide=self.subdivide,
         )
+        _check_slope(mask, setup, self.subdivide)
+        return mask
+
+
+def _check_slope(mask: Mask, setup: Setup, subdivide: int) -> None:
+    """Check that the samples of a surface are as near as the light behind it needs; say what to change."""
+    needed, deflection = needed_pitch(mask, setup)
+    if mask.pitch_um <= needed:
+        return
+    largest_step = max(mask.values.diff(dim=axis).abs().max().item() for axis in (0, 1))
+    if subdivide * largest_step > 0.5 * (mask.values.max() - mask.values.min()).item():
+        advice = "Its steps are as high as the whole surface, as those of a wrapped phase: `levels=256`."
+    else:
+        parts = math.ceil(
+            1.3 * subdivide * mask.pitch_um / needed
+        )  # between samples slopes are up to 1.3 times steeper
+        advice = f"Interpolate between them: `subdivide={parts}`."
+    raise ParameterError(
+        f"`mask` deflects light by {deflection:.2g} degrees, and its samples, {mask.pitch_um:.3g} um apart, must be at "
+        f"most {needed:.3g} um apart to sample that. {advice}"
+    )
+
+
+def _floor(pitch_um: float) -> float:
+    """Two digits of a pitch, rounded down."""
+    step = 10 ** (math.floor(math.log10(pitch_um)) - 1)
+    return math.floor(pitch_um / step) * step
 
 
 def make_mask(
@@ -105,7 +141,7 @@ def make_mask(
         phase_nm: wavelength for which phases are given.
         index: refractive index of a surface.
         levels: round a surface to this many even steps.
-        subdivide: samples of the mask along each side of a number.
+        subdivide: samples of the mask along each side of a number; see `ArrayMask`.
 
     Raises:
         ParameterError: an argument is out of its range, NaN or infinity, an amplitude or transmission outside [0, 1],
@@ -127,7 +163,8 @@ def make_mask(
     # A surface of height h delays light of wavelength w by the phase 2 pi h (index - 1) / w.
     um = phase_nm * UM_PER_NM / (2 * math.pi * (index - 1)) if values == "phase" else 1.0
     height, step = quantise(_relief(numbers.double() * um), levels)
-    return Mask("phase", _subdivided(height.float(), subdivide), pitch, index, step)
+    divide = _interpolated if levels is None else _subdivided
+    return Mask("phase", divide(height.float(), subdivide), pitch, index, step)
 
 
 def _read_design(path: Path) -> Mask | None:
@@ -173,7 +210,7 @@ def _scaled(frame: Numbers, values: Quantity, full_scale: float | None) -> Plane
         unit = "um" if values == "height" else "radians"
         raise ParameterError(
             f"The file holds integers: `full_scale` must say the {values} in {unit} that {largest:,} stands for, "
-            "`--full-scale 1.2`."
+            "`full_scale=1.2`."
         )
     return numbers * ((1.0 if full_scale is None else full_scale) / largest)
 
@@ -182,7 +219,7 @@ def _amplitude(numbers: Plane, values: Quantity) -> Plane:
     low, high = numbers.min().item(), numbers.max().item()
     if low < 0 or high > 1:
         raise ParameterError(
-            f"`mask` ({low:g} to {high:g}) must be in [0, 1] for {values}. For a surface: `--values height` or phase."
+            f"`mask` ({low:g} to {high:g}) must be in [0, 1] for {values}. For a surface: `values='height'` or 'phase'."
         )
     return numbers.float() if values == "amplitude" else numbers.float().sqrt()
 
@@ -199,8 +236,10 @@ def _relief(height_um: Plane) -> Plane:
 
 
 def _subdivided(plane: Plane, count: int) -> Plane:
+    """Squares of the same number."""
     return plane.repeat_interleave(count, 0).repeat_interleave(count, 1)
 
 
-def _option(name: str) -> str:
-    return f"`--{name.replace('_', '-')}`"
+def _interpolated(plane: Plane, count: int) -> Plane:
+    """Bicubic interpolation: straight lines would leave an edge at every sample, which bends light."""
+    return F.interpolate(plane[None, None], scale_factor=count, mode="bicubic")[0, 0] if count > 1 else plane

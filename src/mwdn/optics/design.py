@@ -150,7 +150,7 @@ def check_replaced(out: Path, *, gds: bool = False, stl: bool = False) -> None:
         if path.exists():
             raise ParameterError(
                 f"`{path}` would be replaced, and no camera.json beside it says that it belongs to a design. Choose "
-                "another folder: `--out`."
+                "another folder: `out`."
             )
 
 

@@ -141,7 +141,7 @@ def write_stl(path: str | Path, mask: Mask, *, base_um: float = 100.0, every: in
         ImageError: the file cannot be written.
     """
     if mask.kind != "phase":
-        raise ParameterError("An amplitude mask has no heights for an STL. Use GDSII: `--gds`.")
+        raise ParameterError("An amplitude mask has no heights for an STL. Use GDSII: `gds`.")
     if not base_um > 0 or every < 1:
         raise ParameterError(f"`base_um` ({base_um:g}) must be positive and `every` ({every}) at least 1.")
     heights = mask.values.numpy()[::every, ::every].astype(np.float64)
@@ -149,7 +149,7 @@ def write_stl(path: str | Path, mask: Mask, *, base_um: float = 100.0, every: in
         needed = int(np.ceil(np.sqrt(mask.values.numel() / MAX_STL_SAMPLES)))
         raise ParameterError(
             f"An STL ({heights.shape[0]:,} x {heights.shape[1]:,} samples) must have at least 2 samples a side and at "
-            f"most {MAX_STL_SAMPLES:,} in all: `--stl-every {needed}`, or use GDSII: `--gds`."
+            f"most {MAX_STL_SAMPLES:,} in all: `--stl-every {needed}`, in Python `every={needed}`; or use GDSII."
         )
     triangles = np.concatenate(list(_body(heights, mask.pitch_um * every, base_um)))
     sides = triangles[:, 1:] - triangles[:, :1]

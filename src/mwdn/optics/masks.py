@@ -130,13 +130,18 @@ def mask_psf(mask: Mask, setup: Setup, *, angle_degrees: tuple[float, float] = (
     Raises:
         ParameterError: the mask's pitch cannot sample the light behind it; the message says which pitch can.
     """
-    pitch = mask.pitch_um
+    pitch, mask = mask.pitch_um, _in_aperture(mask, setup)
     opening = tuple(side * UM_PER_MM for side in setup.aperture_mm)
-    mask = mask.middle((2 * math.ceil(opening[0] / pitch / 2) + 1, 2 * math.ceil(opening[1] / pitch / 2) + 1))
     down, across = (overlap(1, side, n, pitch)[0] for side, n in zip(opening, mask.values.shape, strict=True))
     aperture = torch.outer(down, across).float()
     wavelengths, weights = setup.spectrum()
-    _check_slope(mask, setup, min(wavelengths), angle_degrees)
+    needed, deflection = needed_pitch(mask, setup, angle_degrees=angle_degrees)
+    if pitch > needed:
+        raise ParameterError(
+            f"`pitch_um` ({pitch:g}) cannot sample a surface that deflects light of {min(wavelengths):g} nm by "
+            f"{deflection:.2g} degrees: use at most {needed:.3g} um, or a flatter surface; `subdivide` a smooth array. "
+            "If it has steps, such as a wrapped phase, say how many: `levels=256`."
+        )
     window = tuple(math.ceil(n * setup.pitch_um / pitch / 2) * 2 + 2 for n in setup.size)
     shape = mask.values.shape[0], mask.values.shape[1]
     psf = torch.zeros(len(weights), *setup.size)
@@ -152,27 +157,31 @@ def mask_psf(mask: Mask, setup: Setup, *, angle_degrees: tuple[float, float] = (
     return psf[None] / (opening[0] * opening[1] / pitch**2)
 
 
-def _check_slope(mask: Mask, setup: Setup, wavelength_nm: float, angle_degrees: tuple[float, float]) -> None:
-    """Check that the pitch p samples the light behind a continuous surface: ``p <= wavelength / (2 sin(angle))``.
+def _in_aperture(mask: Mask, setup: Setup) -> Mask:
+    """The samples of which a part lies within the aperture."""
+    rows, columns = (2 * math.ceil(side * UM_PER_MM / mask.pitch_um / 2) + 1 for side in setup.aperture_mm)
+    return mask.middle((rows, columns))
+
+
+def needed_pitch(mask: Mask, setup: Setup, *, angle_degrees: tuple[float, float] = (0.0, 0.0)) -> tuple[float, float]:
+    """Largest pitch in um that samples the light behind a surface, ``wavelength / (2 sin(angle))``; and this angle.
 
     A surface deflects light by about its slope times ``index - 1``, on top of the angle of incidence. Surfaces in
-    levels and amplitude masks have no slope: their samples are the structure.
+    levels and amplitude masks have no slope: their samples are the structure, and any pitch will do.
+
+    Returns:
+        The pitch in um, with a tolerance of 1e-6 for rounding, and the angle in degrees.
     """
     if mask.kind == "amplitude" or mask.step_um > 0:
-        return
-    steepest = 0.0
+        return math.inf, 0.0
+    mask, steepest = _in_aperture(mask, setup), 0.0
     for axis, angle in enumerate(angle_degrees):
         slope = mask.values.diff(dim=axis).abs().max().item() / mask.pitch_um * (mask.index - 1)
         half = mask.size_mm[axis] / 2 / setup.source_mm
         steepest = max(steepest, slope + math.sin(math.atan(math.tan(math.radians(abs(angle))) + half)))
-    needed = wavelength_nm * UM_PER_NM / (2 * max(steepest, 1e-12))
-    if mask.pitch_um > needed * (1 + 1e-6):
-        turn = math.degrees(math.asin(min(1.0, steepest)))
-        raise ParameterError(
-            f"`pitch_um` ({mask.pitch_um:g}) cannot sample a surface that deflects light of {wavelength_nm:g} nm by "
-            f"{turn:.2g} degrees: use at most {needed:.3g} um, or a flatter surface. If it has steps, such as a "
-            "wrapped phase, say how many: `--levels 256`."
-        )
+    shortest = min(setup.spectrum()[0]) * UM_PER_NM
+    needed = shortest / (2 * max(steepest, 1e-12))
+    return needed * (1 + 1e-6), math.degrees(math.asin(min(1.0, steepest)))
 
 
 def describe_mask(mask: Mask, psf: Psf) -> dict[str, Any]:
