@@ -12,8 +12,9 @@ from cameras import contour_psf
 from mwdn.fourier.convolution import convolve
 from mwdn.networks import build
 from mwdn.solvers import Penalties
+from mwdn.solvers.levels import REFERENCE_NOISE, Level, brightness
 from mwdn.solvers.plug_and_play import certainty, plug_and_play
-from mwdn.solvers.pyramid import REFERENCE_NOISE, Level, brightness, solve
+from mwdn.solvers.pyramid import solve
 
 SIZE = 24, 32
 

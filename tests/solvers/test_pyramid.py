@@ -14,7 +14,8 @@ from mwdn import fourier
 from mwdn.errors import ParameterError
 from mwdn.optics.noise import noise_level
 from mwdn.solvers import Penalties
-from mwdn.solvers.pyramid import LEVELS, Level, Pyramid, halve, low_band, solve
+from mwdn.solvers.levels import LEVELS, Level
+from mwdn.solvers.pyramid import Pyramid, halve, low_band, solve
 from mwdn.solvers.wiener import Wiener
 
 FINE = Penalties(0.5, 0.0, 0.5)
@@ -80,7 +81,7 @@ def test_smoothing_follows_the_noise_of_the_light_not_of_the_dark(generator, mon
     electrons = 2000 * light + (2000 * light + 9).sqrt() * torch.randn(light.shape, generator=generator)
     truth, errors = light.sum() / fourier.convolve(scene, psf).sum() * scene, {}
     for parts in (16, 1):
-        monkeypatch.setattr("mwdn.solvers.pyramid.noise_level", partial(noise_level, parts=parts))
+        monkeypatch.setattr("mwdn.solvers.levels.noise_level", partial(noise_level, parts=parts))
         errors[parts] = float((Pyramid()(electrons / 2000, psf) - truth).square().mean())
     assert errors[16] < 0.7 * errors[1]
 

@@ -12,8 +12,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from mwdn.errors import ParameterError
 from mwdn.io.images import srgb_decode
+from mwdn.training.report import Report
 from mwdn.training.tensorboard import TensorBoard
-from mwdn.training.trainer import Report
 from mwdn.training.validation import Validation
 
 

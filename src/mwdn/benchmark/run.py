@@ -25,7 +25,7 @@ from mwdn.evaluation.alexnet import SMALLEST, load_alexnet
 from mwdn.io.files import write_text
 from mwdn.runtime.distributed import local_device
 from mwdn.training.losses import NEED_ALEXNET
-from mwdn.training.trainer import Report
+from mwdn.training.report import Report
 
 PAGE = "index.html"
 

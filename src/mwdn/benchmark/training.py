@@ -18,8 +18,9 @@ from mwdn.io.files import write_text
 from mwdn.io.reading import LOG_BYTES, parse_json, read_json, read_text, unexpected_content
 from mwdn.networks import NETWORKS
 from mwdn.training.recipe import OPTIMISERS, Recipe, Schedule
+from mwdn.training.report import Report
 from mwdn.training.tasks import SupervisedTask, supervised_task
-from mwdn.training.trainer import Report, Trainer
+from mwdn.training.trainer import Trainer
 from mwdn.training.validation import Validator
 from mwdn.types import Size
 

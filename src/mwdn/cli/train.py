@@ -19,8 +19,9 @@ from mwdn.io.toml import parse_value
 from mwdn.runtime import distributed
 from mwdn.training import experiment
 from mwdn.training.recipe import Sheet, read_recipe
+from mwdn.training.report import Report
 from mwdn.training.tensorboard import TensorBoard
-from mwdn.training.trainer import Report, Trainer
+from mwdn.training.trainer import Trainer
 
 
 def _recipe_changes(tokens: Any) -> Any:  # noqa: ANN401

@@ -26,7 +26,8 @@ from mwdn.calibration.frame_operations import bin_pixels
 from mwdn.diagnosis.verdict import Verdict
 from mwdn.io.raw import Mosaic
 from mwdn.solvers.alignment import fine_detail
-from mwdn.solvers.pyramid import Level, halve, solve
+from mwdn.solvers.levels import Level
+from mwdn.solvers.pyramid import halve, solve
 from mwdn.solvers.splitting import Penalties
 from mwdn.types import Frame, Image
 

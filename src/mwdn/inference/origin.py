@@ -28,7 +28,7 @@ _OPTIONS = {
 """What counts of a network besides its weights; all public attributes of any other module."""
 
 _FIRST_NAMES = {"downsampling": "shrink", "only_if_noisy": "poor", "min_smoothing": "least"}
-"""Fields of `mwdn.solvers.pyramid.Level` that have been renamed."""
+"""Fields of `mwdn.solvers.levels.Level` that have been renamed."""
 
 
 def settings_hash(reconstruct: Reconstructor, format: str, *, full_size: bool = False) -> str:

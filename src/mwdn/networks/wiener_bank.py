@@ -15,8 +15,9 @@ from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
 from mwdn.networks.blocks import Decoder, Encoder, check_channels, normalise_psf, paper_widths
 from mwdn.networks.drunet import Drunet
 from mwdn.networks.network import Network
+from mwdn.solvers.levels import LEVELS, Level
 from mwdn.solvers.plug_and_play import plug_and_play
-from mwdn.solvers.pyramid import LEVELS, Band, Level, PsfPyramid
+from mwdn.solvers.pyramid import Band, PsfPyramid
 from mwdn.types import Measurement, Psf, Scene, Size
 
 COARSE_ITERATIONS = {8: 12, 4: 18, 2: 8}

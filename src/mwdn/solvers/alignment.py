@@ -28,7 +28,8 @@ from mwdn.fourier.convolution import check_fit
 from mwdn.fourier.transforms import frequency_grid, inverse_spectrum, spectrum
 from mwdn.optics.psf import checked_psf
 from mwdn.optics.warp import hazed, warp
-from mwdn.solvers.pyramid import Level, halve, solve
+from mwdn.solvers.levels import Level
+from mwdn.solvers.pyramid import halve, solve
 from mwdn.solvers.splitting import Penalties
 from mwdn.types import Image, Measurement, Psf, Size
 

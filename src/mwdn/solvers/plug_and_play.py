@@ -22,7 +22,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.fourier.transforms import inverse_spectrum, spectrum
-from mwdn.solvers.pyramid import REFERENCE_NOISE, Estimate, brightness, smoothing_scale
+from mwdn.solvers.levels import REFERENCE_NOISE, brightness, smoothing_scale
+from mwdn.solvers.pyramid import Estimate
 from mwdn.solvers.splitting import Problem, reflected
 
 Denoiser = Callable[[Tensor, Tensor], Tensor]

@@ -19,9 +19,10 @@ from mwdn.data.unpaired import UnpairedCaptures
 from mwdn.errors import ParameterError
 from mwdn.runtime import distributed
 from mwdn.training.recipe import Recipe, read_recipe
+from mwdn.training.report import Report
 from mwdn.training.selfsupervised import SelfSupervisedTask
 from mwdn.training.tasks import SupervisedTask, Task, supervised_task
-from mwdn.training.trainer import Report, Trainer
+from mwdn.training.trainer import Trainer
 from mwdn.training.validation import SHOWN, Validator
 from mwdn.types import Measurement, Psf
 

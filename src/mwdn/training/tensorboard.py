@@ -7,7 +7,7 @@ from typing import Any
 from mwdn.errors import ParameterError
 from mwdn.io.files import as_parameter_error
 from mwdn.io.images import srgb_encode
-from mwdn.training.trainer import Report
+from mwdn.training.report import Report
 
 
 class TensorBoard:

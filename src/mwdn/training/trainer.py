@@ -4,7 +4,6 @@ import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -23,6 +22,7 @@ from mwdn.training.batch_norm import freeze_cancelled, synchronise
 from mwdn.training.losses import Loss
 from mwdn.training.network import build_network, name_and_options, update_average
 from mwdn.training.recipe import Recipe
+from mwdn.training.report import Report
 from mwdn.training.run_folder import MAKE_ROOM, RunFolder, run_identity
 from mwdn.training.sample_cache import Progress
 from mwdn.training.schedule import make_lr_schedule, make_optimiser
@@ -30,24 +30,6 @@ from mwdn.training.tasks import Task
 from mwdn.training.training_state import damaged, restore, write_state
 from mwdn.training.validation import Validation, Validator
 from mwdn.weights.checkpoint import save_network
-
-
-@dataclass(frozen=True)
-class Report:
-    """Progress after a step, for a callback."""
-
-    step: int
-    loss: float
-    parts: dict[str, float]
-    learning_rate: float
-    pictures_per_s: float
-    validation: Validation | None = None
-
-    def line(self) -> dict[str, float | int | None]:
-        """The step's line in the log."""
-        line = {"step": self.step, "loss": self.loss, **self.parts, "learning_rate": self.learning_rate}
-        psnr, loss = (None, None) if self.validation is None else (self.validation.psnr, self.validation.loss)
-        return {**line, "psnr": psnr, "validation_loss": loss}
 
 
 class Trainer:
