@@ -243,6 +243,13 @@ def test_another_method_and_another_set_are_a_line_each(done):
         ("mwdn = {} }", "mwdm = {} }", UnknownNameError, "Did you mean 'mwdn'?"),
         ("mwdn = {} }", "mwdn = { widht = 3 } }", UnknownNameError, "Did you mean 'width'?"),
         ("mwdn = {} }", "mwdn = 3 }", ParameterError, "must be a table of options"),
+        (
+            "mwdn = {} }",
+            "'../../ESC' = { name = 'mwdn' } }",
+            ParameterError,
+            r"label .*'\.\./\.\./ESC'.* name of a folder",
+        ),
+        ("caustic = {", "'a/b' = {", ParameterError, r"label .*'a/b'.* name of a folder"),
         ("quick = { name", "wiener = { name", ParameterError, r"`wiener` .*\[networks\] and in \[solvers\]"),
         ('compared = "mwdn"', 'compared = "unet"', UnknownNameError, "method of this recipe"),
         ('compared = "mwdn"', 'compered = "mwdn"', UnknownNameError, "Did you mean 'compared'?"),

@@ -111,6 +111,15 @@ def test_link_in_the_output_folder_to_an_input(tmp_path):
         check_outputs(captures, tmp_path / "out", "png")
 
 
+def test_link_in_the_output_folder_to_another_file(tmp_path):
+    """A capture in another folder, say, which was not named."""
+    captures, (other,) = touch(tmp_path / "in", "a.png"), touch(tmp_path / "elsewhere", "b.png")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "a.json").symlink_to(other)
+    with pytest.raises(ParameterError, match=r"out/a\.json` is a link to `.*b\.png`"):
+        check_outputs(captures, tmp_path / "out", "png")
+
+
 def test_link_to_an_input_that_is_in_the_output_folder(tmp_path):
     touch(tmp_path / "out", "a.png")
     (tmp_path / "in").mkdir()

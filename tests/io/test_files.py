@@ -1,6 +1,7 @@
 """A file is written completely or not at all."""
 
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import torch
 
 from image_files import put
 from mwdn.errors import ImageError, ParameterError
-from mwdn.io.files import atomic, check_folder
+from mwdn.io.files import atomic, check_folder, refuse_foreign, refuse_overwrite
 from mwdn.io.images import read_frame, write_linear, write_picture
 
 
@@ -33,13 +34,36 @@ def test_a_writer_that_succeeds_replaces_the_file(tmp_path: Path) -> None:
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_a_link_is_followed(tmp_path: Path) -> None:
+def test_a_link_is_not_followed(tmp_path: Path) -> None:
+    """It may lead to an input, or to a capture in another folder."""
     target, link = put(tmp_path / "target.bin", b"old"), tmp_path / "link.bin"
     link.symlink_to(target)
-    with atomic(link) as temporary:
+    with pytest.raises(OSError, match=r"it is a symbolic link to `.*target\.bin`"), atomic(link) as temporary:
         temporary.write_bytes(b"new")
-    assert link.is_symlink()
-    assert target.read_bytes() == b"new"
+    assert target.read_bytes() == b"old"
+    with pytest.raises(ParameterError, match=r"link\.bin` cannot be written: it is a symbolic link"):
+        refuse_overwrite(link)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no pipes in folders")
+def test_a_pipe_is_not_replaced(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(OSError, match="not a regular file"), atomic(tmp_path / "pipe"):
+        pass
+    assert (tmp_path / "pipe").is_fifo()
+
+
+def test_files_of_others_are_not_replaced(tmp_path: Path) -> None:
+    refuse_foreign(tmp_path, ("index.html", "sheet.png"), b"mwdn demo")
+    sheet = put(tmp_path / "sheet.png", b"holiday")
+    with pytest.raises(ParameterError, match=r"sheet\.png` was not written by this command and would be lost"):
+        refuse_foreign(tmp_path, ("index.html", "sheet.png"), b"mwdn demo")
+    page = put(tmp_path / "index.html", b"<title>mwdn demo</title>")
+    refuse_foreign(tmp_path, ("index.html", "sheet.png"), b"mwdn demo")
+    sheet.unlink()
+    put(page, b"my page")
+    with pytest.raises(ParameterError, match=r"index\.html` was not written by this command"):
+        refuse_foreign(tmp_path, ("index.html", "sheet.png"), b"mwdn demo")
 
 
 @pytest.mark.parametrize(

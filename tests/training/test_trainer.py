@@ -19,6 +19,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from cameras import contour_psf
+from conftest import touch
 from mwdn.calibration import Calibration
 from mwdn.cli.app import main
 from mwdn.data.cameras import Cameras
@@ -564,6 +565,14 @@ def test_weights_of_another_run_are_not_replaced(trainer, tmp_path):
     for path in folder.glob("*.safetensors"):
         path.unlink()
     assert trainer(few(learning_rate=1e-4)).step == 0
+
+
+def test_files_of_others_are_not_replaced(trainer, tmp_path):
+    (log,) = touch(tmp_path / "run", "log.jsonl")
+    log.write_text("my diary")
+    with pytest.raises(ParameterError, match=r"log\.jsonl` was not written by this command and would be lost"):
+        trainer().run()
+    assert log.read_text() == "my diary"
 
 
 def test_damaged_or_foreign_state(trainer, tmp_path):

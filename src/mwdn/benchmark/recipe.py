@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from inspect import signature
@@ -9,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mwdn.benchmark.sets import PRESETS, DatasetRecipe
-from mwdn.errors import ParameterError, UnknownNameError, check_options
+from mwdn.errors import ParameterError, UnknownNameError, check_options, shown
 from mwdn.io.toml import find_recipe, read_toml, to_dataclass
 from mwdn.networks import NETWORKS
 from mwdn.optics import Deviation
@@ -155,6 +156,14 @@ def _methods(table: str, content: dict[str, Any], registry: Mapping[str, Any], s
     return methods
 
 
+def _check_name(name: str) -> None:
+    if not re.fullmatch(r"[\w+()=, -][\w.+()=, -]{0,99}", name):
+        raise ParameterError(
+            f"The label of a method or data set ({shown(name)}) becomes the name of a folder: it must be 1 to 100 "
+            "letters, digits, spaces and `_-+.,=()`, and not begin with a dot."
+        )
+
+
 def _scale_width(method: Method, factor: float) -> Method:
     """A network with its default width times a factor, unless the recipe gives its width."""
     if not factor > 0:
@@ -218,6 +227,8 @@ def _check(benchmark: Benchmark) -> None:
         raise ParameterError(
             "A benchmark needs methods and data: `[networks]`, `mwdn = {}`; `[data]`, `mwdn-sim = {...}`."
         )
+    for name in (*labels, *benchmark.data):
+        _check_name(name)
     for label in labels:
         if labels.count(label) > 1:
             raise ParameterError(

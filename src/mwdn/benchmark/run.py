@@ -22,7 +22,7 @@ from mwdn.benchmark.training import train
 from mwdn.data.photographs import Photographs
 from mwdn.evaluation import Perceptual
 from mwdn.evaluation.alexnet import SMALLEST, load_alexnet
-from mwdn.io.files import write_text
+from mwdn.io.files import refuse_foreign, write_text
 from mwdn.runtime.distributed import local_device
 from mwdn.training.losses import NEED_ALEXNET
 from mwdn.training.report import Report
@@ -84,6 +84,7 @@ def run(
         MwdnError: a file cannot be read, a method does not fit, training diverges, or ``out`` holds another benchmark.
     """
     torch_device = local_device(device)
+    refuse_foreign(out, (PAGE, "benchmark.md", "benchmark.json", "benchmark.csv"), b"mwdn")
     if NEED_ALEXNET & benchmark.loss.keys():
         load_alexnet(benchmark.alexnet or None, download=lpips is True)  # an error now instead of after the data
     with lock(out, "data"):

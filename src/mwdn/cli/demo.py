@@ -14,7 +14,7 @@ from mwdn.evaluation import psnr
 from mwdn.evaluation.tables import html_table
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.contact_sheets import contact_sheet, to_display
-from mwdn.io.files import write_text
+from mwdn.io.files import refuse_foreign, write_text
 from mwdn.io.images import write_picture
 from mwdn.io.pictures import dark_scene
 from mwdn.optics import Camera, Contour, Setup
@@ -26,6 +26,7 @@ SETUP = Setup(wavelengths=9)
 MASK = Contour(size_mm=(3.0, 2.5), pitch_um=4.0)
 """The open part of the paper's mask, with squares twice as large: takes a second to simulate."""
 
+FILES = ("index.html", "comparison.png", "psf.png")
 METHODS = ("universal", "pyramid", "admm", "fista", "wiener")
 Picture = Literal["astronaut", "coffee", "cat"]
 PICTURES: tuple[Picture, ...] = ("astronaut", "coffee", "cat")
@@ -44,6 +45,7 @@ def demo(
         seed: of the camera's mask and of its noise.
         pictures: names of the scenes.
     """
+    refuse_foreign(out, FILES, b"mwdn demo")
     generator = torch.Generator().manual_seed(seed)
     camera = Camera(design_camera("contour", replace(MASK, seed=seed), SETUP).psf)
     calibration = Calibration(camera.psf)
@@ -58,11 +60,12 @@ def demo(
         results = [reconstruct(measurement) for reconstruct in reconstructors.values()]
         table.add_row(name, *(f"{psnr(result.clamp(0, 1), scene).item():.2f}" for result in results))
         rows.append([scene, measurement, *results])
-    write_picture(out / "psf.png", to_display(camera.psf))
-    write_picture(out / "comparison.png", contact_sheet(rows, ["scene", "measurement", *METHODS]))
-    write_text(out / "index.html", _PAGE.format(table=html_table(table)))
+    page, comparison, psf = (out / name for name in FILES)
+    write_text(page, _PAGE.format(table=html_table(table)))
+    write_picture(comparison, contact_sheet(rows, ["scene", "measurement", *METHODS]))
+    write_picture(psf, to_display(camera.psf))
     console.print(table)
-    console.print(f"Look at {out / 'index.html'}", highlight=False, markup=False, soft_wrap=True)
+    console.print(f"Look at {page}", highlight=False, markup=False, soft_wrap=True)
 
 
 _PAGE = """<!doctype html>

@@ -16,7 +16,7 @@ from mwdn.cli.weights import ask_for_lpips
 from mwdn.evaluation import Perceptual, Variant
 from mwdn.evaluation.alexnet import SMALLEST
 from mwdn.inference.reconstructor import Reconstructor
-from mwdn.io.files import check_folder, refuse_overwrite
+from mwdn.io.files import check_folder, refuse_foreign, refuse_overwrite
 
 
 @no_empty_folder
@@ -68,6 +68,7 @@ def evaluate(  # noqa: PLR0913
     warnings = [reconstruct.warning for reconstruct in reconstructors.values()]
     warn(*warnings, other_camera(file, calibration.psf_hash))
     refuse_overwrite(out / evaluation.SHEET, *camera.files)
+    refuse_foreign(out, (evaluation.JSON, evaluation.SHEET), b'"protocol"')
     if min(part.crop(calibration.psf).shape[-2:]) >= SMALLEST:
         lpips = ask_for_lpips(lpips)
     perceptual = Perceptual.none("--no-lpips") if lpips is False else Perceptual.load(download=lpips is True)

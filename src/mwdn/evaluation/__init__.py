@@ -4,9 +4,10 @@ from mwdn.evaluation.consistency import Consistency, consistency
 from mwdn.evaluation.distances import feature_mse, l1, log_mse, lpips, mse, ssim
 from mwdn.evaluation.evaluate import First, evaluate, learnable_numbers
 from mwdn.evaluation.metrics import Perceptual, Protocol, Variant, bootstrap, measure, psnr
-from mwdn.evaluation.report import SHEET, Report, Scores
+from mwdn.evaluation.report import JSON, SHEET, Report, Scores
 
 __all__ = [
+    "JSON",
     "SHEET",
     "Consistency",
     "First",

@@ -21,6 +21,7 @@ from mwdn.export.model_file import as_export_error, publish, require_packages, r
 from mwdn.inference.fusion import fuse
 from mwdn.inference.methods import Method, as_method
 from mwdn.inference.reconstructor import Reconstructor
+from mwdn.io.files import refuse_overwrite
 from mwdn.io.pictures import dark_scene
 from mwdn.networks.network import Network, as_network
 from mwdn.optics import Camera, Sensor
@@ -112,13 +113,15 @@ def export(
     Raises:
         ExportError: the method cannot be written in this format, the file's results agree too little, onnx or
             onnxruntime is not installed, or the file cannot be written.
-        ParameterError: another suffix or precision, or options of a method that is not given by its name.
+        ParameterError: another suffix or precision, ``out`` is a symbolic link, or options of a
+            method that is not given by its name.
         UnknownNameError: no such method or option.
         CheckpointError: the checkpoint cannot be used.
         ShapeError: the network takes another number of channels.
     """
     out = Path(out)
     _check(out, precision, channels)
+    refuse_overwrite(out)
     name = str(method) if isinstance(method, str | Path) else type(method).__name__
     method = as_method(method, **options)
     channels = channels or calibration.psf.shape[1]

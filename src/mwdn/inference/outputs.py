@@ -34,7 +34,7 @@ def check_outputs(
 
     Raises:
         ParameterError: two captures have the same output, an output would overwrite an input or a ``.json`` that is
-            not of this package, or ``out`` is a file.
+            not of this package, an output is a symbolic link, or ``out`` is a file.
     """
     if out.exists() and not out.is_dir():
         raise ParameterError(f"`{out}` must be a folder, but is a file. Choose another one: `--out`.")
@@ -44,8 +44,12 @@ def check_outputs(
     def check(output: str) -> None:
         if real(output) in inputs:
             raise ParameterError(f"`{output}` would overwrite an input. Choose another folder: `--out`.")
+        if output in links:
+            raise ParameterError(f"`{output}` is a link to `{links[output]}`. Choose another folder: `out`.")
 
-    existing = {path.name for path in out.glob("*.json")}
+    paths = list(out.iterdir()) if out.exists() else []
+    existing = {path.name for path in paths if path.suffix == ".json"}
+    links = {str(path): path.readlink() for path in paths if path.is_symlink()}
     check(str(out / SUMMARY))
     sources = {SUMMARY: "the summary picture"}
     start = str(out / "x").removesuffix("x")  # text instead of paths: there may be a million captures

@@ -5,7 +5,7 @@ import json
 import os
 import secrets
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -26,15 +26,17 @@ def atomic(path: Path) -> Iterator[Path]:
     before that, an existing ``path`` keeps its content and the hidden file is removed.
 
     Args:
-        path: the file to write. Missing folders are created; a symbolic link is followed, not replaced.
+        path: the file to write. Missing folders are created.
 
     Yields:
         The temporary name to write to: same folder and suffix as ``path``, unique to this call.
 
     Raises:
-        OSError: the folder cannot be written to, the disk is full, or ``path`` is a folder.
+        OSError: the folder cannot be written to, the disk is full, or ``path`` is something else than a regular file:
+            a folder, a device, or a symbolic link, which may lead to a file that nobody meant to replace.
     """
-    path = path.resolve()
+    path = path.absolute()
+    check_regular(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     # Without the stem of `path`: a long one plus the token could exceed the 255 bytes of a file name.
     temporary = path.with_name(f".mwdn-{os.getpid()}-{secrets.token_hex(4)}{path.suffix}")
@@ -48,6 +50,20 @@ def atomic(path: Path) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def check_regular(path: Path) -> None:
+    """Check that a file to be written is new or a regular file.
+
+    Raises:
+        OSError: it is a folder, a device, a pipe or a symbolic link.
+    """
+    if path.is_symlink():
+        raise OSError(errno.ELOOP, f"it is a symbolic link to `{path.readlink()}`, which is not followed", str(path))
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EINVAL, "it is not a regular file", str(path))
 
 
 @contextmanager
@@ -109,14 +125,41 @@ def check_folder(folder: Path) -> None:
 
 
 def refuse_overwrite(output: Path, *inputs: Path | None) -> None:
-    """Check that an output file is not one of the inputs.
+    """Check that an output file can be written and is not one of the inputs.
 
     Raises:
-        ParameterError: it is one of them.
+        ParameterError: it is one of them, or something else than a regular file.
     """
+    try:
+        check_regular(output)
+    except OSError as error:
+        raise ParameterError(f"`{output}` cannot be written: {error.strerror}. Choose another name: `out`.") from None
     for path in filter(None, inputs):
         if output.exists() and path.exists() and output.samefile(path):
             raise ParameterError(f"`{output}` would overwrite an input. Choose another name: `out`.")
+
+
+def refuse_foreign(folder: Path, files: Sequence[str], mark: bytes) -> None:
+    """Check that existing files of a folder, which will be replaced, are results of this package.
+
+    Args:
+        folder: the output folder.
+        files: names of the files that will be replaced. The first tells whose they are, and is written first.
+        mark: bytes in the first file if this package wrote it.
+
+    Raises:
+        ParameterError: one of the files exists and is somebody else's, or is no regular file.
+    """
+    for name in files:
+        refuse_overwrite(folder / name)
+    first = folder / files[0]
+    if first.is_file() and mark in first.read_bytes():
+        return
+    foreign = next((folder / name for name in files if (folder / name).exists()), None)
+    if foreign is not None:
+        raise ParameterError(
+            f"`{foreign}` was not written by this command and would be lost. Choose another folder: `out`."
+        )
 
 
 def path_resolver() -> Callable[[str], str]:

@@ -11,7 +11,7 @@ from typing import Any
 from torch import Tensor
 
 from mwdn.errors import CheckpointError, ParameterError
-from mwdn.io.files import as_parameter_error, check_folder, write_text
+from mwdn.io.files import as_parameter_error, check_folder, refuse_foreign, write_text
 from mwdn.io.reading import LOG_BYTES, TEXT_BYTES, read_bytes
 from mwdn.runtime import distributed
 from mwdn.training.recipe import Recipe, with_current_names
@@ -115,7 +115,8 @@ class RunFolder:
         """Keep other runs out of the folder; the lock ends with the process at the latest.
 
         Raises:
-            ParameterError: another run is using the folder, or it cannot be written to.
+            ParameterError: another run is using the folder, it cannot be written to, or it holds files of the same
+                names that are not of a run.
         """
         if distributed.rank() or sys.platform == "win32":
             yield
@@ -123,6 +124,7 @@ class RunFolder:
         import fcntl
 
         check_folder(self.path)
+        refuse_foreign(self.path, ("recipe.json", "log.jsonl"), b'"recipe"')
         self.path.mkdir(parents=True, exist_ok=True)
         handle = os.open(self.path, os.O_RDONLY)  # the folder itself: a lock file would stay behind
         try:
