@@ -63,6 +63,13 @@ def test_dark_capture_and_lower_bits(light, calibration):
     assert darkness(np.float32(0.02) * stored(light).astype(np.float32), calibration).state == "unknown"
 
 
+def test_bit_depth_is_advised_only_where_it_can_be_given(light, calibration):
+    """`--bit-depth 12` was advised for 8-bit files, which refuse it."""
+    ten, twelve, eight = 500 / 65535 * light, 1500 / 65535 * light, 0.02 * light
+    frames = stored(ten), stored(twelve), stored(eight, 8)
+    assert [darkness(f, calibration).options for f in frames] == ["--bit-depth 10", "--bit-depth 12", ""]
+
+
 def test_even_light_is_bounded(light, calibration):
     """One capture cannot tell it from bright surroundings."""
     verdict = ambient_light(stored(0.5 * light + 0.2), calibration)

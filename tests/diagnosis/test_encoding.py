@@ -80,5 +80,12 @@ def test_low_contrast_without_noise_cannot_tell(psf, light, code):
     assert (verdict.state, verdict.value) == ("unknown", "")
 
 
+def test_a_jpeg_that_cannot_tell_is_coded(psf, light):
+    """Six of eight of DiffuserCam's captures as JPEG stayed open. Evidence of a linear capture counts for more."""
+    verdict = gamma(file(0.5 + 0.02 * light, "srgb", 8), Calibration(psf), for_viewing=True)
+    assert (verdict.state, verdict.options) == ("doubt", "--gamma srgb")
+    assert gamma(file(light, "linear", 8), Calibration(psf), for_viewing=True).value == "linear"
+
+
 def test_an_empty_frame_cannot_tell(psf):
     assert gamma(np.zeros((SIDE, SIDE, 1), np.uint8), Calibration(psf)).state == "unknown"

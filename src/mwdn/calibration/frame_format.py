@@ -154,12 +154,17 @@ class FrameFormat:
         if frame.dtype.kind == "f":
             return 0, 1
         maximum, largest = int(self.full_scale(frame)), int(frame.max())
-        # Sensors that store 12 bits in the upper bits of 16 saturate at 65,520. Others store 10, 12 or 14 bits in the
-        # lower bits, and the bit depth may not have been given. In both cases the frame's largest number counts.
-        in_lower_bits = self.bit_depth is None and maximum > 255 and largest in (1023, 4095, 16383)
-        if in_lower_bits or largest > 0.98 * maximum:
+        bits = self.possible_bit_depth(frame)
+        # Sensors that store 12 bits in the upper bits of 16 saturate at 65,520. Others store them in the lower bits,
+        # and the bit depth may not have been given. In both cases the frame's largest number counts.
+        if largest > 0.98 * maximum or (bits and largest == 2**bits - 1):
             maximum = largest
         return int((frame.max(axis=-1) >= maximum).sum()), maximum
+
+    def possible_bit_depth(self, frame: Frame) -> int | None:
+        """Least of 10, 12 and 14 bits that hold a frame of 16, unless a bit depth is given; or it is only dark."""
+        is_open = self.bit_depth is None and frame.dtype == np.uint16
+        return next((bits for bits in (10, 12, 14) if is_open and frame.max() < 2**bits), None)
 
     def full_size(self, frame: Frame) -> Size:
         """Height and width of a raw frame's measurement before binning."""

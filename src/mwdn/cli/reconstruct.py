@@ -109,7 +109,6 @@ def reconstruct(  # noqa: PLR0913
                 f"PSF {calibration.psf_hash}, background {background} of the full scale subtracted", soft_wrap=True
             )
         resume = distributed.world_size() > 1 if resume is None else resume
-        psf_exif = orientation(camera.psf_file) if camera.psf_format.psf_orientation is None else None
         if is_first:
             _name_turn((camera.psf_file, *files[:SHOWN]))
         batch = Batch(
@@ -120,7 +119,7 @@ def reconstruct(  # noqa: PLR0913
             check_consistency=trust,
             map=map,
             resume=resume,
-            psf_exif=psf_exif,
+            psf_file=Path(camera.psf_file),
             full_size=full_size,
         )
         failed, existing = _run(batch, files)

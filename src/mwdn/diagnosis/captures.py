@@ -8,6 +8,7 @@ from mwdn.calibration.psf import SATURATED_PART
 from mwdn.diagnosis.encoding import gamma
 from mwdn.diagnosis.mosaic import mosaic
 from mwdn.diagnosis.noise import noise
+from mwdn.diagnosis.psf_encoding import psf_gamma
 from mwdn.diagnosis.verdict import Verdict
 from mwdn.types import Frame
 
@@ -18,7 +19,9 @@ FAINT = 0.05
 """Fraction of the light that may be ambient without a word."""
 
 
-def examine_capture(frame: Frame, calibration: Calibration) -> tuple[Verdict, ...]:
+def examine_capture(
+    frame: Frame, calibration: Calibration, *, for_viewing: bool = False, psf_for_viewing: bool = False
+) -> tuple[Verdict, ...]:
     """Run all checks that need nothing but a raw frame and the camera's calibration.
 
     A new check is one more entry here: a function that returns a `Verdict`.
@@ -26,11 +29,15 @@ def examine_capture(frame: Frame, calibration: Calibration) -> tuple[Verdict, ..
     Args:
         frame: (H, W, C), as `FrameFormat.read` returns it.
         calibration: the camera's.
+        for_viewing: the capture's file is of a type for viewing (`mwdn.io.formats.is_for_viewing`).
+        psf_for_viewing: the PSF's file is.
     """
     raw = mosaic(frame, calibration)
-    # Between pixels of other colours the noise of a level cannot be seen: first the mosaic, then the gamma.
-    checks = (saturation, darkness, noise, ambient_light) + (() if raw.state == "doubt" else (gamma,))
-    return (*(check(frame, calibration) for check in checks), raw)
+    verdicts = *(check(frame, calibration) for check in (saturation, darkness, noise, ambient_light)), raw
+    if raw.state == "doubt":  # between pixels of other colours the noise of a level cannot be seen: first the mosaic
+        return verdicts
+    code = gamma(frame, calibration, for_viewing=for_viewing)
+    return *verdicts, code, psf_gamma(frame, calibration, code.value, for_viewing=psf_for_viewing)
 
 
 def saturation(frame: Frame, calibration: Calibration) -> Verdict:
@@ -51,8 +58,9 @@ def darkness(frame: Frame, calibration: Calibration) -> Verdict:
     part = brightest / calibration.frames.full_scale(frame)
     text = f"The brightest thousandth of the capture starts at {part:.1%} of the full scale"
     if part < DIM:
-        text = f"{text}: too dark, or in the lower bits of its file."
-        return Verdict("capture", "darkness", "doubt", text, "darkness", "--bit-depth 12")
+        bits = calibration.frames.possible_bit_depth(frame)
+        text = f"{text}: too dark" + (", or in the lower bits of its file." if bits else ".")
+        return Verdict("capture", "darkness", "doubt", text, "darkness", f"--bit-depth {bits}" if bits else "")
     return Verdict("capture", "darkness", "good", f"{text}.")
 
 

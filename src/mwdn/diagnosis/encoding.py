@@ -7,7 +7,10 @@ slope of log(variance) against log(level) is 1 for linear captures and -0.2 for 
 
 **Misfit.** Light adds up, so a scene explains a linear capture through the PSF, and not its power. With decoded and
 stored numbers in turn, a non-negative scene is fitted at a quarter of the size; the part of the capture's detail that
-is left is compared. An even background does not count as detail.
+is left is compared. An even background does not count as detail. The PSF's file may be coded, too, so the PSF is tried
+as stored and decoded, and the better one counts.
+
+**File.** Cameras and programs write gamma-coded JPEGs, practically always.
 
 Each gives the logarithm of a likelihood ratio, positive for linear captures. They are added.
 """
@@ -29,7 +32,7 @@ from mwdn.solvers.alignment import fine_detail
 from mwdn.solvers.levels import Level
 from mwdn.solvers.pyramid import halve, solve
 from mwdn.solvers.splitting import Penalties
-from mwdn.types import Frame, Image
+from mwdn.types import Frame, Image, Psf
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -48,6 +51,10 @@ SMALLEST = 64
 SURE = 1.3
 """Smallest logarithm of the likelihood ratio that decides: 1.1 gave 4 wrong answers of 200 with seed 28, 1.3 gives 3,
 and none of 200 with seed 29, which chose nothing."""
+
+FOR_VIEWING = -1.5
+"""Logarithm of the likelihood ratio of a file type for viewing: enough to decide alone, and little evidence of a linear
+capture leaves it open. Real ones are rarer: e^-4 to e^-5. A quarter of the simulated JPEGs are linear."""
 
 # At an eighth to a quarter of the frame's size, where noise is low and detail is left.
 _LEVELS = (Level(2, 20, Penalties(0.15, 0.0, 0.6)), Level(1, 12, Penalties(0.1, 1.5, 1.5), 0.02, min_smoothing=0.5))
@@ -81,14 +88,24 @@ class Misfits(NamedTuple):
     """What the best scenes leave of a capture's detail.
 
     Args:
-        stored: part of the detail of the numbers as stored.
-        decoded: part of the detail of the numbers decoded from sRGB.
+        linear_psf: part of the detail of the numbers as stored, and of them decoded from sRGB, if the PSF is linear.
+        coded_psf: the same if the PSF is decoded, too.
         change: part of the detail that differs between the two; small for a capture of low contrast.
     """
 
-    stored: float
-    decoded: float
+    linear_psf: tuple[float, float]
+    coded_psf: tuple[float, float]
     change: float
+
+    @property
+    def stored(self) -> float:
+        """Part that is left of the numbers as stored, by the better PSF."""
+        return min(self.linear_psf[0], self.coded_psf[0])
+
+    @property
+    def decoded(self) -> float:
+        """Part that is left of the decoded numbers, by the better PSF."""
+        return min(self.linear_psf[1], self.coded_psf[1])
 
     @property
     def evidence(self) -> float:
@@ -96,8 +113,13 @@ class Misfits(NamedTuple):
         ratio = 2.5 * (math.log(self.decoded / self.stored) - 0.5) * min(1.0, self.change / 0.07)
         return max(-4.0, min(4.0, ratio))
 
+    def of_psf(self, capture: str) -> float:
+        """Logarithm of the misfit of the linear PSF over that of the decoded, of a "linear" or "srgb" capture."""
+        number = 0 if capture == "linear" else 1
+        return math.log(self.linear_psf[number] / self.coded_psf[number])
 
-def gamma(frame: Frame, calibration: Calibration) -> Verdict:
+
+def gamma(frame: Frame, calibration: Calibration, *, for_viewing: bool = False) -> Verdict:
     """Whether a capture is linear in light, and whether ``--gamma`` says so.
 
     The value is "linear" or "srgb"; a power of 2.2 counts as sRGB.
@@ -105,6 +127,7 @@ def gamma(frame: Frame, calibration: Calibration) -> Verdict:
     Args:
         frame: (H, W, C), numbers as stored.
         calibration: the camera's; the capture must fit its PSF.
+        for_viewing: the capture's file is of a type for viewing, such as JPEG.
     """
     if min(calibration.size) < SMALLEST:
         return Verdict("capture", "gamma", "unknown", "The capture is too small to show whether it is gamma-coded.")
@@ -115,6 +138,10 @@ def gamma(frame: Frame, calibration: Calibration) -> Verdict:
         evidence += fits.evidence
         reasons = reasons if abs(slope.evidence) > SURE / 2 else []
         reasons += [f"the PSF leaves {fits.stored:.1%} of its detail unexplained, decoded from sRGB {fits.decoded:.1%}"]
+    if for_viewing:
+        reasons = reasons if evidence < -SURE else []
+        evidence += FOR_VIEWING
+        reasons += ["it is a JPEG or WebP"] if evidence < 0 else []
     if abs(evidence) < SURE:
         text = "This capture cannot tell whether it is gamma-coded. Frames of a sensor are linear, JPEGs are coded."
         return Verdict("capture", "gamma", "unknown", text)
@@ -155,15 +182,31 @@ def misfits(frame: Frame, calibration: Calibration) -> Misfits:
     both = bin_pixels(torch.cat([_middle(image) for image in captures]).clamp(0, 1), factor)
     both = halve(halve(both))
     both = both / both.amax((1, 2, 3), keepdim=True).clamp(min=1e-30)
-    # Binned, not halved: what the filter of `halve` blurs is the scene.
-    residual = solve(both, bin_pixels(_middle(calibration.psf), 4 * factor), _LEVELS).residual
-    left, detail = fine_detail(residual).flatten(1), fine_detail(both).flatten(1)
+    detail = fine_detail(both).flatten(1)
     energy = detail.square().sum(1)
     if energy.amin() <= 0:
-        return Misfits(1.0, 1.0, 0.0)
-    stored, decoded = (left.square().sum(1) / energy).clamp(min=1e-6).tolist()
+        return Misfits((1.0, 1.0), (1.0, 1.0), 0.0)
+    # Binned, not halved: what the filter of `halve` blurs is the scene.
+    psfs = [bin_pixels(_middle(psf), 4 * factor) for psf in as_linear_and_coded(calibration)]
+    left = (fine_detail(solve(both, psf, _LEVELS).residual).flatten(1).square().sum(1) for psf in psfs)
+    linear_psf, coded_psf = ((energies / energy).clamp(min=1e-6).tolist() for energies in left)
     change = 1 - float((detail[0] @ detail[1]).square() / energy.prod())
-    return Misfits(stored, decoded, change)
+    return Misfits(tuple(linear_psf), tuple(coded_psf), change)
+
+
+def as_linear_and_coded(calibration: Calibration) -> tuple[Psf, Psf]:
+    """The PSF if its file is linear, and if it holds light raised to the power of 1 / 2.2.
+
+    The background is added back, decoded or encoded with the PSF, and subtracted again: numbers that were clipped at
+    the background stay there.
+    """
+    psf, channels = calibration.psf, (1, -1, 1, 1)
+    light = torch.tensor(calibration.light or [1.0]).reshape(channels)
+    level = torch.tensor(calibration.background or [0.0]).reshape(channels)
+    power = 2.2 if calibration.psf_format.psf_gamma is None else 1 / 2.2
+    other = (psf * light + level) ** power - level**power
+    other = other / other.sum((-2, -1), keepdim=True)
+    return (psf, other) if calibration.psf_format.psf_gamma is None else (other, psf)
 
 
 def _middle(image: Image) -> Tensor:

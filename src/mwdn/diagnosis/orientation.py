@@ -100,11 +100,14 @@ def fit_orientations(
     return replace(fit, given=given)
 
 
+def fit_half_turns(measurement: Measurement, psf: Psf) -> OrientationFit:
+    """Fit the best scene through a PSF, its mirror images, and it turned by 180 degrees."""
+    return _fit_each(measurement, psf, ("", *(name for name in get_args(Orientation) if not swaps_axes(name))))
+
+
 def _fit(measurement: Measurement, psf: Psf) -> OrientationFit:
-    names = get_args(Orientation)
-    half_turns = ("", *(name for name in names if not swaps_axes(name)))
-    quarter_turns = tuple(name for name in names if swaps_axes(name))
-    fit = _fit_each(measurement, psf, half_turns)
+    quarter_turns = tuple(name for name in get_args(Orientation) if swaps_axes(name))
+    fit = fit_half_turns(measurement, psf)
     if fit.lead < CLEAR and psf.shape[-2] == psf.shape[-1]:
         others = _fit_each(measurement, psf, quarter_turns)
         fit = replace(fit, misfits={**fit.misfits, **others.misfits})

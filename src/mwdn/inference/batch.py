@@ -23,6 +23,7 @@ from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.contact_sheets import contact_sheet, thumbnail, to_display
 from mwdn.io.exif import orientation
 from mwdn.io.files import as_image_error, write_json
+from mwdn.io.formats import is_for_viewing
 from mwdn.io.images import read_frame, read_picture, write_linear, write_picture
 from mwdn.io.support_picture import support_picture
 from mwdn.runtime import distributed
@@ -98,7 +99,7 @@ class Batch:
             ``check_consistency``.
         resume: skip each capture whose picture exists with the same hash (`mwdn.inference.origin`), and with a
             consistency check and a map if they are requested.
-        psf_exif: EXIF orientation of the PSF's file, to compare with the captures'; ``None`` to compare nothing.
+        psf_file: file of the PSF: its EXIF orientation is compared with the captures', its type tells about its gamma.
         full_size: interpolate the pictures of binned captures to the captures' size before binning.
     """
 
@@ -109,7 +110,7 @@ class Batch:
     check_consistency: bool = True
     map: bool = False
     resume: bool = False
-    psf_exif: int | None = None
+    psf_file: Path | None = None
     full_size: bool = False
 
     def run(
@@ -163,9 +164,14 @@ class Batch:
         job = replace(job, measurement=measurement, full_size=full_size)
         if not self.check_consistency:
             return job
-        verdicts = examine_capture(frame, calibration)
-        if self.psf_exif is not None:
-            verdicts += (exif_turn(orientation(job.capture), self.psf_exif),)
+        verdicts = examine_capture(
+            frame,
+            calibration,
+            for_viewing=is_for_viewing(job.capture),
+            psf_for_viewing=self.psf_file is not None and is_for_viewing(self.psf_file),
+        )
+        if self.psf_file is not None and calibration.psf_format.psf_orientation is None:
+            verdicts += (exif_turn(orientation(job.capture), orientation(self.psf_file)),)
         return replace(job, pose=align(measurement, self.reconstruct.psf), verdicts=verdicts)
 
     def _check_fit(self, measurement: Measurement) -> None:

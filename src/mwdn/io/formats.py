@@ -2,6 +2,7 @@
 
 import logging
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +64,13 @@ def kind_of(start: bytes) -> str | None:
     if start[:4] == b"RIFF" and start[8:12] == b"WEBP":
         return "WebP"
     return next((kind for signature, kind in _SIGNATURES.items() if start.startswith(signature)), None)
+
+
+def is_for_viewing(path: str | Path) -> bool:
+    """Whether a file is a JPEG or WebP, which cameras and programs write gamma-coded."""
+    with suppress(OSError), Path(path).open("rb") as file:  # whoever reads the pixels says what is wrong
+        return kind_of(file.read(12)) in ("JPEG", "WebP")
+    return False
 
 
 def _kind(path: Path) -> str:
