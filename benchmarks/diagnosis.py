@@ -2,8 +2,9 @@
 
     python benchmarks/diagnosis.py ../shared/data [--count 200] [--seed 28] [--only gamma mosaic]
 
-First the real captures (a table: capture, true state, detected), then simulated variants (`benchmarks/variants.py`),
-then for each property the share of right, wrong and unknown answers. Thresholds are chosen with other seeds than 28.
+First the real captures (`known_captures.py`), then simulated variants (`variants.py`), then for each property the share
+of right, wrong and unknown answers; with ``--table``, from the file of results, a table of the real captures. A run
+that was interrupted goes on. Thresholds are chosen with other seeds than 28.
 
 A detector is right if its `Verdict.value` is the truth, or lists it: "rggb|bggr". An unknown state is neither right nor
 wrong.
@@ -12,23 +13,25 @@ wrong.
 import argparse
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from known_captures import Variant, real_captures
 from mwdn import Calibration
 from mwdn.diagnosis import Verdict
 from mwdn.diagnosis.captures import ambient_light, noise
 from mwdn.diagnosis.encoding import gamma
 from mwdn.diagnosis.mosaic import mosaic
 from mwdn.diagnosis.orientation import fit_orientations
+from mwdn.diagnosis.psf_encoding import psf_gamma
 from mwdn.diagnosis.sizes import fitting_size
 from mwdn.io.files import atomic
-from variants import Sources, Variant, draw, real_captures
+from variants import Sources, draw
 
-Detector = Callable[[np.ndarray, Calibration], Verdict]
+Detector = Callable[[Variant, Calibration], Verdict]
 
 
 def fitted_bin(frame: np.ndarray, calibration: Calibration) -> Verdict:
@@ -39,39 +42,58 @@ def fitted_bin(frame: np.ndarray, calibration: Calibration) -> Verdict:
     return fitting_size(measurement, calibration)
 
 
+def gamma_of_psf(variant: Variant, calibration: Calibration) -> Verdict:
+    """As `examine_capture` calls it. The type of the PSF's file is not used."""
+    capture = gamma(variant.frame, calibration, for_viewing=variant.is_jpeg)
+    return psf_gamma(variant.frame, calibration, capture.value)
+
+
 DETECTORS: dict[str, Detector] = {
-    "gamma": gamma,
-    "mosaic": mosaic,
-    "orientation": lambda frame, calibration: fit_orientations(calibration.correct(frame), calibration.psf).verdict,
-    "bin": fitted_bin,
-    "noise": noise,
-    "ambient": ambient_light,
+    "gamma": lambda variant, calibration: gamma(variant.frame, calibration, for_viewing=variant.is_jpeg),
+    "psf-gamma": gamma_of_psf,
+    "mosaic": lambda variant, calibration: mosaic(variant.frame, calibration),
+    "orientation": lambda variant, calibration: (
+        fit_orientations(calibration.correct(variant.frame), calibration.psf).verdict
+    ),
+    "bin": lambda variant, calibration: fitted_bin(variant.frame, calibration),
+    "noise": lambda variant, calibration: noise(variant.frame, calibration),
+    "ambient": lambda variant, calibration: ambient_light(variant.frame, calibration),
 }
-"""A detector for each property of `Variant.truth`: called with the capture's frame and the calibration."""
+"""A detector for each property of `Variant.truth`."""
 
 
-def judge(variant: Variant, only: list[str]) -> Iterator[dict[str, object]]:
-    """One row for each property of the variant that has a detector."""
-    for name, detect in DETECTORS.items():
-        if name not in variant.truth or (only and name not in only):
-            continue
-        calibration, start = variant.calibration(name), time.perf_counter()
-        verdict = detect(variant.frame, calibration)
-        truth = variant.truth[name]
-        candidates = verdict.value.split("|")
-        answer = "unknown" if verdict.state == "unknown" else "right" if truth in candidates else "wrong"
-        yield {
-            "capture": variant.name,
-            "property": name,
-            "truth": truth,
-            "detected": verdict.value,
-            "state": verdict.state,
-            "answer": answer,
-            "among": len(candidates),
-            "text": verdict.text,
-            "seconds": round(time.perf_counter() - start, 3),
-            "drawn": variant.drawn,
-        }
+def judge(variant: Variant, name: str) -> dict[str, object]:
+    """One row: what the detector of this property says."""
+    calibration, start = variant.calibration(name), time.perf_counter()
+    verdict = DETECTORS[name](variant, calibration)
+    seconds, candidates = time.perf_counter() - start, verdict.value.split("|")
+    is_right = variant.truth[name] in candidates
+    return {
+        "capture": variant.name,
+        "property": name,
+        "truth": variant.truth[name],
+        "detected": verdict.value,
+        "state": verdict.state,
+        "answer": "unknown" if verdict.state == "unknown" else "right" if is_right else "wrong",
+        "among": len(candidates),
+        "text": verdict.text,
+        "seconds": round(seconds, 3),
+    }
+
+
+def judge_all(variants: Iterable[Variant], only: list[str], progress: Path) -> Iterator[dict[str, object]]:
+    """A row for each property that has a detector; those in the file of progress are not judged again."""
+    lines = progress.read_text().splitlines() if progress.is_file() else []
+    done = {(row["capture"], row["property"]): row for row in map(json.loads, lines)}
+    with progress.open("a") as file:
+        for variant in variants:
+            for name in (name for name in DETECTORS if name in variant.truth and (not only or name in only)):
+                row = done.get((variant.name, name)) or judge(variant, name)
+                if (variant.name, name) not in done:
+                    print(json.dumps(row), file=file, flush=True)
+                if row["answer"] == "wrong":
+                    print(*(f"{key}: {row[key]}" for key in ("capture", "property", "truth", "text")), variant.drawn)
+                yield row
 
 
 def shares(rows: list[dict[str, object]]) -> Iterator[str]:
@@ -86,6 +108,23 @@ def shares(rows: list[dict[str, object]]) -> Iterator[str]:
         yield f"| {name} | {len(those)} | {parts} | {max(row['seconds'] for row in those):.2f} s |"
 
 
+def table(rows: list[dict[str, object]]) -> Iterator[str]:
+    """A table of captures: for each property the truth, or how the answer differs from it."""
+    names = list(dict.fromkeys(row["property"] for row in rows))
+    yield f"| capture, PSF | {' | '.join(names)} |"
+    yield "| --- " * (len(names) + 1) + "|"
+    for capture in dict.fromkeys(row["capture"] for row in rows):
+        cells = {row["property"]: _cell(row) for row in rows if row["capture"] == capture}
+        yield f"| {capture} | {' | '.join(cells.get(name, '') for name in names)} |"
+
+
+def _cell(row: dict[str, object]) -> str:
+    truth, detected = (str(row[key]).replace("|", " or ") or "none" for key in ("truth", "detected"))
+    if row["answer"] == "unknown":
+        return f"{truth}: cannot tell"
+    return truth if truth == detected else f"{truth}: {detected}" + " (wrong)" * (row["answer"] == "wrong")
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path)
@@ -93,26 +132,23 @@ def main():
     parser.add_argument("--seed", type=int, default=28)
     parser.add_argument("--only", nargs="*", default=[], help="properties")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/diagnosis.json"))
+    parser.add_argument("--table", action="store_true", help="print the table of an earlier run's real captures")
     arguments = parser.parse_args()
+    if arguments.table:
+        print(*table(json.loads(arguments.out.read_text())["real"]), sep="\n")
+        return
     torch.set_num_threads(1)
-    print("| capture | property | truth | detected | state |\n| --- | --- | --- | --- | --- |")
-    real = []
-    for capture in real_captures(arguments.data):
-        for row in judge(capture, arguments.only):
-            real.append(row)
-            print("|", " | ".join(str(row[key]) for key in ("capture", "property", "truth", "detected", "state")), "|")
+    progress = arguments.out.with_suffix(f".seed-{arguments.seed}.progress")
+    real = list(judge_all(real_captures(arguments.data), arguments.only, progress))
     sources = Sources(arguments.data)
-    simulated = []
-    for number in range(arguments.count):
-        for row in judge(draw(sources, arguments.seed, number), arguments.only):
-            simulated.append(row)
-            if row["answer"] == "wrong":
-                print(*(f"{key}: {row[key]}" for key in ("capture", "property", "truth", "text", "drawn")), sep=", ")
+    draws = (draw(sources, arguments.seed, number) for number in range(arguments.count))
+    simulated = list(judge_all(draws, arguments.only, progress))
     for title, rows in (("Real captures", real), (f"{arguments.count} variants", simulated)):
         print("", f"{title}:", "", *shares(rows), sep="\n")
+    lines = [",\n".join(json.dumps(row) for row in rows) for rows in (real, simulated)]
     with atomic(arguments.out) as temporary:
-        record = {"seed": arguments.seed, "real": real, "variants": simulated}
-        temporary.write_text(json.dumps(record, indent=1) + "\n")
+        temporary.write_text('{{"seed": {}, "real": [\n{}],\n"variants": [\n{}]}}\n'.format(arguments.seed, *lines))
+    progress.unlink()
 
 
 if __name__ == "__main__":
