@@ -64,7 +64,7 @@ wider field, so the scene is larger for them.
 Frequencies that the spectrum does not pass can be recovered only with prior knowledge of pictures. A PSF of few bright
 spots (pinholes) gives the best picture where light is plentiful, and needs the longest exposure.
 
-[optics.md](optics.md) explains how to design a mask.
+[optics.md](optics.md) explains how to design a mask, and how to compute the PSF of your own.
 
 ## Designed and measured PSF of the paper's camera
 

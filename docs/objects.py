@@ -31,7 +31,8 @@ def main(camera: Path, weights: str, out: Path = Path("docs/objects.jpg")) -> No
     half = (len(rows) + 1) // 2
     pairs = [left + right for left, right in zip(rows[:half], rows[half:], strict=True)]
     sheet = srgb_encode(contact_sheet(pairs, 2 * ["ADMM", "pyramid", "network"], height=200))
-    cv2.imwrite(str(out), (sheet[0].flip(0).permute(1, 2, 0) * 255).round().byte().numpy())
+    pixels = (sheet[0].flip(0).permute(1, 2, 0) * 255).round().byte().numpy()
+    cv2.imwrite(str(out), pixels, [cv2.IMWRITE_JPEG_QUALITY, 75])
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import torch
+from torch.nn import functional as F
 
 from mwdn import Calibration, Reconstructor, to_display
 from mwdn.io.contact_sheets import contact_sheet
@@ -28,6 +29,12 @@ def rows(calibration: Calibration, captures: list[Path], *, middle: int = 0) -> 
     return sheet
 
 
+def widened(column: list[list[torch.Tensor]]) -> list[list[torch.Tensor]]:
+    """Pad a column's pictures with white to the shape of its widest one, so that they stand under their titles."""
+    shape = max(pair[0].shape[-1] / pair[0].shape[-2] for pair in column)
+    return [[F.pad(p, (0, round(p.shape[-2] * shape) - p.shape[-1]), value=1.0) for p in pair] for pair in column]
+
+
 def main(data: Path, out: Path = Path("docs/universal.jpg")) -> None:
     """Reconstruct all captures and draw the sheet."""
     camera, diffusercam, tutorial = data / "mwdn-camera", data / "diffusercam", data / "diffusercam-tutorial"
@@ -45,9 +52,11 @@ def main(data: Path, out: Path = Path("docs/universal.jpg")) -> None:
     ]
     third = -(-len(pairs) // 3)
     pairs += [[torch.ones_like(p) for p in pairs[0]]] * (3 * third - len(pairs))
-    lines = [a + b + c for a, b, c in zip(pairs[:third], pairs[third : 2 * third], pairs[2 * third :], strict=True)]
+    columns = [widened(pairs[i : i + third]) for i in range(0, 3 * third, third)]
+    lines = [a + b + c for a, b, c in zip(*columns, strict=True)]
     sheet = srgb_encode(contact_sheet(lines, 3 * ["ADMM", "universal"], height=180))
-    cv2.imwrite(str(out), (sheet[0].flip(0).permute(1, 2, 0) * 255).round().byte().numpy())
+    pixels = (sheet[0].flip(0).permute(1, 2, 0) * 255).round().byte().numpy()
+    cv2.imwrite(str(out), pixels, [cv2.IMWRITE_JPEG_QUALITY, 72])
 
 
 if __name__ == "__main__":
