@@ -105,7 +105,7 @@ def test_a_bin_of_1_is_kept_because_it_refuses_automatic_binning(run):
         ("reconstruct capture.png", "`--psf psf.png`, or its camera file, `--camera camera.toml`"),
         ("inspect", "`--psf psf.png`, or its camera file"),
         ("calibrate", "`--psf psf.png`, or its camera file"),
-        ("reconstruct capture.png --camera none.toml", "`none.toml` cannot be read as a camera file"),
+        ("reconstruct capture.png --camera none.toml", "`none.toml` does not exist"),
         ("calibrate lab/psf.png -o capture.png", "must end in .toml"),
         ("calibrate lab/psf.png --grey --white-balance psf", "needs a PSF in colour"),
         ("reconstruct capture.png --psf lab/psf.png --white-balance 1 -1 1", "`--white-balance`"),

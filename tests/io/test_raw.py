@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from image_files import dng, put
-from mwdn import FrameFormat
-from mwdn.errors import ImageError
-from mwdn.io.images import read_frame, read_picture
+from mwdn import Calibration, FrameFormat
+from mwdn.errors import ImageError, ParameterError
+from mwdn.io.images import read_frame, read_picture, write_frame
 from mwdn.io.raw import Mosaic, read_raw
 
 BLACK, WHITE = 64, 1023
@@ -54,6 +54,21 @@ def test_a_raw_file_needs_no_options(tmp_path: Path, colours: str) -> None:
     # A given order is preferred to that of the file.
     other = FrameFormat(mosaic="rggb" if colours != "rggb" else "bggr")
     assert not np.allclose(other.to_measurement(other.read(path)).mean((0, 2, 3)), expected, atol=0.01)
+
+
+def test_crop_counts_the_pixels_of_the_sensor(tmp_path: Path, mosaic: np.ndarray) -> None:
+    """It counted cells, so the same numbers cropped a raw file and the TIFF made of it differently."""
+    path, tiff = put(tmp_path / "psf.dng", dng(mosaic, "gbrg")), tmp_path / "psf.tif"
+    write_frame(tiff, read_raw(path).frame)
+    raw = Calibration.from_file(path, crop=(20, 24), background=0.0)
+    plain = Calibration.from_file(tiff, crop=(20, 24), background=0.0, mosaic="gbrg")
+    assert raw.size == (10, 12)
+    assert raw.frames == plain.frames
+    np.testing.assert_array_equal(raw.psf, plain.psf)
+    np.testing.assert_array_equal(raw.correct(raw.frames.read(path)), plain.correct(plain.frames.read(tiff)))
+    with pytest.raises(ParameterError, match=r"`crop` \(20 x 24\) counts raw pixels.*\(gbrg\)"):
+        FrameFormat(crop=(20, 24)).read(path)  # of a PSF that is no raw file
+    assert FrameFormat(crop=(20, 24)).read(tiff).shape == (36, 48, 1)
 
 
 def test_a_grey_sensor_has_no_cells(tmp_path: Path, mosaic: np.ndarray) -> None:

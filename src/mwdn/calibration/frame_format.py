@@ -12,7 +12,7 @@ from mwdn.calibration.frame_operations import bin_pixels, crop_centre, demosaic,
 from mwdn.errors import ParameterError, checked
 from mwdn.io.formats import as_frame
 from mwdn.io.images import read_frame, srgb_decode
-from mwdn.io.raw import Mosaic, RawFrame, is_raw, read_raw
+from mwdn.io.raw import Mosaic, is_raw, read_raw
 from mwdn.types import Frame, Image, Measurement, Size
 
 Gamma = Literal["srgb"] | float
@@ -33,10 +33,9 @@ class FrameFormat:
         gamma: encoding of the files, decoded to linear light: ``"srgb"`` for a camera's JPEG or another picture for
             viewing, or a power such as 2.2; without it numbers are linear in light, as in raw frames. The PSF's
             file has its own: ``psf_gamma``.
-        crop: height and width of the central part to use, in raw pixels of the frame; even with a mosaic. A camera's
-            raw file is read as one pixel per cell, unless ``mosaic`` is given.
+        crop: height and width of the central part to use, in raw pixels of the frame; even with a mosaic.
         mosaic: raw frames of a colour filter array with this order: each 2 x 2 cell becomes one pixel. A camera's raw
-            file (.dng, .nef ...) says its own order, unless one is given.
+            file (.dng, .nef ...) says its own order: `mwdn.Calibration.from_file` takes that of the PSF's.
         grey: average the colours.
         bin: average blocks of this many pixels along each axis.
         upside_down: the file's first row is the bottom of the picture (DiffuserCam's .npy).
@@ -86,10 +85,29 @@ class FrameFormat:
 
         Raises:
             ImageError: the file cannot be read.
+            ParameterError: ``crop`` without ``mosaic``, and a raw file with one: its pixels are cells now.
+        """
+        frame, frames = self.read_stored(path)
+        if frames.mosaic is None or frames.mosaic == self.mosaic:
+            return frame
+        if self.crop is not None:
+            raise ParameterError(
+                f"`crop` ({self.crop[0]} x {self.crop[1]}) counts raw pixels, but `{path}` is read as one pixel per "
+                f"cell of its mosaic ({frames.mosaic}), for a PSF that is no raw file. Use the PSF's raw file, or crop "
+                "the PSF's file and leave out `crop`."
+            )
+        return _cells(frame, frames.mosaic)
+
+    def read_stored(self, path: str | Path) -> tuple[Frame, "FrameFormat"]:
+        """Read a raw frame as `read`, but with its mosaic; and this format with the mosaic that a raw file says.
+
+        Raises:
+            ImageError: the file cannot be read.
         """
         if is_raw(path) and self.mosaic is None:
-            return _cells(read_raw(path))
-        return read_frame(path, bgr=self.bgr)
+            raw = read_raw(path)
+            return raw.frame, replace(self, mosaic=raw.mosaic)
+        return read_frame(path, bgr=self.bgr), self
 
     def to_measurement(self, frame: Frame, dark: Tensor | None = None) -> Measurement:
         """Turn a raw frame into a measurement.
@@ -183,10 +201,8 @@ def check_gamma(name: str, gamma: Gamma | None) -> None:
         raise ParameterError(f"`{name}` ({gamma}) must be 'srgb', or a number from 1 (linear) to {MAX_GAMMA:g}.")
 
 
-def _cells(raw: RawFrame) -> Frame:
-    """One RGB pixel per cell of a raw file's mosaic; a frame without mosaic as it is."""
-    if raw.mosaic is None:
-        return raw.frame
-    mosaic = torch.from_numpy(raw.frame.astype(np.float32)).movedim(-1, 0)[None]
-    colours = demosaic(mosaic, raw.mosaic)[0].movedim(0, -1)
+def _cells(frame: Frame, mosaic: Mosaic) -> Frame:
+    """One RGB pixel per cell of a raw file's mosaic."""
+    image = torch.from_numpy(frame.astype(np.float32)).movedim(-1, 0)[None]
+    colours = demosaic(image, mosaic)[0].movedim(0, -1)
     return colours.round().numpy().astype(np.uint16, order="C")

@@ -89,9 +89,10 @@ class Calibration:
         """Read the picture of a point source, or a camera file.
 
         Args:
-            path: PNG, TIFF or NPY of 8 to 16 bits or floats, grey or colour; or a ``.toml`` for `load`, where only
-                options that differ are given.
-            frames: format of the PSF, the dark frame and the captures.
+            path: PNG, TIFF or NPY of 8 to 16 bits or floats, grey or colour; a camera's raw file; or a ``.toml`` for
+                `load`, where only options that differ are given.
+            frames: format of the PSF, the dark frame and the captures; without a mosaic, that of the PSF's raw file is
+                added.
             psf_format: where the PSF's file differs from it.
             dark: frame taken with the same exposure and no light; subtracted from the PSF and from captures.
             ambient: frame taken with the room's light alone and the exposure of the captures; subtracted from captures,
@@ -112,9 +113,10 @@ class Calibration:
             frame_files = {"dark": dark, "ambient": ambient}
             return cls.load(path, **options, **{name: file for name, file in frame_files.items() if file is not None})
         frames, psf_format = with_options(frames, psf_format, options)
+        frame, frames = frames.read_stored(path)
         dark_frame = None if dark is None else frames.read(dark)
         ambient_frame = None if ambient is None else frames.read(ambient)
-        return cls._from_frame(frames.read(path), frames, psf_format=psf_format, dark=dark_frame, ambient=ambient_frame)
+        return cls._from_frame(frame, frames, psf_format=psf_format, dark=dark_frame, ambient=ambient_frame)
 
     @classmethod
     def from_array(

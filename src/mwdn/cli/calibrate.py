@@ -44,7 +44,8 @@ def calibrate(
     fresh = replace(camera, camera=None)  # a changed PSF is what this command is for
     calibration = fresh.load()
     check_white_balance(white_balance, calibration.light)
-    report = inspect_psf(at_psf_resolution(fresh).load(), camera.frames.read(fresh.psf_file))
+    own_resolution = at_psf_resolution(fresh).load()
+    report = inspect_psf(own_resolution, own_resolution.frames.read(fresh.psf_file))
     content = {
         "psf": fresh.psf_file,
         "dark": camera.dark,

@@ -41,7 +41,7 @@ def inspect(
         refuse_overwrite(output, *camera.files)
     calibration = at_psf_resolution(camera).load()
     check_folder(out)
-    report = inspect_psf(calibration, camera.frames.read(psf))
+    report = inspect_psf(calibration, calibration.frames.read(psf))
     findings = verdict(report)
     content = {
         "file": str(psf),
