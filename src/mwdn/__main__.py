@@ -1,6 +1,6 @@
 """``python -m mwdn`` is ``mwdn``."""
 
-from mwdn.cli.app import main
+from mwdn.cli import main
 
 if __name__ == "__main__":
     main()

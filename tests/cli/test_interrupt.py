@@ -1,5 +1,6 @@
-"""Ctrl-C in real processes: one line that says how to go on, exit code 130, no traceback."""
+"""Ctrl-C, SIGTERM and closed pipes in real processes: one line that says how to go on, no traceback."""
 
+import os
 import re
 import shutil
 import signal
@@ -35,8 +36,8 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-def interrupted(line, sign):
-    """Start a command, press Ctrl-C when a line with ``sign`` comes; returns the exit code and all output."""
+def interrupted(line, sign, number=signal.SIGINT):
+    """Start a command, send a signal when a line with ``sign`` comes; returns the exit code and all output."""
     command = [sys.executable, "-m", "mwdn", *line.split(), "--psf", "psf.npy", "--device", "cpu"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         limit = Timer(120, process.kill)  # if the sign never comes
@@ -45,7 +46,7 @@ def interrupted(line, sign):
         for text in process.stdout:
             lines.append(text)
             if sign in text:
-                process.send_signal(signal.SIGINT)
+                process.send_signal(number)
                 break
         lines += process.stdout
         limit.cancel()
@@ -61,8 +62,49 @@ def test_reconstruct(here):
 
 
 def test_train(here):
-    code, lines = interrupted("train r.toml --photos photos -o run", "step 2: validation")
-    assert code == 130
+    """Batch systems send SIGTERM some seconds before they kill."""
+    code, lines = interrupted("train r.toml --photos photos -o run", "step 2: validation", signal.SIGTERM)
+    assert code == 143
     step = re.fullmatch(r"Interrupted after step ([\d,]+)\. The same command resumes\.\n", lines[-1])
     state = here / "run" / "state.safetensors"
     assert read_state(state, state.read_bytes())[1]["step"] == step[1].replace(",", "")
+
+
+@pytest.mark.parametrize(
+    ("number", "error", "line", "code", "message"),
+    [
+        (signal.SIGINT, None, "train a.toml", 130, "What is saved is kept. The same command resumes."),
+        (signal.SIGTERM, None, "reconstruct a.png", 143, "The same command with --resume goes on."),
+        (signal.SIGTERM, "ExportError('cannot be exported')", "export admm", 143, "The same command starts again."),
+    ],
+)
+def test_while_modules_are_imported(number, error, line, code, message):
+    """`exec`, as dataclasses use it: Python ended by SIGINT itself. Errors that torch makes of Ctrl-C were printed."""
+    begin = f"""
+import signal
+from mwdn.cli import app, main
+from mwdn.errors import ExportError
+def import_module(name):
+    try: exec("signal.raise_signal({int(number)})")
+    except KeyboardInterrupt as interrupt: raise {error or "interrupt"}
+app.import_module = import_module
+main({line.split()})
+"""
+    done = subprocess.run([sys.executable, "-c", begin], capture_output=True, text=True, check=False, timeout=120)
+    assert (done.returncode, len(done.stderr.splitlines())) == (code, 1)
+    assert done.stderr.startswith("Interrupted. ")
+    assert done.stderr.endswith(f"{message}\n")
+
+
+@pytest.mark.parametrize("line", ["recipes quick-cpu", "--help", "nonsense"])
+def test_nobody_reads_the_output(line):
+    """As in `mwdn recipes quick-cpu | head -1`: status 141, which shells report for SIGPIPE, and no traceback."""
+    closed, pipe = os.pipe()
+    os.close(closed)
+    command = [sys.executable, "-m", "mwdn", *line.split()]
+    wrong = line == "nonsense"  # the error goes to a closed pipe
+    done = subprocess.run(
+        command, stdout=pipe, stderr=pipe if wrong else subprocess.PIPE, text=True, check=False, timeout=120
+    )
+    os.close(pipe)
+    assert (done.returncode, done.stderr or "") == (141, "")

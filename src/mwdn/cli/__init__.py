@@ -1,5 +1,18 @@
 """The command line: one file per command."""
 
-from mwdn.cli.app import main
+import sys
+from typing import NoReturn
+
+from mwdn.cli.signals import ended_by_signals
+
+
+def main(arguments: list[str] | None = None) -> NoReturn:
+    """Run the command line and exit, see `mwdn.cli.app.main`."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    with ended_by_signals(arguments):
+        from mwdn.cli import app  # takes a quarter of a second
+
+        app.main(arguments)
+
 
 __all__ = ["main"]

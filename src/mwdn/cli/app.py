@@ -1,10 +1,9 @@
 """The command line, assembled from one file per command."""
 
-import os
 import sys
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from typing import NoReturn
@@ -16,6 +15,7 @@ from mwdn.cli import terminal
 from mwdn.cli.as_typed import as_typed
 from mwdn.cli.camera_values import from_camera_file
 from mwdn.cli.given_options import note_given_bin
+from mwdn.cli.signals import ended_by_signals
 from mwdn.cli.wrong_calls import wrong_call
 from mwdn.errors import MwdnError
 from mwdn.runtime.memory import keep_memory
@@ -90,8 +90,17 @@ def make_app(command: str | None = None) -> App:
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
-    """Run the command line and exit: 0 on success, 1 if some captures failed, 2 for a wrong call, 130 for Ctrl-C."""
+    """Run the command line and exit: 0 on success, 1 if some captures failed, 2 for a wrong call.
+
+    The other exit codes are those of `mwdn.cli.signals`.
+    """
     arguments = sys.argv[1:] if arguments is None else arguments
+    with ended_by_signals(arguments) as received:
+        sys.exit(_run(arguments, received))
+
+
+def _run(arguments: list[str], received: Sequence[int]) -> int:
+    """Run a command until it ends or a signal is received; returns the exit code."""
     chosen = {name: not {name, short}.isdisjoint(arguments) for name, short in GLOBAL.items()}
     arguments = [argument for argument in arguments if argument not in {*GLOBAL, *GLOBAL.values()}]
     command = next((argument for argument in arguments if argument in COMMANDS), None)
@@ -106,19 +115,17 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     try:
         with warnings.catch_warnings(), _timed(verbose=chosen["--verbose"]):
             warnings.showwarning = lambda message, *_, **__: terminal.warn(str(message))
-            result = app(arguments, exit_on_error=False, print_error=False)
+            result = app(arguments, console=terminal.results, exit_on_error=False, print_error=False)
     except (MwdnError, cyclopts.CycloptsError) as error:
+        if received:  # torch.export turns Ctrl-C into an error of its own
+            raise
         if chosen["--debug"]:
             terminal.errors.print_exception()
         if isinstance(error, cyclopts.CycloptsError):
             error = wrong_call(error, COMMANDS)
         terminal.complain("[bold red]Error:[/]", error)
-        sys.exit(2)
-    except KeyboardInterrupt as interrupt:
-        if os.environ.get("RANK", "0") == "0":  # one of several processes speaks
-            terminal.errors.print(str(interrupt) or "Interrupted.", highlight=False, markup=False, soft_wrap=True)
-        sys.exit(130)  # 128 + SIGINT, as shells report it
-    sys.exit(result if isinstance(result, int) else 0)
+        return 2
+    return result if isinstance(result, int) else 0
 
 
 def _options(app: App, arguments: list[str]) -> set[str]:

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.progress import show_progress
-from mwdn.cli.terminal import console, if_interrupted
+from mwdn.cli.terminal import console
 from mwdn.cli.weights import ask_for_lpips
 
 
@@ -41,8 +41,7 @@ def benchmark(
     contents = read_benchmark(recipe)
     lpips = ask_for_lpips(lpips, contents.alexnet, contents.heads)
     is_first = os.environ.get("RANK", "0") == "0"
-    go_on = "Interrupted. The same command resumes: finished networks and scores are kept."
-    with if_interrupted(lambda: go_on), show_progress(enabled=is_first, titles=True) as progress:
+    with show_progress(enabled=is_first, titles=True) as progress:
         watch = Watch(lambda title, parts: progress.start(title, parts or None, first=None), progress.update)
         run(contents, out, device=device, lpips=lpips, command=shlex.join(["mwdn", *sys.argv[1:]]), watch=watch)
     console.print(f"Look at {out / PAGE}", highlight=False, markup=False, soft_wrap=True)

@@ -11,7 +11,7 @@ from mwdn.cli.camera import CameraOptions
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.method_options import MethodOptions, read_options
 from mwdn.cli.progress import show_progress
-from mwdn.cli.terminal import Json, console, if_interrupted, results, warn
+from mwdn.cli.terminal import Json, console, results, warn
 from mwdn.cli.weights import ask_for_lpips
 from mwdn.evaluation import Perceptual, Variant
 from mwdn.evaluation.alexnet import SMALLEST
@@ -73,7 +73,7 @@ def evaluate(  # noqa: PLR0913
         lpips = ask_for_lpips(lpips)
     perceptual = Perceptual.none("--no-lpips") if lpips is False else Perceptual.load(download=lpips is True)
     check_folder(out)
-    with if_interrupted(lambda: "Interrupted. Nothing is written."), show_progress() as progress:
+    with show_progress() as progress:
         progress.start("Evaluating", len(reconstructors) * len(pairs))
         done = count(1)
         report = evaluation.evaluate(

@@ -10,19 +10,28 @@ from rich.markup import escape
 
 from mwdn.errors import MwdnError
 
-results = Console()
+
+class _Console(Console):
+    """A console that lets `mwdn.cli.signals` end the command when nobody reads its output any more."""
+
+    def on_broken_pipe(self) -> None:
+        """Pass the error on."""
+        raise
+
+
+results = _Console()
 """What the command is asked for, such as a table: always."""
 
-console = Console()
+console = _Console()
 """What the command has done: not with --quiet; with --json on standard error."""
 
-notes = Console(stderr=True)
+notes = _Console(stderr=True)
 """Warnings, remarks and progress: not with --quiet."""
 
-details = Console(stderr=True, quiet=True)
+details = _Console(stderr=True, quiet=True)
 """Versions, times, and what was assumed: only with --verbose."""
 
-errors = Console(stderr=True)
+errors = _Console(stderr=True)
 """Errors: always."""
 
 Json = Annotated[bool, Parameter(negative=())]

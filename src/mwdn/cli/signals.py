@@ -1,0 +1,74 @@
+"""Ctrl-C, SIGTERM and a closed pipe end a command with one line that says how to go on, or none: no traceback.
+
+Imported before all else, so that this holds while the other modules are imported, which takes seconds.
+"""
+
+import os
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType
+
+GO_ON = {
+    "reconstruct": "Finished pictures are kept. The same command with --resume goes on.",
+    "train": "What is saved is kept. The same command resumes.",
+    "benchmark": "Finished networks and scores are kept. The same command resumes.",
+}
+"""What to say where a command does not say more."""
+
+OTHERWISE = "Unfinished files are not kept. The same command starts again."
+
+
+class _Interrupt(KeyboardInterrupt):
+    """Ctrl-C. After a `KeyboardInterrupt` itself in code that `exec` runs, as dataclasses do, Python ends by SIGINT."""
+
+
+@contextmanager
+def ended_by_signals(arguments: Sequence[str]) -> Iterator[Sequence[int]]:
+    """Exit with 130 (128 + SIGINT), 143 (SIGTERM) or 141 (SIGPIPE), as shells report it, if one of them ends the work.
+
+    SIGTERM is turned into Ctrl-C, so the work is ended in the same way: training saves its state after the step in
+    progress. Under torchrun, which waits for its processes, SIGTERM ends a process at once.
+
+    Args:
+        arguments: of the command line.
+
+    Yields:
+        Numbers of the signals received so far.
+    """
+    received: list[int] = []
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+        raise _Interrupt
+
+    def terminate(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+        signal.raise_signal(signal.SIGINT)
+
+    handlers = {signal.SIGINT: interrupt} | ({} if "RANK" in os.environ else {signal.SIGTERM: terminate})
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    try:
+        yield received
+    except SystemExit:
+        raise
+    except BrokenPipeError:
+        for stream in (sys.stdout, sys.stderr):  # what is left in them goes nowhere
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        sys.exit(141)  # Windows has no SIGPIPE
+    except BaseException as error:
+        if not (received or isinstance(error, KeyboardInterrupt)):
+            raise
+        if os.environ.get("RANK", "0") == "0":  # one of several processes speaks
+            said = str(error) if isinstance(error, KeyboardInterrupt) else ""
+            print(said or f"Interrupted. {how_to_go_on(arguments)}", file=sys.stderr)
+        sys.exit(128 + (signal.SIGTERM if signal.SIGTERM in received else signal.SIGINT))
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def how_to_go_on(arguments: Sequence[str]) -> str:
+    """What is kept of an interrupted command, and how to go on."""
+    return next((GO_ON[word] for word in arguments if word in GO_ON), OTHERWISE)
