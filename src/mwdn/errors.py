@@ -53,7 +53,7 @@ class UnknownNameError(ParameterError):
     """
 
     def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
-        name, known = _cut(str(name), 80), sorted(known)
+        name, known = cut(str(name), 80), sorted(known)
         spelling = {word.lower(): word for word in known}
         nearest = difflib.get_close_matches(name.lower(), spelling, n=1)
         hint = f" Did you mean '{spelling[nearest[0]]}'?" if nearest else ""
@@ -166,10 +166,11 @@ def one_line(text: str) -> str:
 def reason(error: BaseException) -> str:
     """First line of another library's error, at most 120 characters; its type if it says nothing."""
     lines = str(error).strip().splitlines()
-    return _cut(one_line(lines[0]).rstrip("."), 120) if lines else type(error).__name__
+    return cut(one_line(lines[0]).rstrip("."), 120) if lines else type(error).__name__
 
 
-def _cut(text: str, most: int) -> str:
+def cut(text: str, most: int) -> str:
+    """Text of at most so many characters; a longer one ends in three dots."""
     return text if len(text) <= most else text[: most - 4] + " ..."
 
 

@@ -1,16 +1,22 @@
 """Readers of pictures and arrays. The format is taken from the content, and the header is checked first."""
 
 import logging
+import math
+import os
 import re
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
-from mwdn.errors import ImageError, shown
-from mwdn.io.headers import COPY_AGAIN, picture_size
+from mwdn.errors import ImageError, cut, one_line, reason, shown
+from mwdn.io.decoder_messages import decoder_messages
+from mwdn.io.headers import COPY_AGAIN, START, check_decoded, check_whole, picture_claim
+from mwdn.io.npy import read_npy
 from mwdn.io.raw import is_raw, read_raw
+from mwdn.io.reading import open_regular
+from mwdn.io.tiff import read_tiff
 from mwdn.types import ArrayPicture, Frame
 
 MAX_PIXELS = 2**28
@@ -20,7 +26,8 @@ claims more is damaged, or made to exhaust the reader's memory."""
 _SIGNATURES = {b"\x89PNG\r\n\x1a\n": "PNG", b"\xff\xd8\xff": "JPEG", b"BM": "BMP", b"\x93NUMPY": "NPY"}
 _SIGNATURES |= dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "TIFF")  # + is BigTIFF
 _SIGNATURES |= dict.fromkeys((b"P5\n", b"P6\n", b"P5 ", b"P6 "), "PGM")
-_PGM_HEADER = re.compile(rb"P([56])" + 3 * rb"\s+(?:#[^\n]*\n\s*)*(\d+)" + rb"\s")
+_PGM_HEADER = re.compile(rb"P([56])" + 3 * rb"\s+(?:#[^\n]*\n\s*)*(\d{1,9})" + rb"\s")
+_PNG_DAMAGE = re.compile("libpng error|IDAT|image data")
 
 _PIL_MODES = ("L", "RGB", "F", "I;16", "I;16L", "I;16B")
 
@@ -38,24 +45,37 @@ def read(path: Path, *, photograph: bool) -> Frame:
         photograph: rotate it according to its EXIF orientation, and resolve palettes. Raw files are refused.
 
     Raises:
-        ImageError: it cannot be read, or holds NaN or infinity.
+        ImageError: it cannot be read, is damaged, or holds NaN or infinity.
     """
     if is_raw(path):
         return _read_raw(path, photograph)
-    try:
-        match _kind(path):
-            case "NPY":
-                frame = _read_npy(path, photograph)
-            case "TIFF":
-                frame = _read_tiff(path, photograph)
-            case kind:
-                frame = decode(kind, path.read_bytes(), photograph)
-        if not np.isfinite(frame).all():
-            raise ImageError("holds NaN or infinity. Capture it again, or replace them with `numpy.nan_to_num`.")
-    except ImageError as error:
-        raise ImageError(f"`{path}` {error}") from error
-    except OSError as error:
-        raise ImageError(f"`{path}` cannot be read: {error.strerror}. Check its permissions.") from error
+    with open_regular(path) as file:
+        try:
+            return _read(file, photograph)
+        except ImageError as error:
+            raise ImageError(f"`{path}` {error}") from error
+        except OSError as error:
+            raise ImageError(f"`{path}` cannot be read: {error.strerror or reason(error)}. {COPY_AGAIN}") from error
+        except Exception as error:  # a damaged file makes tifffile, numpy and OpenCV raise anything
+            what = f"{type(error).__name__}: {reason(error)}"
+            raise ImageError(f"`{path}` cannot be read, it may be damaged ({what}). {COPY_AGAIN}") from error
+
+
+def _read(file: BinaryIO, photograph: bool) -> Frame:
+    kind = _kind(file.read(12))
+    file.seek(0)
+    match kind:
+        case "NPY":
+            stored = read_npy(file, _frame_shape)
+            frame = _to_frame(stored, _frame_shape(stored.shape, stored.dtype), photograph=photograph)
+        case "TIFF":
+            stored, orientation = read_tiff(file, _frame_shape)
+            frame = _to_frame(stored, _frame_shape(stored.shape, stored.dtype), copy=False, photograph=photograph)
+            frame = _upright(frame, orientation) if photograph else frame
+        case _:
+            frame = decode(kind, _content(kind, file), photograph)
+    if not np.isfinite(frame).all():
+        raise ImageError("holds NaN or infinity. Capture it again, or replace them with `numpy.nan_to_num`.")
     return frame
 
 
@@ -68,18 +88,12 @@ def kind_of(start: bytes) -> str | None:
 
 def is_for_viewing(path: str | Path) -> bool:
     """Whether a file is a JPEG or WebP, which cameras and programs write gamma-coded."""
-    with suppress(OSError), Path(path).open("rb") as file:  # whoever reads the pixels says what is wrong
+    with suppress(OSError, ImageError), open_regular(path) as file:  # whoever reads the pixels says what is wrong
         return kind_of(file.read(12)) in ("JPEG", "WebP")
     return False
 
 
-def _kind(path: Path) -> str:
-    if not path.exists():
-        raise ImageError(f"does not exist. Check the name; the current folder is `{Path.cwd()}`.")
-    if not path.is_file():
-        raise ImageError("must be a file, but is a folder or a device. Name one file inside it.")
-    with path.open("rb") as file:
-        start = file.read(12)
+def _kind(start: bytes) -> str:
     if not start:
         raise ImageError(f"is empty (0 bytes). {COPY_AGAIN}")
     if kind := kind_of(start):
@@ -88,6 +102,23 @@ def _kind(path: Path) -> str:
         f"must be PNG, JPEG, WebP, BMP, PGM, PPM, TIFF, NPY or a camera's raw file, but starts with {start[:8]!r}. "
         "Export it as PNG."
     )
+
+
+def _content(kind: str, file: BinaryIO) -> bytes:
+    """All bytes of a file, if its header allows that many."""
+    size, start = os.fstat(file.fileno()).st_size, file.read(START)
+    needed = math.prod(_check_claim(kind, start, size))
+    if size > 2 * needed + START:
+        raise ImageError(f"has {size:,} bytes, too many for a picture of {needed:,}. {COPY_AGAIN}")
+    return start + file.read(size - len(start)) if size > len(start) else start
+
+
+def _check_claim(kind: str, start: bytes, size: int) -> tuple[int, int, int]:
+    """Height, width and decoded bytes of a pixel from the header, if they can be read."""
+    claim = _pgm_header(start)[:3] if kind == "PGM" else picture_claim(kind, start, size)
+    _frame_shape(claim[:2], np.dtype(np.uint8))
+    check_decoded(math.prod(claim), size)
+    return claim
 
 
 def _frame_shape(shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, ...]:
@@ -172,59 +203,9 @@ def _read_raw(path: Path, photograph: bool) -> Frame:
     return read_raw(path).frame
 
 
-def _read_npy(path: Path, photograph: bool) -> Frame:
-    try:
-        stored = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:
-        raise ImageError(f"is not a complete NPY file of numbers ({error}). Copy or save it again.") from error
-    return _to_frame(stored, _frame_shape(stored.shape, stored.dtype), photograph=photograph)
-
-
-def _read_tiff(path: Path, photograph: bool) -> Frame:
-    import tifffile
-
-    try:
-        with tifffile.TiffFile(path) as file:
-            axes, planar, orientation = _tiff_axes(file)
-            # tifffile reads every type of number exactly, but not LZW, JPEG and PackBits: OpenCV decodes those.
-            plain = file.pages[0].compression in (1, 8, 32946)
-            stored = file.series[0].asarray() if plain else _decode_tiff(path)
-            planar = planar and plain
-    except ImageError:
-        raise
-    except Exception as error:  # a damaged file makes tifffile raise struct.error, ValueError, KeyError ...
-        raise ImageError(f"cannot be read as TIFF: {error}. {COPY_AGAIN}") from error
-    frame = _to_frame(np.moveaxis(stored, -3, -1) if planar else stored, axes, photograph=photograph)
-    return _upright(frame, orientation) if photograph else frame
-
-
-def _decode_tiff(path: Path) -> Frame:
-    import cv2
-
-    pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
-    if pixels is None:
-        raise ImageError(f"is damaged: OpenCV cannot decode this TIFF. {COPY_AGAIN}")
-    pixels = np.atleast_3d(pixels)
-    return np.ascontiguousarray(pixels[..., [2, 1, 0, 3][: pixels.shape[2]]] if pixels.shape[2] >= 3 else pixels)
-
-
 def _upright(frame: Frame, orientation: int) -> Frame:
     frame = frame.swapaxes(0, 1) if 5 <= orientation <= 8 else frame
     return frame[:: -1 if orientation in (3, 4, 7, 8) else 1, :: -1 if orientation in (2, 3, 6, 7) else 1]
-
-
-def _tiff_axes(file: Any) -> tuple[tuple[int, ...], bool, int]:  # noqa: ANN401
-    """(H, W, C) of a TIFF's first picture, whether its channels are the first axis, and its EXIF orientation."""
-    pages, handle = file.pages, file.filehandle
-    # If the chain of pages is cut, tifffile silently returns the pages before it: only red of a planar picture.
-    if len(pages) == 0 or (handle.seek(pages.next_page_offset) and any(handle.read(file.tiff.offsetsize))):
-        raise ImageError(f"is cut off: its list of pages leads past its end. {COPY_AGAIN}")
-    if pages[0].photometric not in (1, 2, 32803, 34892):  # grey, RGB, two kinds of raw mosaic
-        colours = getattr(pages[0].photometric, "name", pages[0].photometric)
-        raise ImageError(f"stores its colours as {colours}. Save it as RGB, or as grey with black at 0.")
-    shape, planar = file.series[0].shape, file.series[0].axes[-3:] in ("SYX", "CYX")
-    shape = (*shape[:-3], *shape[-2:], shape[-3]) if planar else shape
-    return _frame_shape(shape, file.series[0].dtype), planar, int(pages[0].tags.valueof(274, 1))
 
 
 def decode(kind: str, data: bytes, photograph: bool) -> Frame:
@@ -238,33 +219,51 @@ def decode(kind: str, data: bytes, photograph: bool) -> Frame:
     Raises:
         ImageError: cut off or damaged; the message does not name the file.
     """
-    import cv2
-
+    _check_claim(kind, data, len(data))
     if kind == "PGM":
         return _read_pgm(data)
-    _frame_shape(picture_size(kind, data), np.dtype(np.uint8))
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH if photograph else cv2.IMREAD_UNCHANGED
-    try:
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error as error:
-        raise ImageError(f"cannot be decoded as {kind}: {error.err}. {COPY_AGAIN}") from error
-    if pixels is None:
-        raise ImageError(f"is damaged: OpenCV cannot decode this {kind}. {COPY_AGAIN}")
-    pixels = np.atleast_3d(pixels)
+    check_whole(kind, data)
+    pixels = np.atleast_3d(_decode(kind, data, photograph))
     pixels = _without_alpha(pixels) if pixels.shape[2] == 4 else pixels
     if pixels.shape[2] == 1 or (kind == "PNG" and data[25] in (0, 4)):  # OpenCV decodes grey with alpha as BGRA
         return pixels[..., :1]
     return pixels[..., ::-1]  # from BGR
 
 
-def _read_pgm(data: bytes) -> Frame:
-    """A binary PGM (grey) or PPM (RGB): a header in text, then the numbers, the high byte of 16 bits first."""
-    if not (header := _PGM_HEADER.match(data)):
+def _decode(kind: str, data: bytes, photograph: bool) -> Frame:
+    import cv2
+
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH if photograph else cv2.IMREAD_UNCHANGED
+    try:
+        with decoder_messages() as lines:
+            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error as error:
+        raise ImageError(f"cannot be decoded as {kind}: {one_line(error.err)}. {COPY_AGAIN}") from error
+    # libjpeg warns of nothing but damage and unknown extensions; libpng also of odd colour profiles.
+    damage = [line for line in lines if kind == "JPEG" or _PNG_DAMAGE.search(line)]
+    if damage:
+        raise ImageError(f"is damaged: {cut(one_line(damage[0]), 120)}. {COPY_AGAIN}")
+    if pixels is None:
+        raise ImageError(f"is damaged: OpenCV cannot decode this {kind}. {COPY_AGAIN}")
+    return pixels
+
+
+def _pgm_header(data: bytes) -> tuple[int, int, int, int, int]:
+    """Height, width, bytes of a pixel, channels, and the position of the numbers."""
+    if not (header := _PGM_HEADER.match(data[: 2**16])):
         raise ImageError(f"is damaged: this PGM or PPM has no width, height and largest number. {COPY_AGAIN}")
     kind, width, height, largest = map(int, header.groups())
-    dtype = np.dtype(np.uint8 if largest < 256 else ">u2")
-    axes = _frame_shape((height, width, 1 if kind == 5 else 3), dtype)
-    needed = header.end() + dtype.itemsize * axes[0] * axes[1] * axes[2]
+    if not 0 < largest <= 65535:
+        raise ImageError(f"is damaged: the largest number of this PGM or PPM ({largest:,}) must be 1 to 65,535.")
+    channels = 1 if kind == 5 else 3
+    return height, width, channels * (1 if largest < 256 else 2), channels, header.end()
+
+
+def _read_pgm(data: bytes) -> Frame:
+    """A binary PGM (grey) or PPM (RGB): a header in text, then the numbers, the high byte of 16 bits first."""
+    height, width, pixel_bytes, channels, start = _pgm_header(data)
+    needed = start + height * width * pixel_bytes
     if len(data) < needed:
         raise ImageError(f"is cut off: this PGM or PPM has {len(data):,} bytes and needs {needed:,}. {COPY_AGAIN}")
-    return _to_frame(np.frombuffer(data[header.end() : needed], dtype), axes)
+    dtype = np.dtype(np.uint8 if pixel_bytes == channels else ">u2")
+    return _to_frame(np.frombuffer(data[start:needed], dtype), (height, width, channels))

@@ -19,8 +19,9 @@ def read_frame(path: str | Path, *, bgr: bool = False, upside_down: bool = False
     """Read a frame, its numbers exactly as stored: no gamma, no scaling except of raw files.
 
     Args:
-        path: PNG, JPEG, WebP, BMP, PGM, PPM, TIFF (its first picture), NPY, or a camera's raw file (`mwdn.io.raw`): the
-            mosaic of the sensor as one channel, with the black level at 0 and the white level at 65,535.
+        path: PNG, JPEG, WebP, BMP, PGM, PPM, TIFF (one picture; smaller copies after it are ignored), NPY, or a
+            camera's raw file (`mwdn.io.raw`): the mosaic of the sensor as one channel, with the black level at 0 and
+            the white level at 65,535.
         bgr: the file's channels are blue, green, red.
         upside_down: the file's first row is the bottom of the picture. DiffuserCam's ``.npy`` files need both.
         upright: rotate a photograph according to its EXIF orientation; frames of a sensor are never rotated.
@@ -30,8 +31,10 @@ def read_frame(path: str | Path, *, bgr: bool = False, upside_down: bool = False
         Grey has one channel, opaque alpha is dropped, leading axes of length 1 are removed.
 
     Raises:
-        ImageError: no such file; damaged, cut off, or of an unknown format; other numbers or axes than these;
-            more than `mwdn.io.formats.MAX_PIXELS` pixels; NaN or infinity.
+        ImageError: no such regular file; damaged, cut off, or of an unknown format; a stack of pictures; other numbers
+            or axes than these; more than `mwdn.io.formats.MAX_PIXELS` pixels or `mwdn.io.headers.MAX_BYTES`, or far
+            more than the file can hold; NaN or infinity. Damage is found by checksums, lengths and libjpeg's warnings:
+            changed numbers of a BMP, PGM, PPM, NPY, WebP or uncompressed TIFF cannot be told from a capture.
     """
     frame = read(Path(path), photograph=upright)
     return np.ascontiguousarray(frame[:: -1 if upside_down else 1, :, :: -1 if bgr else 1])
@@ -62,7 +65,7 @@ def read_picture(path: str | Path) -> Image:
     """Read a photograph as linear light: rotated according to its EXIF orientation, decoded from sRGB.
 
     Args:
-        path: PNG, JPEG, WebP, BMP, PGM, PPM, TIFF (its first picture) or NPY, of 8 or 16 bits.
+        path: PNG, JPEG, WebP, BMP, PGM, PPM, TIFF (one picture) or NPY, of 8 or 16 bits.
 
     Returns:
         (1, 3, H, W), in [0, 1]; 1 is the largest number of 8 or 16 bits. Grey is repeated, alpha dropped.

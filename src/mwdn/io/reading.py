@@ -38,7 +38,7 @@ def open_regular(path: str | Path, error: type[MwdnError] = ImageError) -> Binar
     try:
         _check_regular(Path(path).stat().st_mode)  # before it is opened, which a device may notice
         flags = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
-        file = os.fdopen(os.open(path, flags), "rb")
+        file = open(path, "rb", opener=lambda name, _: os.open(name, flags))  # noqa: SIM115
         try:
             _check_regular(os.fstat(file.fileno()).st_mode)  # another file may have taken its place
         except BaseException:
