@@ -155,9 +155,7 @@ def learned(name, psf):
     "name",
     [
         "universal-small",
-        "mwdn-cpsf",  # has the layers of the other two
-        pytest.param("unet", marks=pytest.mark.acceptance),
-        pytest.param("mwdn", marks=pytest.mark.acceptance),
+        *(pytest.param(name, marks=pytest.mark.acceptance) for name in ("unet", "mwdn", "mwdn-cpsf")),
     ],
 )
 def test_fast_against_exact_on_real_captures(name, data):

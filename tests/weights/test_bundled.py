@@ -79,14 +79,23 @@ def test_other_names_are_no_bundled_networks():
         find_weights("hub:alone")
 
 
-FETCH = "import sys; from mwdn.weights.bundled import find_weights; print(find_weights(sys.argv[1]))"
+FETCH = """
+import sys
+from mwdn.errors import CheckpointError
+from mwdn.weights.bundled import find_weights
+for name in sys.argv[1:]:
+    try:
+        print(find_weights(name))
+    except CheckpointError as error:
+        print(error)
+"""
 
 
 @pytest.fixture
 def hub(tmp_path):
-    """``hub(name)`` downloads with `huggingface_hub` from a server that has one file."""
+    """``hub(*names)`` gives paths or messages, and the names that a server of one file sent by `huggingface_hub`."""
     pytest.importorskip("huggingface_hub", reason="needs `pip install 'mwdn[hub]'`")
-    content = find_weights("universal-small").read_bytes()
+    content, sent = find_weights("universal-small").read_bytes(), []
 
     class Files(BaseHTTPRequestHandler):
         def do_HEAD(self):
@@ -101,6 +110,7 @@ def hub(tmp_path):
 
         def do_GET(self):
             self.do_HEAD()
+            sent.append(self.path)
             self.wfile.write(content)
 
         def log_message(self, *_):
@@ -109,7 +119,7 @@ def hub(tmp_path):
     server = ThreadingHTTPServer(("127.0.0.1", 0), Files)
     threading.Thread(target=server.serve_forever, daemon=True).start()
 
-    def fetch(name):
+    def fetch(*names):
         environment = {
             "HF_ENDPOINT": f"http://127.0.0.1:{server.server_port}",
             "HF_HOME": str(tmp_path / "cache"),
@@ -118,24 +128,20 @@ def hub(tmp_path):
             "PATH": "/usr/bin:/bin",
             "PYTHONPATH": json.dumps(sys.path)[1:-1].replace('", "', ":").strip('"'),
         }
-        line = [sys.executable, "-c", FETCH, name]
-        return subprocess.run(line, env=environment, capture_output=True, text=True, check=False)
+        line = [sys.executable, "-c", FETCH, *names]
+        done = subprocess.run(line, env=environment, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        return done.stdout.splitlines(), sent
 
     yield fetch
     server.shutdown()
     server.server_close()
 
 
-def test_a_network_of_the_hub_is_downloaded_once(hub):
-    first = hub("hub:some/camera")
-    assert first.returncode == 0, first.stderr
-    path = Path(first.stdout.strip())
-    assert path.read_bytes() == find_weights("universal-small").read_bytes()
-    assert hub("hub:some/camera").stdout == first.stdout
-
-
-def test_the_error_names_what_the_hub_does_not_have(hub):
-    missing = hub("hub:some/camera/other.safetensors")
-    assert missing.returncode != 0
-    assert "CheckpointError: `hub:some/camera/other.safetensors` cannot be fetched" in missing.stderr
-    assert "CheckpointError: `hub:some/camera/../a` cannot be fetched" in hub("hub:some/camera/../a").stderr
+def test_a_network_of_the_hub_is_downloaded_once_and_the_error_names_what_is_not_there(hub):
+    said, sent = hub("hub:some/camera", "hub:some/camera", "hub:some/camera/other.safetensors", "hub:some/camera/../a")
+    assert sent == ["/some/camera/resolve/main/model.safetensors"]
+    assert said[0] == said[1]
+    assert Path(said[0]).read_bytes() == find_weights("universal-small").read_bytes()
+    assert "`hub:some/camera/other.safetensors` cannot be fetched" in said[2]
+    assert "`hub:some/camera/../a` cannot be fetched" in said[3]
