@@ -137,7 +137,7 @@ def test_warning_of_a_reconstructor(camera):
             TRAIN + " --pairs p.h5",
             "`--photos` (photos) and `--pairs` (p.h5) exclude each other.",
         ),
-        (TRAIN.replace("--photos photos", "--pairs p.h5"), "`p.h5` is not a file"),
+        (TRAIN.replace("--photos photos", "--pairs p.h5"), "`p.h5` does not exist"),
         (TRAIN + " --captures runs", "`runs`"),
         (TRAIN.replace("train r.toml", "train r.tml"), "`r.tml` does not exist"),
         (TRAIN.replace("--steps 4", "--steps 0"), "[schedule]: `--steps` (0) must be positive"),

@@ -107,7 +107,7 @@ def test_damaged_rows_and_files_of_the_authors_kind(tmp_path):
         import_pairs("mwdn", tmp_path / "pairs.h5", tmp_path / "other.h5")
     with pytest.raises(ParameterError, match="would overwrite an input"):
         import_pairs("mwdn", path, path)
-    with pytest.raises(ImageError, match="is not a file"):
+    with pytest.raises(ImageError, match="does not exist"):
         import_pairs("mwdn", tmp_path / "none.h5", tmp_path / "other.h5")
     assert not (tmp_path / "other.h5").exists()
 

@@ -212,7 +212,7 @@ def test_a_file_cut_off_anywhere_is_refused(pairs, tmp_path):
 
 def test_foreign_files_are_named(tmp_path):
     path = tmp_path / "a.h5"
-    with pytest.raises(ImageError, match=r"a\.h5` is not a file"):
+    with pytest.raises(ImageError, match=r"a\.h5` does not exist"):
         PairFile(path)
     path.write_text("hello")
     with pytest.raises(ImageError, match="is not a complete HDF5"):

@@ -1,10 +1,21 @@
-"""HDF5 files: written so that a full disk is noticed at the pair that no longer fits."""
+"""HDF5 files: a full disk is noticed at the pair that no longer fits; nothing outside the file is ever read."""
 
 import io
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Any
+
+from mwdn.errors import ImageError, MwdnError, reason
+from mwdn.io.reading import open_regular
+
+PICTURE_BYTES = 2**29
+"""Most bytes of one picture, and of one chunk, which is decompressed as a whole: 512 MiB, 44 million RGB floats."""
+
+Numbers = str | int | float
+"""Value of an attribute."""
 
 
 class CheckedFile(io.FileIO):
@@ -58,3 +69,118 @@ def create_hdf5(path: Path) -> Iterator[tuple[Any, CheckedFile]]:
         with h5py.File(disk, "w") as file:
             yield file, disk
         disk.check()
+
+
+@contextmanager
+def as_damage(what: str, advice: str) -> Iterator[None]:
+    """Turn any error of a library that reads a damaged file into an `ImageError`: ``{what}: {reason}. {advice}``."""
+    try:
+        yield
+    except MwdnError:
+        raise
+    except Exception as error:  # h5py's and pyarrow's for damaged files are of a dozen kinds
+        raise ImageError(f"{what}: {reason(error)}. {advice}") from error
+
+
+def open_hdf5(path: Path, advice: str) -> Any:  # noqa: ANN401
+    """Open a file for reading.
+
+    Args:
+        path: of the file.
+        advice: the way out for a damaged file.
+
+    Raises:
+        ImageError: no such file, not a regular one, or not a complete HDF5 file.
+    """
+    import h5py
+
+    open_regular(path).close()
+    with as_damage(f"`{path}` is not a complete HDF5 file", advice):
+        # No lock: finished files never change, and many shared file systems of clusters do not support locks.
+        return h5py.File(path, "r", locking=False)
+
+
+def find_rows(path: Path, file: Any, name: str, advice: str) -> Any:  # noqa: ANN401
+    """A data set, (N, ...), whose numbers are all in the file.
+
+    Links elsewhere, virtual data sets and external storage can name any file of the computer: they are refused, not
+    followed.
+
+    Args:
+        path: of the file.
+        file: the open `h5py.File`.
+        name: of the data set; may be in a group: ``train/blur``.
+        advice: the way out for a damaged file.
+
+    Returns:
+        The `h5py.Dataset`; ``None`` if there is none of this name.
+
+    Raises:
+        ImageError: it is damaged or elsewhere, does not hold all of its numbers, or pictures are too large.
+    """
+    import h5py
+
+    with as_damage(f"`{name}` of `{path}` cannot be read", advice):
+        place = file
+        for part in filter(None, name.split("/")):
+            link = place.get(part, getlink=True) if isinstance(place, h5py.Group) else None
+            if link is None:
+                return None
+            if not isinstance(link, h5py.HardLink):
+                raise ImageError(f"`{name}` of `{path}` is a link, which is not followed. Copy the data to its place.")
+            place = place[part]
+        if not isinstance(place, h5py.Dataset):
+            return None
+        _check_storage(path, place, name)
+        return place
+
+
+def _check_storage(path: Path, data: Any, name: str) -> None:  # noqa: ANN401
+    from h5py import h5d
+
+    settings = data.id.get_create_plist()
+    if settings.get_layout() == h5d.VIRTUAL or settings.get_external_count():
+        raise ImageError(f"`{name}` of `{path}` is stored in other files, which are not read. Copy the data into one.")
+    size = data.dtype.itemsize * math.prod(data.shape)
+    stored, available = data.id.get_storage_size(), path.stat().st_size
+    if data.chunks is None:
+        whole = stored == size
+    else:
+        needed = math.prod(math.ceil(a / b) for a, b in zip(data.shape, data.chunks, strict=True))
+        whole = needed <= available and data.id.get_num_chunks() == needed
+    if not whole or stored > available or (size == 0 and len(data)):
+        raise ImageError(
+            f"`{name}` of `{path}` must hold {size:,} bytes {data.shape}, but not all of them are in the file. "
+            "It was not finished, or it is damaged."
+        )
+    picture = data.dtype.itemsize * math.prod(data.shape[1:])
+    most = max(picture, data.dtype.itemsize * math.prod(data.chunks or ()))
+    if most > PICTURE_BYTES:
+        raise ImageError(
+            f"`{name}` of `{path}` has pictures or chunks of {most:,} bytes; at most {PICTURE_BYTES:,} are read. "
+            "Crop or bin the pictures, or store them in smaller chunks."
+        )
+
+
+def read_attributes(path: Path, file: Any, advice: str) -> dict[str, Numbers]:  # noqa: ANN401
+    """Text and numbers among the attributes of a file; others are left out.
+
+    Raises:
+        ImageError: they are damaged.
+    """
+    attributes = {}
+    with as_damage(f"The attributes of `{path}` cannot be read", advice):
+        for name in file.attrs:
+            stored = file.attrs.get_id(name)
+            if stored.shape == () and (stored.dtype.kind in "biufSU" or stored.dtype.metadata):
+                value = file.attrs[name]
+                value = value.item() if hasattr(value, "item") else value
+                if isinstance(value, Numbers):
+                    attributes[name] = value
+    return attributes
+
+
+def names_in(path: Path, file: Any) -> str:  # noqa: ANN401
+    """The first names in a file, for a message."""
+    with as_damage(f"`{path}` is not a complete HDF5 file", "It is damaged."):
+        return str(sorted(islice(file, 4)))[:80]

@@ -1,5 +1,6 @@
 """Write files of pairs, which `mwdn.data.pairs` reads."""
 
+import math
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -9,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mwdn.data.hdf5 import CheckedFile, create_hdf5
+from mwdn.data.hdf5 import PICTURE_BYTES, CheckedFile, create_hdf5
 from mwdn.errors import ImageError, ParameterError, ShapeError
 from mwdn.io.files import as_image_error, atomic
 from mwdn.types import Frame
@@ -64,11 +65,15 @@ class PairWriter:
         psf: Tensor | None,
     ) -> None:
         check_path(path)
+        if dtype not in ("uint8", "uint16", "float32"):
+            raise ParameterError(f"`dtype` ('{dtype}') must be 'uint8', 'uint16' or 'float32'.")
         for name, shape in zip(NAMES, shapes, strict=True):
             if len(shape) != 3 or min(shape) < 1:
                 raise ParameterError(f"`{name}_shape` {tuple(shape)} must be (height, width, channels), all positive.")
-        if dtype not in ("uint8", "uint16", "float32"):
-            raise ParameterError(f"`dtype` ('{dtype}') must be 'uint8', 'uint16' or 'float32'.")
+            if np.dtype(dtype).itemsize * math.prod(shape) > PICTURE_BYTES:
+                raise ParameterError(
+                    f"`{name}_shape` {tuple(shape)} must have {PICTURE_BYTES:,} bytes at most: crop it."
+                )
         for key, value in attributes.items():
             if not isinstance(value, str | int | float) or key == VERSION_KEY:
                 raise ParameterError(f"`attributes` must hold text and numbers; '{key}' is {type(value).__name__}.")

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from mwdn.data.hdf5 import as_damage, find_rows, names_in, open_hdf5, read_attributes
 from mwdn.data.pair_writer import NAMES, VERSION, VERSION_KEY, Attribute, PairWriter, PixelType, Shape
 from mwdn.errors import ImageError
 from mwdn.types import Psf
@@ -47,8 +48,7 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
         self._file: Any = None
         self._rows: dict[str, Any] = {}  # a lookup by name takes as long as reading a pair
         self._owner = 0
-        file = _open_hdf5(self.path)
-        with file:
+        with open_hdf5(self.path, _MAKE_AGAIN) as file:
             self._header = _read_header(self.path, file)
 
     @classmethod
@@ -110,12 +110,13 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
     def psf(self) -> Psf | None:
         """(1, C, H, W), as stored, or ``None`` if the file has none."""
         file = self._open()
-        if "psf" not in file:
+        data = find_rows(self.path, file, "psf", _MAKE_AGAIN)
+        if data is None:
             return None
-        try:
-            return torch.from_numpy(np.asarray(file["psf"][()], np.float32))[None]
-        except (OSError, ValueError) as error:
-            raise ImageError(f"`psf` of `{self.path}` cannot be read: {error}. {_MAKE_AGAIN}") from error
+        if data.ndim != 3 or data.dtype.kind != "f":
+            raise ImageError(f"`psf` of `{self.path}` ({data.shape}, {data.dtype}) must be floats, (C, H, W).")
+        with as_damage(f"`psf` of `{self.path}` cannot be read", _MAKE_AGAIN):
+            return torch.from_numpy(data[()].astype(np.float32))[None]
 
     def close(self) -> None:
         """Close the file in this process; the next read opens it again."""
@@ -137,44 +138,31 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
             # After a fork the handle is the parent's. Closing this copy does not close the parent's.
             self.close()
         if self._file is None:
-            self._file, self._owner = _open_hdf5(self.path), os.getpid()
+            self._file, self._owner = open_hdf5(self.path, _MAKE_AGAIN), os.getpid()
+            if _read_header(self.path, self._file) != self._header:
+                raise ImageError(f"`{self.path}` was replaced by another file meanwhile. Start again.")
             self._rows = {name: self._file[name] for name in NAMES}
         return self._file
 
     def _read(self, name: str, number: int) -> Tensor:
-        try:
+        with as_damage(f"`{name}` {number} of `{self.path}` cannot be read", _MAKE_AGAIN):
             self._open()
             stored = self._rows[name][number]
-        except (OSError, KeyError, ValueError) as error:
-            raise ImageError(f"`{name}` {number} of `{self.path}` cannot be read: {error}. {_MAKE_AGAIN}") from error
         pixels = stored.transpose(2, 0, 1).astype(np.float32, order="C")
         if stored.dtype.kind == "u":
             pixels /= np.float32(np.iinfo(stored.dtype).max)
         return torch.from_numpy(pixels)
 
 
-def _open_hdf5(path: Path) -> Any:  # noqa: ANN401
-    import h5py
-
-    if not path.is_file():
-        raise ImageError(f"`{path}` is not a file. Check the name, or make one with `mwdn import`.")
-    try:
-        # No lock: finished files never change, and many shared file systems of clusters do not support locks.
-        return h5py.File(path, "r", locking=False)
-    except OSError as error:
-        raise ImageError(f"`{path}` is not a complete HDF5 file: {error}. {_MAKE_AGAIN}") from error
-
-
 def _read_header(path: Path, file: Any) -> _Header:  # noqa: ANN401
-    import h5py
-
-    if {"gt", "blur"} <= set(file):
-        raise ImageError(f"`{path}` is the authors' file: `mwdn import mwdn {path} -o pairs.h5`.")
+    with as_damage(f"`{path}` is not a complete HDF5 file", _MAKE_AGAIN):
+        if "gt" in file and "blur" in file:
+            raise ImageError(f"`{path}` is the authors' file: `mwdn import mwdn {path} -o pairs.h5`.")
     shapes = []
     for name in NAMES:
-        data = file.get(name)
-        if not isinstance(data, h5py.Dataset):
-            raise ImageError(f"`{path}` must have the data set `{name}`, but has {sorted(file)}. {_MAKE_AGAIN}")
+        data = find_rows(path, file, name, _MAKE_AGAIN)
+        if data is None:
+            raise ImageError(f"`{path}` must have the data set `{name}`, but has {names_in(path, file)}. {_MAKE_AGAIN}")
         if data.ndim != 4 or data.dtype.str not in ("|u1", "<u2", ">u2", "<f4", ">f4"):
             raise ImageError(
                 f"`{name}` of `{path}` ({data.shape}, {data.dtype}) must be (N, H, W, C) of uint8, uint16 or float32."
@@ -182,7 +170,7 @@ def _read_header(path: Path, file: Any) -> _Header:  # noqa: ANN401
         shapes.append(data.shape)
     if shapes[0][0] != shapes[1][0]:
         raise ImageError(f"`{path}` has {shapes[0][0]:,} measurements and {shapes[1][0]:,} scenes. {_MAKE_AGAIN}")
-    attributes = {key: value.item() if hasattr(value, "item") else value for key, value in file.attrs.items()}
+    attributes = read_attributes(path, file, _MAKE_AGAIN)
     if (version := attributes.pop(VERSION_KEY, VERSION)) != VERSION:
         raise ImageError(f"`{path}` has format version {version}, but version {VERSION} is needed. Update mwdn.")
     return _Header(shapes[0][0], shapes[0][1:], shapes[1][1:], attributes)

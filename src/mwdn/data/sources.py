@@ -9,9 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from mwdn.data.hdf5 import as_damage, find_rows, names_in, open_hdf5
 from mwdn.errors import ImageError
 from mwdn.io.images import READABLE, decode_frame, read_frame
 from mwdn.types import Frame
+
+MOST_ROWS = 2**21
+"""Most pairs of one file: listing them takes 0.7 GB."""
 
 COPY_AGAIN = "Copy it from its source again."
 
@@ -91,23 +95,18 @@ def list_hdf5(path: Path, captures: str, scenes: str) -> Listing:
     Raises:
         ImageError: not HDF5, cut off, or without these data sets.
     """
-    import h5py
-
-    if not path.is_file():
-        raise ImageError(f"`{path}` is not a file. Check the name.")
-    try:
-        file = h5py.File(path, "r", locking=False)
-    except OSError as error:
-        raise ImageError(f"`{path}` is not a complete HDF5 file: {error}. {COPY_AGAIN}") from error
+    file = open_hdf5(path, COPY_AGAIN)
     for name in (captures, scenes):
-        data = file.get(name)
-        if not isinstance(data, h5py.Dataset) or data.ndim != 4 or data.shape[1] not in (1, 3) or data.dtype != "u1":
+        data = find_rows(path, file, name, COPY_AGAIN)
+        if data is None or data.ndim != 4 or data.shape[1] not in (1, 3) or data.dtype != "u1":
             raise ImageError(
-                f"`{path}` must have `{name}`, (N, 3, H, W) of uint8, but has {sorted(file)}. "
+                f"`{path}` must have `{name}`, (N, 3, H, W) of uint8, but has {names_in(path, file)}. "
                 "Name the data sets: `--captures blur --scenes gt`."
             )
     counts = [len(file[name]) for name in (captures, scenes)]
     complete = min(counts)
+    if max(counts) > MOST_ROWS:
+        raise ImageError(f"`{path}` claims {max(counts):,} pairs; at most {MOST_ROWS:,} are imported. Divide it.")
     refused = {
         f"row {row}": f"Row {row} of `{path}` is in one of `{captures}` ({counts[0]:,}) and `{scenes}` ({counts[1]:,})"
         f" only. {COPY_AGAIN}"
@@ -234,8 +233,6 @@ def _read_both(capture: Path, scene: Path) -> tuple[Frame, Frame]:
 
 
 def _read_row(path: Path, file: Any, names: tuple[str, str], row: int) -> tuple[Frame, Frame]:  # noqa: ANN401
-    try:
+    with as_damage(f"Row {row} of `{path}` cannot be read", COPY_AGAIN):
         capture, scene = (np.moveaxis(file[name][row], 0, -1) for name in names)
-    except OSError as error:
-        raise ImageError(f"Row {row} of `{path}` cannot be read: {error}. {COPY_AGAIN}") from error
-    return capture, scene
+        return capture, scene

@@ -1,0 +1,69 @@
+"""Files of pairs, and authors' files, that reach for other files or claim more than they hold."""
+
+import os
+
+import h5py
+import numpy as np
+import pytest
+
+from mwdn.data import PairFile
+from mwdn.data.sources import list_hdf5
+from mwdn.errors import ImageError
+
+SHAPE = (2, 3, 3, 3)
+
+
+def virtual(file, name, source):
+    layout = h5py.VirtualLayout(SHAPE, "u1")
+    layout[:] = h5py.VirtualSource(source, name, SHAPE)
+    file.create_virtual_dataset(name, layout)
+
+
+def bomb(file, name, _):
+    """Three chunks of 268 MB of zeros, which gzip makes 261 kB; here one byte each, for they are never read."""
+    data = file.create_dataset(name, (1, 3, 16384, 16384), "u1", chunks=(1, 1, 16384, 16384), compression="gzip")
+    for channel in range(3):
+        data.id.write_direct_chunk((0, channel, 0, 0), b"0")
+
+
+CONTENTS = {
+    "external link": (lambda file, name, other: file.update({name: h5py.ExternalLink(other, name)}), "is a link"),
+    "soft link": (lambda file, name, _: file.update({name: h5py.SoftLink("/elsewhere")}), "is a link"),
+    "virtual": (virtual, "is stored in other files"),
+    "external storage": (
+        lambda file, name, other: file.create_dataset(name, SHAPE, "u1", external=[(other, 0, 54)]),
+        "is stored in other files",
+    ),
+    "nothing written": (
+        lambda file, name, _: file.create_dataset(name, (10**12, 3, 3, 3), "u1", chunks=(1, 3, 3, 3)),
+        "must hold 27,000,000,000,000 bytes",
+    ),
+    "no numbers": (lambda file, name, _: file.create_dataset(name, (10**12, 0, 3, 3), "u1"), "must hold 0 bytes"),
+    "a bomb": (bomb, "805,306,368 bytes; at most 536,870,912"),
+}
+
+
+@pytest.mark.parametrize("content", CONTENTS)
+@pytest.mark.parametrize("kind", ["pairs", "authors"])
+@pytest.mark.parametrize("other", ["file", "pipe"])
+def test_only_what_is_in_the_file_is_read(tmp_path, content, kind, other):
+    """Such files reached any readable file, hung on pipes, and took the memory of what they claim."""
+    put, message = CONTENTS[content]
+    names = ("measurement", "scene") if kind == "pairs" else ("gt", "blur")
+    if other == "pipe":
+        os.mkfifo(tmp_path / "other.h5")
+    else:
+        with h5py.File(tmp_path / "other.h5", "w") as file:
+            file.update({name: np.ones(SHAPE, "u1") for name in names})
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name in names:
+            put(file, name, str(tmp_path / "other.h5"))
+    with pytest.raises(ImageError, match=message):
+        PairFile(tmp_path / "a.h5") if kind == "pairs" else list_hdf5(tmp_path / "a.h5", "blur", "gt")
+
+
+def test_a_pipe_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "a.h5")
+    for read in (PairFile, lambda path: list_hdf5(path, "blur", "gt")):
+        with pytest.raises(ImageError, match="is a pipe"):
+            read(tmp_path / "a.h5")
