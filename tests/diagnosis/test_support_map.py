@@ -4,26 +4,16 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from cameras import contour_psf
+from cameras import capture_of_rectangles
 from mwdn.diagnosis.support_map import support_map
 from mwdn.io.support_picture import support_picture
-from mwdn.optics.camera import Camera
 from mwdn.solvers.pyramid import Pyramid
-
-SIZE = (120, 120)
 
 
 @pytest.fixture(scope="module")
 def capture():
-    """A PSF, a scene with coloured rectangles in its middle and darkness around, and its capture."""
-    generator = torch.Generator().manual_seed(2)
-    psf = contour_psf(SIZE, generator=generator).expand(-1, 3, -1, -1)
-    scene = torch.zeros(1, 3, *SIZE)
-    for _ in range(12):
-        top, left = torch.randint(40, 66, (2,), generator=generator).tolist()
-        scene[..., top : top + 10, left : left + 12] = torch.rand(3, 1, 1, generator=generator)
-    light = Camera(psf).forward(scene)
-    return psf, scene, light + 0.004 * light.amax() * torch.randn(light.shape, generator=generator)
+    """The object is in the middle, with darkness around."""
+    return capture_of_rectangles((120, 120), count=12, corners=(40, 66), rectangle=(10, 12))
 
 
 def at_parts(image, support):

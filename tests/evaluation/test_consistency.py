@@ -3,26 +3,16 @@
 import pytest
 import torch
 
-from cameras import contour_psf
+from cameras import capture_of_rectangles
 from mwdn.errors import ShapeError
 from mwdn.evaluation.consistency import Consistency, consistency
 from mwdn.optics.camera import Camera
 from mwdn.solvers.alignment import Pose, fine_detail
 
-SIZE, NOISE = (128, 144), 0.004
-
 
 @pytest.fixture(scope="module")
 def capture():
-    """A PSF, a scene of coloured rectangles, and its capture with white noise."""
-    generator = torch.Generator().manual_seed(2)
-    psf = contour_psf(SIZE, generator=generator).expand(-1, 3, -1, -1)
-    scene = torch.zeros(1, 3, *SIZE)
-    for _ in range(25):
-        top, left = torch.randint(25, 90, (2,), generator=generator).tolist()
-        scene[..., top : top + 12, left : left + 16] = torch.rand(3, 1, 1, generator=generator)
-    light = Camera(psf).forward(scene)
-    return psf, scene, light + NOISE * light.amax() * torch.randn(light.shape, generator=generator)
+    return capture_of_rectangles((128, 144), count=25, corners=(25, 90), rectangle=(12, 16))
 
 
 def test_the_true_scene_explains_all_that_is_not_noise(capture):

@@ -17,6 +17,12 @@ from mwdn.solvers.alignment import Pose
 from mwdn.solvers.spectral_misfit import spectral_misfit
 from mwdn.types import Measurement, Psf
 
+HALF_TURNS = ("", *(name for name in get_args(Orientation) if not swaps_axes(name)))
+"""No turn, mirror images, and a turn by 180 degrees: those of any frame."""
+
+QUARTER_TURNS = tuple(name for name in get_args(Orientation) if swaps_axes(name))
+"""Turns that exchange rows and columns: those of a square frame only."""
+
 CLEAR = 1.17
 """Contrast above which the best orientation is certain."""
 
@@ -100,23 +106,18 @@ def fit_orientations(
     return replace(fit, given=given)
 
 
-def fit_half_turns(measurement: Measurement, psf: Psf) -> OrientationFit:
-    """Fit the best scene through a PSF, its mirror images, and it turned by 180 degrees."""
-    return _fit_each(measurement, psf, ("", *(name for name in get_args(Orientation) if not swaps_axes(name))))
-
-
 def _fit(measurement: Measurement, psf: Psf) -> OrientationFit:
-    quarter_turns = tuple(name for name in get_args(Orientation) if swaps_axes(name))
-    fit = fit_half_turns(measurement, psf)
+    fit = fit_turns(measurement, psf, HALF_TURNS)
     if fit.lead < CLEAR and psf.shape[-2] == psf.shape[-1]:
-        others = _fit_each(measurement, psf, quarter_turns)
+        others = fit_turns(measurement, psf, QUARTER_TURNS)
         fit = replace(fit, misfits={**fit.misfits, **others.misfits})
     return fit
 
 
-def _fit_each(measurement: Measurement, psf: Psf, names: tuple[str, ...]) -> OrientationFit:
-    psfs = [turn(psf, cast(Orientation, name)) if name else psf for name in names]
+def fit_turns(measurement: Measurement, psf: Psf, turns: tuple[str, ...]) -> OrientationFit:
+    """Fit the best scene through a PSF after each of these turns; an empty name is none."""
+    psfs = [turn(psf, cast(Orientation, name)) if name else psf for name in turns]
     misfits = spectral_misfit(measurement, torch.cat(psfs)).exp().tolist()
     return OrientationFit(
-        dict(zip(names, misfits, strict=True)), noise_bounds(measurement).high, min(measurement.shape[-2:])
+        dict(zip(turns, misfits, strict=True)), noise_bounds(measurement).high, min(measurement.shape[-2:])
     )

@@ -20,7 +20,7 @@ from dataclasses import replace
 
 from mwdn.calibration import Calibration
 from mwdn.diagnosis.encoding import as_linear_and_coded, misfits
-from mwdn.diagnosis.orientation import CLEAR, fit_half_turns
+from mwdn.diagnosis.orientation import CLEAR, HALF_TURNS, fit_turns
 from mwdn.diagnosis.verdict import Verdict
 from mwdn.types import Frame
 
@@ -66,7 +66,7 @@ def _score(frame: Frame, calibration: Calibration, capture: str) -> float:
         measurement = calibration.to_measurement(frame)
     else:  # without the dark frame, which was read with the wrong gamma, too
         measurement = replace(calibration.frames, gamma=None if capture == "linear" else "srgb").to_measurement(frame)
-    linear, coded = (fit_half_turns(measurement, psf) for psf in as_linear_and_coded(calibration))
+    linear, coded = (fit_turns(measurement, psf, HALF_TURNS) for psf in as_linear_and_coded(calibration))
     if max(linear.lead, coded.lead) < CLEAR:
         return 0.0
     better = min(coded.misfits.values()) / min(linear.misfits.values())

@@ -12,15 +12,13 @@ are comparable, though the misfit itself is smaller for every smaller, more comp
 import math
 from typing import NamedTuple
 
-import torch
 from torch.nn import functional as F
 
 from mwdn.calibration import Calibration, FrameFormat
 from mwdn.calibration.frame_operations import bin_pixels, crop_centre
-from mwdn.diagnosis.orientation import CLEAR
+from mwdn.diagnosis.orientation import CLEAR, HALF_TURNS, QUARTER_TURNS, fit_turns
 from mwdn.diagnosis.verdict import Verdict
 from mwdn.errors import ShapeError
-from mwdn.solvers.spectral_misfit import spectral_misfit
 from mwdn.types import Measurement, Psf, Size
 
 BINS = range(1, 9)
@@ -65,12 +63,8 @@ def fit_sizes(measurement: Measurement, psf: Psf) -> list[Fit]:
 def _lead(capture: Measurement, psf: Psf) -> float:
     while capture[0, 0].numel() > LARGEST:
         capture, psf = F.avg_pool2d(capture, 2), F.avg_pool2d(psf, 2)
-    turned = [psf, psf.flip(-1), psf.flip(-2), psf.flip(-2, -1)]
-    if psf.shape[-2] == psf.shape[-1]:
-        turned += [image.mT for image in turned]
-    psfs = torch.cat(turned)
-    first, second = spectral_misfit(capture, psfs / psfs.sum((-2, -1), keepdim=True)).sort().values[:2].tolist()
-    return second - first
+    turns = HALF_TURNS + (QUARTER_TURNS if psf.shape[-2] == psf.shape[-1] else ())
+    return math.log(fit_turns(capture, psf / psf.sum(), turns).lead)
 
 
 def fitting_size(measurement: Measurement, calibration: Calibration) -> Verdict:
