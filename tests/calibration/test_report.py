@@ -106,6 +106,8 @@ def test_a_noisy_picture_of_a_blurred_psf_says_how_far_it_is_known(tmp_path, gen
 
 def test_exposure(tmp_path, psf):
     assert said(report_of(tmp_path, frame_of(psf, peak=0.2)), "20 % of the full scale", "Expose longer")
+    # A well exposed 12-bit PSF in a 16-bit file: longer exposures would saturate it.
+    assert said(report_of(tmp_path, frame_of(psf, peak=0.05)), "Expose longer, unless", "`--bit-depth 12`")
     assert said(report_of(tmp_path, frame_of(psf, bits=8)), "230 levels", "16 bits")
     frame = frame_of(psf)
     frame.reshape(-1, 3)[np.argsort(frame[..., 1].ravel())[-5:]] = 65535

@@ -32,6 +32,7 @@ class Levels:
         between: level between the lines, as a fraction of the full scale; mean of the colours.
         noise: standard deviation of a pixel's noise, as a fraction of the full scale.
         noise_floor: power of the noise in |H|^2, for the PSF of unit sum.
+        possible_bit_depth: of the sensor, if its numbers may be in the lower bits of the file's; else ``None``.
     """
 
     integers: bool
@@ -44,6 +45,7 @@ class Levels:
     between: float
     noise: float
     noise_floor: float
+    possible_bit_depth: int | None = None
 
 
 @dataclass(frozen=True)
@@ -187,4 +189,5 @@ def _levels(calibration: Calibration, frame: Frame) -> Levels:
         between=psf_measures.level_between_lines(upright[psf_measures.support_box(calibration.psf)]),
         noise=float(noise.max()),
         noise_floor=float((pixels * (noise / light).square()).max()),
+        possible_bit_depth=frames.possible_bit_depth(frame),
     )

@@ -52,7 +52,10 @@ def _levels(report: PsfReport) -> Iterator[Finding]:
         text = f"{levels.saturated:,} pixels are at the sensor's maximum: the brightest lines may be cut. Expose less."
         yield Finding("mind", text)
     elif levels.peak < 0.3:
-        text = f"The brightest pixel reaches only {_percent(levels.peak)} of the full scale. Expose longer."
+        bits = levels.possible_bit_depth
+        text = f"The brightest pixel reaches only {_percent(levels.peak)} of the full scale. Expose longer" + (
+            f", unless the sensor has {bits} bits: `--bit-depth {bits}`." if bits else "."
+        )
         yield Finding("mind", text)
     else:
         yield Finding("good", f"Well exposed: the brightest pixel reaches {_percent(levels.peak)} of the full scale.")
