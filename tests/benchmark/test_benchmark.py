@@ -14,11 +14,12 @@ import pytest
 import torch
 
 from cameras import contour_psf
-from mwdn.benchmark import read_benchmark, run
+from mwdn.benchmark import Watch, read_benchmark, run
 from mwdn.cli.app import main
 from mwdn.data.pairs import PairFile
 from mwdn.errors import CheckpointError, ParameterError, UnknownNameError
 from mwdn.evaluation import alexnet, bootstrap
+from mwdn.training.recipe import Schedule
 
 RECIPE = """
 title = "Two networks & a solver"
@@ -303,3 +304,16 @@ def test_recipes_that_come_along(name, monkeypatch):
     assert benchmark.data["diffusercam-real"].trained_on == "diffusercam-sim"
     for recipe in benchmark.data.values():
         assert (protocol := recipe.binned_protocol()).name == "full" or protocol.rows or protocol.centre
+
+
+def test_samples_are_a_stage_before_the_steps():
+    """A recipe with `pool` showed a training at 0 % for as long as its samples took."""
+    seen = []
+    watch = Watch(lambda title, parts: seen.append((title, parts)), lambda done, note: seen.append(done))
+    samples = watch.training("data", "net", Schedule(steps=10, pool=4))
+    for done in (1, 2):  # the first one from an interrupted run
+        samples(done, 2)
+    assert seen == [("data: simulating samples for net", 2), 1, 2, ("data: training net", 10)]
+    seen.clear()
+    watch.training("data", "net", Schedule(steps=10))
+    assert seen == [("data: training net", 10)]

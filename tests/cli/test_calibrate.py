@@ -11,7 +11,7 @@ import torch
 
 from cameras import contour_psf
 from mwdn import Camera, read_frame
-from mwdn.calibration.camera_file import read_camera
+from mwdn.calibration.camera_file import read_camera, write_camera
 from mwdn.cli.app import main
 
 SIZE = 64, 80
@@ -76,6 +76,27 @@ def test_options_on_the_command_line_take_precedence(run):
     assert run(f"{RECONSTRUCT} c --camera camera.toml --psf lab/other.png")[0] == 0
     hashes = [json.loads(Path(name, "capture.json").read_text())["psf_hash"] for name in "bc"]
     assert hashes[0] != hashes[1]
+
+
+@pytest.mark.usefixtures("folder")
+def test_none_leaves_out_what_the_camera_file_says(run):
+    """There was no way to do without its dark frame but to edit the file."""
+    cv2.imwrite("dark.png", np.full((*SIZE, 3), 2000, np.uint16))
+    content = {
+        "psf": Path("lab/psf.png"),
+        "dark": "dark.png",
+        "ambient": "dark.png",
+        "crop": (48, 48),
+        "mosaic": "rggb",
+    }
+    content |= {"gamma": 2.2, "psf_orientation": "rotate-180", "bit_depth": 14, "white_balance": "psf"}
+    write_camera("camera.toml", content)
+    without = "--dark none --ambient none --crop none --mosaic none --gamma none --psf-orientation none"
+    line = f"{RECONSTRUCT} a --camera camera.toml {without} --bit-depth none --white-balance none"
+    code, _, err = run(line)
+    assert (code, err) == (0, "")
+    assert run(f"{RECONSTRUCT} b --psf lab/psf.png")[0] == 0
+    np.testing.assert_array_equal(picture("a"), picture("b"))
 
 
 @pytest.mark.usefixtures("folder")

@@ -281,7 +281,7 @@ def test_command_prints_before_it_writes(common, tmp_path, capsys):
     [
         (3, math.nan, 1, "The measurement of pair 1, counted from 0, holds NaN or infinity"),
         (0, 0, 1, "`pairs` must not be empty"),
-        (3, 0, 2, "The PSF is 2 times as large: multiply `--psf-bin` by 2."),
+        (3, 0, 2, "The PSF is 2 times as large: multiply `--bin`, which is 1 unless given, by 2."),
     ],
 )
 def test_command_on_unusable_pairs(common, tmp_path, capsys, count, value, scale, message):
@@ -292,6 +292,17 @@ def test_command_on_unusable_pairs(common, tmp_path, capsys, count, value, scale
     np.save(tmp_path / "psf.npy", np.kron(np.load(tmp_path / "psf.npy"), np.ones((scale, scale, 1), np.float32)))
     assert run("evaluate", "wiener", *common, "--out", tmp_path / "out") == 2
     assert message in capsys.readouterr().err
+
+
+def test_advice_for_pairs_of_another_bin_is_right(common, tmp_path, capsys):
+    """The PSF's file is 4 times as large as the pairs, its camera file says 2: `--psf-bin 2` changed nothing."""
+    np.save(tmp_path / "large.npy", np.kron(np.load(tmp_path / "psf.npy"), np.ones((4, 4, 1), np.float32)))
+    camera = tmp_path / "camera.toml"
+    camera.write_text('psf = "large.npy"\nbackground = 0.0\nbin = 2\n', encoding="utf-8")
+    line = ("evaluate", "wiener", *common[:2], "--camera", camera, "--no-lpips", "--out", tmp_path / "out")
+    assert run(*line) == 2
+    assert "The PSF is 2 times as large: multiply `--bin`, which is 1 unless given, by 2" in capsys.readouterr().err
+    assert run(*line, "--bin", "4") == 0
 
 
 def test_command_warns_of_pairs_of_another_camera(common, tmp_path, capsys):

@@ -25,6 +25,7 @@ from mwdn.evaluation.alexnet import SMALLEST, load_alexnet
 from mwdn.io.files import refuse_foreign, write_text
 from mwdn.runtime.distributed import local_device
 from mwdn.training.losses import NEED_ALEXNET
+from mwdn.training.recipe import Schedule
 from mwdn.training.report import Report
 
 PAGE = "index.html"
@@ -49,6 +50,23 @@ class Watch:
         for number, row in enumerate(rows):
             yield row
             self.done(number + 1, "")
+
+    def training(self, name: str, label: str, schedule: Schedule) -> Callable[[int, int], None]:
+        """Show the training of one network; returns a callback for its cached samples, a stage before the steps."""
+        if not schedule.pool:
+            self.stage(f"{name}: training {label}", schedule.steps)
+        started = False
+
+        def samples(done: int, total: int) -> None:
+            nonlocal started
+            if not started:
+                self.stage(f"{name}: simulating samples for {label}", total)
+            started = True
+            self.done(done, "")
+            if done == total:
+                self.stage(f"{name}: training {label}", schedule.steps)
+
+        return samples
 
     def report(self, report: Report) -> None:
         """Show a training step."""
@@ -137,8 +155,8 @@ def _train_all(
     }
     for part in claim_parts(out, list(runs)):
         dataset, method = runs[part]
-        watch.stage(f"{dataset.name}: training {method.label}", benchmark.schedule.steps)
-        train(method, dataset, benchmark, out / part, device=device, show=watch.report)
+        watched = watch.training(dataset.name, method.label, benchmark.schedule)
+        train(method, dataset, benchmark, out / part, device=device, show=watch.report, samples=watched)
 
 
 def _checkpoint(method: Method, dataset: Dataset, out: Path) -> Path | None:

@@ -72,6 +72,7 @@ def train(
     *,
     device: torch.device,
     show: Callable[[Report], None],
+    samples: Callable[[int, int], None] = lambda done, total: None,
 ) -> Path:
     """Train a network to the end of the budget, resuming an interrupted run; a finished run is left as it is.
 
@@ -82,6 +83,7 @@ def train(
         folder: of the run.
         device: where to train.
         show: called after each step.
+        samples: called with the number of cached samples that are done and their total, if the recipe has a `pool`.
 
     Returns:
         The checkpoint with the best validation.
@@ -111,7 +113,7 @@ def train(
             write_text(folder / CLOCK, json.dumps({"step": report.step, "seconds": total}))
         show(report)
 
-    trainer.run(save_time)
+    trainer.run(save_time, samples=samples)
     return folder / "best.safetensors"
 
 

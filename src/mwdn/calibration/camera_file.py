@@ -50,7 +50,8 @@ _FILES = ("psf", "dark", "ambient")
 _HEAD = """\
 # A camera of mwdn: its PSF, and how its frames become measurements. Paths are relative to this file.
 # Use it in any command: mwdn reconstruct CAPTURES --camera {name}
-# Options on the command line take precedence. To set a key that is a comment, remove its #.
+# Options on the command line take precedence; --mosaic none does without a key.
+# To set a key that is a comment, remove its #.
 """
 
 

@@ -22,15 +22,16 @@ class CameraOptions:
         psf_format: where the PSF's file differs from it.
         dark: frame taken without light, subtracted from the PSF and the captures.
         ambient: frame taken with the room's light alone, subtracted from the captures.
-        camera: camera file of `mwdn calibrate`, with all of these; options on the command line take precedence.
+        camera: camera file of `mwdn calibrate`, with all of these; options on the command line take precedence:
+            --mosaic none, --dark none ... do without what the file says.
     """
 
     psf: Path | None = None
     frames: Annotated[FrameFormat, Parameter(name="*")] = FrameFormat()
     _: KW_ONLY
     psf_format: Annotated[PsfFormat, Parameter(name="*")] = PsfFormat()
-    dark: Path | None = None
-    ambient: Path | None = None
+    dark: None | Path = None  # noqa: RUF036 - cyclopts tries None first, so that `--dark none` is no path
+    ambient: None | Path = None  # noqa: RUF036
     camera: Path | None = None
 
     @property

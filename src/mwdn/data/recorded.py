@@ -179,9 +179,13 @@ def check_pairs(file: PairFile, psf: Psf) -> None:
     (h, w, channels), (H, W), colours = file.measurement_shape, psf.shape[-2:], psf.shape[1]
     if (h, w) != (H, W):
         factor = H // h
-        way_out = "Use the PSF of their camera, cropped and binned as they are: `crop`, `psf_bin`."
+        way_out = "Use the PSF of their camera, cropped and binned as they are: `crop`, `bin`, `psf_bin`."
         if factor > 1 and (h * factor, w * factor) == (H, W):
-            way_out = f"The PSF is {factor} times as large: multiply `psf_bin` by {factor}."
+            # `psf_bin` alone would also crop a larger part of the PSF's file.
+            way_out = (
+                f"The PSF is {factor} times as large: multiply `bin`, which is 1 unless given, by {factor}. If the "
+                "PSF has a bin of its own, `psf_bin`, multiply it, too."
+            )
         raise ShapeError(f"`psf` ({H} x {W}) and the measurements of `{file.path}` ({h} x {w}) must match. {way_out}")
     if colours not in (1, channels):
         raise ShapeError(
