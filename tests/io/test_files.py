@@ -1,6 +1,7 @@
 """A file is written completely or not at all."""
 
 import os
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -43,6 +44,23 @@ def test_a_link_is_not_followed(tmp_path: Path) -> None:
     assert target.read_bytes() == b"old"
     with pytest.raises(ParameterError, match=r"link\.bin` cannot be written: it is a symbolic link"):
         refuse_overwrite(link)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="no number of the computer's start")
+def test_a_killed_process_leaves_nothing_for_long(tmp_path: Path) -> None:
+    """Hidden files of killed runs piled up. Those of running processes and of other computers must stay."""
+    killed = (
+        "import os; from pathlib import Path; from mwdn.io.files import atomic\nwith atomic(Path('b.bin')): os.kill("
+    )
+    subprocess.run([sys.executable, "-c", killed + "os.getpid(), 9)"], cwd=tmp_path, check=False)
+    (left,) = tmp_path.iterdir()
+    _, computer, process, token = left.name.split("-")
+    kept = [f".mwdn-{computer}-{os.getppid()}-{token}", f".mwdn-00000000-{process}-{token}", ".mwdn-notes"]
+    for name in kept:
+        put(tmp_path / name, b"")
+    with atomic(tmp_path / "a.bin"):
+        assert not left.exists()
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*kept, "a.bin"])
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no pipes in folders")

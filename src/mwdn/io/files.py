@@ -1,12 +1,15 @@
 """Atomic writing of files, and errors of the disk as errors of this package."""
 
 import errno
+import hashlib
 import json
 import os
+import re
 import secrets
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +26,8 @@ def atomic(path: Path) -> Iterator[Path]:
     """Write a file completely or not at all.
 
     The file is written under a hidden name in the same folder, and renamed once it is on the disk. If anything fails
-    before that, an existing ``path`` keeps its content and the hidden file is removed.
+    before that, an existing ``path`` keeps its content and the hidden file is removed. That of a process that
+    was killed is removed by the next process that writes to the folder.
 
     Args:
         path: the file to write. Missing folders are created.
@@ -38,18 +42,67 @@ def atomic(path: Path) -> Iterator[Path]:
     path = path.absolute()
     check_regular(path)
     path.parent.mkdir(parents=True, exist_ok=True)
+    _remove_leftovers(path.parent)
     # Without the stem of `path`: a long one plus the token could exceed the 255 bytes of a file name.
-    temporary = path.with_name(f".mwdn-{os.getpid()}-{secrets.token_hex(4)}{path.suffix}")
+    temporary = path.with_name(f".mwdn-{_computer()}-{os.getpid()}-{secrets.token_hex(4)}{path.suffix}")
     try:
         temporary.touch()
         mode = temporary.stat().st_mode
-        yield temporary
+        with _as_os_error():
+            yield temporary
         temporary.chmod(mode)  # the folder's usual mode: safetensors makes its files readable by their owner only
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def _as_os_error() -> Iterator[None]:
+    """Turn the error that safetensors raises when the disk is full into the `OSError` that it stands for."""
+    try:
+        yield
+    except SafetensorError as error:
+        code = re.search(r"\(os error (\d+)\)", str(error))
+        raise (OSError(int(code[1]), os.strerror(int(code[1]))) if code else OSError(str(error))) from error
+
+
+@cache
+def _computer() -> str:
+    """Identifies the computer since its start, and the container: process numbers are unique within it.
+
+    Empty where the system does not tell; nobody then knows which files are left over, and they stay.
+    """
+    try:
+        start = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii")
+        return hashlib.sha256(f"{start} {Path('/proc/self/ns/pid').readlink()}".encode()).hexdigest()[:8]
+    except OSError:
+        return ""
+
+
+@cache
+def _remove_leftovers(folder: Path) -> None:
+    """Remove the hidden files of processes that were killed, once for each folder.
+
+    Another computer that shares the folder may still be writing its own: only those of this one are judged.
+    """
+    hidden = re.compile(rf"\.mwdn-{_computer()}-(\d+)-[0-9a-f]{{8}}(\..*)?")
+    with suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries if _computer() else []:
+            match = hidden.fullmatch(entry.name)
+            if match and entry.is_file(follow_symlinks=False) and not _is_running(int(match[1])):
+                Path(entry.path).unlink(missing_ok=True)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)  # sends nothing
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):  # it belongs to another user
+        return True
+    return True
 
 
 def check_regular(path: Path) -> None:
@@ -72,8 +125,11 @@ def as_image_error(path: str | Path, at: str = "") -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        advice = "Make room, or choose another folder." if error.errno in FULL else "Choose another folder."
-        raise ImageError(f"`{path}` cannot be written{at}: {error.strerror or error}. {advice}") from error
+        # numpy's own errors have no number, only "1000 requested and 10 written".
+        full = error.errno is None or error.errno in FULL
+        advice = "Make room, or choose another folder." if full else "Choose another folder."
+        why = error.strerror or f"The disk may be full ({error})"
+        raise ImageError(f"`{path}` cannot be written{at}: {why}. {advice}") from error
 
 
 @contextmanager
@@ -81,9 +137,9 @@ def as_parameter_error(folder: Path, advice: str = "Choose another one: `out`.")
     """Turn an error of the disk while writing into a folder into a `ParameterError` that names the folder."""
     try:
         yield
-    except (OSError, SafetensorError) as error:  # safetensors raises an error of its own when the disk is full
-        reason = getattr(error, "strerror", None) or error
-        raise ParameterError(f"`{folder}` must be a folder that can be written to: {reason}. {advice}") from error
+    except OSError as error:
+        why = error.strerror or error
+        raise ParameterError(f"`{folder}` must be a folder that can be written to: {why}. {advice}") from error
 
 
 @contextmanager

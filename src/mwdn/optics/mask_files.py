@@ -1,6 +1,8 @@
 """Mask files: a 16-bit height map that can be read back; GDSII and STL for fabrication."""
 
+import errno
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,8 @@ from mwdn.optics.masks import Mask
 _FORMAT = "mwdn mask 1"
 _DEEPEST = 256
 """Levels of a continuous surface in GDSII: 8 layers."""
+
+_GDS_END = b"\0\4\4\0"  # the record ENDLIB
 
 MAX_STL_SAMPLES = 4_000_000
 """Two triangles of 50 bytes a sample: 400 MB, about the largest file that slicers open."""
@@ -125,6 +129,9 @@ def write_gds(path: str | Path, mask: Mask) -> None:
             cell.add(gdstk.rectangle(corner, other, layer=layer))
     with atomic_write(path) as temporary:
         library.write_gds(temporary)
+        # gdstk does not notice a full disk. Its record of the end is missing then, or else some of the rectangles.
+        if temporary.read_bytes()[-4:] != _GDS_END or gdstk.gds_info(temporary)["num_polygons"] != len(cell.polygons):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def write_stl(path: str | Path, mask: Mask, *, base_um: float = 100.0, every: int = 1) -> None:
