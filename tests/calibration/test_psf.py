@@ -12,7 +12,7 @@ from PIL import Image
 
 from cameras import contour_psf
 from mwdn.calibration import Calibration, FrameFormat
-from mwdn.calibration.psf import estimate_background
+from mwdn.calibration.psf_levels import estimate_background
 from mwdn.errors import ImageError, ParameterError, PsfError, ShapeError, UnknownNameError
 from mwdn.fourier.convolution import convolve
 from mwdn.io.images import srgb_encode

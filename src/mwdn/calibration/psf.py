@@ -5,21 +5,18 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from mwdn.calibration.camera_file import check_psf_file, read_camera
 from mwdn.calibration.float_scale import check_float_scale
 from mwdn.calibration.frame_format import FrameFormat
-from mwdn.calibration.psf_format import Background, PsfFormat, with_options
+from mwdn.calibration.psf_format import PsfFormat, with_options
+from mwdn.calibration.psf_levels import background_level, empty, refuse_saturated
 from mwdn.calibration.white_balance import WhiteBalance, check_white_balance
 from mwdn.errors import ParameterError, PsfError, ShapeError, check_batch, checked, shown
 from mwdn.io.formats import as_frame
 from mwdn.optics.psf import checked_psf, psf_hash
-from mwdn.types import ArrayPicture, Frame, Image, Measurement, Psf, Size
-
-SATURATED_PART = 1e-3
-"""Largest fraction of saturated pixels in a PSF: a few hot pixels do no harm, saturated lines do. 102 of 320 x 320."""
+from mwdn.types import ArrayPicture, Frame, Measurement, Psf, Size
 
 
 @checked
@@ -153,15 +150,15 @@ class Calibration:
     def _from_frame(
         cls, frame: Frame, frames: FrameFormat, *, psf_format: PsfFormat, dark: Frame | None, ambient: Frame | None
     ) -> "Calibration":
-        _refuse_saturated(frames, frame)
+        refuse_saturated(frames, frame)
         dark_image = None if dark is None else frames.normalise(dark)
         psf_dark = dark_image if psf_format.shares_pixels(frames) else None
         psf = psf_format.own_frames(frames).to_measurement(frame, psf_dark)
-        level = _background_level(psf, psf_format.background)
+        level = background_level(psf, psf_format.background)
         psf = (psf - level).clamp(min=0)
         total = psf.sum((-2, -1), keepdim=True)
         if not (total > 0).all():
-            raise PsfError(_empty(total.flatten() > 0, level.flatten(), with_dark=dark is not None))
+            raise PsfError(empty(total.flatten() > 0, level.flatten(), with_dark=dark is not None))
         return cls(
             psf_format.turn(psf / total, frames),
             frames,
@@ -245,45 +242,6 @@ class Calibration:
                 "The capture is grey, but `psf` has colours. Use both as grey: `grey=True`. If the capture is the raw "
                 "frame of a colour sensor, give the order of its filters: `mosaic='rggb'`."
             )
-
-
-def estimate_background(image: Image) -> Tensor:
-    """Background level of a PSF, (1, C, 1, 1): the 5th percentile of each channel.
-
-    A PSF is dark between its lines; stray light and the sensor's offset fill these places uniformly. A lower
-    percentile would follow the noise of the darkest pixels, a higher one the tails of the PSF itself: on the
-    paper's camera 5 % gives the sharpest reconstructions, 50 % washes them out.
-    """
-    pixels = image.flatten(2).sort(dim=-1).values
-    return pixels[..., int(0.05 * pixels.shape[-1])][..., None, None]
-
-
-def _refuse_saturated(frames: FrameFormat, frame: Frame) -> None:
-    count, maximum = frames.saturated(frame)
-    pixels = frame.shape[0] * frame.shape[1]
-    if count > SATURATED_PART * pixels:
-        raise PsfError(
-            f"PSF is saturated: {count:,} of {pixels:,} pixels are at the {maximum.bit_length()}-bit maximum "
-            f"{maximum}. Lower the exposure and capture it again."
-        )
-
-
-def _background_level(psf: Tensor, background: Background) -> Tensor:
-    if background == "estimate":
-        return estimate_background(psf).clamp(min=0)  # negative if the file's background was subtracted before
-    return torch.full((1, psf.shape[1], 1, 1), float(background))
-
-
-def _empty(has_light: Tensor, level: Tensor, *, with_dark: bool) -> str:
-    names = ["grey"] if len(has_light) == 1 else ["red", "green", "blue"]
-    empty = [name for name, light in zip(names, has_light.tolist(), strict=True) if not light]
-    advice = ["Expose longer"]
-    advice += ["take the dark frame without light"] if with_dark else []
-    advice += ["give `background=0`"] if level.max() > 0 else []
-    return (
-        f"PSF is empty: no light is left in {', '.join(empty)} after subtracting the background "
-        f"({', '.join(f'{v:.3g}' for v in level)} of the full scale). {', or '.join(advice)}."
-    )
 
 
 def _advise(capture: Size, psf: Size, frames: FrameFormat) -> str:

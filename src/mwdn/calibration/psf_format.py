@@ -21,7 +21,7 @@ class PsfFormat:
 
     Args:
         background: uniform light under the PSF in addition to the dark frame: a fraction of the full scale, or
-            ``"estimate"`` (see `mwdn.calibration.psf.estimate_background`). 0 for a PSF without background.
+            ``"estimate"`` (see `mwdn.calibration.psf_levels.estimate_background`). 0 for a PSF without background.
         psf_bin: ``bin`` of the PSF, if it was taken at another resolution than the captures. ``crop`` is scaled to
             cover the same part of the view, and the dark frame is not subtracted from the PSF.
         psf_gamma: encoding of the PSF's file, as ``gamma`` for captures: linear unless given.

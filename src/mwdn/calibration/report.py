@@ -5,7 +5,8 @@ from typing import Any
 
 import torch
 
-from mwdn.calibration.psf import Calibration, estimate_background
+from mwdn.calibration.psf import Calibration
+from mwdn.calibration.psf_levels import estimate_background
 from mwdn.optics import psf_measures, psf_spectrum
 from mwdn.optics.noise import noise_level
 from mwdn.types import Frame, Psf, Size

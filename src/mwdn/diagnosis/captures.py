@@ -4,7 +4,7 @@ import torch
 from torch.nn import functional as F
 
 from mwdn.calibration import Calibration
-from mwdn.calibration.psf import SATURATED_PART
+from mwdn.calibration.psf_levels import SATURATED_PART
 from mwdn.diagnosis.encoding import gamma
 from mwdn.diagnosis.mosaic import mosaic
 from mwdn.diagnosis.noise import noise
