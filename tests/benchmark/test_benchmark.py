@@ -15,6 +15,8 @@ import torch
 
 from cameras import contour_psf
 from mwdn.benchmark import Watch, read_benchmark, run
+from mwdn.calibration import Calibration
+from mwdn.calibration.camera_file import write_camera
 from mwdn.cli.app import main
 from mwdn.data.pairs import PairFile
 from mwdn.errors import CheckpointError, ParameterError, UnknownNameError
@@ -271,6 +273,33 @@ def test_mistakes_of_a_recipe(tmp_path, before, after, kind, message):
     assert before in RECIPE
     (tmp_path / "r.toml").write_text(RECIPE.replace(before, after, 1), encoding="utf-8")
     with pytest.raises(kind, match=message):
+        read_benchmark(tmp_path / "r.toml")
+
+
+def test_a_camera_file_says_what_a_data_set_does_not(tmp_path):
+    """Its dark frame, gamma, crop and own bin of the PSF had no keys here, so such a camera could not be compared."""
+    frame = np.random.default_rng(0).integers(8, 200, (32, 48, 3), np.uint8)
+    cv2.imwrite(str(tmp_path / "psf.png"), frame)
+    cv2.imwrite(str(tmp_path / "dark.png"), np.full_like(frame, 8))
+    content = {"psf": tmp_path / "psf.png", "dark": tmp_path / "dark.png", "background": 0.0, "psf_gamma": 2.2}
+    content |= {"crop": (16, 24), "bin": 2, "psf_bin": 2, "white_balance": (2.0, 1.0, 1.0), "upside_down": True}
+    write_camera(tmp_path / "camera.toml", content)
+    names = 'photos = "photos", test_photos = "test"'
+    for line, options in (
+        ("", {}),
+        ("upside_down = false, background = 0.01,", {"upside_down": False, "background": 0.01}),
+    ):
+        data = f'[data]\nown = {{ camera = "camera.toml", {line} {names} }}\n'
+        (tmp_path / "r.toml").write_text("networks = { mwdn = {} }\n" + data, encoding="utf-8")
+        recipe = read_benchmark(tmp_path / "r.toml").data["own"]
+        calibration, wanted = recipe.calibration(), Calibration.load(tmp_path / "camera.toml", **options)
+        assert calibration.psf_hash == wanted.psf_hash
+        assert calibration.frames == wanted.frames
+        assert torch.equal(calibration.dark, wanted.dark)
+        assert calibration.white_balance is None
+        assert recipe.bin == 2
+    (tmp_path / "camera.toml").write_text('psf = "psf.png"\nbins = 3\n', encoding="utf-8")
+    with pytest.raises(UnknownNameError, match="Did you mean 'bin'"):
         read_benchmark(tmp_path / "r.toml")
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mwdn.benchmark.sets import PRESETS, DatasetRecipe
+from mwdn.calibration.camera_file import read_camera
 from mwdn.errors import ParameterError, UnknownNameError, check_options, shown
 from mwdn.io.toml import find_recipe, read_toml, to_dataclass
 from mwdn.networks import NETWORKS
@@ -175,7 +176,7 @@ def _scale_width(method: Method, factor: float) -> Method:
 
 
 def _dataset_recipe(name: str, table: dict[str, Any], folder: Path) -> DatasetRecipe:
-    """A preset with the changes of a table; its nested tables change single fields, too."""
+    """A preset with the changes of a camera file and of a table; its nested tables change single fields, too."""
     preset = PRESETS.get(table.pop("preset", name), DatasetRecipe())
     nested = {f.name: getattr(preset, f.name) for f in fields(DatasetRecipe) if is_dataclass(f.default)}
     changes: dict[str, Any] = {}
@@ -186,15 +187,25 @@ def _dataset_recipe(name: str, table: dict[str, Any], folder: Path) -> DatasetRe
         DatasetRecipe, f"data.{name}", {key: value for key, value in table.items() if key not in changes}
     )
     changes |= {key: getattr(plain, key) for key in table if key not in changes}
-    for key in ("psf", "photos", "test_photos", "pairs"):
+    for key in ("camera", "psf", "photos", "test_photos", "pairs"):
         if key in changes:
             changes[key] = _absolute(changes[key], folder)
     if "captures" in changes:
         changes["captures"] = tuple(_absolute(capture, folder) for capture in changes["captures"])
+    if changes.get("camera"):
+        changes = {**_of_camera(changes["camera"]), **changes}
     recipe = replace(preset, **changes)
     if recipe.pairs:  # the photographs of [shared.data] are for simulated data sets only
         recipe = replace(recipe, photos="", test_photos="")
     return recipe
+
+
+def _of_camera(path: str) -> dict[str, Any]:
+    """The keys of a data set that a camera file says; its other keys are read with the PSF."""
+    camera = read_camera(path)
+    background = camera.get("background", "estimate")
+    keys = {"psf": str(camera["psf"]), "psf_bin": 0, "background": -1.0 if background == "estimate" else background}
+    return keys | {key: camera[key] for key in ("bin", "bgr", "upside_down") if key in camera}
 
 
 def _absolute(text: str, folder: Path) -> str:
@@ -251,7 +262,7 @@ def _check(benchmark: Benchmark) -> None:
 
 def _check_dataset(name: str, recipe: DatasetRecipe, names: Iterable[str]) -> None:
     if not recipe.psf:
-        raise ParameterError(f'`{name}` of [data] must name a PSF: `psf = "psf.png"`.')
+        raise ParameterError(f'`{name}` of [data] must name a PSF, `psf = "psf.png"`, or `camera = "camera.toml"`.')
     if not recipe.pairs and not (recipe.photos and recipe.test_photos):
         raise ParameterError(f"`{name}` of [data] must name `photos` and `test_photos`, or recorded `pairs`.")
     if recipe.trained_on and recipe.trained_on not in names:

@@ -36,9 +36,11 @@ class DatasetRecipe:
     """Pairs of one camera: simulated from photographs, or recorded.
 
     Args:
+        camera: camera file of `mwdn calibrate`, for the settings of the camera that are not given here.
         psf: of the calibration, a file.
         bin: average blocks of so many pixels of the PSF and of captures; the protocol shrinks with them.
-        psf_bin: of the PSF besides, where it was taken at so many times the resolution of the captures.
+        psf_bin: of the PSF besides, where it was taken at so many times the resolution of the captures; 0 for that of
+            the camera file.
         background: even light under the PSF, as a part of the full scale; estimated if negative.
         upside_down: files have their first row at the bottom.
         bgr: files have their channels in the order blue, green, red.
@@ -59,6 +61,7 @@ class DatasetRecipe:
         protocol: the part of each picture that counts, in pixels before ``bin``.
     """
 
+    camera: str = ""
     psf: str = ""
     bin: int = 1
     psf_bin: int = 1
@@ -94,12 +97,14 @@ class DatasetRecipe:
 
     def calibration(self) -> Calibration:
         """Read the PSF."""
-        return Calibration.from_file(
-            self.psf,
-            FrameFormat(bgr=self.bgr, bin=self.bin, upside_down=self.upside_down),
-            background=self.background if self.background >= 0 else "estimate",
-            psf_bin=self.bin * self.psf_bin,
-        )
+        options: dict[str, Any] = {"bin": self.bin, "bgr": self.bgr, "upside_down": self.upside_down}
+        options["background"] = self.background if self.background >= 0 else "estimate"
+        if self.psf_bin:
+            options["psf_bin"] = self.bin * self.psf_bin
+        if not self.camera:
+            return Calibration.from_file(self.psf, **options)
+        # Reconstructions are compared with scenes in the camera's colours.
+        return replace(Calibration.load(self.camera, psf=Path(self.psf), **options), white_balance=None)
 
 
 _PAPER = DatasetRecipe(protocol="centre-128")
@@ -186,8 +191,10 @@ def open_dataset(name: str, recipe: DatasetRecipe, folder: Path, device: torch.d
     calibration = recipe.calibration()
     recipe.binned_protocol().crop(calibration.psf)  # refuses a part that does not fit before anything is trained
     simulates = not recipe.pairs
-    shown = {"psf", "captures", "protocol"}
-    identity = {key: value for key, value in asdict(recipe).items() if key not in shown}
+    not_in_pairs = {"camera", "psf", "captures", "protocol"}
+    identity = {key: value for key, value in asdict(recipe).items() if key not in not_in_pairs}
+    if recipe.camera:
+        identity["frames"] = repr(calibration.frames)
     identity = json.loads(json.dumps({**identity, "psf_hash": calibration.psf_hash}))
     note = folder / f"{name}.json"
     own = simulates or recipe.kind  # else the user's file, of which nothing is made
@@ -201,8 +208,11 @@ def open_dataset(name: str, recipe: DatasetRecipe, folder: Path, device: torch.d
         if simulates:
             _simulate(recipe, calibration, path, device, lambda rows: track(f"{name}: simulating", rows))
         else:
-            size = calibration.size if recipe.bin > 1 else None
-            layout, frames = Layout(scene_size=size), FrameFormat(bin=recipe.bin)
+            size = calibration.size if recipe.camera or recipe.bin > 1 else None
+            layout, frames = (
+                Layout(scene_size=size),
+                calibration.frames if recipe.camera else FrameFormat(bin=recipe.bin),
+            )
             import_pairs(recipe.kind, recipe.pairs, path, layout=layout, frames=frames)
         write_text(note, json.dumps(identity, indent=2))
     file = PairFile(path)
