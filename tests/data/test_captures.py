@@ -1,5 +1,8 @@
 """Real captures: which files are some, and how they become measurements."""
 
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +10,8 @@ import torch
 from conftest import touch
 from mwdn.calibration import Calibration, FrameFormat
 from mwdn.data.captures import find_captures, list_captures, read_capture, read_captures
-from mwdn.errors import ParameterError, ShapeError
+from mwdn.errors import ImageError, ParameterError, ShapeError
+from mwdn.io.exif import orientation
 
 
 def test_captures_are_found_in_order_and_once(tmp_path):
@@ -40,6 +44,18 @@ def test_every_file_of_a_folder_is_read_or_named(tmp_path):
     assert "film.gif and phone.heic" in pictures
     assert "day 2/" in folders
     assert "film_0.mp4, film_1.mp4 and 4 more" in others
+
+
+def test_a_pipe_and_a_link_to_itself_do_not_end_a_folder(tmp_path):
+    """They are listed, so that reading each names its fault, and the good captures beside them are read."""
+    touch(tmp_path, "good.png")
+    (tmp_path / "loop.png").symlink_to("loop.png")
+    os.mkfifo(tmp_path / "pipe.png")
+    assert [Path(path).name for path in list_captures([tmp_path]).files] == ["good.png", "loop.png", "pipe.png"]
+    for name, fault in {"loop.png": "leads back to itself", "pipe.png": "is a pipe"}.items():
+        assert orientation(tmp_path / name) == 1
+        with pytest.raises(ImageError, match=fault):
+            FrameFormat().read(tmp_path / name)
 
 
 def test_nothing_to_reconstruct(tmp_path):

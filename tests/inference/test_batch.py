@@ -482,7 +482,7 @@ def test_two_processes_share_the_captures(shop, single):
     out, err = process.communicate(timeout=300)
     assert process.returncode == 1, err
     assert sorted(told(out)) == [f"{number:02}.npy" for number in range(COUNT)]
-    assert err.count("damaged.npy: ") == 1
+    assert err.count("damaged.npy` is not") == 1
     assert out.count(f"{COUNT} of {COUNT + 1} captures reconstructed into two\n") == 1
     assert_finished(shop / "two", single)
 

@@ -1,5 +1,6 @@
 """`mwdn reconstruct`: captures to pictures, in one process or several."""
 
+import os
 from collections import ChainMap
 from collections.abc import Iterable, Mapping
 from contextlib import closing
@@ -19,7 +20,7 @@ from mwdn.cli.method_options import MethodOptions, read_options
 from mwdn.cli.progress import show_progress
 from mwdn.cli.terminal import Json, complain, console, counted, detail, if_interrupted, note, print_json, warn
 from mwdn.data.captures import list_captures
-from mwdn.errors import ParameterError, PsfError
+from mwdn.errors import ParameterError, PsfError, one_line
 from mwdn.inference.batch import SHOWN, Batch, Job
 from mwdn.inference.outputs import Format, check_outputs, output_name, read_sidecar
 from mwdn.inference.reconstructor import Reconstructor
@@ -162,7 +163,7 @@ def _list_files(captures: Iterable[Path], camera: CameraOptions, out: Path, form
     files, skipped = list_captures(captures, exclude=camera.roles)
     note(*skipped)
     check_outputs(files, out, format, protected=camera.files)
-    if out.resolve() in [path.resolve() for path in captures]:
+    if os.path.realpath(out) in map(os.path.realpath, captures):  # which takes a link to itself, too
         raise ParameterError(
             f"`{out}` holds the captures: the next run would take the pictures for captures. Choose another folder: "
             "`--out`."
@@ -196,7 +197,7 @@ def _run(batch: Batch, files: list[str]) -> tuple[Mapping[str, str], int]:
             failed[files[job.number]] = str(job.error)
         done, existing = done + (job.error is None), existing + job.existing
         _report(job)
-        doubts.add(job.capture.name, job.verdicts)
+        doubts.add(one_line(job.capture.name), job.verdicts)
 
     def show_part(done: float) -> None:
         checking = batch.check_consistency and done == len(files)
@@ -216,8 +217,8 @@ def _run(batch: Batch, files: list[str]) -> tuple[Mapping[str, str], int]:
 def _report(job: Job) -> None:
     """Print the outcome of a job."""
     if job.error:
-        named = f"`{job.capture}`" in str(job.error)
-        complain("[red]Error:[/]" if named else f"[red]{escape(str(job.capture))}:[/]", job.error)
+        named = one_line(f"`{job.capture}`") in str(job.error)
+        complain("[red]Error:[/]" if named else f"[red]{escape(one_line(str(job.capture)))}:[/]", job.error)
     elif job.trust:
-        line = f"{job.capture.name}: {job.trust.sentence}"
+        line = f"{one_line(job.capture.name)}: {job.trust.sentence}"
         console.print(line, highlight=False, markup=False, soft_wrap=True)

@@ -4,6 +4,9 @@ import struct
 from pathlib import Path
 from typing import BinaryIO
 
+from mwdn.errors import ImageError
+from mwdn.io.reading import open_regular
+
 TURNS = {
     2: "flip-left-right",
     3: "rotate-180",
@@ -18,6 +21,9 @@ TURNS = {
 _ORIENTATION = 274
 """Number of the tag."""
 
+_STEPS = 100_000
+"""Most parts of a file that are searched: a PNG of 800 MB has as many."""
+
 
 def orientation(path: str | Path) -> int:
     """EXIF orientation of a JPEG, PNG, WebP, TIFF, or raw file that is a TIFF inside; reads a few hundred bytes.
@@ -26,10 +32,10 @@ def orientation(path: str | Path) -> int:
         1 to 8, see `TURNS`; 1 (upright) if the file has no such tag, or cannot be read.
     """
     try:
-        with Path(path).open("rb") as file:
+        with open_regular(path) as file:
             start = _find_tiff(file)
             found = 1 if start is None else _read_tag(file, start)
-    except (OSError, struct.error):  # missing, or cut off: whoever reads the pixels says so
+    except (OSError, ImageError, struct.error):  # missing, or cut off: whoever reads the pixels says so
         return 1
     return found if found in TURNS else 1
 
@@ -50,18 +56,22 @@ def _find_tiff(file: BinaryIO) -> int | None:
 
 def _in_jpeg(file: BinaryIO) -> int | None:
     position = 2
-    while True:
+    for _ in range(_STEPS):
         marker, length = struct.unpack(">HH", _at(file, position, 4))
         if marker == 0xFFE1 and file.read(6) == b"Exif\0\0":
             return position + 10
         if marker < 0xFFC0 or marker == 0xFFDA:  # the compressed data begins
             return None
         position += 2 + length
+    return None
 
 
 def _in_png(file: BinaryIO) -> int | None:
     position = 8
-    while len(head := _at(file, position, 8)) == 8:
+    for _ in range(_STEPS):
+        head = _at(file, position, 8)
+        if len(head) < 8:
+            break
         length, name = struct.unpack(">I4s", head)
         if name == b"eXIf":
             return position + 8
@@ -71,7 +81,10 @@ def _in_png(file: BinaryIO) -> int | None:
 
 def _in_webp(file: BinaryIO) -> int | None:
     position = 12
-    while len(head := _at(file, position, 8)) == 8:
+    for _ in range(_STEPS):
+        head = _at(file, position, 8)
+        if len(head) < 8:
+            break
         name, length = struct.unpack("<4sI", head)
         if name == b"EXIF":
             return position + (14 if file.read(6) == b"Exif\0\0" else 8)  # some programs write JPEG's header

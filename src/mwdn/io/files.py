@@ -226,7 +226,7 @@ def path_resolver() -> Callable[[str], str]:
         links: dict[str, str] = {}
         if folder.is_dir():
             with os.scandir(folder) as entries:
-                links = {entry.name: str(Path(entry.path).resolve()) for entry in entries if entry.is_symlink()}
+                links = {entry.name: os.path.realpath(entry.path) for entry in entries if entry.is_symlink()}
         return str(folder.resolve() / "x").removesuffix("x"), links
 
     def resolve(path: str) -> str:

@@ -2,8 +2,10 @@
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
+from mwdn.errors import one_line
 from mwdn.io.images import READABLE
 from mwdn.io.raw import RAW
 
@@ -36,10 +38,17 @@ def list_folder(folder: Path) -> tuple[list[str], list[str]]:
         The frames, in alphabetical order; and one sentence for each kind of entry that is left out.
     """
     with os.scandir(folder) as entries:
-        names = sorted(entry.name + "/" * (not entry.is_file()) for entry in entries if not entry.name.startswith("."))
+        # A pipe or a link to itself is listed as a frame: reading it names the fault.
+        names = sorted(entry.name + "/" * _is_folder(entry) for entry in entries if not entry.name.startswith("."))
     start = str(folder / "x").removesuffix("x")
     frames = [start + name for name in names if not name.endswith("/") and Path(name).suffix.lower() in FRAMES]
     return frames, _left_out(folder, names, FRAMES)
+
+
+def _is_folder(entry: os.DirEntry[str]) -> bool:
+    with suppress(OSError):  # a link to itself
+        return entry.is_dir()
+    return False
 
 
 def unused_photographs(folder: Path) -> list[str]:
@@ -66,7 +75,8 @@ def _left_out(folder: Path, names: list[str], readable: frozenset[str]) -> list[
 
 
 def enumerate_names(names: Sequence[str]) -> str:
-    """``a, b and c``; of more than three ``a, b and 5 more``."""
+    """``a, b and c``; of more than three ``a, b and 5 more``; control characters of file names are escaped."""
+    names = [one_line(name) for name in names[:_NAMED]] + list(names[_NAMED:])
     if len(names) <= _NAMED:
         return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
     return f"{', '.join(names[: _NAMED - 1])} and {len(names) - _NAMED + 1:,} more"

@@ -1,11 +1,15 @@
 """Raw files of cameras, by rawpy (LibRaw): the numbers of the sensor, before any processing."""
 
+import io
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, cast, get_args
 
 import numpy as np
 
-from mwdn.errors import ImageError
+from mwdn.errors import ImageError, cut, one_line, reason
+from mwdn.io.decoder_messages import decoder_messages
+from mwdn.io.headers import COPY_AGAIN, MAX_BYTES, check_decoded
+from mwdn.io.reading import read_bytes
 from mwdn.types import Frame
 
 RAW = frozenset({".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef"})
@@ -47,18 +51,28 @@ def read_raw(path: str | Path) -> RawFrame:
         import rawpy
     except ImportError as error:
         raise ImageError(f"`{path}` is a camera's raw file, which needs rawpy: pip install 'mwdn[raw]'.") from error
-    if not Path(path).is_file():
-        raise ImageError(f"`{path}` does not exist. Check the name; the current folder is `{Path.cwd()}`.")
+    data = read_bytes(path, most=MAX_BYTES)
     try:
-        with rawpy.imread(str(path)) as file:
-            return _scaled(file)
+        with decoder_messages() as lines, rawpy.imread(io.BytesIO(data)) as file:
+            _check_size(file, len(data))
+            frame = _scaled(file)
+        if lines:
+            raise ImageError(f"is damaged: {cut(one_line(lines[0]), 120)}. {COPY_AGAIN}")
     except ImageError as error:
         raise ImageError(f"`{path}` {error}") from error
-    except (rawpy.LibRawError, rawpy.NotSupportedError) as error:
-        reason = error.args[0].decode() if error.args and isinstance(error.args[0], bytes) else str(error)
+    except Exception as error:  # a damaged file makes rawpy and numpy raise anything
+        said = error.args[0] if error.args else ""
+        why = cut(one_line(said.decode(errors="replace")), 120) if isinstance(said, bytes) else reason(error)
         raise ImageError(
-            f"`{path}` cannot be read as a raw file: {reason}. Check the name, or copy it from its source again."
+            f"`{path}` cannot be read as a raw file: {why}. Check the name, or copy it from its source again."
         ) from error
+    return frame
+
+
+def _check_size(file: Any, stored: int) -> None:  # noqa: ANN401
+    """Refuse a raw file that claims more pixels than it can hold, before they are unpacked."""
+    sizes = file.sizes
+    check_decoded(sizes.raw_height * sizes.raw_width * 8, stored)  # LibRaw keeps up to four numbers of 16 bits
 
 
 def _scaled(file: Any) -> RawFrame:  # noqa: ANN401

@@ -88,6 +88,7 @@ def read_tiff(file: BinaryIO, check: Any) -> TiffPicture:  # noqa: ANN401
 
 def _count_pages(file: BinaryIO) -> int:
     """Number of pages; the chain of their directories must be whole, which tifffile does not check."""
+    file.seek(0)
     head = file.read(16)
     order = "<" if head[:2] == b"II" else ">"
     big = struct.unpack(order + "H", head[2:4])[0] == 43

@@ -12,6 +12,7 @@ from torch.nn import functional as F
 
 from mwdn.errors import ImageError, ParameterError, ShapeError, UnknownNameError
 from mwdn.io.images import read_frame
+from mwdn.io.npy import read_array
 from mwdn.optics.mask_files import read_mask
 from mwdn.optics.masks import Mask, check_index, check_samples, needed_pitch, quantise
 from mwdn.optics.propagation import UM_PER_NM, check_positive
@@ -177,11 +178,8 @@ def _read_design(path: Path) -> Mask | None:
 
 def _read_numbers(path: Path) -> Numbers:
     """The array of a file; openings stored as true and false become 1 and 0."""
-    if path.suffix.lower() == ".npy" and path.is_file():
-        try:
-            stored = np.load(path, mmap_mode="r", allow_pickle=False)
-        except (OSError, ValueError) as error:
-            raise ImageError(f"`{path}` is not a complete NPY file of numbers ({error}). Save it again.") from error
+    if path.suffix.lower() == ".npy":
+        stored = read_array(path)
         if stored.dtype == bool:
             return stored.astype(np.float32)
         if stored.ndim != 2:

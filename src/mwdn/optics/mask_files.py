@@ -10,8 +10,10 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from mwdn.errors import ImageError, MwdnError, ParameterError
+from mwdn.errors import ImageError, MwdnError, ParameterError, reason
 from mwdn.io.files import atomic_write
+from mwdn.io.reading import open_regular
+from mwdn.io.tiff import read_tiff
 from mwdn.optics.masks import Mask
 
 _FORMAT = "mwdn mask 1"
@@ -81,10 +83,13 @@ def read_mask(path: str | Path) -> Mask:
     import tifffile
 
     try:
-        with tifffile.TiffFile(path) as file:
-            about = json.loads(str(file.pages[0].tags["ImageDescription"].value))  # type: ignore[union-attr]
-            numbers = file.pages[0].asarray()
-        if about["format"] != _FORMAT or numbers.ndim != 2:
+        with open_regular(path) as opened:
+            with tifffile.TiffFile(opened, is_ome=False) as file:
+                about = json.loads(str(file.pages[0].tags["ImageDescription"].value))  # type: ignore[union-attr]
+            if about["format"] != _FORMAT:
+                raise KeyError("format")
+            numbers, _ = read_tiff(opened, lambda shape, dtype: None)
+        if numbers.ndim != 2:
             raise KeyError("format")
         values = torch.from_numpy((numbers * about["scale"]).astype(np.float32))
         if step_um := about["step_um"]:
@@ -95,7 +100,8 @@ def read_mask(path: str | Path) -> Mask:
     except OSError as error:
         raise ImageError(f"`{path}` cannot be read: {error.strerror or error}. Check the name.") from error
     except Exception as error:  # a foreign file can raise anything in tifffile and json
-        raise ImageError(f"`{path}` is not a mask written by `mwdn design` ({error!r}). Give its mask.tif.") from error
+        what = f"{type(error).__name__}: {reason(error)}"
+        raise ImageError(f"`{path}` is not a mask written by `mwdn design` ({what}). Give its mask.tif.") from error
 
 
 def write_gds(path: str | Path, mask: Mask) -> None:
