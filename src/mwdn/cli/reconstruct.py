@@ -4,6 +4,7 @@ import os
 from collections import ChainMap
 from collections.abc import Iterable, Mapping
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -91,6 +92,7 @@ def reconstruct(  # noqa: PLR0913
         files: list[str] = distributed.broadcast_json(lambda: _list_files(captures, camera, out, format))
         if auto_bin:
             calibration, is_binned = binned(calibration, camera, method, files)
+        calibration = replace(calibration, white_balance=None)  # the camera file's is `white_balance` unless `none`
         local_device = distributed.local_device(device)
         reconstructor = Reconstructor(
             method,
