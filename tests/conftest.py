@@ -1,8 +1,10 @@
 """Shape checking of every annotated function, fixtures and small objects that many tests share."""
 
 import os
+import random
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import jaxtyping
@@ -37,10 +39,29 @@ def generator() -> torch.Generator:
 
 @pytest.fixture
 def free_port() -> int:
-    """A TCP port that is free now."""
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        return listener.getsockname()[1]
+    """A TCP port that is free now, below those that systems give to outgoing connections (32,768 on Linux).
+
+    One of these could be taken by another test until the process that gets it, seconds later, listens.
+    """
+    while True:
+        port = random.SystemRandom().randrange(20_000, 32_000)
+        with socket.socket() as listener, suppress(OSError):
+            listener.bind(("127.0.0.1", port))
+            return port
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """``run("demo", "--out", path)`` or ``run("demo --out x")`` gives exit code, standard output, standard error."""
+    from mwdn.cli.app import main
+
+    def call(*words: object) -> tuple[int, str, str]:
+        line = str(words[0]).split() if len(words) == 1 else [str(word) for word in words]
+        with pytest.raises(SystemExit) as caught:
+            main(line)
+        return (caught.value.code or 0, *capsys.readouterr())
+
+    return call
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from PIL import Image
 import mwdn
 from cameras import contour_psf
 from mwdn import Camera, read_frame
-from mwdn.cli.app import COMMANDS, main
+from mwdn.cli.app import COMMANDS
 from mwdn.cli.demo import METHODS, PICTURES
 from mwdn.io.toml import find_recipe, packaged_recipes
 
@@ -40,19 +40,6 @@ def camera(tmp_path, monkeypatch, generator):
 def store(path, image):
     frame = (image.expand(-1, 3, -1, -1)[0].movedim(0, -1).clamp(0, 1) * 65535).numpy().astype(np.uint16)
     assert cv2.imwrite(str(path), frame[..., ::-1])
-
-
-@pytest.fixture
-def run(capsys):
-    """``run("demo", ...)`` gives exit code, standard output, standard error."""
-
-    def call(*arguments):
-        with pytest.raises(SystemExit) as caught:
-            main([str(argument) for argument in arguments])
-        code = caught.value.code
-        return (0 if code is None else code, *capsys.readouterr())
-
-    return call
 
 
 def reconstruct(run, *captures, psf="psf.png", out="out", method="wiener"):

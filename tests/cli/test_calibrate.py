@@ -12,7 +12,6 @@ import torch
 from cameras import contour_psf
 from mwdn import Camera, read_frame
 from mwdn.calibration.camera_file import read_camera, write_camera
-from mwdn.cli.app import main
 
 SIZE = 64, 80
 
@@ -30,18 +29,6 @@ def folder(tmp_path, monkeypatch, generator):
         frame = ((image * lamp)[0].flip(-2).movedim(0, -1).clamp(0, 1) * 65535).numpy().astype(np.uint16)
         assert cv2.imwrite(name, frame[..., ::-1])
     return tmp_path
-
-
-@pytest.fixture
-def run(capsys):
-    """``run("calibrate", ...)`` gives exit code, standard output, standard error."""
-
-    def call(line):
-        with pytest.raises(SystemExit) as caught:
-            main(line.split())
-        return (caught.value.code or 0, *capsys.readouterr())
-
-    return call
 
 
 RECONSTRUCT = "reconstruct capture.png --method wiener --format npy --no-trust --device cpu --out"

@@ -12,7 +12,6 @@ import torch
 from cameras import contour_psf
 from mwdn import read_frame
 from mwdn.calibration import Calibration
-from mwdn.cli.app import main
 from mwdn.data.pairs import PairFile
 from mwdn.fourier.convolution import convolve
 from mwdn.inference.reconstructor import Reconstructor
@@ -40,18 +39,6 @@ def camera(tmp_path, monkeypatch, generator):
         cv2.imwrite(f"photos/{number}.png", cv2.resize(small, (24, 24), interpolation=cv2.INTER_CUBIC))
     (tmp_path / "r.toml").write_text(RECIPE, encoding="utf-8")
     return tmp_path
-
-
-@pytest.fixture
-def run(capsys):
-    """``run("train r.toml ...")`` returns the exit code, standard output and standard error."""
-
-    def call(line):
-        with pytest.raises(SystemExit) as caught:
-            main(line.split())
-        return (caught.value.code or 0, *capsys.readouterr())
-
-    return call
 
 
 def flat(text):
@@ -87,7 +74,7 @@ def test_any_key_of_the_recipe_by_its_name(run, camera):
         ("--learnin-rate 1", "No key of [schedule] named 'learnin_rate'. Did you mean 'learning_rate'?"),
         ("--sensor.iso 100", "No key of [sensor] named 'iso'"),
         ("--steps many", "`steps` of [schedule] ('many') must be of the same kind as its default, 2000."),
-        ("--seed", "parameter --seed requires an argument"),
+        ("--seed", "`--seed` must be followed by"),
     ):
         code, _, err = run(f"train r.toml --psf psf.npy --photos photos --out runs/y {wrong}")
         assert code == 2

@@ -477,6 +477,7 @@ def assert_finished(out, single):
 linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells the children of a process in /proc")
 
 
+@pytest.mark.acceptance  # as `test_two_machines_share_the_captures`
 def test_two_processes_share_the_captures(shop, single):
     process = two(shop, "two")
     out, err = process.communicate(timeout=300)
@@ -508,6 +509,7 @@ def test_two_machines_share_the_captures(shop, single, free_port):
     assert all(shares)
     assert sorted(name for share in shares for name in share) == [f"{number:02}.npy" for number in range(COUNT)]
     assert sum(out.count(f"{COUNT} of {COUNT + 1} captures reconstructed into machines\n") for out, _ in said) == 1
+    assert sum(err.count("damaged.npy` is not") for _, err in said) == 1
     assert_finished(shop / "machines", single)
 
 
@@ -560,6 +562,7 @@ def test_killed_work_goes_on_where_it_was(shop, single):
 
 
 @linux
+@pytest.mark.acceptance  # SIGKILL above is harder, and `cli/test_interrupt.py` has Ctrl-C
 def test_interrupted_work_ends_quietly_and_leaves_whole_files(shop, single):
     process, out = start(shop, "interrupted"), shop / "interrupted"
     while len(list(out.glob("??.json"))) < 2:

@@ -302,7 +302,7 @@ def test_killed_runs_end_as_an_unbroken_one(photos, calibration, tmp_path):
         return path.read_bytes().count(b"\n") if path.exists() else 0
 
     whole = start("whole")
-    process, goal = start("killed"), random.randint(3, 20)
+    process, goal = start("killed"), random.randint(3, 15)
     while process.poll() is None and lines() < goal:
         with pytest.raises(subprocess.TimeoutExpired):
             process.wait(0.02)
