@@ -124,6 +124,7 @@ HELP = "from mwdn.cli import main\nwith suppress(SystemExit): main({})"
         ("", HEAVY | {"torch", "numpy", "cyclopts"}),
         *((HELP.format(arguments), HEAVY | {"torch", "numpy"}) for arguments in ([], ["--help"], ["--version"])),
         (HELP.format(["doctor", "--help"]), HEAVY | {"torch", "numpy"}),
+        (HELP.format(["recipes"]), {"torch"}),
         ("for name in mwdn.__all__: getattr(mwdn, name)", HEAVY | {"cyclopts"}),
     ],
 )
