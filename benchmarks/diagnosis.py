@@ -43,7 +43,7 @@ def fitted_bin(frame: np.ndarray, calibration: Calibration) -> Verdict:
 
 
 def gamma_of_psf(variant: Variant, calibration: Calibration) -> Verdict:
-    """As `examine_capture` calls it. The type of the PSF's file is not used."""
+    """With the capture's gamma as it is detected. The type of the PSF's file is not used."""
     capture = gamma(variant.frame, calibration, for_viewing=variant.is_jpeg)
     return psf_gamma(variant.frame, calibration, capture.value)
 

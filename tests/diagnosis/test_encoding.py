@@ -80,11 +80,14 @@ def test_low_contrast_without_noise_cannot_tell(psf, light, code):
     assert (verdict.state, verdict.value) == ("unknown", "")
 
 
-def test_a_jpeg_that_cannot_tell_is_coded(psf, light):
-    """Six of eight of DiffuserCam's captures as JPEG stayed open. Evidence of a linear capture counts for more."""
-    verdict = gamma(file(0.5 + 0.02 * light, "srgb", 8), Calibration(psf), for_viewing=True)
+def test_the_file_type_decides_where_the_evidence_is_weak(psf, light):
+    """Six of eight DiffuserCam captures as sRGB JPEG stayed open. Clear evidence of a linear one counts for more."""
+    weak = file(light + 0.03, "srgb", 8)
+    assert gamma(weak, Calibration(psf)).state == "unknown"
+    verdict = gamma(weak, Calibration(psf), for_viewing=True)
     assert (verdict.state, verdict.options) == ("doubt", "--gamma srgb")
     assert gamma(file(light, "linear", 8), Calibration(psf), for_viewing=True).value == "linear"
+    assert gamma(file(0.5 + 0.02 * light, "srgb", 8), Calibration(psf), for_viewing=True).state == "unknown"
 
 
 def test_an_empty_frame_cannot_tell(psf):

@@ -189,6 +189,17 @@ def test_check_and_network_share_the_pose(tmp_path, captures, psf):
     torch.testing.assert_close(*pictures, rtol=1e-4, atol=1e-5)
 
 
+def test_the_gamma_of_the_psf_is_judged_once_a_run(tmp_path, captures, generator):
+    """In each sidecar file, though it takes a second: the first capture that tells is enough."""
+    psf = contour_psf((96, 96), generator=generator).expand(1, 3, -1, -1)
+    cv2.imwrite(str(tmp_path / "psf.jpg"), np.zeros((8, 8), np.uint8))
+    for capture in captures:
+        cv2.imwrite(str(capture), np.full((96, 96, 3), 99, np.uint8))
+    batch = make_batch(psf, tmp_path / "out", psf_file=tmp_path / "psf.jpg")
+    options = [[verdict.options for verdict in job.verdicts] for job in batch.run(captures)]
+    assert all("--psf-gamma srgb" in each for each in options)
+
+
 def test_captures_are_read_as_the_calibration_says(tmp_path, psf, captures):
     """Blue first and the last row first in the file: the same picture as from a plain file."""
     frame = read_frame(captures[0])

@@ -8,7 +8,6 @@ from mwdn.calibration.psf_levels import SATURATED_PART
 from mwdn.diagnosis.encoding import gamma
 from mwdn.diagnosis.mosaic import mosaic
 from mwdn.diagnosis.noise import noise
-from mwdn.diagnosis.psf_encoding import psf_gamma
 from mwdn.diagnosis.verdict import Verdict
 from mwdn.types import Frame
 
@@ -19,9 +18,7 @@ FAINT = 0.05
 """Fraction of the light that may be ambient without a word."""
 
 
-def examine_capture(
-    frame: Frame, calibration: Calibration, *, for_viewing: bool = False, psf_for_viewing: bool = False
-) -> tuple[Verdict, ...]:
+def examine_capture(frame: Frame, calibration: Calibration, *, for_viewing: bool = False) -> tuple[Verdict, ...]:
     """Run all checks that need nothing but a raw frame and the camera's calibration.
 
     A new check is one more entry here: a function that returns a `Verdict`.
@@ -30,14 +27,12 @@ def examine_capture(
         frame: (H, W, C), as `FrameFormat.read` returns it.
         calibration: the camera's.
         for_viewing: the capture's file is of a type for viewing (`mwdn.io.formats.is_for_viewing`).
-        psf_for_viewing: the PSF's file is.
     """
     raw = mosaic(frame, calibration)
     verdicts = *(check(frame, calibration) for check in (saturation, darkness, noise, ambient_light)), raw
     if raw.state == "doubt":  # between pixels of other colours the noise of a level cannot be seen: first the mosaic
         return verdicts
-    code = gamma(frame, calibration, for_viewing=for_viewing)
-    return *verdicts, code, psf_gamma(frame, calibration, code.value, for_viewing=psf_for_viewing)
+    return *verdicts, gamma(frame, calibration, for_viewing=for_viewing)
 
 
 def saturation(frame: Frame, calibration: Calibration) -> Verdict:
