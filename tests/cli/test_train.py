@@ -131,7 +131,7 @@ def test_warning_of_a_reconstructor(camera):
         (TRAIN.replace("--device cpu", "--device gpu"), "`--device` (gpu) must be one that torch can use here"),
         (TRAIN.replace("--device cpu", "--device cuda:99"), "`--device` (cuda:99) must be one that torch can use here"),
         ("simulate photos --psf psf.npy --count 0", "`--count` (0) must be at least 1"),
-        ("simulate photos --psf psf.npy -o photos", "`photos` is a folder"),
+        ("simulate photos --psf psf.npy -o photos", "`photos` cannot be written: Is a directory"),
         ("simulate photos --psf psf.npy -o photos/0.png", "`0.png` must end in .h5 or .hdf5"),
         ("simulate photos --psf psf.npy -o psf.npy", "`psf.npy` would overwrite an input"),
         (f"simulate photos --psf psf.npy --seed {10**23}", f"`--seed` ({10**23}) must have 63 bits at most"),
