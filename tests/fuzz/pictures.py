@@ -6,11 +6,16 @@
 import argparse
 import json
 import os
+import re
+import struct
+import subprocess
 import sys
 import tempfile
 import time
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +23,20 @@ import cv2
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from image_files import dng, encoded, npy, png16, tiff
+from driver import damaged, outcome
+
+from image_files import chunk, dng, encoded, npy, png16, tiff
 from mwdn.errors import MwdnError
 from mwdn.io.images import read_frame
 from mwdn.io.toml import read_toml
 
-LONGEST = 300
-"""Characters of a message, without the file's name."""
+try:
+    from mwdn.io.reading import read_json
+except ImportError:  # before issue 29
+
+    def read_json(path: Path) -> Any:
+        return json.loads(path.read_text())
+
 
 VISIBLE = 8
 """A picture differs visibly if a channel of any pixel is off by more than this, of 255."""
@@ -50,6 +62,7 @@ def _files() -> dict[str, bytes]:
         "grey.png": encoded(scene(channels=1), "PNG"),
         "rgb.png": encoded(scene(), "PNG"),
         "rgb16.png": png16(scene("uint16")),
+        "crafted.png": encoded(scene(), "PNG"),
         "baseline.jpg": encoded(scene(), "JPEG", quality=90),
         "grey.jpg": encoded(scene(channels=1), "JPEG", quality=90),
         "progressive.jpg": encoded(scene(), "JPEG", quality=90, progressive=True),
@@ -80,42 +93,86 @@ FILES = _files()
 """Content by name, whole and valid."""
 
 
-def damaged(data: bytes, random: np.random.Generator) -> bytes:
-    """One to four damages: bits or bytes changed, a run of zeros, a piece cut, doubled or moved."""
-    content = bytearray(data)
-    for _ in range(random.integers(1, 5)):
-        size = len(content)
-        if size < 8:
-            break
-        # Every third damage hits the header, where most numbers mean something.
-        at = int(random.integers(0, min(size, 200) if random.random() < 0.33 else size))
-        length = int(random.integers(1, 1 + min(64, size - at)))
-        match random.integers(0, 8):
-            case 0 | 1 | 2:
-                content[at] ^= 1 << int(random.integers(0, 8))
-            case 3 | 4:
-                content[at] = int(random.choice([0, 1, 127, 128, 255, random.integers(0, 256)]))
-            case 5:
-                content[at : at + length] = bytes(length)
-            case 6:
-                piece = content[at : at + length]
-                del content[at : at + length]
-                if random.random() < 0.5:
-                    to = int(random.integers(0, len(content) + 1))
-                    content[to:to] = piece
-            case 7:
-                if random.random() < 0.3:
-                    del content[at:]
-                else:
-                    content[at:at] = content[at : at + length]
+def with_tag(data: bytes, tag: int, value: int) -> bytes:
+    """A little-endian TIFF with another value of one of its tags of 16 or 32 bits, stored as 32."""
+    (start,) = struct.unpack_from("<I", data, 4)
+    entries = range(start + 2, start + 2 + 12 * struct.unpack_from("<H", data, start)[0], 12)
+    entry = next(at for at in entries if data[at : at + 2] == struct.pack("<H", tag))
+    return data[: entry + 2] + struct.pack("<HII", 4, 1, value) + data[entry + 12 :]
+
+
+def _squeezed_tiff(dtype: str, side: int) -> bytes:
+    """Zeros by Deflate: 1,000 bytes become one."""
+    return tiff(np.zeros((side, side), dtype), compression="zlib", rowsperstrip=side)
+
+
+def _black_png(side: int) -> bytes:
+    stream = zlib.compressobj(1)
+    rows = b"".join(stream.compress(bytes(1 + 6 * side)) for _ in range(side)) + stream.flush()
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, 16, 2, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+
+
+def _scans(count: int) -> bytes:
+    data = encoded(np.zeros((4096, 4096), np.uint8), "JPEG", progressive=True)
+    return data[:-2] + count * data[data.rindex(b"\xff\xda") : -2] + b"\xff\xd9"
+
+
+def _claimed_jpeg() -> bytes:
+    data = encoded(scene(), "JPEG")
+    size = data.index(b"\xff\xc0") + 5
+    return data[:size] + struct.pack(">HH", 16384, 16384) + data[size + 4 :]
+
+
+def _claimed_npy() -> bytes:
+    head = npy(np.zeros((1, 1, 3)))
+    return head.replace(b"(1, 1, 3), }            ", b"(16384, 16384, 3), }    ")
+
+
+BOMBS: dict[str, tuple[Callable[[], bytes], int]] = {
+    "float64.tif": (lambda: _squeezed_tiff("float64", 14000), 0),
+    "black.png": (lambda: _black_png(13000), 0),
+    "scans.jpg": (lambda: _scans(800), 0),
+    "claimed.jpg": (_claimed_jpeg, 0),
+    "claimed.npy": (_claimed_npy, 7 * 2**30),
+    "sparse.png": (lambda: FILES["rgb.png"][:-12], 5 * 2**30),
+    "sparse.jpg": (lambda: FILES["baseline.jpg"][:-2], 5 * 2**30),
+    "sparse.toml": (lambda: b"#", 5 * 2**30),
+    "sparse.json": (lambda: b"[", 5 * 2**30),
+    "sparse.dng": (lambda: FILES["mosaic.dng"], 5 * 2**30),
+    "claimed.dng": (lambda: with_tag(with_tag(FILES["mosaic.dng"], 256, 40000), 257, 40000), 0),
+    "deep.toml": (lambda: b"a = " + b"[" * 100_000, 0),
+    "deep.json": (lambda: b"[" * 100_000, 0),
+    "keys.toml": (lambda: b"a." * 200_000 + b"a = 1", 0),
+}
+"""Files made to fill the memory or to take long: their content, and the length to which zeros fill them (no disk)."""
+
+SLOW_TO_MAKE = {"float64.tif", "black.png", "scans.jpg"}
+
+
+def write_bomb(path: Path) -> None:
+    content, length = BOMBS[path.name]
+    path.write_bytes(content())
+    if length:
+        os.truncate(path, length)
+
+
+def repaired(png: bytes) -> bytes:
+    """A PNG with right checksums, so that its damage reaches the decoder."""
+    content, at = bytearray(png), 8
+    while at + 12 <= len(content):
+        end = at + 8 + int.from_bytes(content[at : at + 4])
+        content[end : end + 4] = struct.pack(">I", zlib.crc32(content[at + 4 : end]))
+        at = end + 4
     return bytes(content)
 
 
-def cases(name: str, count: int, seed: int = 29) -> Iterator[bytes]:
+def cases(name: str, seed: int = 29) -> Iterator[bytes]:
     """Damaged copies of a file, the same ones for the same seed."""
     random = np.random.default_rng([seed, *name.encode()])
-    for _ in range(count):
+    while True:
         data = damaged(FILES[name], random)
+        data = repaired(data) if name.startswith("crafted") else data
         if data != FILES[name]:
             yield data
 
@@ -125,22 +182,12 @@ def read(path: Path) -> Any:
     if path.suffix == ".toml":
         return read_toml(path)
     if path.suffix == ".json":
-        from mwdn.io.reading import read_json
-
         return read_json(path)
     return read_frame(path)
 
 
-def outcome(path: Path, reference: Any) -> str:
-    """``refused``, ``equal``, ``similar`` (taken, off by `VISIBLE` at most), ``different``, or what went wrong."""
-    try:
-        content = read(path)
-    except MwdnError as error:
-        message = str(error).replace(str(path), "")
-        fine = len(message) <= LONGEST and message.isprintable() and str(path) in str(error)
-        return "refused" if fine else f"bad message: {message[:400]!r}"
-    except Exception as error:
-        return f"traceback: {type(error).__name__}: {error}"
+def compare(content: Any, reference: Any) -> str:
+    """``taken``; of pictures ``equal``, ``similar`` (off by `VISIBLE` at most) or ``different``."""
     if not isinstance(reference, np.ndarray):
         return "taken"
     if content.shape != reference.shape or content.dtype != reference.dtype:
@@ -175,40 +222,68 @@ class StandardError:
         self.file.close()
 
 
-def sweep(name: str, count: int, folder: Path) -> tuple[Counter[str], int, float, int]:
+def measure(name: str, count: int, folder: Path) -> tuple[Counter[str], int, float, int]:
     """Outcomes of damaged copies, lines on the terminal, longest time in s, and JPEGs that look different."""
     path = folder / name
     path.write_bytes(FILES[name])
-    reference = read(path) if path.suffix != ".json" or "mwdn.io.reading" in sys.modules else None
+    reference = read(path)
     outcomes: Counter[str] = Counter()
-    slowest, visible = 0.0, 0
+    slowest, visible, taken = 0.0, 0, []
     with StandardError() as terminal:
-        for data in cases(name, count):
+        for data in islice(cases(name), count):
             path.write_bytes(data)
             start = time.perf_counter()
-            result = outcome(path, reference)
+            result = outcome(lambda: taken.append(read(path)), path)
             slowest = max(slowest, time.perf_counter() - start)
-            outcomes[result if ":" not in result else ":".join(result.split(":")[:2])] += 1
+            outcomes[compare(taken.pop(), reference) if result == "taken" else result[:90]] += 1
     if path.suffix == ".jpg":
         with StandardError():
-            visible = sum(differs(data, reference) for data in cases(name, count))
+            visible = sum(differs(data, reference) for data in islice(cases(name), count))
     return outcomes, len(terminal.lines), slowest, visible
 
 
+def explode(name: str, folder: Path) -> str:
+    """What becomes of a bomb in a process of its own, its time and its memory."""
+    path = folder / name
+    write_bomb(path)
+    code = f"from pictures import *; judge(Path({str(path)!r}))"
+    call = [sys.executable, "-c", code]
+    process = subprocess.run(call, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
+    path.unlink()
+    return process.stdout.strip() or process.stderr.strip()[-100:] or f"exit code {process.returncode}"
+
+
+def judge(path: Path) -> None:
+    """Print what becomes of a file without limits, as a reader of before issue 29 needs them."""
+    start = time.perf_counter()
+    try:
+        read(path)
+        result = "taken"
+    except Exception as error:
+        result = "refused" if isinstance(error, MwdnError) else type(error).__name__
+    seconds = time.perf_counter() - start
+    peak = re.search(r"VmHWM:\s*(\d+)", Path("/proc/self/status").read_text())
+    print(f"{result}, {seconds:.1f} s, {int(peak[1]) / 2**20 if peak else 0:.1f} GiB")
+
+
 def main(report: Callable[[str], None] = print) -> None:
-    """Print a row for each kind of file."""
+    """Print a row for each kind of file, or with ``--bombs`` for each bomb."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cases", type=int, default=80)
     parser.add_argument("--only", default="")
+    parser.add_argument("--bombs", action="store_true")
     arguments = parser.parse_args()
     total: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as folder:
-        for name in FILES:
+        for name in BOMBS if arguments.bombs else FILES:
             if arguments.only not in name:
                 continue
+            if arguments.bombs:
+                report(f"{name:16} {explode(name, Path(folder))}")
+                continue
             try:
-                outcomes, lines, slowest, visible = sweep(name, arguments.cases, Path(folder))
-            except (MwdnError, ImportError) as error:
+                outcomes, lines, slowest, visible = measure(name, arguments.cases, Path(folder))
+            except MwdnError as error:
                 report(f"{name:16} {error}")
                 continue
             report(f"{name:16} {dict(outcomes)} lines {lines}, slowest {slowest:.2f} s, differ {visible}")
