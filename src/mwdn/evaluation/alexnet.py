@@ -16,7 +16,8 @@ from torch import Tensor, nn
 from mwdn.errors import CheckpointError, ShapeError
 from mwdn.io.files import atomic
 from mwdn.types import Image
-from mwdn.weights.checkpoint import first_difference, read_plain
+from mwdn.weights.checkpoint import first_difference
+from mwdn.weights.torch_file import read_plain
 
 SMALLEST = 31
 """Least pixels along each axis: 31 -> 7 (stride 4) -> 3 -> 1 (pooled); with fewer, relu3 to relu5 are empty."""

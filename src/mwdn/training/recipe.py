@@ -2,12 +2,9 @@
 
 import dataclasses
 import math
-import warnings
 from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any, ClassVar
-
-import torch
 
 from mwdn.data.cameras import Cameras
 from mwdn.data.mismatch import Mismatch
@@ -17,7 +14,8 @@ from mwdn.data.simulated import Placement
 from mwdn.data.unpaired import SelfSupervised
 from mwdn.errors import MwdnError, ParameterError, UnknownNameError
 from mwdn.io.toml import current_names, find_recipe, read_toml, to_dataclass
-from mwdn.networks import DENOISERS, build
+from mwdn.networks import DENOISERS
+from mwdn.networks.empty import build_empty
 from mwdn.optics.sensor import Sensor
 from mwdn.training.losses import checked_weights
 
@@ -282,13 +280,7 @@ def _by_table(changes: dict[str, Any]) -> dict[str, dict[str, Any]]:
 def _check_network(network: dict[str, Any]) -> None:
     """Build the network without memory, to find a mistake before a thousand photographs are read."""
     try:
-        with torch.device("meta"), warnings.catch_warnings(action="ignore"):  # torch's, of empty layers
-            built = build(**network)
+        build_empty(**network)
     except MwdnError as error:
         error.args = (f"[network]: {error}",)
         raise
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ParameterError(f"[network] {network} cannot be built: {error}") from error
-    empty = [name for name, parameter in built.named_parameters() if parameter.numel() == 0]
-    if empty:
-        raise ParameterError(f"[network] {network} has layers without channels, `{empty[0]}` first.")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load, save_file
 from torch import Tensor
 
 from mwdn.io.files import as_parameter_error, atomic
@@ -48,7 +48,7 @@ class SampleFiles:
     def read(self, row: int) -> Sample | None:
         """A sample; ``None`` if there is no whole file of it."""
         with suppress(OSError, SafetensorError, KeyError):
-            content = load_file(self._file(row))
+            content = load(self._file(row).read_bytes())  # not mapped: a file that shrinks would end the process
             return Sample(*(content[name] for name in Sample._fields))
         return None
 

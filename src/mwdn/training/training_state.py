@@ -8,7 +8,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save_file
 from torch import Tensor, nn
 
-from mwdn.errors import CheckpointError
+from mwdn.errors import CheckpointError, reason
 from mwdn.io.files import atomic
 
 Header = dict[str, str]
@@ -42,12 +42,11 @@ def read_state(path: Path, content: bytes) -> tuple[dict[str, Tensor], Header]:
     Raises:
         CheckpointError: the file is damaged.
     """
-    try:
-        state = load(content)
-    except SafetensorError as error:
-        raise damaged(path, error) from error
     length = int.from_bytes(content[:8], "little")  # of the JSON header that follows
-    return state, json.loads(content[8 : 8 + length]).get("__metadata__", {})
+    try:
+        return load(content), json.loads(content[8 : 8 + length]).get("__metadata__", {})
+    except (SafetensorError, ValueError, KeyError, RecursionError) as error:
+        raise damaged(path, reason(error)) from error
 
 
 def damaged(path: Path, reason: object) -> CheckpointError:

@@ -5,8 +5,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from mwdn.errors import CheckpointError
-from mwdn.networks import build
+from mwdn.errors import CheckpointError, ParameterError
+from mwdn.networks.empty import build_empty
+from mwdn.weights.tensors import check_shapes, fill
 
 OPTIONS: dict[str, Any] = {"pooling": "average", "boundary": "circular"}
 """Where their code differs from their paper, for both networks."""
@@ -40,6 +41,9 @@ def load_authors(state: dict[str, Tensor]) -> nn.Module:
     """
     name = "mwdn-cpsf" if "inc0.double_conv.0.weight" in state else "mwdn"
     extra = {"authors_scalars": True} if name == "mwdn-cpsf" else {"psf_pooling": "average"}
+    dense = [key for key, value in state.items() if not _is_dense(value)]
+    if dense:
+        raise CheckpointError(f"`{dense[0][:80]}` must be a plain tensor of numbers. Save it with `contiguous()`.")
     first = state["inc.double_conv.0.weight"]
     scalars = {"w": 1, "delta": 5} if name == "mwdn-cpsf" else {"w": 4, "delta": 4}
     wrong = [key for key, length in scalars.items() if state[key].shape != (length,)]
@@ -48,17 +52,24 @@ def load_authors(state: dict[str, Tensor]) -> nn.Module:
             f"`{'`, `'.join(wrong) or 'inc.double_conv.0.weight'}` must have the shape of the authors' {name} "
             f"({scalars} numbers). Take a checkpoint of their code."
         )
-    options = OPTIONS | extra | {"channels": first.shape[1], "width": first.shape[0]}
-    network = build(name, **options)
+    ours = _renamed(state, name)
     try:
-        network.load_state_dict(_renamed(state, name), strict=True)
-    except RuntimeError as error:
-        raise CheckpointError(f"These weights have the names of the authors' {name}, but: {error}") from error
-    return network
+        network = build_empty(name, **OPTIONS, **extra, channels=first.shape[1], width=first.shape[0])
+    except ParameterError as error:
+        raise CheckpointError(f"These weights have the names of the authors' {name}, but {error}") from error
+    shapes = {key: tuple(value.shape) for key, value in ours.items()}
+    check_shapes(network, shapes, f"These weights have the names of the authors' {name}, but not their shapes")
+    return fill(network, ours.items(), "The checkpoint")
+
+
+def _is_dense(tensor: Tensor) -> bool:
+    """Whether a tensor of real numbers has the memory of all its elements; a stride of 0 claims any number of them."""
+    real = tensor.layout == torch.strided and not tensor.is_quantized and not tensor.is_complex()
+    return real and tensor.numel() * tensor.itemsize <= tensor.untyped_storage().nbytes()
 
 
 def _renamed(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:
-    ours = {}
+    ours: dict[str, Tensor] = {}
     for key, value in state.items():
         if key in ("w", "delta"):
             continue

@@ -2,20 +2,19 @@
 
 import json
 from pathlib import Path
-from pickle import UnpicklingError
 from textwrap import shorten
 from typing import Any
 
-import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from mwdn.errors import CheckpointError, ParameterError
+from mwdn.errors import CheckpointError, ParameterError, reason
 from mwdn.io.files import atomic
-from mwdn.networks import build
+from mwdn.networks.empty import build_empty
 from mwdn.version import __version__
 from mwdn.weights.authors import is_authors, load_authors
+from mwdn.weights.tensors import Header, check_shapes, fill, read_header, read_tensors
+from mwdn.weights.torch_file import read_plain
 
 SUFFIXES = frozenset({".safetensors", ".pt", ".pth", ".tar", ".ckpt"})
 """Suffixes of weight files."""
@@ -54,28 +53,31 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
     Raises:
         CheckpointError: the file is no checkpoint of this package.
     """
-    try:
-        with safe_open(path, framework="pt") as file:
-            text = (file.metadata() or {}).get("mwdn")
-    except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"`{path}` cannot be read as safetensors: {error}.") from error
-    if text is None:
+    return _metadata(Path(path), read_header(Path(path)))
+
+
+def _metadata(path: Path, header: Header) -> dict[str, Any]:
+    text = header.metadata.get("mwdn")
+    if not isinstance(text, str):
         raise CheckpointError(f"`{path}` was not written by mwdn: its metadata names no network. Use `save_network`.")
     try:
-        header = json.loads(text)
-    except json.JSONDecodeError as error:
+        content = json.loads(text)
+    except (ValueError, RecursionError) as error:  # ValueError also: a number of over 4,300 digits
         raise CheckpointError(
-            f"The metadata of `{path}` is damaged: {error}. Copy it from its source again."
+            f"The metadata of `{path}` is damaged: {reason(error)}. Copy it from its source again."
         ) from error
     if not (
-        isinstance(header, dict) and isinstance(header.get("name"), str) and isinstance(header.get("options"), dict)
+        isinstance(content, dict) and isinstance(content.get("name"), str) and isinstance(content.get("options"), dict)
     ):
         raise CheckpointError(f"The metadata of `{path}` must hold a name and options. Save it with `save_network`.")
-    return header
+    return content
 
 
 def load_checkpoint(path: str | Path) -> nn.Module:
     """Load a network from a checkpoint, on the CPU, in evaluation mode.
+
+    The network is first built without memory and compared with the shapes in the file: a file that asks for more
+    memory than it holds is refused before any is used.
 
     Args:
         path: a checkpoint of this package (``.safetensors``), or of the MWDN authors (``.tar`` and the like, read
@@ -88,45 +90,20 @@ def load_checkpoint(path: str | Path) -> nn.Module:
     if not path.is_file():
         raise CheckpointError(f"No checkpoint at `{path}`. Check the name; the current folder is `{Path.cwd()}`.")
     if path.suffix != ".safetensors":
-        return load_authors(_read_foreign(path)).eval()
-    header = read_metadata(path)
+        return _load_foreign(path)
+    header = read_header(path)
+    metadata = _metadata(path, header)
+    name = metadata["name"]
     try:
-        options = {key: value for key, value in header["options"].items() if key != "outputs"}
-        network = build(header["name"], **options)
-    except (TypeError, ParameterError) as error:
-        version = header.get("version", "unknown")
+        network = build_empty(name, **{key: v for key, v in metadata["options"].items() if key != "outputs"})
+    except (TypeError, ParameterError) as error:  # TypeError: `name` is one of the options, too
+        version, why = (shorten(str(text), n) for text, n in ((metadata.get("version", "unknown"), 20), (error, 180)))
         raise CheckpointError(
-            f"`{path}`, of mwdn {version}, has a network that cannot be built: {error} Update mwdn."
+            f"`{path}`, of mwdn {version}, has a network that cannot be built: {why} Update mwdn."
         ) from error
-    with safe_open(path, framework="pt") as file:
-        state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    try:
-        network.load_state_dict(state)  # converts the bundled float16 weights to float32
-    except RuntimeError as error:
-        raise CheckpointError(
-            f"`{path}` does not fit the network '{header['name']}' it names: {first_difference(error)}. Copy it again."
-        ) from error
-    not_finite = [key for key, value in network.state_dict().items() if not value.isfinite().all()]
-    if not_finite:
-        raise CheckpointError(f"`{path}` holds NaN or infinity, `{not_finite[0]}` first. Use an earlier checkpoint.")
-    return network.eval()
-
-
-def read_plain(path: Path) -> Any:  # noqa: ANN401
-    """Read a file of `torch.save`, on the CPU, without running code from it.
-
-    Raises:
-        CheckpointError: the file is damaged, or holds more than plain values.
-    """
-    try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises many kinds for damaged files
-        # Without torch's message, which is ten lines long and suggests unpickling the file nevertheless.
-        objects = isinstance(error, UnpicklingError) and "Unsupported operand" not in str(error)
-        why = "it holds objects, whose code is not run" if objects else "it is damaged, or of another format"
-        raise CheckpointError(
-            f"`{path}` cannot be read as plain weights: {why}. Copy it again, or save its `state_dict()` alone."
-        ) from error
+    shapes = {key: entry.shape for key, entry in header.entries.items()}
+    check_shapes(network, shapes, f"`{path}` does not fit the network '{name}' it names")
+    return fill(network, read_tensors(path, header), f"`{path}`")
 
 
 def first_difference(error: Exception) -> str:
@@ -134,14 +111,19 @@ def first_difference(error: Exception) -> str:
     return shorten(str(error).partition(":\n")[2] or str(error), 200, placeholder=" ...").rstrip(".")
 
 
-def _read_foreign(path: Path) -> dict[str, Tensor]:
+def _load_foreign(path: Path) -> nn.Module:
+    """Load a checkpoint of the MWDN authors."""
     content = read_plain(path)
     state = content.get("net_state_dict", content) if isinstance(content, dict) else {}
     state = state if isinstance(state, dict) else {}
     state = {str(key).removeprefix("module."): value for key, value in state.items() if isinstance(value, Tensor)}
     if not is_authors(state):
+        names = shorten(", ".join(key[:40] for key in list(state)[:5]), 80, placeholder=" ...")
         raise CheckpointError(
             f"`{path}` is neither a checkpoint of mwdn (.safetensors) nor one of the MWDN authors "
-            f"(`net_state_dict` with `delta` and `inc.double_conv.*`). It holds: {', '.join(list(state)[:5])} ..."
+            f"(`net_state_dict` with `delta` and `inc.double_conv.*`). It holds: {names or 'nothing'}."
         )
-    return state
+    try:
+        return load_authors(state).eval()
+    except CheckpointError as error:
+        raise CheckpointError(f"`{path}`: {error}") from error
