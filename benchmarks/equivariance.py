@@ -11,12 +11,13 @@ contour PSFs:
   is the method's own bias, such as a network's preference of a direction or the grid of its pooling.
 - cut: scene and PSF fill the sensor, which cuts off a part of the pattern, another part in a moved capture.
 
-Second form: PSNR with and without `ensemble` in the rows of benchmarks/universal.py, with the 95 % confidence interval
-of the gain. Both write their numbers to --out.
+Second form: PSNR with and without `ensemble` in the rows of benchmarks/universal.py, and on the real DiffuserCam pairs
+(best gain and offset), with the 95 % confidence interval of the gain. Both write their numbers to --out.
 """
 
 import argparse
 import json
+import tempfile
 from pathlib import Path
 from statistics import fmean
 
@@ -26,6 +27,8 @@ from torch.nn import functional as F
 import mwdn
 import universal
 from mwdn import Calibration, Camera, Reconstructor
+from mwdn.data.importers import import_pairs
+from mwdn.data.pairs import PairFile
 from mwdn.data.photographs import Photographs
 from mwdn.evaluation import Perceptual, Protocol, bootstrap, evaluate
 from mwdn.io.files import atomic
@@ -38,6 +41,7 @@ METHODS = ["wiener", "admm", "fista", "pyramid", "universal", "universal-small"]
 PARTS = {"inside": 0.4, "cut": 1.0}
 """Part of the frame's width that the scene fills, and that the PSF's aperture has."""
 MOVE = 5
+FULL, NONE = Protocol.parse("full"), Perceptual.none("PSNR alone")
 
 
 def smooth(size, cell, generator):
@@ -97,22 +101,31 @@ def measure(methods, size, count):
     return rows
 
 
-def gains(methods, data, count):
+def rows_of_pairs(data, count):
+    """Name, camera, pairs and variant of the score of each row."""
     recipe, photographs = read_recipe("mismatched"), Photographs(data / "photos" / "test")
-    rows = []
     for name in universal.PSFS:
         camera = universal.camera(data, name)
         for full_well, exact in ((15_000.0, True), (2_000.0, False)):
             made = universal.captures(camera.psf, photographs, recipe, full_well, range(count), exact=exact)
-            for method in methods:
-                bound = {str(each): Reconstructor(method, camera, ensemble=each) for each in (False, True)}
-                report = evaluate(bound, made, Protocol.parse("full"), perceptual=Perceptual.none("--gain")).methods
-                plain, averaged = (report[str(each)].values["psnr"] for each in (False, True))
-                mean, low, high = bootstrap([b - a for a, b in zip(plain, averaged, strict=True)])
-                row = {"method": method, "psf": name, "full_well": full_well, "exact": exact, "count": count}
-                rows.append({**row, "psnr": fmean(plain), "gain": mean, "low": low, "high": high})
-                light = f"{full_well:,.0f} e, {'exact' if exact else 'mismatched'}"
-                print(f"| {name} | {light} | {method} | {fmean(plain):.2f} | {mean:+.2f} ({low:+.2f} to {high:+.2f}) |")
+            yield f"{name}, {full_well:,.0f} e, {'exact' if exact else 'mismatched'}", camera, made, "clipped"
+    with tempfile.TemporaryDirectory() as scratch:
+        file = Path(scratch) / "pairs.h5"
+        import_pairs("diffusercam", data / "diffusercam", file)
+        yield "DiffuserCam, real", universal.camera(data, "DiffuserCam 270x480"), PairFile(file), "best-gain"
+
+
+def gains(methods, data, count):
+    rows = []
+    for name, camera, pairs, variant in rows_of_pairs(data, count):
+        for method in methods:
+            bound = {str(each): Reconstructor(method, camera, ensemble=each) for each in (False, True)}
+            scores = evaluate(bound, pairs, FULL, variant=variant, perceptual=NONE).methods
+            plain, averaged = (scores[str(each)].values["psnr"] for each in (False, True))
+            mean, low, high = bootstrap([b - a for a, b in zip(plain, averaged, strict=True)])
+            row = {"row": name, "method": method, "count": len(plain), "psnr": fmean(plain)}
+            rows.append(row | {"gain": mean, "low": low, "high": high})
+            print(f"| {name} | {method} | {fmean(plain):.2f} | {mean:+.2f} ({low:+.2f} to {high:+.2f}) |", flush=True)
     return rows
 
 
