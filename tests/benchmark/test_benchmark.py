@@ -148,6 +148,7 @@ def test_goes_on_where_it_was_killed(folder, expected, monkeypatch):
                 assert swept[label][axis][size] == pytest.approx(numbers, rel=2e-3), (label, axis, size)
 
 
+@pytest.mark.acceptance  # test_locks has the sharing itself, in real processes
 def test_two_processes_share_the_networks(folder, expected):
     call = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "mwdn"]
     call += ["benchmark", "r.toml", "--out", "out", "--device", "cpu"]
