@@ -13,6 +13,7 @@ from typing import Any
 
 from mwdn.errors import ParameterError, UnknownNameError, check_options
 from mwdn.optics.noise import noise_level
+from mwdn.runtime.forks import survive_forks
 from mwdn.solvers.admm import Admm
 from mwdn.solvers.alignment import Pose, align
 from mwdn.solvers.fista import Fista
@@ -20,6 +21,8 @@ from mwdn.solvers.pyramid import Pyramid
 from mwdn.solvers.splitting import TEXTBOOK, Penalties
 from mwdn.solvers.warm_start import WarmStart
 from mwdn.solvers.wiener import Wiener
+
+survive_forks()  # here, because every method imports the solvers
 
 Solver = Admm | Fista | Pyramid | Wiener
 
