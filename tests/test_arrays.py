@@ -103,6 +103,7 @@ BAD_ARRAYS = {
     "bool": (PICTURE > 0.5, "bool"),
     "complex": (PICTURE.astype(np.complex64), "complex64"),
     "list": ((PICTURE[:2, :2, 0] * 255).astype(int).tolist(), "int64"),
+    "ragged list": ([[1.0, 2.0], [3.0]], "inhomogeneous"),
     "object": (np.array([None, None]), "object"),
     "batch": (np.stack([PICTURE, PICTURE]), "2 x 32 x 40 x 3"),
     "batch of one": (PICTURE[None], "1 x 32 x 40 x 3"),
@@ -203,6 +204,9 @@ BAD_TENSORS = {
     "int64": (MEASUREMENT * 255).long(),
     "bool": MEASUREMENT > 0.5,
     "complex": MEASUREMENT.cfloat(),
+    "8-bit floats": MEASUREMENT.to(torch.float8_e4m3fn),
+    "sparse": MEASUREMENT.to_sparse(),
+    "meta": MEASUREMENT.to("meta"),
     "one picture": MEASUREMENT[0],
     "plane": MEASUREMENT[0, 0],
     "five axes": MEASUREMENT[None],
@@ -219,6 +223,54 @@ def test_other_tensors_are_named(name, bad):
     with pytest.raises(error) as caught:
         (TAKE_TENSORS | TAKE_ARRAYS)[name](value)
     assert named in str(caught.value)
+
+
+# --- Numbers ------------------------------------------------------------------------------------------
+
+
+def with_pixel(value):
+    other = MEASUREMENT.clone()
+    other[0, 1, 3, 4] = value
+    return other
+
+
+BAD_NUMBERS = {
+    "NaN": (with_pixel(torch.nan), "NaN or infinity"),
+    "infinity": (with_pixel(torch.inf), "NaN or infinity"),
+    "both infinities": (torch.cat([MEASUREMENT, with_pixel(torch.inf), with_pixel(-torch.inf)]), "NaN or infinity"),
+    "half precision": (with_pixel(torch.nan).half(), "NaN or infinity"),
+    "negative": (torch.cat([MEASUREMENT, -MEASUREMENT]), "no light"),
+    "large": (1e20 * MEASUREMENT, r"1e\+20.* 1e-12 to 1e\+09"),
+    "small": (1e-14 * MEASUREMENT, r"1e-14.* 1e-12 to 1e\+09"),
+}
+
+
+@pytest.mark.parametrize("method", ["wiener", "universal-small"])
+@pytest.mark.parametrize("bad", BAD_NUMBERS)
+def test_numbers_that_are_no_light_are_refused(bad, method):
+    """Each gave a picture of NaN, or a wrong one, without a word."""
+    value, message = BAD_NUMBERS[bad]
+    reconstruct = Reconstructor(method, CALIBRATION, device="cpu")
+    for call in (reconstruct, reconstruct.on_device):
+        with pytest.raises(ParameterError, match=message):
+            call(value)
+
+
+@pytest.mark.parametrize("method", ["wiener", "admm", "universal-small"])
+def test_scale_of_a_measurement_is_the_scale_of_its_picture(method):
+    """Automatic Wiener lost the contrast below 1e-9. Darkness is a measurement: a video goes on."""
+    reconstruct = Reconstructor(method, CALIBRATION, device="cpu", precision="exact")
+    picture = reconstruct(MEASUREMENT)
+    for scale in (1e-11, 1e8):
+        assert (reconstruct(scale * MEASUREMENT) / scale - picture).norm() < 1e-5 * picture.norm()
+    assert reconstruct(0 * MEASUREMENT).abs().max() < 1e-12
+
+
+@pytest.mark.parametrize("name", ["wiener", "admm", "pyramid"])
+def test_regularisation_is_finite(name):
+    """ADMM gave a picture of NaN, Wiener a black one."""
+    with pytest.raises(ParameterError, match=r"`regularisation` \(inf\)"):
+        Reconstructor(name, CALIBRATION, regularisation=float("inf"))
 
 
 @pytest.mark.usefixtures("unchecked")

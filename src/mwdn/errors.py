@@ -17,6 +17,7 @@ A message states what must hold, what was got, and the way out.
 """
 
 import difflib
+import math
 import reprlib
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache, wraps
@@ -24,6 +25,10 @@ from inspect import Parameter, signature
 from numbers import Integral, Real
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+SMALLEST_LIGHT = 1e-12
+LARGEST_LIGHT = 1e9
+"""Range of the largest number of a measurement, whose squares and their sums over 1e8 pixels float32 must hold."""
 
 _Class = TypeVar("_Class", bound=type)
 
@@ -83,6 +88,8 @@ def check_options(of: Callable[..., Any], what: str, options: Mapping[str, Any])
             if isinstance(value, str) and names:
                 raise UnknownNameError(option, value, names)
             raise ParameterError(f"`{option}` ({shown(value)}) of {what} must be {type_in_words(types[option])}.")
+        if isinstance(value, float) and math.isinf(value):
+            raise ParameterError(f"`{option}` ({value}) of {what} must be finite.")
 
 
 def checked(kind: _Class) -> _Class:
@@ -184,7 +191,8 @@ def check_batch(image: Any, name: str) -> None:  # noqa: ANN401
     """Check that the image called ``name`` is a tensor of floats (B, C, H, W).
 
     Raises:
-        ParameterError: it is no tensor, or one of integers, whose scale is unknown, or of complex numbers.
+        ParameterError: it is no tensor, or one of integers, whose scale is unknown, of complex numbers, or of floats
+            of 8 bits; or it is sparse, or on the device "meta", without numbers.
         ShapeError: it has other axes.
     """
     if not hasattr(image, "is_floating_point"):  # without torch, which takes seconds to import
@@ -194,11 +202,47 @@ def check_batch(image: Any, name: str) -> None:  # noqa: ANN401
         )
     if image.ndim != 4:
         raise ShapeError(f"`{name}` {tuple(image.shape)} must be (B, C, H, W). For one picture: `{name}[None]`.")
-    if not image.is_floating_point():
-        raise ParameterError(
-            f"`{name}` ({image.dtype}) must be floats in linear light, 1 for saturation. Divide integers by the "
-            f"camera's largest number: `{name} / 255` for 8 bits."
+    if not image.is_floating_point() or image.dtype.itemsize < 2:
+        way_out = f"Divide integers by the camera's largest number: `{name} / 255` for 8 bits."
+        if image.is_complex():
+            way_out = f"Its magnitude: `{name}.abs()`."
+        elif image.is_floating_point():
+            way_out = f"Convert it: `{name}.float()`."
+        raise ParameterError(f"`{name}` ({image.dtype}) must be floats in linear light, 1 for saturation. {way_out}")
+    if image.is_sparse or image.is_sparse_csr or image.device.type == "meta":
+        kind, way_out = (
+            ('on the device "meta"', "") if image.device.type == "meta" else ("sparse", f" `{name}.to_dense()`.")
         )
+        raise ParameterError(f"`{name}` ({image.dtype}, {kind}) must be a tensor that holds all its numbers.{way_out}")
+
+
+def check_light(image: Any, name: str) -> None:  # noqa: ANN401
+    """Check that the numbers of the image (B, C, H, W) called ``name`` can be a measurement.
+
+    One NaN or infinity becomes a picture of NaN. From `SMALLEST_LIGHT` to `LARGEST_LIGHT`, no square or sum of a
+    method leaves the range of float32. Darkness, all zeros, is a measurement. Waits for a GPU.
+
+    Raises:
+        ParameterError: it holds NaN or infinity; or the largest number of a sample is negative, or of another scale.
+    """
+    for sample in image:
+        low, high = (float(value) for value in sample.aminmax())  # both NaN if there is one
+        largest = max(-low, high)
+        if not math.isfinite(low + high):
+            raise ParameterError(
+                f"`{name}` holds NaN or infinity, which would spread over the whole picture. Capture it again, or "
+                f"replace them: `torch.nan_to_num({name}, posinf=1)`."
+            )
+        if high <= 0 > low:
+            raise ParameterError(
+                f"`{name}` ({low:.3g} to {high:.3g}) holds no light: no number is positive. Check the frame that was "
+                "subtracted, `dark` or `ambient`."
+            )
+        if largest and not SMALLEST_LIGHT <= largest <= LARGEST_LIGHT:
+            raise ParameterError(
+                f"`{name}` (up to {largest:.3g}) must be linear light, 1 for saturation, with a largest number from "
+                f"{SMALLEST_LIGHT:g} to {LARGEST_LIGHT:g}. Scale it: `{name} / {name}.max()`."
+            )
 
 
 class ImageError(MwdnError, ValueError):

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from mwdn import solvers
 from mwdn.calibration import Calibration
 from mwdn.calibration.white_balance import WhiteBalance, apply_white_balance, check_white_balance
-from mwdn.errors import ParameterError, ShapeError, check_batch, check_options
+from mwdn.errors import ParameterError, ShapeError, check_batch, check_light, check_options
 from mwdn.fourier.convolution import check_fit
 from mwdn.inference.engine import Engine, Precision
 from mwdn.inference.ensemble import Ensemble
@@ -159,7 +159,9 @@ class Reconstructor:
             if due and measurement.isfinite().all():  # else on the next frame
                 reconstruct = aligning.at(solvers.align(to_device(measurement, self.device), self.psf))
                 due = False
-            yield measurement, reconstruct(measurement)
+            with torch.inference_mode():
+                scene = reconstruct._in_chunks(measurement)
+            yield measurement, to_host(self.balance(scene))
 
     def _reconstruct(self, measurement: Measurement) -> Scene:
         if self.align:
@@ -208,8 +210,9 @@ class Reconstructor:
         Raises:
             ShapeError: the measurement is not a batch, or its size or channels do not fit the PSF or the network.
             ImageError: the array or picture is not a frame.
-            ParameterError: the measurement is a tensor of integers, floats of an array exceed 1 by far, or the device
-                does not have enough memory for pictures of this size.
+            ParameterError: the measurement is a tensor of integers or holds NaN, infinity, no light or a scale beyond
+                `mwdn.errors.LARGEST_LIGHT`; floats of an array exceed 1 by far; or the device does not have enough
+                memory for pictures of this size.
         """
         if isinstance(measurement, Tensor):
             return self._to_host(measurement)
@@ -234,6 +237,10 @@ class Reconstructor:
             ParameterError: as for a call.
         """
         self._check(measurement)
+        check_light(measurement, "measurement")
+        return self._in_chunks(measurement)
+
+    def _in_chunks(self, measurement: Measurement) -> Scene:
         try:
             parts = torch.split(measurement, self._pictures_per_chunk(measurement))
             scenes = [self._reconstruct(to_device(part, self.device)) for part in parts]

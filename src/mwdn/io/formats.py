@@ -182,7 +182,10 @@ def as_frame(picture: ArrayPicture, *, finite: bool = True) -> Frame:
     mode = getattr(picture, "mode", "L")
     if mode not in _PIL_MODES:
         raise ImageError(f"The picture (mode {mode}) must be grey or RGB. Convert it: `picture.convert('RGB')`.")
-    stored = np.asarray(picture)
+    try:
+        stored = np.asarray(picture)
+    except ValueError as error:  # lists of other lengths
+        raise ImageError(f"A frame ({shown(picture)}) must be an array (H, W, C): {reason(error)}.") from error
     try:
         if stored.ndim > 3:
             shape = " x ".join(map(str, stored.shape))

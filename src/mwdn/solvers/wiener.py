@@ -80,7 +80,9 @@ class Wiener:
         count[:, 1 : (width + 1) // 2] = 2
         count[0, 0] = 0
         power, filtered = B.abs().square() * count, H.abs().square()
-        target = allowed * power.sum((-2, -1), keepdim=True) / contrast.square().clamp(min=1e-20)
+        target = (
+            allowed * power.sum((-2, -1), keepdim=True) / contrast.square().clamp(min=torch.finfo(torch.float32).tiny)
+        )
         low, high = torch.full_like(target, -16.0), torch.full_like(target, 1.0)
         for _ in range(40):
             middle = (low + high) / 2
