@@ -67,3 +67,16 @@ def test_a_pipe_is_refused(tmp_path):
     for read in (PairFile, lambda path: list_hdf5(path, "blur", "gt")):
         with pytest.raises(ImageError, match="is a pipe"):
             read(tmp_path / "a.h5")
+
+
+def test_a_heap_that_never_ends_is_refused(tmp_path):
+    """An attribute's text in it: HDF5 2.0 searched forever, beyond any signal."""
+    with PairFile.create(tmp_path / "a.h5", measurement_shape=SHAPE[1:], scene_shape=SHAPE[1:], attributes={"a": "b"}):
+        pass
+    content = bytearray((tmp_path / "a.h5").read_bytes())
+    start = content.index(b"GCOL") + 16
+    assert int.from_bytes(content[start + 8 : start + 16], "little") == 1  # byte of text
+    content[start + 8] = 129  # where the next object starts, there are zeros: one of size 0
+    (tmp_path / "a.h5").write_bytes(content)
+    with pytest.raises(ImageError, match=r"The attributes of `.*a\.h5` cannot be read"):
+        PairFile(tmp_path / "a.h5")

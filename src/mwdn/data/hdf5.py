@@ -3,7 +3,7 @@
 import io
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -100,6 +100,45 @@ def open_hdf5(path: Path, advice: str) -> Any:  # noqa: ANN401
         return h5py.File(path, "r", locking=False)
 
 
+class _CheckedHeaps(io.FileIO):
+    """The file that HDF5 reads a header from: a damaged heap of texts, in which it would search forever, is refused."""
+
+    def readinto(self, buffer: Any, /) -> int:  # noqa: ANN401
+        count = super().readinto(buffer)
+        if bytes(buffer[:4]) == b"GCOL":
+            self._check(bytes(buffer))
+        return count
+
+    @staticmethod
+    def _check(heap: bytes) -> None:
+        """HDF5's format specification, section III.E: 16 bytes in front of the heap and of each object in it."""
+        size, start = int.from_bytes(heap[8:16], "little"), 16
+        while start + 16 <= min(size, len(heap)):
+            index, length = (int.from_bytes(heap[start + a : start + b], "little") for a, b in ((0, 2), (8, 16)))
+            step = 16 + -(-length // 8) * 8 if index else length  # 0 is the free space, with its own 16 bytes
+            if not 16 <= step <= size - start:
+                raise OSError("damaged heap")
+            start += step
+
+
+@contextmanager
+def open_hdf5_header(path: Path, advice: str) -> Iterator[Any]:
+    """Open a file for its attributes and for what it says about its data sets; slow for the numbers in them.
+
+    Raises:
+        ImageError: as for `open_hdf5`.
+    """
+    import h5py
+
+    open_regular(path).close()
+    with ExitStack() as stack:
+        with as_damage(f"`{path}` is not a complete HDF5 file", advice):
+            file = stack.enter_context(h5py.File(stack.enter_context(_CheckedHeaps(path)), "r"))
+            if file.id.get_create_plist().get_sizes() != (8, 8):
+                raise ImageError(f"`{path}` has addresses or lengths of other than 8 bytes. {advice}")
+        yield file
+
+
 def find_rows(path: Path, file: Any, name: str, advice: str) -> Any:  # noqa: ANN401
     """A data set, (N, ...), whose numbers are all in the file.
 
@@ -163,7 +202,7 @@ def _check_storage(path: Path, data: Any, name: str) -> None:  # noqa: ANN401
 
 
 def read_attributes(path: Path, file: Any, advice: str) -> dict[str, Numbers]:  # noqa: ANN401
-    """Text and numbers among the attributes of a file; others are left out.
+    """Text and numbers among the attributes of a file from `open_hdf5_header`; others are left out.
 
     Raises:
         ImageError: they are damaged.

@@ -3,16 +3,15 @@
 import operator
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, SupportsIndex
+from typing import Any, NamedTuple, SupportsIndex
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from mwdn.data.hdf5 import as_damage, find_rows, names_in, open_hdf5, read_attributes
+from mwdn.data.hdf5 import as_damage, find_rows, names_in, open_hdf5, open_hdf5_header, read_attributes
 from mwdn.data.pair_writer import NAMES, VERSION, VERSION_KEY, Attribute, PairWriter, PixelType, Shape
 from mwdn.errors import ImageError
 from mwdn.types import Psf
@@ -20,8 +19,7 @@ from mwdn.types import Psf
 _MAKE_AGAIN = "Make it again, with `mwdn import`."
 
 
-@dataclass(frozen=True)
-class _Header:
+class _Header(NamedTuple):
     """Everything in a file except the pixels. It is read once and passed to the workers."""
 
     length: int
@@ -48,7 +46,7 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
         self._file: Any = None
         self._rows: dict[str, Any] = {}  # a lookup by name takes as long as reading a pair
         self._owner = 0
-        with open_hdf5(self.path, _MAKE_AGAIN) as file:
+        with open_hdf5_header(self.path, _MAKE_AGAIN) as file:
             self._header = _read_header(self.path, file)
 
     @classmethod
@@ -139,7 +137,7 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
             self.close()
         if self._file is None:
             self._file, self._owner = open_hdf5(self.path, _MAKE_AGAIN), os.getpid()
-            if _read_header(self.path, self._file) != self._header:
+            if _read_shapes(self.path, self._file) != self._header[:3]:
                 raise ImageError(f"`{self.path}` was replaced by another file meanwhile. Start again.")
             self._rows = {name: self._file[name] for name in NAMES}
         return self._file
@@ -155,6 +153,14 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
 
 
 def _read_header(path: Path, file: Any) -> _Header:  # noqa: ANN401
+    shapes = _read_shapes(path, file)
+    attributes = read_attributes(path, file, _MAKE_AGAIN)
+    if (version := attributes.pop(VERSION_KEY, VERSION)) != VERSION:
+        raise ImageError(f"`{path}` has format version {version}, but version {VERSION} is needed. Update mwdn.")
+    return _Header(*shapes, attributes)
+
+
+def _read_shapes(path: Path, file: Any) -> tuple[int, Shape, Shape]:  # noqa: ANN401
     with as_damage(f"`{path}` is not a complete HDF5 file", _MAKE_AGAIN):
         if "gt" in file and "blur" in file:
             raise ImageError(f"`{path}` is the authors' file: `mwdn import mwdn {path} -o pairs.h5`.")
@@ -170,7 +176,4 @@ def _read_header(path: Path, file: Any) -> _Header:  # noqa: ANN401
         shapes.append(data.shape)
     if shapes[0][0] != shapes[1][0]:
         raise ImageError(f"`{path}` has {shapes[0][0]:,} measurements and {shapes[1][0]:,} scenes. {_MAKE_AGAIN}")
-    attributes = read_attributes(path, file, _MAKE_AGAIN)
-    if (version := attributes.pop(VERSION_KEY, VERSION)) != VERSION:
-        raise ImageError(f"`{path}` has format version {version}, but version {VERSION} is needed. Update mwdn.")
-    return _Header(shapes[0][0], shapes[0][1:], shapes[1][1:], attributes)
+    return shapes[0][0], shapes[0][1:], shapes[1][1:]

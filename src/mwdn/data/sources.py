@@ -1,7 +1,7 @@
 """List the pairs of a public data set and read them one by one: one function per layout."""
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -12,10 +12,17 @@ import numpy as np
 from mwdn.data.hdf5 import as_damage, find_rows, names_in, open_hdf5
 from mwdn.errors import ImageError
 from mwdn.io.images import READABLE, decode_frame, read_frame
+from mwdn.io.reading import open_regular
 from mwdn.types import Frame
 
 MOST_ROWS = 2**21
 """Most pairs of one file: listing them takes 0.7 GB."""
+
+SMALLEST_PICTURE = 67
+"""Bytes of the smallest PNG: a file cannot hold more pictures than this allows."""
+
+UNPACKED_BYTES, PACKED_PART = 2**28, 20
+"""Pictures are compressed already: rows that unpack to over 256 MiB and 20 times the file are refused."""
 
 COPY_AGAIN = "Copy it from its source again."
 
@@ -146,7 +153,7 @@ def list_parquet(path: Path, captures: str, scenes: str) -> Listing:
 
 
 class _Shard:
-    """A parquet file. It can only be read in groups of rows; the latest group is kept in memory."""
+    """A parquet file. It is read in order, a few rows at a time."""
 
     def __init__(self, path: Path, columns: Sequence[str]) -> None:
         try:
@@ -154,30 +161,52 @@ class _Shard:
         except ModuleNotFoundError as error:
             raise _missing("pyarrow", "parquet") from error
         self.path, self.columns = path, list(columns)
-        try:
-            self._file: Any = parquet.ParquetFile(path)
-        except (OSError, ValueError) as error:  # pyarrow's errors are subclasses of these
-            raise ImageError(f"`{path}` is not a complete parquet file: {error}. {COPY_AGAIN}") from error
-        names = self._file.schema_arrow.names
+        open_regular(path).close()
+        with as_damage(f"`{path}` is not a complete parquet file", COPY_AGAIN):
+            self._file: Any = parquet.ParquetFile(path, buffer_size=2**20)
+            names = self._file.schema_arrow.names
+            groups = [self._file.metadata.row_group(i) for i in range(self._file.metadata.num_row_groups)]
+            rows = [group.num_rows for group in groups]
+            self.count, self._ends = sum(rows), np.cumsum(rows, dtype=np.int64)
+            largest = max(map(self._unpacked, groups), default=0)
         if not set(self.columns) <= set(names):
             advice = "Name two of them: `--captures lensless --scenes lensed`."
-            raise ImageError(f"`{path}` must have the columns {self.columns}, but has {names}. {advice}")
-        metadata = self._file.metadata
-        self.count = metadata.num_rows
-        self._ends = np.cumsum([metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)])
-        self._latest: tuple[int, Any] = (-1, None)
+            raise ImageError(f"`{path}` must have the columns {self.columns}, but has {str(names)[:80]}. {advice}")
+        size = path.stat().st_size
+        if min(rows, default=0) < 0 or self.count * SMALLEST_PICTURE > size:
+            raise ImageError(f"`{path}` claims {self.count:,} rows, but has {size:,} bytes for them. {COPY_AGAIN}")
+        if largest > max(PACKED_PART * size, UNPACKED_BYTES):
+            raise ImageError(f"`{path}` would take {largest:,} bytes unpacked, but has {size:,}. {COPY_AGAIN}")
+        self._group, self._next, self._rows = -1, 0, self._read(-1)
+
+    def _unpacked(self, group: Any) -> int:  # noqa: ANN401
+        columns = (group.column(i) for i in range(group.num_columns))
+        return sum(c.total_uncompressed_size for c in columns if c.path_in_schema.split(".")[0] in self.columns)
 
     def load(self, row: int) -> tuple[Frame, Frame]:
+        """Capture and scene of a row, (H, W, C).
+
+        Raises:
+            ImageError: the row or its picture is damaged.
+        """
         group = int(np.searchsorted(self._ends, row, side="right"))
-        try:
-            if self._latest[0] != group:
-                self._latest = (group, self._file.read_row_group(group, columns=self.columns))
-            first = self._ends[group] - self._latest[1].num_rows
-            cells = [self._latest[1][column][int(row - first)].as_py() for column in self.columns]
-        except (OSError, ValueError) as error:
-            raise ImageError(f"Row {row} of `{self.path}` cannot be read: {error}. {COPY_AGAIN}") from error
+        cells: list[Any] | None = []
+        with as_damage(f"Row {row} of `{self.path}` cannot be read", COPY_AGAIN):
+            if group != self._group or row < self._next:
+                start = int(self._ends[group - 1]) if group else 0
+                self._group, self._next, self._rows = group, start, self._read(group)
+            while self._next <= row and cells is not None:
+                cells, self._next = next(self._rows, None), self._next + 1
+        if cells is None:
+            raise ImageError(f"Row {row} of `{self.path}` cannot be read: one before it is damaged. {COPY_AGAIN}")
         capture, scene = (self._decode(cell, column, row) for cell, column in zip(cells, self.columns, strict=True))
         return capture, scene
+
+    def _read(self, group: int) -> Iterator[list[Any]]:
+        # One value may be shared by all rows: in a thousand rows at once it would take a thousand times its memory.
+        for batch in self._file.iter_batches(4, row_groups=[group], columns=self.columns, use_threads=False):
+            for row in range(batch.num_rows):
+                yield [batch.column(name)[row].as_py() for name in self.columns]
 
     def _decode(self, cell: object, column: str, row: int) -> Frame:
         data = cell.get("bytes") if isinstance(cell, dict) else cell
