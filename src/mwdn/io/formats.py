@@ -239,13 +239,18 @@ def _decode(kind: str, data: bytes, photograph: bool) -> Frame:
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH if photograph else cv2.IMREAD_UNCHANGED
     try:
         with decoder_messages() as lines:
-            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+            level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # its lines are C++
+            try:
+                pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+            finally:
+                cv2.utils.logging.setLogLevel(level)
     except cv2.error as error:
         raise ImageError(f"cannot be decoded as {kind}: {one_line(error.err)}. {COPY_AGAIN}") from error
     # libjpeg warns of nothing but damage and unknown extensions; libpng also of odd colour profiles.
     damage = [line for line in lines if kind == "JPEG" or _PNG_DAMAGE.search(line)]
     if damage:
-        raise ImageError(f"is damaged: {cut(one_line(damage[0]), 120)}. {COPY_AGAIN}")
+        why = cut(one_line(damage[0]), 100)
+        raise ImageError(f"is damaged: {why}. {COPY_AGAIN} If it looks whole in a viewer, save it as PNG there.")
     if pixels is None:
         raise ImageError(f"is damaged: OpenCV cannot decode this {kind}. {COPY_AGAIN}")
     return pixels
