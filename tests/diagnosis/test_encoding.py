@@ -86,7 +86,9 @@ def test_the_file_type_decides_where_the_evidence_is_weak(psf, light):
     assert gamma(weak, Calibration(psf)).state == "unknown"
     verdict = gamma(weak, Calibration(psf), for_viewing=True)
     assert (verdict.state, verdict.options) == ("doubt", "--gamma srgb")
-    assert gamma(file(light, "linear", 8), Calibration(psf), for_viewing=True).value == "linear"
+    linear = gamma(file(light, "linear", 8), Calibration(psf), for_viewing=True)
+    assert linear.value == "linear"
+    assert "unexplained" in linear.text  # it gave no reason
     assert gamma(file(0.5 + 0.02 * light, "srgb", 8), Calibration(psf), for_viewing=True).state == "unknown"
 
 

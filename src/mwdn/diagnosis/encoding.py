@@ -139,7 +139,6 @@ def gamma(frame: Frame, calibration: Calibration, *, for_viewing: bool = False) 
         reasons = reasons if abs(slope.evidence) > SURE / 2 else []
         reasons += [f"the PSF leaves {fits.stored:.1%} of its detail unexplained, decoded from sRGB {fits.decoded:.1%}"]
     if for_viewing:
-        reasons = reasons if evidence < -SURE else []
         evidence += FOR_VIEWING
         reasons += ["it is a JPEG or WebP"] if evidence < 0 else []
     if abs(evidence) < SURE:
