@@ -16,6 +16,7 @@ from mwdn.data.photographs import Photographs
 from mwdn.evaluation import measure
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import write_text
+from mwdn.io.reading import unexpected_content
 from mwdn.optics import Sensor
 from mwdn.training.experiment import FILE_START
 
@@ -73,7 +74,9 @@ def sweep(
         pairs: test pairs of an axis and a size, see `pairs_at`.
     """
     identity = {**identity, "count": robustness.count}
-    psnr = (read_record(path, identity) or {"psnr": {}})["psnr"]
+    saved = read_record(path, identity) or {"psnr": {}}
+    with unexpected_content(path):
+        psnr = {axis: {size: [*map(float, row)] for size, row in rows.items()} for axis, rows in saved["psnr"].items()}
     reconstruct: Reconstructor | None = None
     for axis, sizes in robustness.sizes.items():
         for size in sizes:

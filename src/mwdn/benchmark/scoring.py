@@ -14,6 +14,7 @@ from mwdn import solvers
 from mwdn.benchmark.recipe import Method
 from mwdn.benchmark.sets import Dataset, file_hash
 from mwdn.data.captures import find_captures, read_captures
+from mwdn.errors import ImageError, ParameterError
 from mwdn.evaluation import First, Perceptual, Scores, evaluate
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import atomic_write, write_text
@@ -114,10 +115,24 @@ def score(
         reconstruct = make_reconstructor(method, checkpoint, dataset, device)
         record = _measure(reconstruct, dataset, path, perceptual(), shown)
         write_text(path, json.dumps({"identity": record_identity, **record}, indent=1))  # after the pictures
-    pictures = {name: torch.from_numpy(read_array(_pictures_file(path, name))) for name in ("pictures", "captures")}
+    return saved_result(path, record)
+
+
+def saved_result(path: Path, record: dict[str, Any]) -> MethodResult:
+    """The saved result of a method; a `ParameterError` that names the damaged file and the way out."""
+    try:
+        pictures = {name: read_array(_pictures_file(path, name), _check_pictures) for name in ("pictures", "captures")}
+    except ImageError as error:
+        raise ParameterError(f"{error} To measure the method again, remove `{path}`.") from error
+    tensors = {name: torch.from_numpy(array) for name, array in pictures.items()}
     with unexpected_content(path):
         cpu = Scores.read(record["cpu"]) if record["cpu"] else None
-        return MethodResult(Scores.read(record["scores"]), cpu, record["missing"], **pictures)
+        return MethodResult(Scores.read(record["scores"]), cpu, dict(record["missing"]), **tensors)
+
+
+def _check_pictures(shape: tuple[int, ...], dtype: Any) -> None:  # noqa: ANN401
+    if len(shape) != 4 or dtype != np.float32:
+        raise ImageError(f"holds {dtype} of the shape {shape}, not pictures (N, C, H, W) of float32.")
 
 
 def read_record(path: Path, identity: dict[str, Any]) -> dict[str, Any] | None:

@@ -70,9 +70,12 @@ class Scores:
     @classmethod
     def read(cls, content: Mapping[str, Any]) -> "Scores":
         """Inverse of `content`, except that an infinite PSNR becomes NaN."""
-        numbers = {m: tuple(math.nan if v is None else v for v in row) for m, row in content["values"].items()}
-        seconds = tuple(content["seconds"])
-        return cls(numbers, seconds, content["peak_bytes"], content["device"], content["learnable"])
+        numbers = {m: tuple(math.nan if v is None else float(v) for v in row) for m, row in content["values"].items()}
+        seconds = tuple(map(float, content["seconds"]))
+        if not seconds:
+            raise ValueError("no picture was measured")
+        peak = content["peak_bytes"]
+        return cls(numbers, seconds, peak and int(peak), str(content["device"]), int(content["learnable"]))
 
 
 @dataclass(frozen=True)
