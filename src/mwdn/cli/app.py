@@ -15,6 +15,7 @@ from mwdn.cli import terminal
 from mwdn.cli.as_typed import as_typed
 from mwdn.cli.camera_values import from_camera_file
 from mwdn.cli.given_options import note_given_bin
+from mwdn.cli.help_texts import HelpTexts
 from mwdn.cli.signals import ended_by_signals
 from mwdn.cli.wrong_calls import wrong_call
 from mwdn.errors import MwdnError
@@ -74,6 +75,7 @@ def make_app(command: str | None = None) -> App:
         help="Lensless imaging: reconstruct the scene from the pattern that a thin mask casts on a sensor.",
         help_epilogue="Every command takes --quiet (-q) for errors and what was asked for alone, --verbose (-v) for "
         "versions, times and what was assumed, and --debug for the traceback of an error.",
+        help_formatter=HelpTexts(command) if command else None,
         help_format=None if command else "plaintext",  # Markdown takes 0.1 s to import
         suppress_keyboard_interrupt=False,  # `main` says how to go on
         default_parameter=Parameter(negative_iterable=()),  # no `--empty-crop`
