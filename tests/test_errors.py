@@ -52,11 +52,31 @@ def test_an_option_of_another_type_is_named_with_its_value(create, options, want
         lambda: Reconstructor("admm", Calibration(PSF), precision="half"),
         lambda: mwdn.build("mwdn", width="a"),
         lambda: mwdn.solvers.build("admm", iterations="a"),
+        lambda: mwdn.read_frame(torch.rand(8, 8).numpy()),
+        lambda: mwdn.read_picture(None),
+        lambda: mwdn.write_picture(3, PSF),
+        lambda: mwdn.write_linear(None, PSF),
+        lambda: mwdn.load_network(3),
+        lambda: Calibration.from_file(torch.rand(8, 8).numpy()),
+        lambda: Calibration.from_file("psf.png", dark=3),
+        lambda: Calibration.load(None),
+        lambda: Reconstructor("wiener", Calibration(PSF)).stream(None),
+        lambda: Reconstructor("wiener", Calibration(PSF)).stream([], refresh="a"),
+        lambda: mwdn.convolve(PSF, PSF, size=12),
+        lambda: mwdn.correlate(PSF, PSF, size=(3.5, 4)),
+        lambda: mwdn.wiener(PSF, PSF, "a"),
+        lambda: mwdn.train("quick-cpu", PSF, out="runs/none"),
     ],
 )
 def test_every_border_refuses_other_types(create):
-    with pytest.raises(ParameterError):
+    """Python's own TypeErrors named a line inside the package, not the argument."""
+    with pytest.raises(ParameterError, match=r"^`\w+` \(.*\).* must be |Known: "):
         create()
+
+
+def test_a_mistyped_argument_of_a_function_gets_the_nearest():
+    with pytest.raises(UnknownNameError, match=r"named 'upsidedown'\. Did you mean 'upside_down'"):
+        mwdn.read_frame("psf.png", upsidedown=True)
 
 
 @pytest.mark.usefixtures("unchecked")

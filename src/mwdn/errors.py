@@ -30,7 +30,7 @@ SMALLEST_LIGHT = 1e-12
 LARGEST_LIGHT = 1e9
 """Range of the largest number of a measurement, whose squares and their sums over 1e8 pixels float32 must hold."""
 
-_Class = TypeVar("_Class", bound=type)
+_Checked = TypeVar("_Checked", bound=Callable[..., Any])
 
 
 class MwdnError(Exception):
@@ -92,19 +92,22 @@ def check_options(of: Callable[..., Any], what: str, options: Mapping[str, Any])
             raise ParameterError(f"`{option}` ({value}) of {what} must be finite.")
 
 
-def checked(kind: _Class) -> _Class:
-    """Decorate a class: `check_options` checks the arguments of each new object."""
-    any_kind: Any = kind
-    create = any_kind.__init__
+def checked(decorated: _Checked) -> _Checked:
+    """Decorate a class or a function: `check_options` checks the arguments of each new object, or of each call."""
+    kind: Any = decorated
+    is_class = isinstance(kind, type)
+    function = kind.__init__ if is_class else kind
 
-    @wraps(create)
-    def init(self: Any, *values: Any, **options: Any) -> None:  # noqa: ANN401
+    @wraps(function)
+    def call(*values: Any, **options: Any) -> Any:  # noqa: ANN401
         # A mistake in the number of positional arguments is Python's to report.
-        check_options(kind, f"`{kind.__name__}`", dict(zip(_annotations(kind)[0], values, strict=False)) | options)
-        create(self, *values, **options)
+        given = dict(zip(_annotations(kind)[0], values[is_class:], strict=False)) | options
+        check_options(kind, f"`{kind.__name__}`", given)
+        return function(*values, **options)
 
-    any_kind.__init__ = init
-    return kind
+    if is_class:
+        kind.__init__ = call
+    return kind if is_class else call  # type: ignore[return-value]
 
 
 @cache
@@ -131,6 +134,8 @@ def fits_type(value: Any, kind: Any) -> bool:  # noqa: ANN401
         return isinstance(value, tuple | list) and len(value) == len(parts) and all(map(fits_type, value, parts))
     if origin is Callable:
         return callable(value)
+    if origin is Iterable:
+        return isinstance(value, Iterable)
     if kind in (int, float):
         return isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
     return kind is Any or not isinstance(kind, type) or hasattr(kind, "array_type") or isinstance(value, kind)
@@ -158,8 +163,8 @@ def type_in_words(kind: Any) -> str:  # noqa: ANN401
             if parts == (int, int)
             else f"a tuple, each {type_in_words(parts[0])}"
         )
-    if origin is Callable:
-        return "a function"
+    if origin in (Callable, Iterable):
+        return "a function" if origin is Callable else "a list, or another iterable"
     return words.get(kind) or f"`{getattr(kind, '__name__', kind)}`"
 
 

@@ -481,7 +481,7 @@ def test_regularisation_must_be_positive(value):
 
 @pytest.mark.usefixtures("unchecked")
 def test_unknown_boundary_is_refused():
-    with pytest.raises(ParameterError, match=r"`boundary` .* 'mirror'"):
+    with pytest.raises(ParameterError, match="No boundary named 'mirror'"):
         fourier.wiener(torch.ones(1, 1, 8, 8), torch.ones(1, 1, 8, 8), 0.1, boundary="mirror")
 
 

@@ -53,6 +53,7 @@ class Calibration:
     white_balance: WhiteBalance | None = None
 
     @classmethod
+    @checked
     def load(cls, path: str | Path, **options: Any) -> "Calibration":  # noqa: ANN401
         """Read a camera file, as `mwdn calibrate` writes it.
 
@@ -73,6 +74,7 @@ class Calibration:
         return replace(cls.from_file(camera.pop("psf"), **camera), **extra)
 
     @classmethod
+    @checked
     def from_file(
         cls,
         path: str | Path,

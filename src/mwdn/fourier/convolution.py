@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from mwdn.errors import ShapeError, check_batch
+from mwdn.errors import ShapeError, check_batch, checked
 from mwdn.fourier.transforms import fast_length, inverse_spectrum, spectrum, transfer_function
 from mwdn.types import Image, Measurement, Psf, Scene, Size, Spectrum
 
@@ -42,6 +42,7 @@ def check_fit(image: Tensor, psf: Tensor, name: str) -> None:
             )
 
 
+@checked
 def convolve(scene: Scene, psf: Psf, *, size: Size | None = None, circular: bool = False) -> Image:
     """Convolution of a scene with a PSF, as seen by a sensor of ``size`` whose centre faces the scene's centre.
 
@@ -66,6 +67,7 @@ def convolve(scene: Scene, psf: Psf, *, size: Size | None = None, circular: bool
     return inverse_spectrum(spectrum(scene, grid) * transfer, grid, size)
 
 
+@checked
 def correlate(measurement: Measurement, psf: Psf, *, size: Size | None = None, circular: bool = False) -> Scene:
     """Exact adjoint of `convolve`: ``<convolve(v, psf), b> == <v, correlate(b, psf)>``.
 

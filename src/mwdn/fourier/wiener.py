@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from mwdn.errors import ParameterError
+from mwdn.errors import ParameterError, checked
 from mwdn.fourier.convolution import check_fit
 from mwdn.fourier.filtering import filter_image
 from mwdn.fourier.padding import Boundary
@@ -17,6 +17,7 @@ def deconvolution_grid(size: Size, boundary: Boundary) -> Size:
     return fast_length(size[0] + size[0] // 2), fast_length(size[1] + size[1] // 2)
 
 
+@checked
 def wiener(
     measurement: Measurement, psf: Psf, regularisation: float | Tensor, *, boundary: Boundary = "taper"
 ) -> Image:

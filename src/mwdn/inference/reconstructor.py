@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from mwdn import solvers
 from mwdn.calibration import Calibration
 from mwdn.calibration.white_balance import WhiteBalance, apply_white_balance, check_white_balance
-from mwdn.errors import ParameterError, ShapeError, check_batch, check_light, check_options
+from mwdn.errors import ParameterError, ShapeError, check_batch, check_light, check_options, checked
 from mwdn.fourier.convolution import check_fit
 from mwdn.inference.engine import Engine, Precision
 from mwdn.inference.ensemble import Ensemble
@@ -124,6 +124,7 @@ class Reconstructor:
         fixed.engine = self.engine and self.engine.with_psf(fixed.psf)
         return fixed
 
+    @checked
     def stream(self, frames: Iterable[Frame], *, refresh: int = 100) -> Iterator[tuple[Measurement, Scene]]:
         """Reconstruct the frames of a video, faster than one by one because successive frames are similar.
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mwdn.errors import ImageError, ParameterError
+from mwdn.errors import ImageError, ParameterError, checked
 from mwdn.io.files import atomic_write
 from mwdn.io.formats import as_frame, decode, kind_of, read
 from mwdn.types import FloatFrame, Frame, Image
@@ -15,6 +15,7 @@ READABLE = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".pgm", ".ppm", 
 """Suffixes, in lower case, of the files in a folder that are taken for pictures; frames may be `RAW`, too."""
 
 
+@checked
 def read_frame(path: str | Path, *, bgr: bool = False, upside_down: bool = False, upright: bool = False) -> Frame:
     """Read a frame, its numbers exactly as stored: no gamma, no scaling except of raw files.
 
@@ -61,6 +62,7 @@ def decode_frame(data: bytes, name: str) -> Frame:
         raise ImageError(f"{name} {error}") from error
 
 
+@checked
 def read_picture(path: str | Path) -> Image:
     """Read a photograph as linear light: rotated according to its EXIF orientation, decoded from sRGB.
 
@@ -81,6 +83,7 @@ def read_picture(path: str | Path) -> Image:
     return torch.from_numpy(light).movedim(-1, 0)[None].expand(-1, 3, -1, -1).contiguous()
 
 
+@checked
 def write_picture(path: str | Path, image: Tensor | FloatFrame, *, bits: int = 8) -> None:
     """Write a picture for display as PNG, atomically: clipped to [0, 1], encoded as sRGB, rounded.
 
@@ -107,6 +110,7 @@ def write_picture(path: str | Path, image: Tensor | FloatFrame, *, bits: int = 8
     write_frame(path, encoded.astype(f"uint{bits}"))
 
 
+@checked
 def write_linear(path: str | Path, image: Tensor | FloatFrame) -> None:
     """Write the exact float32 numbers of an image, atomically; `read_frame` returns them.
 

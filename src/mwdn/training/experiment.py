@@ -16,7 +16,7 @@ from mwdn.data.photographs import Photographs
 from mwdn.data.recorded import HELD_OUT, record, recorded_pairs
 from mwdn.data.simulated import Samples, SimulatedPairs
 from mwdn.data.unpaired import UnpairedCaptures
-from mwdn.errors import ParameterError
+from mwdn.errors import ParameterError, checked
 from mwdn.runtime import distributed
 from mwdn.training.recipe import Recipe, read_recipe
 from mwdn.training.report import Report
@@ -46,6 +46,7 @@ class TrainingData(NamedTuple):
     validation_count: int | None = None
 
 
+@checked
 def train(
     recipe: Recipe | str | Path,
     calibration: Calibration,

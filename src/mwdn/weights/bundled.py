@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from mwdn.errors import CheckpointError
+from mwdn.errors import CheckpointError, checked
 from mwdn.weights.checkpoint import load_checkpoint, read_metadata, save_network
 
 BUNDLED = ("universal", "universal-small")
@@ -29,6 +29,7 @@ def find_weights(name: str) -> Path | None:
     return _download(name) if name.startswith(HUB) else None
 
 
+@checked
 def load_network(name: str | Path) -> nn.Module:
     """Load a network on the CPU, in evaluation mode.
 
