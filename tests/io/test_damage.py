@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import tifffile
 
 from image_files import HEIGHT, WIDTH, chunk, encoded, noise, put, tiff
 from mwdn.errors import ImageError
@@ -161,12 +162,12 @@ def test_pages_in_a_circle_are_refused(tmp_path: Path) -> None:
     assert "circle" in refusal(tmp_path / "a.tif", changed(data, link, *struct.pack("<I", start)))
 
 
-def test_a_thumbnail_after_the_picture_is_ignored(tmp_path: Path) -> None:
-    import tifffile
-
+@pytest.mark.parametrize("steps", [(1, 4), (4, 1), (4, 1, 2)])
+def test_thumbnails_beside_the_picture_are_ignored(tmp_path: Path, steps: tuple[int, ...]) -> None:
+    """Cameras put them first or last."""
     with tifffile.TiffWriter(tmp_path / "a.tif") as file:
-        file.write(noise(), photometric="rgb", metadata=None)
-        file.write(noise()[::4, ::4], photometric="rgb", subfiletype=1, metadata=None)
+        for step in steps:
+            file.write(noise()[::step, ::step], photometric="rgb", subfiletype=int(step > 1), metadata=None)
     np.testing.assert_array_equal(read_frame(tmp_path / "a.tif"), noise())
 
 

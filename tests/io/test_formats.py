@@ -203,7 +203,7 @@ BAD = {
     "planar.npy": (npy(np.zeros((3, 5, 6), np.uint8)), "channels first"),
     "two.npy": (npy(noise(channels=2)), r"shape \(37 x 51 x 2\)"),
     "five.npy": (npy(noise(channels=5)), r"shape \(37 x 51 x 5\)"),
-    "pages.tif": (tiff(np.zeros((2, 5, 6), np.uint8)), r"shape \(2 x 5 x 6\)"),
+    "pages.tif": (tiff(np.zeros((2, 5, 6), np.uint8)), "is a stack of 2 pictures"),
     "two.tif": (tiff(noise(channels=2), planarconfig="contig"), r"shape \(37 x 51 x 2\)"),
     "nothing.npy": (npy(np.zeros((0, 4, 3), np.uint8)), "shape \\(0 x 4 x 3\\)|NPY"),
     "nan.npy": (npy(np.full((4, 4), np.nan, np.float32)), "holds NaN or infinity"),

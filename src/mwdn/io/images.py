@@ -20,7 +20,7 @@ def read_frame(path: str | Path, *, bgr: bool = False, upside_down: bool = False
     """Read a frame, its numbers exactly as stored: no gamma, no scaling except of raw files.
 
     Args:
-        path: PNG, JPEG, WebP, BMP, PGM, PPM, TIFF (one picture; smaller copies after it are ignored), NPY, or a
+        path: PNG, JPEG, WebP, BMP, PGM, PPM, TIFF (one picture; smaller copies of it are ignored), NPY, or a
             camera's raw file (`mwdn.io.raw`): the mosaic of the sensor as one channel, with the black level at 0 and
             the white level at 65,535.
         bgr: the file's channels are blue, green, red.

@@ -7,7 +7,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from mwdn.errors import ImageError
+from mwdn.errors import ImageError, shown
 from mwdn.io.headers import COPY_AGAIN, check_decoded
 from mwdn.io.tiff_codecs import CODECS, lzw_size
 from mwdn.types import Frame
@@ -69,16 +69,17 @@ def read_tiff(file: BinaryIO, check: Any) -> TiffPicture:  # noqa: ANN401
     pages = _count_pages(file)
     file.seek(0)
     with tifffile.TiffFile(file, name="", is_ome=False) as tiff:
-        first: Any = tiff.pages[0]
+        every: list[Any] = [tiff.pages[number] for number in range(pages)]
+        first = max(every, key=lambda page: page.imagelength * page.imagewidth)  # smaller ones are copies of it
         _check_page(first)
-        planes = [first, *(tiff.pages[number] for number in range(1, pages))]
-        planes = [page for page in planes if page.shape == first.shape]
+        planes = [page for page in every if page.shape == first.shape]
         imagej = tiff.imagej_metadata or {}
         if len(planes) > 1 and not (imagej.get("channels") == len(planes) == 3):
-            check((len(planes), *first.shape), first.dtype)
-            raise ImageError(f"is a stack of {len(planes)} pictures; a frame is one. Save each as a file of its own.")
+            raise ImageError(f"is a stack of {len(planes)} pictures; a frame is one. Save each as its own file.")
         if imagej.get("images", len(planes)) != len(planes):
-            raise ImageError(f"is a stack of {imagej['images']} pictures; a frame is one. Save each as its own file.")
+            raise ImageError(
+                f"is a stack of {shown(imagej['images'])} pictures; a frame is one. Save each as its own file."
+            )
         if len(planes) == 1:
             check(_shape(first), first.dtype)
             return TiffPicture(_decode(first), int(first.tags.valueof(274, 1)))
