@@ -23,10 +23,10 @@ PSF = torch.ones(1, 3, 8, 8)
         (Pyramid, {"levels": (1, 2)}, "a tuple, each `Level`"),
         (WarmStart, {"solver": Wiener()}, "`Admm` or `Fista`"),
         (Mwdn, {"width": 2.0}, "a whole number"),
-        (FlatNet, {"size": 3}, "two whole numbers such as (320, 320) or None"),
+        (FlatNet, {"size": 3}, "two whole numbers or none"),
         (WienerBank, {"regularisations": (1e-3, "a")}, "a tuple, each a number"),
-        (FrameFormat, {"crop": 100}, "two whole numbers such as (320, 320) or None"),
-        (FrameFormat, {"grey": 1}, "True or False"),
+        (FrameFormat, {"crop": 100}, "two whole numbers or none"),
+        (FrameFormat, {"grey": 1}, "true or false"),
         (Sensor, {"bit_depth": "12"}, "a whole number"),
     ],
 )

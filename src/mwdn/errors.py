@@ -23,12 +23,23 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import cache, wraps
 from inspect import Parameter, signature
 from numbers import Integral, Real
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 SMALLEST_LIGHT = 1e-12
 LARGEST_LIGHT = 1e9
 """Range of the largest number of a measurement, whose squares and their sums over 1e8 pixels float32 must hold."""
+
+_WORDS = {
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    str: "text",
+    Path: "a path",
+    NoneType: "none",
+}
+_COUNTS = {2: "two", 3: "three"}
 
 _Checked = TypeVar("_Checked", bound=Callable[..., Any])
 
@@ -150,22 +161,24 @@ def _names(kind: Any) -> list[str]:  # noqa: ANN401
 
 
 def type_in_words(kind: Any) -> str:  # noqa: ANN401
-    """An annotated type as a reader of a message calls it: ``a whole number or None``."""
+    """An annotated type as messages and lists call it: ``srgb, a number or none``, ``two whole numbers``."""
+    *most, last = dict.fromkeys(_alternatives(kind))
+    return f"{', '.join(most)} or {last}" if most else last
+
+
+def _alternatives(kind: Any) -> list[str]:  # noqa: ANN401
     origin, parts = get_origin(kind), get_args(kind)
-    words = {int: "a whole number", float: "a number", bool: "True or False", str: "text", NoneType: "None"}
     if origin in (Union, UnionType):
-        return " or ".join(type_in_words(part) for part in parts)
+        return [words for part in parts for words in _alternatives(part)]
     if origin is Literal:
-        return " or ".join(map(repr, parts))
-    if origin is tuple:
-        return (
-            "two whole numbers such as (320, 320)"
-            if parts == (int, int)
-            else f"a tuple, each {type_in_words(parts[0])}"
-        )
+        return list(map(str, parts))
+    if origin is tuple and parts[0] in _WORDS and len(parts) in _COUNTS and ... not in parts:
+        return [f"{_COUNTS[len(parts)]} {_WORDS[parts[0]].removeprefix('a ')}s"]
+    if origin in (tuple, list):
+        return [f"a {origin.__name__}, each {type_in_words(parts[0])}"]
     if origin in (Callable, Iterable):
-        return "a function" if origin is Callable else "a list, or another iterable"
-    return words.get(kind) or f"`{getattr(kind, '__name__', kind)}`"
+        return ["a function" if origin is Callable else "a list, or another iterable"]
+    return [_WORDS.get(kind) or f"`{getattr(kind, '__name__', kind)}`"]
 
 
 def one_line(text: str) -> str:

@@ -1,20 +1,16 @@
 """Options of solvers and networks: read from their signatures and docstrings, and converted from the command line."""
 
-import difflib
 import inspect
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import fields
 from itertools import chain
 from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
-from cyclopts import Parameter
+from cyclopts import App, Parameter
 
-from mwdn.calibration import FrameFormat, PsfFormat
-from mwdn.cli.camera import CameraOptions
-from mwdn.cli.wrong_calls import in_words
-from mwdn.errors import ParameterError
+from mwdn.cli.wrong_calls import long_options, unknown_option
+from mwdn.errors import ParameterError, type_in_words
 from mwdn.solvers import SOLVERS
 
 MethodOptions = Annotated[Any, Parameter(converter=lambda _, tokens: tokens, show=False)]
@@ -90,15 +86,13 @@ def read_options(
 
 
 def _unknown(name: str, known: Mapping[str, Iterable[str]], command: Callable[..., object]) -> str:
-    options = list(dict.fromkeys(chain.from_iterable(known.values())))
-    parameters = inspect.signature(command).parameters.values()
-    names = [parameter.name for parameter in parameters if parameter.kind == inspect.Parameter.KEYWORD_ONLY]
-    names += [field.name for kind in (CameraOptions, FrameFormat, PsfFormat) for field in fields(kind)]
-    nearest = difflib.get_close_matches(name, [*options, *names], n=1)
-    hint = f" Did you mean {_flag(nearest[0])}?" if nearest else ""
+    app = App()
+    app.default(command)
+    options = [_flag(option) for option in dict.fromkeys(chain.from_iterable(known.values()))]
     methods = f"method{'s' * (len(known) != 1)} {', '.join(map(repr, known))}"
-    listed = ", ".join(map(_flag, options)) or f"none; solvers ({', '.join(SOLVERS)}) have some"
-    return f"Unknown option: {_flag(name)}.{hint} Options of the {methods}: {listed}. See `mwdn methods`."
+    listed = ", ".join(options) or f"none; solvers ({', '.join(SOLVERS)}) have some"
+    sentence = unknown_option(_flag(name), [*options, *long_options(app.assemble_argument_collection())])
+    return f"{sentence} Options of the {methods}: {listed}. See `mwdn methods`."
 
 
 def _flag(name: str) -> str:
@@ -121,15 +115,4 @@ def _convert(option: Option, given: Any) -> Any:  # noqa: ANN401
         if kind in (int, float):
             with suppress(ValueError):
                 return kind(text)
-    raise ParameterError(f"`{_flag(option.name)}` ({text}) must be {in_words(option.type)}.")
-
-
-def type_name(kind: Any) -> str:  # noqa: ANN401
-    """A type in words: ``int``, ``float or none``, ``colour | isotropic``."""
-    if get_origin(kind) is Literal:
-        return " | ".join(map(str, get_args(kind)))
-    if kind is type(None):
-        return "none"
-    if get_args(kind) and get_origin(kind) is not tuple:
-        return " or ".join(map(type_name, get_args(kind)))
-    return kind.__name__ if isinstance(kind, type) and not get_args(kind) else str(kind)
+    raise ParameterError(f"`{_flag(option.name)}` ({text}) must be {type_in_words(option.type)}.")

@@ -6,9 +6,9 @@ from rich.markup import escape
 from rich.padding import Padding
 from rich.table import Table
 
-from mwdn.cli.method_options import Option, list_options, summary, type_name
+from mwdn.cli.method_options import Option, list_options, summary
 from mwdn.cli.terminal import results
-from mwdn.errors import UnknownNameError
+from mwdn.errors import UnknownNameError, type_in_words
 from mwdn.networks import NETWORKS
 from mwdn.solvers import SOLVERS
 from mwdn.weights.bundled import BUNDLED, find_weights
@@ -58,7 +58,7 @@ def _overview() -> Table:
 def _print(title: str, options: list[Option]) -> None:
     results.print(title, style="bold", markup=False, highlight=False)
     for name, annotation, default, meaning in options:
-        line = f"[bold cyan]{name}[/]: {escape(type_name(annotation))} = {escape(_short(default))}"
+        line = f"[bold cyan]{name}[/]: {escape(type_in_words(annotation))} = {escape(_short(default))}"
         results.print(Padding(line, (0, 2)), highlight=False)
         results.print(Padding(escape(meaning), (0, 6)), highlight=False)
 

@@ -1,20 +1,17 @@
 """A wrong call in one sentence: which option or argument, what was given, what is allowed."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from types import NoneType
-from typing import Any, Literal, get_args, get_origin
+from types import UnionType
+from typing import Any, Union, get_args, get_origin
 
 from cyclopts import CoercionError, CycloptsError, MissingArgumentError, UnknownOptionError
 from cyclopts.argument import Argument
 from cyclopts.exceptions import RepeatArgumentError, UnknownCommandError, UnusedCliTokensError
 from cyclopts.token import Token
 
-from mwdn.errors import ParameterError, UnknownNameError
-
-_WORDS = {int: "whole number", float: "number", bool: "true or false", str: "text", Path: "path", NoneType: "none"}
-_NUMBERS = {2: "two", 3: "three"}
+from mwdn.errors import ParameterError, UnknownNameError, type_in_words
 
 
 def wrong_call(error: CycloptsError, commands: Iterable[str]) -> ParameterError:
@@ -50,23 +47,32 @@ def _wrong_value(argument: Argument, token: Token | None) -> str:
             name = token.keyword or name
         else:  # a file, where a table is its keyword
             given += f" in `{token.source}`"
-    return f"`{name}`{given} must be {in_words(argument.hint)}."
+    return f"`{name}`{given} must be {type_in_words(_one_word(argument.hint))}."
 
 
 def _unknown_option(error: UnknownOptionError) -> str:
     name = (error.token.keyword or error.token.value).partition("=")[0]
-    shown = [each for each in error.argument_collection if each.parse and each.show]
-    known = [option for each in shown for option in each.names if option.startswith("--")]
+    known = long_options(error.argument_collection)
+    listed = [option for option in known if not option.startswith("--no-")]
+    return f"{unknown_option(name, known)} Options: {', '.join(listed) or 'none'}. {_see_help(error)}"
+
+
+def unknown_option(name: str, known: Sequence[str]) -> str:
+    """One sentence, or two if one of the known options is like the unknown one."""
     nearest = difflib.get_close_matches(name, known, n=1)
-    hint = f" Did you mean {nearest[0]}?" if nearest else ""
-    listed = ", ".join(option for option in known if not option.startswith("--no-")) or "none"
-    return f"Unknown option: {name}.{hint} Options: {listed}. {_see_help(error)}"
+    return f"Unknown option: {name}." + (f" Did you mean {nearest[0]}?" if nearest else "")
+
+
+def long_options(arguments: Iterable[Argument]) -> list[str]:
+    """All options that the help shows, in their long form."""
+    shown = [each for each in arguments if each.parse and each.show]
+    return [option for each in shown for option in each.names if option.startswith("--")]
 
 
 def _missing(error: MissingArgumentError, argument: Argument) -> str:
     name = error.keyword or next((token.keyword for token in argument.tokens if token.keyword), None)
     if name is not None:
-        return f"`{name}` must be followed by {in_words(argument.hint)}."
+        return f"`{name}` must be followed by {type_in_words(_one_word(argument.hint))}."
     return f"`{_name(argument)}` is missing. {_see_help(error)}"
 
 
@@ -79,26 +85,11 @@ def _name(argument: Argument) -> str:
     return argument.name if argument.field_info.is_keyword_only else argument.name.lstrip("-").upper()
 
 
-def in_words(kind: Any) -> str:  # noqa: ANN401
-    """What an annotated type allows on the command line: "srgb or a number", "two whole numbers"."""
-    return _either(dict.fromkeys(_alternatives(kind)))
-
-
-def _alternatives(kind: Any) -> list[str]:  # noqa: ANN401
+def _one_word(kind: Any) -> Any:  # noqa: ANN401
+    """The type of one word on the command line, where lists are words, and any word can be a path."""
     origin, parts = get_origin(kind), get_args(kind)
-    if origin is Literal:
-        return list(map(str, parts))
-    if origin is tuple and ... not in parts:
-        return [f"{_NUMBERS[len(parts)]} {_WORDS[parts[0]]}s"]
-    if origin in (tuple, list):
-        return _alternatives(parts[0])
-    if parts:
-        if Path in parts:  # cyclopts takes any text for a path
-            return _alternatives(Path)
-        return [words for part in parts for words in _alternatives(part)]
-    return [_WORDS[kind] if kind in (bool, NoneType, str) else f"a {_WORDS[kind]}"]
-
-
-def _either(words: Iterable[str]) -> str:
-    *most, last = words
-    return f"{', '.join(most)} or {last}" if most else last
+    if origin is list or (origin is tuple and ... in parts):
+        return parts[0]
+    if origin in (Union, UnionType):
+        return Path if Path in parts else Union[tuple(map(_one_word, parts))]  # noqa: UP007
+    return kind
