@@ -51,7 +51,7 @@ def printed(capsys):
         terminal.set_up(**options)
         try:
             terminal.results.print("result")
-            terminal.console.print("done")
+            terminal.say("done")
             terminal.note("remark")
             terminal.warn(None, "first\n   line")
             terminal.detail("version")
@@ -62,6 +62,15 @@ def printed(capsys):
         return out.splitlines(), err.splitlines()
 
     return call
+
+
+@pytest.mark.parametrize("say", [terminal.say, terminal.note, terminal.warn])
+def test_any_file_name_is_printed_on_one_line(capsys, say):
+    """A name that is no UTF-8 ended the command with a UnicodeEncodeError, and [red] is no colour."""
+    say("[red]a[/red] \n\udcff.png")
+    (line,) = "".join(capsys.readouterr()).splitlines()
+    assert "[red]a[/red]" in line
+    assert line.endswith(r"\udcff.png")
 
 
 def test_levels_of_output(printed):

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.progress import show_progress
-from mwdn.cli.terminal import console
+from mwdn.cli.terminal import say
 from mwdn.cli.weights import ask_for_lpips
 
 
@@ -44,4 +44,4 @@ def benchmark(
     with show_progress(enabled=is_first, titles=True) as progress:
         watch = Watch(lambda title, parts: progress.start(title, parts or None, first=None), progress.update)
         run(contents, out, device=device, lpips=lpips, command=shlex.join(["mwdn", *sys.argv[1:]]), watch=watch)
-    console.print(f"Look at {out / PAGE}", highlight=False, markup=False, soft_wrap=True)
+    say(f"Look at {out / PAGE}")

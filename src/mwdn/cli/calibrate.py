@@ -13,7 +13,7 @@ from mwdn.calibration.verdict import headline
 from mwdn.calibration.white_balance import WhiteBalance, check_white_balance
 from mwdn.cli.camera import CameraOptions
 from mwdn.cli.inspect import at_psf_resolution
-from mwdn.cli.terminal import console
+from mwdn.cli.terminal import say
 from mwdn.io.files import refuse_overwrite
 
 
@@ -59,12 +59,11 @@ def calibrate(
     }
     write_camera(out, content)
     height, width = calibration.size
-    for line in (
+    say(
         headline(report),
         f"PSF {calibration.psf_hash}, {height} x {width} pixels. More about it: mwdn inspect --camera {out}",
         f"Use it: mwdn reconstruct CAPTURES --camera {out}",
-    ):
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    )
 
 
 def _changes(format: FrameFormat | PsfFormat) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from cyclopts import Parameter
 from rich.table import Table
 
 from mwdn.calibration import Calibration
-from mwdn.cli.terminal import console
+from mwdn.cli.terminal import console, say
 from mwdn.evaluation import psnr
 from mwdn.evaluation.tables import html_table
 from mwdn.inference.reconstructor import Reconstructor
@@ -65,7 +65,7 @@ def demo(
     write_picture(comparison, contact_sheet(rows, ["scene", "measurement", *METHODS]))
     write_picture(psf, to_display(camera.psf))
     console.print(table)
-    console.print(f"Look at {page}", highlight=False, markup=False, soft_wrap=True)
+    say(f"Look at {page}")
 
 
 _PAGE = """<!doctype html>

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from cyclopts import App, Parameter
 from cyclopts.config import Toml
 
-from mwdn.cli.terminal import console
+from mwdn.cli.terminal import say
 from mwdn.errors import UnknownNameError
 from mwdn.io.files import refuse_overwrite
 from mwdn.io.toml import find_recipe
@@ -64,13 +64,10 @@ class Output:
         made = designed.report()["made"]
         light = ", ".join(f"{part:.1%}" for part in made["light_on_sensor"])
         field = " x ".join(f"{angle:.0f}" for angle in made["field_degrees"])
-        console.print(
+        say(
             f"PSF {made['psf_hash']}: {light} of the aperture's light on the sensor, resolution "
             f"{made['resolution_mrad']:.1f} mrad, field {field} degrees. Use it: "
             f"--psf {self.out / 'psf.tif'} --background 0",
-            highlight=False,
-            markup=False,
-            soft_wrap=True,
         )
 
 

@@ -11,7 +11,7 @@ from mwdn.cli.camera import CameraOptions
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.method_options import MethodOptions, read_options
 from mwdn.cli.progress import show_progress
-from mwdn.cli.terminal import Json, console, results, warn
+from mwdn.cli.terminal import Json, results, say, warn
 from mwdn.cli.weights import ask_for_lpips
 from mwdn.evaluation import Perceptual, Variant
 from mwdn.evaluation.alexnet import SMALLEST
@@ -91,4 +91,4 @@ def evaluate(  # noqa: PLR0913
         width = results.measure(table, options=results.options.update(width=1000)).maximum
         results.print(report.table(narrow=True) if width > results.width else table)
     report.write(out)
-    console.print(f"Look at {out}", highlight=False, markup=False, soft_wrap=True)
+    say(f"Look at {out}")

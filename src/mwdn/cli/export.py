@@ -7,7 +7,7 @@ from cyclopts import Parameter
 
 from mwdn.cli.camera import CameraOptions
 from mwdn.cli.method_options import MethodOptions, read_options
-from mwdn.cli.terminal import console
+from mwdn.cli.terminal import say
 from mwdn.export.exporter import MIN_AGREEMENT, Precision
 
 
@@ -46,6 +46,6 @@ def export(
     required = MIN_AGREEMENT[precision] if least is None else least
     size = out.stat().st_size / 1e6
     line = f"{out} ({size:.1f} MB) agrees to {exported.agreement:.1f} dB (at least {required:.0f})"
-    console.print(line, highlight=False, markup=False, soft_wrap=True)
+    say(line)
     if "alignment" in exported.about:
-        console.print(f"Alignment {exported.about['alignment']}.", highlight=False, markup=False, soft_wrap=True)
+        say(f"Alignment {exported.about['alignment']}.")

@@ -10,7 +10,7 @@ from rich.markup import escape
 from mwdn.calibration import FrameFormat
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.progress import track
-from mwdn.cli.terminal import console, counted, if_interrupted, notes
+from mwdn.cli.terminal import counted, if_interrupted, notes, say
 from mwdn.data.importers import Layout, import_pairs
 
 
@@ -43,4 +43,4 @@ def import_(
         notes.print(f"[yellow]skipped:[/] {escape(reason)}", highlight=False, soft_wrap=True)
     names = f": {', '.join(result.skipped)}" if result.skipped else ""
     summary = f"{counted(result.count, 'pair')} written to {out}, {len(result.skipped):,} skipped{names}"
-    console.print(summary, markup=False, highlight=False, soft_wrap=True)
+    say(summary)

@@ -11,7 +11,7 @@ from mwdn.calibration.report import inspect_psf
 from mwdn.calibration.verdict import headline, verdict
 from mwdn.cli.camera import CameraOptions
 from mwdn.cli.folders import no_empty_folder
-from mwdn.cli.terminal import Json, console, print_json, results
+from mwdn.cli.terminal import Json, print_json, results, say
 from mwdn.io.files import check_folder, refuse_overwrite, write_json
 
 _STYLES = {"bad": "bold red", "mind": "yellow", "good": "green"}
@@ -57,7 +57,7 @@ def inspect(
     results.print(f"[bold]{escape(headline(report))}[/]", highlight=False, soft_wrap=True)
     for weight, text in findings:
         results.print(f"[{_STYLES[weight]}]{weight:4}[/] {escape(text)}", highlight=False, soft_wrap=True)
-    console.print(f"Look at {page}", highlight=False, markup=False, soft_wrap=True)
+    say(f"Look at {page}")
 
 
 def at_psf_resolution(camera: CameraOptions) -> CameraOptions:

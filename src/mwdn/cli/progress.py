@@ -13,7 +13,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskProgres
 from rich.table import Column
 from rich.text import Text
 
-from mwdn.cli.terminal import console, notes
+from mwdn.cli.terminal import console, note, notes
 
 T = TypeVar("T")
 Clock = Callable[[], float]
@@ -124,7 +124,7 @@ class Lines(Progressing):
 
     def print(self, line: str) -> None:
         """Print a line."""
-        notes.print(line, markup=False, highlight=False, soft_wrap=True)
+        note(line)
 
 
 class Bars(Progressing):

@@ -19,7 +19,7 @@ from mwdn.cli.doubts import Doubts
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.method_options import MethodOptions, read_options
 from mwdn.cli.progress import show_progress
-from mwdn.cli.terminal import Json, complain, console, counted, detail, if_interrupted, note, print_json, warn
+from mwdn.cli.terminal import Json, complain, counted, detail, if_interrupted, note, print_json, say, warn
 from mwdn.data.captures import list_captures
 from mwdn.errors import ParameterError, PsfError, one_line
 from mwdn.inference.batch import SHOWN, Batch, Job
@@ -108,9 +108,7 @@ def reconstruct(  # noqa: PLR0913
             detail(f"{method} on {reconstructor.device}")
             note(*filter(None, [is_binned]))
             background = ", ".join(f"{level:.4f}" for level in calibration.background)
-            console.print(
-                f"PSF {calibration.psf_hash}, background {background} of the full scale subtracted", soft_wrap=True
-            )
+            say(f"PSF {calibration.psf_hash}, background {background} of the full scale subtracted")
         resume = distributed.world_size() > 1 if resume is None else resume
         if is_first:
             _name_turn((camera.psf_file, *files[:SHOWN]))
@@ -133,7 +131,7 @@ def reconstruct(  # noqa: PLR0913
             before = f", {existing} of them before" if existing else ""
             done = f"{len(files) - len(failed):,} of " if failed else ""
             line = f"{done}{counted(len(files), 'capture')} reconstructed into {out}{before}"
-            console.print(line, highlight=False, markup=False, soft_wrap=True)
+            say(line)
     status = 1 if failed else 0
     distributed.set_exit_status(status)
     return status
@@ -223,4 +221,4 @@ def _report(job: Job) -> None:
         complain("[red]Error:[/]" if named else f"[red]{escape(one_line(str(job.capture)))}:[/]", job.error)
     elif job.trust:
         line = f"{one_line(job.capture.name)}: {job.trust.sentence}"
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+        say(line)

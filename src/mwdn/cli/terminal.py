@@ -8,7 +8,7 @@ from cyclopts import Parameter
 from rich.console import Console
 from rich.markup import escape
 
-from mwdn.errors import MwdnError
+from mwdn.errors import MwdnError, one_line
 
 
 class _Console(Console):
@@ -65,22 +65,28 @@ def print_json(content: Any) -> None:  # noqa: ANN401
     results.out(dumps(content, indent=2, allow_nan=False), highlight=False)
 
 
+def say(*sentences: str) -> None:
+    """Print sentences about what the command has done, each on one line."""
+    for sentence in sentences:
+        console.print(one_line(sentence), markup=False, highlight=False, soft_wrap=True)
+
+
 def detail(*sentences: str) -> None:
     """Print sentences for --verbose, each on one line."""
     for sentence in sentences:
-        details.print(escape(sentence), style="dim", highlight=False, soft_wrap=True)
+        details.print(escape(one_line(sentence)), style="dim", highlight=False, soft_wrap=True)
 
 
 def note(*sentences: str) -> None:
     """Print sentences that are neither results nor warnings, each on one line."""
     for sentence in sentences:
-        notes.print(escape(sentence), highlight=False, soft_wrap=True)
+        notes.print(escape(one_line(sentence)), highlight=False, soft_wrap=True)
 
 
 def warn(*warnings: str | None) -> None:
     """Print each warning that is not ``None``, on one line."""
     for warning in filter(None, warnings):
-        text = escape(_spell(" ".join(warning.split())))
+        text = escape(_spell(one_line(" ".join(warning.split()))))
         notes.print(f"[yellow]Warning:[/] {text}", highlight=False, soft_wrap=True)
 
 

@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from mwdn.cli.camera import CameraOptions
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.progress import Progressing, show_progress, track
-from mwdn.cli.terminal import console, counted, if_interrupted, note, notes
+from mwdn.cli.terminal import counted, if_interrupted, note, notes, say
 from mwdn.data.captures import list_captures
 from mwdn.io.files import refuse_overwrite
 from mwdn.io.listing import unused_photographs
@@ -94,7 +94,7 @@ def train(  # noqa: PLR0913
         )
         _train(trainer, stack.enter_context(show_progress(enabled=is_first, titles=True)), board)
     if is_first:
-        console.print(f"Weights in {out / 'best.safetensors'}", highlight=False, markup=False, soft_wrap=True)
+        say(f"Weights in {out / 'best.safetensors'}")
 
 
 def _train(trainer: Trainer, progress: Progressing, board: TensorBoard | None) -> None:
@@ -163,4 +163,4 @@ def simulate(
     calibration = camera.load()
     with if_interrupted(lambda: f"Interrupted. Nothing is kept: {out} is written when all pairs are done."):
         experiment.simulate(simulation, calibration, photos=photos, out=out, count=count, exact=exact, track=progress)
-    console.print(f"{counted(count, 'pair')} written to {out}", markup=False, highlight=False, soft_wrap=True)
+    say(f"{counted(count, 'pair')} written to {out}")
