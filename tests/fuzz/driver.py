@@ -81,19 +81,20 @@ def limits() -> Iterator[None]:
         signal.signal(signal.SIGPROF, handler)
 
 
-def outcome(read: Callable[[], object], path: Path) -> str:
+def outcome(read: Callable[[], object], path: Path, *, named: bool = True) -> str:
     """``taken``, ``refused``, or ``wrong: ...``.
 
     Args:
         read: reads the file.
-        path: of the file, which the message of a refusal must name.
+        path: of the file.
+        named: whether the message of a refusal must name the file.
     """
     try:
         with limits():
             read()
     except MwdnError as error:
         text = str(error).replace(str(path), "")
-        fine = len(text) <= LONGEST and text.isprintable() and str(path) in str(error)
+        fine = len(text) <= LONGEST and text.isprintable() and (not named or str(path) in str(error))
         return "refused" if fine else f"wrong: message of {len(text):,} characters: {str(error)[:400]!r}"
     except TimeIsUpError:
         return f"wrong: more than {PROCESSOR_S} s"
@@ -103,7 +104,12 @@ def outcome(read: Callable[[], object], path: Path) -> str:
 
 
 def sweep(
-    contents: Iterable[bytes], read: Callable[[Path], object], path: Path, *, duration_s: float = float("inf")
+    contents: Iterable[bytes],
+    read: Callable[[Path], object],
+    path: Path,
+    *,
+    duration_s: float = float("inf"),
+    named: bool = True,
 ) -> Counter[str]:
     """Count the outcomes of many contents of one file; a wrong one has the number of its first case.
 
@@ -112,13 +118,14 @@ def sweep(
         read: reads it.
         path: where to write it.
         duration_s: stop after this time.
+        named: as for `outcome`.
     """
     outcomes: Counter[str] = Counter()
     first: dict[str, int] = {}
     end = time.monotonic() + duration_s
     for number, content in enumerate(contents):
         path.write_bytes(content)
-        result = outcome(lambda: read(path), path)
+        result = outcome(lambda: read(path), path, named=named)
         case = first.setdefault(result, number)
         outcomes[f"{result} (case {case})" if result.startswith("wrong") else result] += 1
         if time.monotonic() > end:

@@ -1,5 +1,6 @@
 """Pairs across cameras: every sample has its own random camera."""
 
+import re
 from dataclasses import dataclass, replace
 
 import torch
@@ -29,8 +30,8 @@ class Cameras:
 
     def __post_init__(self) -> None:
         for text in self.sizes:
-            height, _, width = text.partition("x")
-            if not (height.isdigit() and width.isdigit() and min(int(height), int(width)) >= 8):
+            sides = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text, re.ASCII)
+            if not sides or min(map(int, sides.groups())) < 8:
                 raise ParameterError(f'`sizes` of [cameras] ("{text}") must be height x width: "270x480".')
         for name in self.families:
             if name not in FAMILIES:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import tomllib
 import warnings
 from pathlib import Path
@@ -18,6 +19,10 @@ RECIPES = Path(__file__).parents[1] / "recipes"
 
 _PARTS = 100
 """Most parts of a dotted key."""
+
+
+LARGEST = 1e9
+"""Largest number in a table: its square is far within float32, in which samples are simulated."""
 
 
 def packaged_recipes() -> list[str]:
@@ -86,7 +91,7 @@ def to_dataclass(cls: type[T], name: str, table: dict[str, Any]) -> T:
 
     Raises:
         UnknownNameError: the dataclass has no such field.
-        ParameterError: a value has another type than its default, or is outside its range.
+        ParameterError: a value has another type than its default, or is outside its range or above `LARGEST`.
     """
     table = current_names(cls, name, table)
     defaults = {f.name: f.default for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
@@ -99,10 +104,26 @@ def to_dataclass(cls: type[T], name: str, table: dict[str, Any]) -> T:
                 f"`{key}` of [{name}] ({shown(value)}) must be of the same kind as its default, {example}."
             )
     try:
+        for key, value in table.items():
+            _check_numbers(value, key)  # whole numbers first: a float cannot hold one of 400 digits
+            _check_numbers(_as_float(_as_tuple(value), defaults[key]), key)
         return cls(**{key: _as_float(_as_tuple(value), defaults[key]) for key, value in table.items()})
     except ParameterError as error:
         error.args = (f"[{name}]: {error}",)
         raise
+
+
+def _check_numbers(value: Any, name: str) -> None:  # noqa: ANN401
+    """Check the number called ``name``, or each number of a list; other values pass."""
+    if isinstance(value, list | tuple):
+        for each in value:
+            _check_numbers(each, name)
+    elif isinstance(value, int) and not abs(value) < 2**63:
+        raise ParameterError(f"`{name}` ({shown(value)}) must have 63 bits at most.")
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise ParameterError(f"`{name}` ({value}) must be finite.")
+    elif isinstance(value, float) and not abs(value) <= LARGEST:
+        raise ParameterError(f"`{name}` ({value:g}) must be {LARGEST:g} at most.")
 
 
 def current_names(kind: type, name: str, table: dict[str, Any], *, warn: bool = True) -> dict[str, Any]:

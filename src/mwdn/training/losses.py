@@ -1,6 +1,5 @@
 """The training loss: a weighted sum of distances between images."""
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -8,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from mwdn.errors import ParameterError, UnknownNameError
+from mwdn.errors import ParameterError, UnknownNameError, shown
 from mwdn.evaluation.alexnet import load_alexnet, load_heads
 from mwdn.evaluation.distances import feature_mse, l1, log_mse, lpips, mse, ssim
 from mwdn.types import Image
@@ -84,6 +83,6 @@ def checked_weights(weights: Mapping[str, Any]) -> dict[str, float]:
     for name, weight in weights.items():
         if name not in NAMES:
             raise UnknownNameError("loss", name, NAMES)
-        if not (isinstance(weight, int | float) and math.isfinite(weight) and weight >= 0):
-            raise ParameterError(f"The weight of `{name}` ({weight!r}) must be finite and not negative.")
+        if not (isinstance(weight, int | float) and 0 <= weight < 2**63):
+            raise ParameterError(f"The weight of `{name}` ({shown(weight)}) must be finite and not negative.")
     return {name: float(weight) for name, weight in weights.items()}
