@@ -26,7 +26,18 @@ def bomb(file, name, _):
         data.id.write_direct_chunk((0, channel, 0, 0), b"0")
 
 
+def short(file, name, _):
+    """HDF5 2.0 took the checksum from in front of the chunk: a segmentation fault."""
+    data = file.create_dataset(name, SHAPE, "u1", chunks=SHAPE, compression="gzip", fletcher32=True)
+    data.id.write_direct_chunk((0, 0, 0, 0), b"012")
+
+
 CONTENTS = {
+    "a short chunk": (short, "has a chunk of less than 4 bytes"),
+    "an odd filter": (
+        lambda file, name, _: file.create_dataset(name, SHAPE, "u1", chunks=SHAPE, scaleoffset=0),
+        "is packed by the filters",
+    ),
     "external link": (lambda file, name, other: file.update({name: h5py.ExternalLink(other, name)}), "is a link"),
     "soft link": (lambda file, name, _: file.update({name: h5py.SoftLink("/elsewhere")}), "is a link"),
     "virtual": (virtual, "is stored in other files"),

@@ -14,6 +14,7 @@ from torch import nn
 
 from cameras import contour_psf
 from conftest import trained
+from full_disk import full_after
 from mwdn import Calibration, Reconstructor, read_frame, to_display
 from mwdn.calibration import FrameFormat
 from mwdn.cli.app import main
@@ -384,6 +385,15 @@ def test_a_foreign_file_is_not_run(suffix, tmp_path):
     file.write_bytes(b"something else")
     with pytest.raises(ExportError, match=rf"`camera{suffix}` cannot be run: "):
         run_file(file, torch.rand(1, 3, *SIZE))
+
+
+@pytest.mark.parametrize("suffix", [".onnx", ".pt2"])
+def test_a_full_temporary_folder_is_named(suffix, tmp_path):
+    """ONNX ended in a traceback, torch's writer in an abort of the process."""
+    out = tmp_path / f"a{suffix}"
+    with full_after(100), pytest.raises(ExportError, match=r"cannot be written to: File too large.*TMPDIR"):
+        export(Unchanged(), camera(), out)
+    assert not out.exists()
 
 
 def test_options_of_an_object_are_refused(tmp_path):

@@ -180,6 +180,7 @@ def _check_storage(path: Path, data: Any, name: str) -> None:  # noqa: ANN401
     settings = data.id.get_create_plist()
     if settings.get_layout() == h5d.VIRTUAL or settings.get_external_count():
         raise ImageError(f"`{name}` of `{path}` is stored in other files, which are not read. Copy the data into one.")
+    _check_filters(path, data, name, [settings.get_filter(i)[0] for i in range(settings.get_nfilters())])
     size = data.dtype.itemsize * math.prod(data.shape)
     stored, available = data.id.get_storage_size(), path.stat().st_size
     if data.chunks is None:
@@ -199,6 +200,22 @@ def _check_storage(path: Path, data: Any, name: str) -> None:  # noqa: ANN401
             f"`{name}` of `{path}` has pictures or chunks of {most:,} bytes; at most {PICTURE_BYTES:,} are read. "
             "Crop or bin the pictures, or store them in smaller chunks."
         )
+
+
+def _check_filters(path: Path, data: Any, name: str, filters: list[int]) -> None:  # noqa: ANN401
+    from h5py import h5z
+
+    others = set(filters) - {h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32, h5z.FILTER_LZF}
+    if others or h5z.FILTER_FLETCHER32 in filters[:-1]:
+        raise ImageError(
+            f"`{name}` of `{path}` is packed by the filters {str(filters)[:40]}; gzip, lzf, shuffle and, as the last, "
+            "fletcher32 are read. Pack it again: `h5repack -f GZIP=4`."
+        )
+    small: list[Any] = []
+    if h5z.FILTER_FLETCHER32 in filters:  # HDF5 crashes on a chunk that is shorter than its checksum
+        data.id.chunk_iter(lambda chunk: small.append(chunk) if chunk.size < 4 else None)
+    if small:
+        raise ImageError(f"`{name}` of `{path}` has a chunk of less than 4 bytes. It is damaged.")
 
 
 def read_attributes(path: Path, file: Any, advice: str) -> dict[str, Numbers]:  # noqa: ANN401

@@ -1,5 +1,6 @@
 """Exported files: write, run and describe them; ONNX or torch's ``.pt2``."""
 
+import io
 import json
 import shutil
 import warnings
@@ -24,13 +25,28 @@ def write_file(file: Path, program: ExportedProgram, about: dict[str, str]) -> N
     """Write a program in the format of the file's suffix.
 
     Raises:
-        ExportError: an operation has no ONNX form, or the file would exceed 2 GB, the maximum of ONNX.
+        ExportError: an operation has no ONNX form, or the file would exceed 2 GB, the maximum of ONNX; or the folder
+            is full.
     """
-    if file.suffix == ".pt2":
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torch warns about channels-last weights
-            torch.export.save(program, file, extra_files={ABOUT: json.dumps(about)})
-        return
+    content = _pt2(program, about) if file.suffix == ".pt2" else _onnx(program, about)
+    try:
+        file.write_bytes(content)
+    except OSError as error:
+        raise ExportError(
+            f"`{file.parent}` for temporary files cannot be written to: {error.strerror or error}. Make room, or name "
+            "another folder: `export TMPDIR=/PATH`."
+        ) from error
+
+
+def _pt2(program: ExportedProgram, about: dict[str, str]) -> bytes:
+    content = io.BytesIO()  # torch's own writer ends the process with an abort when the disk is full
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch warns about channels-last weights
+        torch.export.save(program, content, extra_files={ABOUT: json.dumps(about)})
+    return content.getvalue()
+
+
+def _onnx(program: ExportedProgram, about: dict[str, str]) -> bytes:
     import onnx
 
     model = to_onnx(program)
@@ -40,7 +56,7 @@ def write_file(file: Path, program: ExportedProgram, about: dict[str, str]) -> N
         size = model.ByteSize() / 2**30
         raise ExportError(f"The file would have {size:.1f} GB; ONNX files hold 2. Export to .pt2, or `--bin 2`.")
     onnx.checker.check_model(model)
-    onnx.save(model, str(file))
+    return model.SerializeToString()
 
 
 def run_file(file: Path, measurement: Measurement) -> Scene:
