@@ -12,12 +12,12 @@ from torch import Tensor
 
 from mwdn import solvers
 from mwdn.benchmark.recipe import Method
-from mwdn.benchmark.sets import Dataset, file_hash
+from mwdn.benchmark.sets import Dataset
 from mwdn.data.captures import find_captures, read_captures
 from mwdn.errors import ImageError, ParameterError
 from mwdn.evaluation import First, Perceptual, Scores, evaluate
 from mwdn.inference.reconstructor import Reconstructor
-from mwdn.io.files import atomic_write, write_text
+from mwdn.io.files import atomic_write, file_sha256, write_text
 from mwdn.io.npy import read_array
 from mwdn.io.reading import read_json, unexpected_content
 from mwdn.version import __version__
@@ -68,7 +68,7 @@ def identity(method: Method, checkpoint: Path | None, dataset: Dataset) -> dict[
     """Everything the scores depend on: saved scores with another identity are measured again."""
     content = {
         "method": [method.name, method.options],
-        "weights": file_hash(checkpoint) if checkpoint is not None else None,
+        "weights": file_sha256(checkpoint)[:16] if checkpoint is not None else None,
         "version": __version__,
         "pairs": len(dataset.test),
         "data": dataset.identity,

@@ -1,6 +1,5 @@
 """Data sets of a benchmark: what is simulated, what was recorded, and which of it is for what."""
 
-import hashlib
 import json
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
@@ -236,12 +235,6 @@ def simulated_pairs(
         seed=recipe.seed,
         camera=recipe.deviation.camera(psf),
     )
-
-
-def file_hash(path: Path) -> str:
-    """First 16 hexadecimal digits of the SHA-256 of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()[:16]
 
 
 def _simulate(

@@ -1,6 +1,5 @@
 """A camera file: all that is known about a camera, in one TOML file that people can read and edit."""
 
-import hashlib
 import json
 import os
 from collections.abc import Mapping
@@ -11,7 +10,7 @@ from mwdn.calibration.frame_format import FrameFormat
 from mwdn.calibration.psf_format import PsfFormat
 from mwdn.calibration.white_balance import WhiteBalance
 from mwdn.errors import ParameterError, PsfError, UnknownNameError, fits_type
-from mwdn.io.files import as_parameter_error, atomic
+from mwdn.io.files import as_parameter_error, atomic, file_sha256
 from mwdn.io.toml import read_toml
 
 _TYPES: dict[str, Any] = {
@@ -94,7 +93,7 @@ def write_camera(path: str | Path, camera: Mapping[str, Any]) -> None:
     """
     path = Path(path)
     check_camera_path(path)
-    values = {**camera, "psf_sha256": _sha256(camera["psf"])}
+    values = {**camera, "psf_sha256": file_sha256(camera["psf"])}
     lines = []
     for key, (meaning, example) in KEYS.items():
         value = values.get(key)
@@ -116,16 +115,11 @@ def check_camera_path(path: Path) -> None:
 
 def check_psf_file(path: str | Path, sha256: str, psf: Path) -> None:
     """Raise a `PsfError` if the PSF of the camera file ``path`` has changed since that was written."""
-    if sha256 and psf.is_file() and _sha256(psf) != sha256:
+    if sha256 and psf.is_file() and file_sha256(psf) != sha256:
         raise PsfError(
             f"`{psf}` has changed since the camera file `{path}` was written, and may not fit its other values. "
             f"Calibrate again: `mwdn calibrate --camera {path} -o {path}`."
         )
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _relative(path: Path, folder: Path) -> str:

@@ -218,6 +218,12 @@ def refuse_foreign(folder: Path, files: Sequence[str], mark: bytes) -> None:
         )
 
 
+def file_sha256(path: Path) -> str:
+    """SHA-256 of a file, 64 hexadecimal digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
 def path_resolver() -> Callable[[str], str]:
     """A function like `Path.resolve` that scans each folder once: a million files take seconds, not minutes."""
     folders: dict[str, tuple[str, dict[str, str]]] = {}
