@@ -240,8 +240,8 @@ BAD_NUMBERS = {
     "both infinities": (torch.cat([MEASUREMENT, with_pixel(torch.inf), with_pixel(-torch.inf)]), "NaN or infinity"),
     "half precision": (with_pixel(torch.nan).half(), "NaN or infinity"),
     "negative": (torch.cat([MEASUREMENT, -MEASUREMENT]), "no light"),
-    "large": (1e20 * MEASUREMENT, r"1e\+20.* 1e-12 to 1e\+09"),
-    "small": (1e-14 * MEASUREMENT, r"1e-14.* 1e-12 to 1e\+09"),
+    "large": (1e20 * MEASUREMENT, r"1e\+20.* 1e-12 to 1e\+15"),
+    "small": (1e-14 * MEASUREMENT, r"1e-14.* 1e-12 to 1e\+15"),
 }
 
 
@@ -261,7 +261,7 @@ def test_scale_of_a_measurement_is_the_scale_of_its_picture(method):
     """Automatic Wiener lost the contrast below 1e-9. Darkness is a measurement: a video goes on."""
     reconstruct = Reconstructor(method, CALIBRATION, device="cpu", precision="exact")
     picture = reconstruct(MEASUREMENT)
-    for scale in (1e-11, 1e8):
+    for scale in (1e-11, 1e15):
         assert (reconstruct(scale * MEASUREMENT) / scale - picture).norm() < 1e-5 * picture.norm()
     assert reconstruct(0 * MEASUREMENT).abs().max() < 1e-12
 

@@ -28,7 +28,7 @@ from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 SMALLEST_LIGHT = 1e-12
-LARGEST_LIGHT = 1e9
+LARGEST_LIGHT = 1e15
 """Range of the largest number of a measurement, whose squares and their sums over 1e8 pixels float32 must hold."""
 
 _WORDS = {

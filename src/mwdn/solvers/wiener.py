@@ -72,17 +72,17 @@ class Wiener:
             H: transfer function for a PSF of unit sum.
             width: of the grid.
         """
-        contrast = measurement.std((-2, -1), correction=0, keepdim=True)
-        allowed = noise_level(measurement).square() + (self.tolerance * contrast).square()
+        # In units of the contrast, so that no square leaves the range of float32.
+        contrast = measurement.float().std((-2, -1), correction=0, keepdim=True)
+        contrast = contrast.clamp(min=torch.finfo(torch.float32).tiny)
+        allowed = (noise_level(measurement) / contrast).square() + self.tolerance**2
         # Parseval: sum |B|^2 = pixels x variance. In a half spectrum all columns count twice but the first and, of an
         # even width, the last. The mean is left out.
         count = torch.ones(B.shape[-2:], device=B.device)
         count[:, 1 : (width + 1) // 2] = 2
         count[0, 0] = 0
-        power, filtered = B.abs().square() * count, H.abs().square()
-        target = (
-            allowed * power.sum((-2, -1), keepdim=True) / contrast.square().clamp(min=torch.finfo(torch.float32).tiny)
-        )
+        power, filtered = (B.abs() / contrast).square() * count, H.abs().square()
+        target = allowed * power.sum((-2, -1), keepdim=True)
         low, high = torch.full_like(target, -16.0), torch.full_like(target, 1.0)
         for _ in range(40):
             middle = (low + high) / 2
