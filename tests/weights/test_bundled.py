@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import runpy
 import subprocess
 import sys
 import threading
@@ -71,6 +72,15 @@ def test_bundling_with_another_denoiser(tmp_path):
     for module, expected in ((bundled.denoiser, networks[denoiser]), (bundled.encoder, networks[whole].encoder)):
         for one, another in zip(module.parameters(), expected.parameters(), strict=True):
             torch.testing.assert_close(one, another, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize(("line", "message"), [("", "are required: checkpoint"), ("no.tar a.safetensors", "`no.tar`")])
+def test_bundling_by_a_wrong_call_is_one_message(capsys, monkeypatch, line, message):
+    """Both ended in a traceback."""
+    monkeypatch.setattr("sys.argv", ["", *line.split()])
+    with pytest.raises(SystemExit, match="2"):
+        runpy.run_module("mwdn.weights", run_name="__main__")
+    assert message in capsys.readouterr().err
 
 
 def test_other_names_are_no_bundled_networks():
