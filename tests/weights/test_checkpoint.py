@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import os
 import pickle
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from mwdn.networks import NETWORKS, build
 from mwdn.optics import unit_sum
 from mwdn.weights.authors import load_authors
 from mwdn.weights.checkpoint import load_checkpoint, read_metadata, save_network
+from mwdn.weights.tensors import read_header, read_tensors
 
 
 def small(name):
@@ -323,3 +325,16 @@ def test_no_weights_at_all(tmp_path, data):
     (tmp_path / "a.ckpt").write_bytes(data)
     with pytest.raises(CheckpointError, match="cannot be read as plain weights"):
         load_checkpoint(tmp_path / "a.ckpt")
+
+
+def test_a_file_that_shrinks_while_it_is_read(tmp_path):
+    """Mapped into memory it ended the process by SIGBUS."""
+    network, options = small("unet")
+    path = tmp_path / "a.safetensors"
+    save_network(path, network, "unet", options)
+    header = read_header(path)
+    tensors = read_tensors(path, header)
+    next(tensors)
+    os.truncate(path, path.stat().st_size // 2)
+    with pytest.raises(CheckpointError, match=r"`.*a\.safetensors` .* ends before its last tensor"):
+        dict(tensors)
