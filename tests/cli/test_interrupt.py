@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from pathlib import Path
 from threading import Timer
 
 import cv2
@@ -14,6 +15,7 @@ import pytest
 
 from mwdn.training.training_state import read_state
 
+FULL = Path("/dev/full")
 COPIES = 500
 RECIPE = """
 network = { name = "wiener-bank", width = 2, finest = 0, align = false }
@@ -108,3 +110,14 @@ def test_nobody_reads_the_output(line):
     )
     os.close(pipe)
     assert (done.returncode, done.stderr or "") == (141, "")
+
+
+@pytest.mark.parametrize("line", ["recipes quick-cpu", "--version"])
+@pytest.mark.skipif(not FULL.exists(), reason="Linux has a device that is always full")
+def test_no_room_for_the_output(line):
+    """As in `mwdn recipes quick-cpu > mine.toml` on a full disk, which ended in a traceback and left half a file."""
+    with FULL.open("w") as full:
+        command = [sys.executable, "-m", "mwdn", *line.split()]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False, timeout=120)
+    message = "Error: The output cannot be written: No space left on device. Make room.\n"
+    assert (done.returncode, done.stderr) == (2, message)

@@ -1,14 +1,16 @@
-"""Ctrl-C, SIGTERM and a closed pipe end a command with one line that says how to go on, or none: no traceback.
+"""Ctrl-C, SIGTERM, a closed pipe and a full disk end a command with one line, or none: no traceback.
 
 Imported before all else, so that this holds while the other modules are imported, which takes seconds.
 """
 
+import errno
 import os
 import signal
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
+from typing import TypeGuard
 
 GO_ON = {
     "reconstruct": "Finished pictures are kept. The same command with --resume goes on.",
@@ -27,6 +29,8 @@ class _Interrupt(KeyboardInterrupt):
 @contextmanager
 def ended_by_signals(arguments: Sequence[str]) -> Iterator[Sequence[int]]:
     """Exit with 130 (128 + SIGINT), 143 (SIGTERM) or 141 (SIGPIPE), as shells report it, if one of them ends the work.
+
+    Exit with 2 if standard output is a file on a full disk.
 
     SIGTERM is turned into Ctrl-C, so the work is ended in the same way: training saves its state after the step in
     progress. Under torchrun, which waits for its processes, SIGTERM ends a process at once.
@@ -54,12 +58,16 @@ def ended_by_signals(arguments: Sequence[str]) -> Iterator[Sequence[int]]:
     except SystemExit:
         raise
     except BrokenPipeError:
-        for stream in (sys.stdout, sys.stderr):  # what is left in them goes nowhere
-            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        _discard_output()
         sys.exit(141)  # Windows has no SIGPIPE
     except BaseException as error:
         if not (received or isinstance(error, KeyboardInterrupt)):
-            raise
+            if "--debug" in arguments or not _is_full(error):
+                raise
+            with suppress(OSError):  # standard error may be on the same disk
+                print(f"Error: The output cannot be written: {error.strerror}. Make room.", file=sys.stderr)
+            _discard_output()
+            sys.exit(2)
         if os.environ.get("RANK", "0") == "0":  # one of several processes speaks
             said = str(error) if isinstance(error, KeyboardInterrupt) else ""
             print(said or f"Interrupted. {how_to_go_on(arguments)}", file=sys.stderr)
@@ -67,6 +75,18 @@ def ended_by_signals(arguments: Sequence[str]) -> Iterator[Sequence[int]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _is_full(error: BaseException) -> TypeGuard[OSError]:
+    """Whether there is no room for standard output. Errors of other files have their names."""
+    full = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    return isinstance(error, OSError) and error.errno in full and error.filename is None
+
+
+def _discard_output() -> None:
+    """What is left in standard output and standard error goes nowhere: Python would try again at its end."""
+    for stream in (sys.stdout, sys.stderr):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def how_to_go_on(arguments: Sequence[str]) -> str:
