@@ -78,6 +78,7 @@ def test_train(here):
         (signal.SIGINT, None, "train a.toml", 130, "What is saved is kept. The same command resumes."),
         (signal.SIGTERM, None, "reconstruct a.png", 143, "The same command with --resume goes on."),
         (signal.SIGTERM, "ExportError('cannot be exported')", "export admm", 143, "The same command starts again."),
+        (signal.SIGTERM, None, "reconstruct --help", 143, "Interrupted."),  # it promised finished pictures
     ],
 )
 def test_while_modules_are_imported(number, error, line, code, message):
@@ -94,7 +95,7 @@ main({line.split()})
 """
     done = subprocess.run([sys.executable, "-c", begin], capture_output=True, text=True, check=False, timeout=120)
     assert (done.returncode, len(done.stderr.splitlines())) == (code, 1)
-    assert done.stderr.startswith("Interrupted. ")
+    assert done.stderr.startswith("Interrupted.")
     assert done.stderr.endswith(f"{message}\n")
 
 

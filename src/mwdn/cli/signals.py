@@ -70,7 +70,7 @@ def ended_by_signals(arguments: Sequence[str]) -> Iterator[Sequence[int]]:
             sys.exit(2)
         if os.environ.get("RANK", "0") == "0":  # one of several processes speaks
             said = str(error) if isinstance(error, KeyboardInterrupt) else ""
-            print(said or f"Interrupted. {how_to_go_on(arguments)}", file=sys.stderr)
+            print(said or f"Interrupted. {how_to_go_on(arguments)}".rstrip(), file=sys.stderr)
         sys.exit(128 + (signal.SIGTERM if signal.SIGTERM in received else signal.SIGINT))
     finally:
         for number, handler in before.items():
@@ -90,5 +90,8 @@ def _discard_output() -> None:
 
 
 def how_to_go_on(arguments: Sequence[str]) -> str:
-    """What is kept of an interrupted command, and how to go on."""
-    return next((GO_ON[word] for word in arguments if word in GO_ON), OTHERWISE)
+    """What is kept of an interrupted command, and how to go on; empty if only help was asked for."""
+    command = next((word for word in arguments if not word.startswith("-")), None)
+    if command is None or not {"--help", "-h"}.isdisjoint(arguments):
+        return ""
+    return GO_ON.get(command, OTHERWISE)
