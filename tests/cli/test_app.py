@@ -466,7 +466,7 @@ def test_completion_knows_commands_and_options(run, tmp_path, monkeypatch):
     code, out, _ = run("--install-completion", "--shell", "bash", "--output", script)
     assert (code, str(script) in out) == (0, True)
     words = re.findall(r"[\w-]+", script.read_text(encoding="utf-8"))
-    assert {*COMMANDS, "contour", "--psf-bin", "--pitch-um"} <= set(words)
+    assert {*COMMANDS, "contour", "--psf-bin", "--pitch-um", "--quiet", "-q", "--debug"} <= set(words)
     subprocess.run(["bash", "-n", script], check=True)  # valid for bash
 
 

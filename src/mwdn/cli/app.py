@@ -15,6 +15,7 @@ from mwdn.cli import terminal
 from mwdn.cli.as_typed import as_typed
 from mwdn.cli.camera_values import from_camera_file
 from mwdn.cli.given_options import note_given_bin
+from mwdn.cli.global_options import GLOBAL, add_global_options
 from mwdn.cli.help_texts import HelpTexts
 from mwdn.cli.signals import ended_by_signals
 from mwdn.cli.wrong_calls import wrong_call
@@ -62,10 +63,6 @@ COMMANDS = {
 """Module in `mwdn.cli` and function of each command, and the first line of its docstring."""
 
 
-GLOBAL = {"--quiet": "-q", "--verbose": "-v", "--debug": "--debug"}
-"""Options of all commands, and their short forms."""
-
-
 def make_app(command: str | None = None) -> App:
     """The command line. Only the one command that runs is imported: most import torch, which takes two seconds."""
     app = App(
@@ -73,8 +70,6 @@ def make_app(command: str | None = None) -> App:
         version=__version__,
         config=(from_camera_file, note_given_bin),
         help="Lensless imaging: reconstruct the scene from the pattern that a thin mask casts on a sensor.",
-        help_epilogue="Every command takes --quiet (-q) for errors and what was asked for alone, --verbose (-v) for "
-        "versions, times and what was assumed, and --debug for the traceback of an error.",
         help_formatter=HelpTexts(command) if command else None,
         help_format=None if command else "plaintext",  # Markdown takes 0.1 s to import
         suppress_keyboard_interrupt=False,  # `main` says how to go on
@@ -86,6 +81,7 @@ def make_app(command: str | None = None) -> App:
             app.command(getattr(import_module(f"mwdn.cli.{module}"), function), name=name)
         else:
             app.command(f"mwdn.cli.{place}", name=name, help=summary)
+    add_global_options(app)
     app.register_install_completion_command(
         help="Let the shell (bash, zsh, fish, PowerShell) complete commands and options."
     )
