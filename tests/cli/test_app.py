@@ -354,7 +354,7 @@ def test_methods_lists_all_and_the_options_of_one(run):
     assert all(name in out for name in (*mwdn.solvers.SOLVERS, *mwdn.networks.NETWORKS, "universal-small"))
     code, out, _ = run("methods", "admm")
     assert code == 0
-    assert "iterations: int = 100" in out
+    assert "iterations: a whole number = 100" in out
     assert "tau, weight of the total variation" in out
     assert "rounds: int = 12" in run("methods", "universal")[1]
     code, _, err = run("methods", "admn")

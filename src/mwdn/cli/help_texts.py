@@ -6,8 +6,7 @@ The texts are docstrings, also of classes of the library, whose fields are optio
 from collections.abc import Collection
 from typing import Any
 
-from cyclopts.help import DefaultFormatter, HelpEntry, HelpPanel
-from cyclopts.help.inline_text import InlineText
+from cyclopts.help import DefaultFormatter, HelpEntry, HelpPanel, InlineText
 from rich.console import Console, ConsoleOptions
 
 from mwdn.cli.as_typed import as_typed
