@@ -356,7 +356,7 @@ def test_methods_lists_all_and_the_options_of_one(run):
     assert code == 0
     assert "iterations: a whole number = 100" in out
     assert "tau, weight of the total variation" in out
-    assert "rounds: int = 12" in run("methods", "universal")[1]
+    assert "rounds: a whole number = 12" in run("methods", "universal")[1]
     code, _, err = run("methods", "admn")
     assert code == 2
     assert "Did you mean 'admm'?" in err

@@ -73,6 +73,13 @@ def test_any_file_name_is_printed_on_one_line(capsys, say):
     assert line.endswith(r"\udcff.png")
 
 
+def test_a_warning_beside_the_help(run, capsys):
+    """Its words are compared with the command's options: those of cyclopts' own --help ended in a NameError."""
+    run("recipes --help")
+    terminal.warn("`name`")
+    assert capsys.readouterr().err == "Warning: `name`\n"
+
+
 def test_levels_of_output(printed):
     told = ["remark", "Warning: first line"]
     assert printed() == (["result", "done"], [*told, "Error: `bin`"])

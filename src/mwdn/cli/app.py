@@ -128,8 +128,8 @@ def _run(arguments: list[str], received: Sequence[int]) -> int:
 
 
 def _options(app: App, arguments: list[str]) -> set[str]:
-    """Options of the command that runs."""
-    _, apps, _ = app.parse_commands(arguments)
+    """Options of the command that runs, or whose help is printed."""
+    _, apps, _ = app.parse_commands([word for word in arguments if word not in {*app.help_flags, *app.version_flags}])
     if apps[-1].default_command is None:
         return set()
     return {name for argument in apps[-1].assemble_argument_collection() for name in argument.names}
