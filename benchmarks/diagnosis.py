@@ -3,8 +3,8 @@
     python benchmarks/diagnosis.py ../shared/data [--count 200] [--seed 28] [--only gamma mosaic]
 
 First the real captures (`known_captures.py`), then simulated variants (`variants.py`), then for each property the share
-of right, wrong and unknown answers; with ``--table``, from the file of results, a table of the real captures. A run
-that was interrupted goes on. Thresholds are chosen with other seeds than 28.
+of right, wrong and unknown answers. Beside the results, a file `.md` has these shares and a table of the real captures.
+A run that was interrupted goes on. Thresholds are chosen with other seeds than 28.
 
 A detector is right if its `Verdict.value` is the truth, or lists it: "rggb|bggr". An unknown state is neither right nor
 wrong.
@@ -132,22 +132,25 @@ def main():
     parser.add_argument("--seed", type=int, default=28)
     parser.add_argument("--only", nargs="*", default=[], help="properties")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/diagnosis.json"))
-    parser.add_argument("--table", action="store_true", help="print the table of an earlier run's real captures")
     arguments = parser.parse_args()
-    if arguments.table:
-        print(*table(json.loads(arguments.out.read_text())["real"]), sep="\n")
-        return
     torch.set_num_threads(1)
     progress = arguments.out.with_suffix(f".seed-{arguments.seed}.progress")
     real = list(judge_all(real_captures(arguments.data), arguments.only, progress))
     sources = Sources(arguments.data)
     draws = (draw(sources, arguments.seed, number) for number in range(arguments.count))
     simulated = list(judge_all(draws, arguments.only, progress))
-    for title, rows in (("Real captures", real), (f"{arguments.count} variants", simulated)):
-        print("", f"{title}:", "", *shares(rows), sep="\n")
+    titles = "Real captures", f"{arguments.count} simulated captures, seed {arguments.seed}"
+    report = ["# Detectors of `mwdn.diagnosis`", "", "Written by `benchmarks/diagnosis.py`."]
+    for title, rows in zip(titles, (real, simulated), strict=True):
+        report += ["", f"## {title}", "", *shares(rows)]
+    print(*report, sep="\n")
+    report += ["", "## Each real capture", "", "What is true, and after the colon what was detected, if it differs."]
+    report += ["", *table(real)]
     lines = [",\n".join(json.dumps(row) for row in rows) for rows in (real, simulated)]
-    with atomic(arguments.out) as temporary:
-        temporary.write_text('{{"seed": {}, "real": [\n{}],\n"variants": [\n{}]}}\n'.format(arguments.seed, *lines))
+    results = '{{"seed": {}, "real": [\n{}],\n"variants": [\n{}]}}\n'.format(arguments.seed, *lines)
+    for out, text in ((arguments.out, results), (arguments.out.with_suffix(".md"), "\n".join(report) + "\n")):
+        with atomic(out) as temporary:
+            temporary.write_text(text)
     progress.unlink()
 
 
