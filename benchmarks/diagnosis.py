@@ -140,7 +140,8 @@ def main():
     draws = (draw(sources, arguments.seed, number) for number in range(arguments.count))
     simulated = list(judge_all(draws, arguments.only, progress))
     titles = "Real captures", f"{arguments.count} simulated captures, seed {arguments.seed}"
-    report = ["# Detectors of `mwdn.diagnosis`", "", "Written by `benchmarks/diagnosis.py`. Times: on one thread, of a machine that may have had other work."]
+    times = "Times: on one thread, of a machine that may have had other work."
+    report = ["# Detectors of `mwdn.diagnosis`", "", f"Written by `benchmarks/diagnosis.py`. {times}"]
     for title, rows in zip(titles, (real, simulated), strict=True):
         report += ["", f"## {title}", "", *shares(rows)]
     print(*report, sep="\n")
