@@ -1,13 +1,13 @@
-"""The bundled networks against ADMM through PSFs they were not trained on: exact and mismatched, in good and low light.
+"""The bundled networks against ADMM through PSFs they were not trained on: exact, mismatched and real-like cameras.
 
     python benchmarks/universal.py ../shared/data [--count 32] [--methods universal universal-small admm]
-                                                [--psfs "mwdn-camera 320x320" ...]
+                                                [--psfs "mwdn-camera 320x320" ...] [--calibrations real-like]
 
-Four measured PSFs; test photographs placed and mismatched by the recipe mismatched; 15,000 and 2,000 electrons at
-saturation. Scored as in `mwdn evaluate` (full, clipped). Prints a table of means, with the confidence interval of the
-first method's gain over the last, and writes the numbers of each picture, a few at a time. Numbers already in the
-record are not measured again, so a stopped run continues; `--again` measures the named methods again. One process per
-core, of one thread each.
+Four measured PSFs; 15,000 and 2,000 electrons at saturation; test photographs placed and mismatched by the recipe
+mismatched, or seen by cameras with all that real ones have, recipe real-like. Scored as in `mwdn evaluate` (full,
+clipped). Prints a table of means, with the confidence interval of the first method's gain over the last, and writes the
+numbers of each picture, a few at a time. Numbers already in the record are not measured again, so a stopped run
+continues; `--again` measures the named methods again. One process per core, of one thread each.
 
 The method `fine-tuned` is, for each PSF, the network in `TUNED` that the recipe finetune made of `universal`.
 """
@@ -43,7 +43,9 @@ PSFS = {
 }
 TUNED = {name: f"runs/finetune-{path.partition('/')[0]}/best.safetensors" for name, (path, _) in PSFS.items()}
 FULL_WELLS = (15_000.0, 2_000.0)
-KEYS = ("psf", "full_well", "exact")
+CALIBRATIONS = {"exact": "mismatched", "mismatched": "mismatched", "real-like": "real-like"}
+"""How well the PSF is known, and the recipe of the captures."""
+KEYS = ("psf", "full_well", "calibration")
 METRICS = ("psnr", "ssim", "lpips")
 AT_ONCE = 8
 
@@ -82,7 +84,7 @@ def gain(values, other):
 
 def remembered(out):
     """Values by method of each row in a record."""
-    rows = {which: {} for which in itertools.product(PSFS, FULL_WELLS, (True, False))}
+    rows = {which: {} for which in itertools.product(PSFS, FULL_WELLS, CALIBRATIONS)}
     for row in json.loads(out.read_text()) if out.exists() else ():
         rows[tuple(row[key] for key in KEYS)] = row["values"]
     return rows
@@ -108,10 +110,10 @@ def scores(data, which, numbers, methods):
     """Scores (`measured`) of captures through one PSF in one light."""
     torch.set_num_threads(1)
     mwdn.keep_memory()
-    name, full_well, exact = which
-    calibration, recipe = camera(data, name), read_recipe("mismatched")
+    name, full_well, known = which
+    calibration, recipe = camera(data, name), read_recipe(CALIBRATIONS[known])
     photographs = Photographs(data / "photos" / "test")
-    made = captures(calibration.psf, photographs, recipe, full_well, numbers, exact=exact)
+    made = captures(calibration.psf, photographs, recipe, full_well, numbers, exact=known == "exact")
     return measured({each: TUNED[name] if each == "fine-tuned" else each for each in methods}, made, calibration)
 
 
@@ -120,10 +122,10 @@ def table(rows, methods):
     columns = ["PSF", "electrons", "calibration", "captures", *methods] + (["gain"] if len(methods) > 1 else [])
     yield f"| {' | '.join(columns)} |"
     yield "| --- " * len(columns) + "|"
-    for (name, full_well, exact), results in rows.items():
+    for (name, full_well, known), results in rows.items():
         count = min(len(results[method]["psnr"]) for method in methods)
         values = {method: {key: each[:count] for key, each in results[method].items()} for method in methods}
-        cells = [name, f"{full_well:,.0f}", "exact" if exact else "mismatched", str(count)]
+        cells = [name, f"{full_well:,.0f}", known, str(count)]
         cells += [f"{fmean(values[m]['psnr']):.2f} / {fmean(values[m]['lpips']):.3f}" for m in methods]
         if len(methods) > 1:
             cells.append(gain(values[methods[0]], values[methods[-1]]))
@@ -136,11 +138,16 @@ def main():
     parser.add_argument("--count", type=int, default=32)
     parser.add_argument("--methods", nargs="+", default=["universal", "universal-small", "admm"])
     parser.add_argument("--psfs", nargs="+", choices=PSFS, default=list(PSFS))
+    parser.add_argument("--calibrations", nargs="+", choices=CALIBRATIONS, default=list(CALIBRATIONS))
     parser.add_argument("--again", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/universal.json"))
     arguments = parser.parse_args()
     rows = remembered(arguments.out)
-    wanted = {which: values for which, values in rows.items() if which[0] in arguments.psfs}
+    wanted = {
+        which: values
+        for which, values in rows.items()
+        if which[0] in arguments.psfs and which[2] in arguments.calibrations
+    }
     if arguments.again:
         for values in wanted.values():
             for method in arguments.methods:
@@ -153,7 +160,9 @@ def main():
                 known = rows[which].setdefault(method, {key: [] for key in METRICS})
                 for key in METRICS:
                     known[key][numbers.start : numbers.stop] = values[key]
-            record = [dict(zip(KEYS, which, strict=True)) | {"values": values} for which, values in rows.items()]
+            record = [
+                dict(zip(KEYS, which, strict=True)) | {"values": values} for which, values in rows.items() if values
+            ]
             keep(record, arguments.out)
     print("PSNR in dB / LPIPS, means; gain of the first method over the last (95 % confidence)\n")
     print("\n".join(table(wanted, arguments.methods)))

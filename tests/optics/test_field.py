@@ -8,7 +8,7 @@ import torch
 from cameras import contour_psf
 from mwdn.errors import ParameterError, ShapeError
 from mwdn.optics import Aberration, Camera, FieldCamera, Sensor, field_psfs
-from mwdn.optics.field import gaussian_blur
+from mwdn.optics.field import gaussian_blur, two_depths
 
 
 def gaussian(size, sigma_y, sigma_x):
@@ -212,3 +212,15 @@ def test_wrong_calls():
         field_psfs(psfs[0], (0, 2), Aberration())
     with pytest.raises(ShapeError, match="from_psfs"):
         FieldCamera.from_psfs(psfs, (5, 5)).forward(torch.ones(1, 1, 6, 5))
+
+
+def test_two_depths_divide_the_scene_between_two_cameras(generator):
+    """Equal cameras are one; a point is seen through the camera of its own depth."""
+    size = 20, 24
+    one, other = (FieldCamera.from_psfs(contour_psf(size, cell=c, generator=generator)[None], size) for c in (6, 9))
+    is_near = (torch.rand(1, 1, *size, generator=generator) < 0.5).float()
+    scene = torch.rand(2, 3, *size, generator=generator)
+    torch.testing.assert_close(two_depths(one, one, is_near).forward(scene), one.forward(scene), rtol=1e-4, atol=1e-6)
+    both = two_depths(one, other, is_near).forward(scene)
+    expected = one.forward(scene * is_near) + other.forward(scene * (1 - is_near))
+    torch.testing.assert_close(both, expected, rtol=1e-4, atol=1e-6)

@@ -7,6 +7,7 @@ import torch
 
 from mwdn.errors import ParameterError
 from mwdn.optics import Sensor
+from mwdn.optics.sensor import gamma_coded
 
 
 @pytest.mark.parametrize("signal", [0.0, 0.1, 0.5, 0.8])
@@ -126,3 +127,15 @@ def test_light_is_left_as_it_was_and_negative_light_is_dark(generator):
 def test_impossible_sensors_are_refused(options, message):
     with pytest.raises(ParameterError, match=message):
         Sensor(**options)
+
+
+def test_right_gamma_leaves_the_rounding_and_a_wrong_one_a_power():
+    """Half a step of 8 bits is worth 2.2 / 510 v^(1 - 1 / 2.2) of light; darkness below 0 and light above 1 are cut."""
+    light = torch.linspace(-0.1, 1.1, 1201)[None, None, None]
+    inside = light.clamp(0, 1)
+    error = (gamma_coded(light, 2.2, 2.2) - inside).abs()
+    bound = 2.2 / 510 * inside ** (1 - 1 / 2.2)
+    assert (error <= 1.1 * bound + 1e-5).all()  # to first order; more at the darkest levels
+    assert error.max() > 0.8 * 2.2 / 510  # it is rounded
+    wrong = gamma_coded(light, 2.2, 2.42, bit_depth=16)
+    torch.testing.assert_close(wrong, inside**1.1, rtol=0, atol=1e-4)

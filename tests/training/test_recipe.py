@@ -6,7 +6,7 @@ import re
 import pytest
 
 from mwdn.data.cameras import Cameras
-from mwdn.data.mismatch import Mismatch
+from mwdn.data.mismatch import REAL, Mismatch
 from mwdn.data.simulated import Placement
 from mwdn.errors import ParameterError, UnknownNameError
 from mwdn.io.toml import packaged_recipes
@@ -49,6 +49,12 @@ def test_values_and_their_types(read):
     assert recipe.mismatch == Mismatch(shift_px=0.0)
     many = read('[network]\nname = "wiener-bank"\nwidth = 2\nregularisations = [1e-2, 1e-4]\n')
     assert build(**many.network).regularisations == (1e-2, 1e-4)
+
+
+def test_options_that_are_off_leave_the_identity_of_earlier_runs(read):
+    """Otherwise no run begun before them could resume, and every cached sample would be computed again."""
+    assert not set(REAL) & read(NETWORK).as_dict()["mismatch"].keys()
+    assert read(NETWORK + "[mismatch]\ntails = 0.1\n").as_dict()["mismatch"]["tails"] == 0.1
 
 
 def test_overrides(read):

@@ -1,7 +1,7 @@
 """How a camera differs from its calibration: rotated, scaled, shifted, blurred, hazy PSF; uneven light."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import KW_ONLY, dataclass, fields
 
 import torch
 from torch import Tensor
@@ -12,12 +12,24 @@ from mwdn.errors import ParameterError
 from mwdn.optics.warp import affine, hazed
 from mwdn.types import Psf, Size
 
+BELOW_1 = (
+    *("scale", "background", "vignetting", "tilt"),
+    *("envelope_shift", "aperture_gain", "tails", "depth", "hot_pixels", "gamma_error"),
+)
+"""Options that are fractions."""
+
+TAIL_RADIUS = (0.01, 0.1)
+"""Radius of scattered light over the frame's shorter side: from a few pixels to a tenth of it, where haze begins."""
+
 
 @dataclass(frozen=True)
 class Mismatch:
     """The [mismatch] of a recipe: how the camera differs from its calibration.
 
-    Each value is the largest magnitude; the actual ones are drawn uniformly for each sample.
+    Each value is the largest magnitude; the actual ones are drawn uniformly for each sample. The second group is what
+    real captures have beyond that (`mwdn.data.real_camera`), off by default. What the sensor clips and how its light
+    falls off are elsewhere: an `exposure` of [placement] above 1 saturates pixels, `bit_depth` and `black_level` are of
+    [sensor], `vignetting` and `tilt` are here.
 
     Args:
         shift_px: displacement of the PSF.
@@ -33,6 +45,24 @@ class Mismatch:
         grain: relative error of single pixels of the PSF, such as noise of the calibration shot leaves.
         full: always use the largest magnitudes, with random signs.
         exact: fraction of the samples whose camera equals its calibration.
+
+        envelope_shift: displacement of the aperture's shadow against the mask's pattern, over the frame's shorter
+            side. They part by (d_a - d_m) tan(angle): 0.5 mm of glass between them and 15 degrees are 0.13 mm, 0.03 to
+            0.05 of the frame of a small sensor.
+        aperture_gain: relative gain or loss of the PSF's light, smooth over the aperture and different in each colour:
+            uneven calibration source, colour filters seen at an angle. 0.3 is typical of a real capture.
+        tails: part of the PSF's light in tails that fall with the cube of the distance: scattered light, 0.05 of clean
+            optics to 0.3 of a dusty diffuser. Their radius is drawn from `TAIL_RADIUS`.
+        off_axis: change of the PSF from the axis to the corner of the scene: 1 is about the paper's camera in front of
+            its display, see `mwdn.optics.deviation`.
+        depth: magnification of the PSF of near points over that of far ones; a random outline divides the scene. At a
+            distance z it is 1 + d / z: with d = 9 mm, 0.03 is between 20 and 60 cm.
+        room_light: mean of the room's light on the sensor over the mean of the scene's: even, a slope from none to
+            twice the mean, or a spot; in a colour of its own. 0.5 is a lit room.
+        hot_pixels: fraction of a colour's pixels that have up to a full scale of dark current.
+        eight_bit: fraction of the samples that are read out with 8 bits, where [sensor] has more.
+        gamma_coded: fraction of the samples that are stored as 8-bit files of gamma 2.2, clipped at black.
+        gamma_error: relative error of the gamma by which these are decoded: with 0.1 by 2.0 to 2.4.
     """
 
     shift_px: float = 0.5
@@ -47,18 +77,34 @@ class Mismatch:
     sharpen: float = 0.0
     full: bool = False
     exact: float = 0.0
+    _: KW_ONLY
+    envelope_shift: float = 0.0
+    aperture_gain: float = 0.0
+    tails: float = 0.0
+    off_axis: float = 0.0
+    depth: float = 0.0
+    room_light: float = 0.0
+    hot_pixels: float = 0.0
+    eight_bit: float = 0.0
+    gamma_coded: float = 0.0
+    gamma_error: float = 0.0
 
     def __post_init__(self) -> None:
-        if not self.exact <= 1:
-            raise ParameterError(f"`exact` ({self.exact}) must be in [0, 1]: it is a fraction of the samples.")
+        for name in ("exact", "eight_bit", "gamma_coded"):
+            if not getattr(self, name) <= 1:
+                raise ParameterError(
+                    f"`{name}` ({getattr(self, name)}) must be in [0, 1]: it is a fraction of the samples."
+                )
         for part in fields(self):
             if not getattr(self, part.name) >= 0:
                 raise ParameterError(
                     f"`{part.name}` ({getattr(self, part.name)}) must not be negative: it is a magnitude."
                 )
-        for name in ("scale", "background", "vignetting", "tilt"):
+        for name in BELOW_1:
             if not getattr(self, name) < 1:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) must be below 1.")
+        if not self.off_axis <= 3:
+            raise ParameterError(f"`off_axis` ({self.off_axis}) must be 3 at most: it darkens the corners by 0.3 each.")
 
     def size(self, generators: list[torch.Generator], largest: float) -> Tensor:
         """(B, 1) random values in [0, largest]."""
@@ -70,6 +116,9 @@ class Mismatch:
         values = uniform(generators, -1.0, 1.0, count)
         return largest * (torch.where(values < 0, -1.0, 1.0) if self.full else values)
 
+
+REAL = tuple(part.name for part in fields(Mismatch) if part.kw_only)
+"""The options that real captures need, off by default. Only append: a place in this list numbers a random stream."""
 
 EXACT = Mismatch(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """A camera that equals its calibration."""

@@ -6,7 +6,7 @@ number of processes and any batch size.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import wraps
 from typing import NamedTuple, ParamSpec, Protocol, TypeVar, runtime_checkable
 
@@ -17,8 +17,8 @@ from torch.nn import functional as F
 from mwdn.data.mismatch import Mismatch, perturb, shading
 from mwdn.data.photographs import Photographs
 from mwdn.data.random import seeded, uniform
+from mwdn.data.real_camera import RealCamera
 from mwdn.errors import ParameterError
-from mwdn.fourier.convolution import convolve
 from mwdn.optics.field import FieldCamera
 from mwdn.optics.sensor import Sensor
 from mwdn.optics.warp import affine
@@ -175,25 +175,31 @@ class SimulatedPairs(Samples):
         generators = self.generators(numbers)
         scene = self.scenes(generators)
         psf = self.psf.expand(len(scene), -1, -1, -1)
-        true = psf if self.camera else perturb(psf, self.mismatch, generators)
+        real = RealCamera(self.mismatch, tuple(map(self.sample_seed, numbers)), (False,) * len(scene))
+        true = psf if self.camera else perturb(real.psf(psf), self.mismatch, generators)
         factors = shading(self.mismatch, generators, (psf.shape[-2], psf.shape[-1])).to(psf)
         if self.mismatch.exact:
             exact = (uniform(generators, 0.0, 1.0)[..., None, None] < self.mismatch.exact).to(psf.device)
             true, factors = torch.where(exact, psf, true), torch.where(exact, 1.0, factors)
-        light = (self.camera.forward(scene) if self.camera else convolve(scene, true)) * factors
+            real = replace(real, exact=tuple(exact.flatten().tolist()))
+        light = (self.camera.forward(scene) if self.camera else real.forward(scene, true)) * factors
         ambient = uniform(generators, *self.placement.ambient)[..., None, None].to(light)
-        light = light + ambient * light.mean((1, 2, 3), keepdim=True)
+        light = real.lit(light) + ambient * light.mean((1, 2, 3), keepdim=True)
         brightest = light.amax((1, 2, 3), keepdim=True).clamp(min=1e-6)
         darkest, lightest = self.placement.exposure
         stops = uniform(generators, math.log(darkest), math.log(lightest))
         gain = stops.exp()[..., None, None].to(light) / brightest
-        exposed = torch.cat([self._expose(one, g) for one, g in zip(light * gain, generators, strict=True)])
-        return Batch(exposed / gain, scene, self.psf)
+        exposures = zip(real.heated(light * gain), generators, real.sensors(self.sensor), strict=True)
+        captures = real.decoded(torch.cat([_expose(one, g, sensor) for one, g, sensor in exposures]))
+        return Batch(captures / gain, scene, self.psf)
 
     def generators(self, numbers: range | list[int]) -> list[torch.Generator]:
         """A random generator for each sample of these numbers."""
-        # Neighbouring seeds share no sample before the millionth.
-        return [seeded(self.seed * 1_000_003 + n) for n in numbers]
+        return [seeded(self.sample_seed(n)) for n in numbers]
+
+    def sample_seed(self, number: int) -> int:
+        """Seed of a sample."""
+        return self.seed * 1_000_003 + number  # neighbouring seeds share no sample before the millionth
 
     def scenes(self, generators: list[torch.Generator]) -> Scene:
         """Choose a photograph for each scene; mirror, scale, rotate and shift it, in front of a backdrop."""
@@ -217,11 +223,12 @@ class SimulatedPairs(Samples):
             scene = scene + background * uniform(generators, *p.backdrop, 3)[..., None, None].to(scene)
         return scene
 
-    def _expose(self, light: Tensor, generator: torch.Generator) -> Tensor:
-        if light.device.type != "cpu":
-            seed = int(torch.randint(2**62, (1,), generator=generator))
-            generator = torch.Generator(light.device).manual_seed(seed)
-        return self.sensor.expose(light[None], generator=generator)
+
+def _expose(light: Tensor, generator: torch.Generator, sensor: Sensor) -> Tensor:
+    if light.device.type != "cpu":
+        seed = int(torch.randint(2**62, (1,), generator=generator))
+        generator = torch.Generator(light.device).manual_seed(seed)
+    return sensor.expose(light[None], generator=generator)
 
 
 def _resample(pictures: Tensor, theta: Tensor, size: Size) -> Tensor:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 import torch
 
 from mwdn.errors import ParameterError
-from mwdn.optics.field import Aberration, FieldCamera, field_psfs
+from mwdn.optics.field import Aberration, FieldCamera, FieldPsfs, field_psfs
 from mwdn.optics.warp import hazed, warp
 from mwdn.types import Psf
 
@@ -27,6 +27,18 @@ GRID = 5
 
 RANK = 8
 """Kernels that approximate these 25 PSFs; 2 % of the norm is left for the paper's camera at `off_axis` 1."""
+
+
+def off_axis_psfs(psf: Psf, amount: float, *, grid: int = GRID) -> FieldPsfs:
+    """PSFs of a grid of points of the field, from one on the axis.
+
+    Args:
+        psf: (1, C, h, w), on the axis.
+        amount: change from the axis to the corner, in units of `OFF_AXIS`; 0 gives the one PSF.
+        grid: number of points along each side.
+    """
+    change = replace(OFF_AXIS * amount, blur_px=BLUR * amount * min(psf.shape[-2:]))
+    return field_psfs(psf, (grid, grid) if amount else (1, 1), change)
 
 
 @dataclass(frozen=True)
@@ -82,6 +94,4 @@ class Deviation:
         if self.shift_px or self.turn_degrees or self.scale:
             psf = warp(psf, (1 + self.scale) * turn, (self.shift_px, self.shift_px))
             psf = psf / psf.sum((-2, -1), keepdim=True).clamp(min=1e-12)
-        change = replace(OFF_AXIS * self.off_axis, blur_px=BLUR * self.off_axis * min(size))
-        psfs = field_psfs(psf, (GRID, GRID) if self.off_axis else (1, 1), change)
-        return FieldCamera.from_psfs(hazed(psfs, self.background), size, rank=RANK)
+        return FieldCamera.from_psfs(hazed(off_axis_psfs(psf, self.off_axis), self.background), size, rank=RANK)

@@ -188,6 +188,20 @@ class FieldCamera:
         return list(zip(self.kernels, self.weights, strict=True))
 
 
+def two_depths(near: FieldCamera, far: FieldCamera, is_near: Tensor) -> FieldCamera:
+    """One camera for a scene in which each point is at one of two distances, and so seen through one of two cameras.
+
+    At a distance z the PSF is magnified by 1 + d / z, with d from the mask to the sensor.
+
+    Args:
+        near: camera for the near points.
+        far: camera for the others, of the same sizes.
+        is_near: (1, 1, H, W) of the scene, 1 at near points and 0 at far ones.
+    """
+    weights = torch.cat([near.weights * is_near, far.weights * (1 - is_near)])
+    return FieldCamera(torch.cat([near.kernels, far.kernels]), weights, near.size, near.sensor)
+
+
 def gaussian_blur(image: Image, sigma: float) -> Image:
     """Blur pictures by a Gaussian of standard deviation ``sigma`` in pixels; beyond their border is darkness."""
     size = image.shape[-2], image.shape[-1]

@@ -1,4 +1,4 @@
-"""Image sensor: shot noise, read noise, black level, saturation, quantisation."""
+"""Image sensor: shot noise, read noise, black level, saturation, quantisation; gamma-coded files."""
 
 from dataclasses import dataclass
 
@@ -62,3 +62,20 @@ class Sensor:
         steps = 2**self.bit_depth - 1
         counts = ((electrons / self.full_well * span + self.black_level) * steps).round().clamp(0, steps)
         return (counts / steps - self.black_level) / span
+
+
+def gamma_coded(capture: Image, gamma: float, decoded: float, *, bit_depth: int = 8) -> Image:
+    """Store a capture as a gamma-coded file and read it again.
+
+    A pixel of light v in [0, 1] is stored as v^(1 / gamma), rounded to a step of the file, and read as its power of
+    ``decoded``. With the right gamma only the rounding is left: of half a step s, ``s gamma v^(1 - 1 / gamma) / 2``.
+    With a wrong one light v becomes ``v^(decoded / gamma)``.
+
+    Args:
+        capture: (B, C, H, W); below 0 and above 1 it is clipped.
+        gamma: of the file.
+        decoded: the gamma that the reader believes.
+        bit_depth: of the file.
+    """
+    steps = 2**bit_depth - 1
+    return ((capture.clamp(0, 1) ** (1 / gamma) * steps).round() / steps) ** decoded

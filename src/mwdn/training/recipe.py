@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from mwdn.data.cameras import Cameras
-from mwdn.data.mismatch import Mismatch
+from mwdn.data.mismatch import REAL, Mismatch
 from mwdn.data.noisy import Denoising
 from mwdn.data.recorded import Division
 from mwdn.data.simulated import Placement
@@ -215,8 +215,15 @@ class Recipe:
             raise ParameterError("[denoising] has no camera: leave [sheet], [cameras] and [selfsupervised] out.")
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values that JSON can hold."""
-        return dataclasses.asdict(self)
+        """Plain values that JSON can hold.
+
+        The options of `mwdn.data.mismatch.REAL` are left out at their defaults: runs begun before them have none.
+        """
+        tables, off = dataclasses.asdict(self), dataclasses.asdict(Mismatch())
+        for name in REAL:
+            if tables["mismatch"][name] == off[name]:
+                del tables["mismatch"][name]
+        return tables
 
 
 FIELDS = {f.name: f for f in dataclasses.fields(Recipe)}
