@@ -165,7 +165,7 @@ def test_grey_psf_serves_pairs_in_colour(pairs):
 
 
 def test_no_such_file(tmp_path):
-    with pytest.raises(ImageError, match=r"none\.h5` is not a file"):
+    with pytest.raises(ImageError, match=r"none\.h5` does not exist"):
         recorded_pairs(tmp_path / "none.h5", psf(), Division())
 
 

@@ -123,7 +123,7 @@ def saved_result(path: Path, record: dict[str, Any]) -> MethodResult:
     try:
         pictures = {name: read_array(_pictures_file(path, name), _check_pictures) for name in ("pictures", "captures")}
     except ImageError as error:
-        raise ParameterError(f"{error} To measure the method again, remove `{path}`.") from error
+        raise ParameterError(f"{error} To measure the method again, remove `{path.name}` beside it.") from error
     tensors = {name: torch.from_numpy(array) for name, array in pictures.items()}
     with unexpected_content(path):
         cpu = Scores.read(record["cpu"]) if record["cpu"] else None
