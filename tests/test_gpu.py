@@ -12,6 +12,7 @@ import torch
 
 from cameras import contour_psf
 from mwdn import Calibration, Camera, Reconstructor, solvers
+from mwdn.data.mismatch import REAL, Mismatch
 from mwdn.data.pairs import PairFile
 from mwdn.data.photographs import Photographs
 from mwdn.data.recorded import RecordedPairs, record
@@ -86,10 +87,12 @@ def test_reconstructions(method, precision, calibration, batches):
         assert psnr(there(batch), here(batch)) > (60 if precision == "exact" else 40)
 
 
-def test_samples(calibration, photographs):
+@pytest.mark.parametrize("mismatch", [Mismatch(), Mismatch(**dict.fromkeys(REAL, 0.02))])
+def test_samples(calibration, photographs, mismatch):
     """The same scenes and PSFs; the noise differs, as each device has its own generator."""
     here, there = (
-        SimulatedPairs(photographs.to(device), calibration.psf.to(device)).batch(range(4)) for device in (CPU, GPU)
+        SimulatedPairs(photographs.to(device), calibration.psf.to(device), mismatch=mismatch).batch(range(4))
+        for device in (CPU, GPU)
     )
     torch.testing.assert_close(there.scene.cpu(), here.scene, rtol=1e-3, atol=1e-3)
     assert psnr(there.measurement.cpu(), here.measurement) > 20

@@ -15,7 +15,8 @@ from mwdn.data.real_camera import RealCamera, field_camera
 from mwdn.data.simulated import Placement, SimulatedPairs
 from mwdn.errors import ParameterError
 from mwdn.fourier.convolution import convolve
-from mwdn.optics import Sensor
+from mwdn.optics import FieldCamera, Sensor, field_psfs
+from mwdn.optics.deviation import off_axis_change
 from mwdn.optics.warp import warp
 
 SIZE = 32, 40
@@ -123,6 +124,10 @@ def test_field_and_depth_of_nothing_are_the_plain_camera(psf):
 def test_light_of_the_field_falls_towards_the_corner(psf):
     """A fall-off of 0.3 at `off_axis` 1, in the corner of the scene."""
     camera = field_camera(psf, torch.ones(1, 1, *SIZE), 1.0, 0.0)
+    every = field_psfs(psf, (3, 3), off_axis_change(1.0, SIZE))
+    whole = FieldCamera.from_psfs(every, SIZE)  # all nine points
+    for place in ((0, 0), (7, 31), (31, 0), (20, 39)):
+        torch.testing.assert_close(camera.psf_at(*place), whole.psf_at(*place), rtol=1e-3, atol=1e-6)
     middle, corner = (camera.psf_at(*place).sum((-2, -1)) for place in ((16, 20), (0, 0)))
     assert middle.tolist()[0] == pytest.approx([1.0] * 3, abs=0.03)
     assert (corner < 0.75).all()  # and what the larger pattern loses beyond the frame

@@ -8,12 +8,13 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from mwdn.data.mismatch import REAL, TAIL_RADIUS, Mismatch
 from mwdn.data.random import seeded, uniform
 from mwdn.fourier.convolution import convolve
 from mwdn.optics.aperture import displaced_envelope, low_order_field, scattered
-from mwdn.optics.deviation import off_axis_psfs
+from mwdn.optics.deviation import off_axis_change
 from mwdn.optics.field import FieldCamera, two_depths
 from mwdn.optics.room_light import even_light, sloping_light, spot_light
 from mwdn.optics.sensor import Sensor, gamma_coded
@@ -23,8 +24,8 @@ from mwdn.types import Image, Measurement, Psf, Scene, Size
 STREAM = 16
 """Number of the first option's random stream; `mwdn.data.cameras` has 7."""
 
-GRID = 3
-"""PSFs off the axis are computed at 3 x 3 points; those opposite each other are equal, so five kernels suffice."""
+POINTS = ((0, 0), (1, 0), (0, 1), (1, 1), (1, -1))
+"""Points (down, right) at which PSFs off the axis are computed: of a grid of 3 x 3, opposite ones have equal PSFs."""
 
 ORDER = 4
 """Gain over the aperture, and the outline between two depths: cosines of up to one and a half periods a side."""
@@ -66,9 +67,8 @@ class RealCamera:
             changed = changed * (1 + amount * self._gains(generators, psf.shape[1], size)).to(psf)
         if self.mismatch.tails:
             part, generators = self._amount("tails")
-            radius = uniform(generators, math.log(TAIL_RADIUS[0]), math.log(TAIL_RADIUS[1])).exp()[
-                ..., None, None
-            ] * min(size)
+            smallest, largest = (min(size) * end for end in TAIL_RADIUS)
+            radius = uniform(generators, math.log(smallest), math.log(largest)).exp()[..., None, None]
             changed = scattered(changed, part.to(psf), radius.to(psf))
         return psf if changed is psf else changed / changed.sum((-2, -1), keepdim=True).clamp(min=1e-12)
 
@@ -148,17 +148,20 @@ def field_camera(psf: Psf, is_near: Tensor, off_axis: float, depth: float) -> Fi
     Args:
         psf: (1, C, h, w), on the axis and at the middle of both depths; scenes and measurements have its size.
         is_near: (1, 1, h, w), see `mwdn.optics.field.two_depths`.
-        off_axis: change to the corner, see `mwdn.optics.deviation.off_axis_psfs`.
+        off_axis: change to the corner, see `mwdn.optics.deviation.OFF_AXIS`; bilinear between 3 x 3 points.
         depth: relative magnification of the near PSF over the far one.
     """
     size = psf.shape[-2], psf.shape[-1]
+    points = POINTS if off_axis else POINTS[:1]
+    change, grid = off_axis_change(off_axis, size), torch.zeros(len(points), 1, 3, 3, device=psf.device)
+    for number, (y, x) in enumerate(points):
+        grid[number, 0, 1 + y, 1 + x] = grid[number, 0, 1 - y, 1 - x] = 1
+    weights = F.interpolate(grid, size, mode="bilinear", align_corners=True) if off_axis else torch.ones_like(is_near)
 
     def at(magnification: float) -> FieldCamera:
         # `warp` keeps the brightness: the same light on a larger area is darker.
         scaled = psf if magnification == 1 else warp(psf, magnification * torch.eye(2)) / magnification**2
-        if not off_axis:
-            return FieldCamera(scaled, torch.ones(1, 1, *size, device=psf.device))
-        return FieldCamera.from_psfs(off_axis_psfs(scaled, off_axis, grid=GRID), size)
+        return FieldCamera(torch.cat([change.at(scaled, float(y), float(x)) for y, x in points]), weights)
 
     return two_depths(at(1 + depth / 2), at(1 - depth / 2), is_near) if depth else at(1.0)
 

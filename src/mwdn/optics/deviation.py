@@ -6,9 +6,9 @@ from dataclasses import dataclass, fields, replace
 import torch
 
 from mwdn.errors import ParameterError
-from mwdn.optics.field import Aberration, FieldCamera, FieldPsfs, field_psfs
+from mwdn.optics.field import Aberration, FieldCamera, field_psfs
 from mwdn.optics.warp import hazed, warp
-from mwdn.types import Psf
+from mwdn.types import Psf, Size
 
 OFF_AXIS = Aberration(scale=0.005, stretch=0.02, vignetting=0.3)
 """Change of the PSF at the corner for an `off_axis` of 1, except the blur.
@@ -29,16 +29,9 @@ RANK = 8
 """Kernels that approximate these 25 PSFs; 2 % of the norm is left for the paper's camera at `off_axis` 1."""
 
 
-def off_axis_psfs(psf: Psf, amount: float, *, grid: int = GRID) -> FieldPsfs:
-    """PSFs of a grid of points of the field, from one on the axis.
-
-    Args:
-        psf: (1, C, h, w), on the axis.
-        amount: change from the axis to the corner, in units of `OFF_AXIS`; 0 gives the one PSF.
-        grid: number of points along each side.
-    """
-    change = replace(OFF_AXIS * amount, blur_px=BLUR * amount * min(psf.shape[-2:]))
-    return field_psfs(psf, (grid, grid) if amount else (1, 1), change)
+def off_axis_change(amount: float, size: Size) -> Aberration:
+    """Change of a PSF towards the corner of the field, `amount` in units of `OFF_AXIS`, for a frame of this size."""
+    return replace(OFF_AXIS * amount, blur_px=BLUR * amount * min(size))
 
 
 @dataclass(frozen=True)
@@ -94,4 +87,5 @@ class Deviation:
         if self.shift_px or self.turn_degrees or self.scale:
             psf = warp(psf, (1 + self.scale) * turn, (self.shift_px, self.shift_px))
             psf = psf / psf.sum((-2, -1), keepdim=True).clamp(min=1e-12)
-        return FieldCamera.from_psfs(hazed(off_axis_psfs(psf, self.off_axis), self.background), size, rank=RANK)
+        psfs = field_psfs(psf, (GRID, GRID) if self.off_axis else (1, 1), off_axis_change(self.off_axis, size))
+        return FieldCamera.from_psfs(hazed(psfs, self.background), size, rank=RANK)
