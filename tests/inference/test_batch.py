@@ -589,6 +589,7 @@ def test_interrupted_work_ends_quietly_and_leaves_whole_files(shop, single):
 
 
 @linux
+@pytest.mark.acceptance  # restarting is torchrun's; resuming after a kill is tested above
 def test_torchrun_starts_killed_workers_again(shop, single):
     (shop / "in" / "damaged.npy").rename(shop / "damaged.npy")  # or the status would start them once more
     process = two(shop, "again", restarts=1)
