@@ -120,3 +120,11 @@ def test_a_class_of_the_user_is_checked_too():
     assert Mine(width=4, other="anything").width == 4
     with pytest.raises(MwdnError, match=r"`width` \(1\.5\) of `Mine`"):
         Mine(width=1.5)
+
+
+def test_many_known_names_are_cut_off():
+    """The 26 keys of [mismatch], say."""
+    message = str(UnknownNameError("key of [mismatch]", "gamma_errop", [f"gamma_error_{n}" for n in range(40)]))
+    assert len(message) == 300
+    assert "Did you mean 'gamma_error_" in message
+    assert message.endswith(" ....")

@@ -44,6 +44,10 @@ _COUNTS = {2: "two", 3: "three"}
 _Checked = TypeVar("_Checked", bound=Callable[..., Any])
 
 
+LONGEST = 300
+"""Characters of a message at most."""
+
+
 class MwdnError(Exception):
     """Base of the tree: catch this to catch them all. Its message is one line that a terminal can print."""
 
@@ -73,7 +77,8 @@ class UnknownNameError(ParameterError):
         spelling = {word.lower(): word for word in known}
         nearest = difflib.get_close_matches(name.lower(), spelling, n=1)
         hint = f" Did you mean '{spelling[nearest[0]]}'?" if nearest else ""
-        super().__init__(f"No {kind} named '{name}'.{hint} Known: {', '.join(known)}.")
+        start = f"No {kind} named '{name}'.{hint} Known: "
+        super().__init__(f"{start}{cut(', '.join(known), LONGEST - len(start) - 1)}.")
 
 
 def check_options(of: Callable[..., Any], what: str, options: Mapping[str, Any]) -> None:

@@ -45,7 +45,9 @@ def test_objects_of_the_papers_camera(data: Path, pattern: str, psf: str, count:
 
 def test_hand_at_full_size(data: Path) -> None:
     folder = data / "diffusercam-tutorial"
-    reconstruct(folder / "rawdata_hand_sample.tif", "--psf", folder / "psf_sample.tif", "--out", OUT / "hand")
+    reconstruct(
+        folder / "rawdata_hand_sample.tif", "--psf", folder / "psf_sample.tif", "--bin", "1", "--out", OUT / "hand"
+    )
     scene = np.load(OUT / "hand" / "rawdata_hand_sample.npy")
     assert scene.shape == (1200, 1600, 1)
     calibration = Calibration.from_file(folder / "psf_sample.tif")

@@ -40,5 +40,5 @@ def test_most_jpegs_that_look_different_are_refused(tmp_path: Path) -> None:
 @pytest.mark.acceptance
 @pytest.mark.parametrize("name", FILES)
 def test_many_damaged_files(tmp_path: Path, name: str) -> None:
-    """``MWDN_FUZZ_SECONDS`` for all kinds together."""
+    """A quarter of ``MWDN_FUZZ_SECONDS`` for all kinds together."""
     assert failures(sweep(cases(name, seed=1), read, tmp_path / name, duration_s=DURATION_S / len(FILES))) == []
