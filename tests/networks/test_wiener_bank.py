@@ -5,6 +5,10 @@ import torch
 
 from mwdn.errors import ParameterError
 from mwdn.networks import build
+from mwdn.networks.wiener_bank import CLOSED, NUMBERS, WienerBank
+from mwdn.optics import Camera
+from mwdn.solvers.levels import relative_noise
+from mwdn.solvers.pyramid import solve
 
 
 @pytest.mark.parametrize("fold", [1, 2, 4])
@@ -44,3 +48,95 @@ def test_gain_does_not_matter(generator, gain):
 def test_numbers_that_are_no_counts(options):
     with pytest.raises(ParameterError, match=f"`{next(iter(options))}` .* must be .*at least"):
         build("wiener-bank", **options)
+
+
+def constant_output(network: WienerBank, light: float, gate: float) -> WienerBank:
+    """The U-Net answers with this light everywhere, and with this gate if it has one."""
+    with torch.no_grad():
+        network.decoder.head.weight.zero_()
+        network.decoder.head.bias.fill_(light)
+        network.decoder.head.bias[12:].fill_(gate)
+    return network.eval()
+
+
+@pytest.mark.parametrize(("mean_light", "gate", "passed"), [("kept", 0, 0), ("free", 0, 1), ("gated", CLOSED, 0.5)])
+def test_mean_light_passes_as_the_option_says(generator, mean_light, gate, passed):
+    network = constant_output(build("wiener-bank", width=2, block=8, mean_light=mean_light), 0.25, gate)
+    estimates = torch.rand(1, 15, 96, 80, generator=generator)
+    unit = network.unit(estimates)
+    with torch.no_grad():
+        change = network.correct(estimates, unit) - estimates[:, :3]
+    torch.testing.assert_close(change, (0.25 * passed * unit).expand_as(change), atol=1e-6, rtol=1e-5)
+
+
+def test_a_closed_and_an_open_gate_are_kept_and_free_light(generator):
+    estimates = torch.rand(1, 15, 96, 80, generator=generator)
+    networks = {}
+    for light in ("kept", "free", "gated"):
+        torch.manual_seed(0)
+        networks[light] = build("wiener-bank", width=2, block=8, mean_light=light).eval()
+    gated = networks["gated"]
+    for light, gate in (("kept", -100.0), ("free", 100.0)):
+        head = networks[light].decoder.head
+        networks[light].load_state_dict(
+            {**gated.state_dict(), "decoder.head.weight": head.weight, "decoder.head.bias": head.bias}
+        )
+        with torch.no_grad():
+            gated.decoder.head.weight[:12], gated.decoder.head.bias[:12] = head.weight, head.bias
+            gated.decoder.head.weight[12:], gated.decoder.head.bias[12:] = 0, gate
+            one, other = (each.correct(estimates, each.unit(estimates)) for each in (gated, networks[light]))
+        torch.testing.assert_close(one, other)
+
+
+def evidence_of(measurement, psf) -> torch.Tensor:
+    """Noise and doubts as the network is told them."""
+    network = build("wiener-bank", width=2, regularisations=(1e-3,), evidence=True).eval()
+    with torch.no_grad():
+        numbers = network.estimates(measurement, psf)[:, -NUMBERS:]
+    assert (numbers == numbers[..., :1, :1]).all()  # constant maps
+    return numbers[0, :, 0, 0]
+
+
+def test_evidence_tells_a_right_psf_from_a_wrong_one(generator):
+    """With a right PSF the logarithms of the doubts are about 1 at most; turned by 180 degrees it leaves more."""
+    psf = torch.rand(1, 3, 96, 96, generator=generator) ** 12
+    scene = torch.zeros(1, 3, 96, 96)
+    scene[..., 30:60, 25:70] = (
+        torch.rand(1, 3, 6, 9, generator=generator).repeat_interleave(5, -1).repeat_interleave(5, -2)
+    )
+    light = Camera(psf)(scene)
+    noise = 0.02 * light.square().mean().sqrt()
+    measurement = light + noise * torch.randn(light.shape, generator=generator)
+    right, wrong = evidence_of(measurement, psf), evidence_of(measurement, psf.flip((-2, -1)))
+    assert right[0] == pytest.approx(wrong[0])  # the noise, which does not depend on the PSF
+    assert (right[1:] < 1.3).all()
+    assert (wrong[1:] > right[1:] + 1.0).all()
+
+
+def test_evidence_of_noise_alone(generator):
+    """A measurement without a scene: its residual in blocks of s x s has a standard deviation of n / s."""
+    measurement = 1 + 0.05 * torch.randn(1, 3, 128, 128, generator=generator)
+    psf = torch.zeros(1, 3, 128, 128)
+    psf[..., 64, 64] = 1
+    estimate = solve(measurement, psf)
+    network = build("wiener-bank", width=2, evidence=True)
+    numbers = network.evidence(estimate, estimate.detail(1e-3))[0, -NUMBERS:, 0, 0]
+    residual, noise = estimate.residual, relative_noise(measurement) * measurement.square().mean().sqrt()
+    expected = residual.unfold(-1, 16, 16).unfold(-3, 16, 16).mean((-1, -2)).square().mean().sqrt() * 16 / noise
+    assert numbers[2].exp() == pytest.approx(float(expected), rel=0.01)
+
+
+@pytest.mark.parametrize("options", [{"evidence": True}, {"mean_light": "gated"}, {"mean_light": "free"}])
+def test_without_iterations_there_is_no_evidence(options):
+    with pytest.raises(ParameterError, match="need iterations: `finest`"):
+        build("wiener-bank", finest=0, **options)
+
+
+@pytest.mark.parametrize("size", [(41, 57), (64, 64)])
+def test_any_size_with_all_options(generator, size):
+    network = build("wiener-bank", width=2, evidence=True, mean_light="gated").eval()
+    psf, measurement = (torch.rand(1, 3, *size, generator=generator) for _ in range(2))
+    with torch.no_grad():
+        scene = network(measurement, psf**8)
+    assert scene.shape == measurement.shape
+    assert torch.isfinite(scene).all()

@@ -261,6 +261,7 @@ REAL: dict[Any, Handler] = {
     _aten.full_like.default: _full,
     _aten.group_norm.default: _group_norm,
     _aten.linalg_vector_norm.default: _norm,
+    _aten.log.default: _plain("Log"),
     _aten.lt.Tensor: lambda g, node, a, b: g("Less", a, b),
     _aten.max_pool2d.default: _pool("MaxPool"),
     _aten.maximum.default: _plain("Max"),

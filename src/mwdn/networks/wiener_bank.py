@@ -1,7 +1,7 @@
 """A bank of Wiener filters followed by a U-Net; not from the paper."""
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,9 +15,9 @@ from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
 from mwdn.networks.blocks import Decoder, Encoder, check_channels, normalise_psf, paper_widths
 from mwdn.networks.drunet import Drunet
 from mwdn.networks.network import Network
-from mwdn.solvers.levels import LEVELS, Level
+from mwdn.solvers.levels import LEVELS, REFERENCE_NOISE, Level, brightness
 from mwdn.solvers.plug_and_play import plug_and_play
-from mwdn.solvers.pyramid import Band, PsfPyramid
+from mwdn.solvers.pyramid import Band, Estimate, PsfPyramid
 from mwdn.types import Measurement, Psf, Scene, Size
 
 COARSE_ITERATIONS = {8: 12, 4: 18, 2: 8}
@@ -25,6 +25,23 @@ COARSE_ITERATIONS = {8: 12, 4: 18, 2: 8}
 
 BOUNDARY: Boundary = "taper"
 """Boundary handling where the bank filters the measurement itself."""
+
+MeanLight = Literal["kept", "free", "gated"]
+"""What the U-Net may do to the mean light of a block:
+
+- ``kept``: nothing. The iterations' shading is right if the PSF is.
+- ``free``: anything.
+- ``gated``: as much as its gate, which it learns to open where the measurement contradicts the PSF.
+"""
+
+CLOSED = 2.0
+"""A gate of output 0 lets ``sigmoid(-2)`` = 12 % through."""
+
+DOUBT_BLOCKS = 4, 16
+"""Sides in pixels of the blocks over which the residual is averaged to compare it with the noise."""
+
+NUMBERS = 1 + len(DOUBT_BLOCKS)
+"""Of the evidence: the noise, and a doubt for each of `DOUBT_BLOCKS`."""
 
 
 class BankTransfers(NamedTuple):
@@ -64,6 +81,8 @@ class WienerBank(Network[BankTransfers]):
             the crop; their shading and colour are up to 5 dB better than a U-Net's.
         rounds: rounds of plug and play (`mwdn.solvers.plug_and_play`) between the iterations and the bank, for
             ``finest`` 1. The denoiser is trained separately on noisy pictures and frozen here; 0 for none.
+        mean_light: see `MeanLight`; needs iterations unless ``kept``.
+        evidence: whether the U-Net also sees what speaks against the PSF (`WienerBank.evidence`); needs iterations.
     """
 
     def __init__(  # noqa: PLR0913
@@ -77,6 +96,8 @@ class WienerBank(Network[BankTransfers]):
         align: bool = True,
         block: int = 32,
         rounds: int = 0,
+        mean_light: MeanLight = "kept",
+        evidence: bool = False,
     ) -> None:
         super().__init__()
         if not regularisations or min(regularisations) <= 0:
@@ -85,6 +106,10 @@ class WienerBank(Network[BankTransfers]):
             raise ParameterError(f"`finest` ({finest}) must be 0 or one of {[level.downsampling for level in LEVELS]}.")
         if rounds and finest != 1:
             raise ParameterError(f"`rounds` ({rounds}) of plug and play need iterations at full size: `finest` 1.")
+        if not finest and (evidence or mean_light != "kept"):
+            raise ParameterError(
+                f"`mean_light` ({mean_light}) and `evidence` ({evidence}) need iterations: `finest` 1, 2, 4 or 8."
+            )
         minima = (("width", width, 1), ("fold", fold, 1), ("block", block, 1), ("rounds", rounds, 0))
         for name, value, minimum in minima:
             if value < minimum:
@@ -95,9 +120,12 @@ class WienerBank(Network[BankTransfers]):
         self.rounds = rounds
         if rounds:
             self.denoiser = Drunet(channels=channels).requires_grad_(False)
-        pictures = len(regularisations) + (2 if self.levels else 1)
-        self.encoder = Encoder(channels * pictures * fold**2, paper_widths(width))
-        self.decoder = Decoder(channels * fold**2, paper_widths(width))
+        self.mean_light = mean_light
+        self.pictures = channels * (len(regularisations) + (2 if self.levels else 1))
+        evidence_channels = channels + NUMBERS if evidence else 0
+        self.has_evidence = evidence
+        self.encoder = Encoder(self.pictures * fold**2 + evidence_channels, paper_widths(width))
+        self.decoder = Decoder(channels * fold**2 + (mean_light == "gated"), paper_widths(width))
         with torch.no_grad():
             self.decoder.head.weight.mul_(0.1)  # start near the estimate
 
@@ -125,7 +153,7 @@ class WienerBank(Network[BankTransfers]):
         return self.correct(estimates, self.unit(estimates))
 
     def estimates(self, measurement: Measurement, psf: Psf) -> Tensor:
-        """Estimates of the scene, smoothest first, and the measurement: (B, C * pictures, H, W)."""
+        """Estimates of the scene, smoothest first, the measurement, and the evidence if any: (B, channels, H, W)."""
         return self._estimates(measurement, self.prepare(psf, (measurement.shape[-2], measurement.shape[-1])))
 
     def _estimates(self, measurement: Measurement, prepared: BankTransfers) -> Tensor:
@@ -140,7 +168,32 @@ class WienerBank(Network[BankTransfers]):
             details = [estimate.detail(value) for value in self.regularisations]
         else:
             details = self._filter(estimate.residual, prepared.filters, "zero")
-        return torch.cat([estimate.scene, *(estimate.scene + detail for detail in details), b], dim=1)
+        evidence = [self.evidence(estimate, details[0])] if self.has_evidence else []
+        return torch.cat([estimate.scene, *(estimate.scene + detail for detail in details), b, *evidence], dim=1)
+
+    def evidence(self, estimate: Estimate, detail: Tensor) -> Tensor:
+        """What speaks for and against the PSF: (B, C + 3, H, W).
+
+        1. The back-projected residual, averaged over blocks: light that the estimate lacks, or has too much of.
+        2. ``log(n / n0)``: the noise n of the measurement over its root mean square, n0 = `REFERENCE_NOISE`.
+        3. ``log(d)`` for each of `DOUBT_BLOCKS`: d is the root mean square of the residual's mean in blocks of s x s
+           pixels, over ``n / s``, which white noise would leave. With a right PSF d is 1 to 3, with a wrong one
+           5 to 100.
+
+        Args:
+            estimate: of the iterations.
+            detail: first Wiener estimate of its residual.
+        """
+        scale = brightness(estimate.measurement)
+        noise = estimate.noise.clamp(min=REFERENCE_NOISE / 10)
+        doubts = [
+            F.avg_pool2d(estimate.residual, side, ceil_mode=True).square().mean((1, 2, 3), keepdim=True).sqrt()
+            * (side / (noise * scale))
+            for side in DOUBT_BLOCKS
+        ]
+        numbers = [(value + 1e-3).log() for value in (noise / REFERENCE_NOISE, *doubts)]
+        size = detail.shape[-2:]
+        return torch.cat([block_means(detail, self.block), *(n.expand(-1, -1, *size) for n in numbers)], dim=1)
 
     def _filter(self, picture: Tensor, transfers: tuple[Tensor, ...], boundary: Boundary) -> list[Tensor]:
         """Wiener filters of the bank, applied to one spectrum."""
@@ -163,11 +216,24 @@ class WienerBank(Network[BankTransfers]):
         if below or right:
             estimates = F.pad(estimates, (0, right, 0, below))
         rows, columns = (-(-size // self.fold) for size in (height, width))
-        blocks = pixel_unshuffle(estimates, self.fold).div_(unit)
-        correction = self.decoder(self.encoder(blocks))[..., :rows, :columns]
-        if self.levels:  # for each channel separately; otherwise the block pattern shows in dark areas
-            correction = correction - block_means(correction, max(1, self.block // self.fold))
+        inputs = pixel_unshuffle(estimates[:, : self.pictures], self.fold).div_(unit)
+        if self.has_evidence:
+            light, numbers = F.avg_pool2d(estimates[:, self.pictures :], self.fold).split([self.channels, NUMBERS], 1)
+            inputs = torch.cat([inputs, light / unit, numbers], dim=1)
+        correction = self._lit(self.decoder(self.encoder(inputs))[..., :rows, :columns])
         return first + unit * F.pixel_shuffle(correction, self.fold)[..., :height, :width]
+
+    def _lit(self, output: Tensor) -> Tensor:
+        """The U-Net's correction, with as much of its mean light as it may change."""
+        if self.mean_light == "free" or not self.levels:
+            return output
+        block = max(1, self.block // self.fold)
+        correction = output[:, : self.channels * self.fold**2]
+        means = block_means(correction, block)  # for each channel; otherwise the block pattern shows in dark areas
+        if self.mean_light == "kept":
+            return correction - means
+        gate = torch.sigmoid(block_means(output[:, -1:], block) - CLOSED)
+        return correction - (1 - gate) * means
 
 
 def pyramid_levels(finest: int) -> tuple[Level, ...]:

@@ -1,9 +1,10 @@
 """The network of a run: its initial weights, and the moving average of its weights."""
 
+import operator
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from mwdn.errors import CheckpointError
 from mwdn.networks import build
@@ -25,13 +26,26 @@ def build_network(recipe: Recipe) -> nn.Module:
     if denoiser:
         weights |= {f"denoiser.{key}": value for key, value in load_checkpoint(denoiser).state_dict().items()}
     try:
-        network.load_state_dict(weights)
+        network.load_state_dict(grown(weights, network))
     except RuntimeError as error:
         raise CheckpointError(
             f"`start` ('{start}') must hold the network of the recipe, {recipe.network}, and `denoiser` ('{denoiser}') "
             f"its denoiser, if it has one: {first_difference(error)}."
         ) from error
     return network
+
+
+def grown(weights: dict[str, Tensor], network: nn.Module) -> dict[str, Tensor]:
+    """Weights for a network with more inputs or outputs behind those there are; the new ones are zero."""
+    result = {}
+    for name, wanted in network.state_dict().items():
+        value = weights.get(name)
+        if value is not None and value.ndim == wanted.ndim and all(map(operator.le, value.shape, wanted.shape)):
+            result[name] = torch.zeros_like(wanted)
+            result[name][tuple(slice(length) for length in value.shape)] = value
+        elif value is not None:
+            result[name] = value
+    return result | {name: value for name, value in weights.items() if name not in result}
 
 
 @torch.no_grad()

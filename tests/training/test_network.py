@@ -1,0 +1,25 @@
+"""Initial weights of a run."""
+
+import torch
+
+from mwdn.networks import build
+from mwdn.training.network import grown
+
+
+def test_new_inputs_and_outputs_start_without_effect(generator):
+    """A bank without evidence in one with it: the same scene."""
+    options = {"width": 2, "finest": 8, "regularisations": (1e-3,), "block": 8}
+    old = build("wiener-bank", **options).eval()
+    new = build("wiener-bank", **options, evidence=True, mean_light="gated").eval()
+    new.load_state_dict(grown(old.state_dict(), new))
+    psf, measurement = torch.rand(1, 3, 64, 72, generator=generator) ** 8, torch.rand(1, 3, 64, 72, generator=generator)
+    with torch.no_grad():
+        new.decoder.head.bias[-1] = -100  # a closed gate
+        torch.testing.assert_close(new(measurement, psf), old(measurement, psf))
+
+
+def test_a_smaller_network_keeps_the_weights_as_they_are():
+    """Loading them then names what does not fit."""
+    old, new = build("wiener-bank", width=4), build("wiener-bank", width=2)
+    weights = grown(old.state_dict(), new)
+    assert {name: value.shape for name, value in weights.items()} == {n: v.shape for n, v in old.state_dict().items()}
