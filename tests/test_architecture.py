@@ -23,6 +23,7 @@ FLOORS = [
     "calibration",
     "solvers",
     "data",
+    "capture",
     "networks",
     "weights",
     "evaluation",

@@ -11,6 +11,8 @@
     ├── CheckpointError (ValueError)   weights that are damaged or belong to something else
     ├── ExportError                    a method that cannot be exported, or gives other results after export
     ├── DivergenceError                a loss that is no longer finite
+    ├── CameraError                    a camera that cannot be opened, or delivers no frames any more
+    ├── DisplayError                   a display that does not show what it should
     └── ProcessError                   another process of a distributed run has ended
 
 A message states what must hold, what was got, and the way out.
@@ -286,6 +288,14 @@ class ExportError(MwdnError):
 
 class DivergenceError(MwdnError):
     """The loss of a training run is no longer finite."""
+
+
+class CameraError(MwdnError):
+    """A camera is missing, busy, disconnected or silent, or delivers other frames than before."""
+
+
+class DisplayError(MwdnError):
+    """No display is connected, or it does not show what it should."""
 
 
 class ProcessError(MwdnError):

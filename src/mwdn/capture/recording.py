@@ -1,0 +1,215 @@
+"""Record raw frames with their metadata to one file, and play such a file as a camera."""
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mwdn.capture.source import TIMEOUT_S, CameraSource, Frame, check_like
+from mwdn.data.hdf5 import as_damage, find_rows, open_hdf5
+from mwdn.data.journal import Growing, create_growing
+from mwdn.errors import CameraError, ImageError
+from mwdn.io.files import as_image_error
+
+COLUMNS = {"exposure_s": "f8", "gain": "f8", "timestamp": "f8", "number": "i8", "dropped": "i8"}
+"""Metadata of each frame, and their types in a file."""
+
+ROWS = {"recording": "frames", "captured pairs": "measurement"}
+"""Data set of the frames in each kind of file that can be played."""
+
+_ADVICE = "Record it again."
+
+
+class Recorder:
+    """Writes frames to a file, from `record`."""
+
+    def __init__(self, growing: Growing, commit_every: int) -> None:
+        self._growing, self._every, self._since = growing, commit_every, 0
+        self._first: Frame | None = None
+        self._rows: FrameRows | None = None
+
+    def __len__(self) -> int:
+        return 0 if self._rows is None else len(self._rows)
+
+    def append(self, frame: Frame) -> None:
+        """Add a frame. With ``commit_every`` 1 it is on the disk when this returns.
+
+        Raises:
+            CameraError: its size, type, bit depth or mosaic differs from the first frame's.
+            ImageError: the disk is full. The frames of earlier commits are kept.
+        """
+        if self._first is None:
+            self._first = frame
+            set_format(self._growing.file.attrs, frame)
+            self._rows = FrameRows(self._growing.file, "frames", "frame_data", frame)
+        check_like(frame, self._first, "The camera")
+        with as_image_error(self._growing.path, f" at frame {len(self) + 1:,}"):
+            if self._rows is not None:
+                self._rows.append(frame)
+            self._since += 1
+            if self._since >= self._every:
+                self.commit()
+            self._growing.disk.check()
+
+    def commit(self) -> None:
+        """Make all frames so far permanent."""
+        self._since = 0
+        self._growing.commit()
+
+
+@contextmanager
+def record(path: str | Path, *, camera: str = "", commit_every: int = 1) -> Iterator[Recorder]:
+    """Record frames: ``with record("frames.h5") as recorder: recorder.append(camera.read())``.
+
+    Whatever ends the process, all committed frames stay.
+
+    Args:
+        path: a new file, ending in .h5.
+        camera: name of the camera, stored.
+        commit_every: frames between two commits. Each waits for the disk, a few milliseconds on an SSD; a larger number
+            suits fast cameras.
+
+    Raises:
+        ImageError: the file exists, or cannot be written.
+    """
+    with as_image_error(path), create_growing(Path(path)) as growing:
+        growing.file.attrs["camera"] = camera
+        recorder = Recorder(growing, max(commit_every, 1))
+        try:
+            yield recorder
+        finally:
+            if growing.disk.error is None:
+                recorder.commit()
+
+
+class FrameRows:
+    """Raw frames and their metadata as rows of an HDF5 file that is being written.
+
+    Args:
+        file: the open `h5py.File`, or a group of it.
+        name: of the frames' data set, (N, H, W, C).
+        columns: group of their metadata, one data set (N,) for each of `COLUMNS`.
+        first: a frame of the format that all have.
+    """
+
+    def __init__(self, file: Any, name: str, columns: str, first: Frame) -> None:  # noqa: ANN401
+        self.data = add_rows(file, name, first.array.shape, first.array.dtype)
+        group = file.require_group(columns)
+        self.columns = {key: add_rows(group, key, (), np.dtype(kind)) for key, kind in COLUMNS.items()}
+
+    def __len__(self) -> int:
+        return len(self.data)
+
+    def append(self, frame: Frame) -> None:
+        """Add a frame."""
+        write_row(self.data, frame.array)
+        for key, column in self.columns.items():
+            write_row(column, getattr(frame, key))
+
+
+def add_rows(file: Any, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Any:  # noqa: ANN401
+    """A data set that grows, one chunk for each array and 1,024 numbers for scalars; an existing one is returned."""
+    if name in file:
+        return file[name]
+    chunk = (1, *shape) if shape else (1024,)
+    return file.create_dataset(name, (0, *shape), dtype, maxshape=(None, *shape), chunks=chunk, track_times=False)
+
+
+def write_row(data: Any, value: Any) -> None:  # noqa: ANN401
+    """Append one row."""
+    number = len(data)
+    data.resize(number + 1, axis=0)
+    if data.ndim > 1:  # past HDF5's cache of chunks, three times as fast
+        data.id.write_direct_chunk((number, *[0] * (data.ndim - 1)), np.ascontiguousarray(value))
+    else:
+        data[number] = value
+
+
+def set_format(attributes: Any, frame: Frame) -> None:  # noqa: ANN401
+    """Store what all frames have in common: ``bit_depth``, and ``mosaic`` or an empty text."""
+    attributes["bit_depth"], attributes["mosaic"] = frame.bit_depth, frame.mosaic or ""
+
+
+class Replay(CameraSource):
+    """Plays a recording, or the measurements of captured pairs, as a camera.
+
+    Args:
+        path: an .h5 file from `record` or `mwdn capture`.
+        loop: start again at the end.
+        realtime: wait between frames as long as between their timestamps; otherwise each is there at once.
+        timeout_s: has no effect.
+        wait: sleeps so many seconds.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        loop: bool = False,
+        realtime: bool = False,
+        timeout_s: float = TIMEOUT_S,
+        wait: Callable[[float], None] = time.sleep,
+    ) -> None:
+        super().__init__(f"replay:{path}", timeout_s)
+        self.path, self.loop, self.realtime, self._wait = Path(path), loop, realtime, wait
+        self._file: Any = None
+        self._number = 0
+
+    def open(self) -> None:
+        """Open the file at its first frame.
+
+        Raises:
+            ImageError: no such file, damaged, or not a recording.
+        """
+        self.close()
+        file = open_hdf5(self.path, _ADVICE)
+        try:
+            self._load(file)
+        except BaseException:
+            file.close()
+            raise
+        self._file, self._number, self._started = file, 0, time.monotonic()
+
+    def _load(self, file: Any) -> None:  # noqa: ANN401
+        data = next(filter(None, (find_rows(self.path, file, name, _ADVICE) for name in ROWS.values())), None)
+        if data is None or data.ndim != 4 or data.dtype not in (np.uint8, np.uint16) or not len(data):
+            raise ImageError(f"`{self.path}` holds no raw frames. Give a recording, or pairs of `mwdn capture`.")
+        self._data = data
+        with as_damage(f"The metadata of `{self.path}` cannot be read", _ADVICE):
+            self._bits = int(file.attrs.get("bit_depth", 8 * data.dtype.itemsize))
+            self._mosaic = str(file.attrs.get("mosaic", "")) or None
+        columns = {key: find_rows(self.path, file, f"frame_data/{key}", _ADVICE) for key in COLUMNS}
+        self._columns = {key: column for key, column in columns.items() if column is not None}
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def read(self) -> Frame:
+        """The next frame, with the metadata of its recording.
+
+        Raises:
+            CameraError: the recording has ended.
+            ImageError: it is damaged.
+        """
+        if self._file is None:
+            raise self.not_open()
+        if self._number == len(self._data):
+            if not self.loop:
+                raise CameraError(f"{self.name} has ended, after {len(self._data):,} frames. Play it again: `loop`.")
+            self._number, self._started = 0, time.monotonic()
+        with as_damage(f"Frame {self._number} of `{self.path}` cannot be read", _ADVICE):
+            array = self._data[self._number]
+            values = {key: column[self._number].item() for key, column in self._columns.items()}
+            first = float(self._columns["timestamp"][0]) if self._columns else math.nan
+        self._number += 1
+        if self.realtime and values:
+            self._wait(max(values["timestamp"] - first - (time.monotonic() - self._started), 0.0))
+        frame = {"number": self._number - 1, "timestamp": 0.0, **values}
+        return Frame(array=array, bit_depth=self._bits, mosaic=self._mosaic, **frame)  # type: ignore[arg-type]

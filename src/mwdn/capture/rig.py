@@ -1,0 +1,295 @@
+"""A simulated rig: a display in front of a lensless camera, for tests and for trying everything without hardware.
+
+All is known exactly: `Rig.homography` from the display's pixels to the measurement's, and `Rig.psf`.
+"""
+
+import math
+import random
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any, get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mwdn.capture.rig_view import view
+from mwdn.capture.screen import Picture, Pose, Projection, Screen, project
+from mwdn.capture.source import TIMEOUT_S, CameraSource, Frame
+from mwdn.data.mismatch import EXACT, Mismatch, shading
+from mwdn.data.random import seeded
+from mwdn.data.real_camera import RealCamera
+from mwdn.errors import CameraError, ParameterError, ShapeError, UnknownNameError
+from mwdn.io.raw import Mosaic
+from mwdn.io.toml import to_dataclass
+from mwdn.optics import Sensor, Variety, sample_camera
+from mwdn.types import Measurement, Psf
+
+EXPOSURE_S = 0.01
+"""Exposure at which a white display reaches `RigOptions.white` of the full scale, with a gain of 1."""
+
+NEAR, FAR = 1e-6, 1e4
+"""Exposures in seconds that the rig accepts; it does not wait for them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigOptions:
+    """The [rig] of a recipe: the true camera, its display's pose, and what goes wrong.
+
+    Args:
+        seed: of all randomness: two rigs of one seed deliver the same frames.
+        height: pixels of a measurement; raw frames of a mosaic have twice as many.
+        width: likewise.
+        family: kind of the mask, see `mwdn.optics.FAMILIES`; drawn if empty.
+        mosaic: colours of a 2 x 2 cell of raw frames, ``"rggb"``; RGB frames if empty.
+        fill: width of the display in the camera's view, over the frame's.
+        tilt_degrees: see `Pose`.
+        turn_degrees: see `Pose`.
+        offset_cm: see `Pose`.
+        display_gamma: light of the display is the coded number to this power.
+        display_black: light of a black pixel of the display, over that of a white one.
+        white: brightest pixel of a frame of a white display at `EXPOSURE_S`, over the full scale.
+        room_light: see `mwdn.data.mismatch.Mismatch`, as are the next five; relative to a white display. Each is fixed.
+        envelope_shift: likewise.
+        tails: likewise: stray light.
+        off_axis: likewise; takes five times as long.
+        hot_pixels: likewise.
+        vignetting: likewise.
+        full_well: of the sensor in electrons at a gain of 1, see `mwdn.optics.Sensor`.
+        read_noise: in electrons.
+        bit_depth: of the sensor.
+        black_level: of the sensor.
+        drift: standard deviation of the step by which the exposure's logarithm changes from frame to frame.
+        drop: probability that a frame is lost.
+        disconnect_every: frames after which the camera is disconnected, until it is opened again; 0 for never.
+        latency: frames after a change of the display that still show some of the picture before (a rolling shutter).
+        fps: frames per second; 0 for no waiting.
+
+    Raises:
+        ParameterError: a number is outside its range.
+    """
+
+    seed: int = 0
+    height: int = 160
+    width: int = 160
+    family: str = "contours"
+    mosaic: str = ""
+    fill: float = 0.6
+    tilt_degrees: tuple[float, float] = (4.0, -6.0)
+    turn_degrees: float = -1.3
+    offset_cm: tuple[float, float] = (0.6, -0.4)
+    display_gamma: float = 2.2
+    display_black: float = 0.001
+    white: float = 0.7
+    room_light: float = 0.02
+    envelope_shift: float = 0.0
+    tails: float = 0.0
+    off_axis: float = 0.0
+    hot_pixels: float = 0.0
+    vignetting: float = 0.0
+    full_well: float = 15_000.0
+    read_noise: float = 3.0
+    bit_depth: int = 12
+    black_level: float = 0.01
+    drift: float = 0.0
+    drop: float = 0.0
+    disconnect_every: int = 0
+    latency: int = 0
+    fps: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.mosaic and self.mosaic not in get_args(Mosaic):
+            raise UnknownNameError("mosaic", self.mosaic, get_args(Mosaic))
+        for name in ("fill", "white", "display_gamma"):
+            if not getattr(self, name) > 0:
+                raise ParameterError(f"`{name}` ({getattr(self, name)}) of the rig must be positive.")
+        if not 0 <= self.drop < 1:
+            raise ParameterError(f"`drop` ({self.drop}) must be in [0, 1): a probability.")
+        for name in ("drift", "disconnect_every", "latency", "fps", "display_black"):
+            if not getattr(self, name) >= 0:
+                raise ParameterError(f"`{name}` ({getattr(self, name)}) of the rig must not be negative.")
+
+    @property
+    def mismatch(self) -> Mismatch:
+        """How the true camera differs from a plain convolution."""
+        names = ("room_light", "envelope_shift", "tails", "off_axis", "hot_pixels", "vignetting")
+        return replace(EXACT, full=True, **{name: getattr(self, name) for name in names})
+
+
+class Rig(CameraSource):
+    """The camera of a simulated rig; `show` changes what its display shows.
+
+    Args:
+        options: the true camera.
+        screen: the display.
+        psf: (1, 3, height, width) of a point on the axis; one of ``family`` is drawn unless given.
+        picture: on the display at first, with the display's size; a point in its middle unless given.
+        timeout_s: has no effect.
+        wait: sleeps so many seconds.
+
+    Raises:
+        ShapeError: the PSF has another size.
+    """
+
+    def __init__(
+        self,
+        options: RigOptions = RigOptions(),
+        screen: Screen = Screen(),
+        *,
+        psf: Psf | None = None,
+        picture: Picture | None = None,
+        timeout_s: float = TIMEOUT_S,
+        wait: Callable[[float], None] = time.sleep,
+    ) -> None:
+        super().__init__("rig", timeout_s)
+        size = options.height, options.width
+        if psf is None:
+            variety = Variety(support=(0.5, 0.7), glow=(0.0, 0.1), halo=(0.0, 0.1), background=(0.0, 0.0))
+            psf = sample_camera(options.seed, size, family=options.family or None, variety=variety)
+        if psf.shape[1:] != (3, *size):
+            raise ShapeError(f"`psf` {tuple(psf.shape)} must be (1, 3, {size[0]}, {size[1]}), as `height` and `width`.")
+        self.options, self.screen = options, screen
+        self._real = RealCamera(options.mismatch, (options.seed,), (False,))
+        self.psf: Psf = self._real.psf(psf)
+        """(1, 3, H, W): the true response to a point on the axis."""
+        focal_px = options.fill * size[1] * screen.distance_cm / screen.width_cm
+        pose = Pose(tilt_degrees=options.tilt_degrees, turn_degrees=options.turn_degrees, offset_cm=options.offset_cm)
+        self.homography: Projection = project(screen, pose, size, focal_px)
+        """(3, 3), from the display's pixels (x, y, 1) to those of a measurement."""
+        self._noise, self._chance = seeded(options.seed), random.Random(options.seed)
+        self._wait, self._is_open, self._reads = wait, False, 0
+        self._shading = shading(options.mismatch, [seeded(options.seed)], size)
+        white = self._light(np.full((screen.height_px, screen.width_px, 3), 255, np.uint8))
+        self._room = self._real.lit(white) - white
+        self._scale = options.white / float((white + self._room).max())
+        self.exposure_s, self.gain, self._drift, self._number = EXPOSURE_S, 1.0, 0.0, -1
+        self._started, self._stale = 0.0, 0
+        self._shown = self._before = self._dark()
+        self.show(_point(screen) if picture is None else picture)
+        self._before, self._stale = self._shown, 0
+
+    def show(self, picture: Picture) -> None:
+        """Show a picture (H, W, 3) of the display's size, with the light of before in the next `latency` frames.
+
+        Raises:
+            ShapeError: it has another size.
+        """
+        if picture.shape != (self.screen.height_px, self.screen.width_px, 3):
+            wanted = f"{self.screen.height_px} x {self.screen.width_px} x 3"
+            raise ShapeError(f"`picture` {picture.shape} must have the display's size, {wanted}.")
+        self._before, self._shown, self._stale = self._shown, self._light(picture), self.options.latency
+
+    def open(self) -> None:
+        """Connect; after a disconnection, too."""
+        self._is_open, self._reads, self._started = True, 0, time.monotonic()
+        self._number = -1
+
+    def configure(self, exposure_s: float | None = None, gain: float | None = None) -> None:
+        """Set exposure in seconds and gain, a factor; both take effect at once.
+
+        Raises:
+            CameraError: not open, or a value outside of the rig's range.
+        """
+        if not self._is_open:
+            raise self.not_open()
+        if exposure_s is not None and not NEAR <= exposure_s <= FAR:
+            raise CameraError(f"{self.name} takes an `exposure_s` ({exposure_s:g}) from {NEAR:g} to {FAR:g} s.")
+        if gain is not None and not 1 <= gain <= 100:
+            raise CameraError(f"{self.name} takes a `gain` ({gain:g}) from 1 to 100.")
+        self.exposure_s = self.exposure_s if exposure_s is None else exposure_s
+        self.gain = self.gain if gain is None else gain
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._is_open = False
+
+    def read(self) -> Frame:
+        """The next frame.
+
+        Raises:
+            CameraError: not open, or disconnected.
+        """
+        if not self._is_open:
+            raise self.not_open()
+        options = self.options
+        self._reads += 1
+        if options.disconnect_every and self._reads > options.disconnect_every:
+            self._is_open = False
+            raise CameraError(f"{self.name} was disconnected after {options.disconnect_every:,} frames. Connect it.")
+        dropped = self._pass_frames()
+        self._number += 1 + dropped
+        self._drift += options.drift * self._chance.gauss(0, 1)
+        light = self._shown
+        if self._stale:  # rows from some row on were read out before the change
+            self._stale -= 1
+            rows = torch.arange(options.height)[:, None]
+            light = torch.where(rows < self._chance.randrange(options.height), light, self._before)
+        return Frame(
+            array=self._expose(light),
+            bit_depth=options.bit_depth,
+            mosaic=options.mosaic or None,  # type: ignore[arg-type]
+            exposure_s=self.exposure_s,
+            gain=self.gain,
+            timestamp=time.time(),
+            number=self._number,
+            dropped=dropped,
+        )
+
+    def _pass_frames(self) -> int:
+        """Wait for the next frame that is not lost; returns how many were."""
+        dropped = 0
+        while self._chance.random() < self.options.drop:
+            dropped += 1
+        if self.options.fps:
+            passed = int((time.monotonic() - self._started) * self.options.fps)
+            dropped = max(dropped, passed - self._number - 1)
+            self._wait(max((self._number + 1 + dropped) / self.options.fps + self._started - time.monotonic(), 0.0))
+        return dropped
+
+    def _dark(self) -> Measurement:
+        return torch.zeros(1, 3, self.options.height, self.options.width)
+
+    def _light(self, picture: Picture) -> Measurement:
+        """Light (1, 3, H, W) on the sensor of a picture on the display, without the room's."""
+        shown = (picture / np.float32(255)) ** self.options.display_gamma
+        shown = self.options.display_black + (1 - self.options.display_black) * shown
+        scene = view(shown.astype(np.float32), self.homography, (self.options.height, self.options.width))
+        return self._real.forward(scene, self.psf) * self._shading
+
+    def _expose(self, light: Measurement) -> Any:  # noqa: ANN401
+        options = self.options
+        electrons = self.exposure_s / EXPOSURE_S * math.exp(self._drift)
+        sensor = Sensor(options.full_well, options.read_noise, options.bit_depth, options.black_level)
+        if self.gain != 1:  # fewer electrons fill the converter's range
+            sensor = replace(sensor, full_well=sensor.full_well / self.gain)
+        signal = (light + self._room) * self._scale * electrons * self.gain
+        signal = self._real.heated(signal)
+        if options.mosaic:
+            signal = _mosaic(signal, options.mosaic)
+        captured = sensor.expose(signal.clamp(min=0), generator=self._noise)
+        counts = (captured * (1 - sensor.black_level) + sensor.black_level) * (2**sensor.bit_depth - 1)
+        dtype = np.uint8 if sensor.bit_depth <= 8 else np.uint16
+        return counts.round()[0].movedim(0, -1).contiguous().numpy().astype(dtype)
+
+
+def open_rig(**options: Any) -> Rig:  # noqa: ANN401
+    """A rig from the options of a camera's string: those of `RigOptions` and `Screen`, by their names."""
+    own = {name: options.pop(name) for name in ("timeout_s",) if name in options}
+    names = {part.name for part in fields(Screen)}
+    screen = {name: options.pop(name) for name in names & options.keys()}
+    return Rig(to_dataclass(RigOptions, "rig", options), to_dataclass(Screen, "display", screen), **own)
+
+
+def _point(screen: Screen) -> Picture:
+    from mwdn.capture.patterns import point
+
+    return point(screen)
+
+
+def _mosaic(light: Tensor, mosaic: str) -> Tensor:
+    """(1, 1, 2 H, 2 W) of (1, 3, H, W): each pixel becomes a cell, whose filters pass one colour each."""
+    cells = torch.empty(1, 1, 2 * light.shape[-2], 2 * light.shape[-1])
+    for number, letter in enumerate(mosaic):
+        cells[..., number // 2 :: 2, number % 2 :: 2] = light[:, "rgb".index(letter), None]
+    return cells

@@ -1,0 +1,75 @@
+"""Every kind of camera by its name, and the one string that opens one: ``aravis:Basler-2134,pixel_format=Mono12``."""
+
+import re
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any, NamedTuple
+
+from mwdn.capture.source import CameraSource
+from mwdn.errors import CameraError, UnknownNameError, check_options, reason
+from mwdn.io.toml import parse_value
+
+
+class Kind(NamedTuple):
+    """A kind of camera.
+
+    Args:
+        place: module in `mwdn.capture`, and class.
+        address: meaning of what follows the colon; empty if nothing does.
+        requires: how to install what it needs; empty for what the package has.
+    """
+
+    place: str
+    address: str
+    requires: str = ""
+
+
+SOURCES: Mapping[str, Kind] = {
+    "folder": Kind("folder:WatchedFolder", "a folder that another program writes frames to"),
+    "replay": Kind("recording:Replay", "an .h5 file of recorded frames or captured pairs"),
+    "rig": Kind("rig:open_rig", ""),
+}
+"""Kinds of cameras by name. Another one is one line here and one file."""
+
+
+def open_source(text: str, **options: Any) -> CameraSource:  # noqa: ANN401
+    """A camera from one string; use it in a ``with`` statement.
+
+    Args:
+        text: ``NAME``, ``NAME:ADDRESS`` or ``NAME:ADDRESS,option=value,...``: one of `SOURCES`, which camera of this
+            kind, and keyword arguments of its class.
+        **options: further keyword arguments.
+
+    Raises:
+        UnknownNameError: no such kind of camera, or option.
+        ParameterError: an option has another type or is outside its range.
+        CameraError: its driver is not installed, or the address is missing.
+    """
+    name, address, given = parse_source(text)
+    if name not in SOURCES:
+        raise UnknownNameError("camera", name, SOURCES)
+    kind = SOURCES[name]
+    if bool(address) != bool(kind.address):
+        needs = f"needs {kind.address}: `{name}:...`" if kind.address else f"has no address ('{address}'): `{name}`"
+        raise CameraError(f"The camera `{text}` {needs}.")
+    module, _, cls = kind.place.partition(":")
+    create = getattr(import_module(f"mwdn.capture.{module}"), cls)
+    options = {**given, **options}
+    check_options(create, f"the camera '{name}'", options)
+    return create(address, **options) if kind.address else create(**options)
+
+
+def parse_source(text: str) -> tuple[str, str, dict[str, Any]]:
+    """Name, address and options of a camera's string. An address may hold commas and colons."""
+    parts = text.split(",")
+    given: dict[str, Any] = {}
+    while len(parts) > 1 and re.fullmatch(r"[a-z_]+=.*", parts[-1], re.DOTALL):
+        key, _, value = parts.pop().partition("=")
+        given.setdefault(key, parse_value(value))
+    name, _, address = ",".join(parts).partition(":")
+    return name, address, given
+
+
+def missing_driver(name: str, error: BaseException) -> CameraError:
+    """The error of a camera whose library cannot be imported."""
+    return CameraError(f"Cameras of the kind `{name}` need {SOURCES[name].requires} ({reason(error)}).")

@@ -1,0 +1,178 @@
+"""Cameras from one string; recordings; folders with half-written files."""
+
+import shutil
+
+import h5py
+import numpy as np
+import pytest
+
+from mwdn.capture import SOURCES, CameraSource, Frame, open_source
+from mwdn.capture.folder import WatchedFolder
+from mwdn.capture.recording import record
+from mwdn.capture.source import check_like
+from mwdn.capture.sources import parse_source
+from mwdn.errors import CameraError, ImageError, ParameterError, UnknownNameError
+from mwdn.io.images import write_frame
+from mwdn.runtime.streams import latest
+
+
+def frame(number=0, shape=(6, 8, 1), **metadata):
+    array = np.random.default_rng(number).integers(0, 4096, shape, np.uint16)
+    values = {"bit_depth": 12, "mosaic": "rggb", "exposure_s": 0.5, "gain": 2.0, "timestamp": 100.0 + number}
+    return Frame(**{"array": array, "number": number, **values, **metadata})
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("rig", ("rig", "", {})),
+        ("rig,seed=3,family=contours", ("rig", "", {"seed": 3, "family": "contours"})),
+        ("v4l2:0", ("v4l2", "0", {})),
+        ("folder:/a,b/c:d", ("folder", "/a,b/c:d", {})),
+        ("folder:/a,b,bit_depth=12,mosaic=rggb", ("folder", "/a,b", {"bit_depth": 12, "mosaic": "rggb"})),
+        ("replay:a=b.h5,loop=true", ("replay", "a=b.h5", {"loop": True})),
+    ],
+)
+def test_a_string_names_a_camera(text, parts):
+    assert parse_source(text) == parts
+
+
+def test_wrong_strings_are_named(tmp_path):
+    with pytest.raises(UnknownNameError, match="'rigg'"):
+        open_source("rigg")
+    with pytest.raises(CameraError, match="folder"):
+        open_source("folder")
+    with pytest.raises(CameraError, match="no address"):
+        open_source("rig:3")
+    with pytest.raises(UnknownNameError, match="sed"):
+        open_source("rig,sed=3")
+    with pytest.raises(ParameterError, match="loop"):
+        open_source("replay:a.h5,loop=maybe")
+    with pytest.raises(CameraError, match="not a folder"), open_source(f"folder:{tmp_path / 'none'}"):
+        pass
+
+
+def test_the_rig_is_a_camera_like_any_other():
+    with open_source("rig,height=32,width=48,seed=5,bit_depth=8") as camera:
+        assert isinstance(camera, CameraSource)
+        camera.configure(exposure_s=1.0)
+        assert camera.read().array.shape == (32, 48, 3)
+        newest = latest(camera)
+        assert next(newest).array.dtype == np.uint8
+        newest.close()
+
+
+def test_what_is_recorded_is_played_to_the_bit(tmp_path):
+    path, frames = tmp_path / "frames.h5", [frame(number) for number in range(5)]
+    with record(path, camera="v4l2:0", commit_every=2) as recorder:
+        for each in frames:
+            recorder.append(each)
+        assert len(recorder) == 5
+    with h5py.File(path) as file:
+        assert file.attrs["camera"] == "v4l2:0"
+    with open_source(f"replay:{path}") as camera:
+        for each in frames:
+            played = camera.read()
+            assert np.array_equal(played.array, each.array)
+            metadata = [{**vars(one), "array": None} for one in (played, each)]
+            assert metadata[0] == metadata[1]
+        with pytest.raises(CameraError, match="5 frames"):
+            camera.read()
+    with open_source(f"replay:{path},loop=true") as camera:
+        assert [camera.read().number for _ in range(7)] == [0, 1, 2, 3, 4, 0, 1]
+
+
+def test_a_recording_waits_as_long_as_it_was_recorded(tmp_path):
+    with record(tmp_path / "a.h5") as recorder:
+        for number in range(3):
+            recorder.append(frame(number, timestamp=50.0 + 100 * number))
+    waits = []
+    with open_source(f"replay:{tmp_path / 'a.h5'}", realtime=True, wait=waits.append) as camera:
+        for _ in range(3):
+            camera.read()
+    assert waits == pytest.approx([0, 100, 200], abs=30)
+
+
+def test_a_recording_that_was_torn_keeps_its_committed_frames(tmp_path):
+    path = tmp_path / "frames.h5"
+    with record(path, commit_every=1) as recorder:
+        for number in range(3):
+            recorder.append(frame(number))
+        shutil.copy(path, tmp_path / "copy.h5")
+    with open_source(f"replay:{tmp_path / 'copy.h5'}") as camera:
+        assert [camera.read().number for _ in range(3)] == [0, 1, 2]
+
+
+def test_frames_of_another_size_are_refused_and_the_others_kept(tmp_path):
+    path = tmp_path / "frames.h5"
+    with pytest.raises(CameraError, match=r"8, 8"), record(path) as recorder:  # noqa: PT012
+        recorder.append(frame(0))
+        recorder.append(frame(1, shape=(8, 8, 1)))
+    with open_source(f"replay:{path}") as camera:
+        assert camera.read().number == 0
+    with pytest.raises(CameraError, match="14 bits"):
+        check_like(frame(0, bit_depth=14), frame(0), "it")
+
+
+def test_files_without_frames_are_no_recording(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["frames"] = np.zeros((2, 3, 4, 1), np.float32)
+    with pytest.raises(ImageError, match="no raw frames"), open_source(f"replay:{tmp_path / 'a.h5'}"):
+        pass
+
+
+def numbered(folder, number):
+    pixels = np.full((4, 5, 1), number, np.uint16)
+    write_frame(folder / f"{number}.png", pixels)
+    return folder / f"{number}.png"
+
+
+def test_a_folder_gives_each_file_once_in_the_order_of_writing(tmp_path):
+    for number in (2, 1):
+        numbered(tmp_path, number)
+    (tmp_path / "notes.txt").write_text("no frame")
+    with open_source(f"folder:{tmp_path},bit_depth=12", timeout_s=0.2) as camera:
+        frames = [camera.read() for _ in range(2)]
+        assert [int(each.array[0, 0, 0]) for each in frames] == [2, 1]
+        assert [each.number for each in frames] == [0, 1]
+        assert frames[0].bit_depth == 12
+        with pytest.raises(CameraError, match=r"0\.2 s"):
+            camera.read()
+        numbered(tmp_path, 3)
+        assert int(camera.read().array[0, 0, 0]) == 3
+
+
+def test_files_that_were_there_before_can_be_skipped(tmp_path):
+    numbered(tmp_path, 1)
+    with WatchedFolder(tmp_path, existing=False) as camera:
+        numbered(tmp_path, 2)
+        assert int(camera.read().array[0, 0, 0]) == 2
+
+
+def test_a_half_written_file_is_waited_for(tmp_path):
+    whole = numbered(tmp_path, 7).read_bytes()
+    part, waited = tmp_path / "7.png", []
+    part.write_bytes(whole[: len(whole) // 2])
+
+    def wait(seconds):
+        waited.append(seconds)
+        if len(waited) == 6:
+            part.write_bytes(whole)
+
+    with WatchedFolder(tmp_path, wait=wait) as camera:
+        assert int(camera.read().array[0, 0, 0]) == 7
+    assert len(waited) >= 7
+
+
+def test_a_damaged_file_is_named_and_the_next_one_read(tmp_path):
+    (tmp_path / "1.png").write_bytes(numbered(tmp_path, 1).read_bytes()[:50])
+    with WatchedFolder(tmp_path, wait=lambda _: None) as camera:
+        with pytest.raises(ImageError, match=r"1\.png"):
+            camera.read()
+        numbered(tmp_path, 2)
+        assert int(camera.read().array[0, 0, 0]) == 2
+
+
+def test_every_kind_of_camera_can_be_imported():
+    for name, kind in SOURCES.items():
+        assert kind.place.count(":") == 1, name
