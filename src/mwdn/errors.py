@@ -45,7 +45,6 @@ _COUNTS = {2: "two", 3: "three"}
 
 _Checked = TypeVar("_Checked", bound=Callable[..., Any])
 
-
 LONGEST = 300
 """Characters of a message at most."""
 
