@@ -118,8 +118,10 @@ BAD_ARRAYS = {
     "YCbCr": (Image.fromarray(eight(PICTURE)).convert("YCbCr"), "YCbCr"),
     "bilevel": (Image.fromarray(eight(PICTURE)).convert("1"), "1"),
     "path": ("capture.png", "`capture.png` is a path"),
-    "None": (None, "object"),
+    "None": (None, "None"),
 }
+AXES = {"ragged list", "batch", "batch of one", "video", "row", "channels first", "two channels", "RGBA"}
+"""Bad arrays with wrong axes; the others hold numbers of another type."""
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -130,6 +132,7 @@ def test_what_is_no_frame_is_named(name, bad):
     with pytest.raises(ImageError) as caught:
         TAKE_ARRAYS[name](value)
     assert named in str(caught.value)
+    assert isinstance(caught.value, ShapeError if bad in AXES else TypeError)
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -7,6 +7,8 @@
     ├── ParameterError (ValueError)    a number or an option outside its range
     │   └── UnknownNameError           a name that no method, network or recipe key has
     ├── ImageError (ValueError)        a picture or frame that cannot be read or written
+    │   ├── FrameShapeError            an array or file with other axes than a frame; also a ShapeError
+    │   └── FrameTypeError             with numbers of another type, or no array at all; also a TypeError
     ├── PsfError (ValueError)          a PSF that no reconstruction can trust
     ├── CheckpointError (ValueError)   weights that are damaged or belong to something else
     ├── ExportError                    a method that cannot be exported, or gives other results after export
@@ -42,7 +44,6 @@ _WORDS = {
     NoneType: "none",
 }
 _COUNTS = {2: "two", 3: "three"}
-
 _Checked = TypeVar("_Checked", bound=Callable[..., Any])
 
 LONGEST = 300
@@ -271,6 +272,14 @@ def check_light(image: Any, name: str) -> None:  # noqa: ANN401
 
 class ImageError(MwdnError, ValueError):
     """A picture or a frame cannot be read or written; the message names the file."""
+
+
+class FrameShapeError(ImageError, ShapeError):
+    """An array or a file has other axes than one frame: (H, W) or (H, W, 1 or 3 channels)."""
+
+
+class FrameTypeError(ImageError, TypeError):
+    """An array or a file holds numbers of another type than a frame, or there is no array at all."""
 
 
 class PsfError(MwdnError, ValueError):

@@ -10,7 +10,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from mwdn.errors import ImageError, cut, one_line, reason, shown
+from mwdn.errors import FrameShapeError, FrameTypeError, ImageError, cut, one_line, reason, shown
 from mwdn.io.decoder_messages import decoder_messages
 from mwdn.io.headers import COPY_AGAIN, START, check_decoded, check_whole, picture_claim
 from mwdn.io.npy import read_npy
@@ -53,7 +53,7 @@ def read(path: Path, *, photograph: bool) -> Frame:
         try:
             return _read(file, photograph)
         except ImageError as error:
-            raise ImageError(f"`{path}` {error}") from error
+            raise type(error)(f"`{path}` {error}") from error
         except OSError as error:
             raise ImageError(f"`{path}` cannot be read: {error.strerror or reason(error)}. {COPY_AGAIN}") from error
         except Exception as error:  # a damaged file makes tifffile, numpy and OpenCV raise anything
@@ -124,7 +124,7 @@ def _check_claim(kind: str, start: bytes, size: int) -> tuple[int, int, int]:
 def _frame_shape(shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, ...]:
     """(H, W, C) of a stored array; its header is checked before memory is allocated."""
     if dtype.kind != "f" and dtype.str[1:] not in ("u1", "u2"):
-        raise ImageError(
+        raise FrameTypeError(
             f"holds {dtype}; a frame has uint8, uint16 or floats. Convert it: "
             "`frame.astype('uint16')`; integers are divided by their type's maximum, floats are taken as they are."
         )
@@ -133,9 +133,10 @@ def _frame_shape(shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, ...
         axes = axes[1:]
     axes = (*axes, 1) if len(axes) == 2 else axes
     if len(axes) != 3 or axes[2] not in (1, 3, 4) or min(axes) < 1:
-        raise ImageError(
-            f"has the shape ({' x '.join(map(str, shape))}); one frame is (H, W) or (H, W, 1 or 3 channels). For "
-            "channels first: `array.transpose(1, 2, 0)`."
+        way_out = " The first one: `array[0]`." if len(axes) > 3 else ""
+        way_out = " For channels first: `array.transpose(1, 2, 0)`." if axes[:1] in ((3,), (4,)) else way_out
+        raise FrameShapeError(
+            f"has the shape ({' x '.join(map(str, shape))}); one frame is (H, W) or (H, W, 1 or 3 channels).{way_out}"
         )
     if axes[0] * axes[1] > MAX_PIXELS:
         raise ImageError(f"claims {axes[0]:,} x {axes[1]:,} pixels; at most {MAX_PIXELS:,} are read. Crop it.")
@@ -169,32 +170,35 @@ def as_frame(picture: ArrayPicture, *, finite: bool = True) -> Frame:
         finite: refuse NaN and infinity.
 
     Raises:
-        ImageError: other axes, for example a batch; alpha; other types, for example int32; NaN or infinity; a path; a
-            tensor; a PIL picture of another mode.
+        FrameShapeError: other axes, for example a batch or alpha.
+        FrameTypeError: numbers of other types, for example int32; a path; a tensor; a PIL picture of another mode.
+        ImageError: NaN or infinity.
     """
     if isinstance(picture, str | Path):
-        raise ImageError(f"`{picture}` is a path, not a frame: `mwdn.read_frame('{picture}')`.")
+        raise FrameTypeError(f"`{picture}` is a path, not a frame: `mwdn.read_frame('{picture}')`.")
     if hasattr(picture, "is_floating_point"):  # axes and scale of a tensor are others
-        raise ImageError(
+        raise FrameTypeError(
             f"A frame ({shown(picture)}) must be an array (H, W, C), not a tensor: `tensor.movedim(0, -1).numpy()` for "
             "one (C, H, W). A tensor (B, C, H, W) of floats is a measurement already."
         )
     mode = getattr(picture, "mode", "L")
     if mode not in _PIL_MODES:
-        raise ImageError(f"The picture (mode {mode}) must be grey or RGB. Convert it: `picture.convert('RGB')`.")
+        raise FrameTypeError(f"The picture (mode {mode}) must be grey or RGB. Convert it: `picture.convert('RGB')`.")
     try:
         stored = np.asarray(picture)
     except ValueError as error:  # lists of other lengths
-        raise ImageError(f"A frame ({shown(picture)}) must be an array (H, W, C): {reason(error)}.") from error
+        raise FrameShapeError(f"A frame ({shown(picture)}) must be an array (H, W, C): {reason(error)}.") from error
     try:
+        if stored.dtype == object:
+            raise FrameTypeError(f"({shown(picture)}) must hold numbers: uint8, uint16 or floats, (H, W) or (H, W, C).")
         if stored.ndim > 3:
-            shape = " x ".join(map(str, stored.shape))
-            raise ImageError(f"has the shape ({shape}), a frame (H, W) or (H, W, C). For the first one: `array[0]`.")
+            axes = " x ".join(map(str, stored.shape))
+            raise FrameShapeError(f"has the shape ({axes}), one frame (H, W) or (H, W, C). The first one: `array[0]`.")
         if stored.ndim == 3 and stored.shape[2] == 4:
-            raise ImageError(f"{stored.shape} has four channels, a frame 1 or 3. Without alpha: `array[..., :3]`.")
+            raise FrameShapeError(f"{stored.shape} has four channels, a frame 1 or 3. Without alpha: `array[..., :3]`.")
         frame = _to_frame(stored, _frame_shape(stored.shape, stored.dtype), copy=False)
     except ImageError as error:
-        raise ImageError(f"The array {error}") from error
+        raise type(error)(f"The array {error}") from error
     if finite and frame.dtype.kind == "f" and not np.isfinite(frame).all():
         raise ImageError("The array holds NaN or infinity. Replace them: `numpy.nan_to_num`.")
     return frame
