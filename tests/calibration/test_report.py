@@ -63,6 +63,7 @@ def test_background_is_reported(tmp_path, psf):
     share = 0.1 * SIZE[0] * SIZE[1] / (frame / 65535).sum((0, 1)).min()
     assert report.levels.pedestal == pytest.approx(share, rel=0.02)
     assert [finding.weight for finding in said(report, "0.100", "was subtracted")] == ["mind"]
+    assert said(report_of(tmp_path, frame, background=0.05), "0.100", "found, and 0.050, 0.050, 0.050 subtracted")
     kept = report_of(tmp_path, frame, background=0.0)
     assert said(kept, "0.100", "was kept", "--background 0")
     assert said(kept, "at 0.10 of the full scale", "--dark")

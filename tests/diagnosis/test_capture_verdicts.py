@@ -10,6 +10,7 @@ from mwdn.diagnosis.captures import ambient_light, darkness, saturation
 from mwdn.diagnosis.noise import noise, noise_bounds
 from mwdn.diagnosis.trust import examine_picture
 from mwdn.optics.camera import Camera
+from mwdn.solvers.admm import Admm
 from mwdn.solvers.pyramid import Pyramid
 
 SIZE = (96, 104)
@@ -82,8 +83,21 @@ def test_noise_is_no_capture(calibration):
     trust = examine_picture(measurement, calibration.psf, Pyramid()(measurement, calibration.psf))
     assert [verdict.state for verdict in trust.verdicts] == ["unknown", "unknown"]
     assert not trust.doubtful
+    assert trust.sentence.startswith("the picture cannot be judged: only ")
     assert trust.sentence.endswith("; this capture cannot judge the PSF")
     assert trust.content["possible"] < 0.03
+
+
+def test_the_verdict_on_the_psf_does_not_depend_on_the_regularisation(light, calibration):
+    measurement = with_noise(light, 0.002)
+    smooth, sharp = (
+        examine_picture(
+            measurement, calibration.psf, Admm(regularisation=tau, iterations=5)(measurement, calibration.psf)
+        )
+        for tau in (1e-2, 1e-6)
+    )
+    assert smooth.consistency.explained < 0.9 * sharp.consistency.explained
+    assert smooth.orientation == sharp.orientation
 
 
 def test_picture_of_something_else_is_doubted(light, calibration):

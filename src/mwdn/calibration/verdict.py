@@ -71,9 +71,10 @@ def _levels(report: PsfReport) -> Iterator[Finding]:
 def _background(levels: Levels) -> Iterator[Finding]:
     # Floats have no full scale: levels are relative to their brightest pixel.
     scale, unit = (1.0, "full scale") if levels.integers else (levels.peak, "brightest pixel")
-    level = ", ".join(f"{value / scale:.3f}" for value in levels.background)
+    level, subtracted = (
+        ", ".join(f"{value / scale:.3f}" for value in values) for values in (levels.background, levels.subtracted)
+    )
     if levels.integers and levels.between - max(levels.subtracted, default=0.0) > 0.05 * levels.peak:
-        subtracted = ", ".join(f"{value:.3f}" for value in levels.subtracted)
         text = (
             f"Between its lines the PSF is at {levels.between:.2f} of the full scale, but "
             + (f"only {subtracted} was subtracted" if any(levels.subtracted) else "no background was subtracted")
@@ -88,9 +89,11 @@ def _background(levels: Levels) -> Iterator[Finding]:
         )
         yield Finding("bad" if levels.pedestal > 0.3 else "mind", text)
     elif levels.pedestal > 0.02:
+        whole = max(abs(a - b) for a, b in zip(levels.background, levels.subtracted, strict=True)) < 0.005 * scale
         text = (
             f"A uniform background of {level} of the {unit}, {_percent(levels.pedestal)} of the file's light, was "
-            "subtracted. Other programs that use this file must do the same."
+            f"{'subtracted' if whole else f'found, and {subtracted} subtracted'}. Other programs that use this file "
+            "must do the same."
         )
         yield Finding("mind", text)
     else:

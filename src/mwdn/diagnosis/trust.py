@@ -46,9 +46,12 @@ class Trust:
 
     @property
     def sentence(self) -> str:
-        """A one-line summary, which says so if the PSF cannot be judged."""
-        unknown = self.orientation.verdict.state == "unknown"
-        return self.consistency.sentence + "; this capture cannot judge the PSF" * unknown
+        """A one-line summary, which says so if the picture or the PSF cannot be judged."""
+        psf, picture = self.verdicts
+        text = self.consistency.sentence
+        if picture.state == "unknown":  # neither do the numbers of noise mean anything, nor does the pose that fits it
+            text = picture.text[0].lower() + picture.text[1:].rstrip(".")
+        return text + "; this capture cannot judge the PSF" * (psf.state == "unknown")
 
     @property
     def content(self) -> dict[str, object]:
