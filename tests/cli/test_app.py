@@ -233,6 +233,7 @@ def test_o_is_out(run, command):
         ("train a.toml b.toml", "Too many arguments: b.toml."),
         ("demo --pictures dog", "`--pictures` (dog) must be astronaut, coffee or cat."),
         ("design --mask a.npy --pitch-um x", "`--pitch-um` (x) must be a number or none."),
+        ("design lens", "No mask named 'lens'. Did you mean 'lenslets'? Known: array, "),
     ],
 )
 def test_parser_speaks_as_the_commands_do(run, line, message):

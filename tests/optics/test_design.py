@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -150,6 +151,10 @@ def test_a_mask_from_a_file(run, tmp_path):
         assert about["made"] == json.loads((tmp_path / "cam/camera.json").read_text())["made"]
     code, _, err = run("--mask", "cam/mask.tif", *SMALL)
     assert (code, "would overwrite an input" in err) == (2, True)
+    np.save(tmp_path / "heights.npy", np.eye(8))
+    for line in (["array", "--mask", "heights.npy"], ["--mask", "heights.npy"]):
+        assert "`--values height --pitch-um 2`" in run(*line, *SMALL)[2]
+    assert "--values" in run("--mask", "heights.npy", "--help")[1]
 
 
 def test_designed_camera_keeps_its_light():

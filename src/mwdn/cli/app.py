@@ -103,6 +103,7 @@ def _run(arguments: list[str], received: Sequence[int]) -> int:
     chosen = {name: not {name, short}.isdisjoint(arguments) for name, short in GLOBAL.items()}
     arguments = [argument for argument in arguments if argument not in {*GLOBAL, *GLOBAL.values()}]
     command = next((argument for argument in arguments if argument in COMMANDS), None)
+    arguments = _own_mask(arguments) if command == "design" else arguments
     keep_memory()
     app = make_app(command)
     terminal.set_up(
@@ -125,6 +126,14 @@ def _run(arguments: list[str], received: Sequence[int]) -> int:
         terminal.complain("[bold red]Error:[/]", error)
         return 2
     return result if isinstance(result, int) else 0
+
+
+def _own_mask(arguments: list[str]) -> list[str]:
+    """`mwdn design --mask FILE` is short for `mwdn design array --mask FILE`."""
+    first = arguments.index("design") + 1
+    has_mask = any(argument.partition("=")[0] == "--mask" for argument in arguments)
+    is_short = has_mask and arguments[first].startswith("-")
+    return [*arguments[:first], "array", *arguments[first:]] if is_short else arguments
 
 
 def _options(app: App, arguments: list[str]) -> set[str]:

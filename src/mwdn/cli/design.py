@@ -25,7 +25,8 @@ def _recipe(app: App, commands: tuple[str, ...], arguments: Any) -> None:  # noq
 
 design = App(
     name="design",
-    help="Design a mask and compute the PSF of a camera with it.",
+    help="Design a mask and compute the PSF of a camera with it.\n\nYour own mask: mwdn design --mask array.npy, short "
+    "for mwdn design array --mask array.npy.",
     config=_recipe,
 )
 
@@ -108,10 +109,7 @@ def array(
 
 @design.default
 def default(*tokens: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)]) -> None:
-    """`mwdn design --mask FILE` is short for `mwdn design array --mask FILE`."""
-    if any(token.partition("=")[0] == "--mask" for token in tokens):
-        design(("array", *tokens), exit_on_error=False, print_error=False)
-    elif tokens:
+    """Print the help, or refuse an unknown kind of mask."""
+    if tokens:
         raise UnknownNameError("mask", tokens[0], [*MASKS, "array"])
-    else:
-        design.help_print()
+    design.help_print()

@@ -95,7 +95,7 @@ def read_text(path: str | Path, *, most: int = TEXT_BYTES, error: type[MwdnError
     """
     content = read_bytes(path, most=most, error=error)
     try:
-        return content.decode()
+        return content.decode("utf-8-sig")  # editors on Windows write a byte order mark
     except UnicodeDecodeError as wrong:
         raise error(f"`{path}` must be text in UTF-8, but byte {wrong.start:,} is not. Save it as UTF-8.") from wrong
 
