@@ -63,6 +63,11 @@ def test_text_keeps_what_it_holds(tmp_path: Path) -> None:
     assert read_text(put(tmp_path / "a.txt", "é\n".encode())) == "é\n"
 
 
+def test_a_byte_order_mark_is_no_text(tmp_path: Path) -> None:
+    """Editors on Windows write one: a camera file had an invalid statement in column 1."""
+    assert read_toml(put(tmp_path / "a.toml", b'\xef\xbb\xbfpsf = "psf.png"\r\n')) == {"psf": "psf.png"}
+
+
 def test_an_array_is_read_into_memory(tmp_path: Path) -> None:
     """A file that shrank while it was mapped ended the process by SIGBUS."""
     path = put(tmp_path / "a.npy", npy(np.arange(6.0).reshape(2, 3)))
