@@ -88,6 +88,14 @@ def test_noise_is_no_capture(calibration):
     assert trust.content["possible"] < 0.03
 
 
+@pytest.mark.parametrize("levels", [0, 3])
+def test_a_frame_of_few_levels_does_not_doubt_the_psf(levels, light, calibration):
+    """Saturated everywhere, or dark: its PSF, the right one, was another camera's."""
+    measurement = (light * levels / light.max()).round() if levels else torch.ones_like(light)
+    assert noise_bounds(measurement).high == 1
+    assert examine_picture(measurement, calibration.psf, measurement).verdicts[0].state != "doubt"
+
+
 def test_the_verdict_on_the_psf_does_not_depend_on_the_regularisation(light, calibration):
     measurement = with_noise(light, 0.002)
     smooth, sharp = (

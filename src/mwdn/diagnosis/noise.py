@@ -14,6 +14,9 @@ from mwdn.types import Frame, Image, Measurement
 JPEG_EDGES = 1.1
 """`block_edges` of JPEG files is above: 1.2 and more at qualities 85 to 95, 1.06 and less without."""
 
+LEAST_LEVELS = 16
+"""Different numbers in a frame below which rounding hides its detail and its noise."""
+
 
 class NoiseBounds(NamedTuple):
     """Least and greatest part of a capture's detail that may be noise."""
@@ -28,7 +31,7 @@ def noise_bounds(measurement: Measurement) -> NoiseBounds:
     White noise is estimated from the finest detail, twice: of single pixels, and of means of 2 x 2, which have half of
     it. Noise that is correlated, by an interpolated mosaic, is smaller in single pixels only, and a sharp capture has
     detail of its own in the means. So the two are bounds. JPEG removes fine noise and leaves its coarse part: no upper
-    bound.
+    bound. Nor have frames of few levels, dark or saturated ones, whose rounding is no white noise.
 
     Args:
         measurement: (1, C, H, W).
@@ -38,7 +41,9 @@ def noise_bounds(measurement: Measurement) -> NoiseBounds:
     single = float(noise_level(b).square().sum())
     pairs = 4 * float(noise_level(F.avg_pool2d(b, 2)).square().sum()) if min(b.shape[-2:]) > 1 else single
     low, high = (min(1.0, variance / energy) for variance in sorted((single, pairs)))
-    return NoiseBounds(low, 1.0 if block_edges(b) > JPEG_EDGES else high)
+    some = b.flatten()[:: max(1, b.numel() // 100_000)]
+    is_unbounded = len(some.unique()) < LEAST_LEVELS or block_edges(b) > JPEG_EDGES
+    return NoiseBounds(low, 1.0 if is_unbounded else high)
 
 
 def block_edges(image: Image) -> float:
