@@ -56,6 +56,15 @@ def test_pose_is_estimated_from_the_capture_alone(psf, scenes, degrees, scale):
     torch.testing.assert_close(pose.scale, torch.full((2,), scale - 1), rtol=0, atol=0.003)
 
 
+def test_a_fall_off_of_the_sensor_is_not_taken_for_a_smaller_psf(psf, scenes):
+    """20 % less light in the corners; without eq. (2)'s fall-off the scale would be 0.4 % too small."""
+    y, x = torch.meshgrid(*(torch.linspace(-1, 1, length) for length in SIZE), indexing="ij")
+    fall_off = 1 - 0.2 * (x.square() + y.square()) / 2
+    pose = align(fall_off * captured(turned(psf, 0.5, 1.0), scenes), psf)
+    torch.testing.assert_close(pose.turn_degrees, torch.full((2,), 0.5), rtol=0, atol=0.15)
+    assert pose.scale.abs().max() < 0.002
+
+
 def test_turned_psf_is_scipys(psf):
     moved = Pose(torch.tensor([2.0, -3.0]), torch.tensor([0.03, -0.02])).move(psf)
     for one, expected in zip(moved, (turned(psf, 2.0, 1.03), turned(psf, -3.0, 0.98)), strict=True):

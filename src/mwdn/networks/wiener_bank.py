@@ -218,7 +218,8 @@ class WienerBank(Network[BankTransfers]):
         rows, columns = (-(-size // self.fold) for size in (height, width))
         inputs = pixel_unshuffle(estimates[:, : self.pictures], self.fold).div_(unit)
         if self.has_evidence:
-            light, numbers = F.avg_pool2d(estimates[:, self.pictures :], self.fold).split([self.channels, NUMBERS], 1)
+            evidence = F.avg_pool2d(estimates[:, self.pictures :], self.fold)
+            light, numbers = evidence[:, : self.channels], evidence[:, self.channels :]
             inputs = torch.cat([inputs, light / unit, numbers], dim=1)
         correction = self._lit(self.decoder(self.encoder(inputs))[..., :rows, :columns])
         return first + unit * F.pixel_shuffle(correction, self.fold)[..., :height, :width]

@@ -3,9 +3,11 @@
 The capture b is a scene v through a PSF of pose theta = (turn, scale). Variable projection eliminates the scene:
 
 1. ``v(theta) = argmin |C H(theta) v - b|^2 + tau |Psi v|_1`` over ``v >= 0``, by a short pyramid
-2. ``r(theta) = high_pass(b - C H(theta) v(theta))``
+2. ``r(theta) = high_pass(b - g C H(theta) v(theta))``, g the sensor's fall-off: a quadratic polynomial, least squares
 3. ``E(theta) = |r(theta)|^2``, smooth in theta and least at the true pose: a wrong PSF leaves a larger residual for
    every scene
+
+Without g in (2), a smaller PSF would imitate a fall-off: one of 20 % to the corners moves the scale by 2.5 %.
 
 Gauss-Newton steps minimise E with a Gaussian prior of standard deviations S on theta:
 
@@ -73,6 +75,7 @@ SMOOTH_LEVELS = (
     Level(1, 8, Penalties(0.1, 1.5, 1.5), 0.02, min_smoothing=0.2),
 )
 _HIGH_PASS = 0.03  # cycles per pixel: below, most of the residual is ambient light and unconverged iterations
+_MOST_FALL_OFF = 0.25  # of any polynomial: of x^2 + y^2, which is 2 in the corners, half of the light lost there
 _REACH = 16  # pixels, three standard deviations of the Gaussian of `_HIGH_PASS`
 _PRIOR = (0.5, 0.01)  # standard deviations S of a calibration's errors: degrees and relative magnification
 _DELTA = (0.1, 0.002)  # finite differences
@@ -180,9 +183,28 @@ def _residual(measurement: Tensor, psf: Psf, poses: Tensor) -> Tensor:
     psfs = psf.expand(len(measurement), -1, -1, -1).repeat_interleave(count, 0)
     moved = Pose(*poses.flatten(0, 1).unbind(-1)).move(psfs)
     estimate = solve(measurement.repeat_interleave(count, 0), halve_psf(moved), SMOOTH_LEVELS)
-    grid = estimate.psf.bands[-1].grid
+    grid, size = estimate.psf.bands[-1].grid, (measurement.shape[-2], measurement.shape[-1])
     high = 1 - _low_pass(grid, _HIGH_PASS, measurement.device)
-    return inverse_spectrum(estimate.residual_spectrum * high, grid, grid).reshape(len(measurement), count, -1)
+    r = inverse_spectrum(estimate.residual_spectrum * high, grid, size)
+    p = inverse_spectrum(spectrum(estimate.measurement - estimate.residual, grid) * high, grid, size)
+    return _without_fall_off(r, p).reshape(len(measurement), count, -1)
+
+
+def _without_fall_off(r: Tensor, p: Tensor) -> Tensor:
+    """The part (N, C, H, W) of a residual r that no fall-off explains: ``r - sum_k a_k q_k p``, a by least squares.
+
+    The polynomials q are smooth, so that the high-passed product with a prediction is q times the high-passed
+    prediction p. A fall-off of more than `_MOST_FALL_OFF` is not a sensor's: such a residual stays as it is.
+    """
+    y, x = (torch.linspace(-1, 1, length, device=r.device) for length in r.shape[-2:])
+    y, x = torch.meshgrid(y, x, indexing="ij")
+    q = torch.stack([torch.ones_like(x), x, y, x * y, x.square() - y.square(), x.square() + y.square()])
+    A = (q[:, None] * p[:, None]).flatten(2)
+    normal = A @ A.mT
+    ridge = (1e-6 * normal.diagonal(dim1=-2, dim2=-1).mean(-1)).clamp(min=1e-30)[:, None, None]
+    a = torch.linalg.solve(normal + ridge * torch.eye(len(q)).to(r), A @ r.flatten(1)[..., None])
+    a = torch.where(a.abs().amax(1, keepdim=True) < _MOST_FALL_OFF, a, 0.0)
+    return r - (a.mT @ A)[:, 0].reshape(r.shape)
 
 
 def halve_psf(psf: Psf) -> Tensor:
