@@ -7,19 +7,26 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from mwdn.calibration.frame_format import FrameFormat
+from mwdn.calibration.place_files import PlaceFiles
 from mwdn.calibration.psf_format import PsfFormat
 from mwdn.calibration.white_balance import WhiteBalance
 from mwdn.errors import ParameterError, PsfError, UnknownNameError, fits_type
 from mwdn.io.files import as_parameter_error, atomic, file_sha256
 from mwdn.io.toml import read_toml
+from mwdn.optics.sensor import Sensor
 
 _TYPES: dict[str, Any] = {
-    **dict.fromkeys(("psf", "psf_sha256", "dark", "ambient"), str),
+    **dict.fromkeys(("psf", "psf_sha256", "dark", "ambient", "flat_field", "hot_pixels"), str),
+    "psf_corrected": bool,
     **get_type_hints(PsfFormat),
     **get_type_hints(FrameFormat),
     "white_balance": WhiteBalance,
     "pitch_um": float,
     "distance_mm": float,
+    **dict.fromkeys(("electrons_per_count", "read_noise_electrons", "full_well_electrons", "black_level"), float),
+    **dict.fromkeys(("distance_psfs", "field_psfs"), tuple[str, ...]),
+    "distances_mm": tuple[float, ...],
+    "field_positions": tuple[tuple[float, float], ...],
 }
 
 KEYS: dict[str, tuple[str, Any]] = {
@@ -27,6 +34,9 @@ KEYS: dict[str, tuple[str, Any]] = {
     "psf_sha256": ("SHA-256 of the PSF's file: once the file has changed, it is refused.", ""),
     "dark": ("Frame taken without light, subtracted from the PSF and the captures.", "dark.png"),
     "ambient": ("Frame taken with the room's light alone, subtracted from the captures.", "ambient.png"),
+    "flat_field": ("Response of each pixel, by which the captures are divided.", "flat.tif"),
+    "hot_pixels": ("Picture that is not black at defective pixels, which are replaced in the captures.", "hot.png"),
+    "psf_corrected": ("The PSF's file has been corrected: no dark frame, flat field and hot pixels for it.", True),
     "background": ('Uniform light under the PSF, as a fraction of the full scale, or "estimate".', "estimate"),
     "psf_bin": ("`bin` of the PSF, if it was taken at another resolution than the captures.", 4),
     "psf_gamma": ('Encoding of the PSF\'s file: "srgb", or a power such as 2.2. Linear unless given.', "srgb"),
@@ -42,10 +52,19 @@ KEYS: dict[str, tuple[str, Any]] = {
     "white_balance": ('Of the pictures: "grey-world", "psf", or gains of red, green and blue.', "grey-world"),
     "pitch_um": ("Distance between pixels after binning, in micrometres.", 9.6),
     "distance_mm": ("Distance from the point source to the camera, in millimetres.", 200.0),
+    "distance_psfs": ("PSFs of points at other distances, for `mwdn reconstruct --distance`.", ["near.tif"]),
+    "distances_mm": ("Their distances, in millimetres.", [100.0]),
+    "field_psfs": ("PSFs of points off the axis, each centred like the one on it, for simulation.", ["left.tif"]),
+    "field_positions": ("Their displacements, down and right, in pixels of the raw frame.", [[0.0, -80.0]]),
+    "electrons_per_count": ("Gain of the sensor: electrons for a step of its numbers.", 3.7),
+    "read_noise_electrons": ("Noise of a pixel without light, a standard deviation.", 3.0),
+    "full_well_electrons": ("Electrons at saturation.", 15000.0),
+    "black_level": ("Mean of a dark frame, as a fraction of the full scale.", 0.01),
 }
 """Meaning and an example of each key, in the order of the file."""
 
-_FILES = ("psf", "dark", "ambient")
+_FILES = ("psf", "dark", "ambient", "flat_field", "hot_pixels")
+_LISTS = ("distance_psfs", "field_psfs")
 _HEAD = """\
 # A camera of mwdn: its PSF, and how its frames become measurements. Paths are relative to this file.
 # Use it in any command: mwdn reconstruct CAPTURES --camera {name}
@@ -77,7 +96,41 @@ def read_camera(path: str | Path) -> dict[str, Any]:
     if "psf" not in table:
         raise ParameterError(f'`{path}` must name the camera\'s PSF: `psf = "psf.png"`.')
     files = {key: path.parent / table[key] for key in _FILES if key in table}
-    return {**{key: tuple(value) if isinstance(value, list) else value for key, value in table.items()}, **files}
+    lists = {key: tuple(path.parent / name for name in table[key]) for key in _LISTS if key in table}
+    return {**{key: _as_tuple(value) for key, value in table.items()}, **files, **lists}
+
+
+def _as_tuple(value: Any) -> Any:  # noqa: ANN401
+    return tuple(map(_as_tuple, value)) if isinstance(value, list) else value
+
+
+def pop_sensor(camera: dict[str, Any]) -> Sensor | None:
+    """Take the keys of the sensor out of a camera file's; ``None`` unless its noise is there.
+
+    Raises:
+        ParameterError: a number is out of its range.
+    """
+    names = ("electrons_per_count", "read_noise_electrons", "full_well_electrons", "black_level")
+    gain, read_noise, full_well, black = (camera.pop(name, None) for name in names)
+    if read_noise is None or full_well is None:
+        return None
+    steps = full_well / gain if gain else 2**12 - 1  # the numbers between black and saturation
+    bits = camera.get("bit_depth") or min(max(round(steps).bit_length(), 1), 16)
+    return Sensor(full_well, read_noise, bits, black or 0.0)
+
+
+def pop_places(camera: dict[str, Any]) -> PlaceFiles:
+    """Take the keys of PSFs at other places out of a camera file's.
+
+    Raises:
+        ParameterError: there are more files than places, or fewer.
+    """
+    places = {name: camera.pop(name, ()) for name in ("distances_mm", "distance_psfs", "field_positions", "field_psfs")}
+    for names in (("distance_psfs", "distances_mm"), ("field_psfs", "field_positions")):
+        files, numbers = (places[name] for name in names)
+        if len(files) != len(numbers):
+            raise ParameterError(f"`{names[0]}` ({len(files)}) must be as many as `{names[1]}` ({len(numbers)}).")
+    return PlaceFiles(**places)
 
 
 def write_camera(path: str | Path, camera: Mapping[str, Any]) -> None:
@@ -99,6 +152,8 @@ def write_camera(path: str | Path, camera: Mapping[str, Any]) -> None:
         value = values.get(key)
         if key in _FILES and value is not None:
             value = _relative(Path(value), path.parent)
+        elif key in _LISTS and value is not None:
+            value = [_relative(Path(each), path.parent) for each in value]
         line = f"# {key} = {_to_toml(example)}" if value is None else f"{key} = {_to_toml(value)}"
         lines += ["", f"# {meaning}", line]
     with as_parameter_error(path.parent), atomic(path) as temporary:

@@ -8,10 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mwdn.calibration.corrections import Corrections
 from mwdn.calibration.frame_operations import bin_pixels, crop_centre, demosaic, subtract_dark
 from mwdn.errors import ParameterError, checked
 from mwdn.io.formats import as_frame
-from mwdn.io.images import read_frame, srgb_decode
+from mwdn.io.images import read_frame, srgb_decode, srgb_encode
 from mwdn.io.raw import Mosaic, is_raw, read_raw
 from mwdn.types import Frame, Image, Measurement, Size
 
@@ -109,12 +110,15 @@ class FrameFormat:
             return raw.frame, replace(self, mosaic=raw.mosaic)
         return read_frame(path, bgr=self.bgr), self
 
-    def to_measurement(self, frame: Frame, dark: Tensor | None = None) -> Measurement:
+    def to_measurement(
+        self, frame: Frame, dark: Tensor | None = None, corrections: Corrections = Corrections()
+    ) -> Measurement:
         """Turn a raw frame into a measurement.
 
         Args:
             frame: (H, W, C), from `read`.
             dark: frame to subtract, from `normalise`: taken without light, or with the room's light alone.
+            corrections: flat field and hot pixels.
 
         Returns:
             (1, C, height, width), linear light, row 0 at the top; 1 is saturation.
@@ -126,6 +130,7 @@ class FrameFormat:
         image = self.normalise(frame)
         if dark is not None:
             image = subtract_dark(image, dark)
+        image = corrections(image, self.cell)
         if self.crop is not None:
             image = crop_centre(image, self.crop, self.cell)
         if self.mosaic is not None:
@@ -142,6 +147,14 @@ class FrameFormat:
         if self.gamma is None:
             return image
         return srgb_decode(image) if self.gamma == "srgb" else image.clamp(min=0) ** self.gamma
+
+    def denormalise(self, image: Image) -> Frame:
+        """The frame of floats (H, W, C) in the order of the camera's files that `read` and `normalise` make this of."""
+        frame = image if self.gamma is None else image.clamp(min=0)
+        if self.gamma is not None:
+            frame = srgb_encode(frame) if self.gamma == "srgb" else frame ** (1 / self.gamma)
+        pixels = frame[0].movedim(0, -1) * (1 if self.bit_depth is None else 2**self.bit_depth - 1)
+        return (pixels.flip(-1) if self.bgr else pixels).contiguous().numpy().astype(np.float32)
 
     def full_scale(self, frame: Frame) -> float:
         """Largest number of the sensor: ``2^bit_depth - 1``; without a bit depth the file type's maximum, 1 for floats.

@@ -5,18 +5,23 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
-from mwdn.calibration.camera_file import check_psf_file, read_camera
+from mwdn.calibration.camera_file import check_psf_file, pop_places, pop_sensor, read_camera
+from mwdn.calibration.corrections import Corrections
 from mwdn.calibration.float_scale import check_float_scale
 from mwdn.calibration.frame_format import FrameFormat
+from mwdn.calibration.place_files import PlaceFiles
 from mwdn.calibration.psf_format import PsfFormat, with_options
 from mwdn.calibration.psf_levels import background_level, empty, refuse_saturated
+from mwdn.calibration.size_advice import advise_size
 from mwdn.calibration.white_balance import WhiteBalance, check_white_balance
 from mwdn.errors import ParameterError, PsfError, ShapeError, check_batch, checked, shown
 from mwdn.io.formats import as_frame
 from mwdn.optics.psf import checked_psf, psf_hash
-from mwdn.types import ArrayPicture, Frame, Measurement, Psf, Size
+from mwdn.optics.sensor import Sensor
+from mwdn.types import ArrayPicture, Frame, Image, Measurement, Psf, Size
 
 
 @checked
@@ -35,6 +40,9 @@ class Calibration:
         psf_format: where the PSF's file differed from the captures.
         light: sum of each channel of the PSF before it was normalised: the colour of the point source.
         white_balance: of the camera's pictures; `mwdn.Reconstructor` applies it.
+        corrections: flat field and hot pixels, corrected in each frame.
+        sensor: noise and saturation of the sensor's own pixels, if they were measured; see `binned_sensor`.
+        places: files of PSFs at other distances and positions, see `mwdn.calibration.places`.
 
     Raises:
         PsfError: the PSF has other axes, or is negative, not finite, or dark.
@@ -51,6 +59,9 @@ class Calibration:
     psf_format: PsfFormat = PsfFormat()
     light: tuple[float, ...] = ()
     white_balance: WhiteBalance | None = None
+    corrections: Corrections = Corrections()
+    sensor: Sensor | None = None
+    places: PlaceFiles = PlaceFiles()
 
     @classmethod
     @checked
@@ -70,8 +81,13 @@ class Calibration:
         camera |= options
         if camera["psf"] == own_psf:
             check_psf_file(path, sha256, own_psf)
+        else:  # of another file nothing is known
+            camera["psf_corrected"] = False
         extra = {name: camera.pop(name, None) for name in ("white_balance", "pitch_um", "distance_mm")}
-        return replace(cls.from_file(camera.pop("psf"), **camera), **extra)
+        extra |= {"sensor": pop_sensor(camera), "places": pop_places(camera)}
+        files = (camera.pop(name, None) for name in ("flat_field", "hot_pixels"))
+        corrections = Corrections.read(*files, psf_done=camera.pop("psf_corrected", False))
+        return replace(cls.from_file(camera.pop("psf"), corrections=corrections, **camera), **extra)
 
     @classmethod
     @checked
@@ -83,6 +99,7 @@ class Calibration:
         psf_format: PsfFormat = PsfFormat(),
         dark: str | Path | None = None,
         ambient: str | Path | None = None,
+        corrections: Corrections = Corrections(),
         **options: Any,  # noqa: ANN401
     ) -> "Calibration":
         """Read the picture of a point source, or a camera file.
@@ -96,6 +113,7 @@ class Calibration:
             dark: frame taken with the same exposure and no light; subtracted from the PSF and from captures.
             ambient: frame taken with the room's light alone and the exposure of the captures; subtracted from captures,
                 not from the PSF.
+            corrections: flat field and hot pixels; a camera file has its own.
             **options: fields of `FrameFormat` and `PsfFormat`, which replace those of ``frames`` and ``psf_format``:
                 ``bin=4, bit_depth=12, gamma="srgb", background=0.0, psf_bin=8``.
 
@@ -115,7 +133,9 @@ class Calibration:
         frame, frames = frames.read_stored(path)
         dark_frame = None if dark is None else frames.read(dark)
         ambient_frame = None if ambient is None else frames.read(ambient)
-        return cls._from_frame(frame, frames, psf_format=psf_format, dark=dark_frame, ambient=ambient_frame)
+        return cls._from_frame(
+            frame, frames, psf_format, dark=dark_frame, ambient=ambient_frame, corrections=corrections
+        )
 
     @classmethod
     def from_array(
@@ -146,30 +166,44 @@ class Calibration:
         frames, psf_format = with_options(frames, psf_format, options)
         dark_frame = None if dark is None else as_frame(dark)
         ambient_frame = None if ambient is None else as_frame(ambient)
-        return cls._from_frame(as_frame(picture), frames, psf_format=psf_format, dark=dark_frame, ambient=ambient_frame)
+        return cls._from_frame(as_frame(picture), frames, psf_format, dark=dark_frame, ambient=ambient_frame)
 
     @classmethod
     def _from_frame(
-        cls, frame: Frame, frames: FrameFormat, *, psf_format: PsfFormat, dark: Frame | None, ambient: Frame | None
+        cls,
+        frame: Frame,
+        frames: FrameFormat,
+        psf_format: PsfFormat,
+        *,
+        dark: Frame | None,
+        ambient: Frame | None,
+        corrections: Corrections = Corrections(),
     ) -> "Calibration":
         refuse_saturated(frames, frame)
-        dark_image = None if dark is None else frames.normalise(dark)
-        psf_dark = dark_image if psf_format.shares_pixels(frames) else None
-        psf = psf_format.own_frames(frames).to_measurement(frame, psf_dark)
+        draft = cls(
+            torch.ones(1, 1, 1, 1),
+            frames,
+            None if dark is None else frames.normalise(dark),
+            ambient=None if ambient is None else frames.normalise(ambient),
+            psf_format=psf_format,
+            corrections=corrections,
+        )
+        psf = draft.psf_image(frame)
         level = background_level(psf, psf_format.background)
         psf = (psf - level).clamp(min=0)
         total = psf.sum((-2, -1), keepdim=True)
         if not (total > 0).all():
             raise PsfError(empty(total.flatten() > 0, level.flatten(), with_dark=dark is not None))
-        return cls(
-            psf_format.turn(psf / total, frames),
-            frames,
-            dark_image,
-            background=tuple(round(float(value), 6) for value in level.flatten()),
-            ambient=None if ambient is None else frames.normalise(ambient),
-            psf_format=psf_format,
-            light=tuple(total.flatten().tolist()),
-        )
+        background = tuple(round(float(value), 6) for value in level.flatten())
+        light = tuple(total.flatten().tolist())
+        return replace(draft, psf=psf_format.turn(psf / total, frames), background=background, light=light)
+
+    def psf_image(self, frame: Frame) -> Image:
+        """The PSF's own raw frame as an image (1, C, H, W): corrected, cropped and binned, not yet turned."""
+        own_frames = self.psf_format.own_frames(self.frames)
+        if self.corrections.psf_done or not self.psf_format.shares_pixels(self.frames):
+            return own_frames.to_measurement(frame)
+        return own_frames.to_measurement(frame, self.dark, self.corrections)
 
     def __post_init__(self) -> None:
         if not isinstance(self.psf, Tensor):
@@ -198,6 +232,14 @@ class Calibration:
     def size(self) -> Size:
         """Height and width of the PSF and of a measurement."""
         return self.psf.shape[-2], self.psf.shape[-1]
+
+    @property
+    def binned_sensor(self) -> Sensor | None:
+        """The sensor of a measurement's pixels: binned, n of them hold n times the electrons of one."""
+        n = self.frames.bin**2
+        return self.sensor and replace(
+            self.sensor, full_well=n * self.sensor.full_well, read_noise=n**0.5 * self.sensor.read_noise
+        )
 
     def saturated_part(self, frame: Frame) -> float:
         """Fraction of a raw frame's pixels that are saturated; 0 for floats, which have no known maximum."""
@@ -229,7 +271,7 @@ class Calibration:
         offset = self.dark if self.ambient is None else self.ambient
         frame = as_frame(frame, finite=False)
         check_float_scale(frame, self.frames.bit_depth)
-        return self.frames.to_measurement(frame, offset)
+        return self.frames.to_measurement(frame, offset, self.corrections)
 
     def check_fit(self, measurement: Measurement) -> None:
         """Raise a `ShapeError` unless the measurement (1, C, H, W) has the PSF's size, and colours if the PSF has."""
@@ -237,25 +279,10 @@ class Calibration:
         if size != self.size:
             raise ShapeError(
                 f"`psf` ({self.size[0]} x {self.size[1]}) and the capture ({size[0]} x {size[1]}) must have the same "
-                f"height and width. {_advise(size, self.size, self.frames)}"
+                f"height and width. {advise_size(size, self.size, self.frames)}"
             )
         if measurement.shape[1] == 1 and self.psf.shape[1] == 3:
             raise ShapeError(
                 "The capture is grey, but `psf` has colours. Use both as grey: `grey=True`. If the capture is the raw "
                 "frame of a colour sensor, give the order of its filters: `mosaic='rggb'`."
             )
-
-
-def _advise(capture: Size, psf: Size, frames: FrameFormat) -> str:
-    for larger, smaller, name, options in (
-        (psf, capture, "PSF", "psf_bin={product}"),
-        (capture, psf, "capture", "bin={product}, psf_bin={bin}"),
-    ):
-        factor = larger[0] // smaller[0]
-        if factor > 1 and larger == (smaller[0] * factor, smaller[1] * factor):
-            options = options.format(product=frames.bin * factor, bin=frames.bin)
-            return f"The {name} is {factor} times as large: bin it by {factor}, `{options}`."
-    if psf[0] <= capture[0] and psf[1] <= capture[1]:
-        raw = frames.bin * frames.cell
-        return f"Crop the capture around its centre: `crop=({psf[0] * raw}, {psf[1] * raw})`."
-    return "Use the PSF that belongs to this camera."

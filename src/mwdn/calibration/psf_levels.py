@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from mwdn.calibration.exposure import measure_exposure
 from mwdn.calibration.frame_format import FrameFormat
 from mwdn.calibration.psf_format import Background
 from mwdn.errors import PsfError
@@ -30,7 +31,7 @@ def refuse_saturated(frames: FrameFormat, frame: Frame) -> None:
     if count > SATURATED_PART * pixels:
         raise PsfError(
             f"PSF is saturated: {count:,} of {pixels:,} pixels are at the {maximum.bit_length()}-bit maximum "
-            f"{maximum}. Lower the exposure and capture it again."
+            f"{maximum}. Lower the exposure and capture it again: use {measure_exposure(frame, frames).next(None)}."
         )
 
 

@@ -9,6 +9,7 @@ from mwdn.calibration.psf import Calibration
 from mwdn.calibration.psf_levels import estimate_background
 from mwdn.optics import psf_measures, psf_spectrum
 from mwdn.optics.noise import noise_level
+from mwdn.optics.sensor import Sensor
 from mwdn.types import Frame, Psf, Size
 
 LAMBDAS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
@@ -74,6 +75,10 @@ class PsfReport:
         known_frequency: frequency up to which the PSF exceeds the noise of its file; 0.5 at most.
         depth: correlation with the PSF of the design distance, by the distance of the point; may be empty.
         angle: correlation with the PSF on the axis, by the angle; may be empty.
+        off_axis: correlation with the PSF on the axis, by the point's displacement in raw pixels; may be empty.
+        corrected: the PSF's file was made by `mwdn calibrate FRAMES`.
+        defects: number of hot and dead pixels, if they were sought.
+        sensor: full well and read noise in electrons of a raw pixel, if they were measured.
     """
 
     psf_hash: str
@@ -94,6 +99,10 @@ class PsfReport:
     known_frequency: float
     depth: dict[float, float] = field(default_factory=dict)
     angle: dict[float, float] = field(default_factory=dict)
+    off_axis: dict[float, float] = field(default_factory=dict)
+    corrected: bool = False
+    defects: int | None = None
+    sensor: Sensor | None = None
 
     def content(self) -> dict[str, Any]:
         """The report for JSON: keys are strings, and an infinite resolution is ``None``."""
@@ -110,6 +119,7 @@ def inspect_psf(
     *,
     depth: dict[float, Psf] | None = None,
     angle: dict[float, Psf] | None = None,
+    off_axis: dict[float, Psf] | None = None,
 ) -> PsfReport:
     """Measure a PSF.
 
@@ -118,6 +128,7 @@ def inspect_psf(
         frame: the PSF's raw frame, from `FrameFormat.read`; without it there are no levels in the report.
         depth: PSFs of points at other distances, by the distance.
         angle: PSFs of points off the axis, by the angle.
+        off_axis: PSFs of points off the axis, by their displacement in raw pixels.
     """
     psf = calibration.psf.float().cpu()
     colours = [psf[:, [c]] for c in range(psf.shape[1])]
@@ -143,6 +154,10 @@ def inspect_psf(
         known_frequency=_known_frequency(psf, levels.noise_floor if levels else 0.0),
         depth=_likenesses(psf, depth),
         angle=_likenesses(psf, angle),
+        off_axis=_likenesses(psf, off_axis),
+        corrected=calibration.corrections.psf_done,
+        defects=None if calibration.corrections.defects is None else calibration.corrections.count,
+        sensor=calibration.sensor,
     )
 
 
@@ -166,7 +181,7 @@ def _known_frequency(psf: Psf, floor: float) -> float:
 def _levels(calibration: Calibration, frame: Frame) -> Levels:
     psf_format, captures = calibration.psf_format, calibration.frames
     frames = psf_format.own_frames(captures)
-    image = frames.to_measurement(frame, calibration.dark if psf_format.shares_pixels(captures) else None)
+    image = calibration.psf_image(frame)
     background = estimate_background(image)
     integers = frame.dtype.kind != "f"
     scale = frames.full_scale(frame) if integers else 1.0

@@ -1,5 +1,6 @@
 """The verdict on a PSF: what is good about it, what is not, and what to do."""
 
+import math
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
@@ -18,7 +19,7 @@ class Finding(NamedTuple):
 
 def verdict(report: PsfReport) -> tuple[Finding, ...]:
     """Say what the numbers of a report mean, the worst first."""
-    parts = (_levels, _light, _detail, _frequencies, _noise, _colours, _places)
+    parts = (_levels, _sensor, _light, _detail, _frequencies, _noise, _colours, _places)
     findings = [finding for part in parts for finding in part(report)]
     return tuple(sorted(findings, key=lambda finding: ("bad", "mind", "good").index(finding.weight)))
 
@@ -46,7 +47,15 @@ def _levels(report: PsfReport) -> Iterator[Finding]:
     levels = report.levels
     if levels is None:
         return
-    if not levels.integers:
+    if not levels.integers and report.corrected:
+        decades = math.log10(max(levels.peak / max(levels.noise, 1e-12), 1.0))
+        text = f"Averaged and corrected: {decades:.1f} decades from the noise to the brightest pixel."
+        # The tails of a PSF lie three decades below its peak.
+        if decades < 3:
+            yield Finding("mind", f"{text} Average more frames, or merge exposures, to see its tails.")
+        else:
+            yield Finding("good", text)
+    elif not levels.integers:
         yield Finding("mind", "The file holds floats, so saturation of the sensor cannot be detected.")
     elif levels.saturated > 1:
         text = f"{levels.saturated:,} pixels are at the sensor's maximum: the brightest lines may be cut. Expose less."
@@ -66,6 +75,18 @@ def _levels(report: PsfReport) -> Iterator[Finding]:
         )
         yield Finding("mind", text)
     yield from _background(levels)
+
+
+def _sensor(report: PsfReport) -> Iterator[Finding]:
+    if report.defects is not None:
+        yield Finding("good", f"{report.defects:,} hot or dead pixels are replaced in every frame.")
+    if (sensor := report.sensor) is not None:
+        # A bright pixel: the square root of its electrons. A dark one: the read noise.
+        text = (
+            f"Sensor: full well {sensor.full_well:,.0f} electrons, so a bright pixel has {sensor.full_well**-0.5:.2%} "
+            f"noise; read noise {sensor.read_noise:.2g} electrons."
+        )
+        yield Finding("good", text)
 
 
 def _background(levels: Levels) -> Iterator[Finding]:
@@ -197,7 +218,8 @@ def _colours(report: PsfReport) -> Iterator[Finding]:
 
 
 def _places(report: PsfReport) -> Iterator[Finding]:
-    for what, by_place in (("distance", report.depth), ("angle", report.angle)):
+    places = {"distance": report.depth, "angle": report.angle, "displacement in raw pixels": report.off_axis}
+    for what, by_place in places.items():
         if not by_place:
             continue
         valid = [place for place, correlation in by_place.items() if correlation >= 0.7]

@@ -1,69 +1,193 @@
 """`mwdn calibrate`: a PSF and everything else about a camera, as one file for the other commands."""
 
+import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from mwdn.calibration import FrameFormat, PsfFormat
-from mwdn.calibration.camera_file import check_camera_path, write_camera
+from mwdn.calibration import Calibration, FrameFormat, PsfFormat
+from mwdn.calibration.camera_file import check_camera_path, read_camera, write_camera
+from mwdn.calibration.camera_parts import write_camera_with_parts
+from mwdn.calibration.corrections import Corrections
+from mwdn.calibration.photographs import Photographed, develop, expanded
 from mwdn.calibration.report import inspect_psf
 from mwdn.calibration.verdict import headline
+from mwdn.calibration.watching import guide_exposure, watch_folder
 from mwdn.calibration.white_balance import WhiteBalance, check_white_balance
 from mwdn.cli.camera import CameraOptions
 from mwdn.cli.inspect import at_psf_resolution
-from mwdn.cli.terminal import say
-from mwdn.io.files import refuse_overwrite
+from mwdn.cli.photographs import PhotographOptions
+from mwdn.cli.terminal import counted, if_interrupted, note, say
+from mwdn.errors import ParameterError
+from mwdn.io.files import file_sha256, refuse_overwrite
+
+POLL_S = 0.3
+"""Seconds between two looks at a watched folder."""
 
 
-def calibrate(
-    camera: CameraOptions = CameraOptions(),
-    *,
-    white_balance: WhiteBalance | None = None,
+def calibrate(  # noqa: PLR0913
+    *files: Path,
+    psf: Path | None = None,
+    photographs: PhotographOptions = PhotographOptions(),
+    frames: Annotated[FrameFormat, Parameter(name="*")] = FrameFormat(),
+    psf_format: Annotated[PsfFormat, Parameter(name="*")] = PsfFormat(),
+    ambient: None | Path = None,  # noqa: RUF036 - cyclopts tries None first, so that `--ambient none` is no path
+    camera: Path | None = None,
+    white_balance: WhiteBalance | Literal["flat"] | None = None,
     pitch_um: float | None = None,
     distance_mm: float | None = None,
+    watch: Path | None = None,
     out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("camera.toml"),
     auto_bin: Annotated[bool, Parameter(show=False)] = True,
 ) -> None:
     """Write a camera file: the PSF, and everything else that other commands need to know about the camera.
 
-    They take it as --camera camera.toml. With --camera, this command changes an existing camera file.
+    They take it as --camera camera.toml, or in place of the PSF. With --camera, this command changes an existing camera
+    file. One picture of a point source is named by the file as it is. Several, with dark frames, are averaged, merged,
+    corrected and centred, and the PSF is written beside the camera file.
 
     Args:
-        camera: the PSF and its format.
-        white_balance: of the camera's pictures: grey-world, psf (the point source is white), or gains of red, green and
-            blue.
+        files: pictures of a point source: frames of the camera, or folders of them.
+        psf: the picture of a point source, instead of FILES.
+        photographs: exposures, and frames of other kinds.
+        frames: format of the frames.
+        psf_format: where the picture of the point source differs from the captures.
+        ambient: frame taken with the room's light alone, subtracted from the captures.
+        camera: camera file to change.
+        white_balance: of the camera's pictures: grey-world, psf (the point source is white), flat (the light of the
+            flat frames is white), or gains of red, green and blue.
         pitch_um: distance between pixels after binning, in micrometres.
         distance_mm: distance from the point source to the camera, in millimetres.
+        watch: guide the exposure instead: for each frame that is written to this folder, print its peak, its saturated
+            pixels and the exposure to use next.
         out: the camera file, ending in .toml.
         auto_bin: whether --bin is not given: then every reconstruction chooses.
     """
+    if watch is not None:
+        _watch(watch, frames, photographs.exposures)
+        return
     check_camera_path(out)
-    refuse_overwrite(out, camera.psf, camera.dark, camera.ambient)
-    fresh = replace(camera, camera=None)  # a changed PSF is what this command is for
-    calibration = fresh.load()
-    check_white_balance(white_balance, calibration.light)
-    own_resolution = at_psf_resolution(fresh).load()
-    report = inspect_psf(own_resolution, own_resolution.frames.read(fresh.psf_file))
-    content = {
-        "psf": fresh.psf_file,
-        "dark": camera.dark,
-        "ambient": camera.ambient,
-        **_changes(camera.psf_format),
-        **_changes(camera.frames),
-        "bin": None if auto_bin else camera.frames.bin,
+    pictures = [*files] or ([psf] if psf is not None else [])
+    if not pictures:
+        raise ParameterError("Give the camera's PSF, `--psf psf.png`, or its camera file, `--camera camera.toml`.")
+    kept = _kept(camera)
+    own = {
+        "ambient": ambient,
+        **_changes(psf_format),
+        **_changes(frames),
+        "bin": None if auto_bin else frames.bin,
         "white_balance": white_balance,
         "pitch_um": pitch_um,
         "distance_mm": distance_mm,
     }
-    write_camera(out, content)
+    if photographs.are_one_picture(pictures):
+        options = CameraOptions(pictures[0], frames, psf_format=psf_format, ambient=ambient)
+        dark = next(iter(expanded(photographs.dark_files)), None)
+        _of_one_picture(replace(options, dark=dark), kept, own, out)
+        return
+    _refuse_psf_format(psf_format)
+    known = Corrections.read(kept.get("flat_field"), kept.get("hot_pixels"))
+    for file in (*expanded(pictures), *expanded(photographs.dark_files), *expanded(photographs.flat)):
+        refuse_overwrite(out, file)
+    done = develop(photographs.of(pictures), frames, known)
+    _of_photographs(done, {**kept, **own}, out, has_dark=bool(photographs.dark_files))
+
+
+def _kept(camera: Path | None) -> dict[str, Any]:
+    """The values of the camera file to change for which this command has no option."""
+    values = {} if camera is None else read_camera(camera)
+    values.pop("dark", None)  # an option has it
+    psf, sha256 = values.get("psf"), values.pop("psf_sha256", "")
+    if psf is not None and sha256 and psf.is_file() and file_sha256(psf) != sha256:
+        values.pop("psf_corrected", None)  # the PSF has been replaced by another picture
+    return values
+
+
+def _of_one_picture(options: CameraOptions, kept: dict[str, Any], own: dict[str, Any], out: Path) -> None:
+    """Write a camera file that names the PSF's picture as it is."""
+    refuse_overwrite(out, options.psf, options.dark, options.ambient)
+    if options.psf != kept.get("psf"):
+        kept = {
+            key: value for key, value in kept.items() if key not in ("psf_corrected", "distance_psfs", "field_psfs")
+        }
+        kept = {key: value for key, value in kept.items() if key not in ("distances_mm", "field_positions")}
+    corrections = Corrections.read(
+        kept.get("flat_field"), kept.get("hot_pixels"), psf_done=kept.get("psf_corrected", False)
+    )
+    calibration = options.load(corrections)
+    balance = own["white_balance"]
+    if balance == "flat":
+        raise ParameterError("`white_balance` 'flat' needs flat frames: `--flat`. Use 'grey-world', or gains.")
+    check_white_balance(balance, calibration.light)
+    own_resolution = at_psf_resolution(options).load(corrections)
+    report = inspect_psf(own_resolution, own_resolution.frames.read(options.psf_file))
+    write_camera(out, {**kept, "psf": options.psf_file, "dark": options.dark, **own})
+    _finish(headline(report), calibration, out)
+
+
+def _of_photographs(done: Photographed, content: dict[str, Any], out: Path, *, has_dark: bool) -> None:
+    """Write a camera file with the pictures made of photographs."""
+    content = {key: value for key, value in content.items() if value is not None or key not in done.content}
+    if content.get("white_balance") == "flat":
+        content["white_balance"] = _flat_balance(done.flat_colour)
+    # A dark frame with the room's light has no background left; tails below the lines are then the PSF's own.
+    background = content.get("background") or (0.0 if has_dark else None)
+    own_distance = {"distance_mm": content["distance_mm"]} if content.get("distance_mm") else {}
+    content = {**content, "background": background, **done.content, **own_distance, "psf_gamma": None}
+    for key in ("distance_psfs", "field_psfs"):  # those of an earlier PSF do not fit this one
+        if key not in done.parts:
+            content |= {key: None, {"distance_psfs": "distances_mm", "field_psfs": "field_positions"}[key]: None}
+    written = write_camera_with_parts(out, content, done.parts)
+    calibration = Calibration.load(out)
+    check_white_balance(calibration.white_balance, calibration.light)
+    note(*done.notes)
+    say(*done.results)
+    _finish(headline(inspect_psf(calibration, calibration.frames.read(written["psf"]))), calibration, out)
+
+
+def _flat_balance(colour: tuple[float, ...]) -> tuple[float, float, float]:
+    """Gains that make the light of the flat frames white."""
+    if len(colour) != 3 or min(colour) <= 0:
+        raise ParameterError(
+            "`white_balance` 'flat' needs flat frames in colour: `--flat`. Use 'grey-world', or gains."
+        )
+    red, green, blue = colour
+    return round(green / red, 4), 1.0, round(green / blue, 4)
+
+
+def _refuse_psf_format(psf_format: PsfFormat) -> None:
+    if psf_format.psf_bin is not None or psf_format.psf_orientation is not None:
+        raise ParameterError(
+            "`psf_bin` and `psf_orientation` are for one picture from another source. Frames of the camera itself have "
+            "the captures' pixels: leave them out."
+        )
+
+
+def _finish(verdict: str, calibration: Calibration, out: Path) -> None:
     height, width = calibration.size
     say(
-        headline(report),
+        verdict,
         f"PSF {calibration.psf_hash}, {height} x {width} pixels. More about it: mwdn inspect --camera {out}",
         f"Use it: mwdn reconstruct CAPTURES --camera {out}",
     )
+
+
+def _watch(folder: Path, frames: FrameFormat, exposures: tuple[float, ...]) -> None:
+    """Print a line for each new frame, until Ctrl-C."""
+    count = 0
+
+    def wait() -> bool:
+        time.sleep(POLL_S)
+        return True
+
+    say(f"Watching {folder}: save frames there. Ctrl-C ends.")
+    with if_interrupted(lambda: f"Stopped after {counted(count, 'frame')}."):
+        exposure = exposures[0] if len(exposures) == 1 else None
+        for sentence, _ in guide_exposure(watch_folder(folder, frames, wait), frames, exposure_ms=exposure):
+            count += 1
+            say(sentence)
 
 
 def _changes(format: FrameFormat | PsfFormat) -> dict[str, Any]:

@@ -7,7 +7,9 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from mwdn.calibration import Calibration, FrameFormat, PsfFormat
-from mwdn.cli.terminal import detail
+from mwdn.calibration.corrections import Corrections
+from mwdn.calibration.places import at_distance
+from mwdn.cli.terminal import detail, note
 from mwdn.errors import ParameterError
 
 
@@ -24,6 +26,7 @@ class CameraOptions:
         ambient: frame taken with the room's light alone, subtracted from the captures.
         camera: camera file of `mwdn calibrate`, with all of these; options on the command line take precedence:
             --mosaic none, --dark none ... do without what the file says.
+        distance: of the scene in millimetres, for a camera with PSFs at several distances.
     """
 
     psf: Path | None = None
@@ -33,6 +36,7 @@ class CameraOptions:
     dark: None | Path = None  # noqa: RUF036 - cyclopts tries None first, so that `--dark none` is no path
     ambient: None | Path = None  # noqa: RUF036
     camera: Path | None = None
+    distance: float | None = None
 
     @property
     def roles(self) -> dict[str, Path]:
@@ -56,10 +60,21 @@ class CameraOptions:
             raise ParameterError("Give the camera's PSF, `--psf psf.png`, or its camera file, `--camera camera.toml`.")
         return self.psf
 
-    def load(self) -> Calibration:
-        """Read the calibration."""
+    def load(self, corrections: Corrections = Corrections()) -> Calibration:
+        """Read the calibration.
+
+        Args:
+            corrections: flat field and hot pixels, for a camera without a camera file.
+        """
         formats = {**vars(self.frames), **vars(self.psf_format)}
         detail(f"{self.psf_file}: {', '.join(f'{name} {value}' for name, value in formats.items())}")
+        options = {"dark": self.dark, "ambient": self.ambient, **formats}
         if self.camera is None:
-            return Calibration.from_file(self.psf_file, dark=self.dark, ambient=self.ambient, **formats)
-        return Calibration.load(self.camera, psf=self.psf_file, dark=self.dark, ambient=self.ambient, **formats)
+            calibration = Calibration.from_file(self.psf_file, corrections=corrections, **options)
+        else:
+            calibration = Calibration.load(self.camera, psf=self.psf_file, **options)
+        if self.distance is None:
+            return calibration
+        calibration, sentence = at_distance(calibration, self.distance)
+        note(sentence)
+        return calibration

@@ -4,12 +4,15 @@ from typing import Any
 
 from cyclopts import App
 from cyclopts.config import Dict
+from cyclopts.token import Token
 
 
 def from_camera_file(app: App, commands: tuple[str, ...], arguments: Any) -> None:  # noqa: ANN401
-    """Read the options that the command line does not set from the file of ``--camera``."""
+    """Read the options that the command line does not set from the file of ``--camera``, or a ``.toml`` as the PSF."""
     by_name = {argument.name: argument for argument in arguments}
-    given = by_name.get("--camera")
+    given, psf = by_name.get("--camera"), by_name.get("--psf")
+    if given is not None and not given.tokens and psf is not None and is_camera_file(psf.tokens):
+        given.tokens[:], psf.tokens[:] = [psf.tokens[0].evolve(keyword="--camera")], []
     if given is None or not given.tokens:
         return
     from mwdn.calibration.camera_file import read_camera
@@ -21,6 +24,13 @@ def from_camera_file(app: App, commands: tuple[str, ...], arguments: Any) -> Non
     Dict(values, source=path, use_commands_as_keys=False)(app, commands, arguments)
 
 
+def is_camera_file(tokens: list[Token]) -> bool:
+    """Whether the PSF was given as a camera file."""
+    return len(tokens) == 1 and tokens[0].value.lower().endswith(".toml")
+
+
 def _plain(value: Any) -> Any:  # noqa: ANN401
     """A value as in a TOML file: paths are text."""
-    return list(value) if isinstance(value, tuple) else value if isinstance(value, int | float) else str(value)
+    if isinstance(value, tuple):
+        return [_plain(each) for each in value]
+    return value if isinstance(value, int | float) else str(value)

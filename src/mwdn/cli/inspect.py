@@ -7,6 +7,7 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.markup import escape
 
+from mwdn.calibration.places import psfs_elsewhere
 from mwdn.calibration.report import inspect_psf
 from mwdn.calibration.verdict import headline, verdict
 from mwdn.cli.camera import CameraOptions
@@ -29,19 +30,22 @@ def inspect(
     Args:
         camera: the PSF and its format.
         json: print the report as JSON instead of text.
-        out: folder for the page and the JSON file, which are named after the PSF's file.
+        out: folder for the page and the JSON file, which are named after the PSF's file, or the camera file.
     """
     # matplotlib takes a second to load, and no other command needs it.
     from mwdn.calibration.report_page import write_page
 
     psf = camera.psf_file
-    page = out / f"{psf.stem}.png"
+    # The PSF that `mwdn calibrate FRAMES` writes has the camera file's name and a hash.
+    is_part = camera.camera is not None and psf.stem.startswith(f"{camera.camera.stem}-psf-")
+    page = out / f"{camera.camera.stem if camera.camera and is_part else psf.stem}.png"
     json_file = page.with_suffix(".json")
     for output in (page, json_file):
         refuse_overwrite(output, *camera.files)
     calibration = at_psf_resolution(camera).load()
     check_folder(out)
-    report = inspect_psf(calibration, calibration.frames.read(psf))
+    depth, off_axis = psfs_elsewhere(calibration)
+    report = inspect_psf(calibration, calibration.frames.read(psf), depth=depth, off_axis=off_axis)
     findings = verdict(report)
     content = {
         "file": str(psf),

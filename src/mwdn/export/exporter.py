@@ -226,6 +226,10 @@ def _about(name: str, calibration: Calibration, channels: int, precision: str) -
         about["ambient"] = "a frame taken with the room's light alone must be subtracted from raw frames"
     elif calibration.dark is not None:
         about["dark"] = "a frame taken without light must be subtracted from raw frames"
+    if calibration.corrections.flat is not None:
+        about["flat"] = "raw frames must be divided by the camera's flat field"
+    if calibration.corrections.count:
+        about["hot_pixels"] = f"{calibration.corrections.count} pixels of raw frames must be replaced by neighbours"
     return about
 
 

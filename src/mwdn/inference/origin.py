@@ -59,6 +59,7 @@ def _camera(calibration: Calibration) -> dict[str, object]:
     """Everything a measurement depends on; what was added later counts only where it is set."""
     frames = calibration.frames
     later = {"gamma": frames.gamma, "ambient": calibration.ambient}
+    later |= {"flat": calibration.corrections.flat, "hot_pixels": calibration.corrections.defects}
     return {
         "psf": calibration.psf,
         "bit_depth": frames.bit_depth,

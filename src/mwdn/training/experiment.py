@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mwdn.calibration import Calibration
+from mwdn.calibration.places import field_camera
 from mwdn.data.cameras import CameraPairs
 from mwdn.data.captures import find_captures, read_captures
 from mwdn.data.mismatch import EXACT
@@ -17,6 +18,7 @@ from mwdn.data.recorded import HELD_OUT, record, recorded_pairs
 from mwdn.data.simulated import Samples, SimulatedPairs
 from mwdn.data.unpaired import UnpairedCaptures
 from mwdn.errors import ParameterError, checked
+from mwdn.optics.sensor import Sensor
 from mwdn.runtime import distributed
 from mwdn.training.recipe import Recipe, read_recipe
 from mwdn.training.report import Report
@@ -109,6 +111,7 @@ def prepare(
             another run.
     """
     place = distributed.local_device(device)
+    recipe = _with_sensor(recipe, calibration)
     psf = calibration.psf.to(place)
     _check_one_source(recipe, photos, pairs)
     captures = _read_captures(recipe, calibration, exclude)
@@ -191,6 +194,13 @@ def _simulated_pairs(recipe: Recipe, photographs: Photographs, psf: Psf) -> Simu
     )
 
 
+def _with_sensor(recipe: Recipe, calibration: Calibration) -> Recipe:
+    """The recipe with the camera's measured noise, unless it has its own, or random cameras."""
+    measured = calibration.binned_sensor
+    own = recipe.sensor != Sensor() or recipe.cameras.sizes
+    return recipe if measured is None or own else replace(recipe, sensor=measured)
+
+
 def _in_steps(recipe: Recipe, data: TrainingData) -> Recipe:
     """Epochs as steps, with a validation after each; and no validation sample twice."""
     schedule = recipe.schedule
@@ -220,7 +230,7 @@ def simulate(
         photos: folder of photographs.
         out: the file of pairs, ending in .h5 or .hdf5; an existing one is replaced on success.
         count: number of pairs.
-        exact: simulate the calibrated camera itself, without the recipe's mismatch.
+        exact: simulate the calibrated camera itself, without the recipe's mismatch and the PSFs of its field.
         track: wraps the batches to show progress.
 
     Raises:
@@ -229,8 +239,11 @@ def simulate(
     check_path(out)
     if count < 1:
         raise ParameterError(f"`count` ({count}) must be at least 1.")
-    pairs = _simulated_pairs(recipe, Photographs(photos), calibration.psf)
-    pairs = replace(pairs, mismatch=EXACT) if exact else pairs
+    pairs = _simulated_pairs(_with_sensor(recipe, calibration), Photographs(photos), calibration.psf)
+    if exact:
+        pairs = replace(pairs, mismatch=EXACT)
+    elif calibration.places.field_psfs:  # the measured field, instead of random changes of one PSF
+        pairs = replace(pairs, camera=field_camera(calibration))
     attributes: dict[str, Attribute] = {"psf_hash": calibration.psf_hash, "seed": pairs.seed}
     numbers = range(FILE_START, FILE_START + count)
     record(out, [(pairs, numbers)], calibration.psf, batch=recipe.schedule.batch, attributes=attributes, track=track)

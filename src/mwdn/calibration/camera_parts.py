@@ -1,0 +1,87 @@
+"""Write a camera file together with the files that it names: all of them, or none."""
+
+import hashlib
+import re
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mwdn.calibration.camera_file import write_camera
+from mwdn.errors import ParameterError
+from mwdn.io.images import write_frame
+from mwdn.io.toml import read_toml
+from mwdn.types import Frame
+
+PARTS = ("psf", "dark", "flat_field", "hot_pixels", "distance_psfs", "field_psfs")
+"""Keys of a camera file whose files this module writes."""
+
+
+def write_camera_with_parts(
+    path: Path, content: Mapping[str, Any], parts: Mapping[str, Frame | Sequence[Frame]]
+) -> dict[str, Any]:
+    """Write a camera file and its pictures.
+
+    A picture's name ends in a hash of its numbers: ``camera-psf-1a2b3c4d.tif``. So the pictures of an existing camera
+    file stay until the new file has taken its place, at once; then those that it no longer names are removed.
+
+    Args:
+        path: the camera file.
+        content: its values, see `mwdn.calibration.camera_file.KEYS`.
+        parts: frames (H, W, C), or lists of them, by the key that names their file.
+
+    Returns:
+        The content, with the paths of the parts.
+
+    Raises:
+        MwdnError: a file cannot be written. Then nothing has changed.
+    """
+    before, written = _own_parts(path), []
+    try:
+        for key, frames in parts.items():
+            if isinstance(frames, np.ndarray):
+                content = {**content, key: _write(path, key, frames, written)}
+            else:
+                content = {**content, key: tuple(_write(path, key, frame, written) for frame in frames)}
+        write_camera(path, content)
+    except BaseException:
+        for file in written:
+            file.unlink(missing_ok=True)
+        raise
+    for file in before - _own_parts(path):
+        with suppress(OSError):
+            file.unlink()
+    return dict(content)
+
+
+def _write(path: Path, key: str, frame: Frame, written: list[Path]) -> Path:
+    suffix = ".png" if frame.dtype == np.uint8 else ".tif"
+    digest = hashlib.sha256(repr(frame.shape).encode() + np.ascontiguousarray(frame).tobytes()).hexdigest()[:8]
+    name = key.removesuffix("s").replace("_", "-")
+    file = path.with_name(f"{path.stem}-{name}-{digest}{suffix}")
+    if not file.exists():
+        written.append(file)
+    write_frame(file, frame)
+    return file
+
+
+def _own_parts(path: Path) -> set[Path]:
+    """Files that a camera file names, and that this module has written for it."""
+    try:
+        table = read_toml(path, "camera file") if path.is_file() else {}
+    except ParameterError:
+        table = {}
+    names = []
+    for key in PARTS:
+        value = table.get(key, ())
+        names += [value] if isinstance(value, str) else value
+    pattern = re.compile(rf"{re.escape(path.stem)}-[a-z-]+-[0-9a-f]{{8}}\.(tif|png)")
+    return {path.with_name(name) for name in names if isinstance(name, str) and pattern.fullmatch(name)}
+
+
+def picture_of(defects: torch.Tensor) -> Frame:
+    """A map of hot pixels (1, 1, H, W) as a picture (H, W, 1): 255 at hot pixels."""
+    return np.ascontiguousarray(255 * defects[0].movedim(0, -1).numpy().astype(np.uint8))

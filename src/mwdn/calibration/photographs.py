@@ -1,0 +1,188 @@
+"""From all photographs of a camera to the content of its camera file."""
+
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mwdn.calibration.camera_parts import picture_of
+from mwdn.calibration.corrections import Corrections
+from mwdn.calibration.frame_format import FrameFormat
+from mwdn.calibration.point_source import PointSource, centring_shift, photograph_point
+from mwdn.calibration.sensor_frames import SensorFiles, SensorFrames, equal_parts, measure_sensor
+from mwdn.errors import ParameterError
+from mwdn.io.listing import list_folder
+from mwdn.optics.displacement import displacement, shifted
+from mwdn.types import Frame, Image
+
+
+@dataclass(frozen=True)
+class Photographs:
+    """Frames of a point source, and of the sensor.
+
+    Args:
+        groups: files of the point source's frames: for each distance, those of each exposure.
+        exposures: in milliseconds or any other unit; empty for one exposure.
+        sensor: dark and flat frames.
+        distances_mm: of the point source; the first is the camera's own. Empty for one distance.
+        field: files of points off the axis, taken with the shortest exposure.
+        centre: move each PSF's centroid to the centre of the frame.
+
+    Raises:
+        ParameterError: exposures or distances do not divide the groups, or are not positive and different.
+    """
+
+    groups: tuple[tuple[Path, ...], ...]
+    _: KW_ONLY
+    exposures: tuple[float, ...] = ()
+    sensor: SensorFiles = SensorFiles()
+    distances_mm: tuple[float, ...] = ()
+    field: tuple[tuple[Path, ...], ...] = ()
+    centre: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("exposures", "distances_mm"):
+            numbers = getattr(self, name)
+            if len(set(numbers)) < len(numbers) or not all(0 < number < float("inf") for number in numbers):
+                option = name.removesuffix("_mm")
+                raise ParameterError(
+                    f"`{option}` ({', '.join(f'{n:g}' for n in numbers)}) must be positive and differ."
+                )
+        needed = max(1, len(self.exposures)) * max(1, len(self.distances_mm))
+        if len(self.groups) != needed:
+            raise ParameterError(f"`groups` ({len(self.groups)}) must be {needed}, one for each exposure and distance.")
+
+
+def expanded(paths: Sequence[Path]) -> list[Path]:
+    """Files, and the frames in folders in alphabetical order."""
+    files: list[Path] = []
+    for path in paths:
+        listed = [Path(name) for name in list_folder(path)[0]] if path.is_dir() else [path]
+        if not listed:
+            raise ParameterError(f"The folder `{path}` holds no frame. Save the camera's frames in it.")
+        files += listed
+    return files
+
+
+def grouped(paths: Sequence[Path], count: int) -> list[list[Path]]:
+    """Files in groups: one for each path if there are as many, otherwise equal parts in order."""
+    return [expanded([path]) for path in paths] if len(paths) == count else equal_parts(expanded(paths), count, "PSF")
+
+
+@dataclass(frozen=True, eq=False)
+class Photographed:
+    """What the photographs give: the content of a camera file, its pictures, and sentences for the user."""
+
+    content: dict[str, Any]
+    parts: dict[str, Frame | list[Frame]]
+    notes: list[str]
+    results: list[str]
+    flat_colour: tuple[float, ...] = ()
+
+
+def develop(photographs: Photographs, frames: FrameFormat, known: Corrections = Corrections()) -> Photographed:
+    """Average, merge, correct and centre the frames of a point source; measure the sensor.
+
+    Args:
+        photographs: the files, and how they were taken.
+        frames: format of the frames.
+        known: flat field and hot pixels of an earlier calibration.
+
+    Raises:
+        MwdnError: a file cannot be read, frames disagree, or are saturated.
+    """
+    _, frames = frames.read_stored(photographs.groups[0][0])  # a raw file says its own mosaic
+    sensor = measure_sensor(photographs.sensor, frames, known)
+    exposures, distances = photographs.exposures, photographs.distances_mm
+    groups, count = photographs.groups, max(1, len(exposures))
+    points = [
+        photograph_point(groups[start : start + count], exposures, sensor, frames)
+        for start in range(0, len(groups), count)
+    ]
+    own = points[0]
+    shift = centring_shift(own.image, frames.cell) if photographs.centre else (0, 0)
+    parts: dict[str, Frame | list[Frame]] = {"psf": psf_frame(shifted(own.image, *shift), frames)}
+    content: dict[str, Any] = {"mosaic": frames.mosaic, "psf_corrected": True}
+    notes = [*sensor.notes, *(note for point in points for note in point.notes)]
+    if len(distances) > 1:
+        content |= {"distance_mm": distances[0], "distances_mm": tuple(distances[1:])}
+        parts["distance_psfs"] = [psf_frame(_centred(point, photographs, frames), frames) for point in points[1:]]
+    elif distances:
+        content["distance_mm"] = distances[0]
+    if photographs.field:
+        exposure = [min(exposures)] if exposures else []
+        places = [photograph_point([group], exposure, sensor, frames) for group in photographs.field]
+        content["field_positions"], parts["field_psfs"] = _field(places, own.image, shift, frames)
+        notes += [note for place in places for note in place.notes]
+    sensor_content, sensor_parts = of_sensor(sensor, frames)
+    results = [_summary(own, shift), *describe_sensor(sensor)]
+    return Photographed(content | sensor_content, parts | sensor_parts, notes, results, sensor.flat_colour)
+
+
+def psf_frame(image: Image, frames: FrameFormat) -> Frame:
+    """The file's numbers of a linear image; the PSF's file has no gamma of its own."""
+    return FrameFormat(bit_depth=frames.bit_depth, bgr=frames.bgr).denormalise(image)
+
+
+def _centred(point: PointSource, photographs: Photographs, frames: FrameFormat) -> Image:
+    return shifted(point.image, *centring_shift(point.image, frames.cell)) if photographs.centre else point.image
+
+
+def _field(
+    places: Sequence[PointSource], reference: Image, shift: tuple[int, int], frames: FrameFormat
+) -> tuple[tuple[tuple[float, float], ...], list[Frame]]:
+    """Displacements of the points off the axis, and their PSFs moved back onto the one on the axis."""
+    positions, pictures = [], []
+    for place in places:
+        down, right, _ = displacement(place.image, reference)
+        positions.append((round(down, 2), round(right, 2)))
+        back = (round(-moved / frames.cell) * frames.cell for moved in (down, right))
+        total = [step + own for step, own in zip(back, shift, strict=True)]
+        pictures.append(psf_frame(shifted(place.image, total[0], total[1]), frames))
+    return tuple(positions), pictures
+
+
+def of_sensor(sensor: SensorFrames, frames: FrameFormat) -> tuple[dict[str, Any], dict[str, Frame | list[Frame]]]:
+    """Keys and pictures of a camera file that describe its sensor."""
+    content: dict[str, Any] = {}
+    parts: dict[str, Frame | list[Frame]] = {}
+    if (dark := sensor.longest_dark) is not None:
+        parts["dark"] = frames.denormalise(dark.image)
+        content["black_level"] = round(float(dark.image.mean()), 6)
+    if sensor.corrections.flat is not None:
+        parts["flat_field"] = np.ascontiguousarray(sensor.corrections.flat[0].movedim(0, -1).numpy(), np.float32)
+    if sensor.corrections.count:
+        assert sensor.corrections.defects is not None
+        parts["hot_pixels"] = picture_of(sensor.corrections.defects)
+    if (transfer := sensor.transfer) is not None:
+        content |= {
+            "electrons_per_count": round(transfer.electrons_per_count, 5),
+            "read_noise_electrons": round(transfer.read_noise, 4),
+            "full_well_electrons": round(transfer.full_well, 1),
+            "black_level": round(transfer.black_level, 6),
+        }
+    return content, parts
+
+
+def _summary(point: PointSource, shift: tuple[int, int]) -> str:
+    merged = "" if len(point.exposures) == 1 else f" at {len(point.exposures)} exposures, merged"
+    range_ = f"; {point.decades:.1f} decades from the noise to the peak" if point.decades else ""
+    return f"{point.count} frames averaged{merged}{range_}. Moved by ({shift[0]}, {shift[1]}) px to the centre."
+
+
+def describe_sensor(sensor: SensorFrames) -> list[str]:
+    """Sentences about hot pixels and noise."""
+    sentences = []
+    if (defects := sensor.corrections.defects) is not None:
+        part = sensor.corrections.count / defects.numel()
+        sentences.append(f"{sensor.corrections.count:,} hot or dead pixels ({part:.3%}) are replaced.")
+    if (transfer := sensor.transfer) is not None:
+        sentences.append(
+            f"Sensor: {transfer.electrons_per_count:.3g} electrons per count (standard error {transfer.error:.1%}), "
+            f"read noise {transfer.read_noise:.2g} electrons, full well {transfer.full_well:,.0f} electrons."
+        )
+        if transfer.clipped:
+            sentences.append("The black level cuts off the noise of darkness: raise the camera's offset.")
+    return sentences

@@ -1,0 +1,182 @@
+"""What dark and flat frames say of a sensor: dark level, hot pixels, flat field, noise, colour of the light."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from mwdn.calibration.corrections import Corrections
+from mwdn.calibration.frame_average import FrameAverage, Kind, average_frames
+from mwdn.calibration.frame_format import FrameFormat
+from mwdn.calibration.frame_operations import demosaic
+from mwdn.calibration.hot_pixels import find_dead_pixels, find_hot_pixels
+from mwdn.calibration.photon_transfer import SAME_LIGHT, PhotonTransfer, photon_transfer
+from mwdn.errors import ParameterError
+from mwdn.types import Image
+
+LEAST_RESPONSE = 0.1
+"""Smallest value of a flat field: a pixel with less light is replaced, not amplified."""
+
+
+@dataclass(frozen=True)
+class SensorFiles:
+    """Frames that describe the sensor.
+
+    Args:
+        dark: without light, several.
+        dark_exposures: one for each equal part of them, in order; empty if all have the same.
+        flat: of even light at about half of the full scale, in pairs of the same exposure.
+        flat_dark: without light and with the exposure of the flat frames; ``dark`` unless given.
+    """
+
+    dark: tuple[Path, ...] = ()
+    dark_exposures: tuple[float, ...] = ()
+    flat: tuple[Path, ...] = ()
+    flat_dark: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class SensorFrames:
+    """The sensor, as measured.
+
+    Args:
+        darks: average of the dark frames, by exposure; ``None`` for any exposure.
+        corrections: flat field and hot pixels.
+        transfer: gain and noise; ``None`` without pairs of flat and dark frames.
+        flat_colour: mean of red, green and blue of the flat frames; empty without colours.
+        notes: sentences about what was found.
+    """
+
+    darks: dict[float | None, FrameAverage]
+    corrections: Corrections
+    transfer: PhotonTransfer | None = None
+    flat_colour: tuple[float, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def dark(self, exposure: float | None) -> Image | None:
+        """The dark frame for an exposure.
+
+        Raises:
+            ParameterError: there are dark frames of other exposures only.
+        """
+        if not self.darks:
+            return None
+        if None in self.darks:
+            return self.darks[None].image
+        if exposure is None or exposure not in self.darks:
+            known = ", ".join(f"{time:g}" for time in self.darks if time is not None)
+            raise ParameterError(
+                f"`dark_exposures` ({known}) must have one for each of `exposures`, also {exposure:g}."
+            )
+        return self.darks[exposure].image
+
+    @property
+    def longest_dark(self) -> FrameAverage | None:
+        """The dark frame of the longest exposure, which shows hot pixels best."""
+        return self.darks[max(self.darks, key=lambda time: time or 0.0)] if self.darks else None
+
+
+def average_files(
+    paths: Sequence[Path], frames: FrameFormat, *, kind: Kind = "PSF", dark: Image | None = None
+) -> FrameAverage:
+    """Read and average frames of the same light, see `average_frames`."""
+    stored = [frames.read_stored(path)[0] for path in paths]
+    return average_frames(stored, frames, names=[path.name for path in paths], kind=kind, dark=dark)
+
+
+def measure_sensor(files: SensorFiles, frames: FrameFormat, known: Corrections = Corrections()) -> SensorFrames:
+    """Measure a sensor from dark and flat frames.
+
+    Args:
+        files: the frames.
+        frames: format of the camera's frames; that of raw files with their mosaic.
+        known: flat field and hot pixels of an earlier calibration, kept where no frames of this kind are given.
+
+    Raises:
+        MwdnError: a file cannot be read, or frames of the same kind disagree.
+    """
+    groups = equal_parts(files.dark, len(files.dark_exposures) or 1, "dark") if files.dark else []
+    times: Sequence[float | None] = files.dark_exposures or (None,)
+    darks = {time: average_files(group, frames, kind="dark") for time, group in zip(times, groups, strict=False)}
+    measured = SensorFrames(darks, replace(known, psf_done=False))
+    notes = [sentence for average in darks.values() for sentence in average.rejected.values()]
+    if (longest := measured.longest_dark) is not None and longest.count > 1:
+        defects = find_hot_pixels(longest, cell=frames.cell)
+        measured = replace(measured, corrections=replace(measured.corrections, defects=defects))
+    elif darks and known.defects is None:
+        notes.append("A single dark frame cannot tell hot pixels from noise. Take several.")
+    measured = replace(measured, notes=tuple(notes))
+    return _with_flats(measured, files, frames) if files.flat else measured
+
+
+def equal_parts(paths: Sequence[Path], count: int, kind: str) -> list[list[Path]]:
+    """Divide files into consecutive groups of equal size.
+
+    Raises:
+        ParameterError: they cannot be divided.
+    """
+    if len(paths) % count:
+        raise ParameterError(
+            f"{len(paths)} {kind} frames cannot be divided into {count} equal groups. Give as many frames for each."
+        )
+    size = len(paths) // count
+    return [list(paths[start : start + size]) for start in range(0, len(paths), size)]
+
+
+def _with_flats(sensor: SensorFrames, files: SensorFiles, frames: FrameFormat) -> SensorFrames:
+    dark_paths = files.flat_dark or files.dark
+    flats, darks = ([frames.read_stored(path)[0] for path in paths] for paths in (files.flat, dark_paths))
+    names, defects, notes = [path.name for path in files.flat], sensor.corrections.defects, list(sensor.notes)
+    dark = None
+    if darks:
+        dark = average_frames(darks, frames, names=[path.name for path in dark_paths], kind="dark").image
+    else:
+        notes.append("Without dark frames the flat field holds the black level, too: `--dark`.")
+    levels = [float(frames.normalise(frame).mean()) - (0.0 if dark is None else float(dark.mean())) for frame in flats]
+    total, weight = None, 0.0
+    for start, stop in _runs(levels):
+        average = average_frames(flats[start:stop], frames, names=names[start:stop], kind="flat", dark=dark)
+        notes += average.rejected.values()
+        if float(average.saturated.float().mean()) > 1e-3:
+            notes.append(f"`{names[start]}` is saturated, and left out of the flat field.")
+            continue
+        # Frames of more light have less noise, relative to their level, with the square root of the electrons.
+        part = average.count * levels[start]
+        total = part * average.image / levels[start] + (0.0 if total is None else total)
+        weight += part
+    if total is None or weight <= 0:
+        raise ParameterError("All flat frames are saturated or dark. Expose them to about half of the full scale.")
+    flat = total / weight
+    defects = (torch.zeros(1, 1, *flat.shape[-2:]) > 0) if defects is None else defects
+    defects = defects | find_dead_pixels(flat.mean((0, 1)), cell=frames.cell)
+    colour = demosaic(flat, frames.mosaic) if frames.mosaic else flat
+    tint = tuple(colour.mean((0, 2, 3)).tolist()) if colour.shape[1] == 3 else ()
+    transfer = None
+    if len(flats) > 1 and len(darks) > 1 and frames.gamma is None:
+        transfer = photon_transfer(flats, darks, frames, bad=defects)
+    else:
+        notes.append("Gain and read noise need two flat frames of the same exposure and two dark ones.")
+    corrections = Corrections(relative_response(flat, frames.cell), defects)
+    return SensorFrames(sensor.darks, corrections, transfer, tint, tuple(notes))
+
+
+def _runs(levels: Sequence[float]) -> list[tuple[int, int]]:
+    """Start and stop of consecutive frames of the same light."""
+    starts = [0] + [
+        number
+        for number in range(1, len(levels))
+        if abs(levels[number] - levels[number - 1]) > SAME_LIGHT * abs(levels[number - 1])
+    ]
+    return list(zip(starts, [*starts[1:], len(levels)], strict=True))
+
+
+def relative_response(flat: Image, cell: int) -> Tensor:
+    """A flat frame over its mean, for each channel and each kind of pixel of a mosaic; at least `LEAST_RESPONSE`."""
+    response = torch.empty_like(flat)
+    for row in range(cell):
+        for column in range(cell):
+            part = flat[..., row::cell, column::cell]
+            response[..., row::cell, column::cell] = part / part.mean((-2, -1), keepdim=True).clamp(min=1e-12)
+    return response.clamp(min=LEAST_RESPONSE)

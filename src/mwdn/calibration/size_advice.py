@@ -1,0 +1,20 @@
+"""What to do about a capture that has another size than the PSF."""
+
+from mwdn.calibration.frame_format import FrameFormat
+from mwdn.types import Size
+
+
+def advise_size(capture: Size, psf: Size, frames: FrameFormat) -> str:
+    """The options with which a capture and a PSF of other sizes fit."""
+    for larger, smaller, name, options in (
+        (psf, capture, "PSF", "psf_bin={product}"),
+        (capture, psf, "capture", "bin={product}, psf_bin={bin}"),
+    ):
+        factor = larger[0] // smaller[0]
+        if factor > 1 and larger == (smaller[0] * factor, smaller[1] * factor):
+            options = options.format(product=frames.bin * factor, bin=frames.bin)
+            return f"The {name} is {factor} times as large: bin it by {factor}, `{options}`."
+    if psf[0] <= capture[0] and psf[1] <= capture[1]:
+        raw = frames.bin * frames.cell
+        return f"Crop the capture around its centre: `crop=({psf[0] * raw}, {psf[1] * raw})`."
+    return "Use the PSF that belongs to this camera."

@@ -1,0 +1,71 @@
+"""Options of `mwdn calibrate` for its photographs."""
+
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from mwdn.calibration.photographs import Photographs, expanded, grouped
+from mwdn.calibration.sensor_frames import SensorFiles
+
+Files = Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative=())]
+Numbers = Annotated[tuple[float, ...], Parameter(consume_multiple=True, negative=())]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class PhotographOptions:
+    """Photographs that describe the camera, and how they were taken. A folder stands for the frames in it.
+
+    Args:
+        exposures: exposure of each equal part of the frames, in order: --exposures 1 8 64, in milliseconds. Two to four
+            are merged to high dynamic range.
+        dark: frames taken without light, or with the source switched off, several; subtracted from the PSF and the
+            captures.
+        dark_exposures: exposure of each equal part of the dark frames, if they differ.
+        flat: frames of even light, in pairs of the same exposure: flat field, gain and read noise.
+        flat_dark: dark frames with the exposure of the flat frames; --dark unless given.
+        distances: distance of the point source in each equal part of the frames, in millimetres; the first is the
+            camera's own.
+        field: frames of points off the axis, each a file or a folder, with the exposure of the shortest frames.
+        centre: move the PSF's centroid to the centre of the frame; the default for several frames.
+    """
+
+    _: KW_ONLY
+    exposures: Numbers = ()
+    dark: Files = ()
+    dark_exposures: Numbers = ()
+    flat: Files = ()
+    flat_dark: Files = ()
+    distances: Numbers = ()
+    field: Files = ()
+    centre: bool | None = None
+
+    @property
+    def dark_files(self) -> tuple[Path, ...]:
+        """Files of --dark; --dark none does without."""
+        return () if self.dark == (Path("none"),) else self.dark
+
+    def are_one_picture(self, files: Sequence[Path]) -> bool:
+        """Whether a camera file can name these pictures as they are."""
+        others = self.exposures or self.flat or self.distances or self.field or self.centre
+        return len(expanded(files)) <= 1 and len(expanded(self.dark_files)) <= 1 and not others
+
+    def of(self, pictures: Sequence[Path]) -> Photographs:
+        """The photographs, with these pictures of the point source.
+
+        Raises:
+            ParameterError: a folder is empty, or the pictures cannot be divided into exposures and distances.
+        """
+        dark, flat, flat_dark = (tuple(expanded(each)) for each in (self.dark_files, self.flat, self.flat_dark))
+        groups = max(1, len(self.exposures)) * max(1, len(self.distances))
+        return Photographs(
+            tuple(map(tuple, grouped(pictures, groups))),
+            exposures=self.exposures,
+            sensor=SensorFiles(dark, self.dark_exposures, flat, flat_dark),
+            distances_mm=self.distances,
+            field=tuple(tuple(expanded([path])) for path in self.field),
+            centre=self.centre is not False,
+        )

@@ -1,0 +1,191 @@
+"""Frames of a point source become a PSF: averages, hot pixels, dynamic range, noise, exposure."""
+
+import numpy as np
+import pytest
+import torch
+
+from mwdn.calibration import FrameFormat
+from mwdn.calibration.dynamic_range import merge_exposures
+from mwdn.calibration.exposure import measure_exposure
+from mwdn.calibration.frame_average import average_frames
+from mwdn.calibration.hot_pixels import find_hot_pixels
+from mwdn.calibration.photon_transfer import photon_transfer
+from mwdn.calibration.pixel_repair import PixelRepair
+from mwdn.errors import ImageError, ParameterError
+from mwdn.optics import Sensor
+from mwdn.optics.displacement import displacement, shifted
+from photographed_camera import SENSOR, STEPS, Bench
+
+FORMAT = FrameFormat(bit_depth=12)
+SPAN = 1 - SENSOR.black_level  # light of 1 reaches the full scale from the black level on
+
+
+@pytest.fixture(scope="module")
+def bench():
+    return Bench()
+
+
+@pytest.fixture(scope="module")
+def dark(bench):
+    return average_frames([bench.dark() for _ in range(8)], FORMAT, kind="dark")
+
+
+def test_an_average_leaves_out_cosmic_hits_and_names_outlying_frames(bench, dark):
+    frames = [bench.point() for _ in range(7)]
+    frames[2][40:43, 60] = STEPS
+    frames[3] = bench.point(move=(1, 0))
+    frames[5] = bench.point(0.8)
+    average = average_frames(frames, FORMAT, names=list("abcdefg"), dark=dark.image)
+    assert average.rejected.keys() == {"d", "f"}
+    assert "displaced by (1.0, -0.0) px" in average.rejected["d"] or "(1.0, 0.0)" in average.rejected["d"]
+    assert "0.8" in average.rejected["f"]
+    assert (average.count, int(average.saturated.sum())) == (5, 0)
+    assert 3 <= average.left_out < 60
+    good = bench.hot == 0
+    error = (average.image / SPAN - bench.light)[good]
+    read = (SENSOR.read_noise / SENSOR.full_well) ** 2
+    model = ((bench.light / SENSOR.full_well + read) / 5 + read / 8)[good].sqrt()  # of 5 frames less 8 dark ones
+    assert float((error / model).square().mean().sqrt()) == pytest.approx(1, abs=0.1)
+    assert average.noise.slope == pytest.approx(SPAN / SENSOR.full_well, rel=0.25)
+
+
+def test_two_frames_lose_the_higher_of_two_numbers(bench, dark):
+    frames = [bench.dark() for _ in range(2)]
+    frames[1][50, 50] = 3000
+    average = average_frames(frames, FORMAT, kind="dark")
+    assert float(average.image[0, 0, 50, 50]) == pytest.approx(frames[0][50, 50, 0] / STEPS, abs=1e-6)
+
+
+def test_frames_that_disagree_are_refused(bench, dark):
+    with pytest.raises(ParameterError, match=r"disagree: `a` has .*; `b` has .* three or more"):
+        average_frames([bench.point(), bench.point(0.5)], FORMAT, names=["a", "b"], dark=dark.image)
+    with pytest.raises(ImageError, match=r"`frame 2` \(64 x 80 x 1, uint16\) must be like `frame 1`"):
+        average_frames([bench.point(), bench.point()[::2, ::2]], FORMAT)
+    with pytest.raises(ImageError, match="at least one"):
+        average_frames([], FORMAT)
+
+
+def test_hot_pixels_are_found_and_replaced(bench, dark):
+    found = find_hot_pixels(dark)
+    assert int((found & (bench.hot > 0)).sum()) == int((bench.hot > 0).sum())
+    assert int((found & (bench.hot == 0)).sum()) <= 1
+    slope = torch.arange(160.0).expand(1, 1, 128, 160)
+    broken = torch.where(found, 1e3, slope)
+    inside = torch.zeros_like(found)
+    inside[..., 2:-2, 2:-2] = True
+    torch.testing.assert_close(PixelRepair(found[0, 0])(broken)[inside], slope[inside], atol=0.51, rtol=0)
+
+
+def test_repair_of_a_mosaic_takes_pixels_of_the_same_colour(generator):
+    colours = torch.tensor([[1.0, 2.0], [3.0, 4.0]]).repeat(4, 4)[None, None]
+    defects = torch.zeros(8, 8, dtype=torch.bool)
+    defects[3, 4] = defects[0, 0] = defects[3, 6] = True
+    broken = torch.where(defects, 100.0, colours)
+    torch.testing.assert_close(PixelRepair(defects, 2)(broken), colours)
+    block = torch.zeros(8, 8, dtype=torch.bool)
+    block[2:5, 2:5] = True
+    ones = torch.ones(1, 1, 8, 8)
+    torch.testing.assert_close(PixelRepair(block)(torch.where(block, 9.0, ones)), ones)
+
+
+def test_merged_exposures_are_right_over_four_decades(bench, dark):
+    """Within 2 % of the truth in each decade, and at each pixel as far from it as its noise says."""
+    exposures = [64.0, 1.0, 512.0, 8.0]
+    averages = [average_frames([bench.point(t) for _ in range(6)], FORMAT, dark=dark.image) for t in exposures]
+    merged = merge_exposures(averages, exposures)
+    assert merged.exposures == pytest.approx((1, 8, 64, 512), rel=0.01)
+    assert not merged.unknown[bench.hot == 0].any()
+    good = bench.hot == 0
+    for decade in (1e-4, 1e-3, 1e-2, 1e-1):
+        pixels = good & (bench.light >= decade * 0.75) & (bench.light < decade * 7.5)
+        image, light = merged.image[pixels] / SPAN, bench.light[pixels]
+        assert len(light) > 100
+        assert float(image.sum() / light.sum()) == pytest.approx(1, abs=0.01)
+        assert float((image / light - 1).square().mean().sqrt()) < 0.02
+        assert float(((image - light) * SPAN / merged.noise[pixels]).square().mean().sqrt()) == pytest.approx(
+            1, abs=0.2
+        )
+
+
+def test_exposures_are_measured_and_wrong_ones_refused(bench, dark):
+    averages = [average_frames([bench.point(t) for _ in range(3)], FORMAT, dark=dark.image) for t in (1, 7.6)]
+    assert merge_exposures(averages, [1.0, 8.0]).exposures[1] == pytest.approx(7.6, rel=0.01)
+    with pytest.raises(ParameterError, match="times the light"):
+        merge_exposures(averages[::-1], [1.0, 8.0])
+    for exposures in ([1.0, 1.0], [0.0, 1.0], [1.0]):
+        with pytest.raises(ParameterError, match="exposures"):
+            merge_exposures(averages, exposures)
+
+
+@pytest.mark.parametrize("sensor", [SENSOR, Sensor(6_000.0, 8.0, 12, 0.03), Sensor(60_000.0, 20.0, 12, 0.02)])
+def test_photon_transfer_finds_gain_and_noise(sensor):
+    bench = Bench(hot=0)
+    shape = torch.zeros(1, 1, 128, 160)
+    darks = [bench.frame(shape, sensor) for _ in range(2)]
+    slope = torch.linspace(0.8, 1.0, 160)
+    flats = [bench.frame(shape + level * slope, sensor) for level in (0.2, 0.5, 0.8) for _ in range(2)]
+    found = photon_transfer(flats, darks, FORMAT)
+    gain = sensor.full_well / (STEPS * (1 - sensor.black_level))
+    assert found.electrons_per_count == pytest.approx(gain, rel=0.03)
+    assert found.read_noise == pytest.approx(sensor.read_noise, rel=0.04)
+    assert found.full_well == pytest.approx(sensor.full_well, rel=0.03)
+    assert found.black_level == pytest.approx(sensor.black_level, abs=1e-4)
+    assert found.sensor.bit_depth == 12
+    assert (found.error < 0.02, found.clipped) == (True, False)
+
+
+def test_photon_transfer_finds_pixels_that_are_full_before_the_converter():
+    bench, sensor = Bench(hot=0), Sensor(15_000.0, 3.0, 12, 0.01)
+    shape = torch.zeros(1, 1, 128, 160)
+
+    def flat(level):
+        """A well that holds no more than 0.7 of what the converter can read: its noise ends there."""
+        capture = bench.frame(shape + level, sensor)
+        full = round((0.7 * (1 - 0.01) + 0.01) * STEPS)
+        return np.minimum(capture, full)
+
+    flats = [flat(level) for level in (0.2, 0.4, 0.6, 0.8) for _ in range(2)]
+    found = photon_transfer(flats, [bench.frame(shape, sensor) for _ in range(2)], FORMAT)
+    assert found.electrons_per_count == pytest.approx(15_000 / (STEPS * 0.99), rel=0.04)
+    assert found.full_well == pytest.approx(0.6 * 15_000, rel=0.05)  # the highest level that is not full
+
+
+def test_photon_transfer_refuses_what_tells_nothing(bench):
+    darks, flats = [bench.dark() for _ in range(2)], [bench.flat(0.5) for _ in range(2)]
+    for wrong, message in (
+        ((flats[:1], darks), "two flat frames"),
+        (([flats[0], bench.flat(0.8)], darks), "must have the same light"),
+        (([bench.flat(4.0)] * 2, darks), "saturated"),
+        (([flats[0]] * 2, darks), "no noisier"),
+    ):
+        with pytest.raises(ParameterError, match=message):
+            photon_transfer(*wrong, FORMAT)
+    with pytest.raises(ParameterError, match="linear in light"):
+        photon_transfer(flats, darks, FrameFormat(gamma="srgb"))
+
+
+def test_the_exposure_to_use_next():
+    bench = Bench(hot=0)
+    for exposure in (0.25, 0.5, 1.0):
+        measured = measure_exposure(bench.point(exposure), FORMAT, black=SENSOR.black_level)
+        peak = float(bench.light.flatten().sort().values[-3]) * exposure
+        assert measured.peak == pytest.approx(peak * SPAN + SENSOR.black_level, rel=0.06)
+        assert measured.factor == pytest.approx(0.8 / peak, rel=0.06)
+        assert (measured.is_good, measured.saturated) == (exposure == 1.0, 0)
+    longer = measure_exposure(bench.point(3.0), FORMAT)
+    assert longer.saturated > 100
+    assert 0.15 < longer.factor < 0.6  # 0.36, extrapolated from the levels below saturation
+    assert longer.next(12.0).endswith("ms instead of 12 ms")
+    # 12 bits in a file of 16 are recognised once the frame is saturated.
+    assert measure_exposure(bench.point(2.0)).peak == pytest.approx(1)
+    assert measure_exposure(bench.point(1.0)).peak < 1 / 16
+
+
+def test_displacement_between_pixels(bench):
+    image = bench.light
+    for down, right in ((3, -7), (0, 0), (-12, 5)):
+        found = displacement(shifted(image, down, right), image)
+        assert found[:2] == pytest.approx((down, right), abs=0.1)
+    half = (image + shifted(image, 1, 0)) / 2
+    assert displacement(half, image).down == pytest.approx(0.5, abs=0.05)
+    assert torch.equal(shifted(image, 200, 0), torch.zeros_like(image))

@@ -1,0 +1,309 @@
+"""`mwdn calibrate FRAMES`: from photographs on the bench to a camera file that other commands take."""
+
+import json
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from mwdn import Calibration, Camera
+from mwdn.calibration import FrameFormat
+from mwdn.calibration.camera_file import read_camera
+from mwdn.calibration.camera_parts import write_camera_with_parts
+from mwdn.calibration.watching import guide_exposure, watch_folder
+from mwdn.errors import ImageError, PsfError
+from mwdn.optics.displacement import displacement
+from photographed_camera import STEPS, Bench, save
+
+FORMAT = FrameFormat(bit_depth=12)
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory):
+    """A bench, and the folder with its photographs."""
+    bench, folder = Bench(), tmp_path_factory.mktemp("bench")
+    for exposure in (1, 8, 64):
+        save(folder / f"psf_{exposure}", [bench.point(exposure, (3, -5)) for _ in range(4)])
+    save(folder / "dark", [bench.dark() for _ in range(6)])
+    save(folder / "flat", [bench.flat(level) for level in (0.3, 0.3, 0.7, 0.7)])
+    capture = Camera(bench.light).forward(square())
+    save(folder / "captures", [bench.frame(0.8 * capture / capture.max())])
+    return bench, folder
+
+
+def square():
+    scene = torch.zeros(1, 1, 128, 160)
+    scene[..., 40:80, 60:110] = 1
+    return scene
+
+
+@pytest.fixture
+def folder(photographs, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    for path in photographs[1].iterdir():
+        (tmp_path / path.name).symlink_to(path)
+    return tmp_path
+
+
+EVERYTHING = "calibrate psf_1 psf_8 psf_64 --exposures 1 8 64 --dark dark --flat flat --bit-depth 12"
+
+
+def test_frames_become_a_camera_that_other_commands_take(run, folder, photographs):
+    bench, _ = photographs
+    code, out, err = run(EVERYTHING)
+    assert (code, err) == (0, "")
+    assert "12 frames averaged at 3 exposures" in out
+    calibration = Calibration.load("camera.toml")
+    found = displacement(calibration.psf, bench.light)
+    assert found.correlation > 0.99
+    truth = bench.light / bench.light.sum()
+    centroid = [float((truth[0, 0].sum(1 - axis) * torch.arange(n)).sum()) for axis, n in ((0, 128), (1, 160))]
+    assert found[:2] == pytest.approx((64 - centroid[0], 80 - centroid[1]), abs=1)
+    assert calibration.corrections.count == 20
+    assert calibration.sensor.full_well == pytest.approx(15_000, rel=0.03)
+    assert calibration.sensor.read_noise == pytest.approx(3, rel=0.05)
+    assert calibration.background == (0.0,)
+    code, out, err = run("inspect camera.toml --json -o report")
+    report = json.loads(out)
+    assert (code, err) == (0, "")
+    assert report["file"].startswith("camera-psf-")
+    texts = " ".join(finding["text"] for finding in report["verdict"])
+    assert "20 hot or dead pixels" in texts
+    assert "electrons" in texts
+    assert "decades" in texts
+    line = "reconstruct captures --psf camera.toml --method wiener --format npy --no-trust --device cpu --bin 1 -o out"
+    code, _, err = run(line)
+    assert (code, err) == (0, "")
+    picture = np.load("out/frame_1.npy")[..., 0]
+    truth = np.roll(square()[0, 0].numpy(), [-round(step) for step in found[:2]], (0, 1))
+    assert np.corrcoef(picture.ravel(), truth.ravel())[0, 1] > 0.8
+
+
+def test_dark_flat_and_hot_pixels_are_corrected_in_captures(run, folder, photographs):
+    bench, _ = photographs
+    assert run(EVERYTHING)[0] == 0
+    calibration = Calibration.load("camera.toml")
+    uneven = calibration.correct(bench.flat(0.5))
+    # Light that falls off towards the corners by 30 % becomes even; hot pixels are gone.
+    assert float(uneven.std() / uneven.mean()) < 0.02
+    assert float(uneven.max() / uneven.mean()) < 1.1
+    assert float(calibration.correct(bench.dark()).mean()) == pytest.approx(0, abs=2e-5)
+
+
+def test_the_bits_of_a_camera_file_stay_if_it_is_changed(run, folder):
+    assert run(EVERYTHING)[0] == 0
+    before = read_camera("camera.toml")
+    assert run("calibrate --camera camera.toml --pitch-um 4.8 --white-balance 1 1 1")[0] == 0
+    after = read_camera("camera.toml")
+    assert after == {**before, "pitch_um": 4.8, "white_balance": (1.0, 1.0, 1.0)}
+    first = {path.name for path in folder.glob("camera-*")}
+    # New frames of the point source keep what is known of the sensor; the replaced PSF's file is removed.
+    assert run("calibrate psf_1 --camera camera.toml")[0] == 0
+    again = read_camera("camera.toml")
+    assert again["flat_field"] == before["flat_field"]
+    assert again["hot_pixels"] == before["hot_pixels"]
+    assert again["psf"] != before["psf"]
+    assert (again["bit_depth"], again["pitch_um"], again["read_noise_electrons"]) == (
+        12,
+        4.8,
+        before["read_noise_electrons"],
+    )
+    second = {path.name for path in folder.glob("camera-*")}
+    assert first - second == {before["psf"].name}
+    assert run("calibrate psf_1 --camera camera.toml --psf-bin 2")[0] == 2
+
+
+def test_a_camera_file_appears_with_all_its_pictures_or_not_at_all(folder, monkeypatch):
+    parts = {"psf": np.ones((4, 5, 1), np.float32), "dark": np.zeros((4, 5, 1), np.float32)}
+    write_camera_with_parts(Path("camera.toml"), {}, parts)
+    old = {path.name: path.read_bytes() for path in folder.glob("camera*")}
+    assert len(old) == 3
+    with pytest.raises(ImageError):
+        write_camera_with_parts(
+            Path("camera.toml"), {}, {"psf": 2 * parts["psf"], "dark": np.zeros((4, 5, 2), np.uint8)}
+        )
+    monkeypatch.setattr("mwdn.calibration.camera_parts.write_camera", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        write_camera_with_parts(Path("camera.toml"), {}, {"psf": 3 * parts["psf"]})
+    assert {path.name: path.read_bytes() for path in folder.glob("camera*")} == old
+
+
+def test_saturated_frames_are_refused_with_the_exposure_to_use(run, folder, photographs):
+    bench, _ = photographs
+    save("bright", [bench.point(3) for _ in range(3)])
+    code, _, err = run("calibrate bright --dark dark --exposures 12 --bit-depth 12")
+    assert code == 2
+    assert "PSF is saturated" in err
+    assert " ms instead of 12 ms" in err
+    used = float(err.split("Use ")[1].split(" ms")[0])
+    assert 0.12 < used / 12 < 0.6  # 0.27 is right
+    assert not Path("camera.toml").exists()
+    bits = "--bit-depth 12"
+    code, _, err = run(f"calibrate bright/frame_1.png {bits}")
+    assert (code, "use 0." in err, "times this exposure" in err) == (2, True, True)
+    save("dim", [bench.point(0.1) for _ in range(3)])
+    code, _, err = run(f"calibrate dim --dark dark {bits}")
+    assert (code, "of the full scale: use" in err) == (0, True)
+
+
+def test_outlying_frames_are_named(run, folder, photographs):
+    bench, _ = photographs
+    save("moved", [bench.point(move=(0, 4) if number == 2 else (0, 0)) for number in range(5)])
+    code, out, err = run("calibrate moved --dark dark --bit-depth 12")
+    assert (code, "4 frames averaged" in out) == (0, True)
+    assert "`frame_3.png` is displaced by (0.0, 4.0) px" in err.replace("-0.0", "0.0")
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("psf_1 psf_8 --exposures 1 8 64", "cannot be divided into 3"),
+        ("psf_1 psf_8 --exposures 8 8", "`--exposures` (8, 8) must be positive and differ"),
+        ("psf_8 psf_1 --exposures 1 8 --dark dark --bit-depth 12", "saturated"),
+        ("psf_1 --flat flat/frame_1.png flat/frame_3.png --dark dark --bit-depth 12", "must have the same light"),
+        ("psf_1 --dark dark --white-balance flat", "needs flat frames"),
+        ("psf_1 --dark dark --dark-exposures 1 2 --exposures 4", "must have one for each of `--exposures`"),
+        ("empty --dark dark", "holds no frame"),
+    ],
+)
+def test_photographs_that_do_not_fit(run, folder, line, message):
+    (folder / "empty").mkdir()
+    code, _, err = run(f"calibrate {line}")
+    assert code == 2
+    assert message in err
+    assert not Path("camera.toml").exists()
+
+
+def test_watching_guides_the_exposure(folder, photographs):
+    """The program writes frames while one turns the knobs; a half-written file is read when it is whole."""
+    bench, _ = photographs
+    watched = folder / "live"
+    save(watched, [bench.point(0.1)], "old")
+
+    def frames():
+        for number, exposure in enumerate((0.25, 1.0, 4.0)):
+            yield lambda n=number, e=exposure: save(watched, [bench.point(e)], f"shot{n}")
+        yield lambda: (watched / "z.png").write_bytes((watched / "shot1_1.png").read_bytes()[:3000])
+        yield lambda: (watched / "z.png").write_bytes((watched / "shot1_1.png").read_bytes())
+
+    script = frames()
+
+    def wait():
+        step = next(script, None)
+        if step is None:
+            return False
+        step()
+        return True
+
+    seen = list(guide_exposure(watch_folder(watched, FORMAT, wait), FORMAT, exposure_ms=10.0))
+    assert [sentence.split(":")[0] for sentence, _ in seen] == [
+        "old_1.png",
+        "shot0_1.png",
+        "shot1_1.png",
+        "shot2_1.png",
+        "z.png",
+    ]
+    assert "well exposed" in seen[2][0]
+    assert seen[3][1].saturated > 20
+    assert seen[3][1].factor < 0.5 < 2 < seen[1][1].factor
+    assert "ms instead of 10 ms" in seen[1][0]
+    with pytest.raises(ImageError, match="must be a folder"):
+        next(watch_folder(folder / "nothing", FORMAT, wait))
+
+
+def test_a_colour_camera_with_a_mosaic(run, folder):
+    """Dark, flat and hot pixels are those of single pixels; the PSF is moved by whole cells."""
+    bench = Bench(hot=5)
+    tint = torch.tensor([[0.5, 1.0], [1.0, 0.7]]).repeat(64, 80)
+    bench.light = bench.light * tint
+    save("point", [bench.point() for _ in range(3)])
+    save("flats", [bench.frame(0.6 * tint.expand_as(bench.light)) for _ in range(2)])
+    line = "calibrate point --dark dark --flat flats --flat-dark dark --mosaic rggb --bit-depth 12"
+    assert run(f"{line} --white-balance flat")[0] == 0
+    camera = read_camera("camera.toml")
+    assert camera["white_balance"] == pytest.approx((2.0, 1.0, 1 / 0.7), rel=0.02)
+    calibration = Calibration.load("camera.toml")
+    assert calibration.psf.shape == (1, 3, 64, 80)
+    flat = calibration.correct(bench.frame(0.6 * tint.expand_as(bench.light)))
+    assert float(flat.std((-2, -1)).max() / flat.mean()) < 0.03
+    # The flat field keeps the colours: it is 1 on average for each kind of pixel.
+    red, green, blue = flat.mean((0, 2, 3)).tolist()
+    assert (red / green, blue / green) == pytest.approx((0.5, 0.7), rel=0.02)
+
+
+def test_several_distances(run, folder):
+    """Shadows of a point at z are magnified by 1 + d / z; a scene in between gets a PSF in between."""
+    size, gap = (128, 160), 8.0
+    bench = Bench(size, hot=0)
+    flat = bench.light.clone()
+
+    def light(distance):
+        from mwdn.optics.warp import warp
+
+        return warp(flat, (1 + gap / distance) / (1 + gap / 100) * torch.eye(2))
+
+    for distance in (100, 400):
+        bench.light = light(distance)
+        save(f"at_{distance}", [bench.point() for _ in range(3)])
+    save("darks", [bench.dark() for _ in range(3)])
+    line = "calibrate at_100 at_400 --distances 100 400 --dark darks --bit-depth 12"
+    assert run(line)[0] == 0
+    camera = read_camera("camera.toml")
+    assert (camera["distance_mm"], camera["distances_mm"]) == (100.0, (400.0,))
+    from mwdn.calibration.places import at_distance
+
+    calibration = Calibration.load("camera.toml")
+    between, sentence = at_distance(calibration, 160.0)
+    expected = light(160)
+    alike = displacement(between.psf, expected).correlation
+    others = [at_distance(calibration, z)[0] for z in (100.0, 400.0)]
+    assert alike > 0.97
+    assert alike > 0.05 + max(displacement(other.psf, expected).correlation for other in others)
+    assert "that of 160" not in sentence
+    assert "magnified by" in sentence
+    assert at_distance(calibration, 400.0)[0].psf_hash != calibration.psf_hash
+    assert "the nearest one" in at_distance(calibration, 50.0)[1]
+    save("scene", [bench.point()])
+    code, _, err = run("reconstruct scene --psf camera.toml --distance 160 --method wiener --no-trust --device cpu")
+    assert (code, "magnified by" in err) == (0, True)
+    code, _, err = run("reconstruct scene --psf at_100/frame_1.png --distance 160 --method wiener")
+    assert (code, "`--distance`" in err, "several distances" in err) == (2, True, True)
+
+
+def test_several_positions_make_a_field_of_psfs(run, folder):
+    from mwdn.calibration.places import field_camera
+    from mwdn.optics.field import gaussian_blur
+
+    bench = Bench(hot=0)
+    axis = bench.light.clone()
+    save("axis", [bench.point() for _ in range(3)])
+    bench.light = 0.8 * gaussian_blur(axis, 1.5)  # blurred and darker off the axis
+    save("right", [bench.point(move=(0, 20)) for _ in range(3)])
+    save("darks", [bench.dark() for _ in range(3)])
+    assert run("calibrate axis --field right --dark darks --bit-depth 12")[0] == 0
+    camera = read_camera("camera.toml")
+    assert camera["field_positions"][0] == pytest.approx((0, 20), abs=0.6)
+    field = field_camera(Calibration.load("camera.toml"))
+    assert field.rank == 2
+    centre, right = field.psf_at(64, 80), field.psf_at(64, 159)
+    assert displacement(centre, axis).correlation > 0.99
+    assert float(right.sum() / centre.sum()) == pytest.approx(0.8, abs=0.05)
+    assert math.isclose(float(field.weights.sum(0).mean()), 1, rel_tol=1e-3)
+    assert STEPS == 4095
+
+
+def test_saturation_of_an_averaged_frame_is_an_error_of_the_psf(photographs):
+    _, folder = photographs
+    from mwdn.calibration.photographs import Photographs, develop
+
+    with pytest.raises(PsfError, match="maximum, 4,095"):
+        develop(Photographs((tuple(sorted((folder / "psf_64").iterdir())),)), FORMAT)
+
+
+def test_white_flats_need_colour(run, folder):
+    code, _, err = run(f"{EVERYTHING} --white-balance flat")
+    assert (code, "needs flat frames in colour" in err) == (2, True)
+    assert cv2.imread("dark/frame_1.png", -1).ndim == 2
