@@ -39,7 +39,8 @@ def write_camera_with_parts(
     Raises:
         MwdnError: a file cannot be written. Then nothing has changed.
     """
-    before, written = _own_parts(path), []
+    before = _own_parts(path)
+    written: list[Path] = []
     try:
         for key, frames in parts.items():
             if isinstance(frames, np.ndarray):
@@ -74,7 +75,7 @@ def _own_parts(path: Path) -> set[Path]:
         table = read_toml(path, "camera file") if path.is_file() else {}
     except ParameterError:
         table = {}
-    names = []
+    names: list[Any] = []
     for key in PARTS:
         value = table.get(key, ())
         names += [value] if isinstance(value, str) else value

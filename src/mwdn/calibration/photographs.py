@@ -169,7 +169,8 @@ def of_sensor(sensor: SensorFrames, frames: FrameFormat) -> tuple[dict[str, Any]
 def _summary(point: PointSource, shift: tuple[int, int]) -> str:
     merged = "" if len(point.exposures) == 1 else f" at {len(point.exposures)} exposures, merged"
     range_ = f"; {point.decades:.1f} decades from the noise to the peak" if point.decades else ""
-    return f"{point.count} frames averaged{merged}{range_}. Moved by ({shift[0]}, {shift[1]}) px to the centre."
+    frames = "1 frame" if point.count == 1 else f"{point.count} frames"
+    return f"{frames} averaged{merged}{range_}. Moved by ({shift[0]}, {shift[1]}) px to the centre."
 
 
 def describe_sensor(sensor: SensorFrames) -> list[str]:

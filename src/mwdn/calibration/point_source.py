@@ -58,7 +58,8 @@ def photograph_point(
     """
     times: list[float | None] = list(exposures) or [None]
     order = sorted(range(len(times)), key=lambda number: times[number] or 0.0)
-    averages, notes = [], []
+    averages: list[FrameAverage] = []
+    notes: list[str] = []
     for number in order:
         average = average_files(groups[number], frames, dark=sensor.dark(times[number]))
         notes += average.rejected.values()
