@@ -42,7 +42,7 @@ def noise_bounds(measurement: Measurement) -> NoiseBounds:
     pairs = 4 * float(noise_level(F.avg_pool2d(b, 2)).square().sum()) if min(b.shape[-2:]) > 1 else single
     low, high = (min(1.0, variance / energy) for variance in sorted((single, pairs)))
     some = b.flatten()[:: max(1, b.numel() // 100_000)]
-    is_unbounded = len(some.unique()) < LEAST_LEVELS or block_edges(b) > JPEG_EDGES
+    is_unbounded = len(set(some.tolist())) < LEAST_LEVELS or block_edges(b) > JPEG_EDGES
     return NoiseBounds(low, 1.0 if is_unbounded else high)
 
 
