@@ -7,10 +7,13 @@ import threading
 import pytest
 import torch
 
+from cameras import capture_of_rectangles
 from mwdn.data.pairs import PairFile
 from mwdn.data.recorded import Division, PrefetchedPairs, RecordedPairs, recorded_pairs
 from mwdn.data.simulated import Samples
 from mwdn.errors import ImageError, ParameterError, ShapeError, UnknownNameError
+from mwdn.fourier.convolution import convolve
+from mwdn.solvers.alignment import Pose
 
 
 @pytest.fixture
@@ -50,6 +53,22 @@ def test_split_of_the_paper(pairs):
     assert sorted(rows(train, range(24))) == list(range(6, 30))
     assert sorted(rows(validation, range(10**12, 10**12 + 3))) == [3, 4, 5]
     assert rows(validation, range(10**12, 10**12 + 3)) == rows(validation, range(10**12 + 3, 10**12 + 6))
+
+
+def test_the_psf_is_aligned_to_each_pair_once(tmp_path, monkeypatch):
+    """Two captures of one scene, the second through a PSF that is turned by 0.5 degrees."""
+    h, scene, measurement = capture_of_rectangles((96, 96), count=8, corners=(24, 56), rectangle=(12, 12), noise=0.0)
+    turned = Pose(torch.tensor([0.5]), torch.tensor([0.0])).move(h)
+    with PairFile.create(tmp_path / "p.h5", measurement_shape=(96, 96, 3), scene_shape=(96, 96, 3)) as file:
+        for one in (measurement, convolve(scene, turned)):
+            file.append(one[0], scene[0])
+    source = RecordedPairs(PairFile(tmp_path / "p.h5"), range(2), h, shuffled=False, aligned=True)
+    psfs = source.batch([0, 1]).psf
+    errors = [float((psfs[number] - true[0]).norm() / true.norm()) for number, true in ((0, h), (1, turned))]
+    wrong = float((turned - h).norm() / h.norm())
+    assert max(errors) < 0.5 * wrong
+    monkeypatch.setattr("mwdn.data.recorded.align", None)  # not called again
+    assert torch.equal(source.batch([2, 3]).psf, psfs)
 
 
 def test_prefetched_batches(pairs):

@@ -51,3 +51,21 @@ def test_too_few_pairs(count, kind):
 def test_unknown_split():
     with pytest.raises(UnknownNameError, match="Did you mean 'paper'"):
         split(100, "papre")
+
+
+@pytest.mark.parametrize(("count", "folds"), [(8, 4), (9, 4), (4, 4), (200, 4), (5, 2)])
+def test_folds_hold_out_each_pair_once(count, folds):
+    parts = [split(count, "folds", folds=folds, fold=fold) for fold in range(folds)]
+    assert [index for part in parts for index in part["validation"]] == list(range(count))
+    for part in parts:
+        assert sorted([*part["train"], *part["validation"]]) == list(range(count))
+        assert count // folds <= len(part["validation"]) <= -(-count // folds)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [({"folds": 1}, "`folds`"), ({"folds": 9}, "`folds`"), ({"fold": 4}, "`fold`"), ({"fold": -1}, "`fold`")],
+)
+def test_folds_that_do_not_exist(options, said):
+    with pytest.raises(ParameterError, match=said):
+        split(8, "folds", **options)

@@ -105,7 +105,7 @@ def _train(trainer: Trainer, progress: Progressing, board: TensorBoard | None) -
 
     def show_samples(done: int, total: int) -> None:
         if progress.phase is None:
-            progress.start("Simulating samples", total, done)
+            progress.start("Preparing samples", total, done)
         progress.update(done, f"{done:,} of {counted(total, 'sample')}")
         if done == total:
             progress.print(_kept(trainer))

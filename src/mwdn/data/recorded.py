@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
@@ -16,7 +16,8 @@ from mwdn.data.simulated import Batch, Samples
 from mwdn.data.splits import split
 from mwdn.errors import ParameterError, ShapeError
 from mwdn.runtime.transfers import to_device
-from mwdn.types import Psf
+from mwdn.solvers.alignment import Pose, align
+from mwdn.types import Measurement, Psf
 
 HELD_OUT = 20
 """One in this many photographs is held out for validation, or training pairs of a split without a validation part."""
@@ -30,11 +31,19 @@ class Division:
         split: see `mwdn.data.splits.split`. The published ones go by position, so no pair may be missing.
         fractions: of training, validation and test; only for "random".
         seed: only for "random".
+        folds: number of parts; only for "folds".
+        fold: the part for validation, from 0; only for "folds".
+        aligned: align the PSF to each measurement, as `mwdn.Reconstructor` does for a network with ``align``.
+        best_gain: the scenes have units of their own: compare after the gain and offset of each colour that fit best.
     """
 
     split: str = "paper"
     fractions: tuple[float, float, float] = (0.8, 0.1, 0.1)
     seed: int = 0
+    folds: int = 4
+    fold: int = 0
+    aligned: bool = False
+    best_gain: bool = False
 
     def of(self, count: int) -> tuple[range | list[int], range | list[int]]:
         """Positions of the pairs for training and for validation, without the test part.
@@ -43,7 +52,7 @@ class Division:
             UnknownNameError: no such split.
             ParameterError: it does not fit the count, or leaves no pair for training.
         """
-        parts = split(count, self.split, fractions=self.fractions, seed=self.seed)
+        parts = split(count, self.split, fractions=self.fractions, seed=self.seed, folds=self.folds, fold=self.fold)
         train, validation = parts["train"], parts.get("validation", [])
         if not validation:
             validation = train[HELD_OUT - 1 :: HELD_OUT]
@@ -66,6 +75,8 @@ class RecordedPairs(Samples):
         psf: (1, C, H, W), of the camera; its device is where the pairs are put.
         seed: of the orders.
         shuffled: otherwise in the order of ``rows``, repeatedly.
+        aligned: align the PSF to each measurement, when it is first read.
+        poses: of the aligned PSF, by position in the file.
     """
 
     file: PairFile
@@ -73,6 +84,8 @@ class RecordedPairs(Samples):
     psf: Psf
     seed: int = 0
     shuffled: bool = True
+    aligned: bool = False
+    poses: dict[int, Pose] = field(default_factory=dict, repr=False)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -92,14 +105,24 @@ class RecordedPairs(Samples):
         """Read the samples of these numbers.
 
         Returns:
-            measurement and scene, (B, C, H, W) each, linear light, nominally in [0, 1]; and the PSF.
+            measurement and scene, (B, C, H, W) each, linear light, nominally in [0, 1]; and the PSF, of each
+            measurement if it is ``aligned``.
 
         Raises:
             ImageError: a pair cannot be read.
         """
-        pairs = [self.file[self.row(number)] for number in numbers]
+        rows = [self.row(number) for number in numbers]
+        pairs = [self.file[row] for row in rows]
         measurement, scene = (to_device(torch.stack(part), self.psf.device) for part in zip(*pairs, strict=True))
-        return Batch(measurement, scene, self.psf)
+        if not self.aligned:
+            return Batch(measurement, scene, self.psf)
+        moved = [self._pose(row, one[None]).move(self.psf) for row, one in zip(rows, measurement, strict=True)]
+        return Batch(measurement, scene, torch.cat(moved))
+
+    def _pose(self, row: int, measurement: Measurement) -> Pose:
+        if row not in self.poses:
+            self.poses[row] = align(measurement, self.psf)
+        return self.poses[row]
 
     def row(self, number: int) -> int:
         """Position of a sample's pair in the file."""
@@ -167,7 +190,9 @@ def recorded_pairs(
     check_pairs(file, psf)
     train, validation = division.of(len(file))
     psf = psf.to(device)
-    return RecordedPairs(file, train, psf, seed), RecordedPairs(file, validation, psf, seed, shuffled=False)
+    aligned = division.aligned
+    training = RecordedPairs(file, train, psf, seed, aligned=aligned)
+    return training, RecordedPairs(file, validation, psf, seed, shuffled=False, aligned=aligned)
 
 
 def check_pairs(file: PairFile, psf: Psf) -> None:

@@ -9,10 +9,18 @@ from mwdn.errors import ParameterError, UnknownNameError
 Split = dict[str, range | list[int]]
 """Positions of the pairs for ``"train"``, ``"test"`` and, if the protocol has it, ``"validation"``."""
 
-KINDS = ("paper", "diffusercam", "phlatcam", "random")
+KINDS = ("paper", "diffusercam", "phlatcam", "random", "folds")
 
 
-def split(count: int, kind: str = "paper", *, fractions: Sequence[float] = (0.8, 0.1, 0.1), seed: int = 0) -> Split:
+def split(
+    count: int,
+    kind: str = "paper",
+    *,
+    fractions: Sequence[float] = (0.8, 0.1, 0.1),
+    seed: int = 0,
+    folds: int = 4,
+    fold: int = 0,
+) -> Split:
     """Divide pairs by a published protocol or at random.
 
     The published protocols are defined by position, so they are valid only if no pair was skipped at the import.
@@ -22,16 +30,21 @@ def split(count: int, kind: str = "paper", *, fractions: Sequence[float] = (0.8,
         kind: ``"paper"``, 8:1:1 by position, test first, then validation, then training;
             ``"diffusercam"``, test the first 1,000 (im1 to im1000), the rest training;
             ``"phlatcam"``, 9,900 for training, then 100 for test, in the order of ``mwdn import phlatcam``;
-            ``"random"``, by ``fractions`` and ``seed``.
+            ``"random"``, by ``fractions`` and ``seed``;
+        ``"folds"``, for few pairs: one of ``folds`` parts by position validation, the rest training. Neighbours, which
+        are often of one scene, stay together.
         fractions: of training, validation and test, with sum 1; only for ``"random"``.
         seed: only for ``"random"``; the same seed gives the same division on every machine.
+        folds: number of parts, of equal size to one pair; only for ``"folds"``.
+        fold: number of the part for validation, from 0; only for ``"folds"``.
 
     Returns:
         Disjoint positions in ascending order; together they are ``range(count)``.
 
     Raises:
         UnknownNameError: no such kind.
-        ParameterError: too few pairs for the kind, not 10,000 for ``"phlatcam"``, or fractions that do not sum to 1.
+        ParameterError: too few pairs for the kind, not 10,000 for ``"phlatcam"``, fractions that do not sum to 1, or
+            no such fold.
     """
     match kind:
         case "paper":
@@ -54,6 +67,8 @@ def split(count: int, kind: str = "paper", *, fractions: Sequence[float] = (0.8,
             return {"train": range(9900), "test": range(9900, 10_000)}
         case "random":
             return _random(count, fractions, seed)
+        case "folds":
+            return _folds(count, folds, fold)
     raise UnknownNameError("split", kind, KINDS)
 
 
@@ -72,3 +87,12 @@ def _random(count: int, fractions: Sequence[float], seed: int) -> Split:
     if empty := [name for name, fraction in parts.items() if fraction > 0 and not result[name]]:
         raise ParameterError(f"`count` ({count:,}) leaves no pair for {', '.join(empty)}. Use a larger fraction.")
     return result
+
+
+def _folds(count: int, folds: int, fold: int) -> Split:
+    if not 2 <= folds <= count:
+        raise ParameterError(f"`folds` ({folds}) must be 2 or more, and at most the number of pairs ({count:,}).")
+    if not 0 <= fold < folds:
+        raise ParameterError(f"`fold` ({fold}) must be from 0 to {folds - 1}, for {folds} `folds`.")
+    first, end = (count * part // folds for part in (fold, fold + 1))
+    return {"train": [*range(first), *range(end, count)], "validation": range(first, end), "test": range(0)}

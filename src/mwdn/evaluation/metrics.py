@@ -157,7 +157,7 @@ def psnr(image: Image, reference: Image) -> Tensor:
     return -10 * torch.log10(distances.mse(image, reference))
 
 
-def best_gain(image: Image, reference: Image) -> Image:
+def best_gain(image: Image, reference: Image, *, axes: tuple[int, ...] = (1, 2, 3)) -> Image:
     """Apply to each picture x the gain a and offset c that minimise ``|a x + c - reference|^2``; nothing is clipped.
 
     ``a = cov(x, reference) / var(x)``, of either sign. A uniform picture becomes the mean of its reference.
@@ -165,8 +165,8 @@ def best_gain(image: Image, reference: Image) -> Image:
     Args:
         image: (B, C, H, W), any range.
         reference: of the same shape.
+        axes: that share a gain and an offset; (2, 3) for one of each colour.
     """
-    axes = (1, 2, 3)
     mean, target = image.mean(axes, keepdim=True), reference.mean(axes, keepdim=True)
     deviation = image - mean
     power = deviation.square().sum(axes, keepdim=True)

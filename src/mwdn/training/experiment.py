@@ -23,7 +23,7 @@ from mwdn.runtime import distributed
 from mwdn.training.recipe import Recipe, read_recipe
 from mwdn.training.report import Report
 from mwdn.training.selfsupervised import SelfSupervisedTask
-from mwdn.training.tasks import SupervisedTask, Task, supervised_task
+from mwdn.training.tasks import SupervisedTask, Task, few_pairs_tasks, supervised_task
 from mwdn.training.trainer import Trainer
 from mwdn.training.validation import SHOWN, Validator
 from mwdn.types import Measurement, Psf
@@ -149,8 +149,13 @@ def recorded_pairs_of(recipe: Recipe, pairs: Path, psf: Psf) -> TrainingData:
         raise ParameterError("[denoising] makes its own pairs from photographs: give `--photos`, not `--pairs`.")
     seed = recipe.schedule.seed
     training, validation = recorded_pairs(pairs, psf, recipe.pairs, seed=seed, device=psf.device)
-    task = supervised_task(training, recipe.schedule)
-    return TrainingData(task, SupervisedTask(validation), len(training), len(validation))
+    best_gain = recipe.pairs.best_gain
+    if recipe.schedule.pool and recipe.pairs.aligned:
+        task, held_out = few_pairs_tasks(training, validation, recipe.schedule, best_gain=best_gain)
+    else:
+        task = replace(supervised_task(training, recipe.schedule), best_gain=best_gain)
+        held_out = SupervisedTask(validation, best_gain=best_gain)
+    return TrainingData(task, held_out, len(training), len(validation))
 
 
 def captures_alone(recipe: Recipe, captures: Measurement, psf: Psf) -> TrainingData:

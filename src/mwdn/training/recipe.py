@@ -21,6 +21,8 @@ from mwdn.training.losses import checked_weights
 
 LR_SCHEDULES = ("cosine", "plateau")
 OPTIMISERS = ("adam", "adamw")
+LATER = {"mismatch": REAL, "pairs": ("folds", "fold", "aligned", "best_gain"), "schedule": ("anchor",)}
+"""Keys of tables that the first recipes did not have."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,8 @@ class Schedule:
         denoiser: path of a checkpoint of the network's denoiser, which is trained on its own; see `mwdn.data.noisy`.
         fixed_norms: keep the BatchNorm statistics of `start`, for samples that are too few or too similar to estimate
             them from.
+        anchor: decay towards the weights of `start`, times the learning rate. The start is validated, too, and kept as
+            the best if no step improves on it.
     """
 
     steps: int = 2000
@@ -77,6 +81,7 @@ class Schedule:
     start: str = ""
     denoiser: str = ""
     fixed_norms: bool = False
+    anchor: float = 0.0
 
     RENAMED: ClassVar[dict[str, str]] = {"course": "lr_schedule"}
     """Former names of keys, which recipes, command lines and saved runs may still use."""
@@ -85,7 +90,7 @@ class Schedule:
         for name in ("steps", "batch", "learning_rate", "validate_every", "validation"):
             if not getattr(self, name) > 0:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) must be positive.")
-        for name in ("epochs", "warmup", "weight_decay", "clip", "pool", "crop"):
+        for name in ("epochs", "warmup", "weight_decay", "clip", "pool", "crop", "anchor"):
             if not getattr(self, name) >= 0:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) must not be negative.")
         if not abs(self.seed) < 2**63:
@@ -94,6 +99,8 @@ class Schedule:
             raise ParameterError("`learning_rate` (inf) must be finite.")
         if self.crop and not self.pool:
             raise ParameterError(f"`crop` ({self.crop}) applies to cached samples: set `pool`, or leave `crop` out.")
+        if self.anchor and not self.start:
+            raise ParameterError(f"`anchor` ({self.anchor}) pulls towards the weights of `start`, which is missing.")
         if not 0 <= self.ema < 1:
             raise ParameterError(f"`ema` ({self.ema}) must be in [0, 1).")
         for kind, name, names in (
@@ -217,12 +224,12 @@ class Recipe:
     def as_dict(self) -> dict[str, Any]:
         """Plain values that JSON can hold.
 
-        The options of `mwdn.data.mismatch.REAL` are left out at their defaults: runs begun before them have none.
+        The options of `LATER` are left out at their defaults: runs begun before them have none.
         """
-        tables, off = dataclasses.asdict(self), dataclasses.asdict(Mismatch())
-        for name in REAL:
-            if tables["mismatch"][name] == off[name]:
-                del tables["mismatch"][name]
+        tables = dataclasses.asdict(self)
+        for table, names in LATER.items():
+            off = dataclasses.asdict(FIELDS[table].default)  # type: ignore[arg-type]
+            tables[table] = {k: v for k, v in tables[table].items() if k not in names or v != off[k]}
         return tables
 
 

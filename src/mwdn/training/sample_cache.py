@@ -86,6 +86,13 @@ class SampleCache:
                 raise KeyboardInterrupt(message) from interrupt
         progress(len(rows), len(rows))
 
+    @full_precision
+    def reconstruct_whole(self, network: Any, numbers: range | list[int]) -> Image:  # noqa: ANN401
+        """Reconstructions in the order of the numbers, neither mirrored nor cropped: for validation."""
+        samples = [self._cached(network, number % self.size) for number in numbers]
+        estimates, units, _ = (torch.stack(part).float() for part in zip(*samples, strict=True))
+        return network.correct(estimates, units)
+
     def reconstruct(self, network: Any, numbers: range | list[int]) -> tuple[Image, Scene]:  # noqa: ANN401
         """Reconstructions of the samples of these numbers, and their scenes."""
         estimates, unit, scene = self.batch(network, numbers)

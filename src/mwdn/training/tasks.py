@@ -6,7 +6,9 @@ from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
 import torch
 from torch import Tensor, nn
 
+from mwdn.data.recorded import RecordedPairs
 from mwdn.data.simulated import Samples
+from mwdn.evaluation.metrics import best_gain
 from mwdn.networks import Network
 from mwdn.solvers import align
 from mwdn.training.losses import Loss
@@ -65,11 +67,13 @@ class SupervisedTask:
 
     Args:
         pairs: measurement, scene and PSF of each sample.
-        cache: of these pairs, to train on it instead.
+        cache: of these pairs, to train or validate on it instead.
+        best_gain: scenes have units of their own: compare after the gain and offset of each colour that fit best.
     """
 
     pairs: Samples
     cache: SampleCache | None = None
+    best_gain: bool = False
 
     columns: ClassVar[tuple[str, str]] = "measurement", "scene"
 
@@ -87,7 +91,7 @@ class SupervisedTask:
         """Distance of the reconstructions and the scenes of these numbers, and its parts."""
         source = self if self.cache is None else self.cache
         reconstruction, scene = source.reconstruct(network, numbers)
-        return distance(reconstruction.float(), scene)
+        return distance(self._in_units(reconstruction.float(), scene), scene)
 
     def reconstruct(self, network: nn.Module, numbers: range) -> tuple[Image, Scene]:
         """Reconstructions of the samples of these numbers, and their scenes."""
@@ -97,7 +101,11 @@ class SupervisedTask:
     def score(self, network: nn.Module, distance: Loss, numbers: range) -> Scores:
         """PSNR and loss of the reconstructions; the loss always has its initial weights."""
         measurement, scene, psf = self.pairs.batch(numbers)
-        reconstruction = reconstruct_aligned(network, measurement, psf)
+        if self.cache is None:
+            reconstruction = reconstruct_aligned(network, measurement, psf)
+        else:
+            reconstruction = self.cache.reconstruct_whole(network, numbers)
+        reconstruction = self._in_units(reconstruction, scene)
         psnr = -10 * torch.log10((reconstruction.clamp(0, 1) - scene).square().mean((1, 2, 3)))
         parts = distance(reconstruction, scene)[1]
         loss = sum(weight * parts[name].item() for name, weight in distance.initial_weights.items())
@@ -107,6 +115,9 @@ class SupervisedTask:
         """Names the samples in an error message."""
         return self.pairs.describe(numbers)
 
+    def _in_units(self, reconstruction: Image, scene: Scene) -> Image:
+        return best_gain(reconstruction, scene, axes=(2, 3)) if self.best_gain else reconstruction
+
 
 def supervised_task(pairs: Samples, schedule: Schedule) -> SupervisedTask:
     """The task of learning from pairs: cached as the schedule says, or else prefetched."""
@@ -114,6 +125,25 @@ def supervised_task(pairs: Samples, schedule: Schedule) -> SupervisedTask:
         return SupervisedTask(pairs.prefetched(schedule.batch))
     size, batch, crop, seed = schedule.pool, schedule.batch, schedule.crop, schedule.seed
     return SupervisedTask(pairs, SampleCache(pairs, size=size, batch=batch, crop=crop, seed=seed))
+
+
+def few_pairs_tasks(
+    training: RecordedPairs, validation: RecordedPairs, schedule: Schedule, *, best_gain: bool
+) -> tuple[SupervisedTask, SupervisedTask]:
+    """Tasks of training and validation on pairs that are all cached: each is aligned and estimated once.
+
+    Args:
+        training: at most ``pool`` of them are used. The cache is a multiple of the batch: the last pairs may be twice
+            in it.
+        validation: as many as the schedule says.
+        schedule: has the batch and the size of the cache.
+        best_gain: see `SupervisedTask`.
+    """
+    batch, crop, seed = schedule.batch, schedule.crop, schedule.seed
+    size = -(-min(schedule.pool, len(training)) // batch) * batch
+    cache = SampleCache(training, size=size, batch=batch, crop=crop, seed=seed)
+    held_out = SampleCache(validation, size=len(validation), batch=1, crop=0, seed=seed)
+    return SupervisedTask(training, cache, best_gain), SupervisedTask(validation, held_out, best_gain)
 
 
 def reconstruct_aligned(network: nn.Module, measurement: Measurement, psf: Psf) -> Scene:

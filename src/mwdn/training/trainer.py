@@ -80,6 +80,9 @@ class Trainer:
         self.distance = Loss(recipe.loss, alexnet=alexnet).to(self.device)
         self.optimiser = make_optimiser(self.network, self.schedule)
         self.lr_schedule = make_lr_schedule(recipe)
+        # Made before a saved run resumes: these are the weights of `start`.
+        learned = [parameter for parameter in self.network.parameters() if parameter.requires_grad]
+        self.anchors = [(each, each.detach().clone()) for each in learned] if self.schedule.anchor else []
         self.bfloat16 = self.schedule.bfloat16 and has_bfloat16(self.device)
         self.step, self.best = 0, -math.inf
 
@@ -119,6 +122,8 @@ class Trainer:
         with self.folder.lock():
             try:
                 self._fill_cache(samples)
+                if self.step == 0 and self.schedule.anchor:
+                    self.save(self.validate())
                 self._train(callback)
             except DivergenceError:
                 self.folder.remove_samples()
@@ -186,10 +191,18 @@ class Trainer:
         if self.schedule.clip > 0:
             torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.schedule.clip)
         self.optimiser.step()
+        self._pull_to_start()
         self.step += 1
         # The decay grows from 0 to the schedule's, or else a young average would remember the initial weights.
         update_average(self.average, self.network, decay=min(self.schedule.ema, self.step / (self.step + 10)))
         return total, dict(zip(parts, totals, strict=True))
+
+    @torch.no_grad()
+    def _pull_to_start(self) -> None:
+        """Decay towards the start weights, apart from the gradient as AdamW's decay towards 0."""
+        amount = min(1.0, self.schedule.anchor * self.lr_schedule.rate(self.step))
+        for parameter, start in self.anchors:
+            parameter.lerp_(start, amount)
 
     def _loss(self, numbers: range) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of the samples of these numbers in training mode, and its parts."""

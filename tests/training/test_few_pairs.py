@@ -1,0 +1,109 @@
+"""Learning from few recorded pairs: near the start weights, in any units, each pair estimated once."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from cameras import contour_psf
+from mwdn.calibration import Calibration
+from mwdn.data.pairs import PairFile
+from mwdn.data.recorded import Division
+from mwdn.errors import ParameterError
+from mwdn.fourier.convolution import convolve
+from mwdn.networks import build
+from mwdn.solvers.alignment import Pose
+from mwdn.training.experiment import prepare
+from mwdn.training.network import grown
+from mwdn.training.recipe import Recipe, Schedule, read_recipe
+from mwdn.weights.bundled import BUNDLED, load_network
+from mwdn.weights.checkpoint import load_checkpoint, save_network
+
+OPTIONS = {"width": 2, "regularisations": (1e-2, 1e-4), "mean_light": "free"}
+SCHEDULE = Schedule(
+    steps=3, pool=200, batch=2, learning_rate=1e-2, warmup=0, validate_every=3, ema=0.0, weight_decay=0.0,
+    anchor=1.0, fixed_norms=True, start="start.safetensors",
+)  # fmt: skip
+RECIPE = Recipe({"name": "wiener-bank", **OPTIONS}, SCHEDULE, pairs=Division("folds", aligned=True, best_gain=True))
+
+
+@pytest.fixture
+def camera(tmp_path, monkeypatch, generator):
+    """A calibration, five pairs whose scenes are in units of their own, and random start weights."""
+    monkeypatch.chdir(tmp_path)
+    # Tested in tests/data/test_recorded.py; 0.5 s a pair.
+    monkeypatch.setattr("mwdn.data.recorded.align", lambda *_: Pose(torch.zeros(1), torch.zeros(1)))
+    psf = contour_psf((32, 32), cell=10, generator=generator).expand(1, 3, -1, -1).contiguous()
+    with PairFile.create("pairs.h5", measurement_shape=(32, 32, 3), scene_shape=(32, 32, 3)) as file:
+        for number in range(5):
+            scene = torch.rand(1, 3, 32, 32, generator=generator)
+            units = scene * (0.2 + 0.1 * number) + 0.05 * number
+            file.append(0.8 * convolve(scene, psf)[0], units[0])
+    save_network("start.safetensors", build("wiener-bank", **OPTIONS).eval(), "wiener-bank", OPTIONS)
+    return Calibration(psf)
+
+
+def trainer(camera, **schedule):
+    recipe = replace(RECIPE, schedule=replace(SCHEDULE, **schedule))
+    return prepare(recipe, camera, out=folder_of(schedule), pairs=Path("pairs.h5"), device="cpu")
+
+
+def folder_of(schedule):
+    return Path("run-" + "-".join(map(str, schedule.values())))
+
+
+def changes(folder):
+    """Norms of the differences of all weights to the start."""
+    start, end = (load_checkpoint(path).state_dict() for path in ("start.safetensors", f"{folder}/last.safetensors"))
+    return {name: float((end[name].double() - start[name].double()).norm()) for name in start}
+
+
+def test_pairs_are_estimated_once_statistics_stay_and_weights_move(camera):
+    run = trainer(camera, steps=2)
+    run.run()
+    assert len(run.task.cache.samples) == 4  # of a batch of 2; a quarter of five is held out
+    assert len(run.validator.task.pairs) == 1
+    assert run.task.pairs.aligned
+    moved = changes("run-2")
+    assert not any(value for name, value in moved.items() if "running" in name or "num_batches" in name)
+    assert moved["decoder.head.weight"] > 0
+
+
+def test_an_anchor_of_one_over_the_learning_rate_holds_the_start(camera):
+    """Each step ends at the start weights: rate x anchor = 1."""
+    trainer(camera, anchor=1e4, steps=2).run()
+    assert max(changes("run-10000.0-2").values()) < 1e-6
+
+
+def test_the_start_is_kept_if_nothing_is_better(camera):
+    """A learning rate that destroys the weights."""
+    trainer(camera, learning_rate=0.5, anchor=1e-9).run()
+    best = load_checkpoint("run-0.5-1e-09/best.safetensors").state_dict()
+    start = load_checkpoint("start.safetensors").state_dict()
+    assert all(torch.equal(best[name], start[name]) for name in start)
+
+
+def test_validation_has_no_units(camera):
+    """Scenes times two plus a half: gain and offset of each colour are free, so only 6 dB change."""
+    run = trainer(camera, steps=1)
+    held_out = run.validator.task
+    first = held_out.score(run.average, run.distance, range(1)).psnr
+    image = held_out.cache.reconstruct_whole(run.average, range(1))
+    scene = held_out.pairs.batch(range(1)).scene
+    for units in (scene, 2 * scene + 0.5):
+        fitted = held_out._in_units(image, units)
+        torch.testing.assert_close(fitted.mean((2, 3)), units.mean((2, 3)))
+    torch.testing.assert_close((fitted - units).square().mean().log10(), -first[0] / 10 + 2 * torch.tensor(2.0).log10())
+
+
+def test_an_anchor_needs_a_start():
+    with pytest.raises(ParameterError, match="`anchor`"):
+        Schedule(anchor=1.0)
+
+
+def test_the_recipe_fits_the_bundled_network():
+    recipe = read_recipe("few-pairs")
+    network = build(**recipe.network)
+    assert recipe.schedule.start in BUNDLED
+    network.load_state_dict(grown(load_network(recipe.schedule.start).state_dict(), network))
