@@ -21,6 +21,7 @@ from mwdn.version import __version__ as __version__
 if TYPE_CHECKING:  # the names of _MODULES and _PACKAGES, for mypy and editors
     from mwdn import benchmark as benchmark
     from mwdn import calibration as calibration
+    from mwdn import capture as capture
     from mwdn import data as data
     from mwdn import diagnosis as diagnosis
     from mwdn import errors as errors
@@ -79,8 +80,8 @@ __all__ = [
 ]
 
 _PACKAGES = {
-    *("benchmark", "calibration", "data", "diagnosis", "errors", "evaluation", "export", "fourier", "inference"),
-    *("io", "networks", "optics", "runtime", "solvers", "training", "types", "weights"),
+    *("benchmark", "calibration", "capture", "data", "diagnosis", "errors", "evaluation", "export", "fourier"),
+    *("inference", "io", "networks", "optics", "runtime", "solvers", "training", "types", "weights"),
 }
 _MODULES = {
     "Calibration": "calibration",

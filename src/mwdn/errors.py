@@ -35,14 +35,8 @@ SMALLEST_LIGHT = 1e-12
 LARGEST_LIGHT = 1e15
 """Range of the largest number of a measurement, whose squares and their sums over 1e8 pixels float32 must hold."""
 
-_WORDS = {
-    int: "a whole number",
-    float: "a number",
-    bool: "true or false",
-    str: "text",
-    Path: "a path",
-    NoneType: "none",
-}
+_WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text", Path: "a path"}
+_WORDS[NoneType] = "none"
 _COUNTS = {2: "two", 3: "three"}
 _Checked = TypeVar("_Checked", bound=Callable[..., Any])
 
@@ -150,10 +144,8 @@ def fits_type(value: Any, kind: Any) -> bool:  # noqa: ANN401
     if origin is tuple:  # JSON and TOML have lists
         parts = parts[:1] * len(value) if parts[1:] == (...,) and isinstance(value, tuple | list) else parts
         return isinstance(value, tuple | list) and len(value) == len(parts) and all(map(fits_type, value, parts))
-    if origin is Callable:
-        return callable(value)
-    if origin is Iterable:
-        return isinstance(value, Iterable)
+    if origin in (Callable, Iterable):
+        return isinstance(value, origin)
     if kind in (int, float):
         return isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
     return kind is Any or not isinstance(kind, type) or hasattr(kind, "array_type") or isinstance(value, kind)
@@ -161,9 +153,8 @@ def fits_type(value: Any, kind: Any) -> bool:  # noqa: ANN401
 
 def _names(kind: Any) -> list[str]:  # noqa: ANN401
     """The names that a type allows if it allows nothing else: those of a `Literal`, also beside `None`."""
-    kinds = (
-        [part for part in get_args(kind) if part is not NoneType] if get_origin(kind) in (Union, UnionType) else [kind]
-    )
+    parts = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
+    kinds = [part for part in parts if part is not NoneType]
     return list(get_args(kinds[0])) if len(kinds) == 1 and get_origin(kinds[0]) is Literal else []
 
 
@@ -235,9 +226,8 @@ def check_batch(image: Any, name: str) -> None:  # noqa: ANN401
             way_out = f"Convert it: `{name}.float()`."
         raise ParameterError(f"`{name}` ({image.dtype}) must be floats in linear light, 1 for saturation. {way_out}")
     if image.is_sparse or image.is_sparse_csr or image.device.type == "meta":
-        kind, way_out = (
-            ('on the device "meta"', "") if image.device.type == "meta" else ("sparse", f" `{name}.to_dense()`.")
-        )
+        is_meta = image.device.type == "meta"
+        kind, way_out = ('on the device "meta"', "") if is_meta else ("sparse", f" `{name}.to_dense()`.")
         raise ParameterError(f"`{name}` ({image.dtype}, {kind}) must be a tensor that holds all its numbers.{way_out}")
 
 
