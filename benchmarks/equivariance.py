@@ -1,7 +1,7 @@
 """How much a picture changes with the direction and the place of what is in it, and what `ensemble` gains.
 
     python benchmarks/equivariance.py [--size 63] [--count 8] [--methods admm universal-small ...]
-    python benchmarks/equivariance.py --gain ../shared/data [--count 8] [--methods universal-small universal]
+    python benchmarks/equivariance.py --gain ../shared/data [--count 8] [--methods universal] [--psfs NAME ...]
 
 First form: a capture is mirrored (with its PSF), moved by 5 pixels, or put into a batch; the picture should be
 mirrored, moved, or the same. The relative difference is measured for two kinds of captures of random scenes and
@@ -101,10 +101,10 @@ def measure(methods, size, count):
     return rows
 
 
-def rows_of_pairs(data, count):
+def rows_of_pairs(data, count, psfs):
     """Name, camera, pairs and variant of the score of each row."""
     recipe, photographs = read_recipe("mismatched"), Photographs(data / "photos" / "test")
-    for name in universal.PSFS:
+    for name in psfs or universal.PSFS:
         camera = universal.camera(data, name)
         for full_well, exact in ((15_000.0, True), (2_000.0, False)):
             made = universal.captures(camera.psf, photographs, recipe, full_well, range(count), exact=exact)
@@ -115,9 +115,9 @@ def rows_of_pairs(data, count):
         yield "DiffuserCam, real", universal.camera(data, "DiffuserCam 270x480"), PairFile(file), "best-gain"
 
 
-def gains(methods, data, count):
+def gains(methods, data, count, psfs):
     rows = []
-    for name, camera, pairs, variant in rows_of_pairs(data, count):
+    for name, camera, pairs, variant in rows_of_pairs(data, count, psfs):
         for method in methods:
             bound = {str(each): Reconstructor(method, camera, ensemble=each) for each in (False, True)}
             scores = evaluate(bound, pairs, FULL, variant=variant, perceptual=NONE).methods
@@ -135,12 +135,15 @@ def main():
     parser.add_argument("--size", type=int, default=63)
     parser.add_argument("--count", type=int, default=8)
     parser.add_argument("--methods", nargs="+")
+    parser.add_argument("--psfs", nargs="+", help="rows of these PSFs and the real pairs; all unless given")
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     mwdn.keep_memory()
     if arguments.gain:
-        rows = gains(arguments.methods or ["universal-small", "universal"], arguments.gain, arguments.count)
+        rows = gains(
+            arguments.methods or ["universal-small", "universal"], arguments.gain, arguments.count, arguments.psfs
+        )
     else:
         rows = measure(arguments.methods or METHODS, arguments.size, arguments.count)
     if arguments.out:

@@ -128,3 +128,22 @@ def test_many_known_names_are_cut_off():
     assert len(message) == 300
     assert "Did you mean 'gamma_error_" in message
     assert message.endswith(" ....")
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e300, 10**400, -(2**63)])
+def test_numbers_that_no_arithmetic_holds_are_refused(value):
+    """1e300 and 10**400 ended in torch's `RuntimeError` and an `OverflowError`."""
+    with pytest.raises(ParameterError, match="`regularisation` "):
+        mwdn.solvers.build("admm", regularisation=value)
+
+
+def test_a_message_is_short_whatever_was_given():
+    """File names are kept whole; the start and the way out are kept of everything else."""
+    text = str(MwdnError(f"`name` ({'x' * 100_000}) must be short. Cut it."))
+    assert len(text) <= 300
+    assert text.startswith("`name` (xxx")
+    assert text.endswith("xxx) must be short. Cut it.")
+    path = "/a" * 200
+    assert str(MwdnError(f"`{path}` does not exist.")) == f"`{path}` does not exist."
+    assert len(str(MwdnError(f"`{'/a' * 5000}` does not exist."))) <= 300

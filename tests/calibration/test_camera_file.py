@@ -1,6 +1,9 @@
 """Camera files: what is written is read, what is wrong is named."""
 
+import os
 import shutil
+import sys
+from pathlib import Path
 from typing import get_args
 
 import cv2
@@ -12,7 +15,7 @@ from cameras import contour_psf
 from mwdn import Calibration
 from mwdn.calibration import FrameFormat, PsfFormat
 from mwdn.calibration.camera_file import KEYS, read_camera, write_camera
-from mwdn.errors import ParameterError, PsfError, UnknownNameError
+from mwdn.errors import ImageError, MwdnError, ParameterError, PsfError, UnknownNameError
 from mwdn.io.toml import read_toml
 from mwdn.optics.orientation import Orientation
 
@@ -138,6 +141,47 @@ def test_wrong_lines_are_named(tmp_path, line, error, message):
     (tmp_path / "camera.toml").write_text(f'psf = "psf.png"\n{line}\n')
     with pytest.raises(error, match=message):
         read_camera(tmp_path / "camera.toml")
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    "line",
+    [
+        *(f"{key} = {value}" for key in ("pitch_um", "distance_mm") for value in ("nan", "inf", "-1", "0", "1e300")),
+        *(f"white_balance = [{gain}, 1, 1]" for gain in ("nan", "0", "1e-300", "1e300", "9" * 400)),
+        *(f"{key} = {'9' * 400}" for key in ("pitch_um", "gamma", "background", "bin", "bit_depth")),
+        *(f"{key} = '{'x' * 10_000}'" for key in ("mosaic", "gamma", "dark", "crop")),
+    ],
+)
+def test_values_out_of_any_range_are_named_on_one_short_line(folder, monkeypatch, line):
+    """A gain of 1e300 gave pictures of infinity; a pitch of NaN was taken; 100 kB of a value filled the terminal."""
+    monkeypatch.chdir(folder)
+    Path("camera.toml").write_text(f'psf = "lab/psf.png"\n{line}\n')
+    with pytest.raises(MwdnError) as caught:
+        Calibration.load("camera.toml")
+    assert len(str(caught.value)) <= 300
+
+
+def test_the_hash_of_a_huge_file_is_not_computed(folder):
+    """A camera file may name any file as its PSF; a sparse one of 1 TB needs no disk, and an hour to hash."""
+    (folder / "camera.toml").write_text(f'psf = "huge.png"\npsf_sha256 = "{64 * "0"}"\n')
+    (folder / "huge.png").touch()
+    os.truncate(folder / "huge.png", 2**40)
+    with pytest.raises(ImageError, match=r"huge\.png` "):
+        Calibration.load(folder / "camera.toml")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems allow fewer characters in file names")
+def test_names_of_any_characters_are_written_so_that_they_can_be_read(folder):
+    for name in ("a\nbin = 3.toml", "a\x7f.toml"):
+        shutil.copy(folder / "lab/psf.png", psf := folder / f"{name}.png")
+        write_camera(folder / name, {"psf": psf})
+        assert read_camera(folder / name).keys() == {"psf", "psf_sha256"}
+        assert read_camera(folder / name)["psf"] == psf
+    shutil.copy(folder / "lab/psf.png", psf := folder / "\udcff.png")
+    with pytest.raises(ParameterError, match="Rename it"):
+        write_camera(folder / "camera.toml", {"psf": psf})
+    assert not (folder / "camera.toml").exists()
 
 
 def test_a_camera_has_a_psf(tmp_path):

@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import json
+import os
 import re
 import subprocess
 import sys
@@ -478,6 +479,14 @@ def test_recipes_are_listed_and_printed(run):
     assert run("recipes", "quick-cpu") == (0, find_recipe("quick-cpu").read_text(encoding="utf-8"), "")
     code, _, err = run("recipes", "quick-cpo")
     assert (code, "'quick-cpu'" in err) == (2, True)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no pipes in folders")
+def test_a_pipe_is_not_printed_as_a_recipe(run, tmp_path):
+    """The command waited forever."""
+    os.mkfifo(tmp_path / "pipe.toml")
+    code, out, err = run("recipes", tmp_path / "pipe.toml")
+    assert (code, out, "is a pipe" in err) == (2, "", True)
 
 
 def test_doctor(run):

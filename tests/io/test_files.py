@@ -80,6 +80,7 @@ def test_files_of_others_are_not_replaced(tmp_path: Path) -> None:
     refuse_foreign(tmp_path, ("index.html", "sheet.png"), b"mwdn demo")
     sheet.unlink()
     put(page, b"my page")
+    os.truncate(page, 2**40)  # sparse; was read whole
     with pytest.raises(ParameterError, match=r"index\.html` was not written by this command"):
         refuse_foreign(tmp_path, ("index.html", "sheet.png"), b"mwdn demo")
 

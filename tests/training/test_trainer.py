@@ -575,6 +575,29 @@ def test_files_of_others_are_not_replaced(trainer, tmp_path):
     assert log.read_text() == "my diary"
 
 
+def test_a_folder_of_somebody_else_is_not_removed(trainer, tmp_path):
+    """At its end, a run removed everything in the folder `samples`, whoever had put it there."""
+    samples = tmp_path / "run" / "samples"
+    mine = touch(samples, "a.tif", "000001.safetensors") + touch(samples / (16 * "a"), "notes.txt")
+    cached = touch(samples / (16 * "b"), "000001.safetensors")
+    trainer(few(pool=4, steps=1)).run()
+    assert [path.exists() for path in (*mine, *cached)] == [True, True, True, False]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no pipes in folders")
+def test_a_pipe_or_a_huge_file_in_place_of_the_state(trainer, tmp_path):
+    state = tmp_path / "run" / "state.safetensors"
+    state.parent.mkdir()
+    os.mkfifo(state)
+    with pytest.raises(CheckpointError, match="is a pipe"):
+        trainer()
+    state.unlink()
+    state.touch()
+    os.truncate(state, 2**40)  # sparse
+    with pytest.raises(CheckpointError, match=r"is damaged: .* Remove it"):
+        trainer()
+
+
 def test_damaged_or_foreign_state(trainer, tmp_path):
     trainer().run()
     state = tmp_path / "run" / "state.safetensors"

@@ -63,6 +63,10 @@ pre {{ background: #f5f5f5; padding: .8rem; overflow-x: auto; font-size: 12px; }
 """
 
 
+MARK = b'<nav><a href="#s0">'
+"""What every such page begins with, and hardly any other."""
+
+
 def write_html(path: Path, title: str, sections: list[Section]) -> None:
     """Write a self-contained HTML page, atomically."""
     links = "".join(f'<a href="#s{i}">{html.escape(section.title)}</a> ' for i, section in enumerate(sections))

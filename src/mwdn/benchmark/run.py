@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mwdn.benchmark.exports import csv_text, json_content
 from mwdn.benchmark.locks import claim_parts, lock
-from mwdn.benchmark.pages import write_html, write_markdown
+from mwdn.benchmark.pages import MARK, write_html, write_markdown
 from mwdn.benchmark.recipe import Benchmark, Method
 from mwdn.benchmark.results import Results
 from mwdn.benchmark.robustness import Sweep, pairs_at, sweep
@@ -102,7 +102,7 @@ def run(
         MwdnError: a file cannot be read, a method does not fit, training diverges, or ``out`` holds another benchmark.
     """
     torch_device = local_device(device)
-    refuse_foreign(out, (PAGE, "benchmark.md", "benchmark.json", "benchmark.csv"), b"mwdn")
+    refuse_foreign(out, (PAGE, "benchmark.md", "benchmark.json", "benchmark.csv"), MARK)
     if NEED_ALEXNET & benchmark.loss.keys():
         load_alexnet(benchmark.alexnet or None, download=lpips is True)  # an error now instead of after the data
     with lock(out, "data"):

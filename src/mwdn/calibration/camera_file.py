@@ -10,8 +10,9 @@ from mwdn.calibration.frame_format import FrameFormat
 from mwdn.calibration.place_files import PlaceFiles
 from mwdn.calibration.psf_format import PsfFormat
 from mwdn.calibration.white_balance import WhiteBalance
-from mwdn.errors import ParameterError, PsfError, UnknownNameError, fits_type
+from mwdn.errors import ParameterError, PsfError, UnknownNameError, fits_type, one_line, shown
 from mwdn.io.files import as_parameter_error, atomic, file_sha256
+from mwdn.io.headers import MAX_BYTES
 from mwdn.io.toml import read_toml
 from mwdn.optics.sensor import Sensor
 
@@ -91,7 +92,7 @@ def read_camera(path: str | Path) -> dict[str, Any]:
         if not fits_type(value, _TYPES[key]):
             meaning, example = KEYS[key]
             raise ParameterError(
-                f"`{key}` ({value!r}) in `{path}` must be like this: `{key} = {_to_toml(example)}`. {meaning}"
+                f"`{key}` ({shown(value)}) in `{path}` must be like this: `{key} = {_to_toml(example)}`. {meaning}"
             )
     if "psf" not in table:
         raise ParameterError(f'`{path}` must name the camera\'s PSF: `psf = "psf.png"`.')
@@ -157,7 +158,7 @@ def write_camera(path: str | Path, camera: Mapping[str, Any]) -> None:
         line = f"# {key} = {_to_toml(example)}" if value is None else f"{key} = {_to_toml(value)}"
         lines += ["", f"# {meaning}", line]
     with as_parameter_error(path.parent), atomic(path) as temporary:
-        temporary.write_text(_HEAD.format(name=path.name) + "\n".join(lines) + "\n", encoding="utf-8")
+        temporary.write_text(_HEAD.format(name=one_line(path.name)) + "\n".join(lines) + "\n", encoding="utf-8")
 
 
 def check_camera_path(path: Path) -> None:
@@ -170,7 +171,8 @@ def check_camera_path(path: Path) -> None:
 
 def check_psf_file(path: str | Path, sha256: str, psf: Path) -> None:
     """Raise a `PsfError` if the PSF of the camera file ``path`` has changed since that was written."""
-    if sha256 and psf.is_file() and file_sha256(psf) != sha256:
+    # A larger file is refused where it is read; to hash it would take long.
+    if sha256 and psf.is_file() and psf.stat().st_size <= MAX_BYTES and file_sha256(psf) != sha256:
         raise PsfError(
             f"`{psf}` has changed since the camera file `{path}` was written, and may not fit its other values. "
             f"Calibrate again: `mwdn calibrate --camera {path} -o {path}`."
@@ -186,4 +188,9 @@ def _relative(path: Path, folder: Path) -> str:
 
 
 def _to_toml(value: object) -> str:
-    return json.dumps(value, ensure_ascii=False)
+    text = json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")  # which JSON allows
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise ParameterError(f"`{value}` has a name that is not UTF-8, which TOML cannot hold. Rename it.") from None
+    return text

@@ -23,6 +23,9 @@ from mwdn.optics.psf import checked_psf, psf_hash
 from mwdn.optics.sensor import Sensor
 from mwdn.types import ArrayPicture, Frame, Image, Measurement, Psf, Size
 
+LONGEST_LENGTH = 1e9
+"""Largest `pitch_um` and `distance_mm`: 1 km and 1,000 km, beyond any lensless camera."""
+
 
 @checked
 @dataclass(frozen=True, eq=False)
@@ -218,6 +221,10 @@ class Calibration:
             if getattr(self, name) is not None:
                 check_batch(getattr(self, name), name)
         check_white_balance(self.white_balance, self.light)
+        for name in ("pitch_um", "distance_mm"):
+            length = getattr(self, name)
+            if length is not None and not 0 < length <= LONGEST_LENGTH:
+                raise ParameterError(f"`{name}` ({shown(length)}) must be above 0 and at most {LONGEST_LENGTH:g}.")
 
     def __repr__(self) -> str:
         colours = "RGB" if self.psf.shape[1] == 3 else "grey"

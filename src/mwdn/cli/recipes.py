@@ -3,6 +3,7 @@
 from rich.table import Table
 
 from mwdn.cli.terminal import results
+from mwdn.io.reading import read_text
 from mwdn.io.toml import find_recipe, packaged_recipes
 
 
@@ -13,9 +14,9 @@ def recipes(name: str | None = None, /) -> None:
         name: of a recipe; all are listed unless given.
     """
     if name is not None:
-        results.out(find_recipe(name).read_text(encoding="utf-8"), end="", highlight=False)
+        results.out(read_text(find_recipe(name)), end="", highlight=False)
         return
     table = Table("name", "description")
     for recipe in packaged_recipes():
-        table.add_row(recipe, find_recipe(recipe).read_text(encoding="utf-8").partition("\n")[0].removeprefix("# "))
+        table.add_row(recipe, read_text(find_recipe(recipe)).partition("\n")[0].removeprefix("# "))
     results.print(table, markup=False)

@@ -21,6 +21,10 @@ FULL = {errno.ENOSPC, errno.EFBIG, errno.EDQUOT}
 """Errors of a disk that is full, of a file that would be larger than allowed, and of a user's share that is used up."""
 
 
+_MARKED_BYTES = 2**20
+"""Part of a file in which its mark is searched: a foreign file may be larger than the memory."""
+
+
 @contextmanager
 def atomic(path: Path) -> Iterator[Path]:
     """Write a file completely or not at all.
@@ -201,7 +205,7 @@ def refuse_foreign(folder: Path, files: Sequence[str], mark: bytes) -> None:
     Args:
         folder: the output folder.
         files: names of the files that will be replaced. The first tells whose they are, and is written first.
-        mark: bytes in the first file if this package wrote it.
+        mark: bytes in the first MiB of the first file if this package wrote it.
 
     Raises:
         ParameterError: one of the files exists and is somebody else's, or is no regular file.
@@ -209,8 +213,10 @@ def refuse_foreign(folder: Path, files: Sequence[str], mark: bytes) -> None:
     for name in files:
         refuse_overwrite(folder / name)
     first = folder / files[0]
-    if first.is_file() and mark in first.read_bytes():
-        return
+    if first.is_file():
+        with first.open("rb") as file:
+            if mark in file.read(_MARKED_BYTES):
+                return
     foreign = next((folder / name for name in files if (folder / name).exists()), None)
     if foreign is not None:
         raise ParameterError(

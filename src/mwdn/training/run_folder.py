@@ -12,14 +12,17 @@ from torch import Tensor
 
 from mwdn.errors import CheckpointError, ParameterError
 from mwdn.io.files import as_parameter_error, check_folder, refuse_foreign, write_text
-from mwdn.io.reading import LOG_BYTES, TEXT_BYTES, read_bytes
+from mwdn.io.reading import LOG_BYTES, TEXT_BYTES, open_regular, read_bytes
 from mwdn.runtime import distributed
 from mwdn.training.recipe import Recipe, with_current_names
 from mwdn.training.sample_files import SampleFiles
-from mwdn.training.training_state import Header, read_state
+from mwdn.training.training_state import Header, damaged, read_state
+from mwdn.weights.tensors import read_header
 
 MAKE_ROOM = "Make room and give the same command again: it resumes from the last saved state."
 WEIGHTS = ("last", "best")
+STATE_BYTES = 2**33
+"""Most bytes of a state: 8 GiB, twice weights, average and two moments of the largest network that is built."""
 
 
 def run_identity(recipe: Recipe, psf_hash: str, samples: str) -> dict[str, Any]:
@@ -90,7 +93,14 @@ class RunFolder:
         return None
 
     def _read_state(self) -> bytes:
-        return (self.state.read_bytes() or b"empty") if self.state.exists() else b""
+        if not self.state.exists():
+            return b""
+        open_regular(self.state, CheckpointError).close()
+        try:
+            read_header(self.state)  # before the rest: a file that is no state may be of any size
+        except CheckpointError as error:
+            raise damaged(self.state, "its header does not fit it") from error
+        return read_bytes(self.state, most=STATE_BYTES, error=CheckpointError)
 
     def _read_owner(self) -> bytes:
         """Identity of the run whose weights are in the folder; empty without weights."""
@@ -124,7 +134,7 @@ class RunFolder:
         import fcntl
 
         check_folder(self.path)
-        refuse_foreign(self.path, ("recipe.json", "log.jsonl"), b'"recipe"')
+        refuse_foreign(self.path, ("recipe.json", "log.jsonl", "validation.png"), b'"recipe"')
         self.path.mkdir(parents=True, exist_ok=True)
         handle = os.open(self.path, os.O_RDONLY)  # the folder itself: a lock file would stay behind
         try:

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 import shutil
 from contextlib import suppress
 from pathlib import Path
@@ -11,11 +12,29 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save_file
 from torch import Tensor
 
+from mwdn.errors import ImageError
 from mwdn.io.files import as_parameter_error, atomic
+from mwdn.io.reading import read_bytes
 from mwdn.version import __version__
+
+_SAMPLE_BYTES = 2**30
+"""Most bytes of a sample: 1 GiB; 20 pictures of 2000 x 2000 in half precision have a quarter."""
 
 FREE_PART = 0.5
 """Samples are kept only if they take at most this part of the disk's free space."""
+
+
+_FOLDER = re.compile("[0-9a-f]{16}")
+_FILE = re.compile(r"\d{6,}\.safetensors|\.mwdn-.*")
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder of samples, but no file that this class does not write."""
+    with suppress(OSError):
+        for path in folder.iterdir():
+            if _FILE.fullmatch(path.name):
+                path.unlink()
+        folder.rmdir()
 
 
 class Sample(NamedTuple):
@@ -47,8 +66,9 @@ class SampleFiles:
 
     def read(self, row: int) -> Sample | None:
         """A sample; ``None`` if there is no whole file of it."""
-        with suppress(OSError, SafetensorError, KeyError):
-            content = load(self._file(row).read_bytes())  # not mapped: a file that shrinks would end the process
+        with suppress(ImageError, SafetensorError, KeyError):
+            # Not mapped: a file that shrinks would end the process.
+            content = load(read_bytes(self._file(row), most=_SAMPLE_BYTES))
             return Sample(*(content[name] for name in Sample._fields))
         return None
 
@@ -68,13 +88,22 @@ class SampleFiles:
 
     def remove_others(self) -> None:
         """Remove the samples of other recipes, PSFs and photographs."""
-        for folder in self.path.parent.glob("*"):
+        for folder in self._folders():
             if folder != self.path:
-                shutil.rmtree(folder, ignore_errors=True)
+                _remove(folder)
 
     def remove(self) -> None:
         """Remove all samples."""
-        shutil.rmtree(self.path.parent, ignore_errors=True)
+        for folder in self._folders():
+            _remove(folder)
+        with suppress(OSError):  # it is missing, or holds files of somebody else
+            self.path.parent.rmdir()
+
+    def _folders(self) -> list[Path]:
+        """Folders of samples, of any identity; no others, and no links to folders elsewhere."""
+        if self.path.parent.is_symlink():
+            return []
+        return [path for path in self.path.parent.glob("*") if _FOLDER.fullmatch(path.name) and not path.is_symlink()]
 
     def _file(self, row: int) -> Path:
         return self.path / f"{row:06}.safetensors"
