@@ -39,16 +39,17 @@ _WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: 
 _WORDS[NoneType] = "none"
 _COUNTS = {2: "two", 3: "three"}
 _Checked = TypeVar("_Checked", bound=Callable[..., Any])
-
 LONGEST = 300
-"""Characters of a message at most."""
+"""Characters of a message at most, besides those of paths."""
 
 
 class MwdnError(Exception):
-    """Base of the tree: catch this to catch them all. Its message is one line that a terminal can print."""
+    """Base of the tree: catch this to catch them all. Its message is one line, which keeps its start and its end."""
 
     def __str__(self) -> str:
-        return one_line(super().__str__())
+        text = one_line(super().__str__())
+        most = LONGEST + sum(len(part) for part in text.split("`")[1::2] if len(part) < 1000 and {"/", "\\"} & {*part})
+        return text if len(text) <= most else f"{text[: most * 2 // 3 - 5]} ... {text[-(most // 3) :]}"
 
 
 class ShapeError(MwdnError, ValueError):
@@ -100,8 +101,8 @@ def check_options(of: Callable[..., Any], what: str, options: Mapping[str, Any])
             if isinstance(value, str) and names:
                 raise UnknownNameError(option, value, names)
             raise ParameterError(f"`{option}` ({shown(value)}) of {what} must be {type_in_words(types[option])}.")
-        if isinstance(value, float) and math.isinf(value):
-            raise ParameterError(f"`{option}` ({value}) of {what} must be finite.")
+        if isinstance(value, int | float) and not abs(value) < 2**63:  # NaN fails this, too
+            raise ParameterError(f"`{option}` ({shown(value)}) of {what} must be finite, and below 2^63.")
 
 
 def checked(decorated: _Checked) -> _Checked:
@@ -207,8 +208,7 @@ def check_batch(image: Any, name: str) -> None:  # noqa: ANN401
     """Check that the image called ``name`` is a tensor of floats (B, C, H, W).
 
     Raises:
-        ParameterError: it is no tensor, or one of integers, whose scale is unknown, of complex numbers, or of floats
-            of 8 bits; or it is sparse, or on the device "meta", without numbers.
+        ParameterError: no tensor; one of integers, complex numbers or 8-bit floats; sparse, or on the device "meta".
         ShapeError: it has other axes.
     """
     if not hasattr(image, "is_floating_point"):  # without torch, which takes seconds to import
