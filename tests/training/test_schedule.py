@@ -11,8 +11,9 @@ import torch
 from torch import nn
 
 from mwdn.networks import build
+from mwdn.optics import Camera
 from mwdn.training.recipe import Plateau, Recipe, Schedule
-from mwdn.training.schedule import Cosine, ReduceLROnPlateau, learning_rate, make_lr_schedule, make_optimiser
+from mwdn.training.schedule import Cosine, ReduceLROnPlateau, learning_rate, make_lr_schedule, make_optimiser, set_rate
 
 FIRST, LATER = {"mse": 1.0, "feature_mse": 1.0}, {"mse": 1.0, "feature_mse": 0.05}
 PAPER = Recipe({"name": "mwdn"}, Schedule(lr_schedule="plateau", learning_rate=1e-4), FIRST, later_loss=LATER)
@@ -132,3 +133,44 @@ def test_adamw_decays_convolutions_alone():
     assert type(optim) is torch.optim.AdamW
     decay = {id(p): group["weight_decay"] for group in optim.param_groups for p in group["params"]}
     assert all(decay[id(p)] == (0.3 if p.ndim == 4 else 0) for p in network.parameters())
+
+
+def test_filters_have_a_rate_of_their_own():
+    network = build("mwdn", width=4)
+    optim = make_optimiser(network, Schedule(filter_rate=30.0))
+    set_rate(optim, 2e-3)
+    rates = {id(p): group["lr"] for group in optim.param_groups for p in group["params"]}
+    for name, parameter in network.named_parameters():
+        of_filter = name.endswith(("log_weight", "log_regularisation"))
+        assert rates[id(parameter)] == pytest.approx(6e-2 if of_filter else 2e-3)
+
+
+def test_a_learned_wiener_filter_reaches_its_optimum(generator):
+    """100 steps from the paper's initial values, against the best lambda of a grid, with the best w for each."""
+    psf = torch.rand(1, 1, 32, 32, generator=generator) ** 16
+    scene = torch.rand(4, 1, 4, 4, generator=generator).repeat_interleave(8, -1).repeat_interleave(8, -2)
+    light = Camera(psf)(scene)
+    measurement = light + 0.03 * light.mean() * torch.randn(light.shape, generator=generator)
+    network = build("wiener")
+
+    def error():
+        return (network(measurement, psf) - scene).square().mean()
+
+    schedule = Schedule(steps=100, warmup=0, filter_rate=100.0)
+    optim = make_optimiser(network, schedule)
+    for step in range(schedule.steps):
+        set_rate(optim, learning_rate(step, schedule))
+        optim.zero_grad()
+        error().backward()
+        optim.step()
+    learned = 10 * error().log10()
+    # At w = 1 the estimate is w times the one at (w, w^2 lambda): the best w is a least-squares gain.
+    best = []
+    with torch.no_grad():
+        network.filter.log_weight.fill_(0)
+        for log_ratio in torch.arange(-8, 6, 0.25):
+            network.filter.log_regularisation.fill_(log_ratio)
+            estimate = network(measurement, psf)
+            gain = (estimate * scene).sum() / estimate.square().sum()
+            best.append(10 * (gain * estimate - scene).square().mean().log10())
+    assert learned < min(best) + 0.2

@@ -21,7 +21,7 @@ from mwdn.training.losses import checked_weights
 
 LR_SCHEDULES = ("cosine", "plateau")
 OPTIMISERS = ("adam", "adamw")
-LATER = {"mismatch": REAL, "pairs": ("folds", "fold", "aligned", "best_gain"), "schedule": ("anchor",)}
+LATER = {"mismatch": REAL, "pairs": ("folds", "fold", "aligned", "best_gain"), "schedule": ("anchor", "filter_rate")}
 """Keys of tables that the first recipes did not have."""
 
 
@@ -59,6 +59,9 @@ class Schedule:
             them from.
         anchor: decay towards the weights of `start`, times the learning rate. The start is validated, too, and kept as
             the best if no step improves on it.
+        filter_rate: learning rate of the logarithms of the Wiener filters' w and lambda, over that of the other
+            parameters. At 1, w and lambda hardly move: Adam changes each number by about the learning rate a step, and
+            an optimum may be 5 away.
     """
 
     steps: int = 2000
@@ -82,12 +85,13 @@ class Schedule:
     denoiser: str = ""
     fixed_norms: bool = False
     anchor: float = 0.0
+    filter_rate: float = 1.0
 
     RENAMED: ClassVar[dict[str, str]] = {"course": "lr_schedule"}
     """Former names of keys, which recipes, command lines and saved runs may still use."""
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch", "learning_rate", "validate_every", "validation"):
+        for name in ("steps", "batch", "learning_rate", "validate_every", "validation", "filter_rate"):
             if not getattr(self, name) > 0:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) must be positive.")
         for name in ("epochs", "warmup", "weight_decay", "clip", "pool", "crop", "anchor"):

@@ -117,18 +117,30 @@ def make_optimiser(network: nn.Module, schedule: Schedule) -> torch.optim.Optimi
     ``"adamw"`` decays convolution weights, apart from the gradient; biases and BatchNorm are not decayed. ``"adam"``
     adds the decay of all parameters to the gradient, as the authors' code does. Neither decays the Wiener filters' w
     and lambda. The authors' code does, which pulls them to 0; here their logarithms are learned, and decay would pull
-    w and lambda to 1.
+    w and lambda to 1. Their learning rate is ``filter_rate`` times that of the other parameters (`set_rate`).
     """
     paper = schedule.optimiser == "adam"
-    groups: dict[bool, list[nn.Parameter]] = {True: [], False: []}
+    groups: dict[tuple[bool, bool], list[nn.Parameter]] = {}
     for name, parameter in network.named_parameters():
-        physical = name.rpartition(".")[2].startswith("log_")  # log w and log lambda
-        groups[not physical if paper else parameter.ndim > 1].append(parameter)
+        of_filter = name.rpartition(".")[2].startswith("log_")  # log w and log lambda
+        decayed = not of_filter if paper else parameter.ndim > 1
+        groups.setdefault((decayed, of_filter), []).append(parameter)
     kind = torch.optim.Adam if paper else torch.optim.AdamW
-    return kind(
+    optimiser = kind(
         [
-            {"params": parameters, "weight_decay": schedule.weight_decay if decayed else 0.0}
-            for decayed, parameters in groups.items()
-        ],
-        lr=schedule.learning_rate,
+            {
+                "params": parameters,
+                "weight_decay": schedule.weight_decay if decayed else 0.0,
+                "rate": schedule.filter_rate if of_filter else 1.0,
+            }
+            for (decayed, of_filter), parameters in groups.items()
+        ]
     )
+    set_rate(optimiser, schedule.learning_rate)
+    return optimiser
+
+
+def set_rate(optimiser: torch.optim.Optimizer, learning_rate: float) -> None:
+    """Set the learning rate of each group: its ``rate`` times this one."""
+    for group in optimiser.param_groups:
+        group["lr"] = group["rate"] * learning_rate

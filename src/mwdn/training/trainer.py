@@ -25,7 +25,7 @@ from mwdn.training.recipe import Recipe
 from mwdn.training.report import Report
 from mwdn.training.run_folder import MAKE_ROOM, RunFolder, run_identity
 from mwdn.training.sample_cache import Progress
-from mwdn.training.schedule import make_lr_schedule, make_optimiser
+from mwdn.training.schedule import make_lr_schedule, make_optimiser, set_rate
 from mwdn.training.tasks import Task
 from mwdn.training.training_state import damaged, restore, write_state
 from mwdn.training.validation import Validation, Validator
@@ -178,8 +178,7 @@ class Trainer:
         batch = range(first, first + self.schedule.batch)
         share = distributed.shard(batch)
         weight = len(share) / len(batch)  # losses are means over samples
-        for group in self.optimiser.param_groups:
-            group["lr"] = self.lr_schedule.rate(self.step)
+        set_rate(self.optimiser, self.lr_schedule.rate(self.step))
         loss, parts = self._loss(share)
         self.optimiser.zero_grad(set_to_none=True)
         torch.autograd.backward(weight * loss)  # before the loss is read, which waits for a GPU
