@@ -11,11 +11,13 @@ from mwdn.calibration import FrameFormat
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.progress import track
 from mwdn.cli.terminal import counted, if_interrupted, notes, say
+from mwdn.data.digicam import DigiCam, import_digicam
 from mwdn.data.importers import Layout, import_pairs
+from mwdn.errors import ParameterError
 
 
 @no_empty_folder
-def import_(
+def import_(  # noqa: PLR0913
     kind: str,
     path: Path,
     *,
@@ -23,24 +25,45 @@ def import_(
     skip_damaged: bool = False,
     layout: Annotated[Layout, Parameter(name="*")] = Layout(),
     frames: Annotated[FrameFormat, Parameter(name="*")] = FrameFormat(),
+    digicam: Annotated[DigiCam, Parameter(name="*")] = DigiCam(),
     camera: Path | None = None,  # its values are in `frames`, see `from_camera_file`
 ) -> None:
     """Convert a public data set, or two folders of pictures, to one file of pairs.
 
     Args:
-        kind: mwdn (the authors' HDF5), diffusercam, phlatcam, folders (captures/ and scenes/), or parquet.
+        kind: mwdn (the authors' HDF5), diffusercam, phlatcam, folders (captures/ and scenes/), parquet, or digicam
+            (lensless, lensed and the patterns of its mask in masks/).
         path: of the data set; for parquet a shard, a folder of shards, or owner/name on the Hugging Face hub.
         out: file of pairs to write, ending in .h5 or .hdf5; an existing file is replaced only on success.
         skip_damaged: skip pairs with a damaged or missing picture, and list them.
         layout: where this copy of the data set differs from the usual layout.
         frames: format of the captures, where it differs from the usual one.
+        digicam: optics of a camera of the kind digicam.
         camera: camera file with this format; its dark and ambient frames are not subtracted.
     """
     progress = partial(track, title="Importing")
+    if kind != "digicam" and digicam != DigiCam():
+        raise ParameterError(
+            "`mask_distance_mm`, `source_mm`, `sensor_mm`, `psf_turn` and `background` are for digicam."
+        )
+    if kind == "digicam":
+        with if_interrupted(lambda: f"Interrupted. Files that are complete are kept: {out.parent}."):
+            done = import_digicam(
+                path, out, digicam, layout=layout, frames=frames, skip_damaged=skip_damaged, track=progress
+            )
+        _name_skipped(done.skipped)
+        for (file, (label, count)), psf in zip(done.files.items(), done.psfs, strict=True):
+            mask = f" of mask {label}" if label else ""
+            say(f"{counted(count, 'pair')}{mask} written to {file}, its PSF to {psf}")
+        return
     with if_interrupted(lambda: f"Interrupted. Nothing is kept: {out} is written when all pairs are done."):
         result = import_pairs(kind, path, out, layout=layout, frames=frames, skip_damaged=skip_damaged, track=progress)
-    for reason in result.skipped.values():
-        notes.print(f"[yellow]skipped:[/] {escape(reason)}", highlight=False, soft_wrap=True)
+    _name_skipped(result.skipped)
     names = f": {', '.join(result.skipped)}" if result.skipped else ""
     summary = f"{counted(result.count, 'pair')} written to {out}, {len(result.skipped):,} skipped{names}"
     say(summary)
+
+
+def _name_skipped(skipped: dict[str, str]) -> None:
+    for reason in skipped.values():
+        notes.print(f"[yellow]skipped:[/] {escape(reason)}", highlight=False, soft_wrap=True)

@@ -1,7 +1,7 @@
 """From a public data set, in its own layout, to a file of pairs."""
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
@@ -10,12 +10,12 @@ from typing import TypeVar, cast
 import numpy as np
 
 from mwdn.calibration import FrameFormat
-from mwdn.data.pair_writer import PixelType, check_path, quantise
+from mwdn.data.pair_writer import Attribute, PixelType, check_path, quantise
 from mwdn.data.pairs import PairFile
 from mwdn.data.sources import Listing, Source, list_folders, list_hdf5, list_parquet, list_phlatcam
 from mwdn.errors import ImageError, MwdnError, ParameterError, UnknownNameError
 from mwdn.io.files import refuse_overwrite
-from mwdn.types import Frame, Size
+from mwdn.types import Frame, Psf, Size
 
 T = TypeVar("T", "Layout", FrameFormat)
 
@@ -126,17 +126,37 @@ def import_pairs(
     if first is None:
         reason = f" {len(skipped):,} were skipped; {next(iter(skipped.values()))}" if skipped else ""
         raise ImageError(f"`{path}` has no pair to import.{reason} For the layouts: `mwdn import --help`.")
+    result.count = write_pairs(Path(output), chain([first], pairs), {"source": kind})
+    return result
+
+
+def write_pairs(
+    output: Path, pairs: Iterable[Pair], attributes: Mapping[str, Attribute], psf: Psf | None = None
+) -> int:
+    """Write pairs to a file, of which there is at least one; returns how many.
+
+    Args:
+        output: the new file.
+        pairs: all of one shape and type.
+        attributes: of the file.
+        psf: of the camera, as in `PairFile.create`.
+
+    Raises:
+        ImageError: the file cannot be written.
+    """
+    pairs = iter(pairs)
+    first = next(pairs)
     with PairFile.create(
         output,
         measurement_shape=first[1].shape,
         scene_shape=first[2].shape,
         dtype=cast(PixelType, first[1].dtype.name),
-        attributes={"source": kind},
+        attributes=attributes,
+        psf=psf,
     ) as file:
         for _, measurement, scene in chain([first], pairs):
             file.append(measurement, scene)
-        result.count = len(file)
-    return result
+        return len(file)
 
 
 def read_pairs(
@@ -169,6 +189,19 @@ def read_pairs(
         raise UnknownNameError("kind of data set", kind, KINDS)
     layout = _override(KINDS[kind].layout, layout)
     listing = KINDS[kind].list_pairs(Path(path), layout.captures or "", layout.scenes or "")
+    return read_listing(listing, KINDS[kind], layout.scene_size, frames, skipped=skipped, track=track)
+
+
+def read_listing(
+    listing: Listing,
+    kind: Kind,
+    scene_size: Size | None,
+    frames: FrameFormat,
+    *,
+    skipped: dict[str, str] | None = None,
+    track: Callable[[list[Source]], Iterable[Source]] = iter,
+) -> Iterator[Pair]:
+    """Read the pairs of a listing one by one, in its order, see `read_pairs`."""
     if listing.refused and skipped is None:
         reason = next(iter(listing.refused.values()))
         more = f" (and {len(listing.refused) - 1:,} more like it)" if len(listing.refused) > 1 else ""
@@ -178,7 +211,7 @@ def read_pairs(
     first: tuple[Frame, Frame] | None = None
     for source in track(listing.sources):
         try:
-            pair = _convert(source, KINDS[kind], layout.scene_size, frames)
+            pair = _convert(source, kind, scene_size, frames)
             first = first or pair
             _check_like_first(first, pair, source.name)
         except MwdnError as error:

@@ -1,7 +1,6 @@
 """List the pairs of a public data set and read them one by one: one function per layout."""
 
-import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -10,21 +9,13 @@ from typing import Any
 import numpy as np
 
 from mwdn.data.hdf5 import as_damage, find_rows, names_in, open_hdf5
+from mwdn.data.shards import COPY_AGAIN, Shard, find_shards, natural_order
 from mwdn.errors import ImageError
-from mwdn.io.images import READABLE, decode_frame, read_frame
-from mwdn.io.reading import open_regular
+from mwdn.io.images import READABLE, read_frame
 from mwdn.types import Frame
 
 MOST_ROWS = 2**21
 """Most pairs of one file: listing them takes 0.7 GB."""
-
-SMALLEST_PICTURE = 67
-"""Bytes of the smallest PNG: a file cannot hold more pictures than this allows."""
-
-UNPACKED_BYTES, PACKED_PART = 2**28, 20
-"""Pictures are compressed already: rows that unpack to over 256 MiB and 20 times the file are refused."""
-
-COPY_AGAIN = "Copy it from its source again."
 
 # The ten ImageNet classes on which FlatNet's authors tested. The data set has ten pictures of each class, so these are
 # its 100 test pairs. From `val_target.txt` of their code (S. S. Khan et al., TPAMI 44, 1934, 2022).
@@ -51,10 +42,12 @@ class Source:
     Args:
         name: a file's stem, or a row.
         load: reads the capture and the scene as stored, (H, W, C), or raises `ImageError`.
+        mask: label of the mask, for a camera with several.
     """
 
     name: str
     load: Callable[[], tuple[Frame, Frame]]
+    mask: str = ""
 
 
 @dataclass(frozen=True)
@@ -76,8 +69,8 @@ def list_folders(path: Path, captures: str, scenes: str) -> Listing:
     Raises:
         ImageError: a folder is missing, or two files differ only in their suffix.
     """
-    files = {folder: _by_stem(path / folder) for folder in (captures, scenes)}
-    stems = sorted(set(files[captures]) | set(files[scenes]), key=_natural)
+    files = {folder: files_by_stem(path / folder) for folder in (captures, scenes)}
+    stems = sorted(set(files[captures]) | set(files[scenes]), key=natural_order)
     refused, sources = {}, []
     for stem in stems:
         missing = [folder for folder in (captures, scenes) if stem not in files[folder]]
@@ -85,7 +78,7 @@ def list_folders(path: Path, captures: str, scenes: str) -> Listing:
             present = next(paths[stem] for paths in files.values() if stem in paths)
             refused[stem] = f"`{present}` has no partner in `{path / missing[0]}`. Add it, or remove this one."
         else:
-            sources.append(Source(stem, partial(_read_both, files[captures][stem], files[scenes][stem])))
+            sources.append(Source(stem, partial(read_both, files[captures][stem], files[scenes][stem])))
     return Listing(sources, refused)
 
 
@@ -136,104 +129,30 @@ def list_parquet(path: Path, captures: str, scenes: str) -> Listing:
     Raises:
         ImageError: nothing there, or ``pyarrow`` (for the hub ``huggingface_hub``) is not installed.
     """
-    folder = path if path.exists() else _download(path)
-    shards = sorted(folder.rglob("*.parquet"), key=lambda shard: _natural(str(shard))) if folder.is_dir() else [folder]
-    if not shards:
-        raise ImageError(f"`{path}` has no file that ends in .parquet. Name a shard, or the folder of the shards.")
+    shards = find_shards(path)
     sources: list[Source] = []
     refused = {}
     for shard in shards:
         try:
-            rows = _Shard(shard, (captures, scenes))
+            rows = Shard(shard, (captures, scenes))
         except ImageError as error:
             refused[shard.name] = str(error)
             continue
-        sources += [Source(f"{shard.name} row {row}", partial(rows.load, row)) for row in range(rows.count)]
+        sources += [Source(f"{shard.name} row {row}", partial(_read_cells, rows, row)) for row in range(rows.count)]
     return Listing(sources, refused)
 
 
-class _Shard:
-    """A parquet file. It is read in order, a few rows at a time."""
-
-    def __init__(self, path: Path, columns: Sequence[str]) -> None:
-        try:
-            from pyarrow import parquet
-        except ModuleNotFoundError as error:
-            raise _missing("pyarrow", "parquet") from error
-        self.path, self.columns = path, list(columns)
-        open_regular(path).close()
-        with as_damage(f"`{path}` is not a complete parquet file", COPY_AGAIN):
-            self._file: Any = parquet.ParquetFile(path, buffer_size=2**20)
-            names = self._file.schema_arrow.names
-            groups = [self._file.metadata.row_group(i) for i in range(self._file.metadata.num_row_groups)]
-            rows = [group.num_rows for group in groups]
-            self.count, self._ends = sum(rows), np.cumsum(rows, dtype=np.int64)
-            # Not by columns: pyarrow ends the process with an abort for the statistics of a damaged one.
-            largest = max((group.total_byte_size for group in groups), default=0)
-        if not set(self.columns) <= set(names):
-            advice = "Name two of them: `--captures lensless --scenes lensed`."
-            raise ImageError(f"`{path}` must have the columns {self.columns}, but has {str(names)[:80]}. {advice}")
-        size = path.stat().st_size
-        if min(rows, default=0) < 0 or self.count * SMALLEST_PICTURE > size:
-            raise ImageError(f"`{path}` claims {self.count:,} rows, but has {size:,} bytes for them. {COPY_AGAIN}")
-        if largest > max(PACKED_PART * size, UNPACKED_BYTES):
-            raise ImageError(f"`{path}` would take {largest:,} bytes unpacked, but has {size:,}. {COPY_AGAIN}")
-        self._group, self._next, self._rows = -1, 0, self._read(-1)
-
-    def load(self, row: int) -> tuple[Frame, Frame]:
-        """Capture and scene of a row, (H, W, C).
-
-        Raises:
-            ImageError: the row or its picture is damaged.
-        """
-        group = int(np.searchsorted(self._ends, row, side="right"))
-        cells: list[Any] | None = []
-        with as_damage(f"Row {row} of `{self.path}` cannot be read", COPY_AGAIN):
-            if group != self._group or row < self._next:
-                start = int(self._ends[group - 1]) if group else 0
-                self._group, self._next, self._rows = group, start, self._read(group)
-            while self._next <= row and cells is not None:
-                cells, self._next = next(self._rows, None), self._next + 1
-        if cells is None:
-            raise ImageError(f"Row {row} of `{self.path}` cannot be read: one before it is damaged. {COPY_AGAIN}")
-        capture, scene = (self._decode(cell, column, row) for cell, column in zip(cells, self.columns, strict=True))
-        return capture, scene
-
-    def _read(self, group: int) -> Iterator[list[Any]]:
-        # One value may be shared by all rows: in a thousand rows at once it would take a thousand times its memory.
-        for batch in self._file.iter_batches(4, row_groups=[group], columns=self.columns, use_threads=False):
-            for row in range(batch.num_rows):
-                yield [batch.column(name)[row].as_py() for name in self.columns]
-
-    def _decode(self, cell: object, column: str, row: int) -> Frame:
-        data = cell.get("bytes") if isinstance(cell, dict) else cell
-        name = f"`{column}` of row {row} of `{self.path}`"
-        if not isinstance(data, bytes):
-            raise ImageError(f"{name} must hold the bytes of a picture, but holds {type(data).__name__}. {COPY_AGAIN}")
-        return decode_frame(data, name)
+def _read_cells(shard: Shard, row: int) -> tuple[Frame, Frame]:
+    capture, scene = shard.load(row)
+    return capture, scene
 
 
-def _download(name: Path) -> Path:
-    if not re.fullmatch(r"[\w.-]+/[\w.-]+", name.as_posix()) or name.suffix == ".parquet":
-        raise ImageError(f"`{name}` does not exist. Name a shard, a folder of shards, or `owner/name` on the hub.")
-    try:
-        from huggingface_hub import snapshot_download
-    except ModuleNotFoundError as error:
-        raise _missing("huggingface_hub", "hub", f"`{name}` is not on this machine. To download it, ") from error
-    try:
-        return Path(snapshot_download(name.as_posix(), repo_type="dataset", allow_patterns="*.parquet"))
-    except Exception as error:  # the errors of its network library, which changes between versions
-        reason = str(error).partition("\n")[0].rstrip(".")
-        raise ImageError(
-            f"`{name}` cannot be downloaded from the hub: {reason}. Download it and name its folder."
-        ) from error
+def files_by_stem(folder: Path) -> dict[str, Path]:
+    """Frames in a folder and its subfolders, by their path without suffix.
 
-
-def _missing(package: str, extra: str, purpose: str = "") -> ImageError:
-    return ImageError(f"{purpose}`{package}` must be installed: `pip install 'mwdn[{extra}]'`.")
-
-
-def _by_stem(folder: Path) -> dict[str, Path]:
+    Raises:
+        ImageError: no such folder, or two files differ only in their suffix.
+    """
     if not folder.is_dir():
         raise ImageError(
             f"`{folder}` is not a folder. Name the folders inside the data set: `--captures A --scenes B`."
@@ -249,12 +168,8 @@ def _by_stem(folder: Path) -> dict[str, Path]:
     return paths
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Sort key that places im2 before im10."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
-
-
-def _read_both(capture: Path, scene: Path) -> tuple[Frame, Frame]:
+def read_both(capture: Path, scene: Path) -> tuple[Frame, Frame]:
+    """Read a capture and its scene."""
     return read_frame(capture), read_frame(scene)
 
 

@@ -1,0 +1,252 @@
+"""Import data sets of DigiCam and its relatives: a display as the mask, one or several patterns, room light.
+
+The data sets of LenslessPiCam on the Hugging Face hub have the columns ``lensless`` and ``lensed``, encoded pictures;
+``mask_label``, a number, where the pattern changes from pair to pair; the patterns in ``masks/mask_NUMBER.npy``, or one
+in ``mask_pattern.npy``; and, where captures were taken in the light of a room, a picture of that light alone.
+
+A camera has one PSF, and so has a file of pairs: each pattern gets its own file, with the PSF that `mwdn.optics`
+computes for it.
+
+References:
+    E. Bezzam et al., "Towards Robust and Generalizable Lensless Imaging with Modular Learned Reconstruction" (2025).
+"""
+
+import csv
+import io
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from mwdn.calibration import FrameFormat
+from mwdn.data.importers import Kind, Layout, read_listing, write_pairs
+from mwdn.data.pair_writer import Attribute, check_path
+from mwdn.data.shards import COPY_AGAIN, Shard, find_shards
+from mwdn.data.sources import Listing, Source, files_by_stem, list_folders
+from mwdn.errors import ImageError, ParameterError
+from mwdn.io.files import refuse_overwrite
+from mwdn.io.images import read_frame, write_linear
+from mwdn.io.npy import read_array
+from mwdn.io.reading import read_text
+from mwdn.optics.lcd_mask import Lcd, lcd_psf
+from mwdn.optics.orientation import Orientation, turn
+from mwdn.optics.setup import Setup
+from mwdn.types import Frame, Psf, Size
+
+PATTERN = "mask_pattern.npy"
+CAPTURES, SCENES, LABEL = "lensless", "lensed", "mask_label"
+DOWNLOADED = ("*.parquet", "masks/*.npy", "mask_pattern.npy")
+
+KIND = Kind(list_folders, Layout(CAPTURES, SCENES))
+
+
+@dataclass(frozen=True)
+class DigiCam:
+    """The optics of a camera with a display as its mask; the defaults are those of DigiCam.
+
+    Args:
+        mask_distance_mm: from the display to the sensor.
+        source_mm: from the scene to the display.
+        sensor_mm: width of the captures on the sensor; the Raspberry Pi HQ camera's 4056 pixels of 1.55 um.
+        psf_turn: how the computed PSF must be turned to fit the captures; `mwdn reconstruct` says if it is.
+        background: column or folder of frames of the room's light alone, subtracted from the captures, which are then
+            stored as floats; "none" keeps it in them.
+
+    Raises:
+        ParameterError: a length is not positive.
+    """
+
+    mask_distance_mm: float = 2.0
+    source_mm: float = 300.0
+    sensor_mm: float = 6.2868
+    psf_turn: Orientation | None = None
+    background: str = "background"
+
+    def __post_init__(self) -> None:
+        for name in ("mask_distance_mm", "source_mm", "sensor_mm"):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise ParameterError(f"`{name}` ({getattr(self, name)}) must be positive.")
+
+    def psf(self, pattern: Path, size: Size) -> Psf:
+        """PSF (1, 3, H, W) of a pattern's file for captures of a size, each colour of unit sum.
+
+        Raises:
+            ImageError: the file cannot be read.
+            MwdnError: it holds no transmissions of cells.
+        """
+        values = torch.from_numpy(np.asarray(read_array(pattern), np.float32))
+        setup = Setup(
+            distance_mm=self.mask_distance_mm,
+            source_mm=self.source_mm,
+            pixels=size,
+            pixel_um=1e3 * self.sensor_mm / size[1],
+            bin=1,
+        )
+        psf = lcd_psf(values, setup, Lcd())
+        return psf if self.psf_turn is None else turn(psf, self.psf_turn)
+
+
+@dataclass
+class ImportedMasks:
+    """Result: for each file written, its pattern's label and the number of its pairs; and the skipped pairs."""
+
+    files: dict[Path, tuple[str, int]] = field(default_factory=dict)
+    psfs: list[Path] = field(default_factory=list)
+    skipped: dict[str, str] = field(default_factory=dict)
+
+
+def import_digicam(
+    path: Path,
+    output: Path,
+    camera: DigiCam = DigiCam(),
+    *,
+    layout: Layout = Layout(),
+    frames: FrameFormat = FrameFormat(),
+    skip_damaged: bool = False,
+    track: Callable[[list[Source]], Iterable[Source]] = iter,
+) -> ImportedMasks:
+    """Convert a data set to a file of pairs for each pattern, with its computed PSF, also beside it as a TIFF.
+
+    Args:
+        path: folder of the data set, or its name on the hub.
+        output: the new file, ``pairs.h5``; with several patterns ``pairs-mask-0.h5`` and so on.
+        camera: its optics.
+        layout: other names of columns or folders, and the size of scenes.
+        frames: format of the captures.
+        skip_damaged: leave out pairs that are damaged, and name them in the result.
+        track: wraps the pairs of each file, for a progress bar.
+
+    Raises:
+        ImageError: nothing to import, a pattern is missing, or a pair is damaged and not to be skipped.
+        MwdnError: as for `mwdn.data.importers.import_pairs`.
+    """
+    check_path(output)
+    refuse_overwrite(output, path)
+    names = layout.captures or CAPTURES, layout.scenes or SCENES
+    listing, folder = list_digicam(path, *names, background=camera.background)
+    patterns = find_patterns(folder)
+    labels = sorted({source.mask for source in listing.sources}, key=lambda label: (len(label), label))
+    for label in labels:
+        if label not in patterns:
+            if not label:
+                raise ImageError(
+                    f"`{folder}` must have one pattern, `{PATTERN}` or `masks/mask_0.npy`, or a label for each pair: "
+                    f"the column `{LABEL}`, or metadata.csv with file_name and {LABEL}."
+                )
+            raise ImageError(f"`{folder}` has no pattern `masks/mask_{label}.npy`, but pairs of it. {COPY_AGAIN}")
+    result = ImportedMasks()
+    for number, label in enumerate(labels):
+        part = Listing(
+            [source for source in listing.sources if source.mask == label], listing.refused if number == 0 else {}
+        )
+        skipped = result.skipped if skip_damaged else None
+        pairs = read_listing(part, KIND, layout.scene_size, frames, skipped=skipped, track=track)
+        file = output if len(labels) == 1 else output.with_name(f"{output.stem}-mask-{label}{output.suffix}")
+        first = next(pairs, None)
+        if first is None:
+            continue
+        attributes: dict[str, Attribute] = {"source": "digicam", "mask_label": label}
+        psf = camera.psf(patterns[label], (first[1].shape[0], first[1].shape[1]))
+        result.files[file] = label, write_pairs(file, chain([first], pairs), attributes, psf)
+        result.psfs.append(file.with_name(f"{file.stem}-psf.tif"))
+        write_linear(result.psfs[-1], psf / psf.max())
+    if not result.files:
+        raise ImageError(f"`{path}` has no pair to import. For the layouts: `mwdn import --help`.")
+    return result
+
+
+def list_digicam(path: Path, captures: str, scenes: str, *, background: str) -> tuple[Listing, Path]:
+    """The pairs of a data set with the label of each pattern, and its folder.
+
+    Args:
+        path: folder with parquet shards, or with the folders of pictures ``captures`` and ``scenes``; or a name on the
+            hub. In folders, ``metadata.csv`` says the pattern of each picture: file_name, mask_label.
+        captures: column or folder.
+        scenes: column or folder.
+        background: column or folder of the room's light, subtracted if it is there; "none" for no such.
+
+    Raises:
+        ImageError: nothing there, a label is missing, or a named background.
+    """
+    if (path / captures).is_dir():
+        return _list_pictures(path, captures, scenes, background), path
+    sources, refused, folder = [], {}, path
+    for file in find_shards(path, DOWNLOADED):
+        try:
+            shard = Shard(file, (captures, scenes))
+            if background in shard.names:
+                shard = Shard(file, (captures, scenes, background))
+            labels = shard.numbers(LABEL) if LABEL in shard.names else [""] * shard.count
+        except ImageError as error:
+            refused[file.name] = str(error)
+            continue
+        folder = file.parent if path.is_file() else folder
+        rows = range(shard.count)
+        sources += [Source(f"{file.name} row {n}", partial(_read_row, shard, n), _label(labels[n])) for n in rows]
+    if not path.exists():  # downloaded: the patterns lie beside the folder of the shards
+        folder = next((p for p in file.parents if (p / "masks").is_dir() or (p / PATTERN).is_file()), file.parent)
+    return Listing(sources, refused), folder
+
+
+def _label(value: object) -> str:
+    return "" if value is None else str(value)
+
+
+def _read_row(shard: Shard, row: int) -> tuple[Frame, Frame]:
+    capture, scene, *ambient = shard.load(row)
+    return _without(capture, ambient[0], f"row {row}") if ambient else capture, scene
+
+
+def _without(capture: Frame, ambient: Frame, name: str) -> Frame:
+    """The capture less the room's light, as floats of either sign; 1 is saturation."""
+    if capture.shape != ambient.shape or capture.dtype != ambient.dtype:
+        raise ImageError(f"The background of {name} {ambient.shape} must be like its capture {capture.shape}.")
+    scale = np.float32(1 if capture.dtype.kind == "f" else np.iinfo(capture.dtype).max)
+    return (capture.astype(np.float32) - ambient) / scale
+
+
+def _list_pictures(path: Path, captures: str, scenes: str, background: str) -> Listing:
+    listing, labels = list_folders(path, captures, scenes), _read_labels(path)
+    rooms = files_by_stem(path / background) if (path / background).is_dir() else {}
+    if rooms and len(rooms) > 1:  # one for each capture
+        missing = {one.name: f"`{one.name}` has no frame in `{path / background}`." for one in listing.sources}
+        listing.refused.update({name: why for name, why in missing.items() if name not in rooms})
+    sources = []
+    for one in listing.sources:
+        if one.name in listing.refused:
+            continue
+        room = next(iter(rooms.values())) if len(rooms) == 1 else rooms.get(one.name)
+        load = one.load if room is None else partial(_read_room, one, room)
+        sources.append(Source(one.name, load, labels.get(one.name, "")))
+    return Listing(sources, listing.refused)
+
+
+def _read_room(source: Source, room: Path) -> tuple[Frame, Frame]:
+    capture, scene = source.load()
+    return _without(capture, read_frame(room), source.name), scene
+
+
+def _read_labels(path: Path) -> dict[str, str]:
+    """Label of each picture by its stem, from metadata.csv."""
+    file = path / "metadata.csv"
+    if not file.is_file():
+        return {}
+    rows = csv.DictReader(io.StringIO(read_text(file, most=2**26, error=ImageError)))
+    if not {"file_name", LABEL} <= set(rows.fieldnames or ()):
+        raise ImageError(f"`{file}` must have the columns file_name and {LABEL}.")
+    return {Path(row["file_name"] or "").with_suffix("").name: row[LABEL] or "" for row in rows}
+
+
+def find_patterns(folder: Path) -> dict[str, Path]:
+    """Files of the patterns by their labels; a single one, under whatever name, is also that of pairs without label."""
+    named = {re.sub(r"^mask_", "", path.stem): path for path in sorted((folder / "masks").glob("*.npy"))}
+    if (folder / PATTERN).is_file():
+        named[""] = folder / PATTERN
+    elif len(named) == 1:
+        named[""] = next(iter(named.values()))
+    return named
