@@ -15,13 +15,13 @@ from mwdn.optics.lcd_mask import Lcd, lcd_psf
 from mwdn.optics.psf_measures import likeness
 from mwdn.optics.setup import Setup
 
-CAMERA = DigiCam()
+CAMERA = DigiCam(sensor_mm=2.0)
 
 
 def patterns(folder, labels, seed=0):
     (folder / "masks").mkdir(parents=True, exist_ok=True)
     for label in labels:
-        values = np.random.default_rng(seed + label).integers(0, 2, (54, 26)).astype(np.float32)
+        values = np.random.default_rng(seed + label).integers(0, 2, (18, 8)).astype(np.float32)
         np.save(folder / f"masks/mask_{label}.npy", values)
 
 
@@ -40,7 +40,7 @@ def shard(path, labels=None, room=False, count=4):
 def test_each_pattern_gets_its_pairs_and_its_psf(run, tmp_path):
     patterns(tmp_path / "set", (0, 3))
     shard(tmp_path / "set/data/train-0.parquet", labels=[3, 0, 3, 3])
-    code, out, err = run("import", "digicam", tmp_path / "set", "-o", tmp_path / "pairs.h5")
+    code, out, err = run("import", "digicam", tmp_path / "set", "--sensor-mm", 2, "-o", tmp_path / "pairs.h5")
     assert (code, err) == (0, "")
     assert "1 pair of mask 0 written" in out
     assert "3 pairs of mask 3 written" in out
@@ -68,13 +68,13 @@ def test_folders_with_metadata_and_one_room(tmp_path):
         write(folder / f"lensed/{i}.png", flag(i, 38, 50))
     write(folder / "background/room.png", flag(7, 38, 50) // 4)
     (folder / "metadata.csv").write_text("file_name,mask_label\nlensless/0.png,1\nlensless/1.png,2\n2.png,1\n")
-    done = import_digicam(folder, tmp_path / "pairs.h5")
+    done = import_digicam(folder, tmp_path / "pairs.h5", CAMERA)
     assert [(label, count) for label, count in done.files.values()] == [("1", 2), ("2", 1)]
     with PairFile(tmp_path / "pairs-mask-2.h5") as pairs:
         expected = (flag(101, 38, 50).astype(np.float32) - flag(7, 38, 50) // 4) / 255
         np.testing.assert_allclose(pairs[0][0].movedim(0, -1), expected, atol=1e-7)
         assert float(pairs[0][0].min()) < 0
-    kept = import_digicam(folder, tmp_path / "kept.h5", DigiCam(background="none"))
+    kept = import_digicam(folder, tmp_path / "kept.h5", DigiCam(sensor_mm=2.0, background="none"))
     with PairFile(next(iter(kept.files))) as pairs:
         assert torch.equal(pairs[0][0].movedim(0, -1), torch.from_numpy(flag(100, 38, 50) / np.float32(255)))
 
@@ -82,9 +82,9 @@ def test_folders_with_metadata_and_one_room(tmp_path):
 def test_a_column_of_room_light_is_subtracted_and_one_pattern_needs_no_label(tmp_path):
     folder = tmp_path / "set"
     folder.mkdir()
-    np.save(folder / "mask_pattern.npy", np.random.default_rng(1).random((54, 26)).astype(np.float32))
+    np.save(folder / "mask_pattern.npy", np.random.default_rng(1).random((18, 8)).astype(np.float32))
     shard(folder / "test.parquet", room=True)
-    done = import_digicam(folder, tmp_path / "pairs.h5", DigiCam(psf_turn="rotate-180"))
+    done = import_digicam(folder, tmp_path / "pairs.h5", DigiCam(sensor_mm=2.0, psf_turn="rotate-180"))
     assert list(done.files.values()) == [("", 4)]
     with PairFile(tmp_path / "pairs.h5") as pairs:
         expected = (flag(102, 38, 50).astype(np.float32) - flag(202, 38, 50) // 4) / 255
@@ -106,7 +106,7 @@ def test_what_is_missing_or_damaged_is_named(run, tmp_path):
     (folder / "b.parquet").write_bytes((folder / "a.parquet").read_bytes()[:200])
     with pytest.raises(ImageError, match=r"b\.parquet"):
         import_digicam(folder, tmp_path / "pairs.h5")
-    done = import_digicam(folder, tmp_path / "pairs.h5", skip_damaged=True)
+    done = import_digicam(folder, tmp_path / "pairs.h5", CAMERA, skip_damaged=True)
     assert (list(done.files.values()), list(done.skipped)) == ([("", 4)], ["b.parquet"])
     code, _, err = run("import", "parquet", folder, "--source-mm", "200", "-o", tmp_path / "x.h5")
     assert (code, "Only the kind digicam" in err) == (2, True)

@@ -43,9 +43,8 @@ def import_(  # noqa: PLR0913
     """
     progress = partial(track, title="Importing")
     if kind != "digicam" and digicam != DigiCam():
-        raise ParameterError(
-            "`mask_distance_mm`, `source_mm`, `sensor_mm`, `psf_turn` and `background` are for digicam."
-        )
+        options = "`mask_distance_mm`, `source_mm`, `sensor_mm`, `psf_turn`, `background`"
+        raise ParameterError(f"Only the kind digicam has {options}. Leave them out.")
     if kind == "digicam":
         with if_interrupted(lambda: f"Interrupted. Files that are complete are kept: {out.parent}."):
             done = import_digicam(
