@@ -24,10 +24,23 @@ class Kind(NamedTuple):
     requires: str = ""
 
 
+def _extra(name: str) -> str:
+    return f"pip install 'mwdn[{name}]'"
+
+
 SOURCES: Mapping[str, Kind] = {
+    "aravis": Kind(
+        "aravis:AravisCamera",
+        "its name, serial number or IP address, or `first` or `fake`",
+        "apt install gir1.2-aravis-0.8 python3-gi (and pip install 'mwdn[aravis]' for another Python than Debian's)",
+    ),
     "folder": Kind("folder:WatchedFolder", "a folder that another program writes frames to"),
+    "harvesters": Kind("harvesters:HarvestersCamera", "its number, serial number or name", _extra("harvesters")),
+    "picamera2": Kind("picamera:PiCamera", "", "apt install python3-picamera2, or pip install 'mwdn[picamera2]'"),
+    "pypylon": Kind("pylon:PylonCamera", "its serial number or name, or `first`", _extra("pypylon")),
     "replay": Kind("recording:Replay", "an .h5 file of recorded frames or captured pairs"),
     "rig": Kind("rig:open_rig", ""),
+    "v4l2": Kind("v4l2:V4l2Camera", "its number (`v4l2:0`) or device"),
 }
 """Kinds of cameras by name. Another one is one line here and one file."""
 
