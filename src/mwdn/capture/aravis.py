@@ -5,13 +5,13 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
-from importlib import import_module, util
+from importlib import util
 from importlib.machinery import PathFinder
 from typing import Any
 
 from mwdn.capture.pixel_formats import PixelFormat, choose_format, unpack
 from mwdn.capture.source import TIMEOUT_S, CameraSource, Frame
-from mwdn.capture.sources import missing_driver
+from mwdn.capture.sources import load_driver
 from mwdn.errors import CameraError, reason
 
 BUFFERS = 5
@@ -179,13 +179,11 @@ def _library() -> Any:  # noqa: ANN401
     Raises:
         CameraError: not installed.
     """
-    try:
-        _find_gi()
-        gi = import_module("gi")
+    _find_gi()
+    gi = load_driver("aravis", "gi")
+    with suppress(ValueError):  # not installed: the import says so
         gi.require_version("Aravis", "0.8")
-        return import_module("gi.repository.Aravis")
-    except (ImportError, ValueError) as error:
-        raise missing_driver("aravis", error) from error
+    return load_driver("aravis", "gi.repository.Aravis")
 
 
 def _find_gi() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from mwdn.capture.pixel_formats import choose_format, unpack
 from mwdn.capture.source import TIMEOUT_S, CameraSource, Frame
-from mwdn.capture.sources import missing_driver
+from mwdn.capture.sources import load_driver
 from mwdn.errors import CameraError, reason
 
 PRODUCERS = "GENICAM_GENTL64_PATH"
@@ -36,12 +36,9 @@ class HarvestersCamera(CameraSource):
 
     def open(self) -> None:
         """Load the producers, connect, choose the format, and start."""
-        try:
-            from harvesters.core import Harvester
-        except ImportError as error:
-            raise missing_driver("harvesters", error) from error
+        core = load_driver("harvesters", "harvesters.core")
         self.close()
-        self._harvester = Harvester()
+        self._harvester = core.Harvester()
         try:
             for file in self._producers():
                 self._harvester.add_file(str(file), check_existence=True, check_validity=True)

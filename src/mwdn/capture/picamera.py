@@ -11,7 +11,7 @@ from typing import Any
 
 from mwdn.capture.pixel_formats import libcamera_format, unpack
 from mwdn.capture.source import TIMEOUT_S, CameraSource, Frame
-from mwdn.capture.sources import missing_driver
+from mwdn.capture.sources import load_driver
 from mwdn.errors import CameraError, reason
 
 
@@ -32,13 +32,10 @@ class PiCamera(CameraSource):
 
     def open(self) -> None:
         """Connect, choose an unpacked raw format, and start."""
-        try:
-            from picamera2 import Picamera2
-        except ImportError as error:
-            raise missing_driver("picamera2", error) from error
+        library = load_driver("picamera2", "picamera2")
         self.close()
         try:
-            self._camera = Picamera2(self.number)
+            self._camera = library.Picamera2(self.number)
             self._start()
         except CameraError:
             self.close()

@@ -8,7 +8,7 @@ from typing import Any
 
 from mwdn.capture.pixel_formats import choose_format, unpack
 from mwdn.capture.source import TIMEOUT_S, CameraSource, Frame
-from mwdn.capture.sources import missing_driver
+from mwdn.capture.sources import load_driver
 from mwdn.errors import CameraError, reason
 
 _EXPOSURES = "ExposureTime", "ExposureTimeAbs"
@@ -33,10 +33,7 @@ class PylonCamera(CameraSource):
 
     def open(self) -> None:
         """Connect, choose the format, and start."""
-        try:
-            from pypylon import pylon
-        except ImportError as error:
-            raise missing_driver("pypylon", error) from error
+        pylon = load_driver("pypylon", "pypylon.pylon")
         self.close()
         self._pylon = pylon
         factory = pylon.TlFactory.GetInstance()

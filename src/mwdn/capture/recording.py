@@ -145,6 +145,8 @@ class Replay(CameraSource):
         wait: sleeps so many seconds.
     """
 
+    live = False
+
     def __init__(
         self,
         path: str | Path,

@@ -61,6 +61,9 @@ class CameraSource(ABC):
         timeout_s: seconds to wait for a frame, besides its exposure.
     """
 
+    live = True
+    """Whether timestamps are of now: not those of a recording."""
+
     def __init__(self, name: str, timeout_s: float = TIMEOUT_S) -> None:
         self.name, self.timeout_s = name, timeout_s
 

@@ -1,6 +1,7 @@
 """Every kind of camera by its name, and the one string that opens one: ``aravis:Basler-2134,pixel_format=Mono12``."""
 
 import re
+import warnings
 from collections.abc import Mapping
 from importlib import import_module
 from typing import Any, NamedTuple
@@ -83,6 +84,19 @@ def parse_source(text: str) -> tuple[str, str, dict[str, Any]]:
     return name, address, given
 
 
-def missing_driver(name: str, error: BaseException) -> CameraError:
-    """The error of a camera whose library cannot be imported."""
-    return CameraError(f"Cameras of the kind `{name}` need {SOURCES[name].requires} ({reason(error)}).")
+def load_driver(name: str, module: str) -> Any:  # noqa: ANN401
+    """Import a camera's library, without its warnings: as errors they end SWIG's modules with a segmentation fault.
+
+    Args:
+        name: of the kind of camera.
+        module: to import.
+
+    Raises:
+        CameraError: it is not installed.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return import_module(module)
+    except (ImportError, ValueError) as error:  # ValueError: gi, for another version of a library
+        raise CameraError(f"Cameras of the kind `{name}` need {SOURCES[name].requires} ({reason(error)}).") from error

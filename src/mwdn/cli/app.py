@@ -29,6 +29,10 @@ COMMANDS = {
         "calibrate:calibrate",
         "Write a camera file: the PSF, and everything else that other commands need to know about the camera.",
     ),
+    "capture": (
+        "capture:capture",
+        "Show pictures on a display in front of a camera, and record a pair of each: the picture and the raw frame.",
+    ),
     "methods": ("methods:methods", "List the reconstruction methods, or the options of one."),
     "design": ("design:design", "Design a mask and compute the PSF of a camera with it."),
     "inspect": (

@@ -15,6 +15,7 @@ from typing import TypeGuard
 GO_ON = {
     "reconstruct": "Finished pictures are kept. The same command with --resume goes on.",
     "train": "What is saved is kept. The same command resumes.",
+    "capture": "All pairs so far are kept. The same command continues.",
     "benchmark": "Finished networks and scores are kept. The same command resumes.",
 }
 """What to say where a command does not say more."""

@@ -24,10 +24,10 @@ from mwdn.training.tensorboard import TensorBoard
 from mwdn.training.trainer import Trainer
 
 
-def _recipe_changes(tokens: Any) -> Any:  # noqa: ANN401
+def recipe_changes(tokens: Any) -> Any:  # noqa: ANN401
     """Changes of a recipe, from the tokens of ``--key value`` and ``--table.key value``."""
     if isinstance(tokens, dict):
-        return {key.replace("-", "_"): _recipe_changes(value) for key, value in tokens.items()}
+        return {key.replace("-", "_"): recipe_changes(value) for key, value in tokens.items()}
     return parse_value(tokens[-1].value)
 
 
@@ -70,7 +70,7 @@ def train(  # noqa: PLR0913
         tensorboard: write progress to the folder tensorboard in --out, for `tensorboard --logdir`.
         **changes: any key of the recipe.
     """
-    experiment_recipe = read_recipe(recipe, **_recipe_changes(changes))
+    experiment_recipe = read_recipe(recipe, **recipe_changes(changes))
     if captures:
         experiment_recipe = replace(experiment_recipe, sheet=Sheet(tuple(map(str, captures))))
     with distributed.process_group(), ExitStack() as stack:
@@ -157,7 +157,7 @@ def simulate(
         **changes: any key of the recipe.
     """
     refuse_overwrite(out, *camera.files, recipe)
-    simulation = read_recipe(recipe, **_recipe_changes(changes))
+    simulation = read_recipe(recipe, **recipe_changes(changes))
     progress = partial(track, title="Simulating")
     note(*unused_photographs(photos))
     calibration = camera.load()

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from mwdn.data.hdf5 import as_damage, find_rows, names_in, open_hdf5, open_hdf5_header, read_attributes
+from mwdn.data.journal import IDENTITY
 from mwdn.data.pair_writer import NAMES, VERSION, VERSION_KEY, Attribute, PairWriter, PixelType, Shape
 from mwdn.errors import ImageError
 from mwdn.types import Psf
@@ -137,10 +138,16 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
             self.close()
         if self._file is None:
             self._file, self._owner = open_hdf5(self.path, _MAKE_AGAIN), os.getpid()
-            if _read_shapes(self.path, self._file) != self._header[:3]:
+            if not self._is_same(_read_shapes(self.path, self._file)):
                 raise ImageError(f"`{self.path}` was replaced by another file meanwhile. Start again.")
             self._rows = {name: self._file[name] for name in NAMES}
         return self._file
+
+    def _is_same(self, shapes: tuple[int, Shape, Shape]) -> bool:
+        """Whether the open file is that of the header, or has grown since (`mwdn.data.journal`)."""
+        session = self._header.attributes.get(IDENTITY)
+        has_grown = session is not None and self._file.attrs.get(IDENTITY) == session and shapes[0] > len(self)
+        return shapes[1:] == self._header[1:3] and (has_grown or shapes[0] == len(self))
 
     def _read(self, name: str, number: int) -> Tensor:
         with as_damage(f"`{name}` {number} of `{self.path}` cannot be read", _MAKE_AGAIN):

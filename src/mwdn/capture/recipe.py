@@ -1,0 +1,183 @@
+"""The recipe of a capture session: one TOML file."""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mwdn.capture.patterns import PATTERNS
+from mwdn.capture.rig import RigOptions
+from mwdn.errors import ParameterError, UnknownNameError
+from mwdn.io.toml import find_recipe, read_toml, to_dataclass
+
+
+@dataclass(frozen=True)
+class CameraTable:
+    """The [camera] of a recipe.
+
+    Args:
+        source: as for `mwdn.capture.open_source`.
+        exposure_s: 0 leaves it as the camera is set.
+        gain: in the camera's unit; below 0 it is left as the camera is set.
+        timeout_s: seconds to wait for a frame, besides its exposure.
+        attempts: how often a camera that fails is opened again before the session ends.
+    """
+
+    source: str = "rig"
+    exposure_s: float = 0.0
+    gain: float = -1.0
+    timeout_s: float = 5.0
+    attempts: int = 3
+
+
+@dataclass(frozen=True)
+class DisplayTable:
+    """The [display] of a recipe.
+
+    Args:
+        kind: ``page``, a browser page; or ``rig``, the simulated rig's.
+        width_cm: lit width of the display.
+        height_cm: lit height.
+        distance_cm: from the camera to the display.
+        gamma: light of the display is the coded number to this power; 0 measures it with grey steps.
+        host: address that the page is served at; others than 127.0.0.1 need a token.
+        port: of the page.
+        token: secret in the page's address.
+        show_s: seconds in which a picture must be shown.
+        width_px: of the rig's display; a page says its own.
+        height_px: likewise.
+    """
+
+    kind: str = "page"
+    width_cm: float = 48.0
+    height_cm: float = 27.0
+    distance_cm: float = 20.0
+    gamma: float = 0.0
+    host: str = "127.0.0.1"
+    port: int = 8765
+    token: str = ""
+    show_s: float = 30.0
+    width_px: int = 480
+    height_px: int = 270
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("page", "rig"):
+            raise UnknownNameError("kind", self.kind, ("page", "rig"))
+        if self.gamma and not 1 <= self.gamma <= 4:
+            raise ParameterError(f"`gamma` ({self.gamma}) must be from 1 to 4, or 0 to measure it.")
+
+
+@dataclass(frozen=True)
+class PicturesTable:
+    """The [pictures] of a recipe.
+
+    Args:
+        folder: of photographs, searched with its subfolders; relative to the recipe.
+        count: pictures to capture; 0 for all.
+        size: height and width in pixels of the pictures as shown and stored: the central part of each photograph.
+        fill: part of the display's width or height that they fill.
+        seed: of their order.
+    """
+
+    folder: str = "photos"
+    count: int = 0
+    size: tuple[int, int] = (256, 256)
+    fill: float = 0.8
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if min(self.size) < 8 or max(self.size) > 4096:
+            raise ParameterError(f"`size` {self.size} must be from 8 to 4,096 pixels.")
+        if self.count < 0:
+            raise ParameterError(f"`count` ({self.count}) must not be negative; 0 is for all.")
+
+
+@dataclass(frozen=True)
+class SessionTable:
+    """The [session] of a recipe.
+
+    Args:
+        settle_s: seconds between a picture's confirmation and the frame: the display's response, a few frames at least.
+        skip: frames that are read and not used after a picture has changed; 1 empties the driver's queue.
+        references_every: pictures between ambient (dark display) and white frames; 0 for none.
+        drift: relative change of the white frames' light, or of the ambient light over it, that causes a warning.
+        patterns: of `mwdn.capture.patterns.PATTERNS`, captured at the start: they find the camera.
+        frames: that are captured of each pattern.
+    """
+
+    settle_s: float = 0.2
+    skip: int = 1
+    references_every: int = 100
+    drift: float = 0.03
+    patterns: tuple[str, ...] = ("dots", "charuco")
+    frames: int = 4
+
+    def __post_init__(self) -> None:
+        for name in self.patterns:
+            if name not in PATTERNS:
+                raise UnknownNameError("pattern", name, PATTERNS)
+        for name in ("settle_s", "skip", "references_every"):
+            if not getattr(self, name) >= 0:
+                raise ParameterError(f"`{name}` ({getattr(self, name)}) must not be negative.")
+        if not self.drift > 0 or self.frames < 1:
+            raise ParameterError(f"`drift` ({self.drift}) and `frames` ({self.frames}) must be positive.")
+
+
+@dataclass(frozen=True)
+class CaptureRecipe:
+    """A capture session.
+
+    Args:
+        camera: see `CameraTable`.
+        display: see `DisplayTable`.
+        pictures: see `PicturesTable`.
+        session: see `SessionTable`.
+        rig: see `RigOptions`; for ``source = "rig"``.
+        folder: of the recipe, to which paths in it are relative.
+    """
+
+    camera: CameraTable = CameraTable()
+    display: DisplayTable = DisplayTable()
+    pictures: PicturesTable = PicturesTable()
+    session: SessionTable = SessionTable()
+    rig: RigOptions = RigOptions()
+    folder: Path = Path()
+
+    @property
+    def photographs(self) -> Path:
+        """Folder of the photographs."""
+        return self.folder / self.pictures.folder
+
+
+TABLES: dict[str, Any] = {
+    field.name: type(field.default) for field in dataclasses.fields(CaptureRecipe) if field.name != "folder"
+}
+
+
+def read_capture_recipe(path: str | Path, **changes: Any) -> CaptureRecipe:  # noqa: ANN401
+    """Read a recipe.
+
+    Args:
+        path: name of a recipe of the package, or TOML file with the tables of `CaptureRecipe`.
+        **changes: replace values: ``pictures={"count": 50}``.
+
+    Raises:
+        ParameterError: the file cannot be read, or a value is outside its range.
+        UnknownNameError: no such table or key.
+    """
+    path = find_recipe(path)
+    content = read_toml(path)
+    for table in [*content, *changes]:
+        if table not in TABLES:
+            raise UnknownNameError("table of a capture recipe", table, TABLES)
+        for values in (content.get(table, {}), changes.get(table, {})):
+            if not isinstance(values, dict):
+                raise ParameterError(f"`{table}` ({values!r}) must be a table: [{table}].")
+        content[table] = {**content.get(table, {}), **changes.get(table, {})}
+    tables = {name: to_dataclass(TABLES[name], name, table) for name, table in content.items()}
+    recipe = CaptureRecipe(**tables, folder=path.parent)
+    if (recipe.camera.source.split(",")[0] == "rig") != (recipe.display.kind == "rig"):
+        raise ParameterError(
+            "The rig's camera sees the rig's display alone: [camera] source and [display] kind \"rig\"."
+        )
+    return recipe

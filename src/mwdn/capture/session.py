@@ -1,0 +1,283 @@
+"""A capture session: show a picture, let it settle, grab a frame, append the pair; for days, and on after any stop."""
+
+import json
+import math
+import shutil
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from mwdn.capture.captured_pairs import CapturedPairs, create_captured, displayed_light, open_captured
+from mwdn.capture.display import Display
+from mwdn.capture.gamma import fit_gamma
+from mwdn.capture.patterns import grey, grey_levels, pattern
+from mwdn.capture.photograph_list import list_photographs, read_photograph
+from mwdn.capture.recipe import CaptureRecipe
+from mwdn.capture.screen import Picture, Place, Screen, place_picture, put
+from mwdn.capture.source import CameraSource, Frame, check_like
+from mwdn.data.pair_writer import check_path
+from mwdn.errors import CameraError, ImageError, ParameterError
+
+SATURATED = 1e-3
+"""Fraction of a white frame's pixels that may be saturated: hot ones."""
+
+CONTRAST = 0.005
+"""Least difference of white and dark frames' means, over the full scale."""
+
+GAMMA_ERROR = 0.03
+"""Largest difference of a grey step from the fit that is not worth a warning."""
+
+ROOM = 1.02
+"""Bytes of a file over those of its pictures."""
+
+Progress = Callable[[int, int, str], None]
+"""Called with the pairs that are done, of how many, and the last photograph."""
+
+
+class Session:
+    """One session, which `run` starts or continues.
+
+    Args:
+        recipe: what to show and how.
+        camera: open; opened again if it fails.
+        display: in front of it.
+        out: file of pairs, ending in .h5; an existing one of this recipe is continued.
+        wait: sleeps so many seconds.
+        progress: see `Progress`.
+    """
+
+    def __init__(
+        self,
+        recipe: CaptureRecipe,
+        camera: CameraSource,
+        display: Display,
+        out: Path,
+        *,
+        wait: Callable[[float], None] = time.sleep,
+        progress: Progress = lambda done, total, name: None,
+    ) -> None:
+        check_path(out)
+        self.recipe, self.camera, self.display, self.out = recipe, camera, display, out
+        self._wait, self._progress = wait, progress
+        self._first: Frame | None = None
+        self._screen: Screen = display.screen
+        self._place: Place = place_picture(self._screen, recipe.pictures.size, recipe.pictures.fill)
+        self._gamma = 1.0
+
+    def run(self) -> int:
+        """Capture what is left; returns how many pairs the file has.
+
+        Raises:
+            CameraError: the camera failed `attempts` times, delivers other frames, or is overexposed.
+            DisplayError: the page does not show what it should.
+            ImageError: the disk.
+            ParameterError: the file was begun with other settings, or there is no room on the disk.
+        """
+        self._configure()
+        self._show(self._whole(0))
+        self._first = self._grab(time.time())
+        if self.out.exists():
+            with open_captured(self.out) as pairs:
+                self._check_same(pairs.attributes)
+                return self._capture(pairs)
+        self._check_room(len(self._names([])) or 1)
+        with create_captured(self.out, self._first, self.recipe.pictures.size, self._attributes()) as pairs:
+            return self._capture(pairs)
+
+    def _capture(self, pairs: CapturedPairs) -> int:
+        planned, taken = pairs.planned, pairs.names
+        new = self._names(planned)
+        pairs.plan(new)
+        planned += new
+        if self.recipe.pictures.count:
+            planned = planned[: self.recipe.pictures.count]
+        start = planned.index(taken[-1]) + 1 if taken and taken[-1] in planned else len(taken)
+        self._check_room(len(planned) - start)
+        self._calibrate(pairs)
+        for number, name in enumerate(planned[start:], start):
+            picture = self._read(name)
+            if picture is not None:
+                self._take_references(pairs)
+                frame = self._frame_of(put(picture, self._place, self._screen))
+                pairs.append(frame, displayed_light(picture, self._gamma), name)
+            self._progress(number + 1, len(planned), name)
+        return len(pairs)
+
+    def _names(self, planned: list[str]) -> list[str]:
+        return list_photographs(self.recipe.photographs, self.recipe.pictures.seed, planned)
+
+    def _read(self, name: str) -> Picture | None:
+        """A photograph; ``None``, with a warning, for one that cannot be read."""
+        try:
+            return read_photograph(self.recipe.photographs / name, self.recipe.pictures.size)
+        except ImageError as error:
+            warnings.warn(f"{error} It is skipped.", stacklevel=2)
+            return None
+
+    # The display
+
+    def _whole(self, level: int) -> Picture:
+        return grey(level, (self._screen.height_px, self._screen.width_px))
+
+    def _show(self, picture: Picture) -> float:
+        return self.display.show(picture)
+
+    def _frame_of(self, picture: Picture) -> Frame:
+        """Show a picture, let it settle, and grab a frame of it."""
+        shown = self._show(picture)
+        self._wait(self.recipe.session.settle_s)
+        frame = self._grab(shown)
+        if self._first is not None:
+            check_like(frame, self._first, self.camera.name)
+        return frame
+
+    # The camera
+
+    def _configure(self) -> None:
+        table = self.recipe.camera
+        self.camera.configure(table.exposure_s or None, table.gain if table.gain >= 0 else None)
+
+    def _grab(self, shown: float) -> Frame:
+        """The first frame whose exposure began after a moment; a camera that fails is opened again.
+
+        Raises:
+            CameraError: it failed `attempts` times.
+        """
+        failures = 0
+        while True:
+            try:
+                for _ in range(self.recipe.session.skip):
+                    self.camera.read()
+                while True:
+                    frame = self.camera.read()
+                    exposure_s = 0.0 if math.isnan(frame.exposure_s) else frame.exposure_s
+                    if not self.camera.live or frame.timestamp - exposure_s >= shown:
+                        return frame
+            except CameraError as error:
+                failures += 1
+                if failures > self.recipe.camera.attempts:
+                    raise
+                warnings.warn(f"{error} Opened again, attempt {failures}.", stacklevel=2)
+                self._reopen(last=failures == self.recipe.camera.attempts)
+
+    def _reopen(self, *, last: bool) -> None:
+        self.camera.close()
+        self._wait(1.0)
+        try:
+            self.camera.open()
+            self._configure()
+        except CameraError:
+            if last:
+                raise
+
+    # What is known about camera and display
+
+    def _calibrate(self, pairs: CapturedPairs) -> None:
+        """Capture grey steps and patterns, unless an earlier run has."""
+        if not pairs.has_pattern("grey"):
+            levels = grey_levels()
+            frames = [self._frame_of(self._whole(level)) for level in levels]
+            self._check_exposure(frames[0], frames[-1])
+            self._gamma = self.recipe.display.gamma or self._measured_gamma(levels, frames)
+            pairs.set_attributes({"display_gamma": self._gamma})
+            size = self.recipe.pictures.size
+            pairs.add_pattern("grey", frames, [displayed_light(grey(v, size), self._gamma) for v in levels])
+        self._gamma = float(pairs.attributes["display_gamma"])
+        for name in self.recipe.session.patterns:
+            if not pairs.has_pattern(name):
+                picture = pattern(name, self.recipe.pictures.size)
+                first = self._frame_of(put(picture, self._place, self._screen))
+                frames = [first, *(self.camera.read() for _ in range(self.recipe.session.frames - 1))]
+                pairs.add_pattern(name, frames, [displayed_light(picture, self._gamma)] * len(frames))
+
+    def _measured_gamma(self, levels: list[int], frames: list[Frame]) -> float:
+        fit = fit_gamma(levels, [float(frame.array.mean()) for frame in frames])
+        if fit.error > GAMMA_ERROR:
+            warnings.warn(
+                f"The display's light differs from a power of {fit.gamma:.2f} by up to {fit.error:.0%} of white. "
+                "Switch dynamic contrast, night light and automatic exposure off.",
+                stacklevel=2,
+            )
+        return fit.gamma
+
+    def _check_exposure(self, dark: Frame, white: Frame) -> None:
+        full = 2**white.bit_depth - 1
+        part = float((white.array >= full).mean())
+        if part > SATURATED:
+            raise CameraError(
+                f"A white display saturates {part:.1%} of the camera's pixels. Lower `exposure_s` "
+                f"({white.exposure_s:g}) of [camera], or `gain`, by half."
+            )
+        contrast = (float(white.array.mean()) - float(dark.array.mean())) / full
+        if contrast < CONTRAST:
+            raise CameraError(
+                f"A white display is brighter than a dark one by {contrast:.2%} of the full scale only. Turn the "
+                f"camera to the display, or raise `exposure_s` ({white.exposure_s:g}) of [camera]."
+            )
+
+    def _take_references(self, pairs: CapturedPairs) -> None:
+        """Ambient and white frames every `references_every` pairs, with a warning if the light has drifted."""
+        every = self.recipe.session.references_every
+        if not every or len(pairs) % every:
+            return
+        if pairs.references("white")[0][-1:] == [len(pairs)]:
+            return  # taken just before an earlier run was stopped
+        frames = {name: self._frame_of(self._whole(level)) for name, level in (("ambient", 0), ("white", 255))}
+        pairs.add_references(frames)
+        (_, ambient), (_, white) = pairs.references("ambient"), pairs.references("white")
+        light = white[0] - ambient[0]
+        for what, change in (
+            ("display's light", (white[-1] - ambient[-1]) / light - 1),
+            ("room's light", (ambient[-1] - ambient[0]) / light),
+        ):
+            if abs(change) > self.recipe.session.drift:
+                warnings.warn(
+                    f"The {what} has changed by {change:+.1%} of white since the start, at pair {len(pairs):,}. Let "
+                    "the display warm up; darken the room; keep the exposure fixed.",
+                    stacklevel=2,
+                )
+
+    # The file
+
+    def _attributes(self) -> dict[str, Any]:
+        recipe = asdict(self.recipe)
+        recipe["display"].pop("token")
+        return {
+            "camera": self.camera.name,
+            **asdict(self._screen),
+            **{f"place_{name}": value for name, value in asdict(self._place).items()},
+            "recipe": json.dumps(recipe, default=str),
+        }
+
+    def _check_same(self, stored: Mapping[str, Any]) -> None:
+        """Check that a file was begun with this display, place and kind of frames."""
+        frame = self._first
+        now = {**asdict(self._screen), **{f"place_{key}": value for key, value in asdict(self._place).items()}}
+        if frame is not None:
+            now |= {"bit_depth": frame.bit_depth, "mosaic": frame.mosaic or ""}
+        for name, value in now.items():
+            if stored.get(name) != value:
+                raise ParameterError(
+                    f"`{self.out}` was begun with `{name}` {stored.get(name)}, but now it is {value}. Set it as it "
+                    "was, or start a new file: `out`."
+                )
+
+    def _check_room(self, count: int) -> None:
+        if self._first is None or count <= 0:
+            return
+        every = self.recipe.session.references_every
+        height, width = self.recipe.pictures.size
+        references = 2 * math.ceil(count / every) if every else 0
+        needed = ROOM * (
+            count * (self._first.array.nbytes + height * width * 6) + references * self._first.array.nbytes
+        )
+        folder = self.out.absolute().parent
+        free = shutil.disk_usage(folder).free
+        if needed > free:
+            raise ParameterError(
+                f"{count:,} pairs need {needed / 1e9:,.1f} GB, but `{folder}` has {free / 1e9:,.1f} GB left. "
+                "Make room, choose another folder for `out`, or a smaller `count` or `size` of [pictures]."
+            )

@@ -1,0 +1,54 @@
+"""`mwdn capture`: show pictures on a display, and record a pair of each."""
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from mwdn.cli.progress import show_progress
+from mwdn.cli.terminal import counted, if_interrupted, note, say
+from mwdn.cli.train import RecipeKeys, recipe_changes
+
+
+def capture(
+    recipe: Path,
+    *,
+    out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("captured.h5"),
+    **changes: RecipeKeys,
+) -> None:
+    """Show pictures on a display in front of a camera, and record a pair of each: the picture and the raw frame.
+
+    The same command continues a session that was stopped, by whatever. Options override keys of the recipe:
+    --pictures.count 500, --camera.exposure-s 0.02, --session.settle-s 0.5.
+
+    Args:
+        recipe: capture-rig (the simulated rig), capture (a browser page), or a TOML file like those (`mwdn recipes`).
+        out: file of pairs, ending in .h5; it can be read while it grows.
+        **changes: of the recipe.
+    """
+    from mwdn.capture.recipe import read_capture_recipe
+    from mwdn.capture.session import Session
+    from mwdn.capture.set_up import open_camera, open_display
+
+    contents = read_capture_recipe(recipe, **recipe_changes(changes))
+    kept = f"All pairs so far are in {out}. The same command continues."
+    with ExitStack() as stack:
+        stack.enter_context(if_interrupted(lambda: f"Interrupted. {kept}"))
+        camera = stack.enter_context(open_camera(contents))
+        display = stack.enter_context(open_display(contents, camera, note))
+        progress = stack.enter_context(show_progress())
+        session = Session(contents, camera, display, out, progress=_shown_in(progress))
+        count = session.run()
+    say(f"{counted(count, 'pair')} in {out}", f"Next: mwdn align {out}")
+
+
+def _shown_in(progress: Any) -> Any:  # noqa: ANN401
+    """A function that shows how many pairs are done; those of earlier runs say nothing about the speed."""
+
+    def update(done: int, total: int, name: str) -> None:
+        if progress.phase is None:
+            progress.start("Capturing", total, first=done)
+        progress.update(done, name)
+
+    return update

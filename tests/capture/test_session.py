@@ -1,0 +1,317 @@
+"""Sessions on the simulated rig: every pair once, whatever stops them."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+from full_disk import full_after
+from mwdn.capture.display import RigDisplay
+from mwdn.capture.gamma import fit_gamma
+from mwdn.capture.recipe import CaptureRecipe, read_capture_recipe
+from mwdn.capture.rig import Rig, RigOptions
+from mwdn.capture.screen import Screen, place_picture, put
+from mwdn.capture.session import Session
+from mwdn.capture.set_up import open_camera
+from mwdn.data import PairFile
+from mwdn.errors import CameraError, DisplayError, ImageError, ParameterError, UnknownNameError
+
+RECIPE = """
+[camera]
+source = "rig"
+[display]
+kind = "rig"
+width_px = 120
+height_px = 90
+width_cm = 24.0
+height_cm = 18.0
+[pictures]
+folder = "photos"
+size = [80, 80]
+count = {count}
+[session]
+settle_s = 0.0
+references_every = 3
+patterns = ["dots"]
+frames = 2
+[rig]
+height = 32
+width = 32
+white = 0.5
+latency = 1
+{rig}
+"""
+
+
+def write(folder, count=7, rig="", pictures=9):
+    """A recipe and its photographs: each has its own colour."""
+    (folder / "photos" / "more").mkdir(parents=True, exist_ok=True)
+    for number in range(pictures):
+        colour = (255 - 20 * number, 20 * number, 10 * number)
+        picture = np.full((90, 100, 3), colour, np.uint8)
+        picture[:, :: number + 2] = 255
+        cv2.imwrite(str(folder / "photos" / ("more" if number % 2 else "") / f"{number}.png"), picture)
+    path = folder / "recipe.toml"
+    path.write_text(RECIPE.format(count=count, rig=rig))
+    return path
+
+
+def session(recipe, out, camera=None, **options):
+    camera = camera or open_camera(recipe)
+    camera.open()
+    return Session(recipe, camera, RigDisplay(camera), out, wait=lambda _: None, **options)
+
+
+@pytest.fixture
+def recipe(tmp_path):
+    return read_capture_recipe(write(tmp_path))
+
+
+def check_pairs(path, recipe, count):
+    """Each pair is there once, and its measurement is of its own picture."""
+    rig = Rig(replace(recipe.rig, latency=0, drop=0.0, disconnect_every=0, drift=0.0), open_camera(recipe).screen)
+    place = place_picture(rig.screen, recipe.pictures.size, recipe.pictures.fill)
+    rig.open()
+    with h5py.File(path) as file, PairFile(path) as pairs:
+        names = [name.decode() for name in file["photograph"]]
+        gamma = file.attrs["display_gamma"]
+        assert len(names) == len(set(names)) == len(pairs) == count
+        assert len(file["frame_data/number"]) == count
+        for number in range(count):
+            measurement, scene = pairs[number]
+            shown = np.rint(255 * scene.movedim(0, -1).numpy() ** (1 / gamma)).astype(np.uint8)
+            rig.show(put(shown, place, rig.screen))
+            wanted = rig.read().array.astype(float)
+            error = np.abs(measurement.movedim(0, -1).numpy() * 65535 - wanted)
+            assert error.mean() < 0.02 * wanted.mean()
+        return names
+
+
+def test_a_session_records_each_picture_once_with_its_own_frame(tmp_path, recipe):
+    out, seen = tmp_path / "pairs.h5", []
+    assert session(recipe, out, progress=lambda *state: seen.append(state)).run() == 7
+    names = check_pairs(out, recipe, 7)
+    assert [name for *_, name in seen] == names
+    assert seen[-1][:2] == (7, 7)
+    with h5py.File(out) as file:
+        assert file.attrs["display_gamma"] == pytest.approx(2.2, abs=0.02)
+        assert (file.attrs["bit_depth"], file.attrs["mosaic"], file.attrs["width_cm"]) == (12, "", 24.0)
+        assert file["references/white/before"][:].tolist() == [0, 3, 6]
+        assert file["patterns/dots/measurement"].shape == (2, 32, 32, 3)
+        assert file["patterns/dots/scene"].shape == (2, 80, 80, 3)
+        assert file["patterns/grey/measurement"].shape[0] == 9
+        assert (np.diff(file["patterns/grey/measurement"][:].mean((1, 2, 3))) > 0).all()
+    with PairFile(out) as pairs:
+        assert pairs.scene_shape == (80, 80, 3)
+        assert pairs[0][1].max() == 1
+
+
+def test_a_finished_session_goes_on_with_more_pictures(tmp_path, recipe):
+    out = tmp_path / "pairs.h5"
+    session(recipe, out).run()
+    before = PairFile(out)
+    assert session(recipe, out).run() == 7
+    more = replace(recipe, pictures=replace(recipe.pictures, count=0))
+    assert session(more, out).run() == 9
+    check_pairs(out, recipe, 9)
+    assert len(before) == 7  # opened before it grew, read after it
+    assert before[6][0].shape == (3, 32, 32)
+    assert len(PairFile(out)) == 9
+
+
+def test_lost_frames_disconnections_and_drift_lose_no_pair(tmp_path):
+    path = write(tmp_path, rig="drop = 0.3\ndisconnect_every = 11\ndrift = 0.0005")
+    recipe, out = read_capture_recipe(path), tmp_path / "pairs.h5"
+    with pytest.warns(UserWarning, match="disconnected"):
+        assert session(recipe, out).run() == 7
+    check_pairs(out, recipe, 7)
+
+
+def test_a_camera_that_stays_away_ends_the_session_and_the_next_one_goes_on(tmp_path, recipe):
+    class Leaving(Rig):
+        reads = 0
+
+        def read(self):
+            self.reads += 1
+            if self.reads > 45:
+                self._is_open = False
+                raise CameraError("rig is gone.")
+            return super().read()
+
+        def open(self):
+            if self.reads > 45:
+                raise CameraError("rig is busy.")
+            super().open()
+
+    out, screen = tmp_path / "pairs.h5", open_camera(recipe).screen
+    with pytest.warns(UserWarning, match="gone"), pytest.raises(CameraError, match="busy"):
+        session(recipe, out, Leaving(recipe.rig, screen)).run()
+    count = len(PairFile(out))
+    assert 0 < count < 7
+    assert session(recipe, out).run() == 7
+    check_pairs(out, recipe, 7)
+
+
+def test_a_drift_of_the_light_is_warned_of(tmp_path):
+    recipe = read_capture_recipe(write(tmp_path, rig="drift = 0.03"))
+    with pytest.warns(UserWarning, match=r"display's light has changed by"):
+        session(recipe, tmp_path / "pairs.h5").run()
+
+
+def test_a_damaged_photograph_is_skipped_and_named(tmp_path, recipe):
+    (tmp_path / "photos" / "3.png").write_bytes(b"nothing")
+    (tmp_path / "photos" / "0.png").write_bytes(b"nothing")
+    everything = replace(recipe, pictures=replace(recipe.pictures, count=0))
+    out = tmp_path / "pairs.h5"
+    with pytest.warns(UserWarning, match="skipped"):
+        assert session(everything, out).run() == 8
+    check_pairs(out, recipe, 8)
+
+
+def test_a_full_disk_keeps_the_pairs_so_far(tmp_path, recipe):
+    out = tmp_path / "pairs.h5"
+    session(replace(recipe, pictures=replace(recipe.pictures, count=2)), out).run()
+    with full_after(out.stat().st_size + 100_000), pytest.raises(ImageError, match="Make room"):
+        session(recipe, out).run()
+    assert 2 <= len(PairFile(out)) < 7
+    assert session(recipe, out).run() == 7
+    check_pairs(out, recipe, 7)
+
+
+def test_too_little_room_is_noticed_at_the_start(tmp_path, recipe, monkeypatch):
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**6, 10**6, 10**5))
+    with pytest.raises(ParameterError, match="GB"):
+        session(recipe, tmp_path / "pairs.h5").run()
+    assert not (tmp_path / "pairs.h5").exists()
+
+
+def test_a_file_of_other_settings_is_not_mixed(tmp_path, recipe):
+    out = tmp_path / "pairs.h5"
+    session(recipe, out).run()
+    content = out.read_bytes()
+    for changed in (
+        replace(recipe, display=replace(recipe.display, distance_cm=30.0)),
+        replace(recipe, pictures=replace(recipe.pictures, fill=0.5)),
+        replace(recipe, rig=replace(recipe.rig, bit_depth=10)),
+    ):
+        with pytest.raises(ParameterError, match="was begun with"):
+            session(changed, out).run()
+    assert out.read_bytes() == content
+
+
+def test_wrong_exposures_are_refused_before_anything_is_recorded(tmp_path, recipe):
+    for exposure_s, message in ((1.0, "Lower `exposure_s`"), (1e-6, "raise `exposure_s`")):
+        changed = replace(recipe, camera=replace(recipe.camera, exposure_s=exposure_s))
+        out = tmp_path / f"{exposure_s}.h5"
+        with pytest.raises(CameraError, match=message):
+            session(changed, out).run()
+        assert len(PairFile(out)) == 0
+        assert session(recipe, out).run() == 7
+
+
+KILLED = """
+import os, random, signal, sys, threading
+from pathlib import Path
+from mwdn.capture.recipe import read_capture_recipe
+from mwdn.capture.display import RigDisplay
+from mwdn.capture.session import Session
+from mwdn.capture.set_up import open_camera
+from mwdn.data import journal
+recipe = read_capture_recipe(sys.argv[1])
+camera = open_camera(recipe)
+camera.open()
+chance = random.Random(int(sys.argv[3]))
+left = [chance.randrange(4, 60)]
+def killing(function):
+    # A place of its own for each kill: before, within and after each write and flush.
+    def call(*arguments):
+        left[0] -= 1
+        if left[0] == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return function(*arguments)
+    return call
+os.fsync = killing(os.fsync)
+journal.JournalledFile.write = killing(journal.JournalledFile.write)
+journal.JournalledFile.apply = killing(journal.JournalledFile.apply)
+Session(recipe, camera, RigDisplay(camera), Path(sys.argv[2])).run()
+"""
+
+
+def kill_often(tmp_path, kills, count):
+    """Start a session again and again; each is killed at a random moment of writing."""
+    recipe, out = write(tmp_path, count=count, pictures=count), tmp_path / "pairs.h5"
+    lengths, seed = [0], 0
+    while sum(code == -signal.SIGKILL for code in lengths[1:]) < kills:
+        seed += 1
+        process = subprocess.run([sys.executable, "-c", KILLED, recipe, out, str(seed)], timeout=120)
+        lengths.append(process.returncode)
+        if process.returncode == 0:
+            break
+    contents = read_capture_recipe(recipe)
+    session(contents, out).run()
+    check_pairs(out, contents, count)
+    return sum(code == -signal.SIGKILL for code in lengths)
+
+
+def test_sessions_that_are_killed_lose_and_double_no_pair(tmp_path):
+    assert kill_often(tmp_path, kills=3, count=12) == 3
+
+
+def test_gamma_is_fitted_to_grey_steps(generator):
+    levels = [0, 32, 64, 96, 128, 160, 192, 224, 255]
+    light = [7 + 100 * (level / 255) ** 1.8 for level in levels]
+    assert fit_gamma(levels, light).gamma == pytest.approx(1.8, abs=1e-9)
+    noisy = np.array(light) + np.random.default_rng(0).normal(0, 0.3, 9)
+    assert fit_gamma(levels, noisy.tolist()).gamma == pytest.approx(1.8, abs=0.05)
+    bent = [value + 10 * (level == 128) for value, level in zip(light, levels, strict=True)]
+    assert fit_gamma(levels, bent).error > 0.05
+    for wrong in ([5.0] * 9, light[::-1], [7 + 100 * (level / 255) ** 0.2 for level in levels]):
+        with pytest.raises(DisplayError):
+            fit_gamma(levels, wrong)
+
+
+def test_wrong_recipes_are_named(tmp_path):
+    path = write(tmp_path)
+    assert isinstance(read_capture_recipe(path), CaptureRecipe)
+    with pytest.raises(UnknownNameError, match="setle_s"):
+        read_capture_recipe(path, session={"setle_s": 1.0})
+    with pytest.raises(UnknownNameError, match="picture'"):
+        read_capture_recipe(path, picture={})
+    with pytest.raises(UnknownNameError, match="dts"):
+        read_capture_recipe(path, session={"patterns": ["dts"]})
+    with pytest.raises(ParameterError, match="gamma"):
+        read_capture_recipe(path, display={"gamma": 9.0})
+    with pytest.raises(ParameterError, match="kind"):
+        read_capture_recipe(path, display={"kind": "page"})
+    empty = read_capture_recipe(path, pictures={"folder": "none"})
+    with pytest.raises(ParameterError, match="none"):
+        session(empty, tmp_path / "a.h5").run()
+    for name in ("capture", "capture-rig"):
+        assert read_capture_recipe(name).camera.source
+
+
+def test_the_command_captures_and_continues(tmp_path, run):
+    recipe, out = write(tmp_path), tmp_path / "pairs.h5"
+    code, printed, _ = run("capture", recipe, "-o", out, "--pictures.count", "2")
+    assert code == 0
+    assert "2 pairs" in printed
+    assert "align" in printed
+    code, printed, _ = run("capture", recipe, "-o", out, "--pictures.count", 3, "--camera.attempts", 1)
+    assert (code, len(PairFile(out))) == (0, 3)
+    code, _, errors = run("capture", recipe, "-o", out, "--display.distance-cm", 9)
+    assert code == 2
+    assert errors.count("\n") == 1
+    assert "distance_cm" in errors
+
+
+def test_options_of_the_rig_are_those_of_its_recipe():
+    assert RigOptions().height == 160
+    assert Screen().width_px == 480
+    assert os.name == "posix"
