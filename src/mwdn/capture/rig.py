@@ -231,7 +231,7 @@ class Rig(CameraSource):
             mosaic=options.mosaic or None,  # type: ignore[arg-type]
             exposure_s=self.exposure_s,
             gain=self.gain,
-            timestamp=time.time(),
+            timestamp=time.time() + self.exposure_s,  # which it does not wait for
             number=self._number,
             dropped=dropped,
         )

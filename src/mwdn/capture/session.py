@@ -186,7 +186,7 @@ class Session:
             size = self.recipe.pictures.size
             pairs.add_pattern("grey", frames, [displayed_light(grey(v, size), self._gamma) for v in levels])
         self._gamma = float(pairs.attributes["display_gamma"])
-        for name in self.recipe.session.patterns:
+        for name in self.recipe.session.shown:
             if not pairs.has_pattern(name):
                 picture = pattern(name, self.recipe.pictures.size)
                 first = self._frame_of(put(picture, self._place, self._screen))

@@ -7,8 +7,8 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from mwdn.cli.progress import show_progress
+from mwdn.cli.recipe_keys import RecipeKeys, recipe_changes
 from mwdn.cli.terminal import counted, if_interrupted, note, say
-from mwdn.cli.train import RecipeKeys, recipe_changes
 
 
 def capture(

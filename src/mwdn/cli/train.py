@@ -4,34 +4,24 @@ from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from cyclopts import Parameter
 
 from mwdn.cli.camera import CameraOptions
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.progress import Progressing, show_progress, track
+from mwdn.cli.recipe_keys import RecipeKeys, recipe_changes
 from mwdn.cli.terminal import counted, if_interrupted, note, notes, say
 from mwdn.data.captures import list_captures
 from mwdn.io.files import refuse_overwrite
 from mwdn.io.listing import unused_photographs
-from mwdn.io.toml import parse_value
 from mwdn.runtime import distributed
 from mwdn.training import experiment
 from mwdn.training.recipe import Sheet, read_recipe
 from mwdn.training.report import Report
 from mwdn.training.tensorboard import TensorBoard
 from mwdn.training.trainer import Trainer
-
-
-def recipe_changes(tokens: Any) -> Any:  # noqa: ANN401
-    """Changes of a recipe, from the tokens of ``--key value`` and ``--table.key value``."""
-    if isinstance(tokens, dict):
-        return {key.replace("-", "_"): recipe_changes(value) for key, value in tokens.items()}
-    return parse_value(tokens[-1].value)
-
-
-RecipeKeys = Annotated[Any, Parameter(converter=lambda _, tokens: tokens, show=False)]
 
 
 @no_empty_folder
