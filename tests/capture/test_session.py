@@ -11,6 +11,7 @@ import cv2
 import h5py
 import numpy as np
 import pytest
+import torch
 
 from full_disk import full_after
 from mwdn.capture.display import RigDisplay
@@ -235,6 +236,8 @@ def killed_session(recipe, out, seed):
     child = os.fork()
     if child:
         return os.waitpid(child, 0)[1]
+    cv2.setNumThreads(1)  # the parent's threads are not there
+    torch.set_num_threads(1)
     os.fsync = killing(os.fsync)
     for name in ("write", "apply"):
         setattr(JournalledFile, name, killing(getattr(JournalledFile, name)))

@@ -7,6 +7,7 @@ answers with a checksum of the pixels it has drawn.
 import socket
 import threading
 import time
+from urllib.parse import quote
 
 import numpy as np
 
@@ -54,7 +55,9 @@ class PageDisplay(Display):
         self.show_s = show_s
         self._socket = _listen(host, port)
         address = f"[{host}]" if ":" in host else host
-        self.url = f"http://{address}:{self._socket.getsockname()[1]}/{f'?token={token}' if token else ''}"
+        self.url = f"http://{address}:{self._socket.getsockname()[1]}/"
+        if token:
+            self.url += f"?token={quote(token)}"
         self._hub = Hub(token, self._cm, any_host=host not in LOOPBACK)
         self._start()
 
@@ -158,13 +161,12 @@ def checksum(picture: Picture) -> int:
 
 
 def _listen(host: str, port: int) -> socket.socket:
+    listener = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
     try:
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        listener = socket.socket(family, socket.SOCK_STREAM)
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((host, port))
+        listener.listen()  # before the server does: a page that comes early waits
     except (OSError, OverflowError) as error:
-        raise ParameterError(
-            f"`host` and `port` ({host}:{port}) cannot be used: {reason(error)}. Choose others."
-        ) from error
+        listener.close()
+        raise ParameterError(f"`host` and `port` ({host}:{port}) cannot be used: {reason(error)}.") from error
     return listener
