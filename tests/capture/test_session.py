@@ -1,17 +1,14 @@
 """Sessions on the simulated rig: every pair once, whatever stops them."""
 
-import os
-import random
 import shutil
-import signal
-import warnings
+import subprocess
+import sys
 from dataclasses import replace
 
 import cv2
 import h5py
 import numpy as np
 import pytest
-import torch
 
 from full_disk import full_after
 from mwdn.capture.display import RigDisplay
@@ -22,7 +19,6 @@ from mwdn.capture.screen import place_picture, put
 from mwdn.capture.session import Session
 from mwdn.capture.set_up import open_camera
 from mwdn.data import PairFile
-from mwdn.data.journal import JournalledFile
 from mwdn.errors import CameraError, DisplayError, ImageError, ParameterError, UnknownNameError
 
 RECIPE = """
@@ -219,42 +215,52 @@ def test_wrong_exposures_are_refused_before_anything_is_recorded(tmp_path, recip
         assert session(recipe, out).run() == 7
 
 
-def killed_session(recipe, out, seed):
-    """Run a session in a child process, which is killed at a random write or flush; returns how it ended."""
-    left = random.Random(seed).randrange(4, 60)
+KILLS = """
+import os, random, signal, sys
+from pathlib import Path
+from mwdn.capture.display import RigDisplay
+from mwdn.capture.recipe import read_capture_recipe
+from mwdn.capture.session import Session
+from mwdn.capture.set_up import open_camera
+from mwdn.data.journal import JournalledFile
 
-    def killing(function):
-        def call(*arguments):
-            nonlocal left
-            left -= 1
-            if left == 0:
-                os.kill(os.getpid(), signal.SIGKILL)
-            return function(*arguments)
+def killing(function, left):
+    def call(*arguments):
+        left[0] -= 1
+        if left[0] == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return function(*arguments)
+    return call
 
-        return call
-
-    child = os.fork()
-    if child:
-        return os.waitpid(child, 0)[1]
-    cv2.setNumThreads(1)  # the parent's threads are not there
-    torch.set_num_threads(1)
-    os.fsync = killing(os.fsync)
+def run(seed):
+    left = [random.Random(seed).randrange(4, 60)]
+    os.fsync = killing(os.fsync, left)
     for name in ("write", "apply"):
-        setattr(JournalledFile, name, killing(getattr(JournalledFile, name)))
-    try:
-        session(recipe, out).run()
-    finally:
-        os._exit(1)
+        setattr(JournalledFile, name, killing(getattr(JournalledFile, name), left))
+    recipe = read_capture_recipe(sys.argv[1])
+    camera = open_camera(recipe)
+    camera.open()
+    Session(recipe, camera, RigDisplay(camera), Path(sys.argv[2])).run()
+
+for seed in range(int(sys.argv[3])):
+    child = os.fork()  # this process has computed nothing: it has no threads that a child would miss
+    if not child:
+        try:
+            run(seed)
+        finally:
+            os._exit(1)
+    if os.waitpid(child, 0)[1] != signal.SIGKILL:
+        sys.exit(f"session {seed} was not killed")
+"""
+"""Starts a session again and again; each is killed at a random write or flush of the disk."""
 
 
 def kill_often(tmp_path, kills, count):
-    """Start a session again and again, then let it finish."""
-    recipe, out = read_capture_recipe(write(tmp_path, count=count, pictures=count)), tmp_path / "pairs.h5"
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # a child of a process with threads: torch's are idle
-        for seed in range(kills):
-            assert killed_session(recipe, out, seed) == signal.SIGKILL
-    assert len(PairFile(out)) < count
+    """Kill sessions, then let the last one finish."""
+    path, out = write(tmp_path, count=count, pictures=count), tmp_path / "pairs.h5"
+    subprocess.run([sys.executable, "-c", KILLS, path, out, str(kills)], check=True, timeout=300)
+    assert 0 < len(PairFile(out)) < count
+    recipe = read_capture_recipe(path)
     session(recipe, out).run()
     check_pairs(out, recipe, count)
 
