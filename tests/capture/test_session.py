@@ -53,7 +53,7 @@ def write(folder, count=7, rig="", pictures=9):
     """A recipe and its photographs: each has its own colour."""
     (folder / "photos" / "more").mkdir(parents=True, exist_ok=True)
     for number in range(pictures):
-        colour = (255 - 6 * number, 6 * number, 3 * number)
+        colour = (255 - 6 * number % 240, 6 * number % 240, number)
         picture = np.full((90, 100, 3), colour, np.uint8)
         picture[:, :: number + 2] = 255
         cv2.imwrite(str(folder / "photos" / ("more" if number % 2 else "") / f"{number}.png"), picture)
@@ -233,7 +233,7 @@ def killing(function, left):
     return call
 
 def run(seed):
-    left = [random.Random(seed).randrange(4, 60)]
+    left = [random.Random(seed).randrange(30, 120)]
     os.fsync = killing(os.fsync, left)
     for name in ("write", "apply"):
         setattr(JournalledFile, name, killing(getattr(JournalledFile, name), left))
@@ -266,12 +266,12 @@ def kill_often(tmp_path, kills, count):
 
 
 def test_sessions_that_are_killed_lose_and_double_no_pair(tmp_path):
-    kill_often(tmp_path, kills=3, count=12)
+    kill_often(tmp_path, kills=3, count=20)
 
 
 @pytest.mark.acceptance
 def test_twenty_kills_lose_and_double_no_pair(tmp_path):
-    kill_often(tmp_path, kills=20, count=40)
+    kill_often(tmp_path, kills=20, count=150)
 
 
 def test_gamma_is_fitted_to_grey_steps(generator):
