@@ -29,6 +29,7 @@ FLOORS = [
     "evaluation",
     "diagnosis",
     "inference",
+    "registration",
     "training",
     "export",
     "benchmark",

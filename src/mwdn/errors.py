@@ -10,6 +10,7 @@
     │   ├── FrameShapeError            an array or file with other axes than a frame; also a ShapeError
     │   └── FrameTypeError             with numbers of another type, or no array at all; also a TypeError
     ├── PsfError (ValueError)          a PSF that no reconstruction can trust
+    ├── AlignmentError (ValueError)    a displayed picture that cannot be found in a reconstruction
     ├── CheckpointError (ValueError)   weights that are damaged or belong to something else
     ├── ExportError                    a method that cannot be exported, or gives other results after export
     ├── DivergenceError                a loss that is no longer finite
@@ -274,6 +275,10 @@ class FrameTypeError(ImageError, TypeError):
 
 class PsfError(MwdnError, ValueError):
     """A PSF is saturated, empty, not finite, or of the wrong size."""
+
+
+class AlignmentError(MwdnError, ValueError):
+    """A displayed picture cannot be found in a reconstruction, or not with certainty."""
 
 
 class CheckpointError(MwdnError, ValueError):

@@ -1,0 +1,22 @@
+"""Where displayed pictures are in a camera's reconstructions, and aligned pairs for training."""
+
+from mwdn.registration.captured import CapturedPairs
+from mwdn.registration.estimate import Estimate, estimate, through_corners
+from mwdn.registration.outline import find_outline
+from mwdn.registration.projection import Projection
+from mwdn.registration.registration import Place, read_projection
+from mwdn.registration.views import Views
+from mwdn.registration.warp import warp_pictures
+
+__all__ = [
+    "CapturedPairs",
+    "Estimate",
+    "Place",
+    "Projection",
+    "Views",
+    "estimate",
+    "find_outline",
+    "read_projection",
+    "through_corners",
+    "warp_pictures",
+]

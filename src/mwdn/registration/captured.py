@@ -1,0 +1,120 @@
+"""Captured pairs before they are aligned: raw frames of the camera, and the pictures that were on the display."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mwdn.calibration import Calibration
+from mwdn.data.hdf5 import as_damage, find_rows, open_hdf5
+from mwdn.data.pair_writer import NAMES
+from mwdn.data.pairs import PairFile
+from mwdn.errors import ImageError, ParameterError
+from mwdn.io.images import srgb_decode
+from mwdn.io.raw import Mosaic
+from mwdn.types import Frame, Image, Measurement
+
+_ADVICE = "Capture it again: `mwdn capture`."
+
+SRGB = "srgb"
+DISPLAY_GAMMA = "display_gamma"
+"""Attribute of a session with the measured power law of its display."""
+
+
+class CapturedPairs:
+    """The pairs of a session as the camera and the display had them. Use it in a ``with`` statement.
+
+    Args:
+        path: HDF5 with ``measurement``, raw frames (N, H, W, C), and ``scene``, displayed pictures (N, h, w, C).
+        calibration: of the camera; bit depth and mosaic are the session's if the calibration has none.
+        display_gamma: light of the display is the stored number to this power, or ``"srgb"``. Unless given, that of
+            the session; without one, sRGB for pictures of integers and 1 for floats.
+
+    Raises:
+        ImageError: no such file, damaged, or not of pairs; it holds none.
+        ParameterError: the gamma is not a power from 0.5 to 4.
+    """
+
+    def __init__(self, path: Path, calibration: Calibration, *, display_gamma: float | str | None = None) -> None:
+        self.path = path
+        with PairFile(path) as file:
+            attributes, self._count = file.attributes, len(file)
+            self.picture_size = file.scene_shape[0], file.scene_shape[1]
+        if not self._count:
+            raise ImageError(f"`{path}` holds no pair. {_ADVICE}")
+        frames = calibration.frames
+        if frames.bit_depth is None and "bit_depth" in attributes:
+            frames = replace(frames, bit_depth=int(attributes["bit_depth"]))
+        if frames.mosaic is None and (mosaic := attributes.get("mosaic")):
+            frames = replace(frames, mosaic=_as_mosaic(mosaic))
+        self.calibration = replace(calibration, frames=frames)
+        gamma = attributes.get(DISPLAY_GAMMA) if display_gamma is None else display_gamma
+        self.display_gamma = None if gamma is None else as_gamma(gamma)
+        self._file: Any = None
+        self._rows: dict[str, Any] = {}
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __enter__(self) -> "CapturedPairs":
+        self._file = open_hdf5(self.path, _ADVICE)
+        self._rows = {name: find_rows(self.path, self._file, name, _ADVICE) for name in NAMES}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+        self._file, self._rows = None, {}
+
+    def measurement(self, number: int) -> Measurement:
+        """(1, C, H, W), linear light, as the calibration corrects the raw frame.
+
+        Raises:
+            MwdnError: the frame is damaged, or does not fit the camera.
+        """
+        return self.calibration.correct(self._read("measurement", number))
+
+    def picture(self, number: int) -> Image:
+        """(1, C, h, w), linear light of the displayed picture, white 1.
+
+        Raises:
+            ImageError: it is damaged.
+        """
+        return as_light(self._read("scene", number), self.display_gamma)[None]
+
+    def _read(self, name: str, number: int) -> Frame:
+        with as_damage(f"`{name}` {number} of `{self.path}` cannot be read", _ADVICE):
+            return np.asarray(self._rows[name][number])
+
+
+def as_light(picture: Frame, gamma: float | str | None) -> Tensor:
+    """Linear light (C, h, w) of a displayed picture (h, w, C), white 1."""
+    is_coded = picture.dtype.kind == "u"
+    numbers = picture.astype(np.float32) / (np.float32(np.iinfo(picture.dtype).max) if is_coded else 1)
+    light = torch.from_numpy(numbers).movedim(-1, 0).clamp(min=0)
+    if gamma is None:
+        gamma = SRGB if is_coded else 1.0
+    return srgb_decode(light) if gamma == SRGB else light ** float(gamma)
+
+
+def as_gamma(gamma: float | int | str) -> float | str:
+    """A gamma of a display: "srgb" or a power.
+
+    Raises:
+        ParameterError: it is neither, or not from 0.5 to 4.
+    """
+    if gamma == SRGB:
+        return SRGB
+    try:
+        power = float(gamma)
+    except ValueError:
+        power = float("nan")
+    if not 0.5 <= power <= 4:
+        raise ParameterError(f"`display_gamma` ({gamma}) must be srgb, or a power from 0.5 to 4.")
+    return power
+
+
+def _as_mosaic(text: object) -> Mosaic:
+    return str(text)  # type: ignore[return-value]

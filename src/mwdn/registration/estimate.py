@@ -1,0 +1,173 @@
+"""Find where displayed pictures lie in reconstructions of their captures: start, refine, check."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from mwdn.errors import AlignmentError
+from mwdn.registration.correlation import Refined, refine
+from mwdn.registration.features import match_features
+from mwdn.registration.markers import match_markers
+from mwdn.registration.point_fit import fit_points
+from mwdn.registration.projection import Points, Projection, picture_corners
+from mwdn.registration.residuals import Residuals, measure_residuals
+from mwdn.registration.search import search
+from mwdn.registration.views import Views
+from mwdn.types import Size
+
+SURE = 0.8
+"""Correlation after coarse refinement at which no other start is tried. Wrong turns and mirror images of ordinary
+pictures reach 0.75, because their dark surround is right."""
+
+WORST = 0.6
+"""Least correlation that is accepted."""
+
+WORST_PX = 1.5
+"""Largest residual that is accepted; for large pictures 2 % of their side."""
+
+_CLOSE = 0.04
+"""Starts whose correlation is this close to the best after coarse refinement are compared again in detail."""
+
+_AMBIGUOUS = 0.05
+"""Part by which the best start must leave less unexplained than the next, ``1 - correlation``."""
+
+_FEW = 4
+_FEWEST_PARTS = 6
+
+
+class Estimate(NamedTuple):
+    """A projection, and how well it fits.
+
+    Args:
+        projection: from the displayed pictures to the reconstructions.
+        correlation: of the square roots of both, 0 to 1.
+        residuals: displacements of parts of the picture from where the projection puts them.
+        start: what found it: "markers", "features", "search" or "points".
+    """
+
+    projection: Projection
+    correlation: float
+    residuals: Residuals
+    start: str
+
+    def content(self) -> dict[str, object]:
+        """For JSON: the projection's own numbers, and how well it fits."""
+        return {
+            **self.projection.to_dict(),
+            "start": self.start,
+            "correlation": round(self.correlation, 4),
+            "residual_px": round(self.residuals.rms_px, 3),
+            "parts": len(self.residuals.points),
+        }
+
+
+def estimate(views: Views, *, corners: Points | None = None) -> Estimate:
+    """Estimate the projection from displayed pictures to reconstructions.
+
+    Markers of a board, features (SIFT), or a search over all places, sizes, turns and mirrorings give a start. The
+    correlation over all pictures then refines it (ECC). A radial term is kept if the displacements of the picture's
+    parts give strong evidence for it (Bayesian information criterion).
+
+    Args:
+        views: pictures and reconstructions; more pictures give a better estimate.
+        corners: (4, 2), pixels of the camera where the picture's corners are, from its own top left clockwise, to start
+            from instead.
+
+    Raises:
+        AlignmentError: no start leads to a fit, several fit equally well, or the fit is bad.
+    """
+    few = views.first(_FEW)
+    tried: list[tuple[Refined, str]] = []
+    for start, name in _starts(few, views, corners):
+        tried.append((refine(start, few, blurs=(4.0, 2.0)), name))
+        if name != "search" and tried[-1][0].correlation > SURE:
+            break
+    result, name = _single(tried, few)
+    result = refine(result.projection, views, blurs=(2.0, 1.0))
+    residuals = measure_residuals(result.projection, views)
+    if _is_bent(result.projection, residuals):
+        bent = refine(result.projection, views, blurs=(1.0,), radial=True)
+        other = measure_residuals(bent.projection, views)
+        if other.rms_px < residuals.rms_px:
+            result, residuals = bent, other
+    _check(result, residuals)
+    return Estimate(result.projection, result.correlation, residuals, name)
+
+
+def through_corners(corners: Points, picture_size: Size, camera_size: Size) -> Projection:
+    """The projection that puts the picture's corners, from its own top left clockwise, to these pixels (4, 2).
+
+    Raises:
+        AlignmentError: three of them lie on a line.
+    """
+    return fit_points(
+        picture_corners(picture_size), corners, picture_size=picture_size, camera_size=camera_size
+    ).projection
+
+
+def _starts(few: Views, views: Views, corners: Points | None) -> Iterator[tuple[Projection, str]]:
+    """Projections to start from, the quickest first."""
+    if corners is not None:
+        yield through_corners(corners, views.picture_size, views.camera_size), "points"
+        return
+    yield from ((start, "markers") for start in match_markers(few))
+    yield from ((start, "features") for start in match_features(views))
+    yield from ((start, "search") for start in search(few))
+
+
+def _single(tried: list[tuple[Refined, str]], few: Views) -> tuple[Refined, str]:
+    """The best start, by fine detail: patterns such as boards look alike in all turns when they are blurred.
+
+    Raises:
+        AlignmentError: the picture looks the same turned or mirrored.
+    """
+    best = max(each.correlation for each, _ in tried)
+    close = [(each, name) for each, name in tried if best - each.correlation < _CLOSE]
+    if len(close) > 1:
+        close = [(refine(each.projection, few, blurs=(1.0,)), name) for each, name in close]
+    result, name = max(close, key=lambda each: each[0].correlation)
+    corners = result.projection.corners()
+    size = float(np.ptp(corners, axis=0).max())
+    for other, _ in close:
+        is_other = np.abs(other.projection.corners() - corners).max() > 0.2 * size
+        if is_other and result.correlation - other.correlation < _AMBIGUOUS * (1 - other.correlation):
+            raise AlignmentError(
+                "The displayed picture fits the reconstruction in several ways: it looks the same turned or mirrored. "
+                "Show one without symmetry, or give its corners: `--points`."
+            )
+    return result, name
+
+
+def _is_bent(projection: Projection, residuals: Residuals) -> bool:
+    """Whether the displacements of the parts show a radial term."""
+    if len(residuals.points) < 12:
+        return False
+    fit = fit_points(
+        residuals.points,
+        residuals.seen + residuals.displacements,
+        picture_size=projection.picture_size,
+        camera_size=projection.camera_size,
+    )
+    return fit.projection.radial != 0
+
+
+def _check(result: Refined, residuals: Residuals) -> None:
+    """Refuse a bad fit."""
+    way_out = "Check that the picture was on the display, or give its corners: `--points`."
+    if result.correlation < WORST:
+        raise AlignmentError(
+            f"The displayed picture was not found in the reconstruction: their correlation is {result.correlation:.2f} "
+            f"and must be {WORST:g} at least. {way_out}"
+        )
+    if len(residuals.points) < _FEWEST_PARTS:
+        raise AlignmentError(
+            f"Only {len(residuals.points)} of 36 parts of the picture can be placed, and {_FEWEST_PARTS} are needed. "
+            "Use more pictures, or one with more detail."
+        )
+    corners = result.projection.corners()
+    most = max(WORST_PX, 0.02 * float(np.ptp(corners, axis=0).max()))
+    if residuals.rms_px > most:
+        raise AlignmentError(
+            f"The fit is off by {residuals.rms_px:.1f} px, and must be within {most:.1f} px. {way_out}"
+        )

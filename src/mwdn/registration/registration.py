@@ -1,0 +1,96 @@
+"""A registration: a projection with its quality as a file, and in words."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mwdn.data.hdf5 import open_hdf5_header, read_attributes
+from mwdn.errors import ParameterError
+from mwdn.io.files import write_json
+from mwdn.io.reading import parse_json, read_json, unexpected_content
+from mwdn.registration.projection import Points, Projection
+
+KEY = "registration"
+"""Attribute of a file of aligned pairs that holds the registration as JSON."""
+
+_SUFFIXES = (".h5", ".hdf5")
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a displayed picture is in the camera's frame, in words that people use.
+
+    Args:
+        left: of the picture's corner that is the top left one as seen, in pixels.
+        top: likewise.
+        width: mean length of its upper and lower side as seen.
+        height: mean length of its left and right side.
+        turn_degrees: clockwise, -45 to 45 for an outline, -180 to 180 for a known picture.
+        mirrored: whether the camera sees its mirror image.
+    """
+
+    left: float
+    top: float
+    width: float
+    height: float
+    turn_degrees: float
+    mirrored: bool = False
+
+    @classmethod
+    def of(cls, corners: Points) -> "Place":
+        """Of corners (4, 2): of the picture's own top left, top right, bottom right and bottom left."""
+        edges = np.roll(corners, -1, 0) - corners
+        mirrored = edges[0, 0] * edges[1, 1] - edges[0, 1] * edges[1, 0] < 0
+        along = edges[0] - edges[2]  # the picture's own rows
+        turn = np.degrees(np.arctan2(*(along if not mirrored else -along)[::-1]))
+        first = corners[corners.sum(1).argmin()]
+        lengths = np.hypot(*edges.T)
+        upright = abs((turn + 90) % 180 - 90) <= 45
+        across, down = (lengths[0] + lengths[2]) / 2, (lengths[1] + lengths[3]) / 2
+        width, height = (across, down) if upright else (down, across)
+        return cls(*map(float, (*first, width, height, turn)), bool(mirrored))
+
+    def __str__(self) -> str:
+        mirrored = ", mirrored left to right" if self.mirrored else ""
+        return (
+            f"{self.width:.1f} x {self.height:.1f} px (width x height), top left at ({self.left:.1f}, {self.top:.1f}), "
+            f"turned by {self.turn_degrees:.2f} degrees{mirrored}"
+        )
+
+
+def write_registration(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a registration as JSON.
+
+    Raises:
+        ImageError: the file cannot be written.
+    """
+    write_json(path, dict(content))
+
+
+def read_projection(path: str | Path) -> Projection:
+    """Read the projection of a registration from its JSON file, or from a file of aligned pairs.
+
+    Raises:
+        ParameterError: the file holds none, or is damaged.
+        ImageError: no such file.
+    """
+    path = Path(path)
+    if path.suffix.lower() in _SUFFIXES:
+        with open_hdf5_header(path, "Align again: `mwdn align`.") as file:
+            attributes = read_attributes(path, file, "Align again: `mwdn align`.")
+        if KEY not in attributes:
+            raise ParameterError(f"`{path}` has no `{KEY}`: it was not written by `mwdn align`. Align it first.")
+        content = parse_json(str(attributes[KEY]), path)
+    else:
+        content = read_json(path)
+    with unexpected_content(path):
+        return Projection.from_dict(content)
+
+
+def as_attribute(content: Mapping[str, Any]) -> str:
+    """A registration as the text of an attribute."""
+    return json.dumps(content, allow_nan=False)

@@ -1,0 +1,77 @@
+"""How far a projection is off, in pixels: the displacement of each part of the picture that would fit better."""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from mwdn.registration.correlation import Samples, linearise, matched_samples, smooth_images
+from mwdn.registration.projection import Points, Projection
+from mwdn.registration.views import Views
+
+_BLUR = 1.0
+_PARTS = 6
+"""The picture is divided into this many rows and columns of parts, each with a displacement of its own."""
+
+_CORRELATED = 20.0
+"""Pixels of a reconstruction that count as one independent sample."""
+
+_UNCERTAIN_PX = 0.5
+"""Standard error above which a part, such as a clear sky, says nothing about its displacement."""
+
+
+class Residuals(NamedTuple):
+    """Displacements of parts of the picture, those that are certain.
+
+    Args:
+        points: (K, 2), middles of the parts in pixels of the displayed picture.
+        seen: (K, 2), where the projection puts them, in pixels of the camera.
+        displacements: (K, 2), from there to where the reconstruction shows them.
+        errors: (K,), standard errors of the displacements.
+    """
+
+    points: Points
+    seen: Points
+    displacements: Points
+    errors: npt.NDArray[np.float64]
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square length of the displacements; NaN without parts."""
+        return float(np.sqrt((self.displacements**2).sum(-1).mean())) if len(self.points) else float("nan")
+
+
+def measure_residuals(projection: Projection, views: Views) -> Residuals:
+    """Displacement of each part by one Gauss-Newton step of equation (1), with a translation as the only parameters."""
+    images = smooth_images(views.reconstructions, _BLUR)
+    samples = matched_samples(projection, views, images, _BLUR)
+    points = projection.to_camera(samples.points)
+    motion = np.broadcast_to(np.eye(2), (len(points), 2, 2))
+    rows, columns = (np.minimum(np.arange(n) * _PARTS // n, _PARTS - 1) for n in samples.shape)
+    parts = (rows[:, None] * _PARTS + columns).ravel()
+    found = []
+    for part in range(_PARTS**2):
+        inside = parts == part
+        own = Samples(samples.points[inside], samples.values[:, inside], samples.weights[inside], samples.shape)
+        shift, error = _translation(points[inside], motion[inside], own, images)
+        if error < _UNCERTAIN_PX:
+            found.append((own.points.mean(0), points[inside].mean(0), shift, error))
+    columns_of = list(zip(*found, strict=True)) or [np.empty((0, 2))] * 3 + [np.empty(0)]
+    return Residuals(*(np.array(column) for column in columns_of))
+
+
+def _translation(points, motion, samples, images):  # noqa: ANN001, ANN202
+    shift, error = np.zeros(2), np.inf
+    for _ in range(3):
+        fit = linearise(points + shift, motion, samples, images)
+        A = np.einsum("ngi,ng,ngj->ij", fit.slope, fit.weights, fit.slope)
+        g = np.einsum("ngi,ng,ng->i", fit.slope, fit.weights, fit.residual)
+        count = (fit.weights > 0).sum()
+        if count < 30 or np.linalg.cond(A) > 1e6:
+            return shift, np.inf
+        shift = shift - np.linalg.solve(A, g)
+        variance = _CORRELATED * (fit.weights * fit.residual**2).sum() / fit.weights.sum()
+        error = float(np.sqrt(np.trace(np.linalg.inv(A)) * variance))
+        if np.abs(shift).max() > 4:
+            return shift, np.inf
+    return shift, error

@@ -1,0 +1,98 @@
+"""Find a displayed picture in a reconstruction from nothing: correlation at every place, size, turn and mirroring."""
+
+import numpy as np
+import numpy.typing as npt
+
+from mwdn.registration.projection import Projection
+from mwdn.registration.views import Views, compress
+from mwdn.types import FloatFrame
+
+_SIDE = 64
+"""Longer side of the frames that are searched: a picture of 12 % of the frame keeps 8 pixels."""
+
+_SCALES = 0.12 * 1.15 ** np.arange(18)
+"""Width of the picture relative to the frame's: 0.12 to 1.3 in steps of 15 %. Refinement mends half a step."""
+
+_TURNS = range(0, 360, 15)
+_BLUR = 1.2
+_MOST_VIEWS = 4
+
+Matrix = npt.NDArray[np.float64]
+
+
+def search(views: Views) -> list[Projection]:
+    """Similarities under which displayed pictures and reconstructions correlate best.
+
+    Outside of the picture the display is assumed to be dark.
+
+    Returns:
+        The best of each quarter turn and mirroring: eight, best first.
+    """
+    import cv2
+
+    views = views.first(_MOST_VIEWS)
+    height, width = views.camera_size
+    size = max(8, round(width * _SIDE / max(height, width))), max(8, round(height * _SIDE / max(height, width)))
+    frames = [cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in views.reconstructions]
+    spectra = np.stack([np.fft.rfft2(_standard(frame)) for frame in frames])
+    best: dict[tuple[bool, int], tuple[float, Projection]] = {}
+    for scale in _SCALES:
+        factor = scale * width / views.picture_size[1]
+        pictures = [_shrunk(each, scale * size[0]) for each in views.pictures]
+        for mirrored in (False, True):
+            for turn in _TURNS:
+                linear = _turn(turn, mirrored=mirrored)
+                value, shift = _best_shift(pictures, spectra, linear, size)
+                quarter = mirrored, (turn + 45) // 90 % 4
+                if value > best.get(quarter, (-np.inf,))[0]:
+                    middle = (shift + 0.5) * [width / size[0], height / size[1]] - 0.5
+                    best[quarter] = value, _similarity(views, linear * factor, middle)
+    return [projection for _, projection in sorted(best.values(), key=lambda each: -each[0])]
+
+
+def _shrunk(picture: FloatFrame, width: float) -> FloatFrame:
+    import cv2
+
+    h, w = picture.shape
+    size = max(2, round(width)), max(2, round(width * h / w))
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
+
+
+def _standard(image: FloatFrame) -> FloatFrame:
+    """The image smoothed, with mean 0 and norm 1."""
+    import cv2
+
+    smooth = compress(cv2.GaussianBlur(image, (0, 0), _BLUR))
+    smooth -= smooth.mean()
+    return smooth / max(float(np.linalg.norm(smooth)), 1e-9)
+
+
+def _turn(degrees: float, *, mirrored: bool) -> Matrix:
+    """Clockwise, after mirroring left to right."""
+    c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    return np.array([[c, -s], [s, c]]) @ np.diag([-1.0 if mirrored else 1.0, 1.0])
+
+
+def _best_shift(
+    pictures: list[FloatFrame], spectra: npt.NDArray[np.complex128], linear: Matrix, size: tuple[int, int]
+) -> tuple[float, Matrix]:
+    """Mean correlation at the best place, and that place of the picture's middle in the frame."""
+    import cv2
+
+    middle = (np.array(size) - 1) / 2
+    total = np.zeros(size[::-1])
+    for picture, spectrum in zip(pictures, spectra, strict=True):
+        shift = middle - linear @ ((np.array(picture.shape[::-1]) - 1) / 2)
+        placed = _standard(cv2.warpAffine(picture, np.column_stack([linear, shift]), size))
+        total += np.fft.irfft2(spectrum * np.conj(np.fft.rfft2(placed)), size[::-1])
+    y, x = np.unravel_index(np.argmax(total), total.shape)
+    moved = (middle + [x, y]) % size  # correlation is circular
+    return float(total.max()) / len(pictures), moved
+
+
+def _similarity(views: Views, linear: Matrix, middle: Matrix) -> Projection:
+    """Put the middle of the picture to a pixel of the camera."""
+    h, w = views.picture_size
+    shift = middle - linear @ [(w - 1) / 2, (h - 1) / 2]
+    matrix = np.vstack([np.column_stack([linear, shift]), [0, 0, 1]])
+    return Projection.from_homography(matrix, views.picture_size, views.camera_size)
