@@ -1,6 +1,7 @@
 """`mwdn align`: find displayed pictures in reconstructions, and write aligned pairs."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,7 +22,7 @@ from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import check_folder, refuse_overwrite
 from mwdn.io.images import read_frame, write_picture
 from mwdn.registration.captured import CapturedPairs, as_gamma, as_light
-from mwdn.registration.estimate import Estimate, estimate, through_corners
+from mwdn.registration.estimate import estimate, through_corners
 from mwdn.registration.outline import find_outline
 from mwdn.registration.overlay import draw_outline, overlay
 from mwdn.registration.pairs import chosen, fit_levels, reconstruct_views, write_aligned
@@ -37,7 +38,7 @@ def align(  # noqa: PLR0913
     picture: Path | None = None,
     *,
     camera: CameraOptions = CameraOptions(),
-    out: Annotated[Path | None, Parameter(name=["--out", "-o"])] = None,
+    out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("results/align"),
     method: str = "universal",
     count: int = 20,
     points: str | None = None,
@@ -57,7 +58,7 @@ def align(  # noqa: PLR0913
         capture: pairs of `mwdn capture` (.h5), or one raw frame.
         picture: what the display showed in that frame.
         camera: calibration of the camera.
-        out: for a session the file of aligned pairs, aligned.h5 unless given; for one frame a folder, results/align.
+        out: folder for the results, or for a session the file of aligned pairs, ending in .h5.
         method: reconstructs the captures: universal, admm, or any other of `mwdn methods`.
         count: captures of a session that are reconstructed.
         points: start from the corners of the picture as seen in the reconstruction, from its own top left clockwise:
@@ -71,21 +72,134 @@ def align(  # noqa: PLR0913
     """
     if count < 1:
         raise ParameterError(f"`count` ({count}) must be at least 1.")
-    corners = None if points is None else _corners(points)
     own = read_options([method], options, align)[method]
-    calibration = camera.load()
-    reconstruct = partial(Reconstructor, method, device=device, **own)
-    gamma = None if display_gamma is None else as_gamma(display_gamma)
+    task = _Task(
+        calibration=camera.load(),
+        reconstruct=partial(Reconstructor, method, device=device, **own),
+        corners=None if points is None else _corners(points),
+        given=None if homography is None else read_projection(homography),
+        gamma=None if display_gamma is None else as_gamma(display_gamma),
+        inputs=(capture, *camera.files, *filter(None, (picture, homography))),
+    )
     if capture.suffix.lower() in SUFFIXES:
         if picture is not None:
             raise ParameterError(f"`{capture}` has its own pictures. Leave `{picture}` out.")
-        pairs = CapturedPairs(capture, calibration, display_gamma=gamma)
-        content = _align_session(pairs, reconstruct, out or Path("aligned.h5"), corners, homography, count, levels)
+        out = out if out.suffix.lower() in SUFFIXES else out / "aligned.h5"
+        content = _align_session(task, capture, out, count, levels=levels)
     else:
-        out = out or Path("results/align")
-        content = _align_frame(capture, picture, calibration, reconstruct, out, corners, homography, gamma, camera)
+        content = _align_frame(task, capture, picture, out)
     if json:
         print_json(content)
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """What both kinds of alignment need.
+
+    Args:
+        calibration: of the camera.
+        reconstruct: makes a `Reconstructor` for a calibration.
+        corners: to start from.
+        given: projection that is not to be estimated.
+        gamma: of the display.
+        inputs: files that must not be overwritten.
+    """
+
+    calibration: Calibration
+    reconstruct: Callable[[Calibration], Reconstructor]
+    corners: Points | None
+    given: Projection | None
+    gamma: float | str | None
+    inputs: tuple[Path, ...]
+
+    def prepare(self, calibration: Calibration) -> Reconstructor:
+        """A method for the camera, with its warnings printed."""
+        reconstructor = self.reconstruct(replace(calibration, white_balance=None))
+        warn(reconstructor.warning)
+        return reconstructor
+
+    def check_outputs(self, *outputs: Path) -> None:
+        """Check that files can be written, before any work starts."""
+        for output in outputs:
+            refuse_overwrite(output, *self.inputs)
+        check_folder(outputs[0].parent)
+
+
+def _align_session(task: _Task, capture: Path, out: Path, count: int, *, levels: bool) -> dict[str, Any]:
+    """Align the pairs of a session."""
+    check_path(out)
+    page, sidecar = out.with_suffix(".png"), out.with_suffix(".json")
+    task.check_outputs(out, page, sidecar)
+    with (
+        CapturedPairs(capture, task.calibration, display_gamma=task.gamma) as pairs,
+        if_interrupted(lambda: f"Interrupted. Nothing is kept: {out} is written when all pairs are done."),
+    ):
+        rows = chosen(len(pairs), count)
+        reconstructor = task.prepare(pairs.calibration)
+        if task.given is None:
+            progress = partial(track, title="Reconstructing")
+            views = reconstruct_views(pairs, reconstructor, rows, progress)
+            found = estimate(views, corners=task.corners)
+            projection, content = found.projection, found.content()
+        else:
+            found, projection = None, task.given.for_picture(pairs.picture_size)
+            content = projection.to_dict()
+        psf = pairs.calibration.psf
+        white = fit_levels(pairs, projection, psf, rows) if levels else None
+        write_aligned(out, pairs, projection, content, levels=white, track=partial(track, title="Writing pairs"))
+        sheet = overlay(
+            reconstructor(pairs.measurement(rows[0])),
+            warp_pictures(pairs.picture(rows[0]), projection),
+            projection.corners(),
+            found and found.residuals,
+        )
+        number = len(pairs)
+    write_picture(page, sheet)
+    write_registration(sidecar, content)
+    say(_quality(projection, content), f"{counted(number, 'pair')} written to {out}. Look at {page}")
+    return content
+
+
+def _align_frame(task: _Task, capture: Path, picture: Path | None, out: Path) -> dict[str, Any]:
+    """Find one displayed picture, or the outline of the display."""
+    page, sidecar = out / f"{capture.stem}.align.png", out / f"{capture.stem}.align.json"
+    task.check_outputs(page, sidecar)
+    measurement = read_capture(capture, task.calibration)
+    scene = task.prepare(task.calibration)(measurement)
+    size = scene.shape[-2], scene.shape[-1]
+    found = None
+    if picture is None:
+        corners = (
+            task.corners if task.corners is not None else find_outline(Views.of(list(scene), list(scene)).roots[0])
+        )
+        place = Place.of(corners)
+        shape = max(2, round(place.height)), max(2, round(place.width))
+        projection = through_corners(corners, shape, size)
+        content = {**projection.to_dict(), "start": "outline" if task.corners is None else "points"}
+        sheet = draw_outline(scene, corners)
+    else:
+        shown = as_light(read_frame(picture, upright=True), task.gamma)[None]
+        if task.given is None:
+            found = estimate(Views.of(list(shown), list(scene)), corners=task.corners)
+            projection, content = found.projection, found.content()
+        else:
+            projection = task.given.for_picture((shown.shape[-2], shown.shape[-1]))
+            content = projection.to_dict()
+        warped = warp_pictures(shown, projection)
+        sheet = overlay(scene, warped, projection.corners(), found and found.residuals)
+    write_picture(page, sheet)
+    write_registration(sidecar, content)
+    say(_quality(projection, content), f"Look at {page}")
+    return content
+
+
+def _quality(projection: Projection, content: Mapping[str, Any]) -> str:
+    """Place of the picture, and how well it fits, in a sentence."""
+    radial = f", radial term {projection.radial:.3f}" if projection.radial else ""
+    fit = ""
+    if "residual_px" in content:
+        fit = f"; residual {content['residual_px']:.2f} px, correlation {content['correlation']:.3f}{radial}"
+    return f"Picture found: {Place.of(projection.corners())}{fit}."
 
 
 def _corners(points: str) -> Points:

@@ -39,6 +39,10 @@ COMMANDS = {
         "inspect:inspect",
         "Report the quality of a PSF: exposure, background, sharpness, spectrum, noise gain, resolution.",
     ),
+    "align": (
+        "align:align",
+        "Find where displayed pictures are in the camera's frame, and write aligned pairs of a session.",
+    ),
     "simulate": ("train:simulate", "Write a file of pairs: photographs as scenes, and simulated captures of them."),
     "train": (
         "train:train",

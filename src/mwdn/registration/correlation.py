@@ -10,11 +10,13 @@ correlation coefficient. All pictures share theta: artefacts differ from picture
 are Tukey's: what no gain explains, such as a reflection beside the display, has none.
 """
 
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from mwdn.errors import AlignmentError, ParameterError
 from mwdn.registration.projection import Points, Projection
 from mwdn.registration.views import Views, compress
 from mwdn.types import FloatFrame, Size
@@ -48,6 +50,20 @@ class Samples(NamedTuple):
     shape: Size
 
 
+class Smooth(NamedTuple):
+    """Reconstructions, smoothed and compressed, and their derivatives.
+
+    Args:
+        images: (N, H, W).
+        right: derivative along the rows.
+        down: derivative along the columns.
+    """
+
+    images: FloatFrame
+    right: FloatFrame
+    down: FloatFrame
+
+
 class Refined(NamedTuple):
     """A projection and the correlation of pictures and reconstructions under it, -1 to 1."""
 
@@ -78,13 +94,24 @@ def refine(
     return result
 
 
-def matched_samples(projection: Projection, views: Views, smooth: FloatFrame, blur: float) -> Samples:
+def correlate(projection: Projection, views: Views, blur: float) -> float:
+    """Correlation of pictures and reconstructions smoothed by ``blur``, without Tukey's weights.
+
+    They would hide what tells a picture from its mirror image if that is small.
+    """
+    smooth = smooth_images(views.reconstructions, blur)
+    samples = matched_samples(projection, views, smooth, blur)
+    motion = np.zeros((len(samples.points), 2, 0))
+    return linearise(projection.to_camera(samples.points), motion, samples, smooth, robust=False).correlation
+
+
+def matched_samples(projection: Projection, views: Views, smooth: Smooth, blur: float) -> Samples:
     """Samples with the displayed light smoothed like the reconstructions, which are less sharp than the display.
 
     Args:
         projection: from pictures to reconstructions.
         views: pictures.
-        smooth: (N, H, W), reconstructions smoothed by ``blur``.
+        smooth: reconstructions smoothed by ``blur``.
         blur: standard deviation in pixels of the camera.
     """
     trials = [sample(projection, views, float(np.hypot(blur, own)), step=max(1.0, 0.7 * blur)) for own in _OWN_BLURS]
@@ -106,7 +133,7 @@ def sample(projection: Projection, views: Views, blur: float, *, step: float) ->
     for picture in views.pictures:
         small = cv2.resize(picture, (columns, rows), interpolation=cv2.INTER_AREA)
         framed = cv2.copyMakeBorder(small, rim_y, rim_y, rim_x, rim_x, cv2.BORDER_CONSTANT, value=0)
-        values.append(compress(cv2.GaussianBlur(framed, (0, 0), blur / step)).ravel())
+        values.append(compress(np.asarray(cv2.GaussianBlur(framed, (0, 0), blur / step), np.float32)).ravel())
     y, x = np.mgrid[-rim_y : rows + rim_y, -rim_x : columns + rim_x]
     points = np.stack([(x + 0.5) * width / columns - 0.5, (y + 0.5) * height / rows - 0.5], -1).reshape(-1, 2)
     inside = ((x >= 0) & (x < columns) & (y >= 0) & (y < rows)).ravel()
@@ -123,10 +150,12 @@ def _side_lengths(projection: Projection) -> Array:
     return np.clip([(left + right) / 2, (top + bottom) / 2], 8, 4096)
 
 
-def smooth_images(images: FloatFrame, blur: float) -> FloatFrame:
+def smooth_images(images: FloatFrame, blur: float) -> Smooth:
+    """Images (N, H, W) smoothed by a Gaussian of this standard deviation, compressed."""
     import cv2
 
-    return np.stack([compress(cv2.GaussianBlur(image, (0, 0), blur)) for image in images])
+    smooth = np.stack([compress(np.asarray(cv2.GaussianBlur(image, (0, 0), blur), np.float32)) for image in images])
+    return Smooth(smooth, *(np.asarray(np.gradient(smooth, axis=axis), np.float32) for axis in (2, 1)))
 
 
 def _look(images: FloatFrame, points: Points) -> Array:
@@ -160,23 +189,24 @@ class Linear(NamedTuple):
     correlation: float
 
 
-def linearise(points: Points, motion: Array, samples: Samples, smooth: FloatFrame) -> Linear:
+def linearise(points: Points, motion: Array, samples: Samples, smooth: Smooth, *, robust: bool = True) -> Linear:
     """Residual and slope of equation (1).
 
     Args:
         points: (G, 2), pixels of the camera at which the samples appear.
         motion: (G, 2, K), derivative of the points by the parameters.
         samples: of the displayed pictures.
-        smooth: (N, H, W), reconstructions.
+        smooth: reconstructions.
+        robust: weight the samples by Tukey's biweight.
     """
-    height, width = smooth.shape[1:]
+    height, width = smooth.images.shape[1:]
     inside = ((points >= 0) & (points <= [width - 1, height - 1])).all(-1)
     weights = np.broadcast_to(samples.weights * inside, samples.values.shape)
     if inside.mean() < 0.25:
         return Linear(samples.values * 0, np.zeros((*samples.values.shape, motion.shape[-1])), weights, -1.0)
-    gy, gx = np.gradient(smooth, axis=(1, 2))
-    seen, gx, gy = (_look(each.astype(np.float32), points) for each in (smooth, gx, gy))
-    weights = weights * _tukey(_project(seen, samples.values, weights), weights)
+    seen, gx, gy = (_look(each, points) for each in smooth)
+    if robust:
+        weights = weights * _tukey(_project(seen, samples.values, weights), weights)
     slope = gx[..., None] * motion[:, 0] + gy[..., None] * motion[:, 1]
     residual = _project(seen, samples.values, weights)
     total = _project(seen, None, weights)
@@ -205,7 +235,7 @@ def _tukey(residual: Array, weights: Array) -> Array:
     return np.where(np.abs(z) < 1, (1 - z * z) ** 2, 0.0)
 
 
-def _maximise(projection: Projection, samples: Samples, smooth: FloatFrame, *, radial: bool) -> Refined:
+def _maximise(projection: Projection, samples: Samples, smooth: Smooth, *, radial: bool) -> Refined:
     """Levenberg-Marquardt on equation (1) at one blur."""
     free, damping = 9 if radial else 8, 1e-4
     best = linearise(*_placed(projection, samples, free), samples, smooth)
@@ -214,8 +244,8 @@ def _maximise(projection: Projection, samples: Samples, smooth: FloatFrame, *, r
         g = np.einsum("ngi,ng,ng->i", best.slope, best.weights, best.residual, optimize=True)
         step = np.zeros(9)
         step[:free] = -np.linalg.solve(A + damping * np.diag(A.diagonal()) + 1e-12 * np.eye(free), g)
-        moved = projection.moved(step)
-        if not _is_sound(moved):
+        moved = _moved(projection, step)
+        if moved is None:
             damping *= 10
             continue
         trial = linearise(*_placed(moved, samples, free), samples, smooth)
@@ -232,6 +262,14 @@ def _maximise(projection: Projection, samples: Samples, smooth: FloatFrame, *, r
 def _placed(projection: Projection, samples: Samples, free: int) -> tuple[Points, Array]:
     points, motion = projection.project(samples.points)
     return points, motion[..., :free]
+
+
+def _moved(projection: Projection, step: Array) -> Projection | None:
+    """The projection after a step, if the picture is then still a sound quadrilateral."""
+    with suppress(AlignmentError, ParameterError):
+        moved = projection.moved(step)
+        return moved if _is_sound(moved) else None
+    return None
 
 
 def _is_sound(projection: Projection) -> bool:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mwdn.errors import AlignmentError
-from mwdn.registration.correlation import Refined, refine
+from mwdn.registration.correlation import Refined, correlate, refine
 from mwdn.registration.features import match_features
 from mwdn.registration.markers import match_markers
 from mwdn.registration.point_fit import fit_points
@@ -33,7 +33,7 @@ _AMBIGUOUS = 0.05
 """Part by which the best start must leave less unexplained than the next, ``1 - correlation``."""
 
 _FEW = 4
-_FEWEST_PARTS = 6
+_FEWEST_PARTS = 4
 
 
 class Estimate(NamedTuple):
@@ -125,7 +125,8 @@ def _single(tried: list[tuple[Refined, str]], few: Views) -> tuple[Refined, str]
     best = max(each.correlation for each, _ in tried)
     close = [(each, name) for each, name in tried if best - each.correlation < _CLOSE]
     if len(close) > 1:
-        close = [(refine(each.projection, few, blurs=(1.0,)), name) for each, name in close]
+        detailed = [(refine(each.projection, few, blurs=(1.0,)).projection, name) for each, name in close]
+        close = [(Refined(each, correlate(each, few, 1.0)), name) for each, name in detailed]
     result, name = max(close, key=lambda each: each[0].correlation)
     corners = result.projection.corners()
     size = float(np.ptp(corners, axis=0).max())
@@ -162,7 +163,7 @@ def _check(result: Refined, residuals: Residuals) -> None:
         )
     if len(residuals.points) < _FEWEST_PARTS:
         raise AlignmentError(
-            f"Only {len(residuals.points)} of 36 parts of the picture can be placed, and {_FEWEST_PARTS} are needed. "
+            f"Only {len(residuals.points)} parts of the picture can be placed, and {_FEWEST_PARTS} are needed. "
             "Use more pictures, or one with more detail."
         )
     corners = result.projection.corners()

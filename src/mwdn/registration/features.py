@@ -1,6 +1,7 @@
 """A projection from features (SIFT) of displayed pictures and reconstructions, pooled over many pictures."""
 
 from contextlib import suppress
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -54,7 +55,7 @@ def _matches(picture: Bytes, seen: Bytes) -> tuple[Points, Points]:
     """Positions of features that match, in pixels of both."""
     import cv2
 
-    sift = cv2.SIFT_create(contrastThreshold=0.02)
+    sift = cv2.SIFT_create(contrastThreshold=0.02)  # type: ignore[attr-defined]
     described = [_describe(sift, image) for image in (picture, seen)]
     (displayed, first), (camera, second) = described
     if min(len(displayed), len(camera)) < 2:
@@ -64,7 +65,7 @@ def _matches(picture: Bytes, seen: Bytes) -> tuple[Points, Points]:
     return displayed[[match.queryIdx for match in good]], camera[[match.trainIdx for match in good]]
 
 
-def _describe(sift, image: Bytes) -> tuple[Points, npt.NDArray[np.float32]]:  # noqa: ANN001
+def _describe(sift: Any, image: Bytes) -> tuple[Points, npt.NDArray[np.float32]]:  # noqa: ANN401
     """Positions (K, 2) in pixels of the image, and descriptors."""
     import cv2
 

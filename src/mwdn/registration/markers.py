@@ -35,7 +35,9 @@ def match_markers(views: Views) -> list[Projection]:
         return []
     sizes = {"picture_size": views.picture_size, "camera_size": views.camera_size}
     with suppress(AlignmentError):
-        return [fit_points(np.concatenate(displayed), np.concatenate(seen), tolerance_px=_TOLERANCE_PX, **sizes).projection]
+        return [
+            fit_points(np.concatenate(displayed), np.concatenate(seen), tolerance_px=_TOLERANCE_PX, **sizes).projection
+        ]
     return []
 
 

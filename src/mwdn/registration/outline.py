@@ -5,6 +5,8 @@ brightness along profiles across it. Most profiles must agree: dark parts of the
 beside it and ringing of the reconstruction disturb a few.
 """
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -23,7 +25,7 @@ _REACH = 0.12
 """Length of a profile on each side of the line, as a fraction of the display's size."""
 
 _TOLERANCE_PX = 1.5
-_AGREEING = 0.4
+_AGREEING = 0.5
 """Fewest profiles of each side whose edge lies within the tolerance of the line."""
 
 Bytes = npt.NDArray[np.uint8]
@@ -71,13 +73,13 @@ def _rough(image: FloatFrame, threshold: float) -> Points | None:
     contours, _ = cv2.findContours(opened, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     if not contours:
         return None
-    largest = max(contours, key=lambda contour: _light_inside(smooth, contour))
+    largest: Any = max(contours, key=lambda contour: _light_inside(smooth, contour))
     if cv2.contourArea(largest) < _SMALLEST * image.size:
         return None
     return _clockwise(cv2.boxPoints(cv2.minAreaRect(largest)).astype(np.float64))
 
 
-def _light_inside(image: FloatFrame, contour: npt.NDArray[np.int32]) -> float:
+def _light_inside(image: Any, contour: Any) -> float:  # noqa: ANN401
     import cv2
 
     mask = np.zeros(image.shape, np.uint8)

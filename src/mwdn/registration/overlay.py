@@ -1,6 +1,7 @@
 """Pictures that show how well a registration fits."""
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -8,7 +9,7 @@ from mwdn.io.contact_sheets import contact_sheet, to_display
 from mwdn.io.images import srgb_decode, srgb_encode
 from mwdn.registration.projection import Points
 from mwdn.registration.residuals import Residuals
-from mwdn.types import Image
+from mwdn.types import Image, Scene
 
 _SIDE = 640
 """Least height of a drawing in pixels: a pixel of a small camera becomes a block."""
@@ -42,11 +43,11 @@ def draw_outline(reconstruction: Image, corners: Points, residuals: Residuals | 
         for start, shift in zip(residuals.seen, residuals.displacements, strict=True):
             ends = _drawn(np.stack([start, start + _ENLARGED * shift]), factor)
             cv2.circle(canvas, tuple(map(int, ends[0])), 2 << 4, _ORANGE, -1, cv2.LINE_AA, shift=4)
-            cv2.line(canvas, *(tuple(map(int, end)) for end in ends), _ORANGE, 1, cv2.LINE_AA, shift=4)
+            cv2.polylines(canvas, [ends], False, _ORANGE, 1, cv2.LINE_AA, shift=4)
     return srgb_decode(torch.from_numpy(canvas / np.float32(255))).movedim(-1, 0)[None]
 
 
-def overlay(reconstruction: Image, warped: Image, corners: Points, residuals: Residuals | None = None) -> Tensor:
+def overlay(reconstruction: Image, warped: Scene, corners: Points, residuals: Residuals | None = None) -> Tensor:
     """A sheet: the reconstruction with the outline, the displayed picture in the camera's frame, and both in one.
 
     In the last one the reconstruction is red and the displayed picture cyan: where they agree it is grey.
@@ -63,6 +64,6 @@ def overlay(reconstruction: Image, warped: Image, corners: Points, residuals: Re
     return contact_sheet([pictures], ["reconstruction", "displayed picture", "both: red and cyan"], height=_SIDE)
 
 
-def _drawn(points: Points, factor: int) -> np.ndarray:
+def _drawn(points: Points, factor: int) -> npt.NDArray[np.int32]:
     """Points in sixteenths of a pixel of the enlarged canvas."""
     return np.round(((points + 0.5) * factor - 0.5) * 16).astype(np.int32)

@@ -60,8 +60,8 @@ def fit_levels(pairs: CapturedPairs, projection: Projection, psf: Psf, rows: lis
     gains = (x * y).sum(1) / x.square().sum(1).clamp(min=1e-12)
     if not (gains > 0).all():
         raise AlignmentError(
-            "The measurements do not grow with the displayed light. Check the PSF, and that pictures and captures belong "
-            "together; without levels: `--no-levels`."
+            "The measurements do not grow with the displayed light. Check the PSF, and that pictures and captures "
+            "belong together; without levels: `--no-levels`."
         )
     return gains.float()
 

@@ -81,7 +81,7 @@ def _consensus(picture: Points, camera: Points, tolerance_px: float) -> tuple[Po
         method = cv2.USAC_MAGSAC if len(picture) > 4 else 0
         matrix, found = cv2.findHomography(points, camera, method, tolerance_px, maxIters=5000, confidence=0.9999)
         if matrix is not None and (best[0] is None or found.sum() > best[1].sum()):
-            best = matrix @ flip, found
+            best = matrix @ flip, found.astype(np.uint8)
     return best
 
 

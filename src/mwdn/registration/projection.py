@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from mwdn.errors import ParameterError
+from mwdn.errors import AlignmentError, ParameterError
 from mwdn.types import Size
 
 Points = npt.NDArray[np.float64]
@@ -37,7 +37,8 @@ class Projection:
         camera_size: height and width of a reconstruction in pixels.
 
     Raises:
-        ParameterError: the parameters are not nine finite numbers, or map the picture onto a line.
+        ParameterError: the parameters are not nine finite numbers.
+        AlignmentError: they map the picture onto a line.
     """
 
     parameters: tuple[float, ...]
@@ -50,7 +51,7 @@ class Projection:
         if min(*self.picture_size, *self.camera_size) < 2:
             raise ParameterError(f"`picture_size` {self.picture_size} and `camera_size` {self.camera_size} are empty.")
         if abs(np.linalg.det(self._matrix)) < 1e-9:
-            raise ParameterError("`parameters` map the whole picture onto a line. Pick other points.")
+            raise AlignmentError("`parameters` map the whole picture onto a line. Pick other points.")
 
     @classmethod
     def from_homography(
@@ -59,17 +60,17 @@ class Projection:
         """From a 3 x 3 matrix between pixels of the picture and pixels of the camera, as OpenCV has it.
 
         Raises:
-            ParameterError: the matrix is singular, or sends the picture's middle to infinity.
+            AlignmentError: the matrix is singular, or sends the picture's middle to infinity.
         """
         matrix = np.linalg.inv(_to_pixels(*_camera_frame(camera_size))) @ homography
         matrix = matrix @ _to_pixels(*_picture_frame(picture_size))
         if not np.isfinite(matrix).all() or abs(matrix[2, 2]) < 1e-12:
-            raise ParameterError("The homography is singular, or sends the middle of the picture to infinity.")
+            raise AlignmentError("The homography is singular, or sends the middle of the picture to infinity.")
         return cls((*map(float, (matrix / matrix[2, 2]).flat[:8]), radial), picture_size, camera_size)
 
     @property
     def radial(self) -> float:
-        """k of equation (2): relative displacement at the corners of the camera's frame."""
+        """K of equation (2): relative displacement at the corners of the camera's frame."""
         return self.parameters[8]
 
     @property
@@ -117,14 +118,6 @@ class Projection:
         with np.errstate(divide="ignore", invalid="ignore"):
             return homogeneous[..., :2] / homogeneous[..., 2:] * half + middle
 
-    def faces(self, points: Points) -> npt.NDArray[np.bool_]:
-        """Whether pixels of the camera (..., 2) look at the display's plane in front of the camera, not behind it."""
-        centre, scale = _camera_frame(self.camera_size)
-        q = (points - centre) / scale
-        inverse = np.linalg.inv(self._matrix)
-        depth = inverse[2, 0] * q[..., 0] + inverse[2, 1] * q[..., 1] + inverse[2, 2]
-        return np.asarray(depth * np.sign(inverse[2] @ [self.parameters[2], self.parameters[5], 1]) > 0)
-
     def moved(self, step: npt.NDArray[np.float64]) -> "Projection":
         """With a step (9,) added to the parameters."""
         return replace(self, parameters=tuple(map(float, np.add(self.parameters, step))))
@@ -144,7 +137,7 @@ class Projection:
         return replace(self, picture_size=size)
 
     def corners(self) -> Points:
-        """Outer corners of the picture in pixels of the camera (4, 2): top left, top right, bottom right, bottom left."""
+        """Pixels of the camera (4, 2) of the picture's outer corners, clockwise from its own top left."""
         return self.to_camera(picture_corners(self.picture_size))
 
     def to_dict(self) -> dict[str, Any]:
@@ -161,7 +154,7 @@ class Projection:
         """From the numbers of `to_dict`.
 
         Raises:
-            ParameterError: the matrix is singular.
+            AlignmentError: the matrix is singular.
             KeyError, TypeError, ValueError: the content is something else.
         """
         matrix = np.array(content["homography"], np.float64).reshape(3, 3)

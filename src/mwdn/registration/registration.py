@@ -52,7 +52,7 @@ class Place:
         upright = abs((turn + 90) % 180 - 90) <= 45
         across, down = (lengths[0] + lengths[2]) / 2, (lengths[1] + lengths[3]) / 2
         width, height = (across, down) if upright else (down, across)
-        return cls(*map(float, (*first, width, height, turn)), bool(mirrored))
+        return cls(float(first[0]), float(first[1]), float(width), float(height), float(turn), bool(mirrored))
 
     def __str__(self) -> str:
         mirrored = ", mirrored left to right" if self.mirrored else ""

@@ -5,13 +5,14 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from mwdn.registration.correlation import Samples, linearise, matched_samples, smooth_images
+from mwdn.registration.correlation import Samples, Smooth, linearise, matched_samples, smooth_images
 from mwdn.registration.projection import Points, Projection
 from mwdn.registration.views import Views
 
 _BLUR = 1.0
-_PARTS = 6
-"""The picture is divided into this many rows and columns of parts, each with a displacement of its own."""
+_MOST_PARTS, _FEWEST_PARTS, _PART_PX = 6, 3, 14
+"""The picture is divided into rows and columns of parts of this many pixels of the camera at least, each with a
+displacement of its own."""
 
 _CORRELATED = 20.0
 """Pixels of a reconstruction that count as one independent sample."""
@@ -42,25 +43,28 @@ class Residuals(NamedTuple):
 
 
 def measure_residuals(projection: Projection, views: Views) -> Residuals:
-    """Displacement of each part by one Gauss-Newton step of equation (1), with a translation as the only parameters."""
+    """Displacement of each part: equation (1) of `mwdn.registration.correlation`, with a translation as parameters."""
     images = smooth_images(views.reconstructions, _BLUR)
     samples = matched_samples(projection, views, images, _BLUR)
     points = projection.to_camera(samples.points)
-    motion = np.broadcast_to(np.eye(2), (len(points), 2, 2))
-    rows, columns = (np.minimum(np.arange(n) * _PARTS // n, _PARTS - 1) for n in samples.shape)
-    parts = (rows[:, None] * _PARTS + columns).ravel()
+    count = int(np.clip(min(samples.shape) // _PART_PX, _FEWEST_PARTS, _MOST_PARTS))
+    rows, columns = (np.arange(n) * count // n for n in samples.shape)
+    parts = (rows[:, None] * count + columns).ravel()
     found = []
-    for part in range(_PARTS**2):
+    for part in range(count**2):
         inside = parts == part
         own = Samples(samples.points[inside], samples.values[:, inside], samples.weights[inside], samples.shape)
-        shift, error = _translation(points[inside], motion[inside], own, images)
+        shift, error = _translation(points[inside], own, images)
         if error < _UNCERTAIN_PX:
             found.append((own.points.mean(0), points[inside].mean(0), shift, error))
-    columns_of = list(zip(*found, strict=True)) or [np.empty((0, 2))] * 3 + [np.empty(0)]
-    return Residuals(*(np.array(column) for column in columns_of))
+    if not found:
+        return Residuals(np.empty((0, 2)), np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
+    return Residuals(*(np.array(column) for column in zip(*found, strict=True)))
 
 
-def _translation(points, motion, samples, images):  # noqa: ANN001, ANN202
+def _translation(points: Points, samples: Samples, images: Smooth) -> tuple[Points, float]:
+    """Displacement (2,) of samples that appear at points (G, 2), and its standard error; infinite if not certain."""
+    motion = np.broadcast_to(np.eye(2), (len(points), 2, 2))
     shift, error = np.zeros(2), np.inf
     for _ in range(3):
         fit = linearise(points + shift, motion, samples, images)

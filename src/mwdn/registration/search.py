@@ -2,10 +2,13 @@
 
 import numpy as np
 import numpy.typing as npt
+import torch
+from torch import Tensor
 
+from mwdn.fourier.transforms import inverse_spectrum, spectrum
 from mwdn.registration.projection import Projection
 from mwdn.registration.views import Views, compress
-from mwdn.types import FloatFrame
+from mwdn.types import FloatFrame, Size
 
 _SIDE = 64
 """Longer side of the frames that are searched: a picture of 12 % of the frame keeps 8 pixels."""
@@ -32,21 +35,20 @@ def search(views: Views) -> list[Projection]:
 
     views = views.first(_MOST_VIEWS)
     height, width = views.camera_size
-    size = max(8, round(width * _SIDE / max(height, width))), max(8, round(height * _SIDE / max(height, width)))
-    frames = [cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in views.reconstructions]
-    spectra = np.stack([np.fft.rfft2(_standard(frame)) for frame in frames])
+    size = max(8, round(height * _SIDE / max(height, width))), max(8, round(width * _SIDE / max(height, width)))
+    frames = [cv2.resize(each, size[::-1], interpolation=cv2.INTER_AREA) for each in views.reconstructions]
+    seen = spectrum(torch.from_numpy(np.stack([_standard(frame) for frame in frames]))[None], size)[0]
     best: dict[tuple[bool, int], tuple[float, Projection]] = {}
     for scale in _SCALES:
+        pictures = [_shrunk(each, scale * size[1]) for each in views.pictures]
         factor = scale * width / views.picture_size[1]
-        pictures = [_shrunk(each, scale * size[0]) for each in views.pictures]
         for mirrored in (False, True):
-            for turn in _TURNS:
-                linear = _turn(turn, mirrored=mirrored)
-                value, shift = _best_shift(pictures, spectra, linear, size)
+            values, middles = _best_places(pictures, seen, size, mirrored=mirrored)
+            for turn, value, middle in zip(_TURNS, values, middles, strict=True):
                 quarter = mirrored, (turn + 45) // 90 % 4
                 if value > best.get(quarter, (-np.inf,))[0]:
-                    middle = (shift + 0.5) * [width / size[0], height / size[1]] - 0.5
-                    best[quarter] = value, _similarity(views, linear * factor, middle)
+                    pixel = (middle + 0.5) * [width / size[1], height / size[0]] - 0.5
+                    best[quarter] = value, _similarity(views, _turn(float(turn), mirrored=mirrored) * factor, pixel)
     return [projection for _, projection in sorted(best.values(), key=lambda each: -each[0])]
 
 
@@ -62,7 +64,7 @@ def _standard(image: FloatFrame) -> FloatFrame:
     """The image smoothed, with mean 0 and norm 1."""
     import cv2
 
-    smooth = compress(cv2.GaussianBlur(image, (0, 0), _BLUR))
+    smooth = compress(np.asarray(cv2.GaussianBlur(image, (0, 0), _BLUR), np.float32))
     smooth -= smooth.mean()
     return smooth / max(float(np.linalg.norm(smooth)), 1e-9)
 
@@ -73,21 +75,25 @@ def _turn(degrees: float, *, mirrored: bool) -> Matrix:
     return np.array([[c, -s], [s, c]]) @ np.diag([-1.0 if mirrored else 1.0, 1.0])
 
 
-def _best_shift(
-    pictures: list[FloatFrame], spectra: npt.NDArray[np.complex128], linear: Matrix, size: tuple[int, int]
-) -> tuple[float, Matrix]:
-    """Mean correlation at the best place, and that place of the picture's middle in the frame."""
+def _best_places(
+    pictures: list[FloatFrame], seen: Tensor, size: Size, *, mirrored: bool
+) -> tuple[list[float], list[Matrix]]:
+    """Mean correlation of each turn at its best place, and that place (2,) of the picture's middle in the frame."""
     import cv2
 
-    middle = (np.array(size) - 1) / 2
-    total = np.zeros(size[::-1])
-    for picture, spectrum in zip(pictures, spectra, strict=True):
-        shift = middle - linear @ ((np.array(picture.shape[::-1]) - 1) / 2)
-        placed = _standard(cv2.warpAffine(picture, np.column_stack([linear, shift]), size))
-        total += np.fft.irfft2(spectrum * np.conj(np.fft.rfft2(placed)), size[::-1])
-    y, x = np.unravel_index(np.argmax(total), total.shape)
-    moved = (middle + [x, y]) % size  # correlation is circular
-    return float(total.max()) / len(pictures), moved
+    middle = (np.array(size[::-1]) - 1) / 2
+    total = torch.zeros(len(_TURNS), *size)
+    for picture, frame in zip(pictures, seen, strict=True):
+        placed = []
+        for turn in _TURNS:
+            linear = _turn(float(turn), mirrored=mirrored)
+            shift = middle - linear @ ((np.array(picture.shape[::-1]) - 1) / 2)
+            placed.append(_standard(np.asarray(cv2.warpAffine(picture, np.column_stack([linear, shift]), size[::-1]))))
+        shown = spectrum(torch.from_numpy(np.stack(placed))[None], size)
+        total += inverse_spectrum(frame * shown.conj(), size, size)[0]
+    values, places = (total / len(pictures)).flatten(1).max(1)
+    shifts = [np.array([place % size[1], place // size[1]]) for place in places.tolist()]
+    return values.tolist(), [(middle + shift) % size[::-1] for shift in shifts]  # correlation is circular
 
 
 def _similarity(views: Views, linear: Matrix, middle: Matrix) -> Projection:

@@ -57,6 +57,11 @@ class Views:
         chosen = np.unique(np.linspace(0, len(self) - 1, min(count, len(self))).round().astype(int))
         return Views(self.pictures[chosen], self.reconstructions[chosen])
 
+    @property
+    def roots(self) -> FloatFrame:
+        """(N, H, W), square roots of the reconstructions."""
+        return np.sqrt(self.reconstructions)
+
     @cached_property
     def bytes(self) -> tuple[list[npt.NDArray[np.uint8]], list[npt.NDArray[np.uint8]]]:
         """Pictures and reconstructions as 8 bits, for OpenCV's detectors."""

@@ -5,8 +5,8 @@ import torch
 from torch import Tensor
 
 from mwdn.errors import ShapeError
-from mwdn.registration.projection import Projection
-from mwdn.types import FloatFrame, Image
+from mwdn.registration.projection import Points, Projection
+from mwdn.types import FloatFrame, Image, Scene
 
 _SAMPLES = 3
 """Points along each side of a pixel of the camera whose light is averaged."""
@@ -15,7 +15,7 @@ _ROWS = 64
 """Rows of the camera's frame that are warped at a time: the map of 64 rows of 1,920 pixels takes 8 MB."""
 
 
-def warp_pictures(pictures: Image, projection: Projection) -> Image:
+def warp_pictures(pictures: Scene, projection: Projection) -> Image:
     """The ground truth of captures: displayed pictures as the camera sees them, dark beside the display.
 
     Each pixel of the camera is the mean of the light within it.
@@ -44,20 +44,20 @@ def _warp(picture: Tensor, projection: Projection) -> Tensor:
         rows = min(_ROWS, height - top)
         y, x = np.mgrid[: rows * _SAMPLES, : width * _SAMPLES]
         points = (np.stack([x, y], -1) + 0.5) / _SAMPLES - 0.5 + [0, top]
-        fine = _sample(frame, projection.to_picture(points), projection.faces(points))
+        fine = _sample(frame, projection.to_picture(points))
         warped[top : top + rows] = fine.reshape(rows, _SAMPLES, width, _SAMPLES, -1).mean((1, 3))
     return torch.from_numpy(warped).movedim(-1, 0)
 
 
-def _sample(frame: FloatFrame, points: np.ndarray, visible: np.ndarray) -> FloatFrame:
+def _sample(frame: FloatFrame, points: Points) -> FloatFrame:
     """Bilinear samples (rows, columns, C); the border is a sharp edge half a pixel beyond the outer pixels."""
     import cv2
 
     height, width = frame.shape[:2]
-    inside = visible & (points > -0.5).all(-1) & (points < [width - 0.5, height - 0.5]).all(-1)
+    inside = (points > -0.5).all(-1) & (points < [width - 0.5, height - 0.5]).all(-1)
     x, y = np.moveaxis(np.where(inside[..., None], points, 0), -1, 0).astype(np.float32)
     looked = cv2.remap(frame, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(looked).reshape(*x.shape, -1) * inside[..., None]
+    return np.asarray(looked, np.float32).reshape(*x.shape, -1) * inside[..., None]
 
 
 def _shrunk(frame: FloatFrame, projection: Projection) -> tuple[FloatFrame, Projection]:
@@ -73,4 +73,4 @@ def _shrunk(frame: FloatFrame, projection: Projection) -> tuple[FloatFrame, Proj
         return np.ascontiguousarray(frame), projection
     small = cv2.resize(frame, size[::-1], interpolation=cv2.INTER_AREA)
     moved = Projection(projection.parameters, size, projection.camera_size)  # normalised coordinates stay
-    return np.asarray(small).reshape(*size, -1), moved
+    return np.asarray(small, np.float32).reshape(*size, -1), moved
