@@ -17,8 +17,6 @@
     ├── CameraError                    a camera that cannot be opened, or delivers no frames any more
     ├── DisplayError                   a display that does not show what it should
     └── ProcessError                   another process of a distributed run has ended
-
-A message states what must hold, what was got, and the way out.
 """
 
 import difflib
@@ -81,8 +79,6 @@ class UnknownNameError(ParameterError):
 
 def check_options(of: Callable[..., Any], what: str, options: Mapping[str, Any]) -> None:
     """Check that a function or class takes these keyword arguments, and that each is of the annotated type.
-
-    Arrays are not checked here, because the functions that take them check their axes, too.
 
     Args:
         of: the function or class.
@@ -183,8 +179,6 @@ def _alternatives(kind: Any) -> list[str]:  # noqa: ANN401
 
 def one_line(text: str) -> str:
     """Text with control characters and surrogates, which file names may hold, as escape sequences."""
-    if text.isprintable():
-        return text
     return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
 
 

@@ -53,13 +53,13 @@ def session(tmp_path):
         measurement_shape=(SIZE, SIZE, 3),
         scene_shape=(90, 90, 3),
         dtype="uint16",
-        attributes={"bit_depth": 12, "display_gamma": GAMMA},
+        attributes={"bit_depth": 12},
     ) as file:
         for number in range(3):
             picture = displayed(number)
             frame, scene = capture(picture, psf)
             scenes.append(scene)
-            file.append(frame, picture.astype(np.uint16) * 257)
+            file.append(frame, ((picture / 255) ** GAMMA).astype(np.float32))
             write_frame(tmp_path / f"frame{number}.png", frame)
             write_frame(tmp_path / f"picture{number}.png", picture)
     return tmp_path, torch.cat(scenes)

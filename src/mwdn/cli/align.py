@@ -21,7 +21,7 @@ from mwdn.errors import ParameterError
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import check_folder, refuse_overwrite
 from mwdn.io.images import read_frame, write_picture
-from mwdn.registration.captured import CapturedPairs, as_gamma, as_light
+from mwdn.registration.captured import SRGB, CapturedPairs, as_gamma, as_light
 from mwdn.registration.estimate import estimate, through_corners
 from mwdn.registration.outline import find_outline
 from mwdn.registration.overlay import draw_outline, overlay
@@ -64,7 +64,7 @@ def align(  # noqa: PLR0913
         points: start from the corners of the picture as seen in the reconstruction, from its own top left clockwise:
             x,y,x,y,x,y,x,y in pixels.
         homography: take the homography from this .json or file of aligned pairs instead of estimating it.
-        display_gamma: light of the display is the pictures' numbers to this power; srgb unless the session says it.
+        display_gamma: light of the display is PICTURE's numbers to this power; srgb unless given.
         levels: scale scenes and measurements of a session so that the PSF leads from one to the other.
         device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
         json: print the content of the .json to standard output, all else to standard error.
@@ -131,7 +131,7 @@ def _align_session(task: _Task, capture: Path, out: Path, count: int, *, levels:
     page, sidecar = out.with_suffix(".png"), out.with_suffix(".json")
     task.check_outputs(out, page, sidecar)
     with (
-        CapturedPairs(capture, task.calibration, display_gamma=task.gamma) as pairs,
+        CapturedPairs(capture, task.calibration, display_gamma=task.gamma or 1.0) as pairs,
         if_interrupted(lambda: f"Interrupted. Nothing is kept: {out} is written when all pairs are done."),
     ):
         rows = chosen(len(pairs), count)
@@ -178,7 +178,7 @@ def _align_frame(task: _Task, capture: Path, picture: Path | None, out: Path) ->
         content = {**projection.to_dict(), "start": "outline" if task.corners is None else "points"}
         sheet = draw_outline(scene, corners)
     else:
-        shown = as_light(read_frame(picture, upright=True), task.gamma)[None]
+        shown = as_light(read_frame(picture, upright=True), task.gamma or SRGB)[None]
         if task.given is None:
             found = estimate(Views.of(list(shown), list(scene)), corners=task.corners)
             projection, content = found.projection, found.content()

@@ -20,8 +20,6 @@ from mwdn.types import Frame, Image, Measurement
 _ADVICE = "Capture it again: `mwdn capture`."
 
 SRGB = "srgb"
-DISPLAY_GAMMA = "display_gamma"
-"""Attribute of a session with the measured power law of its display."""
 
 
 class CapturedPairs:
@@ -30,15 +28,15 @@ class CapturedPairs:
     Args:
         path: HDF5 with ``measurement``, raw frames (N, H, W, C), and ``scene``, displayed pictures (N, h, w, C).
         calibration: of the camera; bit depth and mosaic are the session's if the calibration has none.
-        display_gamma: light of the display is the stored number to this power, or ``"srgb"``. Unless given, that of
-            the session; without one, sRGB for pictures of integers and 1 for floats.
+        display_gamma: light of the display is the stored number to this power, or ``"srgb"``. `mwdn capture` stores
+            the light itself, as every file of pairs does.
 
     Raises:
         ImageError: no such file, damaged, or not of pairs; it holds none.
         ParameterError: the gamma is not a power from 0.5 to 4.
     """
 
-    def __init__(self, path: Path, calibration: Calibration, *, display_gamma: float | str | None = None) -> None:
+    def __init__(self, path: Path, calibration: Calibration, *, display_gamma: float | str = 1.0) -> None:
         self.path = path
         with PairFile(path) as file:
             attributes, self._count = file.attributes, len(file)
@@ -51,8 +49,7 @@ class CapturedPairs:
         if frames.mosaic is None and (mosaic := attributes.get("mosaic")):
             frames = replace(frames, mosaic=_as_mosaic(mosaic))
         self.calibration = replace(calibration, frames=frames)
-        gamma = attributes.get(DISPLAY_GAMMA) if display_gamma is None else display_gamma
-        self.display_gamma = None if gamma is None else as_gamma(gamma)
+        self.display_gamma = as_gamma(display_gamma)
         self._file: Any = None
         self._rows: dict[str, Any] = {}
 
@@ -89,13 +86,10 @@ class CapturedPairs:
             return np.asarray(self._rows[name][number])
 
 
-def as_light(picture: Frame, gamma: float | str | None) -> Tensor:
-    """Linear light (C, h, w) of a displayed picture (h, w, C), white 1."""
-    is_coded = picture.dtype.kind == "u"
-    numbers = picture.astype(np.float32) / (np.float32(np.iinfo(picture.dtype).max) if is_coded else 1)
-    light = torch.from_numpy(numbers).movedim(-1, 0).clamp(min=0)
-    if gamma is None:
-        gamma = SRGB if is_coded else 1.0
+def as_light(picture: Frame, gamma: float | str) -> Tensor:
+    """Linear light (C, h, w) of a displayed picture (h, w, C), white 1; integers are fractions of their maximum."""
+    scale = np.float32(np.iinfo(picture.dtype).max) if picture.dtype.kind == "u" else np.float32(1)
+    light = torch.from_numpy(picture.astype(np.float32) / scale).movedim(-1, 0).clamp(min=0)
     return srgb_decode(light) if gamma == SRGB else light ** float(gamma)
 
 

@@ -54,7 +54,7 @@ def _sample(frame: FloatFrame, points: Points) -> FloatFrame:
     import cv2
 
     height, width = frame.shape[:2]
-    inside = (points > -0.5).all(-1) & (points < [width - 0.5, height - 0.5]).all(-1)
+    inside = np.asarray((points > -0.5).all(-1) & (points < [width - 0.5, height - 0.5]).all(-1))
     x, y = np.moveaxis(np.where(inside[..., None], points, 0), -1, 0).astype(np.float32)
     looked = cv2.remap(frame, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(looked, np.float32).reshape(*x.shape, -1) * inside[..., None]
