@@ -9,6 +9,7 @@ from typing import Any, get_type_hints
 from mwdn.calibration.frame_format import FrameFormat
 from mwdn.calibration.place_files import PlaceFiles
 from mwdn.calibration.psf_format import PsfFormat
+from mwdn.calibration.refinement import Refinement
 from mwdn.calibration.white_balance import WhiteBalance
 from mwdn.errors import ParameterError, PsfError, UnknownNameError, fits_type, one_line, shown
 from mwdn.io.files import as_parameter_error, atomic, file_sha256
@@ -28,6 +29,7 @@ _TYPES: dict[str, Any] = {
     **dict.fromkeys(("distance_psfs", "field_psfs"), tuple[str, ...]),
     "distances_mm": tuple[float, ...],
     "field_positions": tuple[tuple[float, float], ...],
+    **get_type_hints(Refinement),
 }
 
 KEYS: dict[str, tuple[str, Any]] = {
@@ -61,6 +63,10 @@ KEYS: dict[str, tuple[str, Any]] = {
     "read_noise_electrons": ("Noise of a pixel without light, a standard deviation.", 3.0),
     "full_well_electrons": ("Electrons at saturation.", 15000.0),
     "black_level": ("Mean of a dark frame, as a fraction of the full scale.", 0.01),
+    "psf_gain": ("Gain over the PSF of each colour: 1, y, x, y^2, yx, x^2 ... from -1 to 1.", [[1.0, 0.1, -0.1]]),
+    "envelope_shift": ("Displacement of the aperture's shadow, down and right, over the shorter side.", [0.02, 0.0]),
+    "sensor_field": ("Light that the sensor keeps, in the same terms; captures are divided by it.", [[1.0, 0.1, -0.1]]),
+    "stray_light": ("Light without a scene, a fraction of the full scale; subtracted.", [[0.0, 0.01, 0.0]]),
 }
 """Meaning and an example of each key, in the order of the file."""
 

@@ -15,6 +15,7 @@ from mwdn.calibration.frame_format import FrameFormat
 from mwdn.calibration.place_files import PlaceFiles
 from mwdn.calibration.psf_format import PsfFormat, with_options
 from mwdn.calibration.psf_levels import background_level, empty, refuse_saturated
+from mwdn.calibration.refinement import TERMS, Refinement
 from mwdn.calibration.size_advice import advise_size
 from mwdn.calibration.white_balance import WhiteBalance, check_white_balance
 from mwdn.errors import ParameterError, PsfError, ShapeError, check_batch, checked, shown
@@ -46,6 +47,7 @@ class Calibration:
         corrections: flat field and hot pixels, corrected in each frame.
         sensor: noise and saturation of the sensor's own pixels, if they were measured; see `binned_sensor`.
         places: files of PSFs at other distances and positions, see `mwdn.calibration.places`.
+        refinement: terms found with known pictures, see `refined`.
 
     Raises:
         PsfError: the PSF has other axes, or is negative, not finite, or dark.
@@ -65,6 +67,7 @@ class Calibration:
     corrections: Corrections = Corrections()
     sensor: Sensor | None = None
     places: PlaceFiles = PlaceFiles()
+    refinement: Refinement = Refinement()
 
     @classmethod
     @checked
@@ -82,15 +85,21 @@ class Calibration:
         camera = read_camera(path)
         sha256, own_psf = camera.pop("psf_sha256", ""), camera["psf"]
         camera |= options
+        terms = Refinement(**{name: camera.pop(name) for name in TERMS if name in camera})
         if camera["psf"] == own_psf:
             check_psf_file(path, sha256, own_psf)
         else:  # of another file nothing is known
             camera["psf_corrected"] = False
+            terms = replace(terms, psf_gain=(), envelope_shift=None)
         extra = {name: camera.pop(name, None) for name in ("white_balance", "pitch_um", "distance_mm")}
         extra |= {"sensor": pop_sensor(camera), "places": pop_places(camera)}
         files = (camera.pop(name, None) for name in ("flat_field", "hot_pixels"))
         corrections = Corrections.read(*files, psf_done=camera.pop("psf_corrected", False))
-        return replace(cls.from_file(camera.pop("psf"), corrections=corrections, **camera), **extra)
+        return replace(cls.from_file(camera.pop("psf"), corrections=corrections, **camera), **extra).refined(terms)
+
+    def refined(self, refinement: Refinement) -> "Calibration":
+        """The calibration with a refinement, of which it has none yet: in its PSF and in all measurements."""
+        return replace(self, psf=refinement.psf(self.psf), refinement=refinement) if refinement else self
 
     @classmethod
     @checked
@@ -278,7 +287,7 @@ class Calibration:
         offset = self.dark if self.ambient is None else self.ambient
         frame = as_frame(frame, finite=False)
         check_float_scale(frame, self.frames.bit_depth)
-        return self.frames.to_measurement(frame, offset, self.corrections)
+        return self.refinement.measurement(self.frames.to_measurement(frame, offset, self.corrections))
 
     def check_fit(self, measurement: Measurement) -> None:
         """Raise a `ShapeError` unless the measurement (1, C, H, W) has the PSF's size, and colours if the PSF has."""

@@ -19,6 +19,7 @@ from mwdn.calibration.white_balance import WhiteBalance, check_white_balance
 from mwdn.cli.camera import CameraOptions
 from mwdn.cli.inspect import at_psf_resolution
 from mwdn.cli.photographs import PhotographOptions
+from mwdn.cli.refine import check_pair_file, refine
 from mwdn.cli.terminal import counted, if_interrupted, note, say
 from mwdn.errors import ParameterError
 from mwdn.io.files import file_sha256, refuse_overwrite
@@ -39,6 +40,7 @@ def calibrate(  # noqa: PLR0913
     pitch_um: float | None = None,
     distance_mm: float | None = None,
     watch: Path | None = None,
+    pairs: Path | None = None,
     out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("camera.toml"),
     auto_bin: Annotated[bool, Parameter(show=False)] = True,
 ) -> None:
@@ -62,6 +64,8 @@ def calibrate(  # noqa: PLR0913
         distance_mm: distance from the point source to the camera, in millimetres.
         watch: guide the exposure instead: for each frame that is written to this folder, print its peak, its saturated
             pixels and the exposure to use next.
+        pairs: file of two or more pairs of this camera, from `mwdn import` or `mwdn simulate`, to find a gain over the
+            PSF, the displacement of the aperture's shadow, the sensor's field and stray light.
         out: the camera file, ending in .toml.
         auto_bin: whether --bin is not given: then every reconstruction chooses.
     """
@@ -72,6 +76,9 @@ def calibrate(  # noqa: PLR0913
     pictures = [*files] or ([psf] if psf is not None else [])
     if not pictures:
         raise ParameterError("Give the camera's PSF, `--psf psf.png`, or its camera file, `--camera camera.toml`.")
+    if pairs is not None:
+        check_pair_file(pairs)
+        refuse_overwrite(out, pairs)
     kept = _kept(camera)
     own = {
         "ambient": ambient,
@@ -86,6 +93,7 @@ def calibrate(  # noqa: PLR0913
         options = CameraOptions(pictures[0], frames, psf_format=psf_format, ambient=ambient)
         dark = next(iter(expanded(photographs.dark_files)), None)
         _of_one_picture(replace(options, dark=dark), kept, own, out)
+        refine(out, pairs)
         return
     _refuse_psf_format(psf_format)
     known = Corrections.read(kept.get("flat_field"), kept.get("hot_pixels"))
@@ -93,6 +101,7 @@ def calibrate(  # noqa: PLR0913
         refuse_overwrite(out, file)
     done = develop(photographs.of(pictures), frames, known)
     _of_photographs(done, {**kept, **own}, out, has_dark=bool(photographs.dark_files))
+    refine(out, pairs)
 
 
 def _kept(camera: Path | None) -> dict[str, Any]:
@@ -112,7 +121,8 @@ def _of_one_picture(options: CameraOptions, kept: dict[str, Any], own: dict[str,
         kept = {
             key: value for key, value in kept.items() if key not in ("psf_corrected", "distance_psfs", "field_psfs")
         }
-        kept = {key: value for key, value in kept.items() if key not in ("distances_mm", "field_positions")}
+        of_the_psf = ("distances_mm", "field_positions", "psf_gain", "envelope_shift")
+        kept = {key: value for key, value in kept.items() if key not in of_the_psf}
     corrections = Corrections.read(
         kept.get("flat_field"), kept.get("hot_pixels"), psf_done=kept.get("psf_corrected", False)
     )
@@ -135,6 +145,7 @@ def _of_photographs(done: Photographed, content: dict[str, Any], out: Path, *, h
     # A dark frame with the room's light has no background left; tails below the lines are then the PSF's own.
     background = content.get("background") or (0.0 if has_dark else None)
     own_distance = {"distance_mm": content["distance_mm"]} if content.get("distance_mm") else {}
+    content |= {"psf_gain": None, "envelope_shift": None}  # of an earlier PSF
     content = {**content, "background": background, **done.content, **own_distance, "psf_gamma": None}
     for key in ("distance_psfs", "field_psfs"):  # those of an earlier PSF do not fit this one
         if key not in done.parts:

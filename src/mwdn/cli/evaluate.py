@@ -1,12 +1,14 @@
 """`mwdn evaluate`: compare methods on pairs of measurements and scenes."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from cyclopts import Parameter
+from torch import Tensor
 
+from mwdn.calibration.refinement import Refinement
 from mwdn.cli.camera import CameraOptions
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.method_options import MethodOptions, read_options
@@ -17,6 +19,21 @@ from mwdn.evaluation import Perceptual, Variant
 from mwdn.evaluation.alexnet import SMALLEST
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import check_folder, refuse_foreign, refuse_overwrite
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Pairs whose measurements, imported without it, have the camera's refinement."""
+
+    pairs: Any
+    refinement: Refinement
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
+        measurement, scene = self.pairs[index]
+        return self.refinement.measurement(measurement[None])[0], scene
 
 
 @no_empty_folder
@@ -61,7 +78,8 @@ def evaluate(  # noqa: PLR0913
     part, file = evaluation.Protocol.parse(protocol), PairFile(data)
     calibration = replace(camera.load(), white_balance=None)  # scenes of pairs are in the camera's own colours
     check_pairs(file, calibration.psf)
-    pairs = file if first is None else evaluation.First(file, first)
+    pairs: Any = file if first is None else evaluation.First(file, first)
+    pairs = Refined(pairs, calibration.refinement) if calibration.refinement else pairs
     reconstructors = {
         method: Reconstructor(method, calibration, device=device, **own) for method, own in method_options.items()
     }

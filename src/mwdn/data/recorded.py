@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from mwdn.calibration.refinement import Refinement
 from mwdn.data.pair_writer import Attribute
 from mwdn.data.pairs import PairFile
 from mwdn.data.simulated import Batch, Samples
@@ -77,6 +78,7 @@ class RecordedPairs(Samples):
         shuffled: otherwise in the order of ``rows``, repeatedly.
         aligned: align the PSF to each measurement, when it is first read.
         poses: of the aligned PSF, by position in the file.
+        refinement: of the camera, for measurements that were imported without it.
     """
 
     file: PairFile
@@ -86,6 +88,7 @@ class RecordedPairs(Samples):
     shuffled: bool = True
     aligned: bool = False
     poses: dict[int, Pose] = field(default_factory=dict, repr=False)
+    refinement: Refinement = Refinement()
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -114,6 +117,7 @@ class RecordedPairs(Samples):
         rows = [self.row(number) for number in numbers]
         pairs = [self.file[row] for row in rows]
         measurement, scene = (to_device(torch.stack(part), self.psf.device) for part in zip(*pairs, strict=True))
+        measurement = self.refinement.measurement(measurement)
         if not self.aligned:
             return Batch(measurement, scene, self.psf)
         moved = [self._pose(row, one[None]).move(self.psf) for row, one in zip(rows, measurement, strict=True)]
@@ -170,7 +174,13 @@ class PrefetchedPairs(Samples):
 
 
 def recorded_pairs(
-    path: Path, psf: Psf, division: Division, *, seed: int = 0, device: torch.device | str = "cpu"
+    path: Path,
+    psf: Psf,
+    division: Division,
+    *,
+    seed: int = 0,
+    device: torch.device | str = "cpu",
+    refinement: Refinement = Refinement(),
 ) -> tuple[RecordedPairs, RecordedPairs]:
     """Open a file of pairs for training and for validation.
 
@@ -180,6 +190,7 @@ def recorded_pairs(
         division: into training and validation.
         seed: of the order in each epoch.
         device: where to put the pairs.
+        refinement: of the camera.
 
     Raises:
         ImageError: no such file, or it is damaged or not a file of pairs.
@@ -190,9 +201,8 @@ def recorded_pairs(
     check_pairs(file, psf)
     train, validation = division.of(len(file))
     psf = psf.to(device)
-    aligned = division.aligned
-    training = RecordedPairs(file, train, psf, seed, aligned=aligned)
-    return training, RecordedPairs(file, validation, psf, seed, shuffled=False, aligned=aligned)
+    training = RecordedPairs(file, train, psf, seed, aligned=division.aligned, refinement=refinement)
+    return training, replace(training, rows=validation, shuffled=False, poses={})
 
 
 def check_pairs(file: PairFile, psf: Psf) -> None:

@@ -59,6 +59,7 @@ def _camera(calibration: Calibration) -> dict[str, object]:
     """Everything a measurement depends on; what was added later counts only where it is set."""
     frames = calibration.frames
     later = {"gamma": frames.gamma, "ambient": calibration.ambient}
+    refinement = {"refinement": repr(calibration.refinement)} if calibration.refinement else {}
     later |= {"flat": calibration.corrections.flat, "hot_pixels": calibration.corrections.defects}
     return {
         "psf": calibration.psf,
@@ -73,6 +74,7 @@ def _camera(calibration: Calibration) -> dict[str, object]:
         "distance_mm": calibration.distance_mm,
         "mosaic": frames.mosaic,
         "grey": frames.grey,
+        **refinement,
         **{name: value for name, value in later.items() if value is not None},
     }
 

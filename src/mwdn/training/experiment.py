@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from mwdn.calibration import Calibration
 from mwdn.calibration.places import field_camera
+from mwdn.calibration.refinement import Refinement
 from mwdn.data.cameras import CameraPairs
 from mwdn.data.captures import find_captures, read_captures
 from mwdn.data.mismatch import EXACT
@@ -120,7 +121,7 @@ def prepare(
         data = captures_alone(recipe, captures, psf)
         captures = None  # shown as samples of the validation
     elif pairs is not None:
-        data = recorded_pairs_of(recipe, pairs, psf)
+        data = recorded_pairs_of(recipe, pairs, psf, refinement=calibration.refinement)
     elif photos is not None:
         data = simulated_captures(recipe, photos, psf)
     recipe = _in_steps(recipe, data)
@@ -141,14 +142,14 @@ def simulated_captures(recipe: Recipe, photos: Path, psf: Psf) -> TrainingData:
     return TrainingData(supervised_task(training, recipe.schedule), SupervisedTask(validation), len(photographs))
 
 
-def recorded_pairs_of(recipe: Recipe, pairs: Path, psf: Psf) -> TrainingData:
+def recorded_pairs_of(recipe: Recipe, pairs: Path, psf: Psf, *, refinement: Refinement = Refinement()) -> TrainingData:
     """Recorded pairs of one camera."""
     if recipe.cameras.sizes:
         raise ParameterError("Recorded pairs, `--pairs`, are of one camera: leave [cameras] out of the recipe.")
     if recipe.denoising.levels[1]:
         raise ParameterError("[denoising] makes its own pairs from photographs: give `--photos`, not `--pairs`.")
     seed = recipe.schedule.seed
-    training, validation = recorded_pairs(pairs, psf, recipe.pairs, seed=seed, device=psf.device)
+    training, validation = recorded_pairs(pairs, psf, recipe.pairs, seed=seed, device=psf.device, refinement=refinement)
     best_gain = recipe.pairs.best_gain
     if recipe.schedule.pool and recipe.pairs.aligned:
         task, held_out = few_pairs_tasks(training, validation, recipe.schedule, best_gain=best_gain)

@@ -1,0 +1,130 @@
+"""Choose the terms of a `Refinement` by leaving pairs out.
+
+In each round, each term is tried at each order beyond the one it has, on top of the terms taken so far. A term is
+measured on pairs that it was not fitted to: each pair in turn is left out, and only its own gain and offset are fitted.
+The best term is taken if it lowers the mean unexplained part by `LEAST` and that of more than half of the pairs.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from statistics import fmean
+
+from mwdn.calibration.pair_model import Fit, PairModel, Terms
+from mwdn.errors import ParameterError
+from mwdn.types import Measurement, Psf, Scene
+
+LEAST = 0.02
+"""Relative decrease of the unexplained part that makes a term worth taking."""
+
+HIGHEST = {"envelope": 1, "psf_gain": 3, "sensor_field": 2, "stray_light": 2, "field_dependence": 2}
+"""Terms, and the highest order of each."""
+
+KERNELS = Terms(psf_gain=3, field_dependence=2).kernels
+
+LEAST_PAIRS = 2
+
+
+@dataclass(frozen=True)
+class Step:
+    """A term that was tried, and what it explains.
+
+    Args:
+        term: its name in `Terms`; "" for the calibration as it was.
+        order: of its polynomial.
+        unexplained: of each pair when it is left out, see `PairModel.unexplained`.
+        taken: whether it is part of the refinement.
+        terms: all terms with this one.
+    """
+
+    term: str
+    order: int
+    unexplained: tuple[float, ...]
+    taken: bool
+    terms: Terms
+
+    @property
+    def mean(self) -> float:
+        """Mean over the pairs."""
+        return fmean(self.unexplained)
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """Result of `select_terms`.
+
+    Args:
+        model: of all pairs, with the envelope's displacement if that was taken.
+        steps: the calibration as it was, then the terms in the order in which they were tried.
+    """
+
+    model: PairModel
+    steps: tuple[Step, ...]
+
+    @property
+    def taken(self) -> list[Step]:
+        """The calibration as it was, and the terms that were taken, in their order."""
+        return [step for step in self.steps if step.taken]
+
+    def fit(self, terms: Terms, *, without: int | None = None) -> Fit:
+        """Fit to all pairs, or to all but one."""
+        return self.model.fit(terms, [pair for pair in range(len(self.model)) if pair != without])
+
+
+def select_terms(
+    psf: Psf,
+    pairs: Callable[[], Iterable[tuple[Measurement, Scene]]],
+    *,
+    report: Callable[[Step], None] = lambda step: None,
+) -> Selection:
+    """Choose terms and fit them.
+
+    Args:
+        psf: (1, C, H, W), of the calibration.
+        pairs: reads the pairs, (1, C, H, W) each; called once or twice.
+        report: called with each term that was tried.
+
+    Raises:
+        ParameterError: fewer than two pairs.
+    """
+    model = PairModel(psf, pairs(), kernels=KERNELS)
+    if len(model) < LEAST_PAIRS:
+        raise ParameterError(f"`pairs` ({len(model)}) must be {LEAST_PAIRS} or more: each in turn is left out.")
+    steps = [_tried(model, "", 0, Terms(), taken=True)]
+    report(steps[0])
+    while True:
+        before = [step for step in steps if step.taken][-1]
+        terms = before.terms
+        tried = [
+            _tried(model, term, order, replace(terms, **{term: order}), taken=False)
+            for term, highest in HIGHEST.items()
+            for order in range(getattr(terms, term) + 1, highest + 1)
+        ]
+        best = min(tried, key=lambda step: step.mean, default=None)
+        better = best is not None and _is_better(best, before)
+        for step in tried:
+            steps.append(replace(step, taken=better and step is best))
+            report(steps[-1])
+        if best is None or not better:
+            return Selection(model, tuple(steps))
+        if best.term == "envelope":
+            # The displacement was linear so far; from here on the displaced PSF is the one that other terms change.
+            shift = model.fit(best.terms, range(len(model))).displacement
+            model = PairModel(psf, pairs(), kernels=KERNELS, shift=shift)
+
+
+def _tried(model: PairModel, term: str, order: int, terms: Terms, *, taken: bool) -> Step:
+    everything = range(len(model))
+    start = model.fit(terms, everything)
+    unexplained = [
+        model.unexplained(
+            model.fit(terms, [other for other in everything if other != pair], start=start, steps=2), pair
+        )
+        for pair in everything
+    ]
+    return Step(term, order, tuple(unexplained), taken, terms)
+
+
+def _is_better(step: Step, before: Step) -> bool:
+    pairs = zip(step.unexplained, before.unexplained, strict=True)
+    wins = sum(new < old for new, old in pairs)
+    return step.mean < (1 - LEAST) * before.mean and wins > len(before.unexplained) / 2

@@ -1,0 +1,150 @@
+"""`mwdn calibrate --pairs`: refine a camera file with known pictures."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+from typing import TYPE_CHECKING, Any
+
+from mwdn.calibration import Calibration
+from mwdn.calibration.camera_file import read_camera, write_camera
+from mwdn.calibration.pair_model import Terms
+from mwdn.calibration.refinement import TERMS
+from mwdn.calibration.term_selection import LEAST_PAIRS, Selection, Step, select_terms
+from mwdn.cli.progress import show_progress
+from mwdn.cli.terminal import counted, say
+from mwdn.errors import ParameterError
+from mwdn.io.files import write_json
+from mwdn.types import Measurement, Scene
+
+if TYPE_CHECKING:
+    from mwdn.data.pairs import PairFile
+
+METHOD = "pyramid"
+"""Solver that judges the pictures: it takes seconds, and has learned nothing that could hide an error."""
+
+NO_TERMS: dict[str, Any] = {"psf_gain": (), "envelope_shift": None, "sensor_field": (), "stray_light": ()}
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Pictures of pairs that a refinement was not fitted to, after the best gain and offset.
+
+    Args:
+        step: last term of the refinement.
+        psnr: of each pair, in dB.
+        ssim: of each pair.
+        lpips: of each pair; NaN without its weights.
+    """
+
+    step: Step
+    psnr: tuple[float, ...]
+    ssim: tuple[float, ...]
+    lpips: tuple[float, ...]
+
+
+def check_pair_file(pairs: Path) -> None:
+    """Raise an `MwdnError` unless this is a file of enough pairs."""
+    from mwdn.data.pairs import PairFile
+
+    with PairFile(pairs) as file:
+        if len(file) < LEAST_PAIRS:
+            raise ParameterError(f"`pairs` ({len(file)}) must be {LEAST_PAIRS} or more: each in turn is left out.")
+
+
+def refine(camera: Path, pairs: Path | None) -> None:
+    """Find the terms of a camera file's refinement, write them to it, and a report beside it. Nothing without pairs.
+
+    Raises:
+        MwdnError: the pairs do not fit the camera, or a file cannot be written. The camera file stays as it was.
+    """
+    if pairs is None:
+        return
+    from mwdn.calibration.refinement_page import write_refinement_page
+    from mwdn.data.pairs import PairFile
+    from mwdn.data.recorded import check_pairs
+
+    calibration = Calibration.load(camera, **NO_TERMS, white_balance=None)
+    with PairFile(pairs) as file:
+        check_pairs(file, calibration.psf)
+        selection = select_terms(calibration.psf, lambda: _all(file), report=lambda step: say(_sentence(step)))
+        pictures = _pictures(calibration, selection, file)
+    best = max(pictures, key=lambda each: fmean(each.psnr))
+    refinement = selection.fit(best.step.terms).refinement()
+    values = {**read_camera(camera), **NO_TERMS}
+    values |= {name: getattr(refinement, name) or None for name in TERMS}
+    values.pop("psf_sha256", None)
+    write_camera(camera, values)
+    report = camera.with_name(f"{camera.stem}-refinement.json")
+    write_json(report, _content(selection, pictures, best, {name: values[name] for name in TERMS}))
+    write_refinement_page(report.with_suffix(".png"), calibration.psf, refinement, _lines(pictures, best))
+    say(*_lines(pictures, best), f"Look at {report.with_suffix('.png')}; all numbers are in {report}")
+
+
+def _pictures(calibration: Calibration, selection: Selection, file: "PairFile") -> list[Pictures]:
+    """Reconstruct each pair with the refinement of the others, for each of the terms that were taken in turn."""
+    from mwdn.evaluation.metrics import Perceptual, Protocol, measure
+    from mwdn.inference.reconstructor import Reconstructor
+
+    steps = [step for step in selection.taken if step.term != "field_dependence"]
+    perceptual, results = Perceptual.load(), []
+    with show_progress() as progress:
+        progress.start("Reconstructing left-out pairs", len(steps) * len(file))
+        for number, step in enumerate(steps):
+            scores = []
+            for pair, (b, v) in enumerate(_all(file)):
+                terms = selection.fit(step.terms, without=pair).refinement()
+                reconstruct = Reconstructor(METHOD, calibration.refined(terms))
+                scene = reconstruct(terms.measurement(b))
+                scores.append(measure(scene, v, Protocol(), variant="best-gain", perceptual=perceptual))
+                progress.update(number * len(file) + pair + 1, step.term or "as calibrated")
+            names = ("psnr", "ssim", "lpips")
+            results.append(Pictures(step, *(tuple(round(float(s[name]), 4) for s in scores) for name in names)))
+    return results
+
+
+def _all(file: "PairFile") -> Iterator[tuple[Measurement, Scene]]:
+    for pair in range(len(file)):
+        measurement, scene = file[pair]
+        yield measurement[None], scene[None]
+
+
+def _sentence(step: Step) -> str:
+    what = f"{_name(step)} of order {step.order}" if step.term else "The calibration as it is"
+    taken = " (taken)" if step.taken and step.term else ""
+    return f"{what}: leaves {step.mean:.1%} of left-out measurements unexplained{taken}"
+
+
+def _name(step: Step) -> str:
+    return step.term.replace("_", " ").replace("psf", "PSF")
+
+
+def _lines(pictures: list[Pictures], best: Pictures) -> list[str]:
+    lines = []
+    for each in pictures:
+        name = f"with {_name(each.step)}" if each.step.term else "as calibrated"
+        kept = " (kept up to here)" if each is best else ""
+        lpips = "" if each.lpips[0] != each.lpips[0] else f", LPIPS {fmean(each.lpips):.3f}"
+        lines.append(f"{counted(len(each.psnr), 'left-out pair')} {name}: {fmean(each.psnr):.2f} dB{lpips}{kept}")
+    return lines
+
+
+def _content(selection: Selection, pictures: list[Pictures], best: Pictures, terms: dict[str, Any]) -> dict[str, Any]:
+    tried = [
+        {"term": step.term, "order": step.order, "unexplained": step.unexplained, "taken": step.taken}
+        for step in selection.steps
+    ]
+    scored = [
+        {
+            "terms": _orders(each.step.terms),
+            "psnr": each.psnr,
+            "ssim": each.ssim,
+            "lpips": None if each.lpips[0] != each.lpips[0] else each.lpips,
+        }
+        for each in pictures
+    ]
+    return {"method": METHOD, "tried": tried, "pictures": scored, "kept": _orders(best.step.terms), **terms}
+
+
+def _orders(terms: Terms) -> dict[str, int]:
+    return {name: order for name, order in vars(terms).items() if order}

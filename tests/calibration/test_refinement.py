@@ -1,0 +1,145 @@
+"""Terms that known pictures tell of a camera: found again where they are true, and not taken where they are not."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from cameras import contour_psf
+from mwdn import Calibration, convolve
+from mwdn.calibration.camera_file import write_camera
+from mwdn.calibration.pair_model import PairModel, Terms
+from mwdn.calibration.refinement import Refinement, polynomials, smooth_field
+from mwdn.calibration.term_selection import select_terms
+from mwdn.data.pairs import PairFile
+from mwdn.errors import ParameterError
+from mwdn.io.images import write_frame
+
+SIZE = 64, 80
+FIELD = ((1.0, 0.1, -0.15, -0.2, 0.05, -0.1),)
+GAIN = ((1.0, 0.3, -0.2), (1.0, 0.1, 0.2), (1.0, -0.2, 0.0))
+LIGHT = ((0.0, 0.02, 0.01), (0.0, 0.02, 0.01), (0.0, 0.01, 0.0))
+
+
+@pytest.fixture
+def psf(generator):
+    return contour_psf(SIZE, cell=14, generator=generator).expand(1, 3, -1, -1).contiguous()
+
+
+def pairs(psf, truth, generator, count=4, noise=0.0):
+    """Random scenes of a few coloured squares in units of their own, through the true camera."""
+    made = []
+    for number in range(count):
+        scene = torch.nn.functional.interpolate(torch.rand(1, 3, 5, 6, generator=generator) ** 3, SIZE)
+        light = convolve(scene, truth.psf(psf))
+        if truth.sensor_field:
+            light = light * truth.field_map(SIZE)
+        if truth.stray_light:
+            light = light + truth.stray_map(SIZE)
+        light = light + noise * torch.randn(light.shape, generator=generator)
+        made.append((light, scene * (0.5 + 0.2 * number) + 0.1))
+    return made
+
+
+def test_polynomials_by_hand():
+    corner = polynomials(2, (3, 5))[:, 2, 0].tolist()  # y = 1, x = -1: 1, y, x, y^2, yx, x^2
+    assert corner == [1, 1, -1, 1, -1, 1]
+    assert torch.equal(smooth_field(((2.0, 0.0, 1.0),), (3, 5))[0, 0, 1], torch.tensor([1.0, 1.5, 2.0, 2.5, 3.0]))
+
+
+def test_a_measurement_is_corrected_back(psf, generator):
+    truth = Refinement(sensor_field=FIELD, stray_light=LIGHT)
+    even = torch.rand(1, 3, *SIZE, generator=generator)
+    seen = even * truth.field_map(SIZE) + truth.stray_map(SIZE)
+    torch.testing.assert_close(truth.measurement(seen), even)
+
+
+@pytest.mark.parametrize(
+    ("truth", "terms"),
+    [
+        (Refinement(sensor_field=FIELD), Terms(sensor_field=2)),
+        (Refinement(psf_gain=GAIN), Terms(psf_gain=1)),
+        (Refinement(stray_light=LIGHT), Terms(stray_light=1)),
+        (Refinement(psf_gain=GAIN, sensor_field=FIELD), Terms(psf_gain=1, sensor_field=2)),
+    ],
+)
+def test_true_terms_are_found(psf, generator, truth, terms):
+    made = pairs(psf, truth, generator)
+    model = PairModel(psf, made, kernels=terms.kernels)
+    fit = model.fit(terms, range(4), steps=8)
+    found = fit.refinement()
+    assert max(model.unexplained(fit, pair) for pair in range(4)) < 0.01 < model.unexplained(model.start(Terms()), 0)
+    if truth.sensor_field:
+        torch.testing.assert_close(found.field_map(SIZE), truth.field_map(SIZE), rtol=0, atol=0.02)
+    if truth.stray_light:
+        torch.testing.assert_close(found.stray_map(SIZE), truth.stray_map(SIZE), rtol=0, atol=1e-3)
+    if truth.psf_gain:
+        error = (found.psf(psf) - truth.psf(psf)).norm() / (truth.psf(psf) - psf).norm()
+        assert error < 0.1
+
+
+def test_the_displacement_of_the_envelope_is_found(psf, generator):
+    truth = Refinement(envelope_shift=(0.02, -0.01))
+    model = PairModel(psf, pairs(psf, truth, generator))
+    down, right = model.fit(Terms(envelope=1), range(4)).displacement
+    assert (down, right) == (pytest.approx(0.02, abs=0.007), pytest.approx(-0.01, abs=0.007))  # half a pixel
+
+
+def test_only_terms_that_explain_left_out_pairs_are_taken(psf, generator):
+    exact = select_terms(psf, lambda: pairs(psf, Refinement(), torch.Generator().manual_seed(1), noise=0.01))
+    assert [step.term for step in exact.taken] == [""]
+    uneven = select_terms(
+        psf, lambda: pairs(psf, Refinement(sensor_field=FIELD), torch.Generator().manual_seed(1), noise=0.003)
+    )
+    assert uneven.taken[1].term == "sensor_field"
+
+
+def test_one_pair_is_too_few(psf, generator):
+    with pytest.raises(ParameterError, match=r"`pairs` \(1\)"):
+        select_terms(psf, lambda: pairs(psf, Refinement(), generator, count=1))
+
+
+@pytest.mark.parametrize("rows", [((1.0, 2.0),), ((1.0,), (1.0,)), ((1.0,), (1.0, 0.0, 0.0), (1.0,))])
+def test_rows_that_are_no_polynomials(rows):
+    with pytest.raises(ParameterError, match="`sensor_field`"):
+        Refinement(sensor_field=rows)
+
+
+def test_calibrate_with_pairs(psf, generator, run, tmp_path, monkeypatch):
+    """The camera file holds the field; a calibration read from it divides by it; the PSF's hash stays."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("mwdn.calibration.term_selection.HIGHEST", {"sensor_field": 2})  # others take 20 times as long
+    write_frame("psf.npy", (psf / psf.max())[0].movedim(0, -1).contiguous().numpy())
+    with PairFile.create("pairs.h5", measurement_shape=(*SIZE, 3), scene_shape=(*SIZE, 3)) as file:
+        for light, scene in pairs(psf, Refinement(sensor_field=FIELD), generator, count=3, noise=0.002):
+            file.append(light[0], scene[0])
+    code, out, err = run("calibrate psf.npy --background 0 --pairs pairs.h5 -o camera.toml")
+    assert code == 0, err
+    assert "sensor field of order 2" in out
+    report = json.loads((tmp_path / "camera-refinement.json").read_text())
+    assert report["tried"][0]["term"] == ""
+    assert len(report["tried"][0]["unexplained"]) == 3
+    assert (tmp_path / "camera-refinement.png").exists()
+    calibration = Calibration.load("camera.toml")
+    assert bool(calibration.refinement) == bool(report["kept"])
+
+
+def test_camera_file_holds_the_terms(psf, generator, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_frame("psf.npy", (psf / psf.max())[0].movedim(0, -1).contiguous().numpy())
+    plain = Calibration.from_file("psf.npy", background=0.0)
+    terms = Refinement(GAIN, (0.02, 0.0), FIELD, LIGHT)
+    write_camera("camera.toml", {"psf": Path("psf.npy"), "background": 0.0, **vars(terms)})
+    calibration = Calibration.load("camera.toml")
+    assert calibration.refinement == terms
+    torch.testing.assert_close(calibration.psf, terms.psf(plain.psf))
+    frame = torch.rand(*SIZE, 3, generator=generator).numpy()
+    torch.testing.assert_close(calibration.correct(frame), terms.measurement(plain.correct(frame)))
+    other = Calibration.load("camera.toml", bin=2)  # polynomials fit any size
+    assert other.size == (32, 40)
+    write_frame("other.npy", psf.flip(-1)[0].movedim(0, -1).contiguous().numpy())
+    assert Calibration.load("camera.toml", psf="other.npy").refinement == replace(
+        terms, psf_gain=(), envelope_shift=None
+    )
