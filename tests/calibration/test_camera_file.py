@@ -65,6 +65,10 @@ def everything(folder):
         "read_noise_electrons": 3.0,
         "full_well_electrons": 15000.0,
         "black_level": 0.01,
+        "psf_gain": ((1.0, 0.1, -0.1),),
+        "envelope_shift": (0.02, 0.0),
+        "sensor_field": ((1.0, 0.1, -0.1),),
+        "stray_light": ((0.0, 0.01, 0.0),),
     }
 
 
