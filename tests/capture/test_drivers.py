@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from importlib import util
 from itertools import pairwise
 from pathlib import Path
@@ -14,8 +15,13 @@ import numpy as np
 import pytest
 
 from mwdn.capture import aravis, open_source
+from mwdn.capture.display import Display
 from mwdn.capture.pixel_formats import choose_format, genicam_format, libcamera_format, unpack, v4l2_format
+from mwdn.capture.recipe import CaptureRecipe, PicturesTable, SessionTable
+from mwdn.capture.screen import Screen
+from mwdn.capture.session import Session
 from mwdn.capture.v4l2 import V4l2Camera
+from mwdn.data import PairFile
 from mwdn.errors import CameraError, ParameterError
 
 FAKE_CAMERA = "arv-fake-gv-camera-0.8"
@@ -257,3 +263,37 @@ def test_a_buffer_has_a_stride_and_a_length():
     assert colours[1, 0].tolist() == [9, 10, 11]
     with pytest.raises(CameraError, match="48 bytes"):
         unpack(b"123", format, (3, 8))
+
+
+class Controlled(Display):
+    """A display whose light Aravis's fake camera follows: the scale of its picture is 1 + log10(exposure / 10 ms)."""
+
+    def __init__(self, camera):
+        self.camera, self._screen = camera, Screen(width_px=96, height_px=54)
+
+    @property
+    def screen(self):
+        return self._screen
+
+    def show(self, picture):
+        self.camera.configure(exposure_s=0.01 * 10 ** ((picture.mean() / 255) ** 2.2 - 1))
+        return time.time()
+
+    def close(self):
+        pass
+
+
+def test_a_gige_vision_camera_streams_into_a_session(gige_camera, tmp_path):
+    (tmp_path / "photos").mkdir()
+    for number in range(4):
+        cv2.imwrite(str(tmp_path / "photos" / f"{number}.png"), np.full((20, 30, 3), 60 * number + 40, np.uint8))
+    pictures = PicturesTable(size=(16, 24))
+    recipe = CaptureRecipe(pictures=pictures, session=SessionTable(settle_s=0.0, patterns=("none",)), folder=tmp_path)
+    with open_source("aravis:127.0.0.1,pixel_format=Mono8", timeout_s=30.0) as camera:
+        session = Session(recipe, camera, Controlled(camera), tmp_path / "pairs.h5")
+        assert session.run() == 4
+    with PairFile(tmp_path / "pairs.h5") as pairs:
+        assert pairs.measurement_shape == (512, 512, 1)
+        light = [(float(scene.mean()), float(measurement.mean())) for measurement, scene in pairs]
+    assert [measured for _, measured in sorted(light)] == sorted(measured for _, measured in light)
+    assert len({round(measured, 2) for _, measured in light}) == 4

@@ -233,7 +233,7 @@ def killing(function, left):
     return call
 
 def run(seed):
-    left = [random.Random(seed).randrange(30, 120)]
+    left = [random.Random(seed).randrange(60, 250)]
     os.fsync = killing(os.fsync, left)
     for name in ("write", "apply"):
         setattr(JournalledFile, name, killing(getattr(JournalledFile, name), left))
@@ -266,12 +266,12 @@ def kill_often(tmp_path, kills, count):
 
 
 def test_sessions_that_are_killed_lose_and_double_no_pair(tmp_path):
-    kill_often(tmp_path, kills=3, count=20)
+    kill_often(tmp_path, kills=3, count=30)
 
 
 @pytest.mark.acceptance
 def test_twenty_kills_lose_and_double_no_pair(tmp_path):
-    kill_often(tmp_path, kills=20, count=150)
+    kill_often(tmp_path, kills=20, count=200)
 
 
 def test_gamma_is_fitted_to_grey_steps(generator):
