@@ -184,7 +184,7 @@ def _levels(calibration: Calibration, frame: Frame) -> Levels:
     image = calibration.psf_image(frame)
     background = estimate_background(image)
     integers = frame.dtype.kind != "f"
-    scale = frames.full_scale(frame) if integers else 1.0
+    scale = frames.full_scale(frame)  # of floats: 1, or that of the bit depth by which they are divided, too
     noise = noise_level(image, parts=1)
     if integers:
         # The noise of rounding, step / sqrt(12): the median of an 8-bit frame's differences often misses it.
