@@ -16,8 +16,8 @@ OUT = Path("results/acceptance/align")
 def test_the_display_of_the_papers_camera_is_found(data: Path, run, method: str) -> None:
     """Its published place is about 137 x 137 px at (168, 168), turned by -1.3 degrees.
 
-    What a reconstruction shows lies within: its sides are 129 (or 131) and 117 (or 120) px long, and both reconstructions
-    agree on the corners within 5 px. The lower side is turned by -1.2 (or -1.8) degrees, the upper one is not.
+    What a reconstruction shows lies within: its sides are 129 (or 131) and 117 (or 120) px long, and both
+    reconstructions agree on the corners within 5 px. The lower side is turned by -1.2 (or -1.8) degrees, the upper not.
     """
     camera = data / "mwdn-camera"
     out = OUT / method
