@@ -11,7 +11,7 @@ SQUARES = 7
 """Squares along each side of the ChArUco board, of the dictionary DICT_4X4_50; markers have 3/4 of a square."""
 
 DOTS = 7
-"""Dots along each side; the first has twice the diameter of the others, so that turns are noticed."""
+"""Dots along each side; the first two have twice the diameter of the others, so that turns and mirrors are noticed."""
 
 STEPS = 9
 """Grey steps from black to white by which a display's gamma is measured."""
@@ -63,7 +63,7 @@ def dots(size: tuple[int, int]) -> Picture:
     y, x = np.mgrid[: size[0], : size[1]]
     light = np.zeros(size)
     for number, (column, row) in enumerate(dot_centres(size)):
-        radius = min(size) / DOTS / (4 if number == 0 else 8)
+        radius = min(size) / DOTS / (4 if number < 2 else 8)
         distance = np.hypot(x - column, y - row)
         light = np.maximum(light, np.clip(radius + 0.5 - distance, 0, 1))
     return np.repeat(np.rint(255 * light).astype(np.uint8)[..., None], 3, axis=-1)

@@ -1,5 +1,6 @@
 """Captured pairs before they are aligned: raw frames of the camera, and the pictures that were on the display."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,10 @@ from mwdn.io.raw import Mosaic
 from mwdn.types import Frame, Image, Measurement
 
 _ADVICE = "Capture it again: `mwdn capture`."
+
+_PATTERNS = ("charuco", "dots")
+_FRAMES = 16
+"""Most frames of a pattern, and of the dark display, that are averaged."""
 
 SRGB = "srgb"
 
@@ -48,7 +53,7 @@ class CapturedPairs:
             frames = replace(frames, bit_depth=int(attributes["bit_depth"]))
         if frames.mosaic is None and (mosaic := attributes.get("mosaic")):
             frames = replace(frames, mosaic=_as_mosaic(mosaic))
-        self.calibration = replace(calibration, frames=frames)
+        self.calibration = _with_ambient(path, replace(calibration, frames=frames))
         self.display_gamma = as_gamma(display_gamma)
         self._file: Any = None
         self._rows: dict[str, Any] = {}
@@ -81,9 +86,38 @@ class CapturedPairs:
         """
         return as_light(self._read("scene", number), self.display_gamma)[None]
 
+    def patterns(self) -> Iterator[tuple[Measurement, Image]]:
+        """Mean measurement and light of each pattern for alignment that the session has.
+
+        Raises:
+            MwdnError: as for `measurement` and `picture`.
+        """
+        for name in _PATTERNS:
+            parts = [find_rows(self.path, self._file, f"patterns/{name}/{part}", _ADVICE) for part in NAMES]
+            if None in parts or not all(map(len, parts)) or parts[1].shape[1:3] != self.picture_size:
+                continue
+            with as_damage(f"`patterns/{name}` of `{self.path}` cannot be read", _ADVICE):
+                frames, picture = parts[0][:_FRAMES], parts[1][0]
+            measurements = [self.calibration.correct(frame) for frame in frames]
+            yield torch.stack(measurements).mean(0), as_light(picture, self.display_gamma)[None]
+
     def _read(self, name: str, number: int) -> Frame:
         with as_damage(f"`{name}` {number} of `{self.path}` cannot be read", _ADVICE):
             return np.asarray(self._rows[name][number])
+
+
+def _with_ambient(path: Path, calibration: Calibration) -> Calibration:
+    """The calibration with the session's frames of a dark display as its ambient frame, unless it has one."""
+    if calibration.ambient is not None:
+        return calibration
+    with open_hdf5(path, _ADVICE) as file:
+        rows = find_rows(path, file, "references/ambient/measurement", _ADVICE)
+        if rows is None or not len(rows):
+            return calibration
+        with as_damage(f"`references/ambient` of `{path}` cannot be read", _ADVICE):
+            frames = [rows[int(number)] for number in np.linspace(0, len(rows) - 1, min(len(rows), _FRAMES))]
+    images = [calibration.frames.normalise(frame) for frame in frames]
+    return replace(calibration, ambient=torch.stack(images).mean(0))
 
 
 def as_light(picture: Frame, gamma: float | str) -> Tensor:

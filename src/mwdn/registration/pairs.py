@@ -29,12 +29,15 @@ def chosen(count: int, most: int) -> list[int]:
 
 
 def reconstruct_views(pairs: CapturedPairs, reconstruct: Reconstructor, rows: list[int], track: Track = iter) -> Views:
-    """Reconstruct some of the captures, for `mwdn.registration.estimate`.
+    """Reconstruct the session's patterns and some of the captures, for `mwdn.registration.estimate`.
 
     Raises:
         MwdnError: a pair is damaged, or does not fit the camera.
     """
     scenes, pictures = [], []
+    for measurement, picture in pairs.patterns():
+        scenes.append(reconstruct(measurement)[0])
+        pictures.append(picture[0])
     for row in track(rows):
         scenes.append(reconstruct(pairs.measurement(row))[0])
         pictures.append(pairs.picture(row)[0])
