@@ -27,7 +27,7 @@ def read(tmp_path):
     return call
 
 
-OTHERS = ("camera-", "benchmark-")
+OTHERS = ("camera-", "benchmark-", "capture")
 TRAININGS = [name for name in packaged_recipes() if not name.startswith(OTHERS)]
 
 

@@ -145,9 +145,8 @@ class Calibration:
         frame, frames = frames.read_stored(path)
         dark_frame = None if dark is None else frames.read(dark)
         ambient_frame = None if ambient is None else frames.read(ambient)
-        return cls._from_frame(
-            frame, frames, psf_format, dark=dark_frame, ambient=ambient_frame, corrections=corrections
-        )
+        others = {"dark": dark_frame, "ambient": ambient_frame}
+        return cls._from_frame(frame, frames, psf_format, corrections=corrections, **others)
 
     @classmethod
     def from_array(
@@ -251,11 +250,8 @@ class Calibration:
 
     @property
     def binned_sensor(self) -> Sensor | None:
-        """The sensor of a measurement's pixels: binned, n of them hold n times the electrons of one."""
-        n = self.frames.bin**2
-        return self.sensor and replace(
-            self.sensor, full_well=n * self.sensor.full_well, read_noise=n**0.5 * self.sensor.read_noise
-        )
+        """The sensor of a measurement's pixels."""
+        return self.sensor and self.sensor.binned(self.frames.bin)
 
     def saturated_part(self, frame: Frame) -> float:
         """Fraction of a raw frame's pixels that are saturated; 0 for floats, which have no known maximum."""

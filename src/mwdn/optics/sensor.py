@@ -1,6 +1,6 @@
 """Image sensor: shot noise, read noise, black level, saturation, quantisation; gamma-coded files."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -42,6 +42,11 @@ class Sensor:
             raise ParameterError(f"`bit_depth` ({self.bit_depth}) must be 1 to 16.")
         if not 0 <= self.black_level < 1:
             raise ParameterError(f"`black_level` ({self.black_level}) must be in [0, 1): a fraction of the full scale.")
+
+    def binned(self, side: int) -> "Sensor":
+        """The sensor of pixels that sum side x side of this one's: n of them hold n times the electrons."""
+        n = side**2
+        return replace(self, full_well=n * self.full_well, read_noise=n**0.5 * self.read_noise)
 
     def expose(self, light: Image, *, generator: torch.Generator | None = None) -> Image:
         """One capture of the light on the sensor.

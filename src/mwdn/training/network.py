@@ -1,6 +1,5 @@
 """The network of a run: its initial weights, and the moving average of its weights."""
 
-import operator
 from typing import Any
 
 import torch
@@ -36,16 +35,21 @@ def build_network(recipe: Recipe) -> nn.Module:
 
 
 def grown(weights: dict[str, Tensor], network: nn.Module) -> dict[str, Tensor]:
-    """Weights for a network with more inputs or outputs behind those there are; the new ones are zero."""
-    result = {}
+    """Weights for a network with more inputs or outputs behind those there are; the new ones are zero.
+
+    Weights of a network that is wider inside, so in several axes at once, stay as they are.
+    """
+    result = dict(weights)
     for name, wanted in network.state_dict().items():
         value = weights.get(name)
-        if value is not None and value.ndim == wanted.ndim and all(map(operator.le, value.shape, wanted.shape)):
-            result[name] = torch.zeros_like(wanted)
-            result[name][tuple(slice(length) for length in value.shape)] = value
-        elif value is not None:
-            result[name] = value
-    return result | {name: value for name, value in weights.items() if name not in result}
+        if value is None or value.shape == wanted.shape or value.ndim != wanted.ndim:
+            continue
+        pairs = [(old, new) for old, new in zip(value.shape, wanted.shape, strict=True) if old != new]
+        if len(pairs) > 1 or pairs[0][0] > pairs[0][1]:
+            return weights
+        result[name] = torch.zeros_like(wanted)
+        result[name][tuple(slice(length) for length in value.shape)] = value
+    return result
 
 
 @torch.no_grad()

@@ -59,9 +59,8 @@ class Schedule:
             them from.
         anchor: decay towards the weights of `start`, times the learning rate. The start is validated, too, and kept as
             the best if no step improves on it.
-        filter_rate: learning rate of the logarithms of the Wiener filters' w and lambda, over that of the other
-            parameters. At 1, w and lambda hardly move: Adam changes each number by about the learning rate a step, and
-            an optimum may be 5 away.
+        filter_rate: learning rate of the logarithms of the filters' w and lambda over that of the other parameters. At
+            1 they hardly move: Adam changes a number by about the learning rate a step, and 4 may be needed.
     """
 
     steps: int = 2000
@@ -107,12 +106,9 @@ class Schedule:
             raise ParameterError(f"`anchor` ({self.anchor}) pulls towards the weights of `start`, which is missing.")
         if not 0 <= self.ema < 1:
             raise ParameterError(f"`ema` ({self.ema}) must be in [0, 1).")
-        for kind, name, names in (
-            ("lr_schedule", self.lr_schedule, LR_SCHEDULES),
-            ("optimiser", self.optimiser, OPTIMISERS),
-        ):
-            if name not in names:
-                raise UnknownNameError(kind, name, names)
+        for kind, names in (("lr_schedule", LR_SCHEDULES), ("optimiser", OPTIMISERS)):
+            if getattr(self, kind) not in names:
+                raise UnknownNameError(kind, getattr(self, kind), names)
 
 
 @dataclass(frozen=True)
