@@ -105,6 +105,15 @@ def test_a_page_that_does_not_answer_is_named_and_a_new_one_gets_the_picture():
             display.show(picture(1))
 
 
+def test_a_session_waits_until_the_page_has_its_final_size():
+    with PageDisplay(**CM) as display, connect(address(display)) as page:
+        page.send(json.dumps({"width": 60, "height": 40, "ready": False}))
+        with pytest.raises(DisplayError, match="full-screen"):
+            display.wait(0.2)
+        page.send(json.dumps({"width": 90, "height": 70, "ready": True}))
+        assert display.wait(10.0).width_px == 90
+
+
 def test_only_the_newest_page_is_the_display():
     display = PageDisplay(**CM)
     with connect(address(display)) as first:
@@ -188,7 +197,7 @@ def chromium(url, folder, *options):
 
 
 def test_chromium_shows_each_pixel(tmp_path):
-    with PageDisplay(**CM, show_s=60.0) as display, chromium(display.url, tmp_path):
+    with PageDisplay(**CM, show_s=60.0) as display, chromium(f"{display.url}#start", tmp_path):
         screen = display.wait(60.0)
         assert screen.width_px == 800
         for seed in range(3):
@@ -200,7 +209,7 @@ def test_chromium_shows_each_pixel(tmp_path):
 def test_chromium_with_pixels_of_its_own_still_shows_each_pixel(tmp_path):
     with (
         PageDisplay(**CM, show_s=60.0, token="a b&c") as display,
-        chromium(display.url, tmp_path, "--force-device-scale-factor=1.5"),
+        chromium(f"{display.url}#start", tmp_path, "--force-device-scale-factor=1.5"),
     ):
         screen = display.wait(60.0)
         assert screen.width_px == 1200

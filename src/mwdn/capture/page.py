@@ -84,13 +84,13 @@ class PageDisplay(Display):
             raise DisplayError("The display page could not be served. Choose another `port`.")
 
     def wait(self, seconds: float | None = None) -> Screen:
-        """Wait for a page; without end unless ``seconds`` are given.
+        """Wait for a page on which a person has pressed start; without end unless ``seconds`` are given.
 
         Raises:
-            DisplayError: none was opened in time.
+            DisplayError: none was opened and started in time.
         """
         with self._hub.changed:
-            if not self._hub.changed.wait_for(lambda: self._hub.size is not None, seconds):
+            if not self._hub.changed.wait_for(lambda: self._hub.size is not None and self._hub.ready, seconds):
                 raise DisplayError(f"No page is open. Open {self.url} on the display, full-screen.")
         return self.screen
 

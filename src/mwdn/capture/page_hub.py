@@ -44,7 +44,7 @@ class Hub:
         self.token, self.cm, self.any_host = token, cm, any_host
         self.changed, self.started = threading.Condition(), threading.Event()
         self.size: tuple[int, int] | None = None
-        self.visible = True
+        self.visible = self.ready = True
         self.answers: dict[int, dict[str, Any]] = {}
         self._number, self._current = 0, b""
         self._page: Any = None
@@ -141,6 +141,7 @@ class Hub:
         resend = "id" not in message and self.size is None
         with self.changed:
             self.size, self.visible = size, bool(message.get("visible", True))
+            self.ready = bool(message.get("ready", True))
             if "id" in message:
                 self.answers[int(message["id"])] = message
             self.changed.notify_all()

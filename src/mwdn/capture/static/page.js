@@ -8,6 +8,8 @@ const context = canvas.getContext("2d", { alpha: false, colorSpace: "srgb", will
 let socket = null;
 let setup = null;
 let latest = 0;
+// The session starts once the page has its final size: full-screen, or by the second button. "#start" is for kiosks.
+let started = location.hash === "#start" || window.matchMedia("(display-mode: fullscreen)").matches;
 
 function measure(entry) {
   const ratio = window.devicePixelRatio;
@@ -20,7 +22,7 @@ function measure(entry) {
   }
   panel.size.textContent = `${width} × ${height} pixels`;
   if (setup) {
-    document.getElementById("ruler").style.width = `${(10 / setup.width_cm) * canvas.clientWidth}px`;
+    document.getElementById("ruler").style.width = `${(10 / setup.width_cm) * window.screen.width}px`;
   }
   send({});
 }
@@ -28,7 +30,7 @@ function measure(entry) {
 function send(message) {
   if (socket?.readyState === WebSocket.OPEN) {
     const visible = document.visibilityState === "visible";
-    socket.send(JSON.stringify({ width: canvas.width, height: canvas.height, visible, ...message }));
+    socket.send(JSON.stringify({ width: canvas.width, height: canvas.height, visible, ready: started, ...message }));
   }
 }
 
@@ -70,7 +72,7 @@ function connect() {
   socket = new WebSocket(address);
   socket.binaryType = "arraybuffer";
   socket.onopen = () => {
-    panel.state.textContent = "Connected. The session starts when the page is ready.";
+    panel.state.textContent = "Connected. The session starts when you press a button.";
     measure();
   };
   socket.onmessage = (event) => {
@@ -104,7 +106,16 @@ async function stayAwake() {
   }
 }
 
+function start() {
+  started = true;
+  panel.state.textContent = "The session starts.";
+  measure();
+}
+
 document.getElementById("full").onclick = () => document.documentElement.requestFullscreen();
+document.getElementById("window").onclick = start;
+// The window takes its final size some frames after the event.
+document.addEventListener("fullscreenchange", () => document.fullscreenElement && setTimeout(start, 1000));
 document.addEventListener("visibilitychange", () => {
   send({});
   if (document.visibilityState === "visible") stayAwake();
