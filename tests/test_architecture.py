@@ -30,6 +30,7 @@ FLOORS = [
     "diagnosis",
     "inference",
     "registration",
+    "preview",
     "training",
     "export",
     "benchmark",
@@ -40,7 +41,7 @@ FLOORS = [
 """From the ground up: a folder imports from itself and from those before it in this list, nothing else."""
 
 NETWORKS_MAY_IMPORT = {"errors", "types", "fourier", "optics", "solvers", "networks"}
-HEAVY = {"cv2", "h5py", "starlette", "matplotlib", "tifffile", "rawpy", "skimage", "scipy"}
+HEAVY = {"cv2", "h5py", "starlette", "uvicorn", "matplotlib", "tifffile", "rawpy", "skimage", "scipy"}
 
 LONGEST = 300
 """Lines of a file."""

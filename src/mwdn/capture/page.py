@@ -4,7 +4,6 @@ The page draws each picture pixel by pixel, waits two animation frames, so that 
 answers with a checksum of the pixels it has drawn.
 """
 
-import socket
 import threading
 import time
 from urllib.parse import quote
@@ -12,9 +11,10 @@ from urllib.parse import quote
 import numpy as np
 
 from mwdn.capture.display import Display
-from mwdn.capture.page_hub import LOOPBACK, MESSAGE_BYTES, Hub
+from mwdn.capture.page_hub import MESSAGE_BYTES, Hub
 from mwdn.capture.screen import Picture, Screen
-from mwdn.errors import DisplayError, ParameterError, reason
+from mwdn.errors import DisplayError, reason
+from mwdn.runtime.web_access import LOOPBACK, check_token, listen
 
 SHOW_S = 30.0
 """Seconds in which a picture must be shown: a page that was closed meanwhile can be opened again."""
@@ -48,12 +48,11 @@ class PageDisplay(Display):
         token: str = "",
         show_s: float = SHOW_S,
     ) -> None:
-        if host not in LOOPBACK and not token:
-            raise ParameterError(f"`host` ({host}) can be reached by other computers: it needs a `token`, a secret.")
+        check_token(host, token)
         self._cm = {"width_cm": width_cm, "height_cm": height_cm, "distance_cm": distance_cm}
         Screen(width_px=1, height_px=1, **self._cm)
         self.show_s = show_s
-        self._socket = _listen(host, port)
+        self._socket = listen(host, port)
         address = f"[{host}]" if ":" in host else host
         self.url = f"http://{address}:{self._socket.getsockname()[1]}/"
         if token:
@@ -158,15 +157,3 @@ def checksum(picture: Picture) -> int:
     numbers = rgba.reshape(-1, 4).view("<u4")[:, 0].astype(np.uint64)
     weights = 2 * np.arange(len(numbers), dtype=np.uint64) + 1
     return int((numbers * weights % 2**32).sum() % 2**32)
-
-
-def _listen(host: str, port: int) -> socket.socket:
-    listener = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
-    try:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind((host, port))
-        listener.listen()  # before the server does: a page that comes early waits
-    except (OSError, OverflowError) as error:
-        listener.close()
-        raise ParameterError(f"`host` and `port` ({host}:{port}) cannot be used: {reason(error)}.") from error
-    return listener

@@ -1,23 +1,19 @@
 """The web application behind a display page: one page at a time, pictures to it and answers from it."""
 
 import asyncio
-import hmac
 import json
 import threading
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 import numpy as np
 
 from mwdn.capture.screen import Picture
 from mwdn.errors import ShapeError
+from mwdn.runtime.web_access import is_allowed
 
 STATIC = Path(__file__).parent / "static"
 FILES = {"/": "page.html", "/page.js": "page.js", "/page.css": "page.css"}
-
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
-"""Addresses that other computers cannot reach; all others need a token."""
 
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
@@ -101,18 +97,11 @@ class Hub:
         if self._page is not None:
             await self._page.close(1001)
 
-    def _is_allowed(self, request: Any) -> bool:  # noqa: ANN401
-        """The token; without one, no page of another site (Origin), also behind a forged name (Host)."""
-        given = request.query_params.get("token", "")
-        host, origin = request.headers.get("host", ""), request.headers.get("origin", "")
-        name = urlsplit(f"//{host}").hostname or ""
-        is_own = (not origin or urlsplit(origin).netloc == host) and (self.any_host or name in LOOPBACK)
-        return is_own and hmac.compare_digest(given.encode(), self.token.encode())
-
     async def _connect(self, page: Any) -> None:  # noqa: ANN401
         from starlette.websockets import WebSocketDisconnect
 
-        if not self._is_allowed(page):
+        given = page.query_params.get("token", "")
+        if not is_allowed(page.headers, given, self.token, any_host=self.any_host):
             await page.close(1008)  # before it is accepted: status 403
             return
         await page.accept()

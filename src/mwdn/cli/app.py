@@ -62,6 +62,10 @@ COMMANDS = {
         "demo:demo",
         "Simulate a small lensless camera and reconstruct its captures with every method that needs no training.",
     ),
+    "preview": (
+        "preview:preview",
+        "Serve a page that reconstructs captures, and an HTTP interface: drop a PSF and a capture, or try the samples.",
+    ),
     "doctor": ("doctor:doctor", "Print versions, devices, supported precisions and threads."),
     "import": (
         "import_:import_",

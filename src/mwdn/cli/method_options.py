@@ -1,57 +1,19 @@
-"""Options of solvers and networks: read from their signatures and docstrings, and converted from the command line."""
+"""Options of solvers and networks, converted from the command line."""
 
-import inspect
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from itertools import chain
-from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 from cyclopts import App, Parameter
 
 from mwdn.cli.wrong_calls import long_options, unknown_option
 from mwdn.errors import ParameterError, type_in_words
+from mwdn.inference.method_options import Option, list_options
 from mwdn.solvers import SOLVERS
 
 MethodOptions = Annotated[Any, Parameter(converter=lambda _, tokens: tokens, show=False)]
 """Type of a command's ``**options``: the tokens of each ``--name value`` that the command itself does not have."""
-
-
-class Option(NamedTuple):
-    """A keyword argument of a solver or network.
-
-    Args:
-        name: of the argument.
-        type: as annotated.
-        default: its value unless given.
-        meaning: its entry in the docstring.
-    """
-
-    name: str
-    type: Any
-    default: Any
-    meaning: str
-
-
-def list_options(method: Callable[..., Any]) -> list[Option]:
-    """Keyword arguments of the class of a solver or network."""
-    meanings = _docstring_arguments(inspect.getdoc(method) or "")
-    return [
-        Option(name, parameter.annotation, parameter.default, meanings.get(name, ""))
-        for name, parameter in inspect.signature(method).parameters.items()
-    ]
-
-
-def _docstring_arguments(docstring: str) -> dict[str, str]:
-    """Entries of a Google-style Args section, each as one line."""
-    section = re.search(r"^Args:\n((?: +.*\n?|\n)*)", docstring, re.MULTILINE)
-    entries = re.findall(r"^ {4}(\w+): (.*(?:\n {5,}.*)*)", section[1], re.MULTILINE) if section else []
-    return {name: " ".join(text.split()) for name, text in entries}
-
-
-def summary(method: Callable[..., Any]) -> str:
-    """First line of a docstring."""
-    return (inspect.getdoc(method) or "").partition("\n")[0]
 
 
 def read_options(

@@ -6,9 +6,9 @@ from rich.markup import escape
 from rich.padding import Padding
 from rich.table import Table
 
-from mwdn.cli.method_options import Option, list_options, summary
 from mwdn.cli.terminal import results
 from mwdn.errors import UnknownNameError, type_in_words
+from mwdn.inference.method_options import Option, list_options, summary
 from mwdn.networks import NETWORKS
 from mwdn.solvers import SOLVERS
 from mwdn.weights.bundled import BUNDLED, find_weights

@@ -16,6 +16,7 @@ GO_ON = {
     "reconstruct": "Finished pictures are kept. The same command with --resume goes on.",
     "train": "What is saved is kept. The same command resumes.",
     "capture": "All pairs so far are kept. The same command continues.",
+    "preview": "Stored cameras and recordings are kept.",
     "benchmark": "Finished networks and scores are kept. The same command resumes.",
 }
 """What to say where a command does not say more."""

@@ -4,7 +4,9 @@ import logging
 import math
 import os
 import re
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -23,6 +25,8 @@ MAX_PIXELS = 2**28
 """16,384 x 16,384, more than any sensor has. In RGB that is 1.5 GiB of uint16 or 3 GiB of float32; a header that
 claims more is damaged, or made to exhaust the reader's memory."""
 
+_most_pixels = ContextVar("most_pixels", default=MAX_PIXELS)
+
 _SIGNATURES = {b"\x89PNG\r\n\x1a\n": "PNG", b"\xff\xd8\xff": "JPEG", b"BM": "BMP", b"\x93NUMPY": "NPY"}
 _SIGNATURES |= dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "TIFF")  # + is BigTIFF
 _SIGNATURES |= dict.fromkeys((b"P5\n", b"P6\n", b"P5 ", b"P6 "), "PGM")
@@ -33,6 +37,16 @@ _PIL_MODES = ("L", "RGB", "F", "I;16", "I;16L", "I;16B")
 
 # tifffile logs unusual tags. Without a handler these lines would reach the terminal.
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
+
+
+@contextmanager
+def at_most_pixels(count: int) -> Iterator[None]:
+    """Refuse frames of more pixels, from their headers; for this thread, where strangers send the files."""
+    token = _most_pixels.set(min(count, MAX_PIXELS))
+    try:
+        yield
+    finally:
+        _most_pixels.reset(token)
 
 
 def read(path: Path, *, photograph: bool) -> Frame:
@@ -138,8 +152,8 @@ def _frame_shape(shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, ...
         raise FrameShapeError(
             f"has the shape ({' x '.join(map(str, shape))}); one frame is (H, W) or (H, W, 1 or 3 channels).{way_out}"
         )
-    if axes[0] * axes[1] > MAX_PIXELS:
-        raise ImageError(f"claims {axes[0]:,} x {axes[1]:,} pixels; at most {MAX_PIXELS:,} are read. Crop it.")
+    if axes[0] * axes[1] > _most_pixels.get():
+        raise ImageError(f"claims {axes[0]:,} x {axes[1]:,} pixels; at most {_most_pixels.get():,} are read. Crop it.")
     return axes
 
 

@@ -1,0 +1,52 @@
+"""`mwdn preview`: a page that shows what a lensless camera sees, and the HTTP interface behind it."""
+
+import secrets
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from mwdn.calibration import Calibration
+from mwdn.cli.camera import CameraOptions
+from mwdn.cli.terminal import say
+from mwdn.preview.cameras import Cameras
+from mwdn.preview.limits import Limits
+from mwdn.preview.server import log_to_stderr, make_server
+from mwdn.runtime.web_access import LOOPBACK
+
+OWN = "camera"
+"""Name of the command line's camera on the page."""
+
+
+def preview(
+    camera: CameraOptions = CameraOptions(),
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8032,
+    token: str = "",
+    out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("results/preview"),
+    device: str | None = None,
+    log: Annotated[bool, Parameter(negative=())] = False,
+) -> None:
+    """Serve a page that reconstructs captures, and an HTTP interface: drop a PSF and a capture, or try the samples.
+
+    Args:
+        camera: a camera that the page offers beside the samples.
+        host: address to listen on. All but 127.0.0.1 can be reached by other computers, and need a token.
+        port: to listen on; 0 for a free one.
+        token: secret that requests must know; one is made up where it is needed.
+        out: folder of stored calibrations.
+        device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
+        log: print each request to standard error, one JSON object a line.
+    """
+    given: dict[str, Calibration] = {}
+    if camera.psf is not None:
+        given[OWN] = camera.load()
+    limits = Limits()
+    cameras = Cameras(limits, out / "cameras", given)
+    token = token or ("" if host in LOOPBACK else secrets.token_urlsafe(16))
+    server = make_server(cameras, limits, host=host, port=port, token=token, device=device)
+    if log:
+        log_to_stderr()
+    say(f"Open {server.url} (Ctrl-C ends the server)")
+    server.run()

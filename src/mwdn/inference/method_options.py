@@ -1,0 +1,43 @@
+"""Options of solvers and networks, read from their signatures and docstrings."""
+
+import inspect
+import re
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+
+class Option(NamedTuple):
+    """A keyword argument of a solver or network.
+
+    Args:
+        name: of the argument.
+        type: as annotated.
+        default: its value unless given.
+        meaning: its entry in the docstring.
+    """
+
+    name: str
+    type: Any
+    default: Any
+    meaning: str
+
+
+def list_options(method: Callable[..., Any]) -> list[Option]:
+    """Keyword arguments of the class of a solver or network."""
+    meanings = _docstring_arguments(inspect.getdoc(method) or "")
+    return [
+        Option(name, parameter.annotation, parameter.default, meanings.get(name, ""))
+        for name, parameter in inspect.signature(method).parameters.items()
+    ]
+
+
+def _docstring_arguments(docstring: str) -> dict[str, str]:
+    """Entries of a Google-style Args section, each as one line."""
+    section = re.search(r"^Args:\n((?: +.*\n?|\n)*)", docstring, re.MULTILINE)
+    entries = re.findall(r"^ {4}(\w+): (.*(?:\n {5,}.*)*)", section[1], re.MULTILINE) if section else []
+    return {name: " ".join(text.split()) for name, text in entries}
+
+
+def summary(method: Callable[..., Any]) -> str:
+    """First line of a docstring."""
+    return (inspect.getdoc(method) or "").partition("\n")[0]

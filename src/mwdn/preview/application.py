@@ -1,0 +1,301 @@
+"""The web application: the page, and the HTTP interface that it uses too."""
+
+import asyncio
+import json
+import tempfile
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from anyio import CapacityLimiter, to_thread
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+
+from mwdn.calibration import Calibration
+from mwdn.errors import MwdnError, ParameterError
+from mwdn.io.images import write_frame
+from mwdn.preview.cameras import OPTIONS, Cameras, checked_camera, describe
+from mwdn.preview.guard import Guard, error_response, log
+from mwdn.preview.jobs import ENDED, Job, Jobs
+from mwdn.preview.limits import Limits, RefusedError
+from mwdn.preview.methods import checked_options, list_methods
+from mwdn.preview.metrics import Metrics
+from mwdn.preview.openapi import openapi
+from mwdn.preview.psf_report import psf_report
+from mwdn.preview.reconstruction import Order, Reconstructions
+from mwdn.preview.result import MEDIA, Look, encode
+from mwdn.preview.samples import CAMERA, NAMES, sample_capture
+from mwdn.preview.uploads import Form, parse_number, parse_white_balance, read_form
+from mwdn.version import __version__
+
+STATIC = Path(__file__).parent / "static"
+FILES = ("capture", "psf")
+TEXTS = ("camera", "calibration", "method", "options", "align", "trust", "format", "exposure", "white_balance")
+
+
+class Preview:
+    """The server's parts, and its routes.
+
+    Args:
+        cameras: calibrations by name.
+        limits: of the server.
+        device: of the reconstructions, see `mwdn.Reconstructor`.
+    """
+
+    def __init__(self, cameras: Cameras, limits: Limits = Limits(), *, device: str | None = None) -> None:
+        self.cameras, self.limits, self.metrics = cameras, limits, Metrics()
+        self.jobs, self.reconstructions = Jobs(limits), Reconstructions(limits, device)
+        self.metrics.gauges |= {
+            "mwdn_jobs_waiting": lambda: self.jobs.waiting,
+            "mwdn_jobs_running": lambda: self.jobs.running,
+        }
+
+    def app(self, *, token: str = "", any_host: bool = False) -> Any:  # noqa: ANN401
+        """The application.
+
+        Args:
+            token: secret that requests must know; empty if none is needed.
+            any_host: it may be called by any name, because it needs a token.
+        """
+
+        @asynccontextmanager
+        async def lifespan(_: Starlette) -> AsyncIterator[None]:
+            self._encoders = CapacityLimiter(2)
+            yield
+            await to_thread.run_sync(self.jobs.close)
+
+        routes = [
+            Route("/", self.page),
+            Route("/healthz", self.health),
+            Route("/metrics", self.prometheus),
+            Route("/openapi.json", self.document),
+            Route("/methods", self.methods),
+            Route("/samples", self.samples),
+            Route("/samples/{name}", self.sample),
+            Route("/cameras", self.list_cameras),
+            Route("/cameras", self.add_camera, methods=["POST"]),
+            Route("/cameras/{name}", self.camera),
+            Route("/cameras/{name}", self.remove_camera, methods=["DELETE"]),
+            Route("/inspect", self.inspect, methods=["POST"]),
+            Route("/cameras/{name}/psf", self.camera_psf),
+            Route("/reconstruct", self.reconstruct, methods=["POST"]),
+            Route("/jobs", self.add_job, methods=["POST"]),
+            Route("/jobs/{id}", self.job),
+            Route("/jobs/{id}", self.cancel, methods=["DELETE"]),
+            Route("/jobs/{id}/picture", self.picture),
+            Route("/jobs/{id}/measurement", self.measurement),
+            Mount("/static", StaticFiles(directory=STATIC)),
+        ]
+        handlers = {MwdnError: _failed, HTTPException: _failed, 500: _failed}
+        app = Starlette(routes=routes, lifespan=lifespan, exception_handlers=handlers)
+        return Guard(app, self.limits, self.metrics, token=token, any_host=any_host)
+
+    async def page(self, _: Request) -> Response:
+        """The page."""
+        return FileResponse(STATIC / "index.html")
+
+    async def health(self, _: Request) -> Response:
+        """Whether requests are served."""
+        return JSONResponse({"status": "ok", "version": __version__})
+
+    async def prometheus(self, _: Request) -> Response:
+        """Metrics."""
+        return PlainTextResponse(self.metrics.render(), media_type="text/plain; version=0.0.4")
+
+    async def document(self, _: Request) -> Response:
+        """The interface, as OpenAPI 3.1."""
+        return JSONResponse(openapi(self.limits))
+
+    async def methods(self, _: Request) -> Response:
+        """Methods and their options."""
+        return JSONResponse({"methods": list_methods(), "camera_options": OPTIONS, "limits": vars(self.limits)})
+
+    async def samples(self, _: Request) -> Response:
+        """Captures to try."""
+        return JSONResponse({"camera": CAMERA, "captures": NAMES})
+
+    async def sample(self, request: Request) -> Response:
+        """A capture to try, as a 16-bit PNG."""
+        name = request.path_params["name"]
+        if name not in NAMES:
+            raise RefusedError(404, f"No sample of this name. Known: {', '.join(NAMES)}.")
+        return Response(await self._thread(partial(_png, name)), media_type="image/png")
+
+    async def list_cameras(self, _: Request) -> Response:
+        """Calibrations by name."""
+        return JSONResponse({"cameras": await self._thread(self.cameras.list)})
+
+    async def camera(self, request: Request) -> Response:
+        """One calibration."""
+        name = request.path_params["name"]
+        calibration = await self._thread(partial(self.cameras.get, name))
+        kind = next((each["kind"] for each in self.cameras.list() if each["name"] == name), "sample")
+        return JSONResponse(describe(name, kind, calibration))
+
+    async def add_camera(self, request: Request) -> Response:
+        """Store a calibration."""
+        form = await read_form(request, self.limits, ("psf",), ("name", "calibration"))
+        name, psf, options = form.texts.get("name", ""), form.file("psf"), form.json("calibration")
+
+        def add(job: Job) -> None:
+            self.cameras.add(name, psf, options)
+
+        await self._ended(request, self.jobs.submit(add, size=len(psf)))
+        return JSONResponse(describe(name, "stored", self.cameras.get(name)), 201)
+
+    async def remove_camera(self, request: Request) -> Response:
+        """Remove a stored calibration."""
+        await self._thread(partial(self.cameras.remove, request.path_params["name"]))
+        return Response(status_code=204)
+
+    async def inspect(self, request: Request) -> Response:
+        """What `mwdn inspect` says about a PSF."""
+        form = await read_form(request, self.limits, ("psf",), ("camera", "calibration"))
+        read, found = self._calibration(form), {}
+
+        def inspect(job: Job) -> None:
+            found.update(psf_report(read()))
+
+        await self._ended(request, self.jobs.submit(inspect, size=len(form.files.get("psf", b""))))
+        return JSONResponse(found)
+
+    async def camera_psf(self, request: Request) -> Response:
+        """A picture of the PSF."""
+        calibration = await self._thread(partial(self.cameras.get, request.path_params["name"]))
+        return await self._encoded(lambda look: encode(calibration.psf, look), _look(request.query_params))
+
+    async def reconstruct(self, request: Request) -> Response:
+        """Reconstruct a capture: the picture, with the report in a header."""
+        form = await read_form(request, self.limits, FILES, TEXTS)
+        look = _look(form.texts)
+        job = await self._ended(request, self._submit(form))
+        result = self.jobs.result(job.id)
+        headers = {"Mwdn-Report": json.dumps(result.report, separators=(",", ":")), "Location": f"/jobs/{job.id}"}
+        return await self._encoded(result.encode, look, headers)
+
+    async def add_job(self, request: Request) -> Response:
+        """Start a reconstruction, and answer at once."""
+        form = await read_form(request, self.limits, FILES, TEXTS)
+        job = self._submit(form)
+        return JSONResponse(job.content(), 202, {"Location": f"/jobs/{job.id}"})
+
+    async def job(self, request: Request) -> Response:
+        """State, progress and report of a job."""
+        return JSONResponse(self.jobs.get(request.path_params["id"]).content())
+
+    async def cancel(self, request: Request) -> Response:
+        """Cancel a job."""
+        return JSONResponse(self.jobs.cancel(request.path_params["id"]).content())
+
+    async def picture(self, request: Request) -> Response:
+        """The picture of a job; there before it is checked."""
+        return await self._encoded(self.jobs.result(request.path_params["id"]).encode, _look(request.query_params))
+
+    async def measurement(self, request: Request) -> Response:
+        """The measurement of a job: the capture, corrected, cropped and binned."""
+        measurement = self.jobs.result(request.path_params["id"]).measurement
+        return await self._encoded(lambda look: encode(measurement.clamp(min=0), look), _look(request.query_params))
+
+    def _submit(self, form: Form) -> Job:
+        """Check a form as far as that is fast, and queue its reconstruction."""
+        capture, read = form.file("capture"), self._calibration(form)
+        method = form.texts.get("method") or "universal-small"
+        trust = form.flag("trust")
+        order = Order(
+            capture=capture,
+            calibration=read,
+            method=method,
+            options=checked_options(method, form.json("options")),
+            align=form.flag("align"),
+            trust=trust is not False,
+        )
+        job = self.jobs.submit(
+            partial(self.reconstructions.run, order=order), size=len(capture) + len(form.files.get("psf", b""))
+        )
+        job.when_ended(lambda: self._count(job, method))
+        return job
+
+    def _calibration(self, form: Form) -> Callable[[], Calibration]:
+        """How to get the calibration of a form: an uploaded PSF is read later, in its turn."""
+        named, options = form.texts.get("camera", ""), form.json("calibration")
+        if ("psf" in form.files) == bool(named):
+            raise ParameterError("Give either `psf`, a file, or `camera`, the name of a stored calibration.")
+        if named and options:
+            raise ParameterError("`calibration` belongs to an uploaded `psf`; a stored `camera` has its own.")
+        if named:
+            self.cameras.get(named)
+            return partial(self.cameras.get, named)
+        checked_camera(options)
+        return partial(self.cameras.calibrate, form.file("psf"), options)
+
+    def _count(self, job: Job, method: str) -> None:
+        seconds = job.result.report["seconds"] if job.result else 0.0
+        self.metrics.add("mwdn_reconstructions_total", method=method, outcome=job.state)
+        self.metrics.add("mwdn_reconstruction_seconds_sum", seconds, method=method)
+        log("reconstruction", method=method, outcome=job.state, seconds=seconds)
+
+    async def _ended(self, request: Request, job: Job) -> Job:
+        """Wait for a job; it is cancelled if its client leaves.
+
+        Raises:
+            MwdnError: of the job.
+        """
+        loop, ended = asyncio.get_running_loop(), asyncio.Event()
+        job.when_ended(partial(_wake, loop, ended))
+        while job.state not in ENDED:
+            try:
+                await asyncio.wait_for(ended.wait(), 0.5)
+            except TimeoutError:
+                if await request.is_disconnected():
+                    self.jobs.cancel(job.id)
+                    break
+            except asyncio.CancelledError:
+                self.jobs.cancel(job.id)
+                raise
+        if job.error is not None:
+            raise job.error
+        return job
+
+    async def _encoded(self, make: Callable[[Look], bytes], look: Look, headers: Any = None) -> Response:  # noqa: ANN401
+        data = await to_thread.run_sync(make, look, limiter=self._encoders)
+        return Response(data, media_type=MEDIA[look.format][0], headers=headers)
+
+    async def _thread(self, work: Callable[[], Any]) -> Any:  # noqa: ANN401
+        return await to_thread.run_sync(work, limiter=self._encoders)
+
+
+def _look(values: Any) -> Look:  # noqa: ANN401
+    """How a picture is wanted, from a form or a query."""
+    if values.get("format", "png") not in MEDIA:
+        raise ParameterError(f"`format` ({values['format'][:40]}) must be {', '.join(MEDIA)}.")
+    return Look(
+        format=values.get("format", "png"),
+        exposure=parse_number(values.get("exposure"), "exposure", 0.0),
+        white_balance=parse_white_balance(values.get("white_balance")),
+    )
+
+
+def _wake(loop: asyncio.AbstractEventLoop, ended: asyncio.Event) -> None:
+    with suppress(RuntimeError):  # the server has stopped
+        loop.call_soon_threadsafe(ended.set)
+
+
+def _png(name: str) -> bytes:
+    with tempfile.TemporaryDirectory(prefix="mwdn-") as folder:
+        path = Path(folder) / "capture.png"
+        write_frame(path, sample_capture(name))
+        return path.read_bytes()
+
+
+async def _failed(_: Request, error: Exception) -> Response:
+    if isinstance(error, HTTPException):
+        return error_response(RefusedError(error.status_code, f"{error.detail}. See /openapi.json."))
+    if isinstance(error, MwdnError):
+        return error_response(error)
+    return error_response(RefusedError(500, "An error of mwdn itself. The server's log says more."))

@@ -1,0 +1,132 @@
+"""What surrounds every request: who may ask, how much they may send, security headers, and one line in the log."""
+
+import json
+import logging
+import time
+from typing import Any
+from urllib.parse import parse_qs
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import JSONResponse
+
+from mwdn.preview.limits import Limits, RefusedError
+from mwdn.preview.metrics import Metrics
+from mwdn.runtime.web_access import is_allowed
+
+LOG = logging.getLogger("mwdn.preview")
+
+HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+    "img-src 'self' blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Permissions-Policy": "camera=(), microphone=(), geolocation=()",
+    "Cache-Control": "no-store",
+}
+
+OPEN = ("/", "/healthz")
+"""Paths that need no token, besides /static/: they hold nothing of the user's."""
+
+
+class Guard:
+    """Middleware around the application.
+
+    Args:
+        app: the application.
+        limits: of the server.
+        metrics: counts requests.
+        token: secret that requests must know; empty if none is needed.
+        any_host: see `is_allowed`.
+    """
+
+    def __init__(self, app: Any, limits: Limits, metrics: Metrics, *, token: str, any_host: bool) -> None:  # noqa: ANN401
+        self.app, self.limits, self.metrics, self.token, self.any_host = app, limits, metrics, token, any_host
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:  # noqa: ANN401
+        """Serve one request or WebSocket."""
+        if scope["type"] == "lifespan":
+            await self.app(scope, receive, send)
+        elif scope["type"] == "websocket":
+            await self._websocket(scope, receive, send)
+        else:
+            await self._http(scope, receive, send)
+
+    def _may(self, scope: Any) -> bool:  # noqa: ANN401
+        headers, path = Headers(scope=scope), scope["path"]
+        given = headers.get("authorization", "").removeprefix("Bearer ")
+        given = given or parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
+        if path in OPEN or path.startswith("/static/"):
+            given = self.token
+        return is_allowed(headers, given, self.token, any_host=self.any_host)
+
+    async def _websocket(self, scope: Any, receive: Any, send: Any) -> None:  # noqa: ANN401
+        if self._may(scope):
+            await self.app(scope, receive, send)
+            return
+        await receive()
+        await send({"type": "websocket.close", "code": 1008})  # before it is accepted: status 403
+
+    async def _http(self, scope: Any, receive: Any, send: Any) -> None:  # noqa: ANN401
+        start, received, status = time.perf_counter(), 0, 0
+        most = self.limits.upload_bytes
+
+        async def counted() -> Any:  # noqa: ANN401
+            nonlocal received
+            message = await receive()
+            received += len(message.get("body", b""))
+            if received > most:
+                raise _too_large(most)
+            return message
+
+        async def with_headers(message: Any) -> None:  # noqa: ANN401
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                headers = MutableHeaders(scope=message)
+                for name, value in HEADERS.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        try:
+            refused = self._refusal(scope)
+            app = self.app if refused is None else error_response(refused)
+            await app(scope, counted, with_headers)
+        finally:
+            route = getattr(scope.get("route"), "path", "other")
+            self.metrics.add("mwdn_requests_total", method=_verb(scope["method"]), route=route, status=str(status))
+            self.metrics.add("mwdn_uploaded_bytes_total", received)
+            ms = round(1000 * (time.perf_counter() - start), 1)
+            log("request", method=_verb(scope["method"]), route=route, status=status, ms=ms, bytes=received)
+
+    def _refusal(self, scope: Any) -> RefusedError | None:  # noqa: ANN401
+        if not self._may(scope):
+            if self.token:
+                return RefusedError(401, "This server needs its token: the header `Authorization: Bearer TOKEN`.")
+            return RefusedError(403, "Requests of other sites' pages are not served. Open the page by its own address.")
+        length = Headers(scope=scope).get("content-length", "0")
+        if length.isdigit() and int(length[:20]) > self.limits.upload_bytes:
+            return _too_large(self.limits.upload_bytes)
+        return None
+
+
+def _verb(method: str) -> str:
+    """A method of HTTP: clients may send any word, which must not become a label each."""
+    return method if method in ("GET", "HEAD", "POST", "DELETE") else "other"
+
+
+def _too_large(most: int) -> RefusedError:
+    return RefusedError(413, f"The request has more than {most:,} bytes, the server's limit. Crop or bin the frames.")
+
+
+def error_response(error: Exception) -> JSONResponse:
+    """An error as JSON: ``{"error": "..."}``."""
+    status = error.status if isinstance(error, RefusedError) else 422
+    headers = {"Retry-After": "2"} if status == 503 else {"WWW-Authenticate": "Bearer"} if status == 401 else None
+    return JSONResponse({"error": str(error)}, status, headers)
+
+
+def log(event: str, **values: Any) -> None:  # noqa: ANN401
+    """One JSON object a line. Neither tokens nor file names are logged."""
+    LOG.info(json.dumps({"time": round(time.time(), 3), "event": event, **values}))

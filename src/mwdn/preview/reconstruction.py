@@ -1,0 +1,168 @@
+"""One reconstruction for a client: from an uploaded capture to a picture and a report."""
+
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import torch
+
+from mwdn.calibration import Calibration
+from mwdn.diagnosis.captures import examine_capture
+from mwdn.diagnosis.sizes import mismatch
+from mwdn.diagnosis.trust import examine_picture
+from mwdn.errors import ImageError, PsfError, ShapeError
+from mwdn.inference.reconstructor import Reconstructor
+from mwdn.io.formats import is_for_viewing
+from mwdn.preview.cameras import check_pixels, read_upload
+from mwdn.preview.jobs import Job
+from mwdn.preview.limits import Limits
+from mwdn.preview.result import Result
+from mwdn.runtime.iterations import watch_iterations
+from mwdn.solvers.alignment import align
+from mwdn.types import Frame, Measurement
+
+KEPT = 4
+"""Prepared methods that are kept for the next capture; one of 1 Mpixel takes about 100 MB."""
+
+SMALLEST = 15
+"""Pixels of a PSF along each side, at least, for a reliable result."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Order:
+    """What a client wants.
+
+    Args:
+        capture: the file of a raw frame.
+        calibration: reads that of its camera.
+        method: see `mwdn.preview.methods`.
+        options: of the method.
+        align: as for `Reconstructor`.
+        trust: check the picture, which takes a second or two.
+    """
+
+    capture: bytes
+    calibration: Callable[[], Calibration]
+    method: str = "universal-small"
+    options: dict[str, Any] = field(default_factory=dict)
+    align: bool | None = None
+    trust: bool = True
+
+
+class Reconstructions:
+    """Runs orders, and keeps prepared methods for the next one.
+
+    Args:
+        limits: of the server.
+        device: see `Reconstructor`.
+    """
+
+    def __init__(self, limits: Limits, device: str | None = None) -> None:
+        self.limits, self.device = limits, device
+        self._lock = threading.Lock()
+        self._prepared: OrderedDict[tuple[Any, ...], Reconstructor] = OrderedDict()
+
+    def prepare(self, order: Order, calibration: Calibration) -> Reconstructor:
+        """The method for the camera.
+
+        Raises:
+            MwdnError: no such method or option, or it does not fit the camera.
+        """
+        if min(calibration.size) < SMALLEST:
+            raise PsfError(f"`psf` {calibration.size} must have at least {SMALLEST} pixels along each side.")
+        key = (id(calibration), order.method, tuple(sorted(order.options.items())), order.align)
+        with self._lock:
+            if key in self._prepared:
+                self._prepared.move_to_end(key)
+                return self._prepared[key]
+        made = Reconstructor(order.method, calibration, align=order.align, device=self.device, **order.options)
+        with self._lock:
+            self._prepared[key] = made  # keeps the calibration, so that its id stays its own
+            while len(self._prepared) > KEPT:
+                self._prepared.popitem(last=False)
+        return made
+
+    def run(self, job: Job, order: Order) -> None:
+        """Reconstruct; the picture is in the job before it is checked.
+
+        Raises:
+            MwdnError: what is wrong with the capture, the camera or the method.
+        """
+        calibration = order.calibration()
+        reconstruct, start = self.prepare(order, calibration), time.perf_counter()
+        frame, for_viewing = read_capture(order.capture, calibration, self.limits)
+        measurement = to_measurement(frame, calibration, self.limits)
+        job.advance(0.0)
+        with watch_iterations(lambda part: job.advance(0.9 * part)):
+            pose = align(measurement, reconstruct.psf) if reconstruct.align else None
+            scene = (reconstruct.at(pose) if pose else reconstruct).on_device(measurement).cpu()
+        if not scene.isfinite().all():
+            raise ImageError("The reconstruction holds NaN or infinity. Scale the capture, or use another method.")
+        report = _report(order, reconstruct, time.perf_counter() - start)
+        job.result = Result(measurement, scene, calibration.light, report)
+        if order.trust:
+            job.advance(0.9)
+            job.state = "checking"
+            with torch.inference_mode():
+                found = _check(frame, measurement, reconstruct, scene, for_viewing=for_viewing)
+            job.result = Result(measurement, scene, calibration.light, report | found)
+
+
+def _report(order: Order, reconstruct: Reconstructor, seconds: float) -> dict[str, Any]:
+    height, width = reconstruct.calibration.size
+    return {
+        "method": order.method,
+        "options": order.options,
+        "aligned": reconstruct.align,
+        "psf_hash": reconstruct.calibration.psf_hash,
+        "height": height,
+        "width": width,
+        "seconds": round(seconds, 3),
+        "warning": reconstruct.warning,
+    }
+
+
+def read_capture(data: bytes, calibration: Calibration, limits: Limits) -> tuple[Frame, bool]:
+    """A raw frame, and whether its file is of a type for viewing.
+
+    Raises:
+        MwdnError: the file is wrong.
+    """
+
+    def read(path: Any) -> tuple[Frame, bool]:  # noqa: ANN401
+        return calibration.frames.read(path), is_for_viewing(path)
+
+    return read_upload(data, "capture", limits.frame_pixels, read)
+
+
+def to_measurement(frame: Frame, calibration: Calibration, limits: Limits) -> Measurement:
+    """A measurement that fits the camera.
+
+    Raises:
+        MwdnError: it does not fit; it has too many pixels; it is dark.
+    """
+    measurement = calibration.to_measurement(frame)
+    check_pixels("capture", (measurement.shape[-2], measurement.shape[-1]), limits)
+    try:
+        calibration.check_fit(measurement)
+    except ShapeError as error:
+        raise mismatch(error, measurement, calibration) from None
+    if measurement.amax() <= 0:
+        raise ImageError("The sensor saw no light: no pixel is brighter than the dark frame, or black.")
+    return measurement
+
+
+def _check(
+    frame: Frame, measurement: Measurement, reconstruct: Reconstructor, scene: torch.Tensor, *, for_viewing: bool
+) -> dict[str, Any]:
+    """Verdicts on the capture, the PSF and the picture, and the numbers behind them."""
+    calibration = reconstruct.calibration
+    verdicts = examine_capture(frame, calibration, for_viewing=for_viewing)
+    trust = examine_picture(measurement, calibration.psf, scene, given=calibration.psf_format.psf_orientation)
+    if not trust.finite:
+        raise ImageError("The numbers of the capture are too large or too small to be judged. Scale it.")
+    listed = [{**asdict(verdict), "sentence": verdict.sentence} for verdict in (*verdicts, *trust.verdicts)]
+    return {**trust.content, "summary": trust.sentence, "verdicts": listed}

@@ -1,0 +1,109 @@
+"""Serves the application until it is stopped."""
+
+import logging
+import socket
+import sys
+import threading
+from typing import Any
+
+from mwdn.errors import ParameterError, reason
+from mwdn.preview.limits import Limits
+from mwdn.runtime.web_access import LOOPBACK, check_token, listen
+
+CONNECTIONS = 512
+"""Connections at the same time; others get the status 503 at once."""
+
+STOP_S = 10
+"""Seconds that requests in progress have when the server is stopped."""
+
+
+class PreviewServer:
+    """The server of one `Preview`. Its socket listens from the start.
+
+    Args:
+        preview: `mwdn.preview.application.Preview`.
+        host: address of this computer; others than `LOOPBACK` need a token.
+        port: 0 for a free one.
+        token: secret that requests must know.
+
+    Raises:
+        ParameterError: no token where one is needed, the address cannot be used, or the extra is not installed.
+    """
+
+    def __init__(self, preview: Any, *, host: str = "127.0.0.1", port: int = 0, token: str = "") -> None:  # noqa: ANN401
+        check_token(host, token)
+        import uvicorn
+
+        self.socket: socket.socket = listen(host, port)
+        address = f"[{host}]" if ":" in host else host
+        self.url = f"http://{address}:{self.socket.getsockname()[1]}/{f'?token={token}' if token else ''}"
+        config = uvicorn.Config(
+            preview.app(token=token, any_host=host not in LOOPBACK),
+            ws="websockets-sansio",
+            ws_max_size=4096,
+            http="h11",
+            access_log=False,
+            log_config=None,
+            lifespan="on",
+            limit_concurrency=CONNECTIONS,
+            timeout_keep_alive=5,
+            timeout_graceful_shutdown=STOP_S,
+            server_header=False,
+        )
+        self._server = uvicorn.Server(config)
+        self._thread: threading.Thread | None = None
+
+    def run(self) -> None:
+        """Serve until Ctrl-C or SIGTERM, which let work in progress end."""
+        self._server.run([self.socket])
+
+    def start(self) -> None:
+        """Serve in a thread, for tests and notebooks; `stop` ends it."""
+        self._thread = threading.Thread(target=self.run, daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Let work in progress end, and stop."""
+        self._server.should_exit = True
+        if self._thread is not None:
+            self._thread.join(timeout=2 * STOP_S)
+        self.socket.close()
+
+
+def make_server(
+    cameras: Any,  # noqa: ANN401
+    limits: Limits = Limits(),
+    *,
+    host: str = "127.0.0.1",
+    port: int = 0,
+    token: str = "",
+    device: str | None = None,
+) -> PreviewServer:
+    """A server with its application.
+
+    Args:
+        cameras: `mwdn.preview.cameras.Cameras`.
+        limits: of the server.
+        host: see `PreviewServer`.
+        port: likewise.
+        token: likewise.
+        device: of the reconstructions.
+
+    Raises:
+        ParameterError: as for `PreviewServer`.
+    """
+    try:
+        from mwdn.preview.application import Preview
+    except ImportError as error:
+        raise ParameterError(f"The page needs: pip install 'mwdn[page]' ({reason(error)}).") from error
+    return PreviewServer(Preview(cameras, limits, device=device), host=host, port=port, token=token)
+
+
+def log_to_stderr() -> None:
+    """Write the log of the server, one JSON object a line, to standard error."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("%(message)s"))
+    logger = logging.getLogger("mwdn.preview")
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    logger.propagate = False

@@ -1,0 +1,253 @@
+// The page: what is chosen becomes a reconstruction, at once.
+import { getBlob, getJson, post, remove, RequestError, runJob } from "./requests.js";
+import { setUpDivider, setPicture } from "./divider.js";
+import { drawSliders, readSliders } from "./sliders.js";
+import { showFindings, showVerdicts } from "./verdicts.js";
+
+const byId = (id) => document.getElementById(id);
+const ORIENTATIONS = ["rotate-180", "rotate-90", "rotate-270", "flip-left-right", "flip-top-bottom", "transpose", "transverse"];
+const UPLOAD = "";
+
+const chosen = { psf: null, capture: null, job: null };
+let methods = [];
+let running = null;
+let due = 0;
+
+function say(text, wrong = false) {
+  byId("state").textContent = text;
+  byId("state").classList.toggle("wrong", wrong);
+}
+
+async function guarded(work) {
+  try {
+    return await work();
+  } catch (error) {
+    if (error.name === "AbortError") return undefined;
+    say(error instanceof RequestError ? error.message : `The page failed: ${error.message}`, true);
+    return undefined;
+  }
+}
+
+function calibration() {
+  const options = {};
+  if (Number(byId("bin").value) > 1) options.bin = Number(byId("bin").value);
+  if (byId("gamma").value) options.gamma = byId("gamma").value;
+  if (byId("psf-gamma").value) options.psf_gamma = byId("psf-gamma").value;
+  if (byId("orientation").value) options.psf_orientation = byId("orientation").value;
+  return Object.keys(options).length ? JSON.stringify(options) : "";
+}
+
+function cameraFields() {
+  const name = byId("camera").value;
+  return name === UPLOAD ? { psf: chosen.psf, calibration: calibration() } : { camera: name };
+}
+
+function isReady() {
+  return chosen.capture && (byId("camera").value !== UPLOAD || chosen.psf);
+}
+
+function orderFields(method = byId("method").value, trust = byId("trust").checked) {
+  const options = method === byId("method").value ? readSliders() : {};
+  const align = byId("align").checked ? "true" : "";
+  return { ...cameraFields(), capture: chosen.capture, method, align, trust: String(trust), options: JSON.stringify(options) };
+}
+
+const look = (format = "png") =>
+  `?format=${format}&exposure=${byId("exposure").value}&white_balance=${byId("balance").value}`;
+
+async function reconstruct() {
+  if (!isReady()) {
+    say(chosen.capture ? "Drop a PSF, or choose a calibration." : "Drop a capture, or choose a sample.");
+    return;
+  }
+  running?.abort();
+  const mine = (running = new AbortController());
+  let shown = false;
+  byId("cancel").hidden = byId("progress").hidden = false;
+  byId("progress").value = 0;
+  try {
+    const job = await runJob(orderFields(), async (now) => {
+      byId("progress").value = now.progress;
+      const words = { waiting: "Waiting for its turn …", reconstructing: "Reconstructing …", checking: "Checking the picture …" };
+      if (words[now.state]) say(words[now.state]);
+      if (now.report && !shown) {
+        shown = true;
+        chosen.job = now.id;
+        await showPictures(true);
+      }
+    }, mine.signal);
+    const report = job.report;
+    say(`${report.method}: ${report.width} × ${report.height} pixels in ${report.seconds.toFixed(2)} s.`);
+    showVerdicts(report);
+  } catch (error) {
+    if (error.name === "AbortError") return;
+    say(error instanceof RequestError ? error.message : `The page failed: ${error.message}`, true);
+  } finally {
+    if (running === mine) {
+      running = null;
+      byId("cancel").hidden = byId("progress").hidden = true;
+    }
+  }
+}
+
+// Sliders move faster than methods reconstruct: only the last value counts.
+function soon(work = reconstruct, wait = 150) {
+  clearTimeout(due);
+  due = setTimeout(() => guarded(work), wait);
+}
+
+async function showPictures(both = false) {
+  if (!chosen.job) return;
+  const job = `/jobs/${chosen.job}`;
+  const [scene, measurement] = await Promise.all([
+    getBlob(`${job}/picture${look()}`), both ? getBlob(`${job}/measurement`) : null,
+  ]);
+  await setPicture(byId("scene"), scene);
+  if (measurement) await setPicture(byId("measurement"), measurement);
+  byId("view").hidden = byId("psf-section").hidden = false;
+}
+
+async function save(event, format) {
+  if (event.currentTarget.dataset.ready) {
+    delete event.currentTarget.dataset.ready;
+    return;
+  }
+  event.preventDefault();
+  const link = event.currentTarget;
+  const data = await getBlob(`/jobs/${chosen.job}/picture${look(format)}`);
+  if (link.href) URL.revokeObjectURL(link.href);
+  link.href = URL.createObjectURL(data);
+  link.dataset.ready = "yes";
+  link.click();
+}
+
+async function compareMethods() {
+  byId("grid-section").hidden = false;
+  byId("grid").replaceChildren();
+  for (const { name } of methods) {
+    const figure = document.createElement("figure");
+    const picture = Object.assign(document.createElement("img"), { alt: `Reconstruction by ${name}` });
+    const caption = Object.assign(document.createElement("figcaption"), { textContent: `${name} …` });
+    figure.append(picture, caption);
+    byId("grid").append(figure);
+    try {
+      const job = await runJob(orderFields(name, false), () => {}, new AbortController().signal);
+      await setPicture(picture, await getBlob(`/jobs/${job.id}/picture${look()}`));
+      caption.textContent = `${name}, ${job.report.seconds.toFixed(2)} s`;
+    } catch (error) {
+      caption.textContent = `${name}: ${error.message}`;
+      caption.className = "wrong";
+    }
+  }
+}
+
+async function trySample(name, camera) {
+  say("Loading the sample …");
+  const data = await getBlob(`/samples/${name}`);
+  take("capture", new File([data], `${name}.png`));
+  byId("camera").value = camera;
+  await reconstruct();
+}
+
+function take(what, file) {
+  chosen[what] = file;
+  byId(`${what}-name`).textContent = file.name;
+  byId(`${what}-name`).parentElement.classList.add("full");
+  if (what === "psf") byId("camera").value = UPLOAD;
+  byId("headline").textContent = "";
+  byId("findings").replaceChildren();
+}
+
+function setUpDrop(what) {
+  const input = byId(what);
+  const zone = input.parentElement;
+  input.onchange = () => {
+    if (input.files[0]) take(what, input.files[0]);
+    soon(reconstruct, 0);
+  };
+  zone.ondragover = (event) => {
+    event.preventDefault();
+    zone.classList.add("over");
+  };
+  zone.ondragleave = () => zone.classList.remove("over");
+  zone.ondrop = (event) => {
+    event.preventDefault();
+    zone.classList.remove("over");
+    if (event.dataTransfer.files[0]) take(what, event.dataTransfer.files[0]);
+    soon(reconstruct, 0);
+  };
+}
+
+async function listCameras(selected) {
+  const { cameras } = await getJson("/cameras");
+  const words = { given: "of this server", stored: "stored", sample: "simulated" };
+  byId("camera").replaceChildren(
+    new Option("the PSF below", UPLOAD),
+    ...cameras.map(({ name, kind, width, height }) => new Option(`${name} (${words[kind]}, ${width} × ${height})`, name)),
+  );
+  byId("camera").value = selected ?? cameras[0].name;
+}
+
+async function storeCamera() {
+  const name = byId("store-name").value.trim();
+  if (!chosen.psf) throw new RequestError("Drop a PSF first.");
+  await post("/cameras", { name, psf: chosen.psf, calibration: calibration() });
+  await listCameras(name);
+  say(`Stored as ${name}.`);
+}
+
+async function removeCamera() {
+  const name = byId("camera").value;
+  if (name === UPLOAD) throw new RequestError("Choose a stored calibration first.");
+  await remove(`/cameras/${encodeURIComponent(name)}`);
+  await listCameras();
+  say(`${name} is removed.`);
+}
+
+function chooseMethod() {
+  const method = methods.find(({ name }) => name === byId("method").value);
+  byId("about").textContent = method.about;
+  drawSliders(byId("options"), method.options, () => soon());
+}
+
+async function start() {
+  const [listed, samples] = await Promise.all([getJson("/methods"), getJson("/samples"), listCameras()]);
+  methods = listed.methods;
+  byId("method").replaceChildren(...methods.map(({ name }) => new Option(name, name)));
+  byId("method").value = "universal-small";
+  chooseMethod();
+  byId("orientation").append(...ORIENTATIONS.map((name) => new Option(name, name)));
+  for (const name of samples.captures) {
+    const button = Object.assign(document.createElement("button"), { type: "button", textContent: name });
+    button.onclick = () => guarded(() => trySample(name, samples.camera));
+    byId("samples").append(button);
+  }
+}
+
+setUpDivider(byId("stack"), byId("split"), byId("zoom"));
+setUpDrop("psf");
+setUpDrop("capture");
+byId("controls").onsubmit = (event) => event.preventDefault();
+byId("method").onchange = () => {
+  chooseMethod();
+  soon(reconstruct, 0);
+};
+for (const id of ["camera", "bin", "gamma", "psf-gamma", "orientation", "align", "trust"]) byId(id).onchange = () => soon(reconstruct, 0);
+byId("exposure").oninput = () => {
+  byId("exposure-value").textContent = Number(byId("exposure").value).toFixed(1);
+  soon(() => showPictures());
+};
+byId("balance").onchange = () => soon(() => showPictures(), 0);
+byId("cancel").onclick = () => {
+  running?.abort();
+  say("Cancelled.");
+};
+byId("compare").onclick = () => guarded(compareMethods);
+byId("store").onclick = () => guarded(storeCamera);
+byId("remove").onclick = () => guarded(removeCamera);
+byId("inspect").onclick = () => guarded(async () => showFindings(await post("/inspect", cameraFields())));
+for (const format of ["png", "png16", "tiff"]) byId(`save-${format}`).onclick = (event) => guarded(() => save(event, format));
+for (const format of ["png", "png16", "tiff"]) byId(`save-${format}`).href = "#";
+// A file that misses its zone must not replace the page.
+for (const name of ["dragover", "drop"]) document.addEventListener(name, (event) => event.preventDefault());
+guarded(start);

@@ -1,0 +1,145 @@
+"""Requests to orders: multipart forms with size and time limits, and JSON in their fields."""
+
+import asyncio
+import json
+from dataclasses import dataclass, field
+from typing import Any
+
+from starlette.datastructures import FormData, UploadFile
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect, Request
+
+from mwdn.errors import ParameterError, UnknownNameError, reason
+from mwdn.preview.limits import Limits, RefusedError
+
+FIELD_BYTES = 2**14
+"""Most bytes of a field that is not a file."""
+
+
+@dataclass(frozen=True)
+class Form:
+    """A form's files and texts by their names."""
+
+    files: dict[str, bytes] = field(default_factory=dict)
+    texts: dict[str, str] = field(default_factory=dict)
+
+    def file(self, name: str) -> bytes:
+        """A file that must be there.
+
+        Raises:
+            ParameterError: it is missing or empty.
+        """
+        if not self.files.get(name):
+            raise ParameterError(f"`{name}` must be a file of the form: curl --form {name}=@{name}.png")
+        return self.files[name]
+
+    def json(self, name: str) -> dict[str, Any]:
+        """A JSON object, empty if it is missing.
+
+        Raises:
+            ParameterError: it is none.
+        """
+        return parse_object(self.texts.get(name) or "{}", name)
+
+    def flag(self, name: str) -> bool | None:
+        """``true`` or ``false``; ``None`` if it is missing.
+
+        Raises:
+            ParameterError: it is neither.
+        """
+        text = self.texts.get(name, "")
+        if text not in ("", "true", "false"):
+            raise ParameterError(f"`{name}` ({text[:40]!r}) must be true or false.")
+        return None if not text else text == "true"
+
+
+def parse_object(text: str, name: str) -> dict[str, Any]:
+    """A JSON object.
+
+    Raises:
+        ParameterError: it is none.
+    """
+    try:
+        value = json.loads(text, parse_constant=lambda word: None)
+    except (ValueError, RecursionError) as error:
+        raise ParameterError(f"`{name}` must be JSON: {reason(error)}.") from None
+    if not isinstance(value, dict):
+        raise ParameterError(f'`{name}` must be a JSON object: `{{"bin": 2}}`.')
+    return value
+
+
+def parse_number(text: str | None, name: str, default: float) -> float:
+    """A number of a form or a query.
+
+    Raises:
+        ParameterError: it is none.
+    """
+    try:
+        return float(text) if text else default
+    except ValueError:
+        raise ParameterError(f"`{name}` ({text and text[:40]!r}) must be a number.") from None
+
+
+def parse_white_balance(text: str | None) -> Any:  # noqa: ANN401
+    """``grey-world``, ``psf`` or three gains with commas; ``None`` if empty.
+
+    Raises:
+        ParameterError: none of them.
+    """
+    if not text or text == "none":
+        return None
+    if text in ("grey-world", "psf"):
+        return text
+    try:
+        gains = tuple(float(gain) for gain in text.split(","))
+    except ValueError:
+        gains = ()
+    if len(gains) != 3:
+        raise ParameterError(f"`white_balance` ({text[:40]!r}) must be none, grey-world, psf or three gains: 1.8,1,1.5")
+    return gains
+
+
+async def read_form(request: Request, limits: Limits, files: tuple[str, ...], texts: tuple[str, ...]) -> Form:
+    """Read a multipart form. `mwdn.preview.guard` has limited its bytes.
+
+    Args:
+        request: the request.
+        limits: of the server.
+        files: names that may be files.
+        texts: names that may be texts.
+
+    Raises:
+        RefusedError: it does not arrive in time, is no form, or the client has left.
+        UnknownNameError: a field has another name.
+    """
+    kind = request.headers.get("content-type", "").partition(";")[0].strip()
+    if kind != "multipart/form-data":
+        raise RefusedError(415, f"The request must be multipart/form-data, not {kind[:60] or 'without a type'!r}.")
+    try:
+        async with asyncio.timeout(limits.upload_s):
+            async with request.form(
+                max_files=len(files), max_fields=len(texts), max_part_size=FIELD_BYTES
+            ) as form:  # closes its temporary files
+                return await _read_fields(form, files, texts)
+    except TimeoutError:
+        raise RefusedError(
+            408, f"The request did not arrive within {limits.upload_s:g} s, the server's limit."
+        ) from None
+    except HTTPException as error:
+        raise RefusedError(error.status_code, f"The form cannot be read: {error.detail}") from None
+    except ClientDisconnect:
+        raise RefusedError(400, "The client left before the request was complete.") from None
+
+
+async def _read_fields(form: FormData, files: tuple[str, ...], texts: tuple[str, ...]) -> Form:
+    found = Form()
+    for name, value in form.multi_items():
+        if name not in (*files, *texts):
+            raise UnknownNameError("field", name, [*files, *texts])
+        if isinstance(value, UploadFile) != (name in files):
+            raise ParameterError(f"`{name}` must be a {'file' if name in files else 'text'}.")
+        if isinstance(value, UploadFile):
+            found.files[name] = await value.read()
+        else:
+            found.texts[name] = value
+    return found

@@ -1,0 +1,64 @@
+"""Who may talk to a page of this package: this computer, and whoever knows its token."""
+
+import hmac
+import socket
+from collections.abc import Mapping
+from urllib.parse import urlsplit
+
+from mwdn.errors import ParameterError, reason
+
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+"""Addresses that other computers cannot reach; all others need a token."""
+
+
+def check_token(host: str, token: str) -> None:
+    """Check that an address which other computers can reach has a token.
+
+    Raises:
+        ParameterError: it has none.
+    """
+    if host not in LOOPBACK and not token:
+        raise ParameterError(f"`host` ({host}) can be reached by other computers: it needs a `token`, a secret.")
+
+
+def is_allowed(headers: Mapping[str, str], given: str, token: str, *, any_host: bool) -> bool:
+    """Whether a request may be answered.
+
+    The token must be right. The request must not come from a page of another site (Origin), also not from one whose
+    name was made to lead to this computer (Host).
+
+    Args:
+        headers: of the request, by lower-case names.
+        given: token of the request; empty if it has none.
+        token: the right one; empty if none is needed.
+        any_host: the server may be called by any name, because it needs a token.
+    """
+    host, origin = headers.get("host", ""), headers.get("origin", "")
+    try:
+        name, other = urlsplit(f"//{host}").hostname or "", urlsplit(origin).netloc
+    except ValueError:  # an unclosed bracket
+        return False
+    is_own = (not origin or other == host) and (any_host or name in LOOPBACK)
+    return is_own and hmac.compare_digest(given.encode(), token.encode())
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A listening socket.
+
+    Args:
+        host: address of this computer.
+        port: 0 for a free one.
+
+    Raises:
+        ParameterError: the address is in use, or not of this computer.
+    """
+    try:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        listener = socket.socket(family, socket.SOCK_STREAM)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((host, port))
+    except (OSError, OverflowError) as error:
+        raise ParameterError(
+            f"`host` and `port` ({host}:{port}) cannot be used: {reason(error)}. Choose others."
+        ) from error
+    return listener

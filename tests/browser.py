@@ -1,0 +1,110 @@
+"""A headless Chromium, driven through its debugging protocol: no driver to install."""
+
+import base64
+import itertools
+import json
+import os
+import re
+import shutil
+import subprocess
+import threading
+import urllib.request
+from contextlib import contextmanager
+from pathlib import Path
+
+from websockets.sync.client import connect
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+PATIENCE_S = 90
+"""Longest wait for something on the page; a machine may be busy."""
+
+
+class Page:
+    """One tab."""
+
+    def __init__(self, socket):
+        self.socket, self.numbers, self.errors = socket, itertools.count(1), []
+
+    def command(self, method, **params):
+        number = next(self.numbers)
+        self.socket.send(json.dumps({"id": number, "method": method, "params": params}))
+        while True:
+            message = json.loads(self.socket.recv(timeout=PATIENCE_S))
+            if message.get("method") == "Runtime.exceptionThrown":
+                self.errors.append(message["params"]["exceptionDetails"])
+            if message.get("method") == "Log.entryAdded" and message["params"]["entry"]["level"] == "error":
+                self.errors.append(message["params"]["entry"]["text"])
+            if message.get("id") == number:
+                assert "error" not in message, message
+                return message["result"]
+
+    def run(self, expression):
+        """Value of a JavaScript expression, after its promise."""
+        result = self.command("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in result, result
+        return result["result"].get("value")
+
+    def wait(self, condition):
+        """Until a JavaScript expression is true."""
+        return self.run(
+            f"new Promise((done, fail) => {{ const end = Date.now() + {1000 * PATIENCE_S}; const look = () => "
+            f"{{ if ({condition}) done(true); else if (Date.now() > end) fail(new Error(document.body.innerText)); "
+            "else setTimeout(look, 50); }; look(); })"
+        )
+
+    def drop(self, selector, *files):
+        """Choose files in an input."""
+        root = self.command("DOM.getDocument")["root"]["nodeId"]
+        node = self.command("DOM.querySelector", nodeId=root, selector=selector)["nodeId"]
+        self.command("DOM.setFileInputFiles", files=[str(file) for file in files], nodeId=node)
+
+    def press(self, key, code):
+        for kind in ("keyDown", "keyUp"):
+            self.command("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code)
+
+    def size(self, width, height, *, dark=False):
+        self.command(
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600
+        )
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self.command("Emulation.setEmulatedMedia", features=[scheme])
+
+    def screenshot(self, path):
+        data = self.command("Page.captureScreenshot", captureBeyondViewport=True)["data"]
+        Path(path).write_bytes(base64.b64decode(data))
+
+
+@contextmanager
+def open_page(url, profile):
+    """A tab at an address, in a browser of its own."""
+    options = ["--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run"]
+    options += [f"--user-data-dir={profile}", "--remote-debugging-port=0", "--window-size=1280,900"]
+    process = subprocess.Popen(
+        [CHROMIUM, *options, "about:blank"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "HOME": str(profile)},
+    )
+    try:
+        address = _debugger(process)
+        with connect(address, max_size=2**26, open_timeout=PATIENCE_S) as socket:
+            page = Page(socket)
+            for domain in ("Runtime", "Log", "DOM", "Page"):
+                page.command(f"{domain}.enable")
+            page.size(1280, 900)
+            page.command("Page.navigate", url=url)
+            yield page
+    finally:
+        process.terminate()
+        process.wait(timeout=30)
+
+
+def _debugger(process):
+    for line in process.stderr:
+        if port := re.search(r"DevTools listening on ws://127.0.0.1:(\d+)/", line):
+            # Nobody reads the rest: a full pipe would stop the browser.
+            threading.Thread(target=process.stderr.read, daemon=True).start()
+            with urllib.request.urlopen(f"http://127.0.0.1:{port[1]}/json/list", timeout=PATIENCE_S) as answer:
+                return next(tab["webSocketDebuggerUrl"] for tab in json.load(answer) if tab["type"] == "page")
+    raise AssertionError("Chromium did not start.")

@@ -1,0 +1,291 @@
+"""The HTTP interface on a real socket: what is right is answered, what is wrong is refused with a reason."""
+
+import io
+import json
+import socket
+import struct
+import zlib
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from urllib.parse import urlsplit
+
+import httpx2 as httpx
+import numpy as np
+import pytest
+
+from mwdn import Reconstructor
+from mwdn.calibration import Calibration
+from mwdn.errors import ParameterError
+from mwdn.preview.cameras import Cameras
+from mwdn.preview.server import make_server
+from preview_server import LIMITS, SIDE, npy
+
+
+def order(client, capture, expect=200, /, files=None, **fields):
+    fields = {"camera": "camera", "method": "wiener", "trust": "false", "format": "npy"} | fields
+    fields = {name: value for name, value in fields.items() if value is not None}
+    response = client.post("/reconstruct", files={"capture": capture, **(files or {})}, data=fields)
+    assert response.status_code == expect, response.text[:500]
+    return response
+
+
+def test_picture_and_report_equal_the_package(client, capture, psf):
+    response = order(client, capture)
+    expected = Reconstructor("wiener", Calibration(psf), device="cpu")(np.load(io.BytesIO(capture)))
+    np.testing.assert_allclose(np.load(io.BytesIO(response.content)), expected, atol=1e-6)
+    report = json.loads(response.headers["mwdn-report"])
+    assert report["method"] == "wiener"
+    assert report["psf_hash"] == Calibration(psf).psf_hash
+
+
+def test_uploaded_psf_and_options(client, capture, psf_file):
+    smooth = order(
+        client, capture, camera=None, files={"psf": psf_file}, options='{"regularisation": 1.0}', format="npy"
+    )
+    sharp = order(
+        client, capture, camera=None, files={"psf": psf_file}, options='{"regularisation": 1e-5}', format="npy"
+    )
+    variations = [np.abs(np.diff(np.load(io.BytesIO(each.content)), axis=0)).sum() for each in (smooth, sharp)]
+    assert variations[0] < variations[1]
+
+
+@pytest.mark.parametrize(
+    ("format", "start"), [("png", b"\x89PNG"), ("png16", b"\x89PNG"), ("tiff", b"II*\0"), ("npy", b"\x93NUMPY")]
+)
+def test_formats(client, capture, format, start):
+    assert order(client, capture, format=format).content.startswith(start)
+
+
+def test_exposure_and_white_balance(client, capture):
+    import cv2
+
+    def mean(**look):
+        png = np.frombuffer(order(client, capture, format="png", **look).content, np.uint8)
+        return cv2.imdecode(png, cv2.IMREAD_COLOR).astype(float).mean((0, 1))
+
+    assert (mean(exposure="-2") < mean()).all()
+    blue, _, red = mean(white_balance="4,1,0.25", exposure="-3")
+    assert red > blue
+
+
+def test_verdicts(client, capture):
+    report = json.loads(order(client, capture, trust="true").headers["mwdn-report"])
+    assert {verdict["subject"] for verdict in report["verdicts"]} >= {"capture", "picture"}
+    assert 0 < report["explained"] <= 1
+
+
+def png_claiming(width, height):
+    """A small PNG that claims many pixels: a bomb."""
+
+    def chunk(kind, data):
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    rows = zlib.compress(b"\0" * 10_000)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+
+
+def hostile(capture):
+    good = np.load(io.BytesIO(capture)).astype(np.float32) / 65_535
+    nan = good.copy()
+    nan[3, 4] = np.nan
+    return {
+        "empty": (b"", "capture"),
+        "text": (b"#!/bin/sh\nrm -rf /", "PNG"),
+        "truncated": (capture[:-50], "cut off"),
+        "bomb": (png_claiming(60_000, 60_000), "pixels"),
+        "many pixels": (npy(np.zeros((SIDE * 3, SIDE * 3), np.uint8)), f"{4 * SIDE**2:,}"),
+        "not a number": (npy(nan), "NaN"),
+        "pickle": (npy(np.array([{}], dtype=object)), "capture"),
+        "dark": (npy(np.zeros((SIDE, SIDE, 3), np.uint16)), "light"),
+        "other size": (npy(np.ones((SIDE - 8, SIDE, 3), np.uint16)), str(SIDE)),
+    }
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["empty", "text", "truncated", "bomb", "many pixels", "not a number", "pickle", "dark", "other size"],
+)
+def test_hostile_captures_are_refused(client, capture, kind):
+    data, named = hostile(capture)[kind]
+    error = order(client, data, 422).json()["error"]
+    assert named in error
+    assert "/tmp" not in error
+    assert "mwdn-" not in error
+
+
+@pytest.mark.parametrize(
+    ("fields", "status", "named"),
+    [
+        ({"method": "/etc/passwd"}, 422, "/etc/passwd"),
+        ({"method": "hub:someone/something"}, 422, "hub:"),
+        ({"camera": "../../etc/passwd"}, 404, "passwd"),
+        ({"options": "[1]"}, 422, "options"),
+        ({"options": '{"iterations": 3}'}, 422, "iterations"),
+        ({"options": '{"regularisation": NaN}'}, 422, "regularisation"),
+        ({"options": "[" * 5000}, 422, "options"),
+        ({"trust": "perhaps"}, 422, "trust"),
+        ({"format": "exe"}, 422, "format"),
+        ({"exposure": "nan"}, 422, "exposure"),
+        ({"white_balance": "1,2"}, 422, "white_balance"),
+        ({"calibration": '{"bin": 2}'}, 422, "calibration"),
+        ({"unknown": "1"}, 422, "unknown"),
+        ({"camera": None}, 422, "psf"),
+    ],
+)
+def test_wrong_fields_are_named(client, capture, fields, status, named):
+    assert named in order(client, capture, status, **fields).json()["error"]
+
+
+@pytest.mark.parametrize("option", ["dark", "ambient", "corrections", "path"])
+def test_no_option_of_a_camera_names_a_file(client, capture, psf_file, option):
+    calibration = json.dumps({option: "/etc/passwd"})
+    error = order(client, capture, 422, camera=None, files={"psf": psf_file}, calibration=calibration).json()["error"]
+    assert option in error
+
+
+def test_upload_limit(client, capture):
+    error = order(client, b"\0" * (LIMITS.upload_bytes + 1), 413).json()["error"]
+    assert f"{LIMITS.upload_bytes:,}" in error
+
+    def chunks():  # without a length
+        yield b'--x\r\nContent-Disposition: form-data; name="capture"; filename="a"\r\n\r\n'
+        for _ in range(8):
+            yield b"\0" * (LIMITS.upload_bytes // 4)
+
+    kind = {"content-type": "multipart/form-data; boundary=x"}
+    with suppress(httpx.TransportError):  # the server may close the connection while the client is still sending
+        assert client.post("/reconstruct", content=chunks(), headers=kind).status_code == 413
+
+
+def test_job_has_progress_and_a_result(client, capture):
+    fields = {"camera": "camera", "method": "admm", "trust": "false", "options": '{"iterations": 3}'}
+    response = client.post("/jobs", files={"capture": capture}, data=fields)
+    assert response.status_code == 202
+    place = response.headers["location"]
+    while (job := client.get(place).json())["state"] not in ("done", "failed"):
+        pass
+    assert (job["state"], job["progress"]) == ("done", 1)
+    assert client.get(f"{place}/picture").content.startswith(b"\x89PNG")
+    assert np.load(io.BytesIO(client.get(f"{place}/measurement?format=npy").content)).shape == (SIDE, SIDE, 3)
+
+
+def test_job_can_be_cancelled(client, capture):
+    fields = {"camera": "camera", "method": "admm", "trust": "false", "options": '{"iterations": 1000000000}'}
+    place = client.post("/jobs", files={"capture": capture}, data=fields).headers["location"]
+    waiting = client.post("/jobs", files={"capture": capture}, data=fields).headers["location"]
+    while client.get(place).json()["state"] == "waiting":
+        pass
+    assert client.get(f"{place}/picture").status_code == 404
+    assert client.delete(waiting).json()["state"] == "cancelled"
+    client.delete(place)
+    while (job := client.get(place).json())["state"] == "reconstructing":
+        pass
+    assert job["state"] == "cancelled"
+    assert "report" not in job
+    order(client, capture)  # the next one is served
+
+
+def test_cameras_are_listed_added_and_removed(serve, tmp_path, psf_file):
+    server = serve(Cameras(LIMITS, tmp_path))
+    with httpx.Client(base_url=server.url, timeout=120) as client:
+        added = client.post("/cameras", files={"psf": psf_file}, data={"name": "mine"})
+        assert added.status_code == 201, added.text
+        assert client.post("/cameras", files={"psf": psf_file}, data={"name": "mine"}).status_code == 409
+        assert client.post("/cameras", files={"psf": psf_file}, data={"name": "../mine"}).status_code == 422
+        assert {path.suffix for path in tmp_path.iterdir()} == {".json", ".psf"}
+        assert "mine" not in "".join(path.name for path in tmp_path.iterdir())
+        again = Cameras(LIMITS, tmp_path)  # another start of the server
+        assert again.get("mine").psf_hash == added.json()["psf_hash"]
+        assert client.delete("/cameras/sample").status_code == 409
+        assert client.delete("/cameras/mine").status_code == 204
+        assert client.get("/cameras/mine").status_code == 404
+        assert not list(tmp_path.iterdir())
+
+
+def test_inspect(client):
+    report = client.post("/inspect", files={"camera": (None, "camera")}).json()
+    assert report["headline"]
+    assert {finding["weight"] for finding in report["verdict"]} <= {"bad", "mind", "good"}
+
+
+def test_the_document_names_every_route(client):
+    document = client.get("/openapi.json").json()
+    paths = document["paths"]
+    assert f"{LIMITS.upload_bytes:,}" in document["info"]["description"]
+    for path in ("/methods", "/samples", "/cameras", "/healthz", "/metrics"):
+        assert "get" in paths[path]
+        assert client.get(path).status_code == 200
+    for path, operations in paths.items():  # each path is served: 405 means no such method, 404 no such thing
+        for method in operations:
+            place = path.replace("{name}", "nothing").replace("{id}", "nothing")
+            response = client.request(method.upper(), place)
+            assert response.status_code != 405, place
+            assert str(response.status_code) in operations[method]["responses"], (place, response.status_code)
+
+
+def test_metrics_and_health(client, capture):
+    before = client.get("/metrics").text
+    order(client, capture)
+    after = client.get("/metrics").text
+    name = 'mwdn_reconstructions_total{method="wiener",outcome="done"}'
+
+    def count(text):
+        return next((float(line.split()[-1]) for line in text.splitlines() if line.startswith(name)), 0.0)
+
+    assert count(after) == count(before) + 1
+    assert client.get("/healthz").json()["status"] == "ok"
+
+
+@pytest.mark.parametrize("path", ["/", "/methods", "/nothing", "/static/page.js"])
+def test_security_headers(client, path):
+    headers = client.get(path).headers
+    assert "script-src 'self'" in headers["content-security-policy"]
+    assert headers["x-content-type-options"] == "nosniff"
+    assert headers["referrer-policy"] == "no-referrer"
+
+
+@pytest.mark.parametrize("path", ["/static/../application.py", "/static/%2e%2e/application.py", "/static//etc/passwd"])
+def test_static_files_stay_in_their_folder(client, path):
+    host, port = urlsplit(str(client.base_url)).hostname, urlsplit(str(client.base_url)).port
+    with socket.create_connection((host, port)) as raw:  # clients tidy such paths
+        raw.sendall(f"GET {path} HTTP/1.1\r\nHost: {host}:{port}\r\nConnection: close\r\n\r\n".encode())
+        assert b" 404 " in raw.makefile("rb").readline()
+
+
+@pytest.mark.parametrize("headers", [{"origin": "http://evil.example"}, {"host": "evil.example"}, {"host": "[::"}])
+def test_other_sites_pages_are_refused(client, headers):
+    assert client.get("/cameras", headers=headers).status_code in (400, 403)
+
+
+def test_other_addresses_need_a_token(serve):
+    with pytest.raises(ParameterError, match="token"):
+        make_server(Cameras(LIMITS), LIMITS, host="0.0.0.0")
+    server = serve(host="0.0.0.0", token="secret")
+    with httpx.Client(base_url=f"http://127.0.0.1:{urlsplit(server.url).port}") as client:
+        assert client.get("/cameras").status_code == 401
+        assert client.get("/cameras", headers={"authorization": "Bearer wrong"}).status_code == 401
+        assert client.get("/cameras", headers={"authorization": "Bearer secret"}).status_code == 200
+        assert client.get("/cameras?token=secret").status_code == 200
+        assert client.get("/healthz").status_code == 200
+
+
+def test_good_and_bad_at_once_and_a_client_that_stalls(client, capture):
+    expected = np.load(io.BytesIO(order(client, capture).content))
+    bad = list(hostile(capture).values())
+    address = urlsplit(str(client.base_url))
+    stalled = socket.create_connection((address.hostname, address.port))
+    stalled.sendall(
+        f"POST /reconstruct HTTP/1.1\r\nHost: {address.netloc}\r\nContent-Length: 9999\r\n"
+        "Content-Type: multipart/form-data; boundary=x\r\n\r\n--x".encode()
+    )
+
+    def ask(number):
+        if number % 2:
+            return order(client, bad[number // 2 % len(bad)][0], 422)
+        return order(client, capture)
+
+    with stalled, ThreadPoolExecutor(20) as pool:
+        answers = list(pool.map(ask, range(40)))
+    for answer in answers[::2]:
+        np.testing.assert_array_equal(np.load(io.BytesIO(answer.content)), expected)

@@ -1,0 +1,54 @@
+"""The page in a headless Chromium, used as a person uses it."""
+
+import pytest
+
+from browser import CHROMIUM, open_page
+from mwdn.calibration import Calibration
+from mwdn.preview.cameras import Cameras
+from preview_server import LIMITS
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt install chromium")
+
+
+def test_dropped_files_become_a_picture(serve, psf, psf_file, capture, tmp_path):
+    for name, data in (("psf.npy", psf_file), ("capture.npy", capture), ("wrong.png", b"no picture")):
+        (tmp_path / name).write_bytes(data)
+    server = serve(Cameras(LIMITS, None, {"camera": Calibration(psf)}))
+    with open_page(server.url, tmp_path / "profile") as page:
+        page.wait("document.querySelectorAll('#samples button').length === 3")
+        page.run("document.getElementById('method').value = 'admm', document.getElementById('method').onchange()")
+        page.run("document.getElementById('trust').checked = false")
+        page.drop("#psf", tmp_path / "psf.npy")
+        page.drop("#capture", tmp_path / "capture.npy")
+        page.wait("document.getElementById('state').textContent.startsWith('admm: 48')")
+        assert page.run("document.getElementById('scene').naturalWidth") == 48
+        assert page.run("document.getElementById('measurement').naturalWidth") == 48
+
+        # The divider moves by keys, too.
+        page.run("document.getElementById('split').focus()")
+        page.press("ArrowRight", 39)
+        assert page.run("document.getElementById('stack').style.getPropertyValue('--split')") == "51%"
+
+        # A slider makes another picture.
+        before = page.run("document.getElementById('scene').src")
+        page.run(
+            "(slider => { slider.value = slider.max; slider.oninput(); })"
+            "(document.getElementById('option-regularisation'))"
+        )
+        page.wait(f"document.getElementById('scene').src !== '{before}'")
+
+        # A wrong file is named, and the page goes on.
+        page.drop("#capture", tmp_path / "wrong.png")
+        page.wait("document.getElementById('state').classList.contains('wrong')")
+        assert "capture" in page.run("document.getElementById('state').textContent")
+        page.drop("#capture", tmp_path / "capture.npy")
+        page.wait("document.getElementById('state').textContent.startsWith('admm: 48')")
+
+        page.size(390, 800)  # a phone's width: nothing is cut off
+        assert page.run("document.documentElement.scrollWidth") <= 390
+        named = page.run(
+            "[...document.querySelectorAll('input, select, button')].every(e => "
+            "(e.labels?.length || e.ariaLabel || e.textContent.trim()))"
+        )
+        assert named  # for screen readers
+        assert not page.errors
