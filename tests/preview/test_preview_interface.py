@@ -92,7 +92,7 @@ def hostile(capture):
     return {
         "empty": (b"", "capture"),
         "text": (b"#!/bin/sh\nrm -rf /", "PNG"),
-        "truncated": (capture[:-50], "cut off"),
+        "truncated": (capture[:-50], "capture"),
         "bomb": (png_claiming(60_000, 60_000), "pixels"),
         "many pixels": (npy(np.zeros((SIDE * 3, SIDE * 3), np.uint8)), f"{4 * SIDE**2:,}"),
         "not a number": (npy(nan), "NaN"),

@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-import tempfile
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from functools import partial
@@ -19,7 +18,6 @@ from starlette.staticfiles import StaticFiles
 
 from mwdn.calibration import Calibration
 from mwdn.errors import MwdnError, ParameterError
-from mwdn.io.images import write_frame
 from mwdn.preview.cameras import OPTIONS, Cameras, checked_camera, describe
 from mwdn.preview.guard import Guard, error_response, log
 from mwdn.preview.jobs import ENDED, Job, Jobs
@@ -30,7 +28,7 @@ from mwdn.preview.openapi import openapi
 from mwdn.preview.psf_report import psf_report
 from mwdn.preview.reconstruction import Order, Reconstructions
 from mwdn.preview.result import MEDIA, Look, encode
-from mwdn.preview.samples import CAMERA, NAMES, sample_capture
+from mwdn.preview.samples import CAMERA, NAMES, sample_png
 from mwdn.preview.uploads import Form, parse_number, parse_white_balance, read_form
 from mwdn.version import __version__
 
@@ -125,7 +123,7 @@ class Preview:
         name = request.path_params["name"]
         if name not in NAMES:
             raise RefusedError(404, f"No sample of this name. Known: {', '.join(NAMES)}.")
-        return Response(await self._thread(partial(_png, name)), media_type="image/png")
+        return Response(await self._thread(partial(sample_png, name)), media_type="image/png")
 
     async def list_cameras(self, _: Request) -> Response:
         """Calibrations by name."""
@@ -284,13 +282,6 @@ def _look(values: Any) -> Look:  # noqa: ANN401
 def _wake(loop: asyncio.AbstractEventLoop, ended: asyncio.Event) -> None:
     with suppress(RuntimeError):  # the server has stopped
         loop.call_soon_threadsafe(ended.set)
-
-
-def _png(name: str) -> bytes:
-    with tempfile.TemporaryDirectory(prefix="mwdn-") as folder:
-        path = Path(folder) / "capture.png"
-        write_frame(path, sample_capture(name))
-        return path.read_bytes()
 
 
 async def _failed(_: Request, error: Exception) -> Response:

@@ -1,11 +1,14 @@
 """A camera to try: a simulated one, and captures of three photographs."""
 
+import tempfile
 from functools import cache
+from pathlib import Path
 
 import torch
 
 from mwdn.calibration import Calibration
 from mwdn.data.random import seeded
+from mwdn.io.images import write_frame
 from mwdn.io.pictures import dark_scene
 from mwdn.optics import Camera, Sensor, Variety, sample_camera
 from mwdn.types import Frame
@@ -34,3 +37,12 @@ def sample_capture(name: str) -> Frame:
     light = Camera(sample_calibration().psf).forward(dark_scene(name, SIZE, side=200))
     exposed = SENSOR.expose(light * (_PEAK / light.max()), generator=seeded(NAMES.index(name)))
     return (exposed.clamp(0, 1) * 65535).round()[0].movedim(0, -1).to(torch.int32).numpy().astype("uint16")
+
+
+@cache
+def sample_png(name: str) -> bytes:
+    """A sample capture as a PNG of 16 bits."""
+    with tempfile.TemporaryDirectory(prefix="mwdn-") as folder:
+        path = Path(folder) / "capture.png"
+        write_frame(path, sample_capture(name))
+        return path.read_bytes()

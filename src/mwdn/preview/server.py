@@ -5,6 +5,7 @@ import socket
 import sys
 import threading
 from typing import Any
+from urllib.parse import quote
 
 from mwdn.errors import ParameterError, reason
 from mwdn.preview.limits import Limits
@@ -36,7 +37,7 @@ class PreviewServer:
 
         self.socket: socket.socket = listen(host, port)
         address = f"[{host}]" if ":" in host else host
-        self.url = f"http://{address}:{self.socket.getsockname()[1]}/{f'?token={token}' if token else ''}"
+        self.url = f"http://{address}:{self.socket.getsockname()[1]}/{f'?token={quote(token)}' if token else ''}"
         config = uvicorn.Config(
             preview.app(token=token, any_host=host not in LOOPBACK),
             ws="websockets-sansio",

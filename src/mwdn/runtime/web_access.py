@@ -52,13 +52,12 @@ def listen(host: str, port: int) -> socket.socket:
     Raises:
         ParameterError: the address is in use, or not of this computer.
     """
+    listener = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
     try:
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        listener = socket.socket(family, socket.SOCK_STREAM)
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((host, port))
+        listener.listen()  # before the server does: a page that comes early waits
     except (OSError, OverflowError) as error:
-        raise ParameterError(
-            f"`host` and `port` ({host}:{port}) cannot be used: {reason(error)}. Choose others."
-        ) from error
+        listener.close()
+        raise ParameterError(f"`host` and `port` ({host}:{port}) cannot be used: {reason(error)}.") from error
     return listener
