@@ -86,8 +86,9 @@ def open_page(url, profile):
         text=True,
         env={**os.environ, "HOME": str(profile)},
     )
+    readers = []
     try:
-        address = _debugger(process)
+        address = _debugger(process, readers)
         with connect(address, max_size=2**26, open_timeout=PATIENCE_S) as socket:
             page = Page(socket)
             for domain in ("Runtime", "Log", "DOM", "Page"):
@@ -98,13 +99,17 @@ def open_page(url, profile):
     finally:
         process.terminate()
         process.wait(timeout=30)
+        for thread in readers:
+            thread.join()
+        process.stderr.close()
 
 
-def _debugger(process):
+def _debugger(process, readers):
     for line in process.stderr:
         if port := re.search(r"DevTools listening on ws://127.0.0.1:(\d+)/", line):
             # Nobody reads the rest: a full pipe would stop the browser.
-            threading.Thread(target=process.stderr.read, daemon=True).start()
+            readers.append(threading.Thread(target=process.stderr.read, daemon=True))
+            readers[0].start()
             with urllib.request.urlopen(f"http://127.0.0.1:{port[1]}/json/list", timeout=PATIENCE_S) as answer:
                 return next(tab["webSocketDebuggerUrl"] for tab in json.load(answer) if tab["type"] == "page")
     raise AssertionError("Chromium did not start.")
