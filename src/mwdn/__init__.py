@@ -81,7 +81,8 @@ __all__ = [
 
 _PACKAGES = {
     *("benchmark", "calibration", "capture", "data", "diagnosis", "errors", "evaluation", "export", "fourier"),
-    *("inference", "io", "networks", "optics", "runtime", "solvers", "training", "types", "weights"),
+    *("inference", "io", "networks", "optics", "registration", "runtime", "solvers", "training", "types"),
+    "weights",
 }
 _MODULES = {
     "Calibration": "calibration",

@@ -91,7 +91,7 @@ def test_gamma_is_decoded_to_linear_light(gamma, generator):
 @pytest.mark.parametrize("gamma", [0.9, 4.1, float("nan"), "rgb"])
 @pytest.mark.usefixtures("unchecked")
 def test_gamma_is_srgb_or_a_number(gamma):
-    with pytest.raises(ParameterError, match=rf"`gamma` \('?{gamma}'?\).* must be '?srgb'?,( or)? a number"):
+    with pytest.raises(ParameterError, match=rf"`gamma` \('?{gamma}'?\).* must be ('?srgb'?,( or)? a number|finite)"):
         FrameFormat(gamma=gamma)
 
 

@@ -417,7 +417,7 @@ def test_two_channels_in_the_file(tmp_path):
 @pytest.mark.parametrize("background", [-0.1, 1.0, float("nan")])
 def test_background_out_of_range(tmp_path, caustic, background):
     path = store(tmp_path / "psf.png", (caustic * 255).astype(np.uint8)[..., None])
-    with pytest.raises(ParameterError, match=r"`background` \(.*\) must be in \[0, 1\)"):
+    with pytest.raises(ParameterError, match=r"`background` \(.*\).* must be (in \[0, 1\)|finite)"):
         Calibration.from_file(path, background=background)
 
 

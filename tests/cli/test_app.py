@@ -225,8 +225,8 @@ def test_o_is_out(run, command):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("recunstruct", "No command named 'recunstruct'. Did you mean 'reconstruct'? Known: benchmark, "),
-        ("--foo", "No command named '--foo'. Known: benchmark, "),
+        ("recunstruct", "No command named 'recunstruct'. Did you mean 'reconstruct'? Known: align, "),
+        ("--foo", "No command named '--foo'. Known: align, "),
         ("inspect --psf-bim 2", "Unknown option: --psf-bim. Did you mean --psf-bin? Options: --psf, "),
         ("methods --foo", "Unknown option: --foo. Options: none. See `mwdn methods --help`."),
         ("train", "`RECIPE` is missing. See `mwdn train --help`."),

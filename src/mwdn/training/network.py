@@ -28,8 +28,8 @@ def build_network(recipe: Recipe) -> nn.Module:
         network.load_state_dict(grown(weights, network))
     except RuntimeError as error:
         raise CheckpointError(
-            f"`start` ('{start}') must hold the network of the recipe, {recipe.network}, and `denoiser` ('{denoiser}') "
-            f"its denoiser, if it has one: {first_difference(error)}."
+            f"`start` ('{start}') must hold the network of the recipe, and `denoiser` ('{denoiser}') its denoiser, if "
+            f"it has one: {first_difference(error)}. The recipe has {recipe.network}."
         ) from error
     return network
 
