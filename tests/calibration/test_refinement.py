@@ -94,6 +94,16 @@ def test_only_terms_that_explain_left_out_pairs_are_taken(psf, generator):
         psf, lambda: pairs(psf, Refinement(sensor_field=FIELD), torch.Generator().manual_seed(1), noise=0.003)
     )
     assert uneven.taken[1].term == "sensor_field"
+    assert not uneven.fit(uneven.taken[0].terms).refinement()
+
+
+def test_with_a_displaced_envelope_the_calibration_as_it_was_stays(psf):
+    truth = Refinement(envelope_shift=(0.05, 0.0))
+    made = pairs(psf, truth, torch.Generator().manual_seed(1), noise=0.003)
+    selection = select_terms(psf, lambda: made)
+    assert not selection.fit(selection.taken[0].terms).refinement()
+    with_it = next(step for step in selection.taken if step.term == "envelope")
+    assert selection.fit(with_it.terms).refinement().envelope_shift[0] == pytest.approx(0.05, abs=0.015)
 
 
 def test_one_pair_is_too_few(psf, generator):

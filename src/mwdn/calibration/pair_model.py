@@ -45,7 +45,7 @@ class Terms:
         sensor_field: S, common to all colours.
         stray_light: B for each colour, without the part that is even over the sensor, which o has.
         field_dependence: g that changes linearly over the scene: 1 for its sum, 2 also over the PSF.
-        envelope: displaced aperture.
+        envelope: 1 for a displaced aperture, 2 for one that moves on from the displacement of the model's PSF.
     """
 
     psf_gain: int = 0
@@ -161,7 +161,8 @@ class PairModel:
         return Fit(terms, kernels, zeros(field).double(), zeros(colours, stray).double(), self.shift)
 
     def _columns(self, terms: Terms) -> list[int]:
-        wanted = terms.kernels + ([(-1, 0), (-2, 0)] if terms.envelope and self.shift is None else [])
+        moves = terms.envelope > (self.shift is not None)
+        wanted = terms.kernels + ([(-1, 0), (-2, 0)] if moves else [])
         return [self.kernels.index(name) for name in wanted]
 
     def fit(self, terms: Terms, pairs: Sequence[int], *, start: Fit | None = None, steps: int = 4) -> Fit:

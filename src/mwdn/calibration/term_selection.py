@@ -2,7 +2,8 @@
 
 In each round, each term is tried at each order beyond the one it has, on top of the terms taken so far. A term is
 measured on pairs that it was not fitted to: each pair in turn is left out, and only its own gain and offset are fitted.
-The best term is taken if it lowers the mean unexplained part by `LEAST` and that of more than half of the pairs.
+The best term is taken if it lowers the mean unexplained part by `LEAST` and that of more than half of the pairs. The
+field dependence, which no solver uses, comes last: fitted together, it would take what the other terms can explain.
 """
 
 from collections.abc import Callable, Iterable
@@ -22,6 +23,12 @@ HIGHEST = {"envelope": 1, "psf_gain": 3, "sensor_field": 2, "stray_light": 2, "f
 KERNELS = Terms(psf_gain=3, field_dependence=2).kernels
 
 LEAST_PAIRS = 2
+
+MOVES = 3
+"""Gauss-Newton steps on the envelope's displacement."""
+
+Pairs = Iterable[tuple[Measurement, Scene]]
+"""Measurements and scenes, (1, C, H, W) each."""
 
 
 @dataclass(frozen=True)
@@ -53,11 +60,14 @@ class Selection:
     """Result of `select_terms`.
 
     Args:
-        model: of all pairs, with the envelope's displacement if that was taken.
+        model: of all pairs.
+        displaced: the same with the displaced envelope, if that was taken. The displacement is that of all pairs, also
+            where one is left out.
         steps: the calibration as it was, then the terms in the order in which they were tried.
     """
 
     model: PairModel
+    displaced: PairModel | None
     steps: tuple[Step, ...]
 
     @property
@@ -67,12 +77,13 @@ class Selection:
 
     def fit(self, terms: Terms, *, without: int | None = None) -> Fit:
         """Fit to all pairs, or to all but one."""
-        return self.model.fit(terms, [pair for pair in range(len(self.model)) if pair != without])
+        model = self.displaced if terms.envelope and self.displaced is not None else self.model
+        return model.fit(terms, [pair for pair in range(len(model)) if pair != without])
 
 
 def select_terms(
     psf: Psf,
-    pairs: Callable[[], Iterable[tuple[Measurement, Scene]]],
+    pairs: Callable[[], Pairs],
     *,
     report: Callable[[Step], None] = lambda step: None,
 ) -> Selection:
@@ -86,33 +97,45 @@ def select_terms(
     Raises:
         ParameterError: fewer than two pairs.
     """
-    model = PairModel(psf, pairs(), kernels=KERNELS)
+    plain = model = PairModel(psf, pairs(), kernels=KERNELS)
+    displaced = None
     if len(model) < LEAST_PAIRS:
         raise ParameterError(f"`pairs` ({len(model)}) must be {LEAST_PAIRS} or more: each in turn is left out.")
-    steps = [_tried(model, "", 0, Terms(), taken=True)]
+    steps = [_tried(model, "", 0, Terms())]
     report(steps[0])
+    names, last = HIGHEST.keys() - {"field_dependence"}, HIGHEST.keys() & {"field_dependence"}
     while True:
         before = [step for step in steps if step.taken][-1]
-        terms = before.terms
         tried = [
-            _tried(model, term, order, replace(terms, **{term: order}), taken=False)
+            _tried(model, term, order, replace(before.terms, **{term: order}))
             for term, highest in HIGHEST.items()
-            for order in range(getattr(terms, term) + 1, highest + 1)
+            for order in range(getattr(before.terms, term) + 1, highest + 1)
+            if term in names
         ]
         best = min(tried, key=lambda step: step.mean, default=None)
-        better = best is not None and _is_better(best, before)
+        taken = best if best is not None and _is_better(best, before) else None
         for step in tried:
-            steps.append(replace(step, taken=better and step is best))
+            steps.append(replace(step, taken=step is taken))
             report(steps[-1])
-        if best is None or not better:
-            return Selection(model, tuple(steps))
-        if best.term == "envelope":
-            # The displacement was linear so far; from here on the displaced PSF is the one that other terms change.
-            shift = model.fit(best.terms, range(len(model))).displacement
-            model = PairModel(psf, pairs(), kernels=KERNELS, shift=shift)
+        if taken is None and not last:
+            return Selection(plain, displaced, tuple(steps))
+        if taken is None:
+            names, last = last, set()
+        elif taken.term == "envelope":
+            displaced = model = _displaced(model, taken.terms, psf, pairs)
 
 
-def _tried(model: PairModel, term: str, order: int, terms: Terms, *, taken: bool) -> Step:
+def _displaced(model: PairModel, terms: Terms, psf: Psf, pairs: Callable[[], Pairs]) -> PairModel:
+    """Gauss-Newton on the displacement, which is linear in a model: the displaced PSF is what other terms change."""
+    down, right = 0.0, 0.0
+    for step in range(1, MOVES + 1):
+        moved = model.fit(replace(terms, envelope=min(step, 2)), range(len(model))).displacement
+        down, right = down + moved[0], right + moved[1]
+        model = PairModel(psf, pairs(), kernels=KERNELS, shift=(down, right))
+    return model
+
+
+def _tried(model: PairModel, term: str, order: int, terms: Terms) -> Step:
     everything = range(len(model))
     start = model.fit(terms, everything)
     unexplained = [
@@ -121,7 +144,7 @@ def _tried(model: PairModel, term: str, order: int, terms: Terms, *, taken: bool
         )
         for pair in everything
     ]
-    return Step(term, order, tuple(unexplained), taken, terms)
+    return Step(term, order, tuple(unexplained), taken=not term, terms=terms)
 
 
 def _is_better(step: Step, before: Step) -> bool:
