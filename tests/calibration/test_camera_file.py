@@ -155,6 +155,12 @@ def test_wrong_lines_are_named(tmp_path, line, error, message):
         *(f"white_balance = [{gain}, 1, 1]" for gain in ("nan", "0", "1e-300", "1e300", "9" * 400)),
         *(f"{key} = {'9' * 400}" for key in ("pitch_um", "gamma", "background", "bin", "bit_depth")),
         *(f"{key} = '{'x' * 10_000}'" for key in ("mosaic", "gamma", "dark", "crop")),
+        *(
+            f"{key} = {value}"
+            for key in ("electrons_per_count", "full_well_electrons")
+            for value in ("nan", "0", "1e300")
+        ),
+        *("read_noise_electrons = -1", "black_level = 1", "distances_mm = [nan]", "field_positions = [[inf, 0.0]]"),
     ],
 )
 def test_values_out_of_any_range_are_named_on_one_short_line(folder, monkeypatch, line):
@@ -164,6 +170,22 @@ def test_values_out_of_any_range_are_named_on_one_short_line(folder, monkeypatch
     with pytest.raises(MwdnError) as caught:
         Calibration.load("camera.toml")
     assert len(str(caught.value)) <= 300
+
+
+@pytest.mark.parametrize("pitch", [float("nan"), -1.0, float("inf")])
+def test_a_file_that_could_not_be_read_is_not_written(folder, pitch):
+    """`--pitch-um nan` replaced a camera file by one that no command could read, nor replace."""
+    camera = {"psf": folder / "lab/psf.png", "pitch_um": 2.0}
+    write_camera(folder / "camera.toml", camera)
+    with pytest.raises(ParameterError, match="`pitch_um`"):
+        write_camera(folder / "camera.toml", {**camera, "pitch_um": pitch})
+    assert read_camera(folder / "camera.toml")["pitch_um"] == 2.0
+
+
+def test_a_name_that_no_file_can_have(folder):
+    (folder / "camera.toml").write_text(f'psf = "{5000 * "x"}"\npsf_sha256 = "0"\n')
+    with pytest.raises(ImageError, match="File name too long"):
+        Calibration.load(folder / "camera.toml")
 
 
 def test_the_hash_of_a_huge_file_is_not_computed(folder):

@@ -65,6 +65,12 @@ def test_frames_that_disagree_are_refused(bench, dark):
         average_frames([], FORMAT)
 
 
+def test_dark_frames_of_another_size_are_named(bench):
+    """They ended in torch's error."""
+    with pytest.raises(ImageError, match=r"`frame 1` \(8 x 9\) must be like the dark frames \(8 x 8\)"):
+        average_frames([np.ones((8, 9, 1), np.uint16)] * 2, dark=torch.zeros(1, 1, 8, 8))
+
+
 def test_hot_pixels_are_found_and_replaced(bench, dark):
     found = find_hot_pixels(dark)
     assert int((found & (bench.hot > 0)).sum()) == int((bench.hot > 0).sum())

@@ -3,6 +3,7 @@
 import json
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -14,7 +15,7 @@ from mwdn.calibration.white_balance import WhiteBalance
 from mwdn.errors import ParameterError, PsfError, UnknownNameError, fits_type, one_line, shown
 from mwdn.io.files import as_parameter_error, atomic, file_sha256
 from mwdn.io.headers import MAX_BYTES
-from mwdn.io.toml import read_toml
+from mwdn.io.toml import check_numbers, read_toml
 from mwdn.optics.sensor import Sensor
 
 _TYPES: dict[str, Any] = {
@@ -72,6 +73,7 @@ KEYS: dict[str, tuple[str, Any]] = {
 
 _FILES = ("psf", "dark", "ambient", "flat_field", "hot_pixels")
 _LISTS = ("distance_psfs", "field_psfs")
+_POSITIVE = ("pitch_um", "distance_mm", "distances_mm", "electrons_per_count", "full_well_electrons")
 _HEAD = """\
 # A camera of mwdn: its PSF, and how its frames become measurements. Paths are relative to this file.
 # Use it in any command: mwdn reconstruct CAPTURES --camera {name}
@@ -100,11 +102,24 @@ def read_camera(path: str | Path) -> dict[str, Any]:
             raise ParameterError(
                 f"`{key}` ({shown(value)}) in `{path}` must be like this: `{key} = {_to_toml(example)}`. {meaning}"
             )
+        _check_range(key, value)
     if "psf" not in table:
         raise ParameterError(f'`{path}` must name the camera\'s PSF: `psf = "psf.png"`.')
     files = {key: path.parent / table[key] for key in _FILES if key in table}
     lists = {key: tuple(path.parent / name for name in table[key]) for key in _LISTS if key in table}
     return {**{key: _as_tuple(value) for key, value in table.items()}, **files, **lists}
+
+
+def _check_range(key: str, value: Any) -> None:  # noqa: ANN401
+    """Raise a `ParameterError` if the number of a key, or one of its numbers, is out of any range."""
+    check_numbers(value, key)
+    for number in value if isinstance(value, list | tuple) else [value]:
+        if key in _POSITIVE and not number > 0:
+            raise ParameterError(f"`{key}` ({number}) must be positive.")
+        if key == "read_noise_electrons" and not number >= 0:
+            raise ParameterError(f"`{key}` ({number}) must not be negative.")
+        if key == "black_level" and not 0 <= number < 1:
+            raise ParameterError(f"`{key}` ({number}) must be in [0, 1), a fraction of the full scale.")
 
 
 def _as_tuple(value: Any) -> Any:  # noqa: ANN401
@@ -157,6 +172,7 @@ def write_camera(path: str | Path, camera: Mapping[str, Any]) -> None:
     lines = []
     for key, (meaning, example) in KEYS.items():
         value = values.get(key)
+        _check_range(key, [] if value is None else value)
         if key in _FILES and value is not None:
             value = _relative(Path(value), path.parent)
         elif key in _LISTS and value is not None:
@@ -178,7 +194,9 @@ def check_camera_path(path: Path) -> None:
 def check_psf_file(path: str | Path, sha256: str, psf: Path) -> None:
     """Raise a `PsfError` if the PSF of the camera file ``path`` has changed since that was written."""
     # A larger file is refused where it is read; to hash it would take long.
-    if sha256 and psf.is_file() and psf.stat().st_size <= MAX_BYTES and file_sha256(psf) != sha256:
+    with suppress(OSError):  # a name that no file can have; it is named where the file is read
+        if not sha256 or not psf.is_file() or psf.stat().st_size > MAX_BYTES or file_sha256(psf) == sha256:
+            return
         raise PsfError(
             f"`{psf}` has changed since the camera file `{path}` was written, and may not fit its other values. "
             f"Calibrate again: `mwdn calibrate --camera {path} -o {path}`."

@@ -105,19 +105,19 @@ def to_dataclass(cls: type[T], name: str, table: dict[str, Any]) -> T:
             )
     try:
         for key, value in table.items():
-            _check_numbers(value, key)  # whole numbers first: a float cannot hold one of 400 digits
-            _check_numbers(_as_float(_as_tuple(value), defaults[key]), key)
+            check_numbers(value, key)  # whole numbers first: a float cannot hold one of 400 digits
+            check_numbers(_as_float(_as_tuple(value), defaults[key]), key)
         return cls(**{key: _as_float(_as_tuple(value), defaults[key]) for key, value in table.items()})
     except ParameterError as error:
         error.args = (f"[{name}]: {error}",)
         raise
 
 
-def _check_numbers(value: Any, name: str) -> None:  # noqa: ANN401
+def check_numbers(value: Any, name: str) -> None:  # noqa: ANN401
     """Check the number called ``name``, or each number of a list; other values pass."""
     if isinstance(value, list | tuple):
         for each in value:
-            _check_numbers(each, name)
+            check_numbers(each, name)
     elif isinstance(value, int) and not abs(value) < 2**63:
         raise ParameterError(f"`{name}` ({shown(value)}) must have 63 bits at most.")
     elif isinstance(value, float) and not math.isfinite(value):
