@@ -600,3 +600,14 @@ def test_torchrun_starts_killed_workers_again(shop, single):
     assert re.search(rf"{COUNT} captures reconstructed into again, \d+ of them before", out)
     assert len(set(told(out))) == len(told(out)) <= COUNT
     assert_finished(shop / "again", single)
+
+
+def test_the_share_of_room_light_is_in_the_json(captures, psf, tmp_path):
+    """As a number, also where there is none; absent if it was not looked for."""
+    reconstruct = Reconstructor("wiener", Calibration(psf), device="cpu", room_light=True)
+    jobs = list(Batch(reconstruct, "name", tmp_path / "lit", check_consistency=False).run(captures[:1]))
+    assert jobs[0].error is None
+    content = json.loads(jobs[0].output.with_suffix(".json").read_text())
+    assert content["room_light"] == 0.0
+    jobs = list(make_batch(psf, tmp_path / "plain", check_consistency=False).run(captures[:1]))
+    assert "room_light" not in json.loads(jobs[0].output.with_suffix(".json").read_text())

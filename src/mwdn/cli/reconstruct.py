@@ -44,6 +44,7 @@ def reconstruct(  # noqa: PLR0913
     full_size: bool = False,
     align: bool | None = None,
     ensemble: Annotated[bool, Parameter(negative=())] = False,
+    room_light: bool = False,
     white_balance: WhiteBalance | None = None,
     trust: bool = True,
     map: Annotated[bool, Parameter(negative=())] = False,
@@ -73,6 +74,8 @@ def reconstruct(  # noqa: PLR0913
             calibration; by default for universal, and not for solvers.
         ensemble: average a network's pictures of the capture and its three mirror images: four times the time; on
             average 0.2 dB for universal-small, 0.02 dB for universal.
+        room_light: find even or sloping light of the room in each capture and subtract it, if there is no frame of it
+            for --ambient. The .json and a line say its share.
         white_balance: of the pictures: grey-world, psf (the point source is white), or gains of red, green and blue.
         trust: check how well each picture explains its capture; takes a second or two for a small one.
         map: also draw which parts of each picture its capture supports, as NAME.support.png.
@@ -101,6 +104,7 @@ def reconstruct(  # noqa: PLR0913
             device=local_device,
             white_balance=white_balance,
             ensemble=ensemble,
+            room_light=room_light,
             **method_options,
         )
         if is_first:
@@ -220,5 +224,6 @@ def _report(job: Job) -> None:
         named = one_line(f"`{job.capture}`") in str(job.error)
         complain("[red]Error:[/]" if named else f"[red]{escape(one_line(str(job.capture)))}:[/]", job.error)
     elif job.trust:
-        line = f"{one_line(job.capture.name)}: {job.trust.sentence}"
+        lit = f"; {job.room_light:.0%} of its light was the room's" if job.room_light else ""
+        line = f"{one_line(job.capture.name)}: {job.trust.sentence}{lit}"
         say(line)

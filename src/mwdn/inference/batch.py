@@ -1,5 +1,6 @@
 """Reconstruct a folder of captures: read, reconstruct, check and write in parallel, in one process or several."""
 
+import copy
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
@@ -53,6 +54,7 @@ class Job:
         measurement: (1, C, H, W); like ``pose`` and ``scene`` dropped when the job is done.
         pose: of the PSF, if the consistency is checked.
         scene: (1, C, H, W).
+        room_light: part of the capture's light that was subtracted as the room's; `None` if it was not looked for.
         existing: whether the picture was already there and nothing was done.
         full_size: height and width of the picture, if it is to be larger than the measurement.
         verdicts: on the capture, the PSF and the picture, if they are checked.
@@ -67,6 +69,7 @@ class Job:
     measurement: Measurement | None = None
     pose: Pose | None = None
     scene: Scene | None = None
+    room_light: float | None = None
     existing: bool = False
     full_size: Size | None = None
     verdicts: tuple[Verdict, ...] = ()
@@ -165,7 +168,10 @@ class Batch:
             raise ImageError("The sensor saw no light: no pixel is brighter than the dark frame, or black.")
         measurement = to_device(measurement, self.reconstruct.device)
         full_size = calibration.frames.full_size(frame) if self.full_size else None
-        job = replace(job, measurement=measurement, full_size=full_size)
+        measurement, share = self.reconstruct.without_room_light(measurement)
+        job = replace(
+            job, measurement=measurement, full_size=full_size, room_light=None if share is None else float(share)
+        )
         if not self.check_consistency:
             return job
         verdicts = examine_capture(frame, calibration, for_viewing=is_for_viewing(job.capture))
@@ -205,8 +211,14 @@ class Batch:
     def _reconstruct(self, job: Job) -> Job:
         if job.measurement is None:
             return job
-        reconstruct = self.reconstruct.at(job.pose) if job.pose else self.reconstruct
+        reconstruct = self._dark.at(job.pose) if job.pose else self._dark
         return replace(job, scene=reconstruct.on_device(job.measurement))
+
+    @cached_property
+    def _dark(self) -> Reconstructor:  # for measurements without the room's light
+        dark = copy.copy(self.reconstruct)
+        dark.room_light = False
+        return dark
 
     @_step
     def _finish(self, job: Job) -> Job:
@@ -220,6 +232,7 @@ class Batch:
             "origin": job.origin,
             "bin": self.reconstruct.calibration.frames.bin,
         }
+        content |= {} if job.room_light is None else {"room_light": round(job.room_light, 4)}
         if trust:
             content |= {**trust.content, "verdicts": [asdict(verdict) for verdict in verdicts]}
         scene, sidecar = to_host(self.reconstruct.balance(job.scene)), job.output.with_suffix(".json")

@@ -82,8 +82,9 @@ def _camera(calibration: Calibration) -> dict[str, object]:
 def _method(reconstruct: Reconstructor) -> tuple[object, ...]:
     """What counts of the method; alignment has always been an option of some networks, now of every method."""
     method, aligned = reconstruct.method, ("aligned",) if reconstruct.align else ()
+    lit = ("room light",) if reconstruct.room_light else ()
     if not isinstance(method, nn.Module):
-        return (method, *aligned)
+        return (method, *aligned, *lit)
     kind = type(method).__name__
     names = _OPTIONS.get(kind, tuple(name for name in vars(method) if name[0] != "_" and name != "training"))
     options = {"training": method.training, **{name: getattr(method, name) for name in names}}
@@ -91,7 +92,7 @@ def _method(reconstruct: Reconstructor) -> tuple[object, ...]:
         options["align"], aligned = reconstruct.align, ()
     averaged = ("ensemble",) if isinstance(reconstruct.engine, Ensemble) else ()
     precision = reconstruct.engine and reconstruct.engine.precision
-    return kind, options, method.state_dict(), precision, *aligned, *averaged
+    return kind, options, method.state_dict(), precision, *aligned, *averaged, *lit
 
 
 def _digest(*parts: object) -> str:

@@ -44,6 +44,8 @@ class Reconstructor:
         white_balance: of the pictures, see `mwdn.calibration.white_balance`; that of the calibration unless given.
         ensemble: average a network's results for the measurement and its three mirror images, see
             `mwdn.inference.ensemble.Ensemble`. It takes four times as long; for a network that takes any PSF.
+        room_light: whether to find and subtract even or sloping light of the room in each measurement first, see
+            `mwdn.solvers.room_light`.
         **options: of a solver given by its name, for example ``regularisation=1e-4``.
 
     It can be copied and pickled if its method can.
@@ -61,7 +63,7 @@ class Reconstructor:
             the network has no weights; ``ensemble`` with a solver.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         method: Method | str | Path,
         calibration: Calibration,
@@ -71,9 +73,11 @@ class Reconstructor:
         precision: Precision = "fast",
         white_balance: WhiteBalance | None = None,
         ensemble: bool = False,
+        room_light: bool = False,
         **options: Any,  # noqa: ANN401
     ) -> None:
         given = {"method": method, "align": align, "device": device, "precision": precision, "ensemble": ensemble}
+        given["room_light"] = room_light
         check_options(Reconstructor, "`Reconstructor`", given)
         if not isinstance(calibration, Calibration):
             raise ParameterError(
@@ -82,7 +86,7 @@ class Reconstructor:
             )
         self.device = select_device(device)
         self.pixels_per_chunk = PIXELS_PER_CHUNK.get(self.device.type, PIXELS_PER_CHUNK["cpu"])
-        self.calibration = calibration
+        self.calibration, self.room_light = calibration, room_light
         self.white_balance = calibration.white_balance if white_balance is None else white_balance
         check_white_balance(self.white_balance, calibration.light)
         self.warning = None
@@ -164,6 +168,13 @@ class Reconstructor:
                 scene = reconstruct._in_chunks(measurement)
             yield measurement, to_host(self.balance(scene))
 
+    def without_room_light(self, measurement: Measurement) -> tuple[Measurement, Tensor | None]:
+        """The measurement less the light of the room, and its share (B,); as it is and `None` without that option."""
+        if not self.room_light:
+            return measurement, None
+        found = solvers.find_room_light(measurement, self.psf)
+        return measurement - found.background, found.share
+
     def _reconstruct(self, measurement: Measurement) -> Scene:
         if self.align:
             return self.at(solvers.align(measurement, self.psf))._reconstruct(measurement)
@@ -244,7 +255,7 @@ class Reconstructor:
     def _in_chunks(self, measurement: Measurement) -> Scene:
         try:
             parts = torch.split(measurement, self._pictures_per_chunk(measurement))
-            scenes = [self._reconstruct(to_device(part, self.device)) for part in parts]
+            scenes = [self._reconstruct(self.without_room_light(to_device(part, self.device))[0]) for part in parts]
             return scenes[0] if len(scenes) == 1 else torch.cat(scenes)
         except (MemoryError, RuntimeError) as error:
             out_of_memory = isinstance(error, MemoryError | torch.OutOfMemoryError)

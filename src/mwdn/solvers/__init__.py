@@ -6,7 +6,7 @@
 - `Pyramid`: ADMM from coarse to fine. Better than `Admm`, in a fraction of its time.
 
 `WarmStart` continues `Admm` or `Fista` from frame to frame of a stream; `align` corrects the PSF of a camera that has
-changed since its calibration.
+changed since its calibration; `find_room_light` finds the light of the room in a capture.
 """
 
 from typing import Any
@@ -18,6 +18,7 @@ from mwdn.solvers.admm import Admm
 from mwdn.solvers.alignment import Pose, align
 from mwdn.solvers.fista import Fista
 from mwdn.solvers.pyramid import Pyramid
+from mwdn.solvers.room_light import RoomLight, find_room_light
 from mwdn.solvers.splitting import TEXTBOOK, Penalties
 from mwdn.solvers.warm_start import WarmStart
 from mwdn.solvers.wiener import Wiener
@@ -67,10 +68,12 @@ __all__ = [
     "Penalties",
     "Pose",
     "Pyramid",
+    "RoomLight",
     "Solver",
     "WarmStart",
     "Wiener",
     "align",
     "build",
+    "find_room_light",
     "noise_level",
 ]

@@ -8,8 +8,8 @@ The capture b is a scene v through the PSF, and a background B c of even light a
 
 Scenes can imitate smooth light, by a veil and by light from outside the frame, so E is flat where c has too little of
 it. Too much of it cannot be compensated, because light is not negative: beyond the true background E rises steeply.
-(`mwdn.solvers.alignment` finds haze in the same way.) So c is searched from above, from the largest even light under
-the capture, by Gauss-Newton steps that eliminate the scene (variable projection), until E has hardly risen:
+(`mwdn.solvers.alignment` finds haze in the same way.) So c is searched from above, from the largest plane of light
+under the capture, by Gauss-Newton steps that eliminate the scene (variable projection), until E has hardly risen:
 
 3. ``d = argmin |S^-1 d|^2`` such that ``|r + J d|^2 / pixels <= E(0) + (t |J_0|)^2``, then ``c <- c + d``. The finite
    differences ``J = dr / dc`` have a new scene for each c; J_0 is that of the even term at the first step.
@@ -49,6 +49,9 @@ TOLERANCE = 0.02
 FAINT = 0.08
 """Smaller shares of the light stay in the measurement: as much is found without a room's light in photographs that fill
 the frame."""
+
+ABOVE = 0.002
+"""Weight of light above the largest plane below a capture; that below it has a weight of 1."""
 
 _PENALTIES = Penalties(0.15, 0.0, 0.6)
 _DELTA = -0.05, 0.05, 0.05  # finite differences; less even light, because more is impossible at first
@@ -112,12 +115,14 @@ def _search(b: Measurement, psf: Psf) -> Tensor:
     """Equation (3) for measurements (n, 1, h, w) of mean 1 through PSFs (n, 1, h, w): coefficients (n, 3)."""
     size, count = (b.shape[-2], b.shape[-1]), len(_DELTA) + 1
     delta = b.new_tensor(_DELTA)
-    c = torch.stack([_floor(b), b.new_zeros(len(b)), b.new_zeros(len(b))], 1)
+    c = _largest_plane(b)
     limit = _residual(b, psf).square().mean(1)
     offsets = torch.cat([delta.new_zeros(1, 3), delta.diag()])
     for step in range(STEPS):
         trials = _light((c[:, None] + offsets).flatten(0, 1), size)
-        r = _residual(b.repeat_interleave(count, 0) - trials, psf.repeat_interleave(count, 0)).reshape(len(b), count, -1)
+        r = _residual(b.repeat_interleave(count, 0) - trials, psf.repeat_interleave(count, 0)).reshape(
+            len(b), count, -1
+        )
         J = (r[:, 1:] - r[:, :1]) / delta[:, None]
         if step == 0:
             limit = limit + TOLERANCE**2 * J[:, 0].square().mean(1)
@@ -145,10 +150,19 @@ def _gauss_newton_step(J: Tensor, r: Tensor, limit: Tensor) -> Tensor:
     return torch.where((energy > limit)[:, None], spread * d, 0.0)
 
 
-def _floor(b: Measurement) -> Tensor:
-    """Even light (n,) below all but a hundredth of a capture (n, 1, h, w), whose noise is smoothed."""
-    smooth = F.avg_pool2d(F.pad(b, (1, 1, 1, 1), mode="replicate"), 3, 1).flatten(1)
-    return smooth.kthvalue(max(1, smooth.shape[1] // 100), 1).values.clamp(min=0)
+def _largest_plane(b: Measurement) -> Tensor:
+    """Coefficients (n, 3) of the largest plane of light below captures (n, 1, h, w), whose noise is smoothed.
+
+    Asymmetric least squares: what is above the plane hardly counts.
+    """
+    y = F.avg_pool2d(F.pad(b, (1, 1, 1, 1), mode="replicate"), 3, 1).flatten(1)
+    X = torch.cat([_light(one[None], (b.shape[-2], b.shape[-1])) for one in torch.eye(3, device=b.device)]).flatten(1)
+    weight, c = torch.ones_like(y), y
+    for _ in range(15):
+        XW = X * weight[:, None]
+        c = torch.linalg.solve(XW @ X.mT, XW @ y[..., None])[..., 0]
+        weight = torch.where(c @ X < y, ABOVE, 1.0)
+    return c
 
 
 def _residual(b: Measurement, psf: Psf) -> Tensor:

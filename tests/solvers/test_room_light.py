@@ -1,0 +1,85 @@
+"""Room light against closed forms: a delta PSF, a known slope over a scene on dark, and nothing where there is none."""
+
+import math
+
+import pytest
+import torch
+from torch.nn import functional as F
+
+from cameras import contour_psf
+from mwdn import Calibration, Reconstructor, fourier
+from mwdn.optics.room_light import even_light, sloping_light
+from mwdn.solvers import Pyramid, find_room_light
+
+SIZE = 48, 64
+
+
+@pytest.fixture
+def psf(generator):
+    return contour_psf(SIZE, cell=12, generator=generator).expand(1, 3, -1, -1)
+
+
+@pytest.fixture
+def scene():
+    scene = torch.zeros(1, 3, *SIZE)
+    scene[..., 16:30, 24:42] = torch.tensor([0.9, 0.5, 0.2])[:, None, None]
+    return scene
+
+
+def lit(scene, psf, light):
+    """The measurement, and light of this shape in units of its mean."""
+    measurement = fourier.convolve(scene, psf)
+    return measurement, light * measurement.mean((1, 2, 3), keepdim=True)
+
+
+@pytest.mark.parametrize(("light", "error"), [(0.3 * even_light(SIZE), 0.04), (0.25 * sloping_light(SIZE, 0.0), 0.12)])
+def test_known_light_over_a_scene_on_dark(psf, scene, light, error):
+    measurement, light = lit(scene, psf, light)
+    found = find_room_light(measurement + light, psf)
+    off = (found.background - light).square().mean().sqrt() / measurement.mean()
+    assert float(off) < error
+    assert float(found.share) == pytest.approx(float(light.mean() / (measurement + light).mean()), abs=0.05)
+    assert (found.background >= 0).all()
+
+
+def test_a_scene_on_dark_keeps_its_light(psf, scene):
+    """To the last bit."""
+    found = find_room_light(fourier.convolve(scene, psf), psf)
+    assert float(found.share) == 0.0
+    assert (found.background == 0).all()
+
+
+def test_a_scene_that_fills_the_frame_loses_little(psf, generator):
+    """Its darkest light looks like the room's: an eighth of all light is the bound."""
+    scene = F.interpolate(torch.rand(1, 3, 6, 8, generator=generator) ** 2, size=SIZE, mode="bilinear")
+    assert float(find_room_light(fourier.convolve(scene, psf), psf).share) < 1 / 8
+
+
+def test_even_light_through_a_delta_psf_is_the_floor_of_the_scene(scene):
+    """A delta PSF images, so that even light is a scene as well: at most all of it is taken, not what is above it."""
+    delta = torch.zeros(1, 1, *SIZE)
+    delta[..., SIZE[0] // 2, SIZE[1] // 2] = 1
+    found = find_room_light(scene + 0.1, delta)
+    assert float(found.background.amax()) <= 0.1 + 0.02 * 1.5
+
+
+def test_scale_and_batch_do_not_matter(psf, scene):
+    measurement, light = lit(scene, psf, 0.3 * even_light(SIZE))
+    both = torch.cat([measurement + light, 7 * measurement])
+    found = find_room_light(both, psf)
+    assert float(found.share[1]) == 0.0
+    alone = find_room_light(100 * both[:1], 5 * psf)
+    torch.testing.assert_close(alone.background, 100 * found.background[:1], rtol=1e-3, atol=1e-3)
+    assert math.isclose(float(alone.share), float(found.share[0]), rel_tol=1e-3)
+
+
+def test_a_reconstructor_subtracts_it(psf, scene):
+    measurement, light = lit(scene, psf, 0.3 * even_light(SIZE))
+    calibration = Calibration(psf / psf.sum((-2, -1), keepdim=True))
+    errors = [
+        float((Reconstructor(Pyramid(), calibration, device="cpu", room_light=on)(measurement + light) - scene).norm())
+        for on in (False, True)
+    ]
+    assert errors[1] < 0.8 * errors[0]
+    dark = [Reconstructor(Pyramid(), calibration, device="cpu", room_light=on)(measurement) for on in (False, True)]
+    assert torch.equal(*dark)
