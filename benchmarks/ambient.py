@@ -1,0 +1,105 @@
+"""Light of a room on the sensor: what it costs, and what --ambient and --room-light bring back.
+
+    python benchmarks/ambient.py ../shared/data [--methods pyramid universal-small] [--psfs "mwdn-camera 320x320"]
+                                              [--filling 2] [--dark 2]
+
+Test photographs that fill the frame and objects on dark, 15,000 electrons at saturation, exact PSF. The light is a
+share of the mean measurement: even 20 %, a slope of 0 to 50 %, Gaussian spots of 30 % with a standard deviation of 0.4
+(wide) and 0.15 (narrow) of the frame's width. PSNR over the whole frame, clipped, means. `ambient` subtracts a noisy
+frame of the room's light alone. Prints the table and writes the numbers of each picture.
+"""
+
+import argparse
+import json
+from pathlib import Path
+from statistics import fmean
+
+import torch
+from torch.nn import functional as F
+
+import mwdn
+from mwdn import Camera, Reconstructor, psnr
+from mwdn.data.photographs import Photographs
+from mwdn.optics.room_light import even_light, sloping_light, spot_light
+from mwdn.optics.sensor import Sensor
+from universal import PSFS, camera, keep
+
+HANDLINGS = ("nothing", "room-light", "ambient")
+
+
+def lights(size):
+    """Light (H, W) in units of the mean measurement."""
+    return {
+        "none": 0 * even_light(size),
+        "even": 0.2 * even_light(size),
+        "slope": 0.25 * sloping_light(size, 0.6),
+        "wide spot": 0.3 * spot_light(size, (0.4, 0.6), 0.4),
+        "narrow spot": 0.3 * spot_light(size, (0.4, 0.6), 0.15),
+    }
+
+
+def scene(picture, size, *, fills):
+    """A photograph (1, 3, side, side) over the whole frame, or at half its shorter side on dark."""
+    height, width = size
+    side = max(size) if fills else min(size) // 2
+    picture = F.interpolate(picture, (side, side), mode="bilinear", antialias=True)
+    if fills:
+        top, left = (side - height) // 2, (side - width) // 2
+        return picture[..., top : top + height, left : left + width]
+    top, left = (height - side) // 2, (width - side) // 2
+    return F.pad(picture, (left, width - side - left, top, height - side - top))
+
+
+def scores(reconstructors, calibration, picture, *, fills):
+    """PSNR by light and handling for one scene."""
+    size, sensor, values = calibration.size, Sensor(full_well=15_000), {}
+    truth = scene(picture, size, fills=fills)
+    clean = Camera(calibration.psf.expand(-1, 3, -1, -1)).forward(truth)
+    for name, shape in lights(size).items():
+        room = shape * clean.mean()
+        gain = 0.8 / float((clean + room).max())
+        generator = torch.Generator().manual_seed(1)
+        capture = sensor.expose((clean + room) * gain, generator=generator) / gain
+        frame = sensor.expose((clean * 0 + room) * gain, generator=generator) / gain
+        values[name] = {
+            handling: round(float(psnr(one(capture - frame * (handling == "ambient")).clamp(0, 1), truth)), 3)
+            for handling, one in reconstructors.items()
+        }
+    return values
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--methods", nargs="+", default=["admm", "pyramid", "universal-small", "universal"])
+    parser.add_argument("--psfs", nargs="+", choices=PSFS, default=["mwdn-camera 320x320"])
+    parser.add_argument("--filling", type=int, default=2)
+    parser.add_argument("--dark", type=int, default=2)
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/ambient.json"))
+    arguments = parser.parse_args()
+    mwdn.keep_memory()
+    photographs = Photographs(arguments.data / "photos" / "test", limit=arguments.filling + arguments.dark)
+    rows = json.loads(arguments.out.read_text()) if arguments.out.exists() else []
+    print("| PSF | method | scenes | handling |", " | ".join(lights((2, 2))), "|\n|" + " --- |" * 9)
+    for name in arguments.psfs:
+        calibration = camera(arguments.data, name)
+        for method in arguments.methods:
+            plain = Reconstructor(method, calibration)
+            lit = Reconstructor(method, calibration, room_light=True)
+            ways = dict(zip(HANDLINGS, (plain, lit, plain), strict=True))
+            for kind, numbers in (
+                ("filling", range(arguments.filling)),
+                ("dark", range(arguments.filling, arguments.filling + arguments.dark)),
+            ):
+                pictures = [photographs.light(torch.tensor([n])) for n in numbers]
+                values = [scores(ways, calibration, picture, fills=kind == "filling") for picture in pictures]
+                row = {"psf": name, "method": method, "scenes": kind}
+                rows = [old for old in rows if {key: old[key] for key in row} != row] + [row | {"values": values}]
+                keep(rows, arguments.out)
+                for way in HANDLINGS:
+                    cells = [f"{fmean(value[light][way] for value in values):.2f}" for light in values[0]]
+                    print(f"| {name} | {method} | {kind} | {way} | {' | '.join(cells)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
