@@ -32,6 +32,7 @@ if TYPE_CHECKING:  # the names of _MODULES and _PACKAGES, for mypy and editors
     from mwdn import io as io
     from mwdn import networks as networks
     from mwdn import optics as optics
+    from mwdn import preview as preview
     from mwdn import runtime as runtime
     from mwdn import solvers as solvers
     from mwdn import training as training
@@ -81,8 +82,8 @@ __all__ = [
 
 _PACKAGES = {
     *("benchmark", "calibration", "capture", "data", "diagnosis", "errors", "evaluation", "export", "fourier"),
-    *("inference", "io", "networks", "optics", "registration", "runtime", "solvers", "training", "types"),
-    "weights",
+    *("inference", "io", "networks", "optics", "preview", "registration", "runtime", "solvers", "training"),
+    *("types", "weights"),
 }
 _MODULES = {
     "Calibration": "calibration",
