@@ -34,7 +34,7 @@ def write_refinement_page(path: Path, psf: Psf, refinement: Refinement, lines: l
         if field is not None:
             maps.append((name, field.mean(1)[0]))
     columns = max(3, len(maps))
-    figure = Figure(figsize=(3.6 * columns, 6.5), dpi=100, layout="constrained")
+    figure = Figure(figsize=(3.6 * columns, 4.8), dpi=100, layout="constrained")
     axes = figure.subplots(2, columns)
     bright = psf.flatten().sort().values[int(0.998 * (psf.numel() - 1))].clamp(min=1e-30)
     for axis, (name, image) in zip(axes[0], (("PSF as calibrated", psf), ("PSF refined", refined)), strict=False):
