@@ -1,16 +1,21 @@
 """`mwdn preview`: a page that shows what a lensless camera sees, and the HTTP interface behind it."""
 
 import secrets
+from importlib.resources import files
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 
 from mwdn.calibration import Calibration
+from mwdn.capture import open_source
+from mwdn.capture.photograph_list import read_photograph
 from mwdn.cli.camera import CameraOptions
 from mwdn.cli.terminal import say
+from mwdn.errors import ParameterError
 from mwdn.preview.cameras import Cameras
 from mwdn.preview.limits import Limits
+from mwdn.preview.live import Live
 from mwdn.preview.server import log_to_stderr, make_server
 from mwdn.runtime.web_access import LOOPBACK
 
@@ -18,12 +23,13 @@ OWN = "camera"
 """Name of the command line's camera on the page."""
 
 
-def preview(
+def preview(  # noqa: PLR0913
     camera: CameraOptions = CameraOptions(),
     *,
     host: str = "127.0.0.1",
     port: int = 8032,
     token: str = "",
+    live: str | None = None,
     out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("results/preview"),
     device: str | None = None,
     log: Annotated[bool, Parameter(negative=())] = False,
@@ -35,7 +41,9 @@ def preview(
         host: address to listen on. All but 127.0.0.1 can be reached by other computers, and need a token.
         port: to listen on; 0 for a free one.
         token: secret that requests must know; one is made up where it is needed.
-        out: folder of stored calibrations.
+        live: a camera to watch, as for `mwdn capture`: rig, v4l2:0, folder:frames, replay:frames.h5,loop=true. Its PSF
+            is the camera's, --psf or --camera; the simulated rig has its own.
+        out: folder of stored calibrations and recordings.
         device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
         log: print each request to standard error, one JSON object a line.
     """
@@ -45,8 +53,24 @@ def preview(
     limits = Limits()
     cameras = Cameras(limits, out / "cameras", given)
     token = token or ("" if host in LOOPBACK else secrets.token_urlsafe(16))
-    server = make_server(cameras, limits, host=host, port=port, token=token, device=device)
+    watched = None if live is None else _open_live(live, given.get(OWN), out / "recordings", device)
+    server = make_server(cameras, limits, host=host, port=port, token=token, device=device, live=watched)
     if log:
         log_to_stderr()
     say(f"Open {server.url} (Ctrl-C ends the server)")
     server.run()
+
+
+def _open_live(text: str, calibration: Calibration | None, folder: Path, device: str | None) -> Live:
+    """The live camera; the display of a simulated rig shows a photograph."""
+    from mwdn.capture.rig import Rig
+
+    source = open_source(text)
+    if isinstance(source, Rig):
+        screen = source.screen
+        photograph = Path(str(files("mwdn.io.pictures") / "astronaut.jpg"))
+        source.show(read_photograph(photograph, (screen.height_px, screen.width_px)))
+        calibration = calibration or Calibration(source.psf)
+    if calibration is None:
+        raise ParameterError(f"`live` ({text}) needs the PSF of this camera: `--psf psf.png`, `--camera camera.toml`.")
+    return Live(source, calibration, folder=folder, device=device)

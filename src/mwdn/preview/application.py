@@ -13,8 +13,9 @@ from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
-from starlette.routing import Mount, Route
+from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
+from starlette.websockets import WebSocket
 
 from mwdn.calibration import Calibration
 from mwdn.errors import MwdnError, ParameterError
@@ -22,6 +23,7 @@ from mwdn.preview.cameras import OPTIONS, Cameras, checked_camera, describe
 from mwdn.preview.guard import Guard, error_response, log
 from mwdn.preview.jobs import ENDED, Job, Jobs
 from mwdn.preview.limits import Limits, RefusedError
+from mwdn.preview.live import Live, serve_viewer
 from mwdn.preview.methods import checked_options, list_methods
 from mwdn.preview.metrics import Metrics
 from mwdn.preview.openapi import openapi
@@ -44,14 +46,21 @@ class Preview:
         cameras: calibrations by name.
         limits: of the server.
         device: of the reconstructions, see `mwdn.Reconstructor`.
+        live: the live camera.
     """
 
-    def __init__(self, cameras: Cameras, limits: Limits = Limits(), *, device: str | None = None) -> None:
+    def __init__(
+        self, cameras: Cameras, limits: Limits = Limits(), *, device: str | None = None, live: Live | None = None
+    ) -> None:
+        self.live = live
+        if live is not None:
+            live.metrics = self.metrics
         self.cameras, self.limits, self.metrics = cameras, limits, Metrics()
         self.jobs, self.reconstructions = Jobs(limits), Reconstructions(limits, device)
         self.metrics.gauges |= {
             "mwdn_jobs_waiting": lambda: self.jobs.waiting,
             "mwdn_jobs_running": lambda: self.jobs.running,
+            "mwdn_live_viewers": lambda: live.viewers if live else 0,
         }
 
     def app(self, *, token: str = "", any_host: bool = False) -> Any:  # noqa: ANN401
@@ -66,6 +75,8 @@ class Preview:
         async def lifespan(_: Starlette) -> AsyncIterator[None]:
             self._encoders = CapacityLimiter(2)
             yield
+            if self.live is not None:
+                await to_thread.run_sync(self.live.close)
             await to_thread.run_sync(self.jobs.close)
 
         routes = [
@@ -88,6 +99,7 @@ class Preview:
             Route("/jobs/{id}", self.cancel, methods=["DELETE"]),
             Route("/jobs/{id}/picture", self.picture),
             Route("/jobs/{id}/measurement", self.measurement),
+            WebSocketRoute("/live", self.watch),
             Mount("/static", StaticFiles(directory=STATIC)),
         ]
         handlers = {MwdnError: _failed, HTTPException: _failed, 500: _failed}
@@ -112,7 +124,16 @@ class Preview:
 
     async def methods(self, _: Request) -> Response:
         """Methods and their options."""
-        return JSONResponse({"methods": list_methods(), "camera_options": OPTIONS, "limits": vars(self.limits)})
+        live = self.live and self.live.camera.name
+        about = {"camera_options": OPTIONS, "limits": vars(self.limits), "live": live}
+        return JSONResponse({"methods": list_methods(), **about})
+
+    async def watch(self, socket: WebSocket) -> None:
+        """The live picture."""
+        if self.live is None or self.live.viewers >= self.limits.viewers:
+            await socket.close(1013)  # before it is accepted: status 403
+            return
+        await serve_viewer(self.live, socket)
 
     async def samples(self, _: Request) -> Response:
         """Captures to try."""

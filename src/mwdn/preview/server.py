@@ -79,6 +79,7 @@ def make_server(
     port: int = 0,
     token: str = "",
     device: str | None = None,
+    live: Any = None,  # noqa: ANN401
 ) -> PreviewServer:
     """A server with its application.
 
@@ -89,6 +90,7 @@ def make_server(
         port: likewise.
         token: likewise.
         device: of the reconstructions.
+        live: `mwdn.preview.live.Live`.
 
     Raises:
         ParameterError: as for `PreviewServer`.
@@ -97,7 +99,7 @@ def make_server(
         from mwdn.preview.application import Preview
     except ImportError as error:
         raise ParameterError(f"The page needs: pip install 'mwdn[page]' ({reason(error)}).") from error
-    return PreviewServer(Preview(cameras, limits, device=device), host=host, port=port, token=token)
+    return PreviewServer(Preview(cameras, limits, device=device, live=live), host=host, port=port, token=token)
 
 
 def log_to_stderr() -> None:

@@ -1,6 +1,7 @@
 // The page: what is chosen becomes a reconstruction, at once.
 import { getBlob, getJson, post, remove, RequestError, runJob } from "./requests.js";
 import { setUpDivider, setPicture } from "./divider.js";
+import { setUpLive } from "./live.js";
 import { drawSliders, readSliders } from "./sliders.js";
 import { showFindings, showVerdicts } from "./verdicts.js";
 
@@ -213,6 +214,7 @@ function chooseMethod() {
 async function start() {
   const [listed, samples] = await Promise.all([getJson("/methods"), getJson("/samples"), listCameras()]);
   methods = listed.methods;
+  setUpLive(listed.live);
   byId("method").replaceChildren(...methods.map(({ name }) => new Option(name, name)));
   byId("method").value = "universal-small";
   chooseMethod();
