@@ -52,10 +52,10 @@ class Preview:
     def __init__(
         self, cameras: Cameras, limits: Limits = Limits(), *, device: str | None = None, live: Live | None = None
     ) -> None:
+        self.cameras, self.limits, self.metrics = cameras, limits, Metrics()
         self.live = live
         if live is not None:
             live.metrics = self.metrics
-        self.cameras, self.limits, self.metrics = cameras, limits, Metrics()
         self.jobs, self.reconstructions = Jobs(limits), Reconstructions(limits, device)
         self.metrics.gauges |= {
             "mwdn_jobs_waiting": lambda: self.jobs.waiting,

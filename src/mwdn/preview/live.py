@@ -61,7 +61,7 @@ class Live:
         self._thread: threading.Thread | None = None
         self._pending: dict[str, float] = {}
         self._is_recording = self._is_stopped = False
-        self._recorded = 0
+        self._recorded, self._refused = 0, ""
         self._newest: bytes | None = None
 
     def join(self, wake: Callable[[], None]) -> int:
@@ -138,17 +138,16 @@ class Live:
         while self._wake and not self._is_stopped:
             while self._pending:
                 name, value = self._pending.popitem()
+                self._refused = ""
                 try:
                     self.camera.configure(**{name: value})
                 except MwdnError as error:  # a value that the camera refuses must not end the picture
-                    self._publish({"error": str(error)}, b"", b"")
+                    self._refused = str(error)
             frame = self.camera.read()
             if self._is_recording and recorder is None:
                 name = time.strftime("recording-%Y%m%d-%H%M%S.h5", time.gmtime())
-                recorder, self._recorded = (
-                    recording.enter_context(record(self.folder / name, camera=self.camera.name)),
-                    0,
-                )
+                recorder = recording.enter_context(record(self.folder / name, camera=self.camera.name))
+                self._recorded = 0
             if not self._is_recording and recorder is not None:
                 recorder = None
                 recording.close()
@@ -185,6 +184,7 @@ class Live:
                 "number": frame.number,
                 "exposure_s": _finite(frame.exposure_s),
                 "gain": _finite(frame.gain),
+                "refused": self._refused,
                 "recorded": self._recorded if self._is_recording else None,
             }
             self._publish(said, *pictures)
@@ -249,6 +249,5 @@ def _jpeg(image: Tensor) -> bytes:
     import cv2
 
     pixels = srgb_encode(to_display(image))[0].mul(255).round().byte().movedim(0, -1).numpy()
-    return cv2.imencode(".jpg", np.ascontiguousarray(pixels[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[
-        1
-    ].tobytes()
+    bgr = np.ascontiguousarray(pixels[..., ::-1])
+    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()

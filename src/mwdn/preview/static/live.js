@@ -28,7 +28,7 @@ async function draw(data) {
   await Promise.all([setPicture(byId("measurement"), pictures[0]), setPicture(byId("scene"), pictures[1])]);
   byId("view").hidden = false;
   const recorded = said.recorded === null ? "" : `, ${said.recorded} frames recorded`;
-  show(`${said.fps.toFixed(1)} frames a second, ${said.latency_ms} ms after the exposure, ${said.dropped} dropped${recorded}`);
+  show(`${said.fps.toFixed(1)} frames a second, ${said.latency_ms} ms after the exposure, ${said.dropped} dropped${recorded}. ${said.refused}`, Boolean(said.refused));
   if (document.activeElement !== byId("live-exposure") && said.exposure_s !== null) byId("live-exposure").value = +(1000 * said.exposure_s).toPrecision(4);
   if (document.activeElement !== byId("live-gain") && said.gain !== null) byId("live-gain").value = said.gain;
 }
