@@ -20,7 +20,7 @@ from starlette.websockets import WebSocket
 from mwdn.calibration import Calibration
 from mwdn.errors import MwdnError, ParameterError
 from mwdn.preview.cameras import OPTIONS, Cameras, checked_camera, describe
-from mwdn.preview.guard import Guard, error_response, log
+from mwdn.preview.guard import Guard, failed, log
 from mwdn.preview.jobs import ENDED, Job, Jobs
 from mwdn.preview.limits import Limits, RefusedError
 from mwdn.preview.live import Live, serve_viewer
@@ -31,7 +31,7 @@ from mwdn.preview.psf_report import psf_report
 from mwdn.preview.reconstruction import Order, Reconstructions
 from mwdn.preview.result import MEDIA, Look, encode
 from mwdn.preview.samples import CAMERA, NAMES, sample_png
-from mwdn.preview.uploads import Form, parse_number, parse_white_balance, read_form
+from mwdn.preview.uploads import Form, parse_look, read_form
 from mwdn.version import __version__
 
 STATIC = Path(__file__).parent / "static"
@@ -102,7 +102,7 @@ class Preview:
             WebSocketRoute("/live", self.watch),
             Mount("/static", StaticFiles(directory=STATIC)),
         ]
-        handlers = {MwdnError: _failed, HTTPException: _failed, 500: _failed}
+        handlers = {MwdnError: failed, HTTPException: failed, 500: failed}
         app = Starlette(routes=routes, lifespan=lifespan, exception_handlers=handlers)
         return Guard(app, self.limits, self.metrics, token=token, any_host=any_host)
 
@@ -187,12 +187,12 @@ class Preview:
     async def camera_psf(self, request: Request) -> Response:
         """A picture of the PSF."""
         calibration = await self._thread(partial(self.cameras.get, request.path_params["name"]))
-        return await self._encoded(lambda look: encode(calibration.psf, look), _look(request.query_params))
+        return await self._encoded(lambda look: encode(calibration.psf, look), parse_look(request.query_params))
 
     async def reconstruct(self, request: Request) -> Response:
         """Reconstruct a capture: the picture, with the report in a header."""
         form = await read_form(request, self.limits, FILES, TEXTS)
-        look = _look(form.texts)
+        look = parse_look(form.texts)
         job = await self._ended(request, self._submit(form))
         result = self.jobs.result(job.id)
         headers = {"Mwdn-Report": json.dumps(result.report, separators=(",", ":")), "Location": f"/jobs/{job.id}"}
@@ -214,12 +214,14 @@ class Preview:
 
     async def picture(self, request: Request) -> Response:
         """The picture of a job; there before it is checked."""
-        return await self._encoded(self.jobs.result(request.path_params["id"]).encode, _look(request.query_params))
+        return await self._encoded(self.jobs.result(request.path_params["id"]).encode, parse_look(request.query_params))
 
     async def measurement(self, request: Request) -> Response:
         """The measurement of a job: the capture, corrected, cropped and binned."""
         measurement = self.jobs.result(request.path_params["id"]).measurement
-        return await self._encoded(lambda look: encode(measurement.clamp(min=0), look), _look(request.query_params))
+        return await self._encoded(
+            lambda look: encode(measurement.clamp(min=0), look), parse_look(request.query_params)
+        )
 
     def _submit(self, form: Form) -> Job:
         """Check a form as far as that is fast, and queue its reconstruction."""
@@ -289,25 +291,6 @@ class Preview:
         return await to_thread.run_sync(work, limiter=self._encoders)
 
 
-def _look(values: Any) -> Look:  # noqa: ANN401
-    """How a picture is wanted, from a form or a query."""
-    if values.get("format", "png") not in MEDIA:
-        raise ParameterError(f"`format` ({values['format'][:40]}) must be {', '.join(MEDIA)}.")
-    return Look(
-        format=values.get("format", "png"),
-        exposure=parse_number(values.get("exposure"), "exposure", 0.0),
-        white_balance=parse_white_balance(values.get("white_balance")),
-    )
-
-
 def _wake(loop: asyncio.AbstractEventLoop, ended: asyncio.Event) -> None:
     with suppress(RuntimeError):  # the server has stopped
         loop.call_soon_threadsafe(ended.set)
-
-
-async def _failed(_: Request, error: Exception) -> Response:
-    if isinstance(error, HTTPException):
-        return error_response(RefusedError(error.status_code, f"{error.detail}. See /openapi.json."))
-    if isinstance(error, MwdnError):
-        return error_response(error)
-    return error_response(RefusedError(500, "An error of mwdn itself. The server's log says more."))

@@ -7,8 +7,11 @@ from typing import Any
 from urllib.parse import parse_qs
 
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
 from starlette.responses import JSONResponse
 
+from mwdn.errors import MwdnError
 from mwdn.preview.limits import Limits, RefusedError
 from mwdn.preview.metrics import Metrics
 from mwdn.runtime.web_access import is_allowed
@@ -125,6 +128,15 @@ def error_response(error: Exception) -> JSONResponse:
     status = error.status if isinstance(error, RefusedError) else 422
     headers = {"Retry-After": "2"} if status == 503 else {"WWW-Authenticate": "Bearer"} if status == 401 else None
     return JSONResponse({"error": str(error)}, status, headers)
+
+
+async def failed(_: Request, error: Exception) -> JSONResponse:
+    """Any error of the application as JSON."""
+    if isinstance(error, HTTPException):
+        return error_response(RefusedError(error.status_code, f"{error.detail}. See /openapi.json."))
+    if isinstance(error, MwdnError):
+        return error_response(error)
+    return error_response(RefusedError(500, "An error of mwdn itself. The server's log says more."))
 
 
 def log(event: str, **values: Any) -> None:  # noqa: ANN401

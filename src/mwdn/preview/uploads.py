@@ -11,6 +11,7 @@ from starlette.requests import ClientDisconnect, Request
 
 from mwdn.errors import ParameterError, UnknownNameError, reason
 from mwdn.preview.limits import Limits, RefusedError
+from mwdn.preview.result import MEDIA, Look
 
 FIELD_BYTES = 2**14
 """Most bytes of a field that is not a file."""
@@ -97,6 +98,17 @@ def parse_white_balance(text: str | None) -> Any:  # noqa: ANN401
     if len(gains) != 3:
         raise ParameterError(f"`white_balance` ({text[:40]!r}) must be none, grey-world, psf or three gains: 1.8,1,1.5")
     return gains
+
+
+def parse_look(values: Any) -> Look:  # noqa: ANN401
+    """How a picture is wanted, from a form or a query."""
+    if values.get("format", "png") not in MEDIA:
+        raise ParameterError(f"`format` ({values['format'][:40]}) must be {', '.join(MEDIA)}.")
+    return Look(
+        format=values.get("format", "png"),
+        exposure=parse_number(values.get("exposure"), "exposure", 0.0),
+        white_balance=parse_white_balance(values.get("white_balance")),
+    )
 
 
 async def read_form(request: Request, limits: Limits, files: tuple[str, ...], texts: tuple[str, ...]) -> Form:
