@@ -18,7 +18,6 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 jaxtyping.install_import_hook("mwdn", "beartype.beartype")
 
 import torch  # noqa: E402
-from torch import nn  # noqa: E402
 
 torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else 2)
 
@@ -96,31 +95,3 @@ def noisy_pair(generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
     scene = torch.nn.functional.interpolate(coarse, (48, 57), mode="bicubic")
     noise = torch.randn(scene.shape, generator=generator) * torch.tensor([0.02, 0.2]).view(2, 1, 1, 1)
     return (scene + noise).clamp(0, 1), scene.clamp(0, 1)
-
-
-def trained(network: nn.Module, generator: torch.Generator, *, spread: float = 0.0, power: float = 1.0) -> nn.Module:
-    """Evaluation mode, BatchNorm's moments as after training: means of 0 and variances of 1 would hide mistakes.
-
-    Args:
-        spread: standard deviation of what is added to the logarithms of learned constants (names with ``log_``).
-        power: mean of the variances, which lie within 50 % of it.
-    """
-    with torch.no_grad():
-        if spread:
-            for key, parameter in network.named_parameters():
-                if "log_" in key:
-                    parameter.add_(spread * torch.randn(parameter.shape, generator=generator))
-        for module in network.modules():
-            if isinstance(module, nn.BatchNorm2d):
-                module.running_mean.copy_(0.1 * torch.randn(module.num_features, generator=generator))
-                module.running_var.copy_(power * (0.5 + torch.rand(module.num_features, generator=generator)))
-    return network.eval()
-
-
-def touch(folder: Path, *names: str) -> list[Path]:
-    """Empty files of these names in a folder, which is made."""
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / name for name in names]
-    for path in paths:
-        path.touch()
-    return paths

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from conftest import touch
+from made import touch
 from mwdn.calibration import Calibration, FrameFormat
 from mwdn.data.captures import find_captures, list_captures, read_capture, read_captures
 from mwdn.errors import ImageError, ParameterError, ShapeError

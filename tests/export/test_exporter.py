@@ -13,8 +13,8 @@ import torch
 from torch import nn
 
 from cameras import contour_psf
-from conftest import trained
 from full_disk import full_after
+from made import trained
 from mwdn import Calibration, Reconstructor, read_frame, to_display
 from mwdn.calibration import FrameFormat
 from mwdn.cli.app import main

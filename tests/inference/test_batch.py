@@ -19,7 +19,7 @@ import pytest
 import torch
 
 from cameras import contour_psf
-from conftest import touch
+from made import touch
 from mwdn import Camera, read_frame
 from mwdn.calibration import Calibration, FrameFormat
 from mwdn.errors import ImageError, ParameterError

@@ -7,7 +7,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from conftest import trained
+from made import trained
 from mwdn import Calibration, Camera, Reconstructor, read_frame
 from mwdn.errors import ParameterError
 from mwdn.inference.engine import Engine

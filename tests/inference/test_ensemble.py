@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from cameras import contour_psf
-from conftest import trained
+from made import trained
 from mwdn import Calibration, Camera, Reconstructor
 from mwdn.errors import ParameterError
 from mwdn.inference.ensemble import MIRRORS

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from cameras import contour_psf
-from conftest import touch
+from made import touch
 from mwdn import Camera, solvers
 from mwdn.calibration import Calibration, FrameFormat
 from mwdn.errors import CheckpointError, ParameterError, ShapeError, UnknownNameError

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from conftest import trained
+from made import trained
 from mwdn.fourier import memory_format
 from mwdn.inference.engine import Engine
 from mwdn.inference.fusion import fuse

@@ -8,7 +8,7 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch.nn import functional as F
 
-from conftest import trained
+from made import trained
 from mwdn import fourier
 from mwdn.errors import MwdnError, ParameterError, ShapeError, UnknownNameError
 from mwdn.inference.engine import Engine

@@ -9,7 +9,7 @@ from torch import nn
 from torch.nn import functional as F
 
 import oracles
-from conftest import trained
+from made import trained
 from mwdn.networks import build
 from mwdn.optics import unit_sum
 

@@ -6,7 +6,7 @@ import torch
 from torch.nn import functional as F
 
 import oracles
-from conftest import trained
+from made import trained
 from mwdn.benchmark.published import PUBLISHED
 from mwdn.networks import NETWORKS, build
 from mwdn.optics import unit_sum

@@ -142,7 +142,7 @@ def test_error_of_the_source_comes_after_its_last_frame():
 
 
 def test_source_stops_with_its_consumer():
-    ended = threading.Event()
+    ended, others = threading.Event(), set(threading.enumerate())
 
     def endless():
         try:
@@ -154,7 +154,7 @@ def test_source_stops_with_its_consumer():
     with closing(latest(endless())) as frames:
         assert next(frames) == 0
     assert ended.wait(WAIT)
-    assert not any(thread.name.endswith("(run)") for thread in threading.enumerate())
+    assert not any(thread.name.endswith("(run)") for thread in set(threading.enumerate()) - others)
 
 
 # --- Memory -------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from cameras import contour_psf
-from conftest import touch
+from made import touch
 from mwdn.calibration import Calibration
 from mwdn.cli.app import main
 from mwdn.data.cameras import Cameras
