@@ -1,4 +1,4 @@
-"""The walk of examples/build_a_camera.py, as small as it gets; tests/acceptance/test_build_a_camera.py trains a network, too."""
+"""The walk of examples/build_a_camera.py, as small as it gets; its acceptance test trains a network, too."""
 
 import importlib.util
 import json
