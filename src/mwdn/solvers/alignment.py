@@ -186,8 +186,8 @@ def _residual(measurement: Tensor, psf: Psf, poses: Tensor) -> Tensor:
     grid, size = estimate.psf.bands[-1].grid, (measurement.shape[-2], measurement.shape[-1])
     high = 1 - _low_pass(grid, _HIGH_PASS, measurement.device)
     r = inverse_spectrum(estimate.residual_spectrum * high, grid, size)
-    p = inverse_spectrum(spectrum(estimate.measurement - estimate.residual, grid) * high, grid, size)
-    return _without_fall_off(r, p).reshape(len(measurement), count, -1)
+    b = inverse_spectrum(spectrum(measurement, grid) * high, grid, size)  # the prediction is b - r, high-passed
+    return _without_fall_off(r, b.repeat_interleave(count, 0) - r).reshape(len(measurement), count, -1)
 
 
 def _without_fall_off(r: Tensor, p: Tensor) -> Tensor:
