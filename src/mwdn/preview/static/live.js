@@ -71,6 +71,8 @@ export function setUpLive(name) {
     byId("live-start").textContent = isStarted ? "Stop" : "Start";
     for (const control of controls) control.disabled = !isStarted;
     if (isStarted) {
+      byId("trust-section").hidden = true; // its verdicts are of another capture
+      byId("state").textContent = `Live: ${name}.`;
       connect();
     } else {
       toggle(byId("live-record"), false);

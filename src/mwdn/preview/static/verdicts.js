@@ -2,6 +2,12 @@
 
 const WORDS = { good: "good", doubt: "doubtful", unknown: "cannot tell", bad: "bad", mind: "mind" };
 
+// "psf, little explained" as a title.
+function titled(text) {
+  const words = text.replace("psf", "PSF").replaceAll("-", " ");
+  return words[0].toUpperCase() + words.slice(1);
+}
+
 function list(place, entries) {
   place.replaceChildren(...entries.map(([state, title, text]) => {
     const item = document.createElement("li");
@@ -19,7 +25,7 @@ export function showVerdicts(report) {
   document.getElementById("summary").textContent = `${report.doubtful ? "Doubtful" : "Consistent"}: ${report.summary}.`;
   const order = ["doubt", "unknown", "good"];
   const sorted = [...report.verdicts].sort((a, b) => order.indexOf(a.state) - order.indexOf(b.state));
-  list(document.getElementById("verdicts"), sorted.map((v) => [v.state, `${v.subject}, ${v.topic.replaceAll("-", " ")}`, v.sentence]));
+  list(document.getElementById("verdicts"), sorted.map((v) => [v.state, titled(`${v.subject}, ${v.topic}`), v.sentence]));
 }
 
 export function showFindings(report) {
