@@ -114,6 +114,7 @@ def killed(folder, where):
     assert done.returncode == -signal.SIGKILL, done.stderr
 
 
+@pytest.mark.acceptance  # 25 s, three starts; test_kills.py kills at random moments
 def test_goes_on_where_it_was_killed(folder, expected, monkeypatch):
     monkeypatch.chdir(folder)
     killed(folder, "save")

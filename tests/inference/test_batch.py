@@ -512,6 +512,7 @@ def listened_to(port):
         return caller.connect_ex(("127.0.0.1", port)) == 0
 
 
+@pytest.mark.acceptance  # 22 s, most of it two starts of torchrun
 def test_two_machines_share_the_captures(shop, single, free_port):
     machines = [machine(shop, "machines", free_port, 2, host=host) for host in (True, False)]
     said = [each.communicate(timeout=300) for each in machines]

@@ -39,10 +39,8 @@ turn_degrees = 5.0
 """
 
 
-@pytest.mark.parametrize(
-    ("patterns", "most"),
-    [('["dots", "charuco"]', 0.3), pytest.param('["none"]', 0.7, marks=pytest.mark.acceptance)],  # 10 s each
-)
+@pytest.mark.acceptance  # 10 s each; test_estimate.py measures the same with a projection of its own
+@pytest.mark.parametrize(("patterns", "most"), [('["dots", "charuco"]', 0.3), ('["none"]', 0.7)])
 def test_a_session_on_the_rig_is_aligned(tmp_path, run, patterns, most):
     import torch
 
