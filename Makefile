@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check acceptance benchmark clean
+.PHONY: demo test check docs acceptance benchmark clean
 
 .venv/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
@@ -16,10 +16,14 @@ demo: .venv/.ready  ## a synthetic camera, its captures, the untrained methods
 test: .venv/.ready  ## all tests except the slow ones on real captures
 	OMP_WAIT_POLICY=passive OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal
 
-check: .venv/.ready  ## lint, format, types
+check: .venv/.ready  ## lint, format, types, documentation
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+docs: .venv/.ready  ## the documentation site at http://127.0.0.1:8000/, built again at each change
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs serve
 
 acceptance: .venv/.ready  ## reconstruct real captures (MWDN_DATA or ../shared/data) into results/acceptance
 	$(BIN)/python -m pytest -m acceptance -s

@@ -31,8 +31,8 @@ def split(
             ``"diffusercam"``, test the first 1,000 (im1 to im1000), the rest training;
             ``"phlatcam"``, 9,900 for training, then 100 for test, in the order of ``mwdn import phlatcam``;
             ``"random"``, by ``fractions`` and ``seed``;
-        ``"folds"``, for few pairs: one of ``folds`` parts by position validation, the rest training. Neighbours, which
-        are often of one scene, stay together.
+            ``"folds"``, for few pairs: one of ``folds`` parts by position validation, the rest training. Neighbours,
+            which are often of one scene, stay together.
         fractions: of training, validation and test, with sum 1; only for ``"random"``.
         seed: only for ``"random"``; the same seed gives the same division on every machine.
         folds: number of parts, of equal size to one pair; only for ``"folds"``.
