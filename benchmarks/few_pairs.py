@@ -8,6 +8,8 @@ Each fold is tested by the last weights, not the best: no choice depends on the 
 from the first pairs that are not left out. `universal` itself and ADMM are measured on the same pairs. Every pair is
 aligned and estimated once and kept beside the file of pairs. Scores are those of `mwdn evaluate --variant best-gain`.
 Results are written after each fold, and folds that are already in the record are not measured again.
+
+`--calibrated` refines the calibration first, as `mwdn calibrate --pairs` does, from the pairs that a fold learns from.
 """
 
 import argparse
@@ -20,6 +22,7 @@ from statistics import fmean
 import torch
 
 from mwdn import Calibration, Reconstructor, load_network
+from mwdn.calibration.term_selection import select_terms
 from mwdn.data.pairs import PairFile
 from mwdn.data.recorded import RecordedPairs
 from mwdn.data.splits import split
@@ -38,13 +41,27 @@ from mwdn.training.validation import Validation
 METRICS = ("psnr", "ssim", "lpips")
 
 
-def estimated(path, psf, network):
-    """Each pair's sample as the training caches it, by its position in the file."""
-    kept = path.with_suffix(".estimates.pt")
+def refined(calibration, file, rows):
+    """The calibration with the terms that explain these pairs, each left out in turn."""
+
+    def pairs():
+        for row in rows:
+            measurement, scene = file[row]
+            yield measurement[None], scene[None]
+
+    selection = select_terms(calibration.psf, pairs)
+    return calibration.refined(selection.fit(selection.taken[-1].terms).refinement())
+
+
+def estimated(path, calibration, network, name):
+    """Each pair's sample as the training caches it, by its position in the file; kept under this name."""
+    kept = path.with_suffix(f".{name}.pt")
     if kept.exists():
         return [Sample(*parts) for parts in torch.load(kept, weights_only=True)]
     file = PairFile(path)
-    pairs = RecordedPairs(file, range(len(file)), psf, shuffled=False, aligned=True)
+    pairs = RecordedPairs(
+        file, range(len(file)), calibration.psf, shuffled=False, aligned=True, refinement=calibration.refinement
+    )
     cache = SampleCache(pairs, size=len(file), batch=1, crop=0, seed=0)
     samples = [cache._cached(network, row) for row in range(len(file))]
     torch.save([tuple(sample) for sample in samples], kept)
@@ -95,6 +112,7 @@ def main():
     parser.add_argument("--learn", type=int, nargs="+", default=[6])
     parser.add_argument("--folds", type=int, default=4)
     parser.add_argument("--steps", type=int)
+    parser.add_argument("--calibrated", action="store_true", help="refine the calibration from the learned pairs first")
     parser.add_argument("--sheets", type=Path, help="folder for a sheet of each fold: before, after, scene")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/few-pairs.json"))
     arguments = parser.parse_args()
@@ -104,18 +122,21 @@ def main():
     recipe = read_recipe("few-pairs", steps=arguments.steps)
     protocol, perceptual, file = Protocol.parse(arguments.protocol), Perceptual.load(), PairFile(arguments.pairs)
     universal = load_network(recipe.schedule.start)
-    samples = estimated(arguments.pairs, calibration.psf, universal)
+    plain = estimated(arguments.pairs, calibration, universal, "estimates")
     record = json.loads(arguments.out.read_text()) if arguments.out.exists() else {}
     admm = Reconstructor("admm", calibration)
     for learn in arguments.learn:
         for fold in range(arguments.folds):
-            key = f"{arguments.pairs.stem}, {learn} pairs, fold {fold}, {recipe.schedule.steps} steps"
+            kind = " calibrated" * arguments.calibrated
+            key = f"{arguments.pairs.stem}, {learn} pairs{kind}, fold {fold}, {recipe.schedule.steps} steps"
             if key in record:
                 continue
             parts = split(len(file), "folds", folds=arguments.folds, fold=fold)
-            network = tuned(
-                recipe, calibration, (parts["train"][:learn], parts["validation"]), samples, arguments.pairs
-            )
+            learned, samples = parts["train"][:learn], plain
+            if arguments.calibrated:
+                better = refined(calibration, file, learned)
+                samples = estimated(arguments.pairs, better, universal, f"{learn}-{fold}")
+            network = tuned(recipe, calibration, (learned, parts["validation"]), samples, arguments.pairs)
             values, lines = {}, []
             for row in parts["validation"]:
                 measurement, scene = file[row]

@@ -275,6 +275,7 @@ def test_every_network(name, tmp_path):
     export(network(name), camera((64, 72)), tmp_path / "camera.onnx", least=100)
 
 
+@pytest.mark.acceptance
 def test_plug_and_play(tmp_path):
     """After one iteration of one level, each mirrored denoising: more are the same again."""
     bank = network("wiener-bank", regularisations=(1e-3,), align=False, rounds=3)

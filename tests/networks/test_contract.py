@@ -17,6 +17,9 @@ from mwdn.networks import NETWORKS, build
 FEW = ("wiener", "le-admm")
 """Networks of so few numbers that they learn the camera's constants at most."""
 
+SLOW = ("mmcn", "updn", "le-admm-u", "ifin", "wiener-bank", "svdeconv")
+"""Networks that take 5 to 10 seconds to learn four pairs."""
+
 NARROW = {"le-admm-u": 8, "mmcn": 12, "updn": 4}
 """Widths of networks that compute small pictures on grids of twice or four times their sides."""
 
@@ -162,6 +165,9 @@ def test_measurement_of_other_channels_is_named(name, generator):
         small(name).eval()(b, h[:, :1])
 
 
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.acceptance] * (name in SLOW)) for name in NETWORKS]
+)
 def test_overfits_four_pairs(name, generator):
     """Networks learn the pictures, not just their mean; a few numbers learn the camera's constants at most."""
     b, h, scene = pair(generator, (16, 16), batch=4)

@@ -181,6 +181,7 @@ def test_two_processes_end_as_one(one, two):
     assert sorted(path.name for path in two.iterdir()) == sorted(path.name for path in one.iterdir())
 
 
+@pytest.mark.acceptance
 def test_two_processes_end_as_one_in_float64(worked):
     """The difference vanishes. `mwdn-cpsf` also encodes the PSF, of which each process has the whole batch."""
     states = [load_file(worked / "double" / name / "state.safetensors") for name in ("one-0", "two")]
@@ -247,6 +248,7 @@ def test_batch_norm_over_two_processes(worked, rank, dtype, tolerance):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends a process with its parent")
+@pytest.mark.acceptance
 def test_killed_run_goes_on_with_two_machines_and_ends_as_an_unbroken_one(folder, two, free_port):
     """SIGKILL of torchrun only, after some steps: its processes end with it, and the next run resumes.
 
