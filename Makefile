@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check docs acceptance benchmark clean
+.PHONY: demo test check docs acceptance package benchmark clean
 
 .venv/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
@@ -27,6 +27,9 @@ docs: .venv/.ready  ## the documentation site at http://127.0.0.1:8000/, built a
 
 acceptance: .venv/.ready  ## reconstruct real captures (MWDN_DATA or ../shared/data) into results/acceptance
 	$(BIN)/python -m pytest -m acceptance -s
+
+package: .venv/.ready  ## wheel and sdist in dist/; two builds of one commit are equal
+	SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) $(BIN)/python -m hatchling build
 
 benchmark: .venv/.ready  ## speed and memory against plain baselines in the same run
 	$(BIN)/python benchmarks/admm.py

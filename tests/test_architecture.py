@@ -40,7 +40,7 @@ FLOORS = [
 ]
 """From the ground up: a folder imports from itself and from those before it in this list, nothing else."""
 
-NETWORKS_MAY_IMPORT = {"errors", "types", "fourier", "optics", "solvers", "networks"}
+NETWORKS_MAY_IMPORT = {"errors", "types", "fourier", "runtime", "optics", "solvers", "networks"}
 HEAVY = {"cv2", "h5py", "starlette", "uvicorn", "matplotlib", "tifffile", "rawpy", "skimage", "scipy"}
 
 LONGEST = 300

@@ -20,6 +20,7 @@ What `import mwdn` offers. Each name is imported at its first use, so `import mw
 
 All subpackages: {packages}. Every error that this package raises on purpose is an
 [`MwdnError`](mwdn.errors.md).
+[Plugins](../plugins.md) add networks, solvers, masks and cameras.
 """
 
 

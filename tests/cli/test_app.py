@@ -418,7 +418,7 @@ def test_overexposed_capture_is_named_before_its_psf_is_doubted(run, camera):
     code, out, err = reconstruct(run, "captures/bright.png")
     assert code == 0
     assert f"Warning: bright.png: {part:.1%} of the capture's pixels are saturated" in err
-    assert "docs/troubleshooting.md#saturation" in err
+    assert "`mwdn explain saturation`" in err
     assert (out + err).index("the picture reproduces") > 0
     beside = json.loads((camera / "out" / "bright.json").read_text(encoding="utf-8"))
     (verdict,) = [verdict for verdict in beside["verdicts"] if verdict["topic"] == "saturation"]

@@ -13,7 +13,7 @@ def test_each_doubt_is_printed_once_and_counted(capsys):
     doubts.add("f.png", (other,))
     doubts.summarise()
     assert capsys.readouterr().err.splitlines() == [
-        "Warning: a.png: Gamma-coded. Try `--gamma srgb`. See docs/troubleshooting.md#gamma.",
-        "Warning: f.png: Gamma-coded. Try `--gamma 2.2`. See docs/troubleshooting.md#gamma.",
+        "Warning: a.png: Gamma-coded. Try `--gamma srgb`. Read `mwdn explain gamma`.",
+        "Warning: f.png: Gamma-coded. Try `--gamma 2.2`. Read `mwdn explain gamma`.",
         "Warning: gamma: 4 other captures like a.png: b.png, c.png, d.png ...",
     ]

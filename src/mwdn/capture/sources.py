@@ -2,26 +2,27 @@
 
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable
 from importlib import import_module
 from typing import Any, NamedTuple
 
 from mwdn.capture.source import CameraSource
 from mwdn.errors import CameraError, UnknownNameError, check_options, reason
 from mwdn.io.toml import parse_value
+from mwdn.runtime.plugins import Registry
 
 
 class Kind(NamedTuple):
     """A kind of camera.
 
     Args:
-        place: module in `mwdn.capture`, and class.
+        place: module in `mwdn.capture`, and class; a plugin's class or function itself.
         address: meaning of what follows the colon; empty if nothing does.
         requires: how to install what it needs; empty for what the package has.
     """
 
-    place: str
-    address: str
+    place: str | Callable[..., CameraSource]
+    address: str = ""
     requires: str = ""
 
 
@@ -29,7 +30,7 @@ def _extra(name: str) -> str:
     return f"pip install 'mwdn[{name}]'"
 
 
-SOURCES: Mapping[str, Kind] = {
+_OWN = {
     "aravis": Kind(
         "aravis:AravisCamera",
         "its name, serial number or IP address, or `first` or `fake`",
@@ -43,7 +44,14 @@ SOURCES: Mapping[str, Kind] = {
     "rig": Kind("rig:open_rig", ""),
     "v4l2": Kind("v4l2:V4l2Camera", "its number (`v4l2:0`) or device"),
 }
-"""Kinds of cameras by name. Another one is one line here and one file."""
+
+SOURCES: Registry[Kind] = Registry(
+    _OWN,
+    "mwdn.cameras",
+    accepts=lambda entry: isinstance(entry, Kind) and callable(entry.place),
+    must_be="a `mwdn.capture.Kind` of a class or function that returns a `mwdn.capture.CameraSource`",
+)
+"""Kinds of cameras by name, those of plugins included. Another one of this package is one line above and one file."""
 
 
 def open_source(text: str, **options: Any) -> CameraSource:  # noqa: ANN401
@@ -66,8 +74,10 @@ def open_source(text: str, **options: Any) -> CameraSource:  # noqa: ANN401
     if bool(address) != bool(kind.address):
         needs = f"needs {kind.address}: `{name}:...`" if kind.address else f"has no address ('{address}'): `{name}`"
         raise CameraError(f"The camera `{text}` {needs}.")
-    module, _, cls = kind.place.partition(":")
-    create = getattr(import_module(f"mwdn.capture.{module}"), cls)
+    create = kind.place
+    if isinstance(create, str):
+        module, _, cls = create.partition(":")
+        create = getattr(import_module(f"mwdn.capture.{module}"), cls)
     options = {**given, **options}
     check_options(create, f"the camera '{name}'", options)
     return create(address, **options) if kind.address else create(**options)

@@ -66,6 +66,7 @@ COMMANDS = {
         "preview:preview",
         "Serve a page that reconstructs captures, and an HTTP interface: drop a PSF and a capture, or try the samples.",
     ),
+    "explain": ("explain:explain", "Explain a doubt of another command: what it means, its cause, and what to do."),
     "doctor": ("doctor:doctor", "Print versions, devices, supported precisions and threads."),
     "import": (
         "import_:import_",
@@ -127,6 +128,8 @@ def _run(arguments: list[str], received: Sequence[int]) -> int:
     try:
         with warnings.catch_warnings(), _timed(verbose=chosen["--verbose"]):
             warnings.showwarning = lambda message, *_, **__: terminal.warn(str(message))
+            if command == "design":
+                import_module("mwdn.cli.design").add_plugins(arguments)
             result = app(arguments, console=terminal.results, exit_on_error=False, print_error=False)
     except (MwdnError, cyclopts.CycloptsError) as error:
         if received:  # torch.export turns Ctrl-C into an error of its own

@@ -28,7 +28,7 @@ def binned(
     Returns:
         The calibration, and a sentence for the user, empty if nothing is binned.
     """
-    if method not in (*SOLVERS, *BUNDLED):
+    if method not in BUNDLED and method not in SOLVERS:
         return calibration, ""
     verdict = binning(calibration)
     bin, psf_bin = int(verdict.value), camera.psf_format.psf_bin

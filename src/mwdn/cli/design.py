@@ -1,5 +1,6 @@
 """The command `mwdn design`: a mask and its PSF from a few parameters."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -91,8 +92,15 @@ def _add_command(name: str, kind: type[MaskDesign]) -> None:
     design.command(command, name=name, help=(kind.__doc__ or "").partition("\n")[0])
 
 
-for _name, _kind in MASKS.items():
+for _name, _kind in MASKS.own.items():
     _add_command(_name, _kind)
+
+
+def add_plugins(words: Collection[str]) -> None:
+    """Add the commands of the masks of plugins, unless the command line names a mask of this package."""
+    for name in MASKS if {*MASKS.own, "array"}.isdisjoint(words) else ():
+        if name not in {*MASKS.own, *design}:
+            _add_command(name, MASKS[name])
 
 
 @design.command

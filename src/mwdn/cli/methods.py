@@ -29,7 +29,7 @@ def methods(name: str | None = None, /) -> None:
     if name is None:
         results.print(_overview())
         return
-    if name not in {*SOLVERS, *BUNDLED, *NETWORKS}:
+    if not any(name in names for names in (BUNDLED, SOLVERS, NETWORKS)):
         raise UnknownNameError("method", name, {*SOLVERS, *BUNDLED, *NETWORKS})
     if name in SOLVERS:  # `wiener` is a solver and a network type
         _print(f"Solver {name}. Options, as --name value:", list_options(SOLVERS[name]))

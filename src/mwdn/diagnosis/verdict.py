@@ -7,8 +7,6 @@ Subject = Literal["psf", "capture", "picture"]
 State = Literal["good", "doubt", "unknown"]
 """``good``: nothing to do. ``doubt``: something is probably wrong. ``unknown``: this capture cannot tell."""
 
-GUIDE = "docs/troubleshooting.md"
-
 
 @dataclass(frozen=True)
 class Verdict:
@@ -16,7 +14,7 @@ class Verdict:
 
     Args:
         subject: what it is about.
-        topic: section of `GUIDE` that says more, in lower case with hyphens: ``"gamma"``, ``"mosaic"``.
+        topic: of `mwdn explain`, a section of docs/troubleshooting.md: ``"gamma"``, ``"another-camera"``.
         state: how sure, and whether something is wrong.
         text: one sentence that states the fact, and the number it comes from.
         value: what was detected, for programs: ``"srgb"``, ``"rggb"``, ``"rotate-180"``, ``"4"``; empty if nothing.
@@ -34,5 +32,5 @@ class Verdict:
     def sentence(self) -> str:
         """The statement, the options to try, and where to read more."""
         parts = [self.text, f"Try `{self.options}`." if self.options else ""]
-        parts.append(f"See {GUIDE}#{self.topic}." if self.state != "good" else "")
+        parts.append(f"Read `mwdn explain {self.topic}`." if self.state != "good" else "")
         return " ".join(filter(None, parts))

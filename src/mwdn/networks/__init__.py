@@ -20,9 +20,10 @@ from mwdn.networks.updn import Updn
 from mwdn.networks.wiener import WienerNetwork
 from mwdn.networks.wiener_bank import WienerBank
 from mwdn.networks.wiener_unet import WienerUNet
+from mwdn.runtime.plugins import Registry
 from mwdn.solvers import SOLVERS
 
-NETWORKS: dict[str, type[Network[Any]]] = {
+_OWN: dict[str, type[Network[Any]]] = {
     "wiener": WienerNetwork,
     "unet": UNet,
     "wiener-unet": WienerUNet,
@@ -37,7 +38,14 @@ NETWORKS: dict[str, type[Network[Any]]] = {
     "svdeconv": SvDeconv,
     "ifin": Ifin,
 }
-"""Networks by the names used in recipes and on the command line."""
+
+NETWORKS: Registry[type[Network[Any]]] = Registry(
+    _OWN,
+    "mwdn.networks",
+    accepts=lambda entry: isinstance(entry, type) and issubclass(entry, Network),
+    must_be="a subclass of `mwdn.networks.Network`",
+)
+"""Networks by the names used in recipes and on the command line, those of plugins included."""
 
 DENOISERS: dict[str, type[nn.Module]] = {"drunet": Drunet}
 """Denoisers, trained on their own as parts of networks: ``clean = denoiser(picture, level)``."""
@@ -54,7 +62,7 @@ def build(name: str, **options: Any) -> nn.Module:  # noqa: ANN401
         UnknownNameError: no such network, or it has no such option.
         ParameterError: ``name`` is a solver, ``width`` is below 1, or an option is of another type.
     """
-    kind = NETWORKS.get(name) or DENOISERS.get(name)
+    kind = DENOISERS.get(name) or NETWORKS.get(name)
     if kind is None and name in SOLVERS:
         raise ParameterError(f"'{name}' is a solver, not a network: `mwdn.solvers.build('{name}')`.")
     if kind is None:

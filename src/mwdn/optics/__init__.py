@@ -1,5 +1,7 @@
 """Lensless cameras in software: masks, propagation of light, PSFs, forward models, the sensor."""
 
+from dataclasses import MISSING, fields, is_dataclass
+
 from mwdn.optics.amplitude_masks import CodedAperture, Pinholes, ZoneAperture
 from mwdn.optics.array_mask import ArrayMask
 from mwdn.optics.camera import Camera
@@ -11,16 +13,31 @@ from mwdn.optics.psf import unit_sum
 from mwdn.optics.random_psf import FAMILIES, Variety, sample_camera
 from mwdn.optics.sensor import Sensor
 from mwdn.optics.setup import Setup
+from mwdn.runtime.plugins import Registry
 
-MASKS: dict[str, type[MaskDesign]] = {
-    "contour": Contour,
-    "diffuser": Diffuser,
-    "lenslets": Lenslets,
-    "zone": ZoneAperture,
-    "coded": CodedAperture,
-    "pinholes": Pinholes,
-}
-"""Every kind of mask that parameters describe, by its name in `mwdn design`; `ArrayMask` is read from a file."""
+
+def _is_mask(entry: object) -> bool:
+    """Whether an entry is a dataclass with a default for each field and a method ``build``."""
+    if not isinstance(entry, type) or not is_dataclass(entry) or not callable(getattr(entry, "build", None)):
+        return False
+    return not any(field.default is field.default_factory is MISSING for field in fields(entry))
+
+
+MASKS: Registry[type[MaskDesign]] = Registry(
+    {
+        "contour": Contour,
+        "diffuser": Diffuser,
+        "lenslets": Lenslets,
+        "zone": ZoneAperture,
+        "coded": CodedAperture,
+        "pinholes": Pinholes,
+    },
+    "mwdn.masks",
+    accepts=_is_mask,
+    must_be="a dataclass with a default for each field and a method `build(setup)` that returns a `mwdn.optics.Mask`",
+)
+"""Every kind of mask that parameters describe, by its name in `mwdn design`, those of plugins included; `ArrayMask` is
+read from a file."""
 
 __all__ = [
     "Aberration",

@@ -50,7 +50,7 @@ def checked_options(name: str, options: dict[str, Any]) -> dict[str, Any]:
         UnknownNameError: no such method or option.
         ParameterError: an option is no number.
     """
-    if name not in {*SOLVERS, *BUNDLED}:
+    if name not in BUNDLED and name not in SOLVERS:
         raise UnknownNameError("method", name, [*BUNDLED, *SOLVERS])
     known = {option["name"]: option["type"] for option in _options(name)} if name in SOLVERS else {}
     for option, value in options.items():

@@ -9,11 +9,13 @@
 changed since its calibration; `find_room_light` finds the light of the room in a capture.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 from mwdn.errors import ParameterError, UnknownNameError, check_options
 from mwdn.optics.noise import noise_level
 from mwdn.runtime.forks import survive_forks
+from mwdn.runtime.plugins import Registry
 from mwdn.solvers.admm import Admm
 from mwdn.solvers.alignment import Pose, align
 from mwdn.solvers.fista import Fista
@@ -22,14 +24,19 @@ from mwdn.solvers.room_light import RoomLight, find_room_light
 from mwdn.solvers.splitting import TEXTBOOK, Penalties
 from mwdn.solvers.warm_start import WarmStart
 from mwdn.solvers.wiener import Wiener
+from mwdn.types import Measurement, Psf, Scene
 
 survive_forks()  # here, because every method imports the solvers
 
 Solver = Admm | Fista | Pyramid | Wiener
 
-SOLVERS: dict[str, type[Solver]] = {"admm": Admm, "fista": Fista, "pyramid": Pyramid, "wiener": Wiener}
-"""Every solver by its name on the command line."""
-
+SOLVERS: Registry[type[Solver]] = Registry(
+    {"admm": Admm, "fista": Fista, "pyramid": Pyramid, "wiener": Wiener},
+    "mwdn.solvers",
+    accepts=lambda entry: isinstance(entry, type) and any("__call__" in vars(base) for base in entry.__mro__),
+    must_be="a class whose objects are called as `solver(measurement, psf)`",
+)
+"""Every solver by its name on the command line, those of plugins included."""
 
 _NETWORKS = frozenset(
     {"drunet", "flatnet", "ifin", "le-admm", "le-admm-u", "mmcn", "mwdn", "mwdn-cpsf", "svdeconv", "unet", "updn"}
@@ -38,7 +45,7 @@ _NETWORKS = frozenset(
 """Names of networks, known here only for the message of `build`: `mwdn.networks` is above this folder."""
 
 
-def build(name: str, **options: Any) -> Solver:  # noqa: ANN401
+def build(name: str, **options: Any) -> Callable[[Measurement, Psf], Scene]:  # noqa: ANN401
     """Make a solver.
 
     Args:

@@ -1,0 +1,160 @@
+"""Entries of other packages: the example of examples/plugin, and packages that are broken."""
+
+import sys
+import tomllib
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import mwdn
+from mwdn.capture import SOURCES, open_source
+from mwdn.errors import ParameterError, UnknownNameError
+from mwdn.io.pictures import dark_scene
+from mwdn.networks import NETWORKS
+from mwdn.optics import MASKS, sample_camera
+from mwdn.runtime import plugins
+from mwdn.solvers import SOLVERS
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "plugin"
+REGISTRIES = (SOLVERS, NETWORKS, MASKS, SOURCES)
+SIZE = (48, 52)
+
+
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """``install(name, {group: {entry: place}})`` makes the metadata of an installed package, for this test."""
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def call(name, groups):
+        folder = tmp_path / f"{name.replace('-', '_')}-0.1.0.dist-info"
+        folder.mkdir()
+        (folder / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 0.1.0\n")
+        lines = [f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in table.items()) for group, table in groups.items()]
+        (folder / "entry_points.txt").write_text("\n".join(lines))
+        for registry in REGISTRIES:
+            registry.refresh()
+        return tmp_path
+
+    yield call
+    monkeypatch.undo()
+    for registry in REGISTRIES:
+        registry.refresh()
+    sys.modules.pop("mwdn_example", None)
+
+
+@pytest.fixture
+def example(install, monkeypatch):
+    """The package of examples/plugin, as its pyproject.toml describes it."""
+    monkeypatch.syspath_prepend(EXAMPLE)
+    project = tomllib.loads((EXAMPLE / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    return install(project["name"], project["entry-points"])
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    """A PSF and a capture."""
+    monkeypatch.chdir(tmp_path)
+    psf = sample_camera(0, SIZE)
+    light = mwdn.convolve(dark_scene("cat", SIZE, 30), psf)
+    for name, image in (("psf", psf), ("capture", light)):
+        np.save(f"{name}.npy", (image / image.max())[0].movedim(0, -1).numpy())
+    return psf, light
+
+
+@pytest.mark.usefixtures("example")
+def test_a_solver_reconstructs_by_its_name_on_the_command_line(run, files):
+    line = "reconstruct capture.npy --psf psf.npy --method richardson-lucy --iterations 60 --format npy --background 0"
+    code, _, err = run(f"{line} --bin 1 --no-trust --out out")
+    assert (code, err) == (0, "")
+    assert "at least 1" in run("reconstruct capture.npy --psf psf.npy --method richardson-lucy --iterations 0")[2]
+    psf, _ = files
+    scene = torch.from_numpy(np.load("out/capture.npy")).movedim(-1, 0)[None]
+    measured = torch.from_numpy(np.load("capture.npy")).movedim(-1, 0)[None]
+    unexplained = [
+        (mwdn.convolve(guess, mwdn.Calibration(psf).psf) - measured).norm()
+        for guess in (scene, measured.mean((-2, -1), keepdim=True).expand_as(measured))
+    ]
+    assert unexplained[0] < 0.1 * unexplained[1]
+
+
+@pytest.mark.usefixtures("example")
+def test_methods_are_listed_with_their_options(run):
+    out = run("methods")[1]
+    assert "richardson-lucy" in out
+    assert "residual" in out
+    assert "Options, as --name value" in run("methods richardson-lucy")[1]
+    assert "channels between the layers" in run("methods residual")[1]
+
+
+@pytest.mark.usefixtures("example")
+def test_a_network_is_loaded_by_its_name_and_reconstructs_on_the_command_line(run, files):
+    network = mwdn.build("residual", width=2)
+    mwdn.weights.save_network("mine.safetensors", network, "residual", {"width": 2})
+    assert type(mwdn.load_network("mine.safetensors")) is NETWORKS["residual"]
+    line = "reconstruct capture.npy --psf psf.npy --method mine.safetensors --format npy --background 0 --no-trust"
+    assert run(f"{line} --out out")[0] == 0
+    _, measurement = files
+    psf = mwdn.Calibration.from_file("psf.npy", background=0.0).psf
+    expected = network.eval()(measurement / measurement.max(), psf)[0].movedim(0, -1)
+    np.testing.assert_allclose(np.load("out/capture.npy"), expected.detach().numpy(), atol=2e-2)
+
+
+@pytest.mark.usefixtures("example")
+def test_a_mask_is_a_command_of_design(run, tmp_path):
+    assert "ring" in run("design", "--help")[1]
+    small = "--pixels 64 64 --bin 1 --wavelengths 1 --aperture-mm 0.4 0.4 --radius-mm 0.1 --pitch-um 8"
+    code, _, err = run(*f"design ring {small} --out {tmp_path / 'ring'}".split())
+    assert (code, err) == (0, "")
+    assert (tmp_path / "ring" / "psf.tif").is_file()
+
+
+@pytest.mark.usefixtures("example")
+def test_a_camera_is_opened_by_its_name():
+    with open_source("test-card,width=8,height=4") as camera:
+        first, second = camera.read(), camera.read()
+    assert first.array[..., 0].tolist() == 4 * [[0, 511, 1023, 1535, 2047, 2559, 3071, 3583]]
+    assert second.array[0, :, 0].tolist() == [511, 1023, 1535, 2047, 2559, 3071, 3583, 0]
+    with pytest.raises(UnknownNameError, match="width"):
+        open_source("test-card,with=8")
+
+
+@pytest.mark.filterwarnings("always")
+def test_a_broken_plugin_is_named_and_the_others_work(install, run):
+    folder = install(
+        "mwdn-broken",
+        {"mwdn.solvers": {"lost": "no_such_module:Solver", "three": "sums:THREE", "ends": "ending:Solver"}},
+    )
+    (folder / "sums.py").write_text("THREE = 3\n")
+    (folder / "ending.py").write_text("raise SystemExit('licence expired')\n")
+    code, out, err = run("methods")
+    assert code == 0
+    assert "admm" in out
+    lines = err.splitlines()
+    assert [line.partition(" in `")[0] for line in lines] == ["Warning: `ends`", "Warning: `lost`", "Warning: `three`"]
+    assert all("`pip uninstall mwdn-broken`" in line for line in lines)
+    assert "SystemExit: licence expired" in lines[0]
+    assert "must be a class whose objects are called" in lines[2]
+    assert isinstance(mwdn.solvers.build("wiener"), mwdn.solvers.Wiener)
+    with pytest.raises(ParameterError, match="No module named 'no_such_module'"):
+        mwdn.solvers.build("lost")
+
+
+def test_a_plugin_cannot_replace_a_method_of_this_package_or_of_another(install):
+    install("a-first", {"mwdn.solvers": {"mine": "mwdn.solvers:Fista"}})
+    install("b-second", {"mwdn.solvers": {"mine": "mwdn.solvers:Wiener", "admm": "mwdn.solvers:Wiener"}})
+    with pytest.warns(UserWarning, match="is ignored") as caught:
+        assert SOLVERS["mine"] is mwdn.solvers.Fista
+    assert SOLVERS["admm"] is mwdn.solvers.Admm
+    assert [str(warning.message).split("`")[-2] for warning in caught] == ["mwdn", "a-first"]
+
+
+@pytest.mark.parametrize("line", ["--help", "reconstruct --help", "design contour --help", "recipes"])
+def test_plugins_are_not_looked_for_without_need(run, line, monkeypatch):
+    for registry in REGISTRIES:
+        registry.refresh()
+    monkeypatch.setattr(plugins, "entry_points", lambda **_: pytest.fail("looked for plugins"))
+    with warnings.catch_warnings():
+        assert run(line)[0] == 0
