@@ -1,6 +1,7 @@
 """Terms that known pictures tell of a camera: found again where they are true, and not taken where they are not."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,11 +12,16 @@ from cameras import contour_psf
 from mwdn import Calibration, convolve
 from mwdn.calibration.camera_file import write_camera
 from mwdn.calibration.pair_model import PairModel, Terms
+from mwdn.calibration.psf_identity import psf_identity
 from mwdn.calibration.refinement import Refinement, polynomials, smooth_field
 from mwdn.calibration.term_selection import select_terms
 from mwdn.data.pairs import PairFile
+from mwdn.data.recorded import other_camera
 from mwdn.errors import ParameterError
+from mwdn.inference.methods import psf_warning
 from mwdn.io.images import write_frame
+from mwdn.networks import build
+from mwdn.weights.checkpoint import save_network
 
 SIZE = 64, 80
 FIELD = ((1.0, 0.1, -0.15, -0.2, 0.05, -0.1),)
@@ -134,6 +140,27 @@ def test_calibrate_with_pairs(psf, generator, run, tmp_path, monkeypatch):
     assert (tmp_path / "camera-refinement.png").exists()
     calibration = Calibration.load("camera.toml")
     assert bool(calibration.refinement) == bool(report["kept"])
+
+
+def test_pairs_and_weights_of_a_camera_stay_its_own_when_it_is_refined(psf, tmp_path):
+    """Of the calibrated PSF, of a refined one, and refined in another way; those of another PSF are told apart."""
+    plain, other = Calibration(psf), Calibration(psf.flip(-1))
+    first, second = plain.refined(Refinement(GAIN)), plain.refined(Refinement(GAIN[::-1]))
+    assert first.psf_hash != plain.psf_hash == first.unrefined_hash
+    for made in (plain, first):
+        path = tmp_path / f"{made.psf_hash}.h5"
+        shape = (*SIZE, 3)
+        attributes = psf_identity(made)
+        with PairFile.create(path, measurement_shape=shape, scene_shape=shape, attributes=attributes) as file:
+            file.append(psf[0], psf[0])
+        weights = path.with_suffix(".safetensors")
+        save_network(weights, build("wiener"), "wiener", {}, **attributes)
+        with PairFile(path) as file:
+            for used in (plain, first, second):
+                assert other_camera(file, used) is None
+                assert psf_warning(weights, used) is None
+            for warning in (other_camera(file, other), psf_warning(weights, other)):
+                assert {made.psf_hash, other.psf_hash} <= set(re.findall(r"\b[0-9a-f]{16}\b", warning))
 
 
 def test_camera_file_holds_the_terms(psf, generator, tmp_path, monkeypatch):

@@ -9,6 +9,7 @@ import cv2
 import h5py
 import numpy as np
 import pytest
+import torch
 
 from full_disk import full_after
 from mwdn.capture.display import RigDisplay
@@ -18,7 +19,9 @@ from mwdn.capture.rig import Rig
 from mwdn.capture.screen import place_picture, put
 from mwdn.capture.session import Session
 from mwdn.capture.set_up import open_camera
+from mwdn.cli.refine import check_pair_file
 from mwdn.data import PairFile
+from mwdn.data.recorded import Division, recorded_pairs
 from mwdn.errors import CameraError, DisplayError, ImageError, ParameterError, UnknownNameError
 
 RECIPE = """
@@ -88,7 +91,7 @@ def check_pairs(path, recipe, count):
             shown = np.rint(255 * scene.movedim(0, -1).numpy() ** (1 / gamma)).astype(np.uint8)
             rig.show(put(shown, place, rig.screen))
             wanted = rig.read().array.astype(float)
-            error = np.abs(measurement.movedim(0, -1).numpy() * 65535 - wanted)
+            error = np.abs(measurement.movedim(0, -1).numpy() * 4095 - wanted)
             assert error.mean() < 0.02 * wanted.mean()
         return names
 
@@ -110,6 +113,10 @@ def test_a_session_records_each_picture_once_with_its_own_frame(tmp_path, recipe
     with PairFile(out) as pairs:
         assert pairs.scene_shape == (80, 80, 3)
         assert pairs[0][1].max() > 0.9
+        assert 0.1 < pairs[0][0].max() <= 1  # the full scale of 12 bits is 1, and not 1/16
+    for refused in (lambda: recorded_pairs(out, torch.ones(1, 3, 32, 32), Division()), lambda: check_pair_file(out)):
+        with pytest.raises(ParameterError, match=r"raw frames of 12 bits.*`mwdn align"):
+            refused()
 
 
 def test_a_finished_session_goes_on_with_more_pictures(tmp_path, recipe):

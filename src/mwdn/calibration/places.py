@@ -53,7 +53,7 @@ def at_distance(calibration: Calibration, distance_mm: float) -> tuple[Calibrati
     ordered = sorted(files, key=lambda z: abs(1 / z - 1 / distance_mm))
     nearest = ordered[0]
     psf = _psf(calibration, files[nearest])
-    chosen = replace(calibration, psf=psf, distance_mm=distance_mm)
+    chosen = replace(calibration, psf=psf, distance_mm=distance_mm, unrefined_hash="")
     other = next((z for z in ordered if (z - distance_mm) * (nearest - distance_mm) < 0), None)
     if abs(nearest / distance_mm - 1) < 1e-3 or other is None:
         beyond = "" if min(files) <= distance_mm * 1.001 and distance_mm <= max(files) * 1.001 else ", the nearest one"

@@ -48,6 +48,7 @@ class Calibration:
         sensor: noise and saturation of the sensor's own pixels, if they were measured; see `binned_sensor`.
         places: files of PSFs at other distances and positions, see `mwdn.calibration.places`.
         refinement: terms found with known pictures, see `refined`.
+        unrefined_hash: `psf_hash` before the refinement; empty without one.
 
     Raises:
         PsfError: the PSF has other axes, or is negative, not finite, or dark.
@@ -68,6 +69,7 @@ class Calibration:
     sensor: Sensor | None = None
     places: PlaceFiles = PlaceFiles()
     refinement: Refinement = Refinement()
+    unrefined_hash: str = ""
 
     @classmethod
     @checked
@@ -99,7 +101,8 @@ class Calibration:
 
     def refined(self, refinement: Refinement) -> "Calibration":
         """The calibration with a refinement, of which it has none yet: in its PSF and in all measurements."""
-        return replace(self, psf=refinement.psf(self.psf), refinement=refinement) if refinement else self
+        terms: dict[str, Any] = {"psf": refinement.psf(self.psf), "refinement": refinement}
+        return replace(self, **terms, unrefined_hash=self.psf_hash) if refinement else self
 
     @classmethod
     @checked
@@ -143,10 +146,8 @@ class Calibration:
             return cls.load(path, **options, **{name: file for name, file in frame_files.items() if file is not None})
         frames, psf_format = with_options(frames, psf_format, options)
         frame, frames = frames.read_stored(path)
-        dark_frame = None if dark is None else frames.read(dark)
-        ambient_frame = None if ambient is None else frames.read(ambient)
-        others = {"dark": dark_frame, "ambient": ambient_frame}
-        return cls._from_frame(frame, frames, psf_format, corrections=corrections, **others)
+        dark_frame, room_frame = (None if file is None else frames.read(file) for file in (dark, ambient))
+        return cls._from_frame(frame, frames, psf_format, dark=dark_frame, ambient=room_frame, corrections=corrections)
 
     @classmethod
     def from_array(
@@ -175,8 +176,7 @@ class Calibration:
             MwdnError: as for `from_file`.
         """
         frames, psf_format = with_options(frames, psf_format, options)
-        dark_frame = None if dark is None else as_frame(dark)
-        ambient_frame = None if ambient is None else as_frame(ambient)
+        dark_frame, ambient_frame = (None if frame is None else as_frame(frame) for frame in (dark, ambient))
         return cls._from_frame(as_frame(picture), frames, psf_format, dark=dark_frame, ambient=ambient_frame)
 
     @classmethod

@@ -84,7 +84,7 @@ def evaluate(  # noqa: PLR0913
         method: Reconstructor(method, calibration, device=device, **own) for method, own in method_options.items()
     }
     warnings = [reconstruct.warning for reconstruct in reconstructors.values()]
-    warn(*warnings, other_camera(file, calibration.psf_hash))
+    warn(*warnings, other_camera(file, calibration))
     refuse_overwrite(out / evaluation.SHEET, *camera.files)
     refuse_foreign(out, (evaluation.JSON, evaluation.SHEET), b'"protocol"')
     if min(part.crop(calibration.psf).shape[-2:]) >= SMALLEST:

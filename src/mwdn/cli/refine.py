@@ -46,8 +46,10 @@ class Pictures:
 def check_pair_file(pairs: Path) -> None:
     """Raise an `MwdnError` unless this is a file of enough pairs."""
     from mwdn.data.pairs import PairFile
+    from mwdn.data.recorded import refuse_raw
 
     with PairFile(pairs) as file:
+        refuse_raw(file)
         if len(file) < LEAST_PAIRS:
             raise ParameterError(f"`pairs` ({len(file)}) must be {LEAST_PAIRS} or more: each in turn is left out.")
 

@@ -82,7 +82,10 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
         return self._header.length
 
     def __getitem__(self, index: SupportsIndex) -> tuple[Tensor, Tensor]:
-        """Measurement and scene, each (C, H, W), linear light, float32, nominally in [0, 1]."""
+        """Measurement and scene, each (C, H, W), linear light, float32, nominally in [0, 1].
+
+        A file of `mwdn capture` has raw frames and displayed pictures, with the sensor's full scale and white as 1.
+        """
         number = operator.index(index)
         if not -len(self) <= number < len(self):
             raise IndexError(f"`{self.path}` has {len(self):,} pairs; there is no pair {number}.")
@@ -94,6 +97,12 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
     def attributes(self) -> dict[str, Attribute]:
         """Metadata of the camera."""
         return dict(self._header.attributes)
+
+    @property
+    def raw_bits(self) -> int | None:
+        """Bit depth of the raw frames of a file of `mwdn capture` before `mwdn align`; ``None`` for other files."""
+        bits = self._header.attributes.get("bit_depth") if IDENTITY in self._header.attributes else None
+        return bits if isinstance(bits, int) and 0 < bits <= 16 else None
 
     @property
     def measurement_shape(self) -> Shape:
@@ -155,7 +164,8 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
             stored = self._rows[name][number]
         pixels = stored.transpose(2, 0, 1).astype(np.float32, order="C")
         if stored.dtype.kind == "u":
-            pixels /= np.float32(np.iinfo(stored.dtype).max)
+            bits = self.raw_bits if name == NAMES[0] else None  # 12 bits are in the lower bits of 16
+            pixels /= np.float32(2**bits - 1 if bits else np.iinfo(stored.dtype).max)
         return torch.from_numpy(pixels)
 
 

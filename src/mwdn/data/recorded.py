@@ -10,6 +10,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from mwdn.calibration.psf import Calibration
+from mwdn.calibration.psf_identity import other_psf
 from mwdn.calibration.refinement import Refinement
 from mwdn.data.pair_writer import Attribute
 from mwdn.data.pairs import PairFile
@@ -206,11 +208,13 @@ def recorded_pairs(
 
 
 def check_pairs(file: PairFile, psf: Psf) -> None:
-    """Check that a file's pairs fit the PSF.
+    """Check that a file's pairs are measurements with their scenes, and fit the PSF.
 
     Raises:
+        ParameterError: they are a session's raw frames.
         ShapeError: they have another size or other channels.
     """
+    refuse_raw(file)
     (h, w, channels), (H, W), colours = file.measurement_shape, psf.shape[-2:], psf.shape[1]
     if (h, w) != (H, W):
         factor = H // h
@@ -235,15 +239,22 @@ def check_pairs(file: PairFile, psf: Psf) -> None:
         )
 
 
-def other_camera(file: PairFile, psf_hash: str) -> str | None:
-    """A warning if a file's pairs have another PSF than the one of this hash, otherwise ``None``."""
-    own_hash = file.attributes.get("psf_hash")
-    if own_hash in (None, psf_hash):
-        return None
-    return (
-        f"`{file.path}` holds pairs of the camera of PSF {own_hash}, but the PSF given is {psf_hash}. Expect blur, "
-        "ghosts and low scores, unless both belong to one camera: another crop, bin or background of the same PSF "
-        "file also gives another hash."
+def refuse_raw(file: PairFile) -> None:
+    """Raise a `ParameterError` if a file of `mwdn capture` was not aligned: raw frames, and pictures of the display."""
+    if file.raw_bits is not None:
+        raise ParameterError(
+            f"`{file.path}` holds raw frames of {file.raw_bits} bits and the pictures as displayed, not yet pairs of "
+            f"measurement and scene. Align them first: `mwdn align {file.path} --camera camera.toml -o aligned.h5`."
+        )
+
+
+def other_camera(file: PairFile, calibration: Calibration) -> str | None:
+    """A warning if a file's pairs have another PSF than the calibration, otherwise ``None``."""
+    own_hash = other_psf(calibration, file.attributes)
+    return own_hash and (
+        f"`{file.path}` holds pairs of the camera of PSF {own_hash}, but the PSF given is {calibration.psf_hash}. "
+        "Expect blur, ghosts and low scores, unless both belong to one camera: another crop, bin or background of the "
+        "same PSF file also gives another hash."
     )
 
 

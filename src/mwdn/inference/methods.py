@@ -6,6 +6,7 @@ from typing import Any
 
 from mwdn import solvers
 from mwdn.calibration import Calibration
+from mwdn.calibration.psf_identity import other_psf
 from mwdn.errors import CheckpointError, ParameterError, UnknownNameError
 from mwdn.networks import DENOISERS, NETWORKS
 from mwdn.types import Measurement, Psf, Scene
@@ -73,10 +74,8 @@ def psf_warning(method: str | Path, calibration: Calibration) -> str | None:
     path = find_weights(str(method)) or Path(method)
     if path.suffix != ".safetensors":
         return None
-    trained = read_metadata(path).get("psf_hash")
-    if trained in (None, calibration.psf_hash):
-        return None
-    return (
+    trained = other_psf(calibration, read_metadata(path))
+    return trained and (
         f"`{method}` was trained for PSF {trained}, but the calibration has PSF {calibration.psf_hash}. "
         "Expect blur, ghosts and invented detail, unless both are from the same camera: another crop, bin or "
         "background counts as another PSF. Use the PSF of the training, or train for this one: `mwdn train`."

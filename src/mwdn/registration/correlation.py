@@ -94,15 +94,19 @@ def refine(
     return result
 
 
-def correlate(projection: Projection, views: Views, blur: float) -> float:
-    """Correlation of pictures and reconstructions smoothed by ``blur``, without Tukey's weights.
+def correlate(projection: Projection, views: Views, blur: float, *, robust: bool = False) -> float:
+    """Correlation of pictures and reconstructions smoothed by ``blur``.
 
-    They would hide what tells a picture from its mirror image if that is small.
+    Args:
+        projection: from pictures to reconstructions.
+        views: pictures and reconstructions.
+        blur: standard deviation in pixels of the camera.
+        robust: with Tukey's weights, as `refine`; they hide what tells a picture from its mirror image if it is small.
     """
     smooth = smooth_images(views.reconstructions, blur)
     samples = matched_samples(projection, views, smooth, blur)
     motion = np.zeros((len(samples.points), 2, 0))
-    return linearise(projection.to_camera(samples.points), motion, samples, smooth, robust=False).correlation
+    return linearise(projection.to_camera(samples.points), motion, samples, smooth, robust=robust).correlation
 
 
 def matched_samples(projection: Projection, views: Views, smooth: Smooth, blur: float) -> Samples:

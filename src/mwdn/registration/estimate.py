@@ -1,6 +1,7 @@
 """Find where displayed pictures lie in reconstructions of their captures: start, refine, check."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +10,7 @@ from mwdn.errors import AlignmentError
 from mwdn.registration.correlation import Refined, correlate, refine
 from mwdn.registration.features import match_features
 from mwdn.registration.markers import match_markers
-from mwdn.registration.point_fit import fit_points
+from mwdn.registration.point_fit import correct, fit_points
 from mwdn.registration.projection import Points, Projection, picture_corners
 from mwdn.registration.residuals import Residuals, measure_residuals
 from mwdn.registration.search import search
@@ -34,6 +35,10 @@ _AMBIGUOUS = 0.05
 
 _FEW = 4
 _FEWEST_PARTS = 4
+_ENOUGH_PARTS = 12
+"""Parts that tell shading from a displacement of the whole: 24 numbers for the 8 of a homography."""
+
+_ROUNDS = 2
 
 
 class Estimate(NamedTuple):
@@ -66,8 +71,8 @@ def estimate(views: Views, *, corners: Points | None = None) -> Estimate:
     """Estimate the projection from displayed pictures to reconstructions.
 
     Markers of a board, features (SIFT), or a search over all places, sizes, turns and mirrorings give a start. The
-    correlation over all pictures then refines it (ECC). A radial term is kept if the displacements of the picture's
-    parts give strong evidence for it (Bayesian information criterion).
+    correlation over all pictures then refines it (ECC), and the displacements of the picture's parts correct what
+    shading and the picture's border have displaced. They decide about a radial term, see `correct`.
 
     Args:
         views: pictures and reconstructions; more pictures give a better estimate.
@@ -85,12 +90,8 @@ def estimate(views: Views, *, corners: Points | None = None) -> Estimate:
             break
     result, name = _single(tried, few)
     result = refine(result.projection, views, blurs=(2.0, 1.0))
-    residuals = measure_residuals(result.projection, views)
-    if _is_bent(result.projection, residuals):
-        bent = refine(result.projection, views, blurs=(1.0,), radial=True)
-        other = measure_residuals(bent.projection, views)
-        if other.rms_px < residuals.rms_px:
-            result, residuals = bent, other
+    projection, residuals = _through_parts(result.projection, views)
+    result = Refined(projection, correlate(projection, views, 1.0, robust=True))
     _check(result, residuals)
     return Estimate(result.projection, result.correlation, residuals, name)
 
@@ -140,17 +141,19 @@ def _single(tried: list[tuple[Refined, str]], few: Views) -> tuple[Refined, str]
     return result, name
 
 
-def _is_bent(projection: Projection, residuals: Residuals) -> bool:
-    """Whether the displacements of the parts show a radial term."""
-    if len(residuals.points) < 12:
-        return False
-    fit = fit_points(
-        residuals.points,
-        residuals.seen + residuals.displacements,
-        picture_size=projection.picture_size,
-        camera_size=projection.camera_size,
-    )
-    return fit.projection.radial != 0
+def _through_parts(projection: Projection, views: Views) -> tuple[Projection, Residuals]:
+    """The projection through the parts of the picture where the reconstructions show them, and what is left."""
+    residuals = measure_residuals(projection, views)
+    for _ in range(_ROUNDS):
+        if len(residuals.points) < _ENOUGH_PARTS:
+            break
+        with suppress(AlignmentError):  # the parts are scattered by more than the tolerance: `_check` refuses them
+            seen = residuals.seen + residuals.displacements
+            moved = correct(projection, residuals.points, seen, errors=residuals.errors)
+            left = measure_residuals(moved, views)
+            if left.rms_px < residuals.rms_px:
+                projection, residuals = moved, left
+    return projection, residuals
 
 
 def _check(result: Refined, residuals: Residuals) -> None:

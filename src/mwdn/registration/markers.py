@@ -33,11 +33,15 @@ def match_markers(views: Views) -> list[Projection]:
         seen += [found[number] for number in common]
     if len(displayed) < 2:
         return []
-    sizes = {"picture_size": views.picture_size, "camera_size": views.camera_size}
     with suppress(AlignmentError):
-        return [
-            fit_points(np.concatenate(displayed), np.concatenate(seen), tolerance_px=_TOLERANCE_PX, **sizes).projection
-        ]
+        fit = fit_points(
+            np.concatenate(displayed),
+            np.concatenate(seen),
+            picture_size=views.picture_size,
+            camera_size=views.camera_size,
+            tolerance_px=_TOLERANCE_PX,
+        )
+        return [fit.projection]
     return []
 
 

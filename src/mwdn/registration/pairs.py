@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from mwdn.calibration.psf_identity import psf_identity
 from mwdn.data.pair_writer import Attribute
 from mwdn.data.pairs import PairFile
 from mwdn.errors import AlignmentError, ShapeError
@@ -104,7 +105,7 @@ def write_aligned(
     shape = (*first.shape[-2:], first.shape[1])
     attributes: dict[str, Attribute] = {
         KEY: as_attribute(content),
-        "psf_hash": pairs.calibration.psf_hash,
+        **psf_identity(pairs.calibration),
         "source": pairs.path.name,
         "display_white": brightest,
     }

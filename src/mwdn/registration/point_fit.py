@@ -1,4 +1,4 @@
-"""Fit a projection to points: robust against outliers, with a radial term only where the points show one."""
+"""Fit a projection to points: robust against outliers, with a radial term only where it predicts other points."""
 
 from typing import NamedTuple
 
@@ -12,6 +12,16 @@ from mwdn.types import Size
 _ITERATIONS = 20
 _STRONG = 10.0
 """Difference of the Bayesian information criterion that is strong evidence (Kass and Raftery, 1995)."""
+
+_MOST = 0.3
+"""Largest radial term: `Projection.to_picture` converges below 1/3."""
+
+_LEAST_PX = 0.03
+"""Error of a part that no standard error tells of."""
+
+_PREDICTS = 0.8
+"""Part of the error at points that were left out that a radial term must leave. Errors of neighbours are alike in
+reconstructions, and the criterion takes them for independent."""
 
 
 class PointFit(NamedTuple):
@@ -33,20 +43,47 @@ class PointFit(NamedTuple):
         return float(np.sqrt((self.residuals[self.inliers] ** 2).sum(-1).mean()))
 
 
+class _Seen(NamedTuple):
+    """Points of the picture, where the camera sees them, and the weights of their errors."""
+
+    picture: Points
+    camera: Points
+    weights: npt.NDArray[np.float64]
+
+    @classmethod
+    def of(cls, picture: Points, camera: Points, errors: npt.NDArray[np.float64] | None) -> "_Seen":
+        return cls(picture, camera, np.ones(len(picture)) if errors is None else 1 / np.hypot(errors, _LEAST_PX))
+
+    def part(self, chosen: npt.NDArray[np.bool_]) -> "_Seen":
+        return _Seen(self.picture[chosen], self.camera[chosen], self.weights[chosen])
+
+    def error(self, projection: Projection) -> float:
+        """Sum of the squared weighted distances from a projection."""
+        distances = (self.camera - projection.to_camera(self.picture)) * self.weights[:, None]
+        return float(np.square(distances).sum())
+
+
 def fit_points(
-    picture: Points, camera: Points, *, picture_size: Size, camera_size: Size, tolerance_px: float = 3.0
+    picture: Points,
+    camera: Points,
+    *,
+    picture_size: Size,
+    camera_size: Size,
+    errors: npt.NDArray[np.float64] | None = None,
+    tolerance_px: float = 3.0,
 ) -> PointFit:
-    """Fit a projection to points of the displayed picture and where the camera sees them.
+    """Fit a homography to points of the displayed picture and where the camera sees them.
 
     Args:
         picture: (N, 2), in pixels of the displayed picture; at least 4.
         camera: (N, 2), in pixels of the reconstruction.
         picture_size: height and width of the displayed picture.
         camera_size: height and width of the reconstruction.
+        errors: (N,), standard errors of the points in the reconstruction; equal unless given.
         tolerance_px: points farther from the fit are outliers.
 
     Raises:
-        AlignmentError: fewer than 4 points, or no projection fits 4 of them.
+        AlignmentError: fewer than 4 points, or no homography fits 4 of them.
 
     References:
         D. Barath et al., MAGSAC++, a fast, reliable and accurate robust estimator, CVPR (2020).
@@ -61,14 +98,36 @@ def fit_points(
     if inliers.sum() < 4:
         raise AlignmentError(f"No homography fits 4 of the {count} points within {tolerance_px:g} px.")
     start = Projection.from_homography(matrix, picture_size, camera_size)
-    flat = _descend(start, picture[inliers], camera[inliers], radial=False)
-    bent = _descend(flat, picture[inliers], camera[inliers], radial=True)
-    best = bent if _evidence(flat, bent, picture[inliers], camera[inliers]) > _STRONG else flat
+    best = _descend(start, _Seen.of(picture, camera, errors).part(inliers), radial=False)
     residuals = camera - best.to_camera(picture)
     inliers = np.hypot(*residuals.T) <= tolerance_px
     if inliers.sum() < 4:
         raise AlignmentError(f"No homography fits 4 of the {count} points within {tolerance_px:g} px.")
     return PointFit(best, residuals, inliers)
+
+
+def correct(
+    projection: Projection, picture: Points, camera: Points, *, errors: npt.NDArray[np.float64] | None = None
+) -> Projection:
+    """Correct a projection by points, where there is strong evidence that it is off (Bayesian information criterion).
+
+    A radial term is fitted if there is strong evidence for it, too, and if it predicts rows and columns of points that
+    are left out better.
+
+    Args:
+        projection: that was found in another way.
+        picture: (N, 2), in pixels of the displayed picture; at least 12.
+        camera: (N, 2), in pixels of the reconstruction.
+        errors: (N,), standard errors of the points in the reconstruction; equal unless given.
+
+    Raises:
+        AlignmentError: no homography fits the points.
+    """
+    sizes = projection.picture_size, projection.camera_size
+    fit = fit_points(picture, camera, picture_size=sizes[0], camera_size=sizes[1], errors=errors)
+    seen = _Seen.of(picture, camera, errors).part(fit.inliers)
+    best = _bent(fit.projection, seen)
+    return best if _evidence(projection, best, seen, 9 if best.radial else 8) > _STRONG else projection
 
 
 def _consensus(picture: Points, camera: Points, tolerance_px: float) -> tuple[Points | None, npt.NDArray[np.uint8]]:
@@ -85,23 +144,43 @@ def _consensus(picture: Points, camera: Points, tolerance_px: float) -> tuple[Po
     return best
 
 
-def _descend(projection: Projection, picture: Points, camera: Points, *, radial: bool) -> Projection:
-    """Least squares by Gauss-Newton."""
+def _descend(projection: Projection, seen: _Seen, *, radial: bool) -> Projection:
+    """Weighted least squares by Gauss-Newton."""
     free = 9 if radial else 8
-    for _ in range(_ITERATIONS if len(picture) > 4 else 0):  # a homography through four points is exact
-        seen, slope = projection.project(picture)
+    for _ in range(_ITERATIONS if len(seen.picture) > 4 else 0):  # a homography through four points is exact
+        fitted, slope = projection.project(seen.picture)
+        A = (slope[..., :free] * seen.weights[:, None, None]).reshape(-1, free)
         step = np.zeros(9)
-        step[:free] = np.linalg.lstsq(slope[..., :free].reshape(-1, free), (camera - seen).ravel(), rcond=None)[0]
+        step[:free] = np.linalg.lstsq(A, ((seen.camera - fitted) * seen.weights[:, None]).ravel(), rcond=None)[0]
         projection = projection.moved(step)
         if np.abs(step).max() < 1e-10:
             break
     return projection
 
 
-def _evidence(flat: Projection, bent: Projection, picture: Points, camera: Points) -> float:
-    """Bayesian information criterion for the radial term: ``n ln(RSS0 / RSS1) - ln n``, n coordinates."""
-    n = camera.size
-    if n < 24 or abs(bent.radial) > 0.3:  # twelve points: fewer cannot tell distortion from their errors
+def _bent(flat: Projection, seen: _Seen) -> Projection:
+    """The fit with a radial term if the points show one, otherwise the one without."""
+    bent = _descend(flat, seen, radial=True)
+    is_shown = abs(bent.radial) < _MOST and _evidence(flat, bent, seen, 1) > _STRONG
+    return bent if is_shown and _prediction(flat, seen) < _PREDICTS else flat
+
+
+def _evidence(before: Projection, after: Projection, seen: _Seen, free: int) -> float:
+    """Bayesian information criterion for more parameters: ``n ln(RSS0 / RSS1) - free ln n``, n coordinates."""
+    n = seen.camera.size
+    if n < 24:  # twelve points: fewer cannot tell distortion from their errors
         return -np.inf
-    rss = [max(((camera - each.to_camera(picture)) ** 2).sum(), 1e-12) for each in (flat, bent)]
-    return float(n * np.log(rss[0] / rss[1]) - np.log(n))
+    rss = [max(seen.error(each), 1e-12) for each in (before, after)]
+    return float(n * np.log(rss[0] / rss[1]) - free * np.log(n))
+
+
+def _prediction(flat: Projection, seen: _Seen) -> float:
+    """Error at points that are left out, with a radial term over without: each row and column of points in turn."""
+    errors = np.zeros(2)
+    count = int(np.clip(np.sqrt(len(seen.picture)), 3, 6))
+    for axis in (0, 1):
+        places = seen.picture[:, axis].argsort().argsort() * count // len(seen.picture)
+        for place in range(count):
+            others, left = seen.part(places != place), seen.part(places == place)
+            errors += [left.error(_descend(flat, others, radial=radial)) for radial in (False, True)]
+    return float(errors[1] / max(errors[0], 1e-12))

@@ -43,13 +43,18 @@ class Residuals(NamedTuple):
 
 
 def measure_residuals(projection: Projection, views: Views) -> Residuals:
-    """Displacement of each part: equation (1) of `mwdn.registration.correlation`, with a translation as parameters."""
+    """Displacement of each part: equation (1) of `mwdn.registration.correlation`, with a translation as parameters.
+
+    Each part has its own gain and offset, so shading does not displace it. The picture's border is not compared: where
+    light ends, a blur that is not quite that of the reconstruction looks like a displacement.
+    """
     images = smooth_images(views.reconstructions, _BLUR)
     samples = matched_samples(projection, views, images, _BLUR)
     points = projection.to_camera(samples.points)
     count = int(np.clip(min(samples.shape) // _PART_PX, _FEWEST_PARTS, _MOST_PARTS))
-    rows, columns = (np.arange(n) * count // n for n in samples.shape)
-    parts = (rows[:, None] * count + columns).ravel()
+    height, width = views.picture_size
+    columns, rows = np.floor((samples.points + 0.5) / [width, height] * count).astype(int).T
+    parts = np.where((np.minimum(rows, columns) >= 0) & (np.maximum(rows, columns) < count), rows * count + columns, -1)
     found = []
     for part in range(count**2):
         inside = parts == part

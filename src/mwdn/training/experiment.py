@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from mwdn.calibration import Calibration
 from mwdn.calibration.places import field_camera
+from mwdn.calibration.psf_identity import psf_identity
 from mwdn.calibration.refinement import Refinement
 from mwdn.data.cameras import CameraPairs
 from mwdn.data.captures import find_captures, read_captures
@@ -250,6 +251,6 @@ def simulate(
         pairs = replace(pairs, mismatch=EXACT)
     elif calibration.places.field_psfs:  # the measured field, instead of random changes of one PSF
         pairs = replace(pairs, camera=field_camera(calibration))
-    attributes: dict[str, Attribute] = {"psf_hash": calibration.psf_hash, "seed": pairs.seed}
+    attributes: dict[str, Attribute] = {**psf_identity(calibration), "seed": pairs.seed}
     numbers = range(FILE_START, FILE_START + count)
     record(out, [(pairs, numbers)], calibration.psf, batch=recipe.schedule.batch, attributes=attributes, track=track)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mwdn.calibration import Calibration
+from mwdn.calibration.psf_identity import psf_identity
 from mwdn.errors import DivergenceError, MwdnError, ParameterError
 from mwdn.io.files import as_parameter_error
 from mwdn.io.images import write_picture
@@ -88,6 +89,7 @@ class Trainer:
 
         # 2. Resume a run that was stopped.
         self.identity = run_identity(recipe, calibration.psf_hash, task.name)
+        self.psf_identity = psf_identity(calibration) if self.identity["psf_hash"] else {}
         distributed.check_same(self.identity)
         distributed.shard(range(self.schedule.batch))  # raises if the batch is too small
         self.folder = RunFolder(out, self.identity)
@@ -257,7 +259,7 @@ class Trainer:
         self.best = max(self.best, validation.psnr)
         if distributed.rank() > 0:
             return
-        metadata = {**self.identity, "step": self.step, "psnr": validation.psnr}
+        metadata = {**self.psf_identity, **self.identity, "step": self.step, "psnr": validation.psnr}
         name, options = name_and_options(self.recipe)
         with as_parameter_error(self.out, MAKE_ROOM):
             for file in ("last", *(["best"] if validation.psnr == self.best else [])):
