@@ -1,13 +1,17 @@
 """The live picture on a real socket, with the simulated rig as camera."""
 
+import io
 import itertools
 import json
 
+import httpx2 as httpx
+import numpy as np
 import pytest
 from websockets.sync.client import connect
 
 from mwdn.calibration import Calibration
 from mwdn.capture import open_source
+from mwdn.io.formats import as_frame
 from mwdn.preview.cameras import Cameras
 from mwdn.preview.live import Live
 from mwdn.preview.server import make_server
@@ -15,13 +19,19 @@ from preview_server import LIMITS, SIDE
 
 
 @pytest.fixture
-def live(tmp_path):
-    rig = open_source(f"rig,height={SIDE},width={SIDE},drop=0.2")
-    live = Live(rig, Calibration(rig.psf), method="wiener", folder=tmp_path, device="cpu")
+def live(tmp_path, request):
+    rig = open_source(f"rig,height={SIDE},width={SIDE},drop=0.2{getattr(request, 'param', '')}")
+    live = Live(rig, Calibration(rig.psf), method="wiener", folder=tmp_path, device="cpu", retry_s=0.01)
     server = make_server(Cameras(LIMITS), LIMITS, device="cpu", live=live)
     server.start()
     yield server.url.replace("http", "ws") + "live", live
     server.stop()
+
+
+@pytest.fixture
+def viewer(live):
+    with connect(live[0], open_timeout=60, close_timeout=0.1) as socket:  # it leaves with frames that it has not read
+        yield socket
 
 
 def parts(message):
@@ -58,18 +68,106 @@ def test_viewers_share_frames_that_grow_newer(live):
         assert "exposure_s" in until(second, lambda said: said["refused"])["refused"]
 
 
-def test_recording_holds_raw_frames(live, tmp_path):
-    url, served = live
-    with connect(url, open_timeout=60) as viewer:
-        viewer.send('{"record": true}')
-        said = until(viewer, lambda said: (said.get("recorded") or 0) >= 3)
+def test_viewer_that_shows_nothing_gets_two_frames_at_most(live):
+    url, _ = live
+    with connect(url, open_timeout=60) as slow, connect(url, open_timeout=60) as fast:
+
+        def frames_until_answer(number):
+            slow.send(json.dumps({"clock": number}))
+            count = 0
+            while isinstance(message := slow.recv(timeout=60), bytes):
+                count += 1
+            answer = json.loads(message)
+            assert answer["clock"] == number
+            assert answer["server"] > 1e9
+            return count
+
+        slow.send('{"shown": true}')
+        frames_until_answer(1)  # those before the message was read
+        for _ in range(12):
+            until(fast, lambda said: True)
+        assert frames_until_answer(2) <= 2
+
+
+def test_method_and_options_change(live, viewer):
+    viewer.send('{"method": "admm", "options": {"iterations": 2}}')
+    said = until(viewer, lambda said: said["method"] == "admm")
+    assert said["options"] == {"iterations": 2}
+    viewer.send('{"options": {"iterations": 0}}')  # refused by the solver: the settings before stay
+    said = until(viewer, lambda said: said["refused"])
+    assert "iterations" in said["refused"]
+    viewer.send('{"method": "no-such"}')
+    said = until(viewer, lambda said: "no-such" in said["refused"])
+    assert (said["method"], said["options"]) == ("admm", {"iterations": 2})
+    viewer.send('{"stops": 1.5, "white_balance": "grey-world", "room_light": true}')
+    assert until(viewer, lambda said: said["room_light"])["refused"] == ""
+
+
+def test_frame_of_the_room_is_subtracted_until_the_exposure_changes(live, viewer):
+    _, served = live
+    viewer.send('{"ambient": true}')
+    until(viewer, lambda said: said["ambient"])
+    picture = served.snapshot()
+    assert picture.calibration.ambient is not None
+    viewer.send('{"exposure_s": 0.005}')
+    said = until(viewer, lambda said: not said["ambient"])
+    assert "exposure" in said["refused"]
+
+
+def test_snapshot_holds_the_raw_frame_and_its_picture(live, viewer):
+    from mwdn import Reconstructor
+
+    url, _ = live
+    with httpx.Client(base_url=url.replace("ws", "http").removesuffix("/live"), timeout=60) as client:
+        until(viewer, lambda said: True)
+        job = client.post("/live/snapshots").json()
+        assert job["report"]["exposure_s"] == 0.01
+        assert job["report"]["bit_depth"] == 12
+        raw = client.get(f"/jobs/{job['id']}/capture").content
+        picture = np.load(io.BytesIO(client.get(f"/jobs/{job['id']}/picture?format=npy").content))
+        cameras = client.get("/cameras").json()["cameras"]
+        assert job["camera"] in [camera["name"] for camera in cameras]
+        # The raw frame as a capture of the live camera gives the same picture.
+        fields = {"camera": job["camera"], "method": "wiener", "trust": "false", "format": "npy"}
+        again = client.post("/reconstruct", files={"capture": raw}, data=fields)
+        np.testing.assert_array_equal(np.load(io.BytesIO(again.content)), picture)
+    import cv2
+
+    array = cv2.imdecode(np.frombuffer(raw, np.uint8), cv2.IMREAD_UNCHANGED)[..., ::-1]
+    assert array.dtype == np.uint16
+    calibration = Calibration(open_source(f"rig,height={SIDE},width={SIDE}").psf)
+    scaled = as_frame(np.ascontiguousarray(array).astype(np.float32) / 4095)
+    np.testing.assert_allclose(Reconstructor("wiener", calibration, device="cpu")(scaled), picture, atol=1e-5)
+
+
+def test_recording_holds_raw_frames(live, viewer, tmp_path):
+    _, served = live
+    viewer.send('{"record": true}')
+    said = until(viewer, lambda said: (said.get("recorded") or 0) >= 3)
     served.close()
-    (path,) = tmp_path.glob("recording-*.h5")
+    path = tmp_path / said["recording"]
     with open_source(f"replay:{path}") as replay:
         frames = [replay.read() for _ in range(said["recorded"])]
     assert frames[0].array.shape == (SIDE, SIDE, 3)
     assert frames[0].bit_depth == 12
     assert all(a.number < b.number for a, b in itertools.pairwise(frames))
+
+
+@pytest.mark.parametrize("live", [",disconnect_every=5"], indirect=True)
+def test_camera_that_is_disconnected_is_opened_again(live, viewer):
+    assert "disconnected" in until(viewer, lambda said: "error" in said)["error"]
+    assert until(viewer, lambda said: "error" not in said)["number"] >= 0
+
+
+@pytest.mark.parametrize("live", [",read_noise=0"], indirect=True)
+def test_frames_without_light_do_not_end_the_picture(live, viewer):
+    _, served = live
+    viewer.send('{"ambient": true}')
+    until(viewer, lambda said: said["ambient"])
+    served.camera._scale = 0.0  # a lens cap: less than the room's light
+    assert "light" in until(viewer, lambda said: said["refused"])["refused"]
+    served.camera._scale = 1.0
+    until(viewer, lambda said: not said["refused"])
 
 
 @pytest.mark.parametrize("message", ["no JSON", "[]", '{"path": "/etc/passwd"}', '{"record": 1}', '{"gain": "x"}'])

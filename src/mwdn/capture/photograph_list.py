@@ -40,13 +40,18 @@ def read_photograph(path: Path, size: tuple[int, int]) -> Picture:
     Raises:
         ImageError: it cannot be read, or holds floats.
     """
-    import cv2
-
     frame = read_frame(path, upright=True)
     if frame.dtype == np.uint16:
         frame = np.rint(frame / 257).astype(np.uint8)
     if frame.dtype != np.uint8:
         raise ImageError(f"`{path}` holds {frame.dtype}; photographs have 8 or 16 bits. Save it as PNG or JPEG.")
+    return fit_photograph(frame, size)
+
+
+def fit_photograph(frame: Picture, size: tuple[int, int]) -> Picture:
+    """The largest central part of a photograph (h, w, 1 or 3) with these proportions, at this size (height, width)."""
+    import cv2
+
     height, width = frame.shape[:2]
     scale = min(height / size[0], width / size[1])
     rows, columns = max(round(size[0] * scale), 1), max(round(size[1] * scale), 1)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mwdn.capture.patterns import PATTERNS
-from mwdn.capture.rig import RigOptions
+from mwdn.capture.rig_options import RigOptions
 from mwdn.errors import ParameterError, UnknownNameError
 from mwdn.io.toml import find_recipe, read_toml, to_dataclass
 

@@ -7,21 +7,23 @@ import math
 import random
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
-from typing import Any, get_args
+from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from mwdn.capture.playlist import Playlist, PlaylistOptions, open_playlist
+from mwdn.capture.prepared_frames import PreparedFrames
+from mwdn.capture.rig_options import RigOptions
 from mwdn.capture.rig_view import view
 from mwdn.capture.screen import Picture, Pose, Projection, Screen, project
 from mwdn.capture.source import TIMEOUT_S, CameraSource, Frame
-from mwdn.data.mismatch import EXACT, Mismatch, shading
+from mwdn.data.mismatch import shading
 from mwdn.data.random import seeded
 from mwdn.data.real_camera import RealCamera
-from mwdn.errors import CameraError, ParameterError, ShapeError, UnknownNameError
-from mwdn.io.raw import Mosaic
+from mwdn.errors import CameraError, ShapeError
 from mwdn.io.toml import to_dataclass
 from mwdn.optics import Sensor, Variety, sample_camera
 from mwdn.types import Measurement, Psf
@@ -33,90 +35,6 @@ NEAR, FAR = 1e-6, 1e4
 """Exposures in seconds that the rig accepts; it does not wait for them."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class RigOptions:
-    """The [rig] of a recipe: the true camera, its display's pose, and what goes wrong.
-
-    Args:
-        seed: of all randomness: two rigs of one seed deliver the same frames.
-        height: pixels of a measurement; raw frames of a mosaic have twice as many.
-        width: likewise.
-        family: kind of the mask, see `mwdn.optics.FAMILIES`; drawn if empty.
-        mosaic: colours of a 2 x 2 cell of raw frames, ``"rggb"``; RGB frames if empty.
-        fill: width of the display in the camera's view, over the frame's.
-        tilt_degrees: see `Pose`.
-        turn_degrees: see `Pose`.
-        offset_cm: see `Pose`.
-        display_gamma: light of the display is the coded number to this power.
-        display_black: light of a black pixel of the display, over that of a white one.
-        white: brightest pixel of a frame of a white display at `EXPOSURE_S`, over the full scale.
-        room_light: see `mwdn.data.mismatch.Mismatch`, as are the next five; relative to a white display. Each is fixed.
-        envelope_shift: likewise.
-        tails: likewise: stray light.
-        off_axis: likewise; takes five times as long.
-        hot_pixels: likewise.
-        vignetting: likewise.
-        full_well: of the sensor in electrons at a gain of 1, see `mwdn.optics.Sensor`.
-        read_noise: in electrons.
-        bit_depth: of the sensor.
-        black_level: of the sensor.
-        drift: standard deviation of the step by which the exposure's logarithm changes from frame to frame.
-        drop: probability that a frame is lost.
-        disconnect_every: frames after which the camera is disconnected, until it is opened again; 0 for never.
-        latency: frames after a change of the display that still show some of the picture before (a rolling shutter).
-        fps: frames per second; 0 for no waiting.
-
-    Raises:
-        ParameterError: a number is outside its range.
-    """
-
-    seed: int = 0
-    height: int = 160
-    width: int = 160
-    family: str = "contours"
-    mosaic: str = ""
-    fill: float = 0.6
-    tilt_degrees: tuple[float, float] = (4.0, -6.0)
-    turn_degrees: float = -1.3
-    offset_cm: tuple[float, float] = (0.6, -0.4)
-    display_gamma: float = 2.2
-    display_black: float = 0.001
-    white: float = 0.7
-    room_light: float = 0.02
-    envelope_shift: float = 0.0
-    tails: float = 0.0
-    off_axis: float = 0.0
-    hot_pixels: float = 0.0
-    vignetting: float = 0.0
-    full_well: float = 15_000.0
-    read_noise: float = 3.0
-    bit_depth: int = 12
-    black_level: float = 0.01
-    drift: float = 0.0
-    drop: float = 0.0
-    disconnect_every: int = 0
-    latency: int = 0
-    fps: float = 0.0
-
-    def __post_init__(self) -> None:
-        if self.mosaic and self.mosaic not in get_args(Mosaic):
-            raise UnknownNameError("mosaic", self.mosaic, get_args(Mosaic))
-        for name in ("fill", "white", "display_gamma"):
-            if not getattr(self, name) > 0:
-                raise ParameterError(f"`{name}` ({getattr(self, name)}) of the rig must be positive.")
-        if not 0 <= self.drop < 1:
-            raise ParameterError(f"`drop` ({self.drop}) must be in [0, 1): a probability.")
-        for name in ("drift", "disconnect_every", "latency", "fps", "display_black"):
-            if not getattr(self, name) >= 0:
-                raise ParameterError(f"`{name}` ({getattr(self, name)}) of the rig must not be negative.")
-
-    @property
-    def mismatch(self) -> Mismatch:
-        """How the true camera differs from a plain convolution."""
-        names = ("room_light", "envelope_shift", "tails", "off_axis", "hot_pixels", "vignetting")
-        return replace(EXACT, full=True, **{name: getattr(self, name) for name in names})
-
-
 class Rig(CameraSource):
     """The camera of a simulated rig; `show` changes what its display shows.
 
@@ -125,6 +43,7 @@ class Rig(CameraSource):
         screen: the display.
         psf: (1, 3, height, width) of a point on the axis; one of ``family`` is drawn unless given.
         picture: on the display at first, with the display's size; a point in its middle unless given.
+        playlist: what the display plays while the camera is read.
         timeout_s: has no effect.
         wait: sleeps so many seconds.
 
@@ -139,6 +58,7 @@ class Rig(CameraSource):
         *,
         psf: Psf | None = None,
         picture: Picture | None = None,
+        playlist: Playlist | None = None,
         timeout_s: float = TIMEOUT_S,
         wait: Callable[[float], None] = time.sleep,
     ) -> None:
@@ -149,7 +69,7 @@ class Rig(CameraSource):
             psf = sample_camera(options.seed, size, family=options.family or None, variety=variety)
         if psf.shape[1:] != (3, *size):
             raise ShapeError(f"`psf` {tuple(psf.shape)} must be (1, 3, {size[0]}, {size[1]}), as `height` and `width`.")
-        self.options, self.screen = options, screen
+        self.options, self.screen, self.playlist = options, screen, playlist
         self._real = RealCamera(options.mismatch, (options.seed,), (False,))
         self.psf: Psf = self._real.psf(psf)
         """(1, 3, H, W): the true response to a point on the axis."""
@@ -166,6 +86,7 @@ class Rig(CameraSource):
         self.exposure_s, self.gain, self._drift, self._number = EXPOSURE_S, 1.0, 0.0, -1
         self._started, self._stale = 0.0, 0
         self._shown = self._before = self._dark()
+        self._entry, self._lit, self._frames = -1, -1, PreparedFrames(options.prepared)
         self.show(_point(screen) if picture is None else picture)
         self._before, self._stale = self._shown, 0
 
@@ -179,6 +100,7 @@ class Rig(CameraSource):
             wanted = f"{self.screen.height_px} x {self.screen.width_px} x 3"
             raise ShapeError(f"`picture` {picture.shape} must have the display's size, {wanted}.")
         self._before, self._shown, self._stale = self._shown, self._light(picture), self.options.latency
+        self._frames.clear()
 
     def open(self) -> None:
         """Connect; after a disconnection, too."""
@@ -219,22 +141,30 @@ class Rig(CameraSource):
             raise CameraError(f"{self.name} was disconnected after {options.disconnect_every:,} frames. Connect it.")
         dropped = self._pass_frames()
         self._number += 1 + dropped
+        self._entry = self._entry if self.playlist is None else self.playlist.entry
         self._drift += options.drift * self._chance.gauss(0, 1)
-        light = self._shown
-        if self._stale:  # rows from some row on were read out before the change
-            self._stale -= 1
-            rows = torch.arange(options.height)[:, None]
-            light = torch.where(rows < self._chance.randrange(options.height), light, self._before)
         return Frame(
-            array=self._expose(light),
+            array=self._frames.next((self._entry, self.exposure_s, self.gain), lambda: self._expose(self._seen())),
             bit_depth=options.bit_depth,
             mosaic=options.mosaic or None,  # type: ignore[arg-type]
             exposure_s=self.exposure_s,
             gain=self.gain,
-            timestamp=time.time() + self.exposure_s,  # which it does not wait for
+            # Without a rate it does not wait for the exposure; with one, the exposure ends when the wait does.
+            timestamp=time.time() + (0.0 if options.fps else self.exposure_s),
             number=self._number,
             dropped=dropped,
         )
+
+    def _seen(self) -> Measurement:
+        """Light on the sensor of what the display shows."""
+        if self.playlist is not None and self._lit != self._entry:
+            self._shown = self._before = self._light(self.playlist.read(self._entry))
+            self._lit = self._entry
+        if not self._stale:
+            return self._shown
+        self._stale -= 1  # rows from some row on were read out before the change
+        rows = torch.arange(self.options.height)[:, None]
+        return torch.where(rows < self._chance.randrange(self.options.height), self._shown, self._before)
 
     def _pass_frames(self) -> int:
         """Wait for the next frame that is not lost; returns how many were."""
@@ -274,11 +204,20 @@ class Rig(CameraSource):
 
 
 def open_rig(**options: Any) -> Rig:  # noqa: ANN401
-    """A rig from the options of a camera's string: those of `RigOptions` and `Screen`, by their names."""
+    """A rig from the options of a camera's string: those of `RigOptions` and `Screen`, by their names.
+
+    ``pictures`` is a folder of pictures, each shown for ``picture_s`` seconds, or a video; either is played again and
+    again.
+    """
     own = {name: options.pop(name) for name in ("timeout_s",) if name in options}
-    names = {part.name for part in fields(Screen)}
-    screen = {name: options.pop(name) for name in names & options.keys()}
-    return Rig(to_dataclass(RigOptions, "rig", options), to_dataclass(Screen, "display", screen), **own)
+
+    def part(cls: type, name: str) -> Any:  # noqa: ANN401
+        names = {each.name for each in fields(cls)}
+        return to_dataclass(cls, name, {key: options.pop(key) for key in names & options.keys()})
+
+    display = part(Screen, "display")
+    own["playlist"] = open_playlist(part(PlaylistOptions, "display"), (display.height_px, display.width_px))
+    return Rig(to_dataclass(RigOptions, "rig", options), display, **own)
 
 
 def _point(screen: Screen) -> Picture:

@@ -3,13 +3,14 @@
 import secrets
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
 from mwdn.calibration import Calibration
 from mwdn.capture import open_source
 from mwdn.capture.photograph_list import read_photograph
+from mwdn.capture.sources import parse_source
 from mwdn.cli.camera import CameraOptions
 from mwdn.cli.terminal import say
 from mwdn.errors import ParameterError
@@ -21,6 +22,9 @@ from mwdn.runtime.web_access import LOOPBACK
 
 OWN = "camera"
 """Name of the command line's camera on the page."""
+
+LIVE_DEFAULTS: dict[str, dict[str, Any]] = {"rig": {"fps": 30.0, "prepared": 8}, "replay": {"realtime": True}}
+"""Options of a live camera unless given: the rig runs at a camera's rate, and a recording at its own."""
 
 
 def preview(  # noqa: PLR0913
@@ -65,11 +69,14 @@ def _open_live(text: str, calibration: Calibration | None, folder: Path, device:
     """The live camera; the display of a simulated rig shows a photograph."""
     from mwdn.capture.rig import Rig
 
-    source = open_source(text)
-    if isinstance(source, Rig):
+    name, _, options = parse_source(text)
+    defaults = {key: value for key, value in LIVE_DEFAULTS.get(name, {}).items() if key not in options}
+    source = open_source(text, **defaults)
+    if isinstance(source, Rig) and source.playlist is None:
         screen = source.screen
         photograph = Path(str(files("mwdn.io.pictures") / "astronaut.jpg"))
         source.show(read_photograph(photograph, (screen.height_px, screen.width_px)))
+    if isinstance(source, Rig):
         calibration = calibration or Calibration(source.psf)
     if calibration is None:
         raise ParameterError(f"`live` ({text}) needs the PSF of this camera: `--psf psf.png`, `--camera camera.toml`.")

@@ -13,9 +13,8 @@ from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
-from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
-from starlette.websockets import WebSocket
 
 from mwdn.calibration import Calibration
 from mwdn.errors import MwdnError, ParameterError
@@ -23,7 +22,8 @@ from mwdn.preview.cameras import OPTIONS, Cameras, checked_camera, describe
 from mwdn.preview.guard import Guard, failed, log
 from mwdn.preview.jobs import ENDED, Job, Jobs
 from mwdn.preview.limits import Limits, RefusedError
-from mwdn.preview.live import Live, serve_viewer
+from mwdn.preview.live import Live
+from mwdn.preview.live_routes import LiveRoutes
 from mwdn.preview.methods import checked_options, list_methods
 from mwdn.preview.metrics import Metrics
 from mwdn.preview.openapi import openapi
@@ -35,8 +35,9 @@ from mwdn.preview.uploads import Form, parse_look, read_form
 from mwdn.version import __version__
 
 STATIC = Path(__file__).parent / "static"
-FILES = ("capture", "psf")
-TEXTS = ("camera", "calibration", "method", "options", "align", "trust", "format", "exposure", "white_balance")
+FILES = ("capture", "psf", "ambient")
+LOOKS = ("format", "exposure", "white_balance")
+TEXTS = ("camera", "calibration", "method", "options", "align", "trust", "room_light", *LOOKS)
 
 
 class Preview:
@@ -99,7 +100,7 @@ class Preview:
             Route("/jobs/{id}", self.cancel, methods=["DELETE"]),
             Route("/jobs/{id}/picture", self.picture),
             Route("/jobs/{id}/measurement", self.measurement),
-            WebSocketRoute("/live", self.watch),
+            *LiveRoutes(self.live, self.cameras, self.jobs, self.limits).routes,
             Mount("/static", StaticFiles(directory=STATIC)),
         ]
         handlers = {MwdnError: failed, HTTPException: failed, 500: failed}
@@ -127,13 +128,6 @@ class Preview:
         live = self.live and self.live.camera.name
         about = {"camera_options": OPTIONS, "limits": vars(self.limits), "live": live}
         return JSONResponse({"methods": list_methods(), **about})
-
-    async def watch(self, socket: WebSocket) -> None:
-        """The live picture."""
-        if self.live is None or self.live.viewers >= self.limits.viewers:
-            await socket.close(1013)  # before it is accepted: status 403
-            return
-        await serve_viewer(self.live, socket)
 
     async def samples(self, _: Request) -> Response:
         """Captures to try."""
@@ -235,10 +229,10 @@ class Preview:
             options=checked_options(method, form.json("options")),
             align=form.flag("align"),
             trust=trust is not False,
+            room_light=form.flag("room_light") is True,
+            ambient=form.files.get("ambient", b""),
         )
-        job = self.jobs.submit(
-            partial(self.reconstructions.run, order=order), size=len(capture) + len(form.files.get("psf", b""))
-        )
+        job = self.jobs.submit(partial(self.reconstructions.run, order=order), size=sum(map(len, form.files.values())))
         job.when_ended(lambda: self._count(job, method))
         return job
 

@@ -124,6 +124,15 @@ class Jobs:
             self._changed.notify()
         return job
 
+    def keep(self, result: Result) -> Job:
+        """A job that is done already: a live picture that somebody wants to keep."""
+        job = Job(self.limits.seconds, progress=1.0, result=result)
+        job.end("done")
+        with self._changed:
+            self._jobs[job.id] = job
+        self._forget()
+        return job
+
     def _work(self) -> None:
         while True:
             with self._changed:

@@ -1,37 +1,29 @@
 """The live picture: one camera and one reconstruction for all viewers; the newest frame wins, nothing queues."""
 
-import asyncio
 import json
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, suppress
-from dataclasses import replace
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-import torch
-from torch import Tensor
 
 from mwdn.calibration import Calibration
 from mwdn.capture.recording import Recorder, record
 from mwdn.capture.source import CameraSource, Frame
-from mwdn.errors import MwdnError, ParameterError
-from mwdn.inference.reconstructor import Reconstructor
-from mwdn.io.contact_sheets import to_display
-from mwdn.io.images import srgb_encode
+from mwdn.errors import MwdnError
+from mwdn.preview.limits import RefusedError
+from mwdn.preview.live_pictures import LivePicture, LivePictures, finite
+from mwdn.preview.live_settings import CAMERA, LiveSettings
 from mwdn.preview.metrics import Metrics
 from mwdn.runtime.streams import latest
-
-QUALITY = 90
-"""Of the JPEGs that viewers get."""
 
 RATE_FRAMES = 20
 """Frames over which the rate is averaged."""
 
-SETTINGS = ("exposure_s", "gain")
+RETRY_S = 2.0
+"""Seconds after which a camera that failed is opened again."""
 
 
 class Live:
@@ -40,9 +32,10 @@ class Live:
     Args:
         camera: opened for the first viewer, closed after the last.
         calibration: of the camera.
-        method: see `Reconstructor`.
+        method: see `Reconstructor`; viewers may choose another.
         folder: of recordings.
         device: see `Reconstructor`.
+        retry_s: seconds after which a camera that failed is opened again.
     """
 
     def __init__(
@@ -53,16 +46,19 @@ class Live:
         method: str = "universal-small",
         folder: Path,
         device: str | None = None,
+        retry_s: float = RETRY_S,
     ) -> None:
-        self.camera, self.calibration, self.method, self.device = camera, calibration, method, device
-        self.folder, self.metrics = folder, Metrics()
-        self._lock = threading.Lock()
+        self.camera, self.calibration, self.folder, self.metrics = camera, calibration, folder, Metrics()
+        self.pictures = LivePictures(calibration, LiveSettings(method), device, count=self._count)
+        self._retry_s = retry_s
+        self._lock, self._changed = threading.Lock(), threading.Event()
         self._wake: dict[int, Callable[[], None]] = {}
         self._thread: threading.Thread | None = None
         self._pending: dict[str, float] = {}
         self._is_recording = self._is_stopped = False
-        self._recorded, self._refused = 0, ""
+        self._recorded, self._recording, self._refused = 0, "", ""
         self._newest: bytes | None = None
+        self._picture: LivePicture | None = None
 
     def join(self, wake: Callable[[], None]) -> int:
         """Add a viewer, and start the camera for the first one.
@@ -77,7 +73,7 @@ class Live:
             number = max(self._wake, default=0) + 1
             self._wake[number] = wake
             if self._thread is None:
-                self._is_stopped, self._newest = False, None
+                self._is_stopped, self._newest, self._picture = False, None, None
                 self._thread = threading.Thread(target=self._run, daemon=True)
                 self._thread.start()
             return number
@@ -86,6 +82,8 @@ class Live:
         """Remove a viewer; the camera stops after the last."""
         with self._lock:
             self._wake.pop(number, None)
+            if not self._wake:
+                self._changed.set()
 
     @property
     def viewers(self) -> int:
@@ -97,38 +95,46 @@ class Live:
         """The newest message for viewers."""
         return self._newest
 
-    def control(self, message: dict[str, Any]) -> None:
-        """What a viewer asks for: ``exposure_s``, ``gain``, ``record``.
+    def snapshot(self) -> LivePicture:
+        """The newest frame and its picture.
 
         Raises:
-            ParameterError: something else, or of another type.
+            RefusedError: there is none.
         """
-        for name, value in message.items():
-            if name in SETTINGS and isinstance(value, int | float) and not isinstance(value, bool):
-                self._pending[name] = float(value)
-            elif name == "record" and isinstance(value, bool):
-                self._is_recording = value
-            else:
-                raise ParameterError(f"`{name[:40]}` must be exposure_s, gain (numbers) or record (true, false).")
+        if self._picture is None:
+            raise RefusedError(409, "The live camera has no picture. Start it first.")
+        return self._picture
+
+    def control(self, message: dict[str, Any]) -> None:
+        """Follow a message, of `mwdn.preview.live_settings.check_message`."""
+        message = dict(message)
+        self._pending |= {name: float(message.pop(name)) for name in CAMERA if name in message}
+        self._is_recording = message.pop("record", self._is_recording)
+        if message:
+            self.pictures.change(message)
 
     def close(self) -> None:
         """Stop the camera; a recording is complete afterwards."""
         self._is_stopped = True
+        self._changed.set()
         thread = self._thread
         if thread is not None:
             thread.join(timeout=20)
 
     def _run(self) -> None:
-        is_failed = False
         while True:
+            failed = False
             try:
                 with self.camera, ExitStack() as recording, closing(latest(self._frames(recording))) as frames:
                     self._reconstruct(frames)
             except MwdnError as error:
-                is_failed = True
+                failed, self._is_recording = True, False
                 self._publish({"error": str(error)}, b"", b"")
+            self._changed.clear()
+            if failed and self._wake and not self._is_stopped:
+                self._changed.wait(self._retry_s)
             with self._lock:  # somebody may have come since the last one left
-                if is_failed or self._is_stopped or not self._wake:
+                if self._is_stopped or not self._wake:
                     self._thread = None
                     return
 
@@ -136,17 +142,11 @@ class Live:
         """All frames; settings change between them, and each is recorded if that is wanted."""
         recorder: Recorder | None = None
         while self._wake and not self._is_stopped:
-            while self._pending:
-                name, value = self._pending.popitem()
-                self._refused = ""
-                try:
-                    self.camera.configure(**{name: value})
-                except MwdnError as error:  # a value that the camera refuses must not end the picture
-                    self._refused = str(error)
+            self._configure()
             frame = self.camera.read()
             if self._is_recording and recorder is None:
-                name = time.strftime("recording-%Y%m%d-%H%M%S.h5", time.gmtime())
-                recorder = recording.enter_context(record(self.folder / name, camera=self.camera.name))
+                self._recording = time.strftime("recording-%Y%m%d-%H%M%S.h5", time.gmtime())
+                recorder = recording.enter_context(record(self.folder / self._recording, camera=self.camera.name))
                 self._recorded = 0
             if not self._is_recording and recorder is not None:
                 recorder = None
@@ -157,43 +157,56 @@ class Live:
             yield frame
         recording.close()
 
+    def _configure(self) -> None:
+        """Set what viewers want of the camera; a value that it refuses must not end the picture."""
+        while self._pending:
+            name, value = self._pending.popitem()
+            self._refused = ""
+            try:
+                self.camera.configure(**{name: value})
+            except MwdnError as error:
+                self._refused = str(error)
+
     def _reconstruct(self, frames: Iterator[Frame]) -> None:
-        reconstruct: Reconstructor | None = None
         times: deque[float] = deque(maxlen=RATE_FRAMES)
         before: Frame | None = None
         dropped = 0
         for frame in frames:
-            if reconstruct is None:
-                reconstruct = Reconstructor(self.method, self._calibration(frame), align=False, device=self.device)
             start = time.time()
-            measurement = reconstruct.calibration.correct(frame.array)
-            with torch.inference_mode():
-                scene = reconstruct(measurement)
+            self._picture = picture = self.pictures(frame)
+            encoding = time.perf_counter()
+            encoded = picture.encode()
+            self._count("encode", time.perf_counter() - encoding)
             lost = frame.dropped if before is None else max(frame.number - before.number - 1, 0)
             dropped, before = dropped + lost, frame
             self.metrics.add("mwdn_live_frames_total")
             self.metrics.add("mwdn_live_dropped_total", lost)
-            pictures = _jpeg(measurement.clamp(min=0)), _jpeg(scene)
             now = time.time()
             times.append(now)
             rate = (len(times) - 1) / (times[-1] - times[0]) if times[-1] > times[0] else 0.0
-            said = {
-                "fps": round(rate, 1),
-                "latency_ms": round(1000 * (now - (frame.timestamp or start))),
-                "dropped": dropped,
-                "number": frame.number,
-                "exposure_s": _finite(frame.exposure_s),
-                "gain": _finite(frame.gain),
-                "refused": self._refused,
-                "recorded": self._recorded if self._is_recording else None,
-            }
-            self._publish(said, *pictures)
+            taken = frame.timestamp if self.camera.live and frame.timestamp else start
+            said = {"fps": round(rate, 1), "timestamp": taken, "latency_ms": round(1000 * (now - taken))}
+            self._publish(said | {"dropped": dropped} | self._about(picture), *encoded)
 
-    def _calibration(self, frame: Frame) -> Calibration:
-        """The calibration, with what the camera says about its frames."""
-        frames = self.calibration.frames
-        depth, mosaic = frames.bit_depth or frame.bit_depth, frames.mosaic or frame.mosaic
-        return replace(self.calibration, frames=replace(frames, bit_depth=depth, mosaic=mosaic))
+    def _about(self, picture: LivePicture) -> dict[str, Any]:
+        """For JSON: the frame, and the settings that all viewers share."""
+        frame, settings = picture.frame, self.pictures.settings
+        return {
+            "number": frame.number,
+            "exposure_s": finite(frame.exposure_s),
+            "gain": finite(frame.gain),
+            "refused": self._refused or self.pictures.note,
+            "recorded": self._recorded if self._is_recording else None,
+            "recording": self._recording,
+            "method": settings.method,
+            "options": settings.options,
+            "align": settings.align,
+            "room_light": settings.room_light,
+            "ambient": self.pictures.has_ambient,
+        }
+
+    def _count(self, stage: str, seconds: float) -> None:
+        self.metrics.add("mwdn_live_seconds_total", seconds, stage=stage)
 
     def _publish(self, said: dict[str, Any], measurement: bytes, scene: bytes) -> None:
         said |= {"measurement_bytes": len(measurement), "scene_bytes": len(scene)}
@@ -203,51 +216,3 @@ class Live:
             wake = list(self._wake.values())
         for call in wake:
             call()
-
-
-async def serve_viewer(live: Live, socket: Any) -> None:  # noqa: ANN401
-    """One viewer's WebSocket: a slow one skips frames, and does not delay the others."""
-    from starlette.websockets import WebSocketDisconnect
-
-    await socket.accept()
-    loop, fresh = asyncio.get_running_loop(), asyncio.Event()
-
-    def wake() -> None:
-        with suppress(RuntimeError):  # the server has stopped
-            loop.call_soon_threadsafe(fresh.set)
-
-    number = live.join(wake)
-
-    async def send() -> None:
-        while True:
-            await fresh.wait()
-            fresh.clear()
-            if live.newest is not None:
-                await socket.send_bytes(live.newest)
-
-    sender = asyncio.create_task(send())
-    try:
-        while True:
-            message = json.loads(await socket.receive_text())
-            if not isinstance(message, dict):
-                raise ParameterError("A message must be a JSON object.")
-            live.control(message)
-    except (WebSocketDisconnect, RuntimeError):
-        pass
-    except (MwdnError, ValueError, KeyError, RecursionError):  # not from our page
-        await socket.close(1003)
-    finally:
-        live.leave(number)
-        sender.cancel()
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
-
-
-def _jpeg(image: Tensor) -> bytes:
-    import cv2
-
-    pixels = srgb_encode(to_display(image))[0].mul(255).round().byte().movedim(0, -1).numpy()
-    bgr = np.ascontiguousarray(pixels[..., ::-1])
-    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()

@@ -12,6 +12,7 @@ MEANINGS = {
     "mwdn_jobs_running": ("gauge", "Reconstructions in progress."),
     "mwdn_live_frames_total": ("counter", "Live frames reconstructed."),
     "mwdn_live_dropped_total": ("counter", "Live frames that a newer one replaced, or that the camera lost."),
+    "mwdn_live_seconds_total": ("counter", "Seconds for live frames, by stage: correct, reconstruct, encode."),
     "mwdn_live_viewers": ("gauge", "Pages that show the live picture."),
 }
 

@@ -1,10 +1,12 @@
 """One reconstruction for a client: from an uploaded capture to a picture and a report."""
 
+import copy
+import hashlib
 import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import torch
@@ -42,6 +44,8 @@ class Order:
         options: of the method.
         align: as for `Reconstructor`.
         trust: check the picture, which takes a second or two.
+        room_light: find and subtract the room's light, see `mwdn.Reconstructor`.
+        ambient: the file of a frame of the room's light alone, taken as the capture; empty if there is none.
     """
 
     capture: bytes
@@ -50,6 +54,8 @@ class Order:
     options: dict[str, Any] = field(default_factory=dict)
     align: bool | None = None
     trust: bool = True
+    room_light: bool = False
+    ambient: bytes = b""
 
 
 class Reconstructions:
@@ -63,7 +69,7 @@ class Reconstructions:
     def __init__(self, limits: Limits, device: str | None = None) -> None:
         self.limits, self.device = limits, device
         self._lock = threading.Lock()
-        self._prepared: OrderedDict[tuple[Any, ...], Reconstructor] = OrderedDict()
+        self._prepared: OrderedDict[tuple[Any, ...], tuple[Calibration, Reconstructor]] = OrderedDict()
 
     def prepare(self, order: Order, calibration: Calibration) -> Reconstructor:
         """The method for the camera.
@@ -73,14 +79,18 @@ class Reconstructions:
         """
         if min(calibration.size) < SMALLEST:
             raise PsfError(f"`psf` {calibration.size} must have at least {SMALLEST} pixels along each side.")
-        key = (id(calibration), order.method, tuple(sorted(order.options.items())), order.align)
+        ambient = hashlib.sha256(order.ambient).digest()
+        options = tuple(sorted(order.options.items()))
+        key = (id(calibration), order.method, options, order.align, order.room_light, ambient)
         with self._lock:
             if key in self._prepared:
                 self._prepared.move_to_end(key)
-                return self._prepared[key]
-        made = Reconstructor(order.method, calibration, align=order.align, device=self.device, **order.options)
+                return self._prepared[key][1]
+        lit = with_ambient(calibration, order.ambient, self.limits)
+        how: dict[str, Any] = {"align": order.align, "room_light": order.room_light, "device": self.device}
+        made = Reconstructor(order.method, lit, **how, **order.options)
         with self._lock:
-            self._prepared[key] = made  # keeps the calibration, so that its id stays its own
+            self._prepared[key] = calibration, made  # keeps the calibration, so that its id stays its own
             while len(self._prepared) > KEPT:
                 self._prepared.popitem(last=False)
         return made
@@ -91,17 +101,18 @@ class Reconstructions:
         Raises:
             MwdnError: what is wrong with the capture, the camera or the method.
         """
-        calibration = order.calibration()
-        reconstruct, start = self.prepare(order, calibration), time.perf_counter()
+        reconstruct, start = self.prepare(order, order.calibration()), time.perf_counter()
+        calibration = reconstruct.calibration
         frame, for_viewing = read_capture(order.capture, calibration, self.limits)
         measurement = to_measurement(frame, calibration, self.limits)
         job.advance(0.0)
+        measurement, share = reconstruct.without_room_light(measurement)
         with watch_iterations(lambda part: job.advance(0.9 * part)):
-            pose = align(measurement, reconstruct.psf) if reconstruct.align else None
-            scene = (reconstruct.at(pose) if pose else reconstruct).on_device(measurement).cpu()
+            scene = _without_light(reconstruct, measurement).on_device(measurement).cpu()
         if not scene.isfinite().all():
             raise ImageError("The reconstruction holds NaN or infinity. Scale the capture, or use another method.")
         report = _report(order, reconstruct, time.perf_counter() - start)
+        report["room_light"] = None if share is None else round(float(share), 4)
         job.result = Result(measurement, scene, calibration.light, report)
         if order.trust:
             job.advance(0.9)
@@ -109,6 +120,25 @@ class Reconstructions:
             with torch.inference_mode():
                 found = _check(frame, measurement, reconstruct, scene, for_viewing=for_viewing)
             job.result = Result(measurement, scene, calibration.light, report | found)
+
+
+def _without_light(reconstruct: Reconstructor, measurement: Measurement) -> Reconstructor:
+    """For a measurement whose room light is subtracted: with the pose of its PSF, if that is wanted."""
+    ready = copy.copy(reconstruct)
+    ready.room_light = False
+    return ready.at(align(measurement, ready.psf)) if ready.align else ready
+
+
+def with_ambient(calibration: Calibration, ambient: bytes, limits: Limits) -> Calibration:
+    """The calibration with an uploaded frame of the room's light, if there is one.
+
+    Raises:
+        MwdnError: the file is wrong.
+    """
+    if not ambient:
+        return calibration
+    frame = read_upload(ambient, "ambient", limits.frame_pixels, calibration.frames.read)
+    return replace(calibration, ambient=calibration.frames.normalise(frame))
 
 
 def _report(order: Order, reconstruct: Reconstructor, seconds: float) -> dict[str, Any]:

@@ -5,12 +5,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy.typing as npt
 from torch import Tensor
 
 from mwdn.calibration.white_balance import WhiteBalance, apply_white_balance, check_white_balance
 from mwdn.errors import ParameterError
 from mwdn.io.contact_sheets import to_display
-from mwdn.io.images import write_linear, write_picture
+from mwdn.io.images import write_frame, write_linear, write_picture
 from mwdn.types import Measurement, Scene
 
 PictureFormat = Literal["png", "png16", "tiff", "npy"]
@@ -57,17 +58,19 @@ class Result:
         scene: (1, C, H, W), in the colours of the camera.
         light: of the point source, for the white balance.
         report: for JSON.
+        frame: the raw frame of a live picture, as the camera delivered it.
     """
 
     measurement: Measurement
     scene: Scene
     light: tuple[float, ...] = ()
     report: dict[str, Any] = field(default_factory=dict)
+    frame: npt.NDArray[Any] | None = None
 
     @property
     def size(self) -> int:
-        """Memory of both pictures."""
-        return self.measurement.nbytes + self.scene.nbytes
+        """Memory of the pictures."""
+        return self.measurement.nbytes + self.scene.nbytes + (0 if self.frame is None else self.frame.nbytes)
 
     def encode(self, look: Look) -> bytes:
         """The scene as a file.
@@ -91,4 +94,12 @@ def encode(image: Tensor, look: Look) -> bytes:
         else:
             shown = (to_display(image) * 2**look.exposure).clamp(0, 1)
             write_picture(path, shown, bits=16 if look.format == "png16" else 8)
+        return path.read_bytes()
+
+
+def encode_frame(frame: npt.NDArray[Any]) -> bytes:
+    """A raw frame as a PNG of 8 or 16 bits: the numbers of the sensor."""
+    with tempfile.TemporaryDirectory(prefix="mwdn-") as folder:
+        path = Path(folder) / "capture.png"
+        write_frame(path, frame)
         return path.read_bytes()

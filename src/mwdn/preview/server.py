@@ -42,6 +42,7 @@ class PreviewServer:
             preview.app(token=token, any_host=host not in LOOPBACK),
             ws="websockets-sansio",
             ws_max_size=4096,
+            ws_per_message_deflate=False,  # the pictures are JPEGs: deflating them again takes time and gains nothing
             http="h11",
             access_log=False,
             log_config=None,

@@ -1,11 +1,15 @@
 // The live camera: one message a frame, with both pictures; a page that is slow gets fewer frames, not older ones.
-import { setPicture } from "./divider.js";
+import { clockOffset, compareClocks, tellClock } from "./clock.js";
+import { setUpSnapshots } from "./snapshots.js";
 
 const byId = (id) => document.getElementById(id);
-const controls = ["live-record", "live-exposure", "live-gain"].map(byId);
+const controls = ["live-record", "live-snapshot", "live-exposure", "live-gain"].map(byId);
+const wishes = {}; // of this page, for a server that was started again
+const shown = { count: 0, latency_ms: 0 };
 let socket = null;
-let isDrawing = false;
 let isStarted = false;
+let isDrawing = false;
+let next = null;
 
 function show(text, wrong = false) {
   byId("live-state").textContent = text;
@@ -16,21 +20,73 @@ function send(message) {
   if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
 }
 
-async function draw(data) {
+// A setting: kept, and sent again when the connection comes back.
+export function wish(message) {
+  Object.assign(wishes, message);
+  send(message);
+}
+
+export const isLive = () => isStarted;
+
+function parse(data) {
   const length = new DataView(data).getUint32(0, true);
-  const said = JSON.parse(new TextDecoder().decode(data.slice(4, 4 + length)));
-  if (said.error) {
-    show(said.error, true);
-    return;
-  }
-  const middle = 4 + length + said.measurement_bytes;
-  const pictures = [data.slice(4 + length, middle), data.slice(middle)].map((part) => new Blob([part], { type: "image/jpeg" }));
-  await Promise.all([setPicture(byId("measurement"), pictures[0]), setPicture(byId("scene"), pictures[1])]);
-  byId("view").hidden = false;
-  const recorded = said.recorded === null ? "" : `, ${said.recorded} frames recorded`;
-  show(`${said.fps.toFixed(1)} frames a second, ${said.latency_ms} ms after the exposure, ${said.dropped} dropped${recorded}. ${said.refused}`, Boolean(said.refused));
+  const said = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
+  const parts = [new Uint8Array(data, 4 + length, said.measurement_bytes ?? 0), new Uint8Array(data, 4 + length + (said.measurement_bytes ?? 0))];
+  return [said, parts];
+}
+
+const decode = (part) => createImageBitmap(new Blob([part], { type: "image/jpeg" }));
+const nextPaint = () => new Promise((resolve) => { requestAnimationFrame(resolve); });
+
+function paint(canvas, picture) {
+  if (canvas.width !== picture.width || canvas.height !== picture.height) Object.assign(canvas, { width: picture.width, height: picture.height });
+  canvas.getContext("bitmaprenderer").transferFromImageBitmap(picture);
+}
+
+function tell(said) {
+  const recorded = said.recorded === null ? "" : `, ${said.recorded} frames recorded in ${said.recording}`;
+  const offset = clockOffset();
+  shown.count += 1;
+  shown.latency_ms = offset === null ? said.latency_ms : Date.now() + offset - 1000 * said.timestamp;
+  Object.assign(byId("live-state").dataset, { frame: said.number, count: shown.count, latency: shown.latency_ms.toFixed(1) });
+  show(`${said.fps.toFixed(1)} frames a second, ${Math.round(shown.latency_ms)} ms after the exposure, ${said.dropped} dropped${recorded}. ${said.refused}`, Boolean(said.refused));
+  byId("live-record").setAttribute("aria-pressed", String(said.recorded !== null));
+  byId("live-ambient").setAttribute("aria-pressed", String(said.ambient));
   if (document.activeElement !== byId("live-exposure") && said.exposure_s !== null) byId("live-exposure").value = +(1000 * said.exposure_s).toPrecision(4);
   if (document.activeElement !== byId("live-gain") && said.gain !== null) byId("live-gain").value = said.gain;
+}
+
+async function draw(data) {
+  const [said, parts] = parse(data);
+  if (said.error) {
+    show(`${said.error} Trying again …`, true);
+    return;
+  }
+  const pictures = await Promise.all(parts.map(decode));
+  await nextPaint();
+  if (!isStarted) return;
+  paint(byId("live-measurement"), pictures[0]);
+  paint(byId("live-scene"), pictures[1]);
+  byId("view").hidden = false;
+  byId("stack").classList.add("live");
+  tell(said);
+}
+
+// One frame at a time; of those that come meanwhile, the newest.
+async function drawNewest() {
+  if (isDrawing) return;
+  isDrawing = true;
+  while (next) {
+    const data = next;
+    next = null;
+    try {
+      await draw(data);
+    } catch (error) {
+      show(`The page failed: ${error.message}`, true);
+    }
+    send({ shown: true });
+  }
+  isDrawing = false;
 }
 
 function connect() {
@@ -38,16 +94,18 @@ function connect() {
   address.protocol = location.protocol === "https:" ? "wss:" : "ws:";
   socket = new WebSocket(address);
   socket.binaryType = "arraybuffer";
-  socket.onmessage = async (event) => {
-    if (isDrawing) return; // the next one is newer
-    isDrawing = true;
-    try {
-      await draw(event.data);
-    } catch (error) {
-      show(`The page failed: ${error.message}`, true);
-    } finally {
-      isDrawing = false;
+  socket.onopen = () => {
+    compareClocks(send);
+    if (Object.keys(wishes).length) send(wishes);
+  };
+  socket.onmessage = (event) => {
+    if (typeof event.data === "string") {
+      tellClock(JSON.parse(event.data), send);
+      return;
     }
+    if (next) send({ shown: true }); // replaced: it will never be
+    next = event.data;
+    drawNewest();
   };
   socket.onclose = () => {
     socket = null;
@@ -57,34 +115,44 @@ function connect() {
   };
 }
 
-function toggle(button, is) {
-  button.setAttribute("aria-pressed", String(is));
+function start(name) {
+  byId("trust-section").hidden = true; // its verdicts are of another capture
+  byId("state").textContent = `Live: ${name}.`;
+  connect();
 }
 
-export function setUpLive(name) {
+function stop(name) {
+  byId("live-record").setAttribute("aria-pressed", "false");
+  socket?.close();
+  byId("stack").classList.remove("live");
+  byId("view").hidden = !byId("scene").src;
+  byId("state").textContent = "";
+  show(`${name} is stopped.`);
+}
+
+export function stopLive() {
+  if (isStarted) byId("live-start").click();
+}
+
+export function setUpLive(name, useSnapshot) {
   if (!name) return;
   byId("live").hidden = false;
   show(`${name} is ready.`);
   byId("live-start").onclick = () => {
     isStarted = !isStarted;
-    toggle(byId("live-start"), isStarted);
+    byId("live-start").setAttribute("aria-pressed", String(isStarted));
     byId("live-start").textContent = isStarted ? "Stop" : "Start";
-    for (const control of controls) control.disabled = !isStarted;
-    if (isStarted) {
-      byId("trust-section").hidden = true; // its verdicts are of another capture
-      byId("state").textContent = `Live: ${name}.`;
-      connect();
-    } else {
-      toggle(byId("live-record"), false);
-      socket?.close();
-      show(`${name} is stopped.`);
-    }
+    for (const control of [...controls, byId("live-ambient")]) control.disabled = !isStarted;
+    document.body.classList.toggle("live", isStarted);
+    if (isStarted) start(name);
+    else stop(name);
   };
-  byId("live-record").onclick = () => {
-    const is = byId("live-record").getAttribute("aria-pressed") !== "true";
-    toggle(byId("live-record"), is);
-    send({ record: is });
+  const toggle = (id, name) => {
+    byId(id).onclick = () => send({ [name]: byId(id).getAttribute("aria-pressed") !== "true" });
   };
-  byId("live-exposure").onchange = () => send({ exposure_s: Number(byId("live-exposure").value) / 1000 });
-  byId("live-gain").onchange = () => send({ gain: Number(byId("live-gain").value) });
+  toggle("live-record", "record");
+  toggle("live-ambient", "ambient");
+  byId("live-exposure").onchange = () => wish({ exposure_s: Number(byId("live-exposure").value) / 1000 });
+  byId("live-gain").onchange = () => wish({ gain: Number(byId("live-gain").value) });
+  setUpSnapshots(useSnapshot);
 }

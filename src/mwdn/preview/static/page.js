@@ -1,7 +1,9 @@
 // The page: what is chosen becomes a reconstruction, at once.
 import { getBlob, getJson, post, remove, RequestError, runJob } from "./requests.js";
 import { setUpDivider, setPicture } from "./divider.js";
-import { setUpLive } from "./live.js";
+import { pageWords } from "./hints.js";
+import { isLive, setUpLive, stopLive, wish } from "./live.js";
+import { saveBlob } from "./saving.js";
 import { drawSliders, readSliders } from "./sliders.js";
 import { showFindings, showVerdicts } from "./verdicts.js";
 
@@ -9,13 +11,13 @@ const byId = (id) => document.getElementById(id);
 const ORIENTATIONS = ["rotate-180", "rotate-90", "rotate-270", "flip-left-right", "flip-top-bottom", "transpose", "transverse"];
 const UPLOAD = "";
 
-const chosen = { psf: null, capture: null, job: null };
+const chosen = { psf: null, capture: null, ambient: null, job: null };
 let methods = [];
 let running = null;
 let due = 0;
 
 function say(text, wrong = false) {
-  byId("state").textContent = text;
+  byId("state").textContent = pageWords(text);
   byId("state").classList.toggle("wrong", wrong);
 }
 
@@ -32,6 +34,8 @@ async function guarded(work) {
 function calibration() {
   const options = {};
   if (Number(byId("bin").value) > 1) options.bin = Number(byId("bin").value);
+  if (byId("bit-depth").value) options.bit_depth = Number(byId("bit-depth").value);
+  if (byId("mosaic").value) options.mosaic = byId("mosaic").value;
   if (byId("gamma").value) options.gamma = byId("gamma").value;
   if (byId("psf-gamma").value) options.psf_gamma = byId("psf-gamma").value;
   if (byId("orientation").value) options.psf_orientation = byId("orientation").value;
@@ -50,13 +54,27 @@ function isReady() {
 function orderFields(method = byId("method").value, trust = byId("trust").checked) {
   const options = method === byId("method").value ? readSliders() : {};
   const align = byId("align").checked ? "true" : "";
-  return { ...cameraFields(), capture: chosen.capture, method, align, trust: String(trust), options: JSON.stringify(options) };
+  const room = byId("room-light").value;
+  const light = { room_light: room === "found" ? "true" : "", ambient: room === "frame" ? chosen.ambient : null };
+  return { ...cameraFields(), ...light, capture: chosen.capture, method, align, trust: String(trust), options: JSON.stringify(options) };
 }
 
 const look = (format = "png") =>
   `?format=${format}&exposure=${byId("exposure").value}&white_balance=${byId("balance").value}`;
 
+// What all viewers of the live picture share.
+function wishLive() {
+  wish({
+    method: byId("method").value, options: readSliders(), align: byId("align").checked, room_light: byId("room-light").value === "found",
+    stops: Number(byId("exposure").value), white_balance: byId("balance").value,
+  });
+}
+
 async function reconstruct() {
+  if (isLive()) {
+    wishLive();
+    return;
+  }
   if (!isReady()) {
     say(chosen.capture ? "Drop a PSF, or choose a calibration." : "Drop a capture, or choose a sample.");
     return;
@@ -98,7 +116,8 @@ function soon(work = reconstruct, wait = 150) {
 }
 
 async function showPictures(both = false) {
-  if (!chosen.job) return;
+  if (isLive()) wishLive();
+  if (isLive() || !chosen.job) return;
   const job = `/jobs/${chosen.job}`;
   const [scene, measurement] = await Promise.all([
     getBlob(`${job}/picture${look()}`), both ? getBlob(`${job}/measurement`) : null,
@@ -108,19 +127,8 @@ async function showPictures(both = false) {
   byId("view").hidden = byId("psf-section").hidden = false;
 }
 
-async function save(event, format) {
-  if (event.currentTarget.dataset.ready) {
-    delete event.currentTarget.dataset.ready;
-    return;
-  }
-  event.preventDefault();
-  const link = event.currentTarget;
-  const data = await getBlob(`/jobs/${chosen.job}/picture${look(format)}`);
-  if (link.href) URL.revokeObjectURL(link.href);
-  link.href = URL.createObjectURL(data);
-  link.dataset.ready = "yes";
-  link.click();
-}
+const SAVED = { png: "reconstruction.png", png16: "reconstruction-16bit.png", tiff: "reconstruction.tif" };
+const save = async (format) => saveBlob(await getBlob(`/jobs/${chosen.job}/picture${look(format)}`), SAVED[format]);
 
 async function compareMethods() {
   byId("grid-section").hidden = false;
@@ -142,7 +150,16 @@ async function compareMethods() {
   }
 }
 
+// A snapshot of the live camera as a capture, to check it, compare methods and save the picture.
+async function useSnapshot(frame, job) {
+  stopLive();
+  take("capture", new File([frame], `frame-${job.report.number}.png`, { type: "image/png" }));
+  await listCameras(job.camera);
+  await reconstruct();
+}
+
 async function trySample(name, camera) {
+  stopLive();
   say("Loading the sample …");
   const data = await getBlob(`/samples/${name}`);
   take("capture", new File([data], `${name}.png`));
@@ -214,7 +231,7 @@ function chooseMethod() {
 async function start() {
   const [listed, samples] = await Promise.all([getJson("/methods"), getJson("/samples"), listCameras()]);
   methods = listed.methods;
-  setUpLive(listed.live);
+  setUpLive(listed.live, (frame, job) => guarded(() => useSnapshot(frame, job)));
   byId("method").replaceChildren(...methods.map(({ name }) => new Option(name, name)));
   byId("method").value = "universal-small";
   chooseMethod();
@@ -229,12 +246,17 @@ async function start() {
 setUpDivider(byId("stack"), byId("split"), byId("zoom"));
 setUpDrop("psf");
 setUpDrop("capture");
+setUpDrop("ambient");
 byId("controls").onsubmit = (event) => event.preventDefault();
 byId("method").onchange = () => {
   chooseMethod();
   soon(reconstruct, 0);
 };
-for (const id of ["camera", "bin", "gamma", "psf-gamma", "orientation", "align", "trust"]) byId(id).onchange = () => soon(reconstruct, 0);
+byId("room-light").onchange = () => {
+  byId("ambient-zone").hidden = byId("room-light").value !== "frame";
+  soon(reconstruct, 0);
+};
+for (const id of ["camera", "bin", "bit-depth", "mosaic", "gamma", "psf-gamma", "orientation", "align", "trust"]) byId(id).onchange = () => soon(reconstruct, 0);
 byId("exposure").oninput = () => {
   byId("exposure-value").textContent = Number(byId("exposure").value).toFixed(1);
   soon(() => showPictures());
@@ -248,8 +270,7 @@ byId("compare").onclick = () => guarded(compareMethods);
 byId("store").onclick = () => guarded(storeCamera);
 byId("remove").onclick = () => guarded(removeCamera);
 byId("inspect").onclick = () => guarded(async () => showFindings(await post("/inspect", cameraFields())));
-for (const format of ["png", "png16", "tiff"]) byId(`save-${format}`).onclick = (event) => guarded(() => save(event, format));
-for (const format of ["png", "png16", "tiff"]) byId(`save-${format}`).href = "#";
+for (const format of Object.keys(SAVED)) byId(`save-${format}`).onclick = () => guarded(() => save(format));
 // A file that misses its zone must not replace the page.
 for (const name of ["dragover", "drop"]) document.addEventListener(name, (event) => event.preventDefault());
 guarded(start);

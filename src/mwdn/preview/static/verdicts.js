@@ -1,5 +1,7 @@
 // Verdicts on the capture, the PSF and the picture, in words.
 
+import { pageWords } from "./hints.js";
+
 const WORDS = { good: "good", doubt: "doubtful", unknown: "cannot tell", bad: "bad", mind: "mind" };
 
 // "psf, little explained" as a title.
@@ -13,7 +15,7 @@ function list(place, entries) {
     const item = document.createElement("li");
     item.className = state;
     const strong = Object.assign(document.createElement("strong"), { textContent: `${title}: ${WORDS[state]}. ` });
-    item.append(strong, text);
+    item.append(strong, pageWords(text));
     return item;
   }));
 }
@@ -25,7 +27,7 @@ export function showVerdicts(report) {
   document.getElementById("summary").textContent = `${report.doubtful ? "Doubtful" : "Consistent"}: ${report.summary}.`;
   const order = ["doubt", "unknown", "good"];
   const sorted = [...report.verdicts].sort((a, b) => order.indexOf(a.state) - order.indexOf(b.state));
-  list(document.getElementById("verdicts"), sorted.map((v) => [v.state, titled(`${v.subject}, ${v.topic}`), v.sentence]));
+  list(document.getElementById("verdicts"), sorted.map((v) => [v.state, titled(`${v.subject}, ${v.topic}`), v.options ? `${v.text} Try \`${v.options}\`.` : v.text]));
 }
 
 export function showFindings(report) {

@@ -1,0 +1,180 @@
+"""Live frames to pictures, with the settings of the moment."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mwdn.calibration import Calibration
+from mwdn.calibration.white_balance import apply_white_balance
+from mwdn.capture.source import Frame
+from mwdn.errors import MwdnError, ParameterError
+from mwdn.inference.reconstructor import Reconstructor
+from mwdn.preview.live_encoding import brightest, encode_jpeg
+from mwdn.preview.live_settings import LiveSettings
+from mwdn.preview.result import Result
+from mwdn.solvers.alignment import align
+from mwdn.types import Measurement, Scene
+
+
+@dataclass(frozen=True, eq=False)
+class LivePicture:
+    """A frame and its reconstruction.
+
+    Args:
+        frame: as the camera delivered it.
+        measurement: (1, C, H, W).
+        scene: likewise, in the colours of the camera.
+        settings: with which it was made.
+        calibration: of the camera, with what the camera says about its frames.
+    """
+
+    frame: Frame
+    measurement: Measurement
+    scene: Scene
+    settings: LiveSettings
+    calibration: Calibration
+
+    def encode(self) -> tuple[bytes, bytes]:
+        """JPEGs of the measurement and the scene."""
+        scene, look = self.scene, self.settings.look
+        if look.white_balance is not None:
+            scene = apply_white_balance(scene, look.white_balance, self.calibration.light)
+        measurement = encode_jpeg(self.measurement, brightest(self.measurement))
+        return measurement, encode_jpeg(scene, brightest(scene) / 2**look.exposure)
+
+    def result(self) -> Result:
+        """As a finished reconstruction, with the frame's metadata in its report."""
+        frame = self.frame
+        report = {
+            "method": self.settings.method,
+            "options": self.settings.options,
+            "psf_hash": self.calibration.psf_hash,
+            "height": self.scene.shape[-2],
+            "width": self.scene.shape[-1],
+            "number": frame.number,
+            "timestamp": frame.timestamp,
+            "exposure_s": finite(frame.exposure_s),
+            "gain": finite(frame.gain),
+            "bit_depth": frame.bit_depth,
+            "mosaic": frame.mosaic,
+        }
+        return Result(self.measurement, self.scene, self.calibration.light, report, frame=frame.array)
+
+
+def finite(value: float) -> float | None:
+    """The number, or ``None`` for JSON if it is none."""
+    return value if math.isfinite(value) else None
+
+
+class LivePictures:
+    """Reconstructs one frame after the other.
+
+    Args:
+        calibration: of the camera.
+        settings: at first.
+        device: see `Reconstructor`.
+        count: called with a stage and its seconds.
+    """
+
+    def __init__(
+        self,
+        calibration: Calibration,
+        settings: LiveSettings,
+        device: str | None = None,
+        *,
+        count: Callable[[str, float], None] = lambda stage, seconds: None,
+    ) -> None:
+        self._given, self.settings, self.device, self.count = calibration, settings, device, count
+        self._refused = self._wrong = ""
+        self._reconstruct: Reconstructor | None = None
+        self._used = settings
+        self._ambient: Frame | None = None
+        self._takes_ambient = False
+
+    @property
+    def note(self) -> str:
+        """Why a wish was refused, or what is wrong with the last frame."""
+        return self._refused or self._wrong
+
+    @property
+    def has_ambient(self) -> bool:
+        """Whether a frame of the room's light is subtracted."""
+        return self._ambient is not None
+
+    def change(self, message: dict[str, Any]) -> None:
+        """Take over the settings of a message; what is wrong with it becomes the `note`."""
+        self._refused = ""
+        if "ambient" in message:
+            self._takes_ambient = message["ambient"]
+            if not message["ambient"]:
+                self._ambient = self._reconstruct = None
+        try:
+            self.settings = self.settings.changed(message, self._given.light)
+        except MwdnError as error:
+            self._refused = str(error)
+
+    def __call__(self, frame: Frame) -> LivePicture:
+        """Reconstruct a frame.
+
+        Raises:
+            MwdnError: it does not fit the camera, or the method does not.
+        """
+        start = time.perf_counter()
+        reconstruct = self._prepared(frame)
+        measurement = reconstruct.calibration.correct(frame.array)
+        corrected = time.perf_counter()
+        self._wrong = ""
+        try:
+            scene = self._scene(reconstruct, measurement)
+        except ParameterError as error:  # a dark frame must not end the live picture
+            self._wrong, scene = str(error), torch.zeros_like(measurement)
+        self.count("correct", corrected - start)
+        self.count("reconstruct", time.perf_counter() - corrected)
+        return LivePicture(frame, measurement.clamp(min=0), scene, self._used, reconstruct.calibration)
+
+    @torch.inference_mode()
+    def _scene(self, reconstruct: Reconstructor, measurement: Measurement) -> Tensor:
+        if reconstruct.align:  # the pose of the first frame holds for those that follow
+            pose = align(measurement.to(reconstruct.device), reconstruct.psf)
+            self._reconstruct = reconstruct = reconstruct.at(pose)
+        return reconstruct.on_device(measurement).cpu().nan_to_num_()
+
+    def _prepared(self, frame: Frame) -> Reconstructor:
+        """The method for the settings of now; those of before if it is refused."""
+        settings = self.settings
+        if self._takes_ambient:
+            self._ambient, self._takes_ambient, self._reconstruct = frame, False, None
+        elif self._ambient is not None and not _is_alike(self._ambient, frame):
+            self._ambient = self._reconstruct = None
+            self._refused = "The exposure has changed: take the frame of the room's light again."
+        if self._reconstruct is None or not settings.is_same_method(self._used):
+            try:
+                self._reconstruct = settings.prepare(self._calibration(frame), self.device)
+            except MwdnError as error:
+                if self._reconstruct is None:
+                    raise
+                self.settings = settings = replace(self._used, look=settings.look)
+                self._refused = str(error)
+        self._used = settings
+        return self._reconstruct
+
+    def _calibration(self, frame: Frame) -> Calibration:
+        """The calibration, with what the camera says about its frames, and the room's light."""
+        frames = self._given.frames
+        depth, mosaic = frames.bit_depth or frame.bit_depth, frames.mosaic or frame.mosaic
+        frames = replace(frames, bit_depth=depth, mosaic=mosaic)
+        ambient = self._given.ambient if self._ambient is None else frames.normalise(self._ambient.array)
+        return replace(self._given, frames=frames, ambient=ambient)
+
+
+def _is_alike(a: Frame, b: Frame) -> bool:
+    """Whether two frames have the same exposure and gain, or the camera does not say."""
+    return all(
+        not math.isfinite(x - y) or math.isclose(x, y, rel_tol=0.01)
+        for x, y in ((a.exposure_s, b.exposure_s), (a.gain, b.gain))
+    )
