@@ -4,8 +4,8 @@
 
 `mwdn preview --live rig` runs in a process of its own, with frames of 320 x 320 that the rig has prepared, so that its
 simulation is not counted, and `universal-small`; a headless Chromium (`apt install chromium`) opens the page and
-presses *Start*. Latency is from the end of a frame's exposure to the moment at which the page paints its picture, by the page's
-own measurement. Processor time is that of the two programs with all their processes, over the frames on the page.
+presses *Start*. Latency is from the end of a frame's exposure to the moment at which the page paints its picture, as
+the page measures it. Processor time is that of the two programs with all their processes, over the frames on the page.
 `--stages` measures the server's stages alone, in this process, with one thread and without a page.
 """
 
