@@ -6,12 +6,15 @@ import os
 import pickle
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from torch.nn import functional as F
 
+from authors_code import authors, authors_output
+from mwdn.calibration import Calibration
 from mwdn.errors import CheckpointError
+from mwdn.inference.reconstructor import Reconstructor
 from mwdn.networks import NETWORKS, build
 from mwdn.optics import unit_sum
 from mwdn.weights.authors import load_authors
@@ -155,80 +158,6 @@ def test_missing_file(tmp_path, name):
 # --- The authors --------------------------------------------------------------------------------------
 
 
-def double(state, name, inputs, outputs, inner, generator):
-    """Random weights of a double (3x3 convolution, BatchNorm, ReLU), under the authors' names 0 to 5."""
-    for index, (a, b) in ((0, (inputs, inner)), (3, (inner, outputs))):
-        state[f"{name}.double_conv.{index}.weight"] = torch.randn(b, a, 3, 3, generator=generator) / (3 * a**0.5)
-        state[f"{name}.double_conv.{index}.bias"] = 0.1 * torch.randn(b, generator=generator)
-        norm = f"{name}.double_conv.{index + 1}"
-        state[f"{norm}.weight"] = 1 + 0.1 * torch.randn(b, generator=generator)
-        state[f"{norm}.bias"] = 0.1 * torch.randn(b, generator=generator)
-        state[f"{norm}.running_mean"] = 0.1 * torch.randn(b, generator=generator)
-        state[f"{norm}.running_var"] = 0.5 + torch.rand(b, generator=generator)
-        state[f"{norm}.num_batches_tracked"] = torch.tensor(7)
-
-
-def authors(generator, *, cpsf, width=4):
-    """State of the authors' network at any width, with random weights."""
-    state = {"w": 1e-3 * (1 + torch.rand(1 if cpsf else 4, generator=generator))}
-    state["delta"] = 1e-2 * (0.5 + torch.rand(5 if cpsf else 4, generator=generator))
-    widths = (3, width, 2 * width, 4 * width, 8 * width, 8 * width)
-    names = ["inc", *(f"down{i}.avgpool_conv.1" for i in (1, 2, 3, 4))]
-    for name, a, b in zip(names, widths[:-1], widths[1:], strict=True):
-        double(state, name, a, b, b, generator)
-    ups = [(16 * width, 4 * width), (8 * width, 2 * width), (4 * width, width), (2 * width, width)]
-    for i, (a, b) in enumerate(ups, 1):
-        double(state, f"up{i}.conv", a, b, a // 2, generator)
-    state["outc.conv.weight"] = torch.randn(3, width, 1, 1, generator=generator)
-    state["outc.conv.bias"] = torch.randn(3, generator=generator)
-    if cpsf:
-        names = ["inc0", *(f"down{i}.avgpool_conv.1" for i in (11, 22, 33))]
-        for name, a, b in zip(names, widths[:-2], widths[1:-1], strict=True):
-            double(state, name, a, b, b, generator)
-    return state
-
-
-def blocks(state, name, x):
-    for index in (0, 3):
-        x = F.conv2d(
-            x, state[f"{name}.double_conv.{index}.weight"], state[f"{name}.double_conv.{index}.bias"], padding=1
-        )
-        norm = {
-            key: state[f"{name}.double_conv.{index + 1}.{key}"]
-            for key in ("running_mean", "running_var", "weight", "bias")
-        }
-        x = F.batch_norm(x, **norm).relu()
-    return x
-
-
-def features(state, names, x):
-    scales = [blocks(state, names[0], x)]
-    for name in names[1:]:
-        scales.append(blocks(state, f"{name}.avgpool_conv.1", F.avg_pool2d(scales[-1], 2)))
-    return scales
-
-
-def circular_wiener(b, h, constant):
-    """Eq. (2) with circular boundaries and an unshifted PSF; the result is shifted by half the frame instead."""
-    H = torch.fft.rfft2(h)
-    v = torch.fft.irfft2(H.conj() / (H.abs() ** 2 + constant) * torch.fft.rfft2(b), s=b.shape[-2:])
-    return v.roll((b.shape[-2] // 2, b.shape[-1] // 2), (-2, -1))
-
-
-def authors_output(state, b, h, *, cpsf):
-    """Output of the authors' network for a PSF with a peak of 1."""
-    *skips, x = features(state, ["inc", "down1", "down2", "down3", "down4"], b)
-    if cpsf:
-        psfs = features(state, ["inc0", "down11", "down22", "down33"], state["w"] * h)
-    else:
-        psfs = [w * F.avg_pool2d(h.sum(1, keepdim=True), 2**i) for i, w in enumerate(state["w"])]
-    for i in (3, 2, 1, 0):
-        x = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=True)
-        x = torch.cat([circular_wiener(skips[i], psfs[i], state["delta"][i]), x], 1)
-        x = blocks(state, f"up{4 - i}.conv", x)
-    return F.conv2d(x, state["outc.conv.weight"], state["outc.conv.bias"])
-
-
 @torch.no_grad()
 @pytest.mark.parametrize("prefix", ["", "module."])
 @pytest.mark.parametrize("cpsf", [False, True], ids=["mwdn", "mwdn-cpsf"])
@@ -251,13 +180,43 @@ def test_full_width_has_the_papers_count(cpsf, count, generator):
     assert sum(parameter.numel() for parameter in network.parameters()) == count
 
 
-@pytest.mark.parametrize(("key", "index"), [("w", 0), ("w", 3), ("delta", 2)])
-def test_negative_constants_are_refused(tmp_path, key, index, generator):
+def test_a_negative_lambda_is_refused(tmp_path, generator):
     state = authors(generator, cpsf=False)
-    state[key][index] *= -1
+    state["delta"][2] *= -1
     torch.save(state, tmp_path / "a.pt")
-    with pytest.raises(CheckpointError, match=rf"`{key}` \(\[.*-0\.0.*\]\) must be positive"):
+    with pytest.raises(CheckpointError, match=r"`delta` \(\[.*-0\.0.*\]\) must be positive"):
         load_checkpoint(tmp_path / "a.pt")
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("cpsf", [False, True], ids=["mwdn", "mwdn-cpsf"])
+def test_a_negative_w_gives_their_output(cpsf, generator):
+    """With w < 0 the filter of eq. (2) turns negative, and the next convolution with it."""
+    state = authors(generator, cpsf=cpsf)
+    state["w"][0] *= -1
+    b, h = pair(generator, (32, 32))
+    h = h / h.max()
+    expected = authors_output(state, b, h, cpsf=cpsf)
+    torch.testing.assert_close(load_authors(state)(b, h), expected, rtol=1e-3, atol=1e-3 * expected.abs().max().item())
+
+
+@pytest.mark.parametrize("cpsf", [False, True], ids=["mwdn", "mwdn-cpsf"])
+def test_a_reconstructor_gives_the_psf_as_stored(tmp_path, cpsf, generator):
+    """The brightness of the PSF's colours, its exposure and its background are those of the file."""
+    state = authors(generator, cpsf=cpsf)
+    torch.save(state, tmp_path / "theirs.pt")
+    stored = torch.rand(32, 32, 3, generator=generator) ** 4 * torch.tensor([0.7, 0.5, 0.3]) + 0.05
+    pixels = (255 * stored).to(torch.uint8).numpy()
+    b = torch.rand(1, 3, 32, 32, generator=generator)
+    psf = torch.from_numpy(pixels / np.float32(255)).movedim(-1, 0)[None]
+    expected = authors_output(state, b, psf, cpsf=cpsf).detach()
+    reconstruct = Reconstructor(
+        tmp_path / "theirs.pt", Calibration.from_array(pixels, background=0.0), precision="exact", device="cpu"
+    )
+    torch.testing.assert_close(reconstruct(b), expected, rtol=1e-3, atol=1e-3 * expected.abs().max().item())
+    assert reconstruct.warning is None
+    subtracted = Reconstructor(tmp_path / "theirs.pt", Calibration.from_array(pixels), device="cpu")
+    assert "background=0" in subtracted.warning
 
 
 def test_the_unused_lambda_may_be_negative(generator):

@@ -17,9 +17,10 @@ from mwdn.errors import ParameterError
 from mwdn.io.files import write_text
 from mwdn.io.reading import LOG_BYTES, parse_json, read_json, read_text, unexpected_content
 from mwdn.networks import NETWORKS
+from mwdn.training.network import stored_psf
 from mwdn.training.recipe import OPTIMISERS, Recipe, Schedule
 from mwdn.training.report import Report
-from mwdn.training.tasks import SupervisedTask, supervised_task
+from mwdn.training.tasks import SupervisedTask, supervised_task, with_stored_psf
 from mwdn.training.trainer import Trainer
 from mwdn.training.validation import Validator
 from mwdn.types import Size
@@ -96,12 +97,15 @@ def train(
     training, validation = dataset.training
     schedule = replace(settings(method, benchmark).schedule, validation=len(validation))
     recipe = Recipe({"name": method.name, **options(method, dataset.calibration.size)}, schedule, benchmark.loss)
+    stored = stored_psf(recipe, dataset.calibration)
+    stored = None if stored is None else stored.to(device)
+    psf = dataset.calibration.psf.to(device) if stored is None else stored
     trainer = Trainer(
         recipe,
-        supervised_task(training, schedule),
+        with_stored_psf(supervised_task(training, schedule), stored),
         out=folder,
         calibration=dataset.calibration,
-        validator=Validator(recipe, SupervisedTask(validation), dataset.calibration.psf.to(device)),
+        validator=Validator(recipe, with_stored_psf(SupervisedTask(validation), stored), psf),
         device=device,
         alexnet=Path(benchmark.alexnet) if benchmark.alexnet else None,
     )

@@ -19,7 +19,7 @@ from mwdn.calibration import Calibration
 from mwdn.errors import ExportError, ParameterError
 from mwdn.export.model_file import as_export_error, publish, require_packages, run_file, write_file
 from mwdn.inference.fusion import fuse
-from mwdn.inference.methods import Method, as_method
+from mwdn.inference.methods import Method, as_method, psf_for
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import refuse_overwrite
 from mwdn.io.pictures import dark_scene
@@ -133,7 +133,7 @@ def export(
     expected = exact.on_device(measurement)
     with torch.no_grad(), tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / out.name
-        module = FixedPsf(method, calibration.psf, dtype=torch.float16 if precision == "float16" else None)
+        module = FixedPsf(method, psf_for(method, calibration), dtype=torch.float16 if precision == "float16" else None)
         write_file(file, _program(module.eval(), measurement), about)
         if precision == "int8":
             from mwdn.export.quantise import quantise

@@ -35,7 +35,7 @@ class Engine(Generic[Prepared]):
 
     Args:
         network: the trained network, which is copied.
-        psf: (1 or B, C, H, W); each channel is scaled to unit sum.
+        psf: (1 or B, C, H, W); each channel is scaled to unit sum, unless the network has ``stored_psf``.
         precision: see `Precision`.
 
     Raises:
@@ -45,7 +45,7 @@ class Engine(Generic[Prepared]):
     def __init__(self, network: Network[Prepared], psf: Psf, *, precision: Precision = "fast") -> None:
         if precision not in get_args(Precision):
             raise ParameterError(f"`precision` must be fast or exact, not {precision!r}.")
-        self.precision, psf = precision, checked_psf(psf)
+        self.precision, psf = precision, checked_psf(psf, scale=not network.stored_psf)
         exact = copy.deepcopy(network).to(psf.device).eval().requires_grad_(False)
         half = half_precision(psf.device) if precision == "fast" else None
         self.network = cast(Network[Prepared], fuse(copy.deepcopy(exact), half))

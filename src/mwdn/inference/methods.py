@@ -8,7 +8,7 @@ from mwdn import solvers
 from mwdn.calibration import Calibration
 from mwdn.calibration.psf_identity import other_psf
 from mwdn.errors import CheckpointError, ParameterError, UnknownNameError
-from mwdn.networks import DENOISERS, NETWORKS
+from mwdn.networks import DENOISERS, NETWORKS, Network
 from mwdn.types import Measurement, Psf, Scene
 from mwdn.weights.bundled import BUNDLED, find_weights
 from mwdn.weights.checkpoint import SUFFIXES, load_checkpoint, read_metadata
@@ -67,6 +67,31 @@ def as_method(method: Method | str | Path, **options: Any) -> Method:  # noqa: A
     if options:
         raise ParameterError(f"Options ({', '.join(options)}) need a method given by its name, not an object.")
     return method
+
+
+def psf_for(method: object, calibration: Calibration) -> Psf:
+    """The PSF that a method takes, (1, C, H, W).
+
+    Most take the calibration's, whose channels have unit sum. A network with ``stored_psf`` takes that of the file: the
+    numbers in [0, 1] with the brightness of each colour, and the background if none was subtracted. A calibration that
+    does not know the brightness (``light``) gives a peak of 1.
+    """
+    psf = calibration.psf
+    if not (isinstance(method, Network) and method.stored_psf):
+        return psf
+    if not calibration.light:
+        return psf / psf.max()
+    return psf * psf.new_tensor(calibration.light)[:, None, None]
+
+
+def background_warning(name: str, method: object, calibration: Calibration) -> str | None:
+    """Warning if a network takes the PSF as stored, with its background, but the calibration subtracted that."""
+    takes_all = isinstance(method, Network) and method.stored_psf
+    if not takes_all or not any(calibration.background):
+        return None
+    return (
+        f"`{name}` takes the PSF as stored, with its background, which was subtracted: calibrate with `background=0`."
+    )
 
 
 def psf_warning(method: str | Path, calibration: Calibration) -> str | None:

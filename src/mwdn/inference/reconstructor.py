@@ -15,7 +15,7 @@ from mwdn.errors import ParameterError, ShapeError, check_batch, check_light, ch
 from mwdn.fourier.convolution import check_fit
 from mwdn.inference.engine import Engine, Precision
 from mwdn.inference.ensemble import Ensemble
-from mwdn.inference.methods import Method, as_method, psf_warning
+from mwdn.inference.methods import Method, as_method, background_warning, psf_for, psf_warning
 from mwdn.io.formats import as_frame
 from mwdn.networks.blocks import check_channels
 from mwdn.networks.network import Network, as_network
@@ -95,8 +95,9 @@ class Reconstructor:
             self.warning = psf_warning(method, calibration)
         self.method: Method = as_method(method, **options)
         method = self.method
+        self.warning = self.warning or background_warning(self.name, method, calibration)
         self.align = method.align if align is None and isinstance(method, Network) else bool(align)
-        self.psf = calibration.psf.to(self.device)
+        self.psf = psf_for(method, calibration).to(self.device)
         self.engine: Engine[Any] | Ensemble[Any] | None = None
         if isinstance(method, nn.Module):
             engine = Engine(as_network(method), self.psf, precision=precision)

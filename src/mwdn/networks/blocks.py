@@ -142,6 +142,8 @@ class WienerFilter(nn.Module):
         weight: initial value of w; ``None`` leaves w out (MWDN-CPSF, whose PSF is learned).
         regularisation: initial value of lambda.
         boundary: see `mwdn.fourier.padding.Boundary`.
+        linear: learn w and lambda themselves, as the authors' code does. w may then be or become negative, and training
+            moves both by about the learning rate a step, whatever their size.
 
     Attributes:
         max_grid_pixels: transfer functions with more grid pixels than this, over all channels, are not stored but
@@ -150,18 +152,42 @@ class WienerFilter(nn.Module):
     """
 
     max_grid_pixels = 2**28
+    log_weight: nn.Parameter
+    linear_weight: nn.Parameter
+    log_regularisation: nn.Parameter
+    linear_regularisation: nn.Parameter
 
     def __init__(
-        self, *, weight: float | None = 1e-3, regularisation: float = 1e-2, boundary: Boundary = "taper"
+        self,
+        *,
+        weight: float | None = 1e-3,
+        regularisation: float = 1e-2,
+        boundary: Boundary = "taper",
+        linear: bool = False,
     ) -> None:
         super().__init__()
-        for name, value in (("weight", weight), ("regularisation", regularisation)):
-            if value is not None and not value > 0:
-                raise ParameterError(f"`{name}` ({value}) must be positive: its logarithm is learned.")
-        self.log_regularisation = nn.Parameter(torch.tensor(math.log(regularisation)))
-        if weight is not None:
-            self.log_weight = nn.Parameter(torch.tensor(math.log(weight)))
-        self.boundary = boundary
+        self.boundary, self.linear, self.has_weight = boundary, linear, weight is not None
+        for name, value in (("regularisation", regularisation), ("weight", weight)):
+            if value is None:
+                continue
+            if not value > 0 and not (linear and name == "weight"):
+                why = "a filter with a negative lambda has poles" if linear else "its logarithm is learned"
+                raise ParameterError(f"`{name}` ({value}) must be positive: {why}.")
+            # The names tell `mwdn.training.schedule.make_optimiser` which numbers are logarithms.
+            learned = torch.tensor(float(value) if linear else math.log(value))
+            setattr(self, f"linear_{name}" if linear else f"log_{name}", nn.Parameter(learned))
+
+    @property
+    def weight(self) -> Tensor | None:
+        """w, a scalar; ``None`` without one."""
+        if not self.has_weight:
+            return None
+        return self.linear_weight if self.linear else self.log_weight.exp()
+
+    @property
+    def regularisation(self) -> Tensor:
+        """lambda, a scalar."""
+        return self.linear_regularisation if self.linear else self.log_regularisation.exp()
 
     def forward(self, features: Tensor, psf: Psf) -> Tensor:
         """Deconvolve features (B, C, H, W) with a PSF of 1 or C channels."""
@@ -178,9 +204,9 @@ class WienerFilter(nn.Module):
 
     def transfer(self, psf: Psf) -> Tensor:
         """``w conj(H) / (|w H|^2 + lambda)`` on the grid for features of the PSF's size."""
-        if hasattr(self, "log_weight"):
-            psf = self.log_weight.exp() * psf
-        return wiener_transfer(psf, self.log_regularisation.exp(), self.grid(psf))
+        if self.weight is not None:
+            psf = self.weight * psf
+        return wiener_transfer(psf, self.regularisation, self.grid(psf))
 
     def deconvolve(self, features: Tensor, prepared: Tensor) -> Tensor:
         """Deconvolve features with the result of `prepare`."""
@@ -209,19 +235,20 @@ class WienerFilters(nn.ModuleList):
         return cast(Iterator[WienerFilter], super().__iter__())
 
 
-def normalise_psf(psf: Psf, size: Size, channels: int | None = None) -> Tensor:
+def normalise_psf(psf: Psf, size: Size, channels: int | None = None, *, stored: bool = False) -> Tensor:
     """Scale each PSF to a peak of 1, as the paper's PSFs have.
 
     Args:
         psf: (1 or B, 1 or C, H, W).
         size: height and width of the measurement.
         channels: number of channels to which a grey PSF is expanded; ``None`` keeps it grey.
+        stored: leave the scale as it is, for a network with ``stored_psf``.
 
     Raises:
         ShapeError: the PSF does not have the height and width of the measurement.
     """
     check_size(psf, size)
-    psf = psf / psf.amax(dim=(1, 2, 3), keepdim=True)
+    psf = psf if stored else psf / psf.amax(dim=(1, 2, 3), keepdim=True)
     return psf if channels is None or psf.shape[1] != 1 else psf.expand(-1, channels, -1, -1)
 
 

@@ -32,9 +32,12 @@ class Mwdn(Network[list[Tensor]]):
         weight: initial value of w, for a PSF whose peak is 1 (the value of the authors' code).
         regularisation: initial value of lambda (the value of the authors' code).
         boundary: see `mwdn.fourier.padding.Boundary`. The paper writes linear convolutions; its code is circular.
+        authors_form: learn w and lambda as the authors' code does, themselves instead of their logarithms, so that w
+            may become negative; and take the PSF as stored (`mwdn.networks.Network.stored_psf`). For exact comparison,
+            together with both poolings "average" and the boundary "circular".
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         *,
         channels: int = 3,
@@ -44,13 +47,16 @@ class Mwdn(Network[list[Tensor]]):
         weight: float = 1e-3,
         regularisation: float = 1e-2,
         boundary: Boundary = "taper",
+        authors_form: bool = False,
     ) -> None:
         super().__init__()
+        self.stored_psf = authors_form
         widths = paper_widths(width)
         self.encoder = Encoder(channels, widths, pooling=pooling)
         self.channels = channels
         self.filters = WienerFilters(
-            WienerFilter(weight=weight, regularisation=regularisation, boundary=boundary) for _ in widths[:-1]
+            WienerFilter(weight=weight, regularisation=regularisation, boundary=boundary, linear=authors_form)
+            for _ in widths[:-1]
         )
         self.pool_psf = pooling_layer(psf_pooling)
         self.decoder = Decoder(channels, widths)
@@ -64,7 +70,7 @@ class Mwdn(Network[list[Tensor]]):
 
     def prepare(self, psf: Psf, size: Size) -> list[Tensor]:
         """Transfer function of each scale's filter."""
-        psfs = self.pyramid(normalise_psf(psf, size, self.channels))
+        psfs = self.pyramid(normalise_psf(psf, size, self.channels, stored=self.stored_psf))
         return [wiener.prepare(h) for wiener, h in zip(self.filters, psfs, strict=True)]
 
     def reconstruct(self, measurement: Measurement, prepared: list[Tensor]) -> Scene:

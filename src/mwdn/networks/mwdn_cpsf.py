@@ -23,6 +23,7 @@ class MwdnCpsf(Network[list[Tensor]]):
         boundary: see `mwdn.fourier.padding.Boundary`. The paper writes linear convolutions; its code is circular.
         authors_scalars: add two scalars of the authors' code that are not in the paper: a learned weight of the PSF
             before its encoder, and an unused fifth lambda. 21,956,745 learnable parameters.
+        authors_form: see `mwdn.networks.Mwdn`.
     """
 
     def __init__(
@@ -34,14 +35,17 @@ class MwdnCpsf(Network[list[Tensor]]):
         regularisation: float = 1e-2,
         boundary: Boundary = "taper",
         authors_scalars: bool = False,
+        authors_form: bool = False,
     ) -> None:
         super().__init__()
+        self.stored_psf = authors_form
         widths = paper_widths(width)
         self.encoder = Encoder(channels, widths, pooling=pooling)
         self.psf_encoder = Encoder(channels, widths[:-1], pooling=pooling)
         self.channels = channels
         self.filters = WienerFilters(
-            WienerFilter(weight=None, regularisation=regularisation, boundary=boundary) for _ in widths[:-1]
+            WienerFilter(weight=None, regularisation=regularisation, boundary=boundary, linear=authors_form)
+            for _ in widths[:-1]
         )
         self.decoder = Decoder(channels, widths)
         if authors_scalars:
@@ -54,7 +58,7 @@ class MwdnCpsf(Network[list[Tensor]]):
 
     def prepare(self, psf: Psf, size: Size) -> list[Tensor]:
         """Transfer functions of each scale's filter, one per feature channel."""
-        psfs = self.pyramid(normalise_psf(psf, size, self.channels))
+        psfs = self.pyramid(normalise_psf(psf, size, self.channels, stored=self.stored_psf))
         return [wiener.prepare(psfs.pop(0)) for wiener in self.filters]
 
     def reconstruct(self, measurement: Measurement, prepared: list[Tensor]) -> Scene:

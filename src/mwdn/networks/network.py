@@ -22,12 +22,16 @@ class Network(nn.Module, Generic[Prepared]):
         channels: colours of the measurement; 0 for any number.
         align: whether `mwdn.Reconstructor` aligns the PSF to each capture by default, because the network was trained
             with accurate PSFs. The network itself never aligns.
+        stored_psf: whether the network takes the PSF as its file stores it, in [0, 1], with the brightness of each
+            colour and the background, as the MWDN authors' code does (`mwdn.inference.methods.psf_for`). Others take
+            each channel as of unit sum.
 
     Arguments of every subclass are checked against their annotations (`mwdn.errors.checked`).
     """
 
     channels: int = 0
     align: bool = False
+    stored_psf: bool = False
 
     def __init_subclass__(cls, **options: Any) -> None:  # noqa: ANN401
         super().__init_subclass__(**options)
@@ -66,7 +70,8 @@ class Network(nn.Module, Generic[Prepared]):
 
         Args:
             measurement: (B, C, H, W), linear light, 1 is saturation.
-            psf: (1 or B, 1 or C, H, W), centred. Its scale does not matter: each channel counts as of unit sum.
+            psf: (1 or B, 1 or C, H, W), centred. Its scale does not matter: each channel counts as of unit sum,
+                unless the network has ``stored_psf``.
 
         Raises:
             ShapeError: batch, channels or size do not fit.
@@ -74,7 +79,7 @@ class Network(nn.Module, Generic[Prepared]):
             PsfError: the PSF is negative, not finite, or dark; not checked in training.
         """
         check_batch(measurement, "measurement")
-        psf = checked_psf(psf, values=not self.training)
+        psf = checked_psf(psf, values=not self.training, scale=not self.stored_psf)
         return self.reconstruct(measurement, self.prepare(psf, (measurement.shape[-2], measurement.shape[-1])))
 
 

@@ -15,15 +15,24 @@ class WienerNetwork(Network[Tensor]):
         weight: initial value of w, for a PSF whose peak is 1.
         regularisation: initial value of lambda.
         boundary: see `mwdn.fourier.padding.Boundary`.
+        authors_form: see `mwdn.networks.Mwdn`.
     """
 
-    def __init__(self, *, weight: float = 1e-3, regularisation: float = 1e-2, boundary: Boundary = "taper") -> None:
+    def __init__(
+        self,
+        *,
+        weight: float = 1e-3,
+        regularisation: float = 1e-2,
+        boundary: Boundary = "taper",
+        authors_form: bool = False,
+    ) -> None:
         super().__init__()
-        self.filter = WienerFilter(weight=weight, regularisation=regularisation, boundary=boundary)
+        self.stored_psf = authors_form
+        self.filter = WienerFilter(weight=weight, regularisation=regularisation, boundary=boundary, linear=authors_form)
 
     def prepare(self, psf: Psf, size: Size) -> Tensor:
         """Transfer function of the filter."""
-        return self.filter.prepare(normalise_psf(psf, size))
+        return self.filter.prepare(normalise_psf(psf, size, stored=self.stored_psf))
 
     def reconstruct(self, measurement: Measurement, prepared: Tensor) -> Scene:
         """Scene (B, C, H, W), each colour deconvolved with its own PSF."""

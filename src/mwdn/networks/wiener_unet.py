@@ -20,6 +20,7 @@ class WienerUNet(Network[Tensor]):
         weight: initial value of w.
         regularisation: initial value of lambda.
         boundary: see `mwdn.fourier.padding.Boundary`.
+        authors_form: see `mwdn.networks.Mwdn`.
     """
 
     def __init__(
@@ -31,10 +32,14 @@ class WienerUNet(Network[Tensor]):
         weight: float = 1e-3,
         regularisation: float = 1e-2,
         boundary: Boundary = "taper",
+        authors_form: bool = False,
     ) -> None:
         super().__init__()
+        self.stored_psf = authors_form
         self.channels = channels
-        self.wiener = WienerNetwork(weight=weight, regularisation=regularisation, boundary=boundary)
+        self.wiener = WienerNetwork(
+            weight=weight, regularisation=regularisation, boundary=boundary, authors_form=authors_form
+        )
         self.unet = UNet(channels=channels, width=width, pooling=pooling)
 
     def prepare(self, psf: Psf, size: Size) -> Tensor:

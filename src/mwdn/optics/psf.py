@@ -24,7 +24,7 @@ def unit_sum(psf: Tensor) -> Tensor:
     return psf / psf.sum((-2, -1), keepdim=True)
 
 
-def checked_psf(psf: Tensor, *, values: bool = True) -> Psf:
+def checked_psf(psf: Tensor, *, values: bool = True, scale: bool = True) -> Psf:
     """Check a PSF and scale each channel to unit sum.
 
     The brightness of a captured PSF depends on its exposure, so only its shape counts, for every method alike. A PSF of
@@ -33,6 +33,7 @@ def checked_psf(psf: Tensor, *, values: bool = True) -> Psf:
     Args:
         psf: (1 or B, C, h, w), light; of any scale.
         values: refuse numbers that are no light. This waits for a GPU; training leaves it out.
+        scale: scale it; otherwise it is returned as it is.
 
     Raises:
         ShapeError: other axes.
@@ -43,7 +44,7 @@ def checked_psf(psf: Tensor, *, values: bool = True) -> Psf:
     total = psf.sum((-2, -1), keepdim=True, dtype=torch.promote_types(psf.dtype, torch.float32))
     if values and not torch.compiler.is_compiling() and psf.numel() > 0:  # a graph cannot depend on values
         _refuse_values(psf.detach(), total.detach())
-    return psf / torch.where((total - 1).abs() <= SUM_TOLERANCE, 1.0, total)
+    return psf if not scale else psf / torch.where((total - 1).abs() <= SUM_TOLERANCE, 1.0, total)
 
 
 def _refuse_values(psf: Tensor, total: Tensor) -> None:

@@ -22,10 +22,11 @@ from mwdn.data.unpaired import UnpairedCaptures
 from mwdn.errors import ParameterError, checked
 from mwdn.optics.sensor import Sensor
 from mwdn.runtime import distributed
+from mwdn.training.network import stored_psf
 from mwdn.training.recipe import Recipe, read_recipe
 from mwdn.training.report import Report
 from mwdn.training.selfsupervised import SelfSupervisedTask
-from mwdn.training.tasks import SupervisedTask, Task, few_pairs_tasks, supervised_task
+from mwdn.training.tasks import SupervisedTask, Task, few_pairs_tasks, supervised_task, with_stored_psf
 from mwdn.training.trainer import Trainer
 from mwdn.training.validation import SHOWN, Validator
 from mwdn.types import Measurement, Psf
@@ -126,8 +127,11 @@ def prepare(
     elif photos is not None:
         data = simulated_captures(recipe, photos, psf)
     recipe = _in_steps(recipe, data)
-    validator = Validator(recipe, data.validation, psf, captures)
-    return Trainer(recipe, data.task, out=out, calibration=calibration, validator=validator, device=place)
+    stored = stored_psf(recipe, calibration)
+    stored = None if stored is None else stored.to(place)
+    task, validation = (with_stored_psf(part, stored) for part in (data.task, data.validation))
+    validator = Validator(recipe, validation, psf if stored is None else stored, captures)
+    return Trainer(recipe, task, out=out, calibration=calibration, validator=validator, device=place)
 
 
 def simulated_captures(recipe: Recipe, photos: Path, psf: Psf) -> TrainingData:

@@ -5,9 +5,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from mwdn.errors import CheckpointError
-from mwdn.networks import build
+from mwdn.calibration import Calibration
+from mwdn.errors import CheckpointError, ParameterError
+from mwdn.inference.methods import psf_for
+from mwdn.networks import Network, build
+from mwdn.networks.empty import build_empty
 from mwdn.training.recipe import Recipe
+from mwdn.types import Psf
 from mwdn.weights.bundled import load_network
 from mwdn.weights.checkpoint import first_difference, load_checkpoint
 
@@ -32,6 +36,23 @@ def build_network(recipe: Recipe) -> nn.Module:
             f"it has one: {first_difference(error)}. The recipe has {recipe.network}."
         ) from error
     return network
+
+
+def stored_psf(recipe: Recipe, calibration: Calibration) -> Psf | None:
+    """The PSF (1, C, H, W) for a network that takes it as stored; ``None`` for the others, which take the samples'.
+
+    Raises:
+        ParameterError: such a network has one camera, and pairs to learn from.
+    """
+    network = build_empty(**recipe.network)
+    if not (isinstance(network, Network) and network.stored_psf):
+        return None
+    if recipe.cameras.sizes or recipe.selfsupervised.consistency or recipe.pairs.aligned:
+        raise ParameterError(
+            f"[network] {recipe.network} takes the PSF as stored, of one camera: leave [cameras], [selfsupervised] and "
+            "`aligned` of [pairs] out of the recipe."
+        )
+    return psf_for(network, calibration)
 
 
 def grown(weights: dict[str, Tensor], network: nn.Module) -> dict[str, Tensor]:

@@ -1,13 +1,13 @@
 """What a network learns: a loss of numbered samples. Here from pairs; `selfsupervised` has the task without scenes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
 
 from mwdn.data.recorded import RecordedPairs
-from mwdn.data.simulated import Samples
+from mwdn.data.simulated import Batch, Samples
 from mwdn.evaluation.metrics import best_gain
 from mwdn.networks import Network
 from mwdn.solvers import align
@@ -69,11 +69,13 @@ class SupervisedTask:
         pairs: measurement, scene and PSF of each sample.
         cache: of these pairs, to train or validate on it instead.
         best_gain: scenes have units of their own: compare after the gain and offset of each colour that fit best.
+        stored_psf: (1, C, H, W), PSF for a network that takes it as stored, instead of that of the samples.
     """
 
     pairs: Samples
     cache: SampleCache | None = None
     best_gain: bool = False
+    stored_psf: Psf | None = None
 
     columns: ClassVar[tuple[str, str]] = "measurement", "scene"
 
@@ -95,12 +97,12 @@ class SupervisedTask:
 
     def reconstruct(self, network: nn.Module, numbers: range) -> tuple[Image, Scene]:
         """Reconstructions of the samples of these numbers, and their scenes."""
-        measurement, scene, psf = self.pairs.batch(numbers)
+        measurement, scene, psf = self._batch(numbers)
         return network(measurement.contiguous(memory_format=torch.channels_last), psf), scene
 
     def score(self, network: nn.Module, distance: Loss, numbers: range) -> Scores:
         """PSNR and loss of the reconstructions; the loss always has its initial weights."""
-        measurement, scene, psf = self.pairs.batch(numbers)
+        measurement, scene, psf = self._batch(numbers)
         if self.cache is None:
             reconstruction = reconstruct_aligned(network, measurement, psf)
         else:
@@ -115,6 +117,10 @@ class SupervisedTask:
         """Names the samples in an error message."""
         return self.pairs.describe(numbers)
 
+    def _batch(self, numbers: range) -> Batch:
+        batch = self.pairs.batch(numbers)
+        return batch if self.stored_psf is None else batch._replace(psf=self.stored_psf)
+
     def _in_units(self, reconstruction: Image, scene: Scene) -> Image:
         return best_gain(reconstruction, scene, axes=(2, 3)) if self.best_gain else reconstruction
 
@@ -125,6 +131,11 @@ def supervised_task(pairs: Samples, schedule: Schedule) -> SupervisedTask:
         return SupervisedTask(pairs.prefetched(schedule.batch))
     size, batch, crop, seed = schedule.pool, schedule.batch, schedule.crop, schedule.seed
     return SupervisedTask(pairs, SampleCache(pairs, size=size, batch=batch, crop=crop, seed=seed))
+
+
+def with_stored_psf(task: Task, psf: Psf | None) -> Task:
+    """The task of learning from pairs, for a network that takes this PSF as stored; ``None`` changes nothing."""
+    return replace(task, stored_psf=psf) if isinstance(task, SupervisedTask) else task
 
 
 def few_pairs_tasks(

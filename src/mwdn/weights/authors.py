@@ -9,7 +9,7 @@ from mwdn.errors import CheckpointError, ParameterError
 from mwdn.networks.empty import build_empty
 from mwdn.weights.tensors import check_shapes, fill
 
-OPTIONS: dict[str, Any] = {"pooling": "average", "boundary": "circular"}
+OPTIONS: dict[str, Any] = {"pooling": "average", "boundary": "circular", "authors_form": True}
 """Where their code differs from their paper, for both networks."""
 
 # Their module names and ours. Each scale is a double convolution, which theirs wraps in one more module.
@@ -31,13 +31,14 @@ def is_authors(state: dict[str, Tensor]) -> bool:
 def load_authors(state: dict[str, Tensor]) -> nn.Module:
     """Build MWDN or MWDN-CPSF as in the authors' code, with their weights.
 
-    These networks take the PSF as stored, in [0, 1] with its background: calibrate with ``background=0``.
+    These networks take the PSF as stored (`mwdn.networks.Network.stored_psf`), in [0, 1] with its background:
+    calibrate with ``background=0``. Their w may be negative, to which training with their own settings leads.
 
     Args:
         state: tensors under the authors' names.
 
     Raises:
-        CheckpointError: a tensor is missing, unexpected or of another shape, or a w or lambda is not positive.
+        CheckpointError: a tensor is missing, unexpected or of another shape, or a lambda is not positive.
     """
     name = "mwdn-cpsf" if "inc0.double_conv.0.weight" in state else "mwdn"
     extra = {"authors_scalars": True} if name == "mwdn-cpsf" else {"psf_pooling": "average"}
@@ -52,7 +53,7 @@ def load_authors(state: dict[str, Tensor]) -> nn.Module:
             f"`{'`, `'.join(wrong) or 'inc.double_conv.0.weight'}` must have the shape of the authors' {name} "
             f"({scalars} numbers). Take a checkpoint of their code."
         )
-    ours = _renamed(state, name)
+    ours = renamed(state, name)
     try:
         network = build_empty(name, **OPTIONS, **extra, channels=first.shape[1], width=first.shape[0])
     except ParameterError as error:
@@ -68,24 +69,25 @@ def _is_dense(tensor: Tensor) -> bool:
     return real and tensor.numel() * tensor.itemsize <= tensor.untyped_storage().nbytes()
 
 
-def _renamed(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:
+def renamed(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:
+    """Their tensors under our names, for the network ``name``."""
     ours: dict[str, Tensor] = {}
     for key, value in state.items():
         if key in ("w", "delta"):
             continue
         module = next((module for module in _MODULES if key.startswith(module + ".")), None)
         ours[key.replace(module, _MODULES[module], 1) if module else key] = value
-    for i, regularisation in enumerate(_logarithm("delta", state["delta"][:4])):
-        ours[f"filters.{i}.log_regularisation"] = regularisation
+    for i, regularisation in enumerate(_positive("delta", state["delta"][:4])):
+        ours[f"filters.{i}.linear_regularisation"] = regularisation
     if name == "mwdn-cpsf":
         return ours | {"weight": state["w"], "unused_regularisation": state["delta"][4]}
-    return ours | {f"filters.{i}.log_weight": weight for i, weight in enumerate(_logarithm("w", state["w"]))}
+    return ours | {f"filters.{i}.linear_weight": weight for i, weight in enumerate(state["w"])}
 
 
-def _logarithm(name: str, values: Tensor) -> Tensor:
+def _positive(name: str, values: Tensor) -> Tensor:
     if not (values > 0).all():
         raise CheckpointError(
-            f"`{name}` ({values.tolist()}) must be positive: this package stores its logarithm, and a filter with a "
-            "negative lambda has poles. Train longer, or take another checkpoint."
+            f"`{name}` ({values.tolist()}) must be positive: a filter with a negative lambda has poles. Take another "
+            "checkpoint of the training."
         )
-    return torch.log(values)
+    return values
