@@ -1,0 +1,77 @@
+"""The scripts of the gallery run, at a small size; what the site makes of them."""
+
+import ast
+import importlib.util
+import json
+import re
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pytest
+import torch
+
+ROOT = Path(__file__).resolve().parents[2]
+SCRIPTS = sorted(path for path in (ROOT / "examples" / "gallery").glob("*.py") if path.stem != "__main__")
+LIKELY = {  # what each prints, with its numbers left out
+    "forward_model": r"a point gives the PSF.*two points give the sum.*<A x, y>",
+    "wiener_or_admm": r"Wiener, 15,000 electrons: [\d.]+ dB.*ADMM, 500 electrons: [\d.]+ dB",
+    "cropping": r"light on the small sensor: \d\d%.*cropped: .* dB in the middle.*whole: ",
+    "wrong_psf": r"right: .*psf, good.*mirrored: .*another camera: ",
+    "zero_shot": r"admm: [\d.]+ dB.*universal: [\d.]+ dB",
+}
+
+
+@pytest.fixture(autouse=True)
+def _no_window():
+    matplotlib.use("agg")
+    yield
+    matplotlib.pyplot.close("all")
+
+
+def run_small(path, size):
+    """Names of a script that was run with another SIZE."""
+    source, count = re.subn(r"^SIZE = \d+", f"SIZE = {size}", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    assert count == 1
+    names = {"__name__": "gallery"}
+    with torch.inference_mode():
+        exec(compile(source, str(path), "exec"), names)
+    return names
+
+
+@pytest.mark.parametrize("path", [path for path in SCRIPTS if path.stem != "zero_shot"], ids=lambda path: path.stem)
+def test_a_script_runs_and_draws(path, capsys):
+    figure = run_small(path, 48)["figure"]
+    assert re.search(LIKELY[path.stem], capsys.readouterr().out, re.DOTALL)
+    pictures = [image.get_array() for axis in figure.axes for image in axis.get_images()]
+    assert len(pictures) >= 3
+    assert all(np.isfinite(picture).all() and picture.max() > picture.min() for picture in pictures)
+
+
+@pytest.mark.acceptance
+def test_the_network_of_the_gallery_is_better_than_admm(capsys):
+    path = ROOT / "examples" / "gallery" / "zero_shot.py"
+    run_small(path, 96)
+    printed = capsys.readouterr().out
+    assert re.search(LIKELY["zero_shot"], printed, re.DOTALL)
+    numbers = np.array([float(number) for number in re.findall(r": ([\d.]+) dB", printed)]).reshape(-1, 2)
+    assert (numbers[:, 1] > numbers[:, 0]).all()
+
+
+def test_every_script_has_its_picture_its_text_and_its_page():
+    pytest.importorskip("mkdocs", reason="the extra `docs` is not installed")
+    spec = importlib.util.spec_from_file_location("site_gallery", ROOT / "docs" / "site" / "gallery.py")
+    hook = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(hook)
+    assert set(hook.ORDER) == {path.stem for path in SCRIPTS} == set(LIKELY)
+    for path in SCRIPTS:
+        kept = ROOT / "docs" / "gallery" / path.stem
+        printed = kept.with_suffix(".txt").read_text(encoding="utf-8")
+        assert kept.with_suffix(".webp").stat().st_size < 100_000
+        assert re.search(LIKELY[path.stem], printed, re.DOTALL)
+        title, cells = hook.read_cells(path.read_text(encoding="utf-8"))
+        assert title.endswith("?")
+        script = ast.parse(path.read_text(encoding="utf-8"))
+        listed = json.loads(hook.notebook(title, cells))["cells"]
+        code = "\n".join(cell["source"] for cell in listed if cell["cell_type"] == "code")
+        assert ast.dump(ast.parse(code)) == ast.dump(ast.Module(script.body[1:], []))
