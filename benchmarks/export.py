@@ -138,7 +138,7 @@ def operation(size, grid, channels):
         planes = g("DFT", planes, None, axis=axis, **options)
     planes = g("Slice", planes, g.integers([0, 0, 0]), g.integers([*size, 1]), g.integers([2, 3, 4]))
     shape = [1, channels, *size]
-    return g.model(g("Squeeze", planes, g.integers([4])), {"measurement": shape, "scene": shape})
+    return g.model({"measurement": shape}, {"scene": (g("Squeeze", planes, g.integers([4])), shape)})
 
 
 def transforms(arguments, clock):

@@ -52,7 +52,10 @@ COMMANDS = {
         "recipes:recipes",
         "List the recipes of the package, or print one: `mwdn recipes quick-cpu > mine.toml`.",
     ),
-    "export": ("export:export", "Write a method for one camera as a file for other programs: ONNX, or torch's .pt2."),
+    "export": (
+        "export:export",
+        "Write a method for one camera as a file for other programs: ONNX, torch's .pt2, or a page for browsers (--web).",
+    ),
     "benchmark": (
         "benchmark:benchmark",
         "Train and score every method of a recipe under one protocol, and write one page.",

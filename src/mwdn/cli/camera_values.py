@@ -6,11 +6,20 @@ from cyclopts import App
 from cyclopts.config import Dict
 from cyclopts.token import Token
 
+from mwdn.errors import ParameterError
+
 
 def from_camera_file(app: App, commands: tuple[str, ...], arguments: Any) -> None:  # noqa: ANN401
-    """Read the options that the command line does not set from the file of ``--camera``, or a ``.toml`` as the PSF."""
+    """Read the options that the command line does not set from the file of ``--camera``.
+
+    A ``.toml`` as the PSF or of ``--web`` is such a file, too.
+    """
     by_name = {argument.name: argument for argument in arguments}
-    given, psf = by_name.get("--camera"), by_name.get("--psf")
+    given, psf, web = (by_name.get(name) for name in ("--camera", "--psf", "--web"))
+    if web is not None and web.tokens and psf is not None:  # the camera of a page
+        if psf.tokens or (given is not None and given.tokens):
+            raise ParameterError("`--web` names the camera: leave out `--psf` and `--camera`.")
+        psf.tokens[:] = [web.tokens[0].evolve(keyword="--psf")]
     if given is not None and not given.tokens and psf is not None and is_camera_file(psf.tokens):
         given.tokens[:], psf.tokens[:] = [psf.tokens[0].evolve(keyword="--camera")], []
     if given is None or not given.tokens:

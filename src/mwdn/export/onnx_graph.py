@@ -62,16 +62,19 @@ class OnnxGraph:
             self.constants[key] = numpy_helper.from_array(array, f"constant_{len(self.constants)}")
         return self.constants[key].name
 
-    def model(self, result: str, shapes: Mapping[str, Sequence[int | str]]) -> "onnx.ModelProto":
-        """The finished model, with one input and one output of float32.
+    def model(
+        self, inputs: Mapping[str, Sequence[int | str]], outputs: Mapping[str, tuple[Any, Sequence[int | str]]]
+    ) -> "onnx.ModelProto":
+        """The finished model, whose inputs and outputs are float32.
 
         Args:
-            result: name of the value to output.
-            shapes: of input and output by name, in this order; a string is an axis of any length.
+            inputs: shape of each by name; a string is an axis of any length.
+            outputs: value and shape of each by name.
         """
         from onnx import TensorProto, helper
 
-        source, target = (helper.make_tensor_value_info(n, TensorProto.FLOAT, s) for n, s in shapes.items())
-        last = helper.make_node("Identity", [result], [target.name])
-        graph = helper.make_graph([*self.nodes, last], "mwdn", [source], [target], list(self.constants.values()))
+        sources = [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in inputs.items()]
+        targets = [helper.make_tensor_value_info(name, TensorProto.FLOAT, s) for name, (_, s) in outputs.items()]
+        last = [helper.make_node("Identity", [self.name(value)], [name]) for name, (value, _) in outputs.items()]
+        graph = helper.make_graph([*self.nodes, *last], "mwdn", sources, targets, list(self.constants.values()))
         return helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=8)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, fx
 
 from mwdn.errors import ExportError
-from mwdn.export.onnx_graph import OnnxGraph
+from mwdn.export.onnx_graph import OnnxGraph, Pair
 
 _aten = torch.ops.aten
 _TYPES = {torch.float32: 1, torch.float16: 10}  # numbers of onnx.TensorProto
@@ -252,6 +252,7 @@ REAL: dict[Any, Handler] = {
     _aten.avg_pool2d.default: _pool("AveragePool"),
     _aten.cat.default: _concatenation,
     _aten.clamp.default: _clamp,
+    _aten.complex.default: lambda g, node, real, imaginary: Pair(real, imaginary),
     _aten.conv2d.default: _convolution,
     _aten.conv_transpose2d.input: _convolution_transpose,
     _aten.div.Tensor: _plain("Div"),

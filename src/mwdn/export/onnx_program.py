@@ -6,6 +6,7 @@ operations, leaves transforms to the runtime, and takes minutes for the thousand
 
 import operator
 import warnings
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -27,11 +28,13 @@ _AXIS: dict[Any, int] = {_ROWS: -1, _COLUMNS: -2, _TO_ROWS: -1, _TO_COLUMNS: -2}
 """The transforms used by `mwdn.fourier`, and the axis of each."""
 
 
-def to_onnx(program: ExportedProgram) -> "onnx.ModelProto":
-    """Convert a program to a model with the input ``measurement`` and the output ``scene``.
+def to_onnx(program: ExportedProgram, outputs: Sequence[str] = ("scene",)) -> "onnx.ModelProto":
+    """Convert a program to a model whose inputs have the names of the program's arguments.
 
     Args:
-        program: from `torch.export.export`, with one input and one output; its batch size may be free.
+        program: from `torch.export.export`; its inputs and outputs are real. If its batch size is free, it is that of
+            an argument ``measurement``.
+        outputs: their names, in the program's order.
 
     Raises:
         ExportError: an operation is not supported.
@@ -41,18 +44,18 @@ def to_onnx(program: ExportedProgram) -> "onnx.ModelProto":
         module = program.run_decompositions({}).module()
     values, steps = _fold_constants(module)
     g = OnnxGraph()
-    shapes = {}
+    inputs = {}
     for step in steps:
         if step.op == "placeholder":
-            values[step] = "measurement"
-            shapes["measurement"] = _axes(value(step))
+            values[step] = step.name
+            inputs[step.name] = _axes(value(step))
         elif step.op == "call_function":
             arguments, options = fx.map_arg((step.args, step.kwargs), values.get)
             values[step] = _convert(g, step, arguments, options)
         elif step.op == "output":
-            result = step.all_input_nodes[0]
-            shapes["scene"] = _axes(value(result))
-            return g.model(values[result], shapes)
+            results: Any = step.args[0]
+            named = zip(outputs, results if isinstance(results, tuple | list) else [results], strict=True)
+            return g.model(inputs, {name: (values[node], _axes(value(node))) for name, node in named})
     raise AssertionError("A program has an output.")
 
 
@@ -80,8 +83,8 @@ def _convert(g: OnnxGraph, step: fx.Node, arguments: Any, options: Any) -> Any: 
     """Add an operation to the graph; returns its result."""
     if not isinstance(value(step), Tensor | tuple | list):
         return None  # the batch size, which the shapes hold
-    if step.target is operator.getitem:
-        return arguments[0][arguments[1]]
+    if step.target is operator.getitem or (step.target is _aten.select.int and isinstance(arguments[0], Pair)):
+        return arguments[0][arguments[-1]]
     handlers = _TRANSFORMS if step.target in _AXIS else REAL
     if step.target not in _AXIS and any(_is_complex(source) for source in step.all_input_nodes):
         handlers = _ON_PAIRS
@@ -167,11 +170,18 @@ def _add(g: OnnxGraph, node: fx.Node, a: Pair, b: Pair) -> Pair:
     return Pair(*(g("Add", *each) for each in zip(a, b, strict=True)))
 
 
+def _concatenate(g: OnnxGraph, node: fx.Node, pairs: list[Pair], axis: int = 0) -> Pair:
+    return Pair(*(g("Concat", *parts, axis=axis) for parts in zip(*pairs, strict=True)))
+
+
 _ON_PAIRS: dict[Any, Handler] = {
-    **{each: _on_both(each) for each in (_aten.alias.default, _aten.clone.default, _aten.slice.Tensor)},
+    **dict.fromkeys((_aten.alias.default, _aten.clone.default), lambda g, node, pair, **_: pair),
+    **{each: _on_both(each) for each in (_aten.slice.Tensor, _aten.transpose.int)},
     _aten._conj.default: lambda g, node, a: Pair(a.real, g("Neg", a.imaginary)),
     _aten.abs.default: lambda g, node, a: g("Sqrt", g("Add", g("Mul", a[0], a[0]), g("Mul", a[1], a[1]))),
     _aten.add.Tensor: _add,
+    _aten.cat.default: _concatenate,
+    _aten.view_as_real.default: lambda g, node, pair: pair,  # of which one part is selected
     _aten.addcmul.default: lambda g, node, a, b, c: _add(g, node, a, _multiply(g, node, b, c)),
     _aten.div.Tensor: lambda g, node, a, b: Pair(*(g("Div", part, b) for part in a)),
     _aten.mul.Tensor: _multiply,

@@ -1,0 +1,216 @@
+"""The static page in a headless Chromium, from the disk and from a static host, used as a person uses it."""
+
+import base64
+import functools
+import http.server
+import io
+import threading
+from contextlib import contextmanager
+
+import cv2
+import jaxtyping
+import numpy as np
+import pytest
+import torch
+
+from browser import CHROMIUM, open_page
+from mwdn import Calibration, Camera, Reconstructor, read_frame, to_display, write_picture
+from mwdn.cli.app import main
+from mwdn.data.random import seeded
+from mwdn.errors import ExportError
+from mwdn.export.exporter import agreement
+from mwdn.export.web_runtime import read_runtime
+from mwdn.io.images import write_frame
+from mwdn.io.pictures import dark_scene
+from mwdn.optics import sample_camera
+
+pytest.importorskip("onnxruntime", reason="The extra is missing: pip install 'mwdn[export]'")
+pytestmark = [
+    pytest.mark.acceptance,
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt install chromium"),
+]
+
+SIZE = 96, 128
+STATE = "document.getElementById('state')"
+AT_LEAST = 50  # dB against the package
+
+
+def psf_frame(seed, bits):
+    psf = sample_camera(seed, SIZE, family="contours")[0].movedim(0, -1)
+    return (psf / psf.max() * 0.9 * 2**bits + 0.02 * 2**bits).numpy().astype(np.uint8 if bits == 8 else np.uint16)
+
+
+def write_capture(path, calibration, picture, maximum=65535):
+    light = Camera(calibration.psf).simulate(dark_scene(picture, SIZE, 60), generator=seeded(1))
+    light = light * (0.8 / light.max())
+    write_frame(path, (light.clamp(0, 1) * maximum).round()[0].movedim(0, -1).numpy().astype(np.uint16))
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A site for a camera of 12 bits, files of that camera and of another one."""
+    try:
+        read_runtime()
+    except ExportError as error:
+        pytest.skip(str(error))
+    folder = tmp_path_factory.mktemp("site")
+    write_frame(folder / "psf.png", psf_frame(0, 12))
+    write_frame(folder / "other.png", psf_frame(1, 8))
+    own = Calibration.from_file(folder / "psf.png", bit_depth=12)
+    other = Calibration.from_file(folder / "other.png", psf_orientation="rotate-180")
+    write_capture(folder / "capture.png", own, "coffee", maximum=4095)
+    write_capture(folder / "of-the-other.png", other, "cat")
+    (folder / "wrong.png").write_bytes((folder / "capture.png").read_bytes()[:-1000])
+    (folder / "photo.jpg").write_bytes(cv2.imencode(".jpg", np.zeros((96, 128, 3), np.uint8))[1].tobytes())
+    write_frame(folder / "small.png", np.zeros((64, 64, 3), np.uint8))
+    jaxtyping.config.update("jaxtyping_disable", True)  # torch traces with sizes that are no numbers
+    with pytest.raises(SystemExit) as ended:
+        main(["export", "--web", str(folder / "psf.png"), "--bit-depth", "12", "-o", str(folder / "site")])
+    jaxtyping.config.update("jaxtyping_disable", False)
+    assert ended.value.code == 0
+    return folder, own, other
+
+
+class Quiet(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, *_):
+        pass
+
+
+@contextmanager
+def static_host(folder):
+    """Python's own file server on the loopback interface."""
+    handler = functools.partial(Quiet, directory=str(folder))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{server.server_address[1]}/index.html"
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def said(page):
+    return page.run(f"{STATE}.textContent")
+
+
+def wait_for(page, name):
+    page.wait(f"{STATE}.textContent.startsWith('{name}: 128 × 96 pixels in ') || {STATE}.classList.contains('wrong')")
+    assert said(page).endswith("by WebAssembly, on this computer."), said(page)
+
+
+def saved(page, button):
+    """What a download holds."""
+    page.run(
+        "window.made ??= []; window.make ??= URL.createObjectURL; "
+        "URL.createObjectURL = blob => { window.made.push(blob); return window.make(blob); }"
+    )
+    count = page.run("window.made.length")
+    page.run(f"document.getElementById('{button}').click()")
+    page.wait(f"window.made.length > {count}")
+    data = page.run(
+        "new Promise(done => { const reader = new FileReader(); reader.onload = () => done(reader.result); "
+        "reader.readAsDataURL(window.made.at(-1)); })"
+    )
+    return base64.b64decode(data.split(",")[1])
+
+
+def check_scene(page, calibration, capture):
+    """The page's float picture against the package's for the same file."""
+    scene = np.load(io.BytesIO(saved(page, "save-npy")))
+    reconstruct = Reconstructor("universal-small", calibration, device="cpu", precision="exact")
+    expected = reconstruct(calibration.correct(calibration.frames.read(capture)))
+    reached = agreement(torch.from_numpy(scene).movedim(-1, 0)[None], expected)
+    print(f"{capture.name}: {reached:.1f} dB")
+    assert reached > AT_LEAST
+    return expected
+
+
+def check_files(page, folder, own, other):
+    """Captures of this camera and of another one, and files that are none."""
+    page.drop("#capture", folder / "capture.png")
+    wait_for(page, "capture.png")
+    check_scene(page, own, folder / "capture.png")
+
+    page.drop("#psf", folder / "other.png")
+    page.wait(f"{STATE}.textContent.startsWith('capture.png: ') || {STATE}.classList.contains('wrong')")
+    page.run("(o => { o.value = 'rotate-180'; o.onchange(); })(document.getElementById('orientation'))")
+    page.drop("#capture", folder / "of-the-other.png", folder / "capture.png")
+    wait_for(page, "of-the-other.png")
+    expected = check_scene(page, other, folder / "of-the-other.png")
+    assert page.run("document.querySelectorAll('#captures button').length") == 2
+
+    # Pictures for people are the package's, within rounding.
+    for button, bits in (("save-png", 8), ("save-png16", 16)):
+        (folder / "saved.png").write_bytes(saved(page, button))
+        write_picture(folder / "expected.png", to_display(expected), bits=bits)
+        difference = read_frame(folder / "saved.png").astype(int) - read_frame(folder / "expected.png").astype(int)
+        assert abs(difference).max() <= (1 if bits == 8 else 64)
+
+    for name, words in (
+        ("wrong.png", "damaged or cut off"),
+        ("photo.jpg", "neither PNG nor NPY"),
+        ("small.png", "64 x 64"),
+    ):
+        page.drop("#capture", folder / name)
+        page.wait(f"{STATE}.classList.contains('wrong') && {STATE}.textContent.startsWith('{name} ')")
+        assert words in said(page)
+    page.drop("#psf", folder / "small.png")
+    page.wait(f"{STATE}.textContent.includes('This page reconstructs 96 x 128')")
+
+
+def check_controls(page):
+    page.run("document.querySelector('#samples button').click()")
+    wait_for(page, "astronaut")
+    before = page.run("document.getElementById('scene').src")
+    page.run("(slider => { slider.value = 1; slider.oninput(); })(document.getElementById('exposure'))")
+    page.wait(f"document.getElementById('scene').src !== '{before}'")
+    page.run("document.getElementById('split').focus()")
+    page.press("ArrowRight", 39)
+    assert page.run("document.getElementById('stack').style.getPropertyValue('--split')") == "51%"
+    page.size(390, 800)  # a phone's width: nothing is cut off
+    assert page.run("document.documentElement.scrollWidth") <= 390
+    assert page.run(
+        "[...document.querySelectorAll('input, select, button')].every(e => "
+        "(e.labels?.length || e.ariaLabel || e.textContent.trim()))"
+    )
+
+
+def test_from_the_disk(files, tmp_path):
+    folder, own, other = files
+    with open_page((folder / "site" / "index.html").as_uri(), tmp_path / "profile") as page:
+        page.wait(STATE)
+        wait_for(page, "astronaut")
+        assert "agrees with mwdn" in page.run("document.getElementById('checked').textContent")
+        check_files(page, folder, own, other)
+        check_controls(page)
+        assert not page.errors
+
+
+def test_from_a_static_host_whose_connection_is_lost(files, tmp_path):
+    folder, own, _ = files
+    with static_host(folder / "site") as address, open_page(address, tmp_path / "profile") as page:
+        page.wait(STATE)
+        wait_for(page, "astronaut")
+        # Nothing can be sent: the page's own policy forbids it.
+        assert page.run(f"fetch('{address}').then(() => 'sent', () => 'refused')") == "refused"
+        page.errors.clear()  # that refusal
+        page.command("Network.enable")
+        offline = {"offline": True, "latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
+        page.command("Network.emulateNetworkConditions", **offline)
+        page.drop("#capture", folder / "capture.png")
+        wait_for(page, "capture.png")
+        check_scene(page, own, folder / "capture.png")
+        assert not page.errors
+
+
+def test_a_missing_file_is_named(files, tmp_path):
+    folder, _, _ = files
+    site = tmp_path / "site"
+    site.mkdir()
+    for path in (folder / "site").iterdir():
+        if path.name != "runtime-wasm.js":
+            (site / path.name).symlink_to(path)
+    with open_page((site / "index.html").as_uri(), tmp_path / "profile") as page:
+        page.wait(f"{STATE}?.classList.contains('wrong')")
+        assert said(page) == "runtime-wasm.js is missing. Copy the whole folder."
