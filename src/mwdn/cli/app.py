@@ -54,7 +54,7 @@ COMMANDS = {
     ),
     "export": (
         "export:export",
-        "Write a method for one camera as a file for other programs: ONNX, torch's .pt2, or a page for browsers (--web).",
+        "Write a method for one camera as a file for other programs: ONNX, torch's .pt2, or a page (--web).",
     ),
     "benchmark": (
         "benchmark:benchmark",

@@ -25,7 +25,7 @@ def export(  # noqa: PLR0913
     runtime: Path | None = None,
     **options: MethodOptions,
 ) -> None:
-    """Write a method for one camera as a file for other programs: ONNX, torch's .pt2, or a page for browsers (--web).
+    """Write a method for one camera as a file for other programs: ONNX, torch's .pt2, or a page (--web).
 
     The file is run on simulated captures and is kept only if its results agree with mwdn's.
 

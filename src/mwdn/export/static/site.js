@@ -224,12 +224,12 @@ function setUpDropZone(id, take) {
   };
   zone.ondragover = (event) => {
     event.preventDefault();
-    zone.classList.add("over");
+    zone.classList.add("target");
   };
-  zone.ondragleave = () => zone.classList.remove("over");
+  zone.ondragleave = () => zone.classList.remove("target");
   zone.ondrop = (event) => {
     event.preventDefault();
-    zone.classList.remove("over");
+    zone.classList.remove("target");
     accept(event.dataTransfer.files);
   };
 }
