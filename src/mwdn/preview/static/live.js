@@ -5,6 +5,10 @@ import { setUpSnapshots } from "./snapshots.js";
 const byId = (id) => document.getElementById(id);
 const controls = ["live-record", "live-snapshot", "live-exposure", "live-gain"].map(byId);
 const wishes = {}; // of this page, for a server that was started again
+const PATIENCE_MS = 3000; // until the server has followed a wish; then its settings are shown again
+let wishedAt = -Infinity;
+let followed = "";
+let page = null;
 const shown = { count: 0, latency_ms: 0 };
 let socket = null;
 let isStarted = false;
@@ -23,6 +27,7 @@ function send(message) {
 // A setting: kept, and sent again when the connection comes back.
 export function wish(message) {
   Object.assign(wishes, message);
+  wishedAt = performance.now();
   send(message);
 }
 
@@ -56,6 +61,16 @@ function tell(said) {
   if (document.activeElement !== byId("live-gain") && said.gain !== null) byId("live-gain").value = said.gain;
 }
 
+// Settings are shared: another page may have changed them.
+function showSettings({ method, options, align, room_light }) {
+  const now = JSON.stringify([method, options, align, room_light]);
+  const isMine = method === wishes.method && align === wishes.align && room_light === wishes.room_light;
+  if (isMine) wishedAt = -Infinity;
+  if (now === followed || performance.now() - wishedAt < PATIENCE_MS) return;
+  followed = now;
+  if (!isMine) page.follow({ method, options, align, room_light });
+}
+
 async function draw(data) {
   const [said, parts] = parse(data);
   if (said.error) {
@@ -70,6 +85,7 @@ async function draw(data) {
   byId("view").hidden = false;
   byId("stack").classList.add("live");
   tell(said);
+  showSettings(said);
 }
 
 // One frame at a time; of those that come meanwhile, the newest.
@@ -118,6 +134,7 @@ function connect() {
 function start(name) {
   byId("trust-section").hidden = true; // its verdicts are of another capture
   byId("state").textContent = `Live: ${name}.`;
+  page.started();
   connect();
 }
 
@@ -134,8 +151,10 @@ export function stopLive() {
   if (isStarted) byId("live-start").click();
 }
 
-export function setUpLive(name, useSnapshot) {
+// `parts` of the page: `started()`, `follow(settings)` of another page, `use(frame, job)` of a snapshot.
+export function setUpLive(name, parts) {
   if (!name) return;
+  page = parts;
   byId("live").hidden = false;
   show(`${name} is ready.`);
   byId("live-start").onclick = () => {
@@ -154,5 +173,5 @@ export function setUpLive(name, useSnapshot) {
   toggle("live-ambient", "ambient");
   byId("live-exposure").onchange = () => wish({ exposure_s: Number(byId("live-exposure").value) / 1000 });
   byId("live-gain").onchange = () => wish({ gain: Number(byId("live-gain").value) });
-  setUpSnapshots(useSnapshot);
+  setUpSnapshots(page.use);
 }

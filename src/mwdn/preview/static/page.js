@@ -15,6 +15,7 @@ const chosen = { psf: null, capture: null, ambient: null, job: null };
 let methods = [];
 let running = null;
 let due = 0;
+let isTouched = false;
 
 function say(text, wrong = false) {
   byId("state").textContent = pageWords(text);
@@ -111,6 +112,7 @@ async function reconstruct() {
 
 // Sliders move faster than methods reconstruct: only the last value counts.
 function soon(work = reconstruct, wait = 150) {
+  isTouched = true;
   clearTimeout(due);
   due = setTimeout(() => guarded(work), wait);
 }
@@ -222,16 +224,29 @@ async function removeCamera() {
   say(`${name} is removed.`);
 }
 
-function chooseMethod() {
+// The settings of the live picture, which another page has changed.
+function followLive({ method, options, align, room_light }) {
+  byId("method").value = method;
+  byId("align").checked = align;
+  byId("room-light").value = room_light ? "found" : "";
+  byId("ambient-zone").hidden = true;
+  chooseMethod(options);
+}
+
+function chooseMethod(values = {}) {
   const method = methods.find(({ name }) => name === byId("method").value);
   byId("about").textContent = method.about;
-  drawSliders(byId("options"), method.options, () => soon());
+  drawSliders(byId("options"), method.options, () => soon(), values);
 }
 
 async function start() {
   const [listed, samples] = await Promise.all([getJson("/methods"), getJson("/samples"), listCameras()]);
   methods = listed.methods;
-  setUpLive(listed.live, (frame, job) => guarded(() => useSnapshot(frame, job)));
+  setUpLive(listed.live, {
+    started: () => isTouched && wishLive(), // else the settings of the server hold
+    follow: followLive,
+    use: (frame, job) => guarded(() => useSnapshot(frame, job)),
+  });
   byId("method").replaceChildren(...methods.map(({ name }) => new Option(name, name)));
   byId("method").value = "universal-small";
   chooseMethod();

@@ -4,7 +4,7 @@ let current = [];
 
 const format = (value) => (value === null ? "automatic" : Number(value.toPrecision(3)).toString());
 
-export function drawSliders(place, options, changed) {
+export function drawSliders(place, options, changed, values = {}) {
   current = [];
   place.replaceChildren();
   for (const option of options.filter(({ low }) => low !== null)) {
@@ -14,14 +14,16 @@ export function drawSliders(place, options, changed) {
     const label = Object.assign(document.createElement("label"), { htmlFor: id, title: option.about });
     const value = document.createElement("output");
     label.append(`${option.name} `, value);
-    const start = option.default ?? (logarithmic ? Math.sqrt(option.low * option.high) : option.low);
+    const isSet = option.name in values;
+    const chosen = isSet ? values[option.name] : option.default;
+    const start = chosen ?? (logarithmic ? Math.sqrt(option.low * option.high) : option.low);
     const slider = Object.assign(document.createElement("input"), {
       id, type: "range", min: to(option.low), max: to(option.high), step: logarithmic ? "any" : 1,
     });
     slider.value = to(start);
-    const state = { name: option.name, value: option.default, isSet: false };
+    const state = { name: option.name, value: chosen, isSet };
     current.push(state);
-    value.textContent = format(option.default);
+    value.textContent = format(chosen);
     slider.oninput = () => {
       Object.assign(state, { value: from(Number(slider.value)), isSet: true });
       value.textContent = format(state.value);
