@@ -148,9 +148,9 @@ def of_sensor(sensor: SensorFrames, frames: FrameFormat) -> tuple[dict[str, Any]
     """Keys and pictures of a camera file that describe its sensor."""
     content: dict[str, Any] = {}
     parts: dict[str, Frame | list[Frame]] = {}
-    if (dark := sensor.longest_dark) is not None:
-        parts["dark"] = frames.denormalise(dark.image)
-        content["black_level"] = round(float(dark.image.mean()), 6)
+    if (dark := sensor.capture_dark) is not None:
+        parts["dark"] = frames.denormalise(dark)
+        content["black_level"] = round(float(dark.mean()), 6)
     if sensor.corrections.flat is not None:
         parts["flat_field"] = np.ascontiguousarray(sensor.corrections.flat[0].movedim(0, -1).numpy(), np.float32)
     if sensor.corrections.count:

@@ -29,12 +29,16 @@ class SensorFiles:
         dark_exposures: one for each equal part of them, in order; empty if all have the same.
         flat: of even light at about half of the full scale, in pairs of the same exposure.
         flat_dark: without light and with the exposure of the flat frames; ``dark`` unless given.
+        flat_field: whether the flat frames' light is even; otherwise they say the noise alone.
+        capture_exposure: that of the captures, one of ``dark_exposures``; the longest unless given.
     """
 
     dark: tuple[Path, ...] = ()
     dark_exposures: tuple[float, ...] = ()
     flat: tuple[Path, ...] = ()
     flat_dark: tuple[Path, ...] = ()
+    flat_field: bool = True
+    capture_exposure: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +51,7 @@ class SensorFrames:
         transfer: gain and noise; ``None`` without pairs of flat and dark frames.
         flat_colour: mean of red, green and blue of the flat frames; empty without colours.
         notes: sentences about what was found.
+        capture_exposure: of the captures; that of the longest dark frames if it is ``None``.
     """
 
     darks: dict[float | None, FrameAverage]
@@ -54,6 +59,7 @@ class SensorFrames:
     transfer: PhotonTransfer | None = None
     flat_colour: tuple[float, ...] = ()
     notes: tuple[str, ...] = ()
+    capture_exposure: float | None = None
 
     def dark(self, exposure: float | None) -> Image | None:
         """The dark frame for an exposure.
@@ -71,6 +77,17 @@ class SensorFrames:
                 f"`dark_exposures` ({known}) must have one for each of `exposures`, also {exposure:g}."
             )
         return self.darks[exposure].image
+
+    @property
+    def capture_dark(self) -> Image | None:
+        """The dark frame of the captures.
+
+        Raises:
+            ParameterError: there is none of their exposure.
+        """
+        if self.capture_exposure is None:
+            return None if self.longest_dark is None else self.longest_dark.image
+        return self.dark(self.capture_exposure)
 
     @property
     def longest_dark(self) -> FrameAverage | None:
@@ -100,7 +117,7 @@ def measure_sensor(files: SensorFiles, frames: FrameFormat, known: Corrections =
     groups = equal_parts(files.dark, len(files.dark_exposures) or 1, "dark") if files.dark else []
     times: Sequence[float | None] = files.dark_exposures or (None,)
     darks = {time: average_files(group, frames, kind="dark") for time, group in zip(times, groups, strict=False)}
-    measured = SensorFrames(darks, replace(known, psf_done=False))
+    measured = SensorFrames(darks, replace(known, psf_done=False), capture_exposure=files.capture_exposure)
     notes = [sentence for average in darks.values() for sentence in average.rejected.values()]
     if (longest := measured.longest_dark) is not None and longest.count > 1:
         defects = find_hot_pixels(longest, cell=frames.cell)
@@ -158,8 +175,9 @@ def _with_flats(sensor: SensorFrames, files: SensorFiles, frames: FrameFormat) -
         transfer = photon_transfer(flats, darks, frames, bad=defects)
     else:
         notes.append("Gain and read noise need two flat frames of the same exposure and two dark ones.")
-    corrections = Corrections(relative_response(flat, frames.cell), defects)
-    return SensorFrames(sensor.darks, corrections, transfer, tint, tuple(notes))
+    response = relative_response(flat, frames.cell) if files.flat_field else sensor.corrections.flat
+    corrections = Corrections(response, defects)
+    return replace(sensor, corrections=corrections, transfer=transfer, flat_colour=tint, notes=tuple(notes))
 
 
 def _runs(levels: Sequence[float]) -> list[tuple[int, int]]:

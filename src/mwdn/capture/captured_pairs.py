@@ -118,8 +118,7 @@ class CapturedPairs:
         """
         place = f"patterns/{name}"
         with self._disk():
-            if place in self._file:
-                del self._file[place]
+            self._delete(place)
             group = self._file.require_group(place)
             rows = FrameRows(group, "measurement", "frame_data", frames[0])
             scenes = add_rows(group, "scene", lights[0].shape, lights[0].dtype)
@@ -130,7 +129,36 @@ class CapturedPairs:
 
     def has_pattern(self, name: str) -> bool:
         """Whether frames of a pattern are there."""
-        return f"patterns/{name}" in self._file
+        return self.has_group(f"patterns/{name}")
+
+    def add_frames(self, place: str, frames: Sequence[Frame], attributes: Mapping[str, float]) -> None:
+        """Add a group of frames with attributes of its own, replacing an earlier one."""
+        with self._disk():
+            self._delete(place)
+            group = self._file.require_group(place)
+            group.attrs.update(attributes)
+            rows = FrameRows(group, "measurement", "frame_data", frames[0])
+            for frame in frames:
+                rows.append(frame)
+            self._growing.commit()
+
+    def frames(self, place: str) -> npt.NDArray[Any]:
+        """(K, H, W, C), the frames of a group."""
+        return np.asarray(self._file[place]["measurement"][:])
+
+    def has_group(self, place: str) -> bool:
+        """Whether a group is there."""
+        return place in self._file
+
+    def remove(self, place: str) -> None:
+        """Remove a group."""
+        with self._disk():
+            self._delete(place)
+            self._growing.commit()
+
+    def _delete(self, place: str) -> None:
+        if place in self._file:
+            del self._file[place]
 
     def add_references(self, frames: Mapping[str, Frame]) -> None:
         """Add frames of known displays, taken before the next pair."""

@@ -68,6 +68,36 @@ class DisplayTable:
 
 
 @dataclass(frozen=True)
+class PointTable:
+    """The [point] of a recipe: frames for `mwdn calibrate`, at the start of the session.
+
+    Args:
+        frames: of each kind at each exposure, see `mwdn.capture.point_frames`; 0 for none. An odd number counts as the
+            next even one.
+        size_cm: side of the point. It blurs the PSF by its size in the camera's view; a larger one has more light.
+        exposures: of the point, for high dynamic range.
+        ratio: of each exposure to the one before.
+        most_s: longest exposure in seconds of the shortest one, if the point stays faint.
+    """
+
+    frames: int = 0
+    size_cm: float = 0.1
+    exposures: int = 2
+    ratio: float = 8.0
+    most_s: float = 10.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.frames <= 1000 or not 1 <= self.exposures <= 4:
+            raise ParameterError(
+                f"`frames` ({self.frames}) of [point] must be from 0 to 1,000, and `exposures` ({self.exposures}) from "
+                "1 to 4."
+            )
+        for name, least in (("size_cm", 0.0), ("ratio", 1.0), ("most_s", 0.0)):
+            if not getattr(self, name) > least:
+                raise ParameterError(f"`{name}` ({getattr(self, name)}) of [point] must be above {least:g}.")
+
+
+@dataclass(frozen=True)
 class PicturesTable:
     """The [pictures] of a recipe.
 
@@ -138,6 +168,7 @@ class CaptureRecipe:
         display: see `DisplayTable`.
         pictures: see `PicturesTable`.
         session: see `SessionTable`.
+        point: see `PointTable`.
         rig: see `RigOptions`; for ``source = "rig"``.
         folder: of the recipe, to which paths in it are relative.
     """
@@ -146,6 +177,7 @@ class CaptureRecipe:
     display: DisplayTable = DisplayTable()
     pictures: PicturesTable = PicturesTable()
     session: SessionTable = SessionTable()
+    point: PointTable = PointTable()
     rig: RigOptions = RigOptions()
     folder: Path = Path()
 

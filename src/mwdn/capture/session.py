@@ -15,6 +15,7 @@ from mwdn.capture.display import Display
 from mwdn.capture.gamma import fit_gamma
 from mwdn.capture.patterns import grey, grey_levels, pattern
 from mwdn.capture.photograph_list import list_photographs, read_photograph
+from mwdn.capture.point_frames import Shooting, record_point
 from mwdn.capture.recipe import CaptureRecipe
 from mwdn.capture.screen import Picture, Place, Screen, place_picture, put
 from mwdn.capture.source import CameraSource, Frame, check_like
@@ -176,7 +177,7 @@ class Session:
     # What is known about camera and display
 
     def _calibrate(self, pairs: CapturedPairs) -> None:
-        """Capture grey steps and patterns, unless an earlier run has."""
+        """Capture the point source, grey steps and patterns, unless an earlier run has."""
         if not pairs.has_pattern("grey"):
             levels = grey_levels()
             frames = [self._frame_of(self._whole(level)) for level in levels]
@@ -186,6 +187,9 @@ class Session:
             size = self.recipe.pictures.size
             pairs.add_pattern("grey", frames, [displayed_light(grey(v, size), self._gamma) for v in levels])
         self._gamma = float(pairs.attributes["display_gamma"])
+        shooting = Shooting(self.camera, self._screen, self._frame_of, self._grab)
+        usual_s = self.recipe.camera.exposure_s or (math.nan if self._first is None else self._first.exposure_s)
+        record_point(pairs, self.recipe.point, shooting, usual_s=usual_s)
         for name in self.recipe.session.shown:
             if not pairs.has_pattern(name):
                 picture = pattern(name, self.recipe.pictures.size)
@@ -270,7 +274,8 @@ class Session:
             return
         every = self.recipe.session.references_every
         height, width = self.recipe.pictures.size
-        references = 2 * math.ceil(count / every) if every else 0
+        point = self.recipe.point
+        references = (2 * math.ceil(count / every) if every else 0) + (2 * point.exposures + 3) * point.frames
         needed = ROOM * (
             count * (self._first.array.nbytes + height * width * 6) + references * self._first.array.nbytes
         )

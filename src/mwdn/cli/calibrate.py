@@ -20,6 +20,7 @@ from mwdn.cli.camera import CameraOptions
 from mwdn.cli.inspect import at_psf_resolution
 from mwdn.cli.photographs import PhotographOptions
 from mwdn.cli.refine import check_pair_file, refine
+from mwdn.cli.session_frames import BenchFrames, bench_frames
 from mwdn.cli.terminal import counted, if_interrupted, note, say
 from mwdn.errors import ParameterError
 from mwdn.io.files import file_sha256, refuse_overwrite
@@ -51,7 +52,8 @@ def calibrate(  # noqa: PLR0913
     corrected and centred, and the PSF is written beside the camera file.
 
     Args:
-        files: pictures of a point source: frames of the camera, or folders of them.
+        files: pictures of a point source: frames of the camera, folders of them, or a session of `mwdn capture` whose
+            recipe has `frames` of [point] (.h5, or its folder).
         psf: the picture of a point source, instead of FILES.
         photographs: exposures, and frames of other kinds.
         frames: format of the frames.
@@ -79,29 +81,31 @@ def calibrate(  # noqa: PLR0913
     if pairs is not None:
         check_pair_file(pairs)
         refuse_overwrite(out, pairs)
-    kept = _kept(camera)
-    own = {
-        "ambient": ambient,
-        **_changes(psf_format),
-        **_changes(frames),
-        "bin": None if auto_bin else frames.bin,
-        "white_balance": white_balance,
-        "pitch_um": pitch_um,
-        "distance_mm": distance_mm,
-    }
-    if photographs.are_one_picture(pictures):
-        options = CameraOptions(pictures[0], frames, psf_format=psf_format, ambient=ambient)
-        dark = next(iter(expanded(photographs.dark_files)), None)
-        _of_one_picture(replace(options, dark=dark), kept, own, out)
+    with bench_frames(BenchFrames(pictures, photographs, frames)) as bench:
+        pictures, photographs, frames = bench.pictures, bench.photographs, bench.frames
+        kept = _kept(camera)
+        own = {
+            "ambient": ambient,
+            **_changes(psf_format),
+            **_changes(frames),
+            "bin": None if auto_bin else frames.bin,
+            "white_balance": white_balance,
+            "pitch_um": pitch_um,
+            "distance_mm": distance_mm,
+        }
+        if photographs.are_one_picture(pictures):
+            options = CameraOptions(pictures[0], frames, psf_format=psf_format, ambient=ambient)
+            dark = next(iter(expanded(photographs.dark_files)), None)
+            _of_one_picture(replace(options, dark=dark), kept, own, out)
+            refine(out, pairs)
+            return
+        _refuse_psf_format(psf_format)
+        known = Corrections.read(kept.get("flat_field"), kept.get("hot_pixels"))
+        for file in (*expanded(pictures), *expanded(photographs.dark_files), *expanded(photographs.flat)):
+            refuse_overwrite(out, file)
+        done = develop(photographs.of(pictures), frames, known)
+        _of_photographs(done, {**kept, **own}, out, has_dark=bool(photographs.dark_files))
         refine(out, pairs)
-        return
-    _refuse_psf_format(psf_format)
-    known = Corrections.read(kept.get("flat_field"), kept.get("hot_pixels"))
-    for file in (*expanded(pictures), *expanded(photographs.dark_files), *expanded(photographs.flat)):
-        refuse_overwrite(out, file)
-    done = develop(photographs.of(pictures), frames, known)
-    _of_photographs(done, {**kept, **own}, out, has_dark=bool(photographs.dark_files))
-    refine(out, pairs)
 
 
 def _kept(camera: Path | None) -> dict[str, Any]:

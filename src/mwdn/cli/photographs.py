@@ -27,6 +27,9 @@ class PhotographOptions:
         dark_exposures: exposure of each equal part of the dark frames, if they differ.
         flat: frames of even light, in pairs of the same exposure: flat field, gain and read noise.
         flat_dark: dark frames with the exposure of the flat frames; --dark unless given.
+        flat_through_mask: the flat frames were taken through the mask: no flat field, gain and read noise alone.
+        capture_exposure: exposure of the captures, one of --dark-exposures, whose dark frame they have; the longest
+            unless given.
         distances: distance of the point source in each equal part of the frames, in millimetres; the first is the
             camera's own.
         field: frames of points off the axis, each a file or a folder, with the exposure of the shortest frames.
@@ -39,6 +42,8 @@ class PhotographOptions:
     dark_exposures: Numbers = ()
     flat: Files = ()
     flat_dark: Files = ()
+    flat_through_mask: Annotated[bool, Parameter(negative=())] = False
+    capture_exposure: float | None = None
     distances: Numbers = ()
     field: Files = ()
     centre: bool | None = None
@@ -64,7 +69,9 @@ class PhotographOptions:
         return Photographs(
             tuple(map(tuple, grouped(pictures, groups))),
             exposures=self.exposures,
-            sensor=SensorFiles(dark, self.dark_exposures, flat, flat_dark),
+            sensor=SensorFiles(
+                dark, self.dark_exposures, flat, flat_dark, not self.flat_through_mask, self.capture_exposure
+            ),
             distances_mm=self.distances,
             field=tuple(tuple(expanded([path])) for path in self.field),
             centre=self.centre is not False,

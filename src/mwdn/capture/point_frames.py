@@ -1,0 +1,155 @@
+"""Frames for `mwdn calibrate` at the start of a session: a point on the display, darkness, and the white display.
+
+They are stored in the session's file, each group (K, H, W, C) of `GROUPS` with its exposure:
+
+| group | display | exposure |
+| --- | --- | --- |
+| ``point-1``, ``point-2`` ... | a white point on black | the shortest; each next one `PointTable.ratio` times as long |
+| ``dark-1``, ``dark-2`` ... | black | likewise |
+| ``dark`` | black | that of the session's pictures |
+| ``white``, ``half`` | white, and grey of half of its light | likewise |
+
+Differences of point and dark frames are the point's light alone: the room's light and the light of black pixels are in
+both. The frames of ``white`` and ``half`` are for the sensor's noise (photon transfer); they are no flat field, because
+the mask is in front of the sensor.
+"""
+
+import math
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from mwdn.calibration.exposure import BRIGHTEST, measure_exposure
+from mwdn.calibration.frame_format import FrameFormat
+from mwdn.capture.captured_pairs import CapturedPairs
+from mwdn.capture.patterns import grey, point
+from mwdn.capture.recipe import PointTable
+from mwdn.capture.screen import Picture, Screen
+from mwdn.capture.source import CameraSource, Frame
+from mwdn.errors import CameraError
+
+GROUPS = "calibration"
+"""HDF5 group of a session's file that holds them."""
+
+HALF = 186
+"""Level of a display with a gamma of 2.2 that has half of white's light: 255 * 0.5 ** (1 / 2.2)."""
+
+_CONTRAST = 0.1
+"""Least peak of the point above a dark display at the shortest exposure, over the full scale."""
+
+_SAME = 0.02
+"""Relative difference of exposures that cameras round."""
+
+_TRIES = 12
+
+
+class Shooting(NamedTuple):
+    """How a session shows and grabs.
+
+    Args:
+        camera: of the session; its exposure is changed, and set back in the end.
+        screen: pixels and centimetres of the display.
+        frame_of: shows a picture and returns the first frame of it.
+        grab: the first frame whose exposure began after a moment, in seconds since 1970.
+    """
+
+    camera: CameraSource
+    screen: Screen
+    frame_of: Callable[[Picture], Frame]
+    grab: Callable[[float], Frame]
+
+    def expose(self, exposure_s: float) -> Frame:
+        """Set an exposure, and return the first frame that has it."""
+        self.camera.configure(exposure_s=exposure_s)
+        return self.grab(time.time())
+
+
+def record_point(pairs: CapturedPairs, table: PointTable, shooting: Shooting, *, usual_s: float) -> None:
+    """Record the groups that the file does not have yet.
+
+    Args:
+        pairs: file of the session.
+        table: of the recipe.
+        shooting: how to show and grab.
+        usual_s: exposure of the session's pictures in seconds.
+
+    Raises:
+        CameraError: the exposure cannot be set, or the point is too faint beside the room's light.
+    """
+    screen, last = shooting.screen, f"dark-{table.exposures}"
+    if not table.frames or pairs.has_group(f"{GROUPS}/{last}"):
+        return
+    if not math.isfinite(usual_s):
+        raise CameraError(
+            f"{shooting.camera.name} does not say its exposure, which [point] must change. Set `frames` of [point] to "
+            "0, and photograph a point source: docs/calibrate.md."
+        )
+    size = screen.height_px, screen.width_px
+    for name, level in (("dark", 0), ("white", 255), ("half", HALF)):
+        first = shooting.frame_of(grey(level, size))
+        _add(pairs, name, _series(shooting, first, table.frames), usual_s)
+    try:
+        shooting.frame_of(point(screen, table.size_cm))
+        exposures = _exposures(shooting, table, usual_s)
+        for kind, picture in (("point", point(screen, table.size_cm)), ("dark", grey(0, size))):
+            shooting.frame_of(picture)
+            for number, exposure_s in enumerate(exposures, 1):
+                frames = _series(shooting, shooting.expose(exposure_s), table.frames)
+                if kind == "dark" and number == 1:
+                    _check_contrast(pairs, frames[0], table)
+                _add(pairs, f"{kind}-{number}", frames, exposure_s)
+    finally:
+        shooting.camera.configure(exposure_s=usual_s)
+
+
+def _series(shooting: Shooting, first: Frame, count: int) -> list[Frame]:
+    """The first frame and the next ones, an even number: photon transfer takes pairs."""
+    return [first, *(shooting.camera.read() for _ in range(count + count % 2 - 1))]
+
+
+def _add(pairs: CapturedPairs, name: str, frames: list[Frame], exposure_s: float) -> None:
+    """Store frames that were to have this exposure.
+
+    Raises:
+        CameraError: they have another one: the camera was opened again meanwhile, or does not take this exposure.
+    """
+    for frame in frames:
+        if not abs(frame.exposure_s / exposure_s - 1) <= _SAME:
+            raise CameraError(
+                f"A frame of {name} has an exposure of {frame.exposure_s:.4g} s instead of {exposure_s:.4g} s. The "
+                "same command tries again; for shorter exposures set `ratio` or `exposures` of [point] lower."
+            )
+    pairs.add_frames(f"{GROUPS}/{name}", frames, {"exposure_s": exposure_s})
+
+
+def _exposures(shooting: Shooting, table: PointTable, exposure_s: float) -> list[float]:
+    """The exposure at which the point's peak is well below saturation, and the longer ones."""
+    for _ in range(_TRIES):
+        frame = shooting.expose(exposure_s)
+        exposure = measure_exposure(frame.array, FrameFormat(bit_depth=frame.bit_depth))
+        longer = min(exposure_s * exposure.factor, table.most_s)
+        if exposure.is_good or longer == exposure_s:
+            break
+        exposure_s = longer
+    return [exposure_s * table.ratio**number for number in range(table.exposures)]
+
+
+def _check_contrast(pairs: CapturedPairs, dark: Frame, table: PointTable) -> None:
+    """Refuse a point that is faint beside what a dark display adds.
+
+    Raises:
+        CameraError: it is.
+    """
+    frames = pairs.frames(f"{GROUPS}/point-1")
+    light = np.mean(frames, axis=0, dtype=np.float64).max(-1) - dark.array.max(-1)
+    part = float(np.quantile(light, 1 - BRIGHTEST)) / (2**dark.bit_depth - 1)
+    if part < _CONTRAST:
+        pairs.remove(GROUPS)
+        raise CameraError(
+            f"The point on the display adds only {max(part, 0):.1%} of the full scale in {dark.exposure_s:.3g} s; the "
+            "rest is the room's light and that of black pixels. Darken the room, raise `size_cm` "
+            f"({table.size_cm:g}) of [point], or set its `frames` to 0 and photograph a lamp behind a pinhole: "
+            "docs/calibrate.md."
+        )

@@ -1,0 +1,99 @@
+"""The point source in a session: recorded at its start, and calibrated from its file."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from mwdn import Calibration
+from mwdn.calibration.camera_file import read_camera
+from mwdn.capture.display import RigDisplay
+from mwdn.capture.patterns import point
+from mwdn.capture.recipe import read_capture_recipe
+from mwdn.capture.session import Session
+from mwdn.capture.set_up import open_camera
+from mwdn.errors import CameraError
+from mwdn.optics.displacement import displacement
+
+TABLES = {
+    "camera": {"source": "rig"},
+    "display": {"kind": "rig", "width_px": 120, "height_px": 90, "width_cm": 24.0, "height_cm": 18.0},
+    "pictures": {"folder": "photos", "size": [84, 84], "count": 1},
+    "session": {"settle_s": 0.0, "references_every": 0, "patterns": ["none"]},
+    "point": {"frames": 5, "size_cm": 0.2},
+    "rig": {"height": 48, "width": 64, "fill": 0.9, "room_light": 0.0, "display_black": 0.0, "latency": 1},
+}
+
+
+@pytest.fixture
+def recipe(tmp_path):
+    (tmp_path / "photos").mkdir()
+    cv2.imwrite(str(tmp_path / "photos" / "grey.png"), np.full((84, 84, 3), 128, np.uint8))
+    return replace(read_capture_recipe("capture-rig", **TABLES), folder=tmp_path)
+
+
+def session(recipe, out):
+    camera = open_camera(recipe)
+    camera.open()
+    return camera, Session(recipe, camera, RigDisplay(camera), out, wait=lambda _: None)
+
+
+def exact(recipe):
+    """The light of the point alone: a frame without noise, less one of a dark display, (1, 3, H, W)."""
+    options = replace(recipe.rig, full_well=1e9, read_noise=0.0, bit_depth=16, latency=0, drop=0.0)
+    rig = open_camera(replace(recipe, rig=options))
+    frames = []
+    with rig:
+        rig.configure(exposure_s=1.0)
+        for picture in (point(rig.screen, recipe.point.size_cm), np.zeros((90, 120, 3), np.uint8)):
+            rig.show(picture)
+            frames.append(torch.from_numpy(rig.read().array.astype(np.float32)))
+    return (frames[0] - frames[1]).movedim(-1, 0)[None]
+
+
+def test_a_session_becomes_a_camera_file(tmp_path, run, recipe):
+    rig, made = session(recipe, tmp_path / "captured.h5")
+    assert made.run() == 1
+    assert rig.exposure_s == pytest.approx(0.01)  # set back
+    code, out, err = run("calibrate", tmp_path / "captured.h5", "--no-centre", "-o", tmp_path / "camera.toml")
+    assert code == 0, err
+    assert "12 frames averaged at 2 exposures" in out
+    calibration = Calibration.load(tmp_path / "camera.toml")
+    assert displacement(calibration.psf, exact(recipe)).correlation > 0.99
+    assert calibration.sensor.full_well == pytest.approx(15_000, rel=0.1)
+    assert float(calibration.dark.mean()) == pytest.approx(0.01, rel=0.05)  # the black level, at the usual exposure
+    content = read_camera(tmp_path / "camera.toml")
+    assert content["bit_depth"] == 12
+    assert "flat_field" not in content  # the mask was in front of the sensor
+    (tmp_path / "session").mkdir()
+    (tmp_path / "captured.h5").rename(tmp_path / "session" / "captured.h5")
+    code, _, err = run("calibrate", tmp_path / "session", "--exposures", 1, "-o", tmp_path / "camera.toml")
+    assert code == 2
+    assert "Leave those options out" in err
+
+
+def test_it_is_recorded_once_and_not_at_all_unless_asked_for(tmp_path, run, recipe):
+    out = tmp_path / "captured.h5"
+    plain = replace(recipe, point=replace(recipe.point, frames=0))
+    assert session(plain, out)[1].run() == 1
+    code, _, err = run("calibrate", out)
+    assert code == 2
+    assert "has no frames of a point source" in err
+    rig, made = session(recipe, out)
+    made.run()
+    before = rig._number
+    session(recipe, out)[1].run()
+    again, made = session(recipe, out)
+    made.run()
+    assert again._number < 10 < before
+
+
+@pytest.mark.parametrize(
+    ("change", "said"), [({"room_light": 0.02}, "adds only"), ({"display_black": 0.01}, "adds only")]
+)
+def test_a_point_that_drowns_in_other_light_is_refused(tmp_path, recipe, change, said):
+    _, made = session(replace(recipe, rig=replace(recipe.rig, **change)), tmp_path / "captured.h5")
+    with pytest.raises(CameraError, match=said):
+        made.run()
