@@ -89,5 +89,7 @@ def test_no_violation(page, axe, show):
         assert result["passes"]
         page.screenshot(OUT / f"{name}-{look}.png")
         for violation in result["violations"]:
-            found.setdefault(violation["id"], []).append((look, [node["html"][:120] + node["failureSummary"] for node in violation["nodes"]]))
+            found.setdefault(violation["id"], []).append(
+                (look, [node["html"][:120] + node["failureSummary"] for node in violation["nodes"]])
+            )
     assert not found

@@ -62,7 +62,9 @@ def test_live_picture_is_started_used_and_stopped(serve, tmp_path):
         page.run("document.getElementById('live-snapshot').click()")
         page.wait("document.querySelector('#snapshots img')?.naturalWidth > 0")
         page.run("document.getElementById('trust').checked = false")
-        page.run("[...document.querySelectorAll('#snapshots button')].find(b => b.textContent === 'Work on it').click()")
+        page.run(
+            "[...document.querySelectorAll('#snapshots button')].find(b => b.textContent === 'Work on it').click()"
+        )
         page.wait("document.getElementById('state').textContent.startsWith('admm: 48')")  # and live has stopped
         assert page.run("document.getElementById('live-start').textContent") == "Start"
         assert page.run("document.getElementById('camera').value") == "live"
