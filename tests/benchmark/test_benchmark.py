@@ -15,6 +15,8 @@ import torch
 
 from cameras import contour_psf
 from mwdn.benchmark import Watch, read_benchmark, run
+from mwdn.benchmark.sets import Dataset
+from mwdn.benchmark.training import schedule_on
 from mwdn.calibration import Calibration
 from mwdn.calibration.camera_file import write_camera
 from mwdn.cli.app import main
@@ -267,7 +269,6 @@ def test_another_method_and_another_set_are_a_line_each(done):
         ("noise = [2]", "noise = []", ParameterError, "must be a list of numbers"),
         ("noise = [2]", "nois = [2]", UnknownNameError, "Did you mean 'noise'?"),
         ('data = "caustic"', 'data = "castic"', UnknownNameError, "Did you mean 'caustic'?"),
-        ("steps = 6", "epochs = 6", ParameterError, "`epochs`.*`steps`"),
         ("test = 3", 'test = 3, pairs = "a.h5"', ParameterError, "`split`.*`trained_on`"),
     ],
 )
@@ -275,6 +276,23 @@ def test_mistakes_of_a_recipe(tmp_path, before, after, kind, message):
     assert before in RECIPE
     (tmp_path / "r.toml").write_text(RECIPE.replace(before, after, 1), encoding="utf-8")
     with pytest.raises(kind, match=message):
+        read_benchmark(tmp_path / "r.toml")
+
+
+def test_epochs_are_steps_of_each_data_set(tmp_path):
+    """Five pairs are three steps of two; a source without end has no epochs."""
+    plateau = "epochs = 4, lr_schedule = 'plateau', clip = 0.0"
+    tail = "\n[plateau]\nlater = 1e-5\n[later_loss]\nmse = 0.5\n"
+    (tmp_path / "r.toml").write_text(RECIPE.replace("steps = 6", plateau) + tail, encoding="utf-8")
+    benchmark = read_benchmark(tmp_path / "r.toml")
+    assert (benchmark.plateau.later, benchmark.later_loss) == (1e-5, {"mse": 0.5})
+    dataset = object.__new__(Dataset)
+    object.__setattr__(dataset, "training", (range(5), None))
+    schedule = schedule_on(benchmark.methods[-1], benchmark, dataset)
+    assert (schedule.steps, schedule.validate_every, schedule.batch) == (12, 3, 2)
+    endless = RECIPE.replace("steps = 6", plateau).replace("train = 4", "train = 0")
+    (tmp_path / "r.toml").write_text(endless, encoding="utf-8")
+    with pytest.raises(ParameterError, match=r"`epochs`.*`caustic`.*`steps`"):
         read_benchmark(tmp_path / "r.toml")
 
 

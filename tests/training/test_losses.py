@@ -34,7 +34,8 @@ def test_loss_has_gradients_for_the_reconstruction_only(noisy_pair, lpips_files)
 
 
 def test_grey_pictures_have_all_losses(noisy_pair, lpips_files):
-    total, _ = Loss(dict.fromkeys(NAMES, 1.0), **lpips_files)(noisy_pair[0][:, :1], noisy_pair[1][:, :1])
+    names = set(NAMES) - {"vgg_mse"}  # in test_vgg.py
+    total, _ = Loss(dict.fromkeys(sorted(names), 1.0), **lpips_files)(noisy_pair[0][:, :1], noisy_pair[1][:, :1])
     assert total.isfinite()
 
 

@@ -5,6 +5,7 @@ import re
 
 import pytest
 
+from mwdn.benchmark.published import PUBLISHED
 from mwdn.data.cameras import Cameras
 from mwdn.data.mismatch import REAL, Mismatch
 from mwdn.data.simulated import Placement
@@ -13,6 +14,7 @@ from mwdn.io.toml import packaged_recipes
 from mwdn.networks import build
 from mwdn.optics import Sensor
 from mwdn.training.recipe import Recipe, Schedule, read_recipe
+from mwdn.training.schedule import make_lr_schedule
 
 DENOISER = '[network]\nname = "drunet"\n'
 NETWORK = '[network]\nname = "wiener-bank"\nwidth = 4\n'
@@ -200,10 +202,49 @@ def test_recipe_of_the_paper():
     assert recipe.loss == {"mse": 1, "feature_mse": 1}
     assert recipe.later_loss == {"mse": 1, "feature_mse": 0.05}
     assert recipe.pairs.split == "paper"
+    assert schedule.best_by == "loss"
     # A scene of 137 x 137, padded by 94 at the top and 89 on the left to 320 x 320.
     extent, room = 137 / 320, 1 - 137 / 320
     assert recipe.placement.extent == pytest.approx((extent, extent), abs=1e-3)
     assert recipe.placement.offset * room * 160 == pytest.approx(94 - (320 - 137) / 2, abs=0.3)
+
+
+@pytest.mark.parametrize("name", ["wiener", "unet", "wiener-unet", "mwdn-cpsf"])
+def test_recipe_of_the_paper_for_the_other_networks(name):
+    changed = read_recipe("paper", network={"name": name})
+    assert changed.network == {"name": name}
+    assert changed.schedule == read_recipe("paper").schedule
+
+
+@pytest.mark.parametrize("name", ["le-admm-u", "mmcn", "updn"])
+def test_recipes_of_compared_networks_have_their_published_settings(name):
+    schedule, published = read_recipe(f"paper-{name}").schedule, PUBLISHED.get(name)
+    if published:
+        assert schedule.optimiser == published.optimiser
+        assert schedule.weight_decay == published.weight_decay
+        assert published.rate in (None, schedule.learning_rate)
+        assert published.epochs in (None, schedule.epochs)
+        assert published.batch in (None, schedule.batch)
+        assert published.lr_schedule in (None, schedule.lr_schedule)
+
+
+def test_recipe_of_the_authors_code():
+    """Its rates are floats: 1e-4 x 0.1 x 0.1 is not yet 1e-6, so three of the four are the first phase."""
+    recipe = read_recipe("paper-code")
+    lr, phases = make_lr_schedule(recipe), []
+    while not lr.finished:
+        phases.append(lr.loss_weights["feature_mse"])
+        for _ in range(7):
+            lr = lr.after(1.0)
+    assert phases == [1.0, 1.0, 1.0, 0.05]
+    assert recipe.network["authors_form"]
+    assert recipe.schedule.filter_rate == 1
+
+
+def test_another_network_drops_the_options_of_the_first(read):
+    assert read(NETWORK, network={"name": "mwdn"}).network == {"name": "mwdn"}
+    assert read(NETWORK, network={"name": "mwdn", "width": 8}).network == {"name": "mwdn", "width": 8}
+    assert read(NETWORK, network={"name": "wiener-bank", "fold": 1}).network["width"] == 4
 
 
 def test_no_such_file(tmp_path):

@@ -12,8 +12,16 @@ from torch import nn
 
 from mwdn.networks import build
 from mwdn.optics import Camera
-from mwdn.training.recipe import Plateau, Recipe, Schedule
-from mwdn.training.schedule import Cosine, ReduceLROnPlateau, learning_rate, make_lr_schedule, make_optimiser, set_rate
+from mwdn.training.recipe import Recipe, Schedule
+from mwdn.training.schedule import (
+    FixedSchedule,
+    ReduceLROnPlateau,
+    learning_rate,
+    make_lr_schedule,
+    make_optimiser,
+    set_rate,
+)
+from mwdn.training.tables import Plateau
 
 FIRST, LATER = {"mse": 1.0, "feature_mse": 1.0}, {"mse": 1.0, "feature_mse": 0.05}
 PAPER = Recipe({"name": "mwdn"}, Schedule(lr_schedule="plateau", learning_rate=1e-4), FIRST, later_loss=LATER)
@@ -36,7 +44,7 @@ def test_learning_rate_rises_then_falls_as_half_a_cosine():
 
 def test_cosine_is_independent_of_the_validation():
     lr = make_lr_schedule(replace(PAPER, schedule=Schedule(), later_loss={}))
-    assert isinstance(lr, Cosine)
+    assert isinstance(lr, FixedSchedule)
     assert lr.after(1.0) == lr
     assert (lr.finished, lr.loss_weights, lr.state()) == (False, FIRST, {})
     assert lr.rate(7) == learning_rate(7, Schedule())
@@ -107,6 +115,11 @@ def test_state_goes_through_json_to_the_last_bit():
         lr = lr.after(next(stream))
     assert lr.bad or lr.current < 1e-4
     assert make_lr_schedule(PAPER, **json.loads(json.dumps(lr.state()))) == lr
+
+
+def test_a_constant_rate():
+    schedule = Schedule(steps=100, warmup=4, lr_schedule="constant", learning_rate=0.5)
+    assert [learning_rate(step, schedule) for step in (0, 3, 4, 50, 99)] == [0.125, 0.5, 0.5, 0.5, 0.5]
 
 
 # --- Optimiser ----------------------------------------------------------------------------------------

@@ -19,8 +19,9 @@ from mwdn.optics.noise import noise_level
 from mwdn.solvers.alignment import Pose
 from mwdn.training.experiment import prepare
 from mwdn.training.losses import Loss
-from mwdn.training.recipe import Recipe, Schedule, Sheet
+from mwdn.training.recipe import Recipe, Schedule
 from mwdn.training.selfsupervised import selfsupervised_loss, unexplained
+from mwdn.training.tables import Sheet
 from mwdn.weights import bundled
 
 RECIPE = Recipe(

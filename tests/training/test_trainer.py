@@ -31,9 +31,10 @@ from mwdn.errors import CheckpointError, DivergenceError, ParameterError, ShapeE
 from mwdn.inference.methods import find_method
 from mwdn.optics.sensor import Sensor
 from mwdn.training.experiment import prepare, simulate
-from mwdn.training.recipe import Plateau, Recipe, Schedule, Sheet
+from mwdn.training.recipe import Recipe, Schedule
 from mwdn.training.run_folder import RunFolder
 from mwdn.training.schedule import learning_rate
+from mwdn.training.tables import Plateau, Sheet
 from mwdn.training.tasks import SupervisedTask
 from mwdn.training.trainer import Trainer
 from mwdn.training.training_state import read_state
@@ -198,6 +199,17 @@ def test_network_with_an_unused_parameter_is_resumed(trainer, tmp_path):
     assert trainer(recipe, "halves").step == 1
     trainer(recipe, "halves").run()
     assert same(tmp_path / "whole" / "state.safetensors", tmp_path / "halves" / "state.safetensors")
+
+
+@pytest.mark.parametrize(("best_by", "step"), [("psnr", 2), ("loss", 1)])
+def test_the_best_weights_are_chosen_by_psnr_or_loss(trainer, tmp_path, best_by, step):
+    """The second validation has the higher PSNR, the first the lower loss."""
+    run = trainer(few(best_by=best_by))
+    for psnr, loss in ((10.0, 0.1), (20.0, 0.2)):
+        run.step += 1
+        run.save(Validation(psnr, loss))
+    assert read_metadata(tmp_path / "run" / "best.safetensors")["step"] == step
+    assert trainer(few(best_by=best_by)).best == run.best
 
 
 @pytest.mark.parametrize("recipe", [RECIPE, few(bfloat16=False)], ids=["bfloat16", "float32"])

@@ -17,7 +17,8 @@ from mwdn.networks import NETWORKS
 from mwdn.optics import Deviation
 from mwdn.solvers import SOLVERS
 from mwdn.training.losses import checked_weights
-from mwdn.training.recipe import Schedule
+from mwdn.training.recipe import Recipe, Schedule
+from mwdn.training.tables import Plateau
 
 AXES = {"noise": 1.0, **{part.name: 0.0 for part in fields(Deviation)}}
 """What a robustness sweep varies, and its value in the camera of the training; noise is a factor."""
@@ -65,6 +66,8 @@ class Benchmark:
         data: data sets by name.
         schedule: training schedule of every network; see `published`.
         loss: weights of the loss's parts, for every network.
+        plateau: of the schedule "plateau", for every network.
+        later_loss: weights of the second phase of that schedule.
         published: take a network's optimiser, learning rate and weight decay from its publication if that gives them.
         rate_factor: factor on the published learning rates; less than 1 slows sources that train much longer.
         ablation: labels of the paper's ablation, in its order.
@@ -82,6 +85,8 @@ class Benchmark:
     data: dict[str, DatasetRecipe] = field(default_factory=dict)
     schedule: Schedule = Schedule()
     loss: dict[str, float] = field(default_factory=lambda: {"mse": 1.0})
+    plateau: Plateau = Plateau()
+    later_loss: dict[str, float] = field(default_factory=dict)
     published: bool = True
     rate_factor: float = 1.0
     ablation: tuple[str, ...] = ()
@@ -122,6 +127,8 @@ def read_benchmark(path: str | Path) -> Benchmark:
         },
         "schedule": to_dataclass(Schedule, "schedule", content.pop("schedule", {})),
         "loss": checked_weights(content.pop("loss", {"mse": 1.0})),
+        "plateau": to_dataclass(Plateau, "plateau", content.pop("plateau", {})),
+        "later_loss": checked_weights(content.pop("later_loss")) if "later_loss" in content else {},
         "robustness": _robustness(content.pop("robustness", {})),
     }
     for name in ("alexnet", "heads"):
@@ -249,8 +256,14 @@ def _check(benchmark: Benchmark) -> None:
     for label in (*benchmark.ablation, *([benchmark.compared] if benchmark.compared else [])):
         if label not in labels:
             raise UnknownNameError("method of this recipe", label, labels)
-    if benchmark.schedule.epochs:
-        raise ParameterError("`epochs` of [schedule] depends on the data set. Use `steps`, the same for all data sets.")
+    # Raises the errors of the schedule, the plateau and the losses.
+    Recipe({}, benchmark.schedule, benchmark.loss, benchmark.plateau, benchmark.later_loss)
+    endless = [name for name, recipe in benchmark.data.items() if not recipe.pairs and not recipe.train]
+    if benchmark.schedule.epochs and endless:
+        raise ParameterError(
+            f"`epochs` of [schedule] needs a number of training pairs, but those of `{endless[0]}` are without end "
+            "(`train` is 0). Give `train` or `steps`."
+        )
     if not benchmark.rate_factor > 0:
         raise ParameterError(f"`rate_factor` ({benchmark.rate_factor}) must be positive.")
     for name, recipe in benchmark.data.items():

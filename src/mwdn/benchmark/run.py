@@ -18,7 +18,7 @@ from mwdn.benchmark.robustness import Sweep, pairs_at, sweep
 from mwdn.benchmark.scoring import MethodResult, identity, make_reconstructor, score
 from mwdn.benchmark.sections import sections
 from mwdn.benchmark.sets import Dataset, open_dataset
-from mwdn.benchmark.training import train
+from mwdn.benchmark.training import schedule_on, train
 from mwdn.data.photographs import Photographs
 from mwdn.evaluation import Perceptual
 from mwdn.evaluation.alexnet import SMALLEST, load_alexnet
@@ -155,7 +155,7 @@ def _train_all(
     }
     for part in claim_parts(out, list(runs)):
         dataset, method = runs[part]
-        watched = watch.training(dataset.name, method.label, benchmark.schedule)
+        watched = watch.training(dataset.name, method.label, schedule_on(method, benchmark, dataset))
         train(method, dataset, benchmark, out / part, device=device, show=watch.report, samples=watched)
 
 

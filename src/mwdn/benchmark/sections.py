@@ -34,6 +34,7 @@ def sections(results: Results) -> list[Section]:
 def _glance(results: Results) -> list[Block]:
     """Mean PSNR of every method on every data set."""
     benchmark, schedule = results.benchmark, results.benchmark.schedule
+    length = f"at most {schedule.epochs:,} epochs" if schedule.epochs else f"{schedule.steps:,} steps"
     learned = sum(method.learned for method in benchmark.methods)
     table = _method_table(list(results.datasets), "PSNR / dB, mean over the test pictures")
     means = [
@@ -46,7 +47,7 @@ def _glance(results: Results) -> list[Block]:
             escape(label), *(_bold(f"{mean[label]:.2f}", mean[label] == max(mean.values())) for mean in means)
         )
     return [
-        f"{learned} networks, each trained for {schedule.steps:,} steps of {schedule.batch} on the same pairs, and "
+        f"{learned} networks, each trained for {length} of {schedule.batch} on the same pairs, and "
         f"{len(benchmark.methods) - learned} methods without training, scored under one protocol on "
         f"{len(results.datasets)} data sets. Scores on different data sets are not comparable.",
         table,
@@ -207,7 +208,8 @@ def _provenance(results: Results) -> list[Block]:
     for key, value in environment(results.device).items():
         facts.add_row(escape(key), escape(value))
     return [
-        f"One schedule for all networks: {json.dumps(asdict(benchmark.schedule))}. Loss: {json.dumps(benchmark.loss)}. "
+        f"One schedule for all networks: {json.dumps(asdict(benchmark.schedule))}. Loss: {json.dumps(benchmark.loss)}"
+        f"{_second_phase(benchmark)}. "
         "Weights are those of the best validation. Confidence intervals: percentile bootstrap over the pictures.",
         table,
         facts,
@@ -216,6 +218,12 @@ def _provenance(results: Results) -> list[Block]:
         "The recipe:",
         Code(Path(benchmark.path).read_text(encoding="utf-8").rstrip() if benchmark.path else ""),
     ]
+
+
+def _second_phase(benchmark: Benchmark) -> str:
+    if not benchmark.later_loss:
+        return ""
+    return f", from the learning rate {benchmark.plateau.later:g} down {json.dumps(benchmark.later_loss)}"
 
 
 def _training_cells(method: Method, benchmark: Benchmark) -> list[str]:

@@ -128,7 +128,8 @@ PRESETS: dict[str, DatasetRecipe] = {
     "diffusercam-real": replace(_DIFFUSERCAM, kind="diffusercam", trained_on="diffusercam-sim", test=0),
     # The public sets in their own layouts, and their own splits.
     "mwdn": replace(_PAPER, kind="mwdn", split="paper", test=0),
-    "diffusercam": replace(_DIFFUSERCAM, kind="diffusercam", split="diffusercam", test=0),
+    "diffusercam": replace(_DIFFUSERCAM, kind="diffusercam", split="diffusercam", validation=2500, test=0),
+    "diffusercam-paper": replace(_DIFFUSERCAM, kind="diffusercam", split="paper", validation=2500, test=0),
     "phlatcam": replace(_PHLATCAM, kind="phlatcam", split="phlatcam", test=0),
 }
 """What is known of the data sets of the paper; a recipe names the files, and overrides what it likes."""

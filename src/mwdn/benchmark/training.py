@@ -1,18 +1,20 @@
 """Training of one network of a benchmark on one data set."""
 
 import json
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from inspect import signature
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 
 from mwdn.benchmark.published import PUBLISHED
 from mwdn.benchmark.recipe import Benchmark, Method
 from mwdn.benchmark.sets import Dataset
+from mwdn.data.recorded import RecordedPairs
 from mwdn.errors import ParameterError
 from mwdn.io.files import write_text
 from mwdn.io.reading import LOG_BYTES, parse_json, read_json, read_text, unexpected_content
@@ -58,6 +60,15 @@ def settings(method: Method, benchmark: Benchmark) -> Settings:
     return Settings(replace(benchmark.schedule, **changes), f"{published.source}{factor}")
 
 
+def schedule_on(method: Method, benchmark: Benchmark, dataset: Dataset) -> Schedule:
+    """The schedule of a network on a data set, its epochs as steps with a validation after each."""
+    schedule = settings(method, benchmark).schedule
+    if not (schedule.epochs and dataset.training):
+        return schedule
+    steps = math.ceil(len(cast(RecordedPairs, dataset.training[0])) / schedule.batch)
+    return replace(schedule, steps=schedule.epochs * steps, validate_every=steps)
+
+
 def options(method: Method, size: Size) -> dict[str, Any]:
     """Options to build a network with; includes the picture size for a network that learns a PSF of this size."""
     if "size" in signature(NETWORKS[method.name]).parameters:
@@ -95,8 +106,9 @@ def train(
     if dataset.training is None:
         raise ParameterError(f"Nothing is trained on `{dataset.name}`: its networks are those of `trained_on`.")
     training, validation = dataset.training
-    schedule = replace(settings(method, benchmark).schedule, validation=len(validation))
-    recipe = Recipe({"name": method.name, **options(method, dataset.calibration.size)}, schedule, benchmark.loss)
+    schedule = replace(schedule_on(method, benchmark, dataset), validation=len(validation))
+    network = {"name": method.name, **options(method, dataset.calibration.size)}
+    recipe = Recipe(network, schedule, benchmark.loss, benchmark.plateau, benchmark.later_loss)
     stored = stored_psf(recipe, dataset.calibration)
     stored = None if stored is None else stored.to(device)
     psf = dataset.calibration.psf.to(device) if stored is None else stored

@@ -18,8 +18,9 @@ from mwdn.io.files import refuse_overwrite
 from mwdn.io.listing import unused_photographs
 from mwdn.runtime import distributed
 from mwdn.training import experiment
-from mwdn.training.recipe import Sheet, read_recipe
+from mwdn.training.recipe import read_recipe
 from mwdn.training.report import Report
+from mwdn.training.tables import Sheet
 from mwdn.training.tensorboard import TensorBoard
 from mwdn.training.trainer import Trainer
 
@@ -105,8 +106,9 @@ def _train(trainer: Trainer, progress: Progressing, board: TensorBoard | None) -
         speed = f"{report.pictures_per_s:.1f} pictures/s"
         progress.update(report.step, f"step {report.step:,}, {speed}, loss {report.loss:.4f}")
         if report.validation is not None:
-            psnr = report.validation.psnr
-            progress.print(f"step {report.step}: validation {psnr:.2f} dB, best {trainer.best:.2f} dB")
+            best = f"loss {-trainer.best:.4f}" if trainer.schedule.best_by == "loss" else f"{trainer.best:.2f} dB"
+            validation = f"{report.validation.psnr:.2f} dB, loss {report.validation.loss:.4f}"
+            progress.print(f"step {report.step}: validation {validation}, best {best}")
         if board is not None:
             board(report)
 

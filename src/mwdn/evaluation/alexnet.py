@@ -101,19 +101,27 @@ class Heads(nn.Module):
 
 
 @dataclass(frozen=True)
-class _Public:
-    """A public weights file."""
+class PublicWeights:
+    """A public weights file.
+
+    Args:
+        what: the network, for messages.
+        file: its name.
+        variable: environment variable that names another file.
+        address: to download it from.
+        sha256: the first digits of the file's SHA-256.
+        mebibytes: its size.
+    """
 
     what: str
     file: str
     variable: str
     address: str
     sha256: str
-    """The first digits of the file's SHA-256."""
     mebibytes: int
 
 
-_ALEXNET = _Public(
+_ALEXNET = PublicWeights(
     "AlexNet",
     "alexnet-owt-7be5be79.pth",
     "MWDN_ALEXNET",
@@ -122,7 +130,7 @@ _ALEXNET = _Public(
     233,
 )
 # The publisher gives no checksum; this is the one of the file that torchmetrics ships.
-_HEADS = _Public(
+_HEADS = PublicWeights(
     "the heads of LPIPS",
     "lin_v0.1_alex.pth",
     "MWDN_LPIPS",
@@ -149,7 +157,7 @@ def load_alexnet(path: str | Path | None = None, *, download: bool = True) -> Al
     Raises:
         CheckpointError: the file is missing and cannot or may not be downloaded, or holds other weights.
     """
-    return _load_weights(AlexNet(), _locate(_ALEXNET, path, download=download), "features.")
+    return load_weights(AlexNet(), locate(_ALEXNET, path, download=download), "features.")
 
 
 def load_heads(path: str | Path | None = None, *, alexnet: str | Path | None = None, download: bool = True) -> Heads:
@@ -165,7 +173,7 @@ def load_heads(path: str | Path | None = None, *, alexnet: str | Path | None = N
     Raises:
         CheckpointError: the file is missing and cannot or may not be downloaded, or holds other weights.
     """
-    return _load_weights(Heads(), _locate(_HEADS, path or _beside(alexnet), download=download), "lin")
+    return load_weights(Heads(), locate(_HEADS, path or _beside(alexnet), download=download), "lin")
 
 
 def download_mebibytes(alexnet: str | Path = "", heads: str | Path = "") -> int:
@@ -182,7 +190,12 @@ def _beside(alexnet: str | Path | None) -> Path | None:
     return beside if beside and beside.is_file() and _HEADS.variable not in os.environ else None
 
 
-def _locate(public: _Public, path: str | Path | None, *, download: bool) -> Path:
+def locate(public: PublicWeights, path: str | Path | None, *, download: bool) -> Path:
+    """File of public weights: the one given, that of the environment variable, or the one in `cache_folder`.
+
+    Raises:
+        CheckpointError: it is missing and cannot or may not be downloaded.
+    """
     chosen = path or os.environ.get(public.variable)
     if chosen:
         if not Path(chosen).is_file():
@@ -202,7 +215,7 @@ def _locate(public: _Public, path: str | Path | None, *, download: bool) -> Path
     return cached
 
 
-def _download(public: _Public, path: Path) -> None:
+def _download(public: PublicWeights, path: Path) -> None:
     # A warning, which reaches the error stream even without logging set up: 233 MiB take a while.
     logging.getLogger(__name__).warning(
         "Downloading %s (%d MiB, once) from %s", public.what, public.mebibytes, public.address
@@ -233,7 +246,8 @@ def _fetch(address: str, path: Path) -> str:
     return digest.hexdigest()
 
 
-def _load_weights(network: _Network, path: Path, prefix: str) -> _Network:
+def load_weights(network: _Network, path: Path, prefix: str | tuple[str, ...]) -> _Network:
+    """Fill a network with the tensors of a file whose keys start with one of these; frozen, in evaluation mode."""
     content = read_plain(path)
     try:
         network.load_state_dict({key: value for key, value in content.items() if key.startswith(prefix)})

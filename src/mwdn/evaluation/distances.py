@@ -19,6 +19,7 @@ from torch import Tensor
 
 from mwdn.errors import ParameterError, ShapeError, check_batch
 from mwdn.evaluation.alexnet import AlexNet, Heads, load_alexnet, load_heads
+from mwdn.evaluation.vgg import Vgg16
 from mwdn.io.formats import as_frame
 from mwdn.types import ArrayPicture, Image
 
@@ -207,6 +208,31 @@ def feature_mse(image: Image, reference: Image, alexnet: AlexNet) -> Tensor:
     pairs = zip(alexnet(image, 4), alexnet(reference, 4), strict=True)
     relu = [(a - b).square().mean((1, 2, 3)) for a, b in pairs]
     return relu[1] + relu[3]
+
+
+@comparing
+def vgg_mse(image: Image, reference: Image, vgg: Vgg16) -> Tensor:
+    """Mean squared error of VGG-16's relu2_2 features plus that of relu4_3, of each sample.
+
+    The alternative to `feature_mse` in the MWDN authors' code. Pictures are not normalised as for ImageNet.
+
+    Args:
+        image: (B, 1 or 3, H, W), nominally in [0, 1], at least 8 x 8 pixels; grey is repeated.
+        reference: of the same shape.
+        vgg: from `mwdn.evaluation.vgg.load_vgg16`, on the device of the pictures.
+
+    Returns:
+        (B,), 0 for identical pictures.
+
+    Raises:
+        ShapeError: the shapes differ or do not suit VGG-16.
+
+    References:
+        Eq. (3) of the MWDN paper, which names VGG-16 besides AlexNet and uses AlexNet.
+    """
+    pairs = zip(vgg(image), vgg(reference), strict=True)
+    middle, late = ((a - b).square().mean((1, 2, 3)) for a, b in pairs)
+    return middle + late
 
 
 @comparing

@@ -9,10 +9,11 @@ from torch import Tensor, nn
 
 from mwdn.errors import ParameterError, UnknownNameError, shown
 from mwdn.evaluation.alexnet import load_alexnet, load_heads
-from mwdn.evaluation.distances import feature_mse, l1, log_mse, lpips, mse, ssim
+from mwdn.evaluation.distances import feature_mse, l1, log_mse, lpips, mse, ssim, vgg_mse
+from mwdn.evaluation.vgg import load_vgg16
 from mwdn.types import Image
 
-NAMES = ("feature_mse", "l1", "log_mse", "lpips", "mse", "ssim")
+NAMES = ("feature_mse", "l1", "log_mse", "lpips", "mse", "ssim", "vgg_mse")
 """Parts of a `Loss`."""
 NEED_ALEXNET = {"feature_mse", "lpips"}
 """Parts that compare AlexNet's features."""
@@ -21,7 +22,7 @@ NEED_ALEXNET = {"feature_mse", "lpips"}
 class Loss(nn.Module):
     """A weighted sum of distances, averaged over the batch.
 
-    AlexNet and the linear heads of LPIPS are loaded only if a part needs them; move them with ``.to(device)``.
+    AlexNet, VGG-16 and the linear heads of LPIPS are loaded only if a part needs them; move them with ``.to(device)``.
 
     Args:
         weights: of each part by its name in `NAMES`; the last phase of the MWDN paper's training has
@@ -43,6 +44,7 @@ class Loss(nn.Module):
         self.weights = dict(self.initial_weights)
         """Current weights, which a schedule may replace by others of the same names."""
         self.alexnet = load_alexnet(alexnet) if NEED_ALEXNET & set(weights) else None
+        self.vgg = load_vgg16() if "vgg_mse" in weights else None
         self.heads = load_heads(heads, alexnet=alexnet) if "lpips" in weights else None
 
     def forward(self, reconstruction: Image, scene: Image) -> tuple[Tensor, dict[str, Tensor]]:
@@ -71,6 +73,8 @@ class Loss(nn.Module):
             return 1 - ssim(image, reference)
         if name == "feature_mse" and self.alexnet is not None:
             return feature_mse(image, reference, self.alexnet)
+        if name == "vgg_mse" and self.vgg is not None:
+            return vgg_mse(image, reference, self.vgg)
         if name == "lpips" and self.alexnet is not None and self.heads is not None:
             return lpips(image, reference, self.alexnet, self.heads)
         return {"mse": mse, "l1": l1, "log_mse": log_mse}[name](image, reference)

@@ -18,10 +18,17 @@ from mwdn.networks import DENOISERS
 from mwdn.networks.empty import build_empty
 from mwdn.optics.sensor import Sensor
 from mwdn.training.losses import checked_weights
+from mwdn.training.tables import Plateau, Sheet
 
-LR_SCHEDULES = ("cosine", "plateau")
+LR_SCHEDULES = ("cosine", "constant", "plateau")
+BEST_BY = ("psnr", "loss")
 OPTIMISERS = ("adam", "adamw")
-LATER = {"mismatch": REAL, "pairs": ("folds", "fold", "aligned", "best_gain"), "schedule": ("anchor", "filter_rate")}
+LATER_SCHEDULE = ("anchor", "filter_rate", "best_by")
+LATER = {
+    "mismatch": REAL,
+    "pairs": ("folds", "fold", "aligned", "best_gain"),
+    "schedule": ("anchor", "filter_rate", "best_by"),
+}
 """Keys of tables that the first recipes did not have."""
 
 
@@ -34,10 +41,10 @@ class Schedule:
         epochs: passes over the training pairs, or over as many samples as there are training photographs. If positive,
             it sets `steps` and `validate_every`: one validation after each epoch.
         batch: samples per step, over all processes together.
-        lr_schedule: "cosine", or the paper's "plateau", see `Plateau`.
+        lr_schedule: "cosine", "constant", or the paper's "plateau", see `Plateau`.
         learning_rate: highest learning rate, reached after the warm-up; "cosine" then lowers it to 1 % in half a
             period.
-        warmup: steps of linear rise, "cosine" only.
+        warmup: steps of linear rise; not for "plateau".
         optimiser: "adamw", or the paper's "adam"; see `mwdn.training.schedule.make_optimiser`.
         weight_decay: of the optimiser.
         clip: largest norm of the gradient over all parameters; longer gradients are scaled down, 0 disables this.
@@ -61,6 +68,8 @@ class Schedule:
             the best if no step improves on it.
         filter_rate: learning rate of the logarithms of the filters' w and lambda over that of the other parameters. At
             1 they hardly move: Adam changes a number by about the learning rate a step, and 4 may be needed.
+        best_by: which validation has the best weights: that of the highest "psnr", or of the lowest "loss" (with the
+            weights of [loss]), as in the authors' code.
     """
 
     steps: int = 2000
@@ -85,6 +94,7 @@ class Schedule:
     fixed_norms: bool = False
     anchor: float = 0.0
     filter_rate: float = 1.0
+    best_by: str = "psnr"
 
     RENAMED: ClassVar[dict[str, str]] = {"course": "lr_schedule"}
     """Former names of keys, which recipes, command lines and saved runs may still use."""
@@ -106,47 +116,9 @@ class Schedule:
             raise ParameterError(f"`anchor` ({self.anchor}) pulls towards the weights of `start`, which is missing.")
         if not 0 <= self.ema < 1:
             raise ParameterError(f"`ema` ({self.ema}) must be in [0, 1).")
-        for kind, names in (("lr_schedule", LR_SCHEDULES), ("optimiser", OPTIMISERS)):
+        for kind, names in (("lr_schedule", LR_SCHEDULES), ("optimiser", OPTIMISERS), ("best_by", BEST_BY)):
             if getattr(self, kind) not in names:
                 raise UnknownNameError(kind, getattr(self, kind), names)
-
-
-@dataclass(frozen=True)
-class Plateau:
-    """The [plateau] of a recipe: reduce the learning rate when the validation loss stops falling.
-
-    Defaults are the paper's. The validation loss always has the weights of [loss].
-
-    Args:
-        factor: multiplies the learning rate at each reduction.
-        patience: validations without a new lowest loss that are tolerated; the next one reduces the learning rate.
-        later: from this learning rate down, the loss has the weights of [later_loss].
-        stop: the run ends below this learning rate.
-    """
-
-    factor: float = 0.1
-    patience: int = 5
-    later: float = 1e-6
-    stop: float = 2e-8
-
-    def __post_init__(self) -> None:
-        if not 0 < self.factor < 1:
-            raise ParameterError(f"`factor` ({self.factor}) must be in (0, 1): it reduces the learning rate.")
-        for name in ("patience", "later", "stop"):
-            if not getattr(self, name) >= 0:
-                raise ParameterError(f"`{name}` ({getattr(self, name)}) must not be negative.")
-
-
-@dataclass(frozen=True)
-class Sheet:
-    """The [sheet] of a recipe: real captures to show on the contact sheet of each validation.
-
-    Args:
-        captures: files and folders of real captures, which have no scene to compare with; the first six are shown.
-            Paths are relative to the recipe's folder. They do not influence the training.
-    """
-
-    captures: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -243,7 +215,8 @@ def read_recipe(path: str | Path | None, **changes: Any) -> Recipe:  # noqa: ANN
 
     Args:
         path: TOML file with the tables of `Recipe`, or the name of a recipe of the package; ``None`` for all defaults,
-            where nothing is trained.
+            where nothing is trained. Another ``name`` of [network] in ``changes`` drops the recipe's options of its own
+            network.
         **changes: replace values of the recipe: ``learning_rate=1e-4`` of [schedule], ``mismatch={"blur_px": 0.5}`` of
             any other table; ``None`` changes nothing.
 
@@ -259,6 +232,8 @@ def read_recipe(path: str | Path | None, **changes: Any) -> Recipe:  # noqa: ANN
             raise UnknownNameError("table of a recipe", table, FIELDS)
         if not isinstance(content.setdefault(table, {}), dict):
             raise ParameterError(f"`{table}` of `{path}` ({content[table]!r}) must be a table: [{table}].")
+        if table == "network" and replaced.get(table, {}).get("name") not in (None, content[table].get("name")):
+            content[table] = {}  # the options are those of another network
         content[table] = _named(table, content[table]) | _named(table, replaced.get(table, {}))
     if path is not None:
         if not isinstance(content.get("network", {}).get("name"), str):

@@ -14,16 +14,18 @@ THRESHOLD = 1e-4
 
 
 def learning_rate(step: int, schedule: Schedule) -> float:
-    """Linear warm-up, then half a cosine down to 1 % of the highest rate."""
+    """Linear warm-up, then half a cosine down to 1 % of the highest rate; or that rate, if it is "constant"."""
     if step < schedule.warmup:
         return schedule.learning_rate * (step + 1) / schedule.warmup
+    if schedule.lr_schedule == "constant":
+        return schedule.learning_rate
     progress = (step - schedule.warmup) / max(1, schedule.steps - schedule.warmup)
     return schedule.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * progress)))
 
 
 @dataclass(frozen=True)
-class Cosine:
-    """Cosine schedule, fixed in advance: it does not depend on the validation."""
+class FixedSchedule:
+    """Cosine or constant schedule, fixed in advance: it does not depend on the validation."""
 
     recipe: Recipe
     finished: ClassVar[bool] = False
@@ -37,7 +39,7 @@ class Cosine:
         """Weights of the parts of the loss."""
         return self.recipe.loss
 
-    def after(self, loss: float) -> "Cosine":
+    def after(self, loss: float) -> "FixedSchedule":
         """The schedule after a validation with this loss: unchanged."""
         return self
 
@@ -101,13 +103,13 @@ class ReduceLROnPlateau:
         return {"current": self.current, "best": self.best, "bad": self.bad}
 
 
-LRSchedule = Cosine | ReduceLROnPlateau
+LRSchedule = FixedSchedule | ReduceLROnPlateau
 
 
 def make_lr_schedule(recipe: Recipe, **state: Any) -> LRSchedule:  # noqa: ANN401
     """The learning rate schedule of a recipe, at its beginning or in a saved ``state``."""
-    if recipe.schedule.lr_schedule == "cosine":
-        return Cosine(recipe)
+    if recipe.schedule.lr_schedule != "plateau":
+        return FixedSchedule(recipe)
     return ReduceLROnPlateau(recipe, **({"current": recipe.schedule.learning_rate} | state))
 
 

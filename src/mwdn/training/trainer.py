@@ -112,7 +112,7 @@ class Trainer:
             samples: called after each cached sample, with those of this process that are done and their total.
 
         Returns:
-            The best validation PSNR in dB.
+            The best validation: its PSNR in dB, or minus its loss, see `best_by` of [schedule].
 
         Raises:
             KeyboardInterrupt: Ctrl-C; its message says how to go on.
@@ -256,13 +256,14 @@ class Trainer:
             ParameterError: the folder cannot be written to, for example because the disk is full; the last saved state
                 stays as it was.
         """
-        self.best = max(self.best, validation.psnr)
+        score = -validation.loss if self.schedule.best_by == "loss" else validation.psnr
+        self.best = max(self.best, score)
         if distributed.rank() > 0:
             return
         metadata = {**self.psf_identity, **self.identity, "step": self.step, "psnr": validation.psnr}
         name, options = name_and_options(self.recipe)
         with as_parameter_error(self.out, MAKE_ROOM):
-            for file in ("last", *(["best"] if validation.psnr == self.best else [])):
+            for file in ("last", *(["best"] if score == self.best else [])):
                 save_network(self.folder.weights(file), self.average, name, options, **metadata)
         self._save_state()
 
