@@ -162,6 +162,23 @@ def test_train_on_recorded_pairs(run, camera):
     assert run(line.replace("psf.npy", "large.npy --psf-bin 2").replace("runs/x", "runs/y"))[0] == 0
 
 
+def test_the_file_of_pairs_and_the_table_have_one_name(run, camera):
+    """`--pairs` is a file and `--pairs.split` a key of the recipe, in either order."""
+    assert run("simulate photos --psf psf.npy -o pairs.h5 --count 20 --recipe r.toml")[0] == 0
+    line = TRAIN.replace("--photos photos --steps 4", "--pairs pairs.h5 --pairs.split random --best-by loss --steps 1")
+    code, _, err = run(line)
+    assert code == 0, err
+    assert re.search(r"validation \d+\.\d\d dB, best loss \d", flat(err))
+    assert json.loads((camera / "runs/x/recipe.json").read_text())["recipe"]["pairs"]["split"] == "random"
+    code, _, err = run(line.replace("--pairs pairs.h5 --pairs.split random", "--pairs.splt random --pairs pairs.h5"))
+    assert (code, "No key of [pairs] named 'splt'" in err) == (2, True)
+    code, out, err = run("evaluate wiener --data pairs.h5 --psf psf.npy --device cpu --split paper --no-lpips --json")
+    assert code == 0, err
+    assert json.loads(out)["pictures"] == 2  # the test's tenth of twenty
+    code, _, err = run("evaluate wiener --data pairs.h5 --psf psf.npy --split folds")
+    assert (code, "has no test part" in err) == (2, True)
+
+
 def test_tensorboard_and_captures(run, camera):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 

@@ -11,7 +11,7 @@ from PIL import Image as Pillow
 
 from mwdn.calibration import FrameFormat
 from mwdn.data import PairFile, import_pairs, read_pairs
-from mwdn.data.importers import Layout
+from mwdn.data.kinds import Layout
 from mwdn.errors import ImageError, ParameterError, UnknownNameError
 
 RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)

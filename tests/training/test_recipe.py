@@ -203,7 +203,7 @@ def test_recipe_of_the_paper():
     assert recipe.later_loss == {"mse": 1, "feature_mse": 0.05}
     assert recipe.pairs.split == "paper"
     assert schedule.best_by == "loss"
-    # A scene of 137 x 137, padded by 94 at the top and 89 on the left to 320 x 320.
+    # A scene of 137 x 137, padded by 94 at the top and on the left to 320 x 320.
     extent, room = 137 / 320, 1 - 137 / 320
     assert recipe.placement.extent == pytest.approx((extent, extent), abs=1e-3)
     assert recipe.placement.offset * room * 160 == pytest.approx(94 - (320 - 137) / 2, abs=0.3)

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from mwdn.calibration import Calibration, FrameFormat
-from mwdn.data.importers import Layout, import_pairs
+from mwdn.data.importers import import_pairs
+from mwdn.data.kinds import KINDS, Layout
 from mwdn.data.mismatch import EXACT
 from mwdn.data.pair_writer import Attribute
-from mwdn.data.pairs import PairFile
+from mwdn.data.pairs import PairFile, Part
 from mwdn.data.photographs import Photographs
 from mwdn.data.recorded import HELD_OUT, Division, RecordedPairs, check_pairs, record
 from mwdn.data.simulated import Placement, Samples, SimulatedPairs
@@ -53,7 +53,7 @@ class DatasetRecipe:
         deviation: how the true camera differs from its calibration, which is all that methods are told.
         sensor: its noise.
         pairs: recorded ones in place of photographs: a file of ``mwdn import``, or a data set of this ``kind``.
-        kind: how they are laid out, see `mwdn.data.importers.KINDS`; empty for a file of pairs.
+        kind: how they are laid out, see `mwdn.data.kinds.KINDS`; empty for a file of pairs.
         split: which are for what, see `mwdn.data.splits.split`; empty if all are for the test.
         trained_on: another data set, of the same camera, whose networks are tested here; nothing is trained.
         captures: real ones without a scene, files and folders, to be shown.
@@ -135,20 +135,6 @@ PRESETS: dict[str, DatasetRecipe] = {
 """What is known of the data sets of the paper; a recipe names the files, and overrides what it likes."""
 
 
-@dataclass(frozen=True)
-class Part:
-    """Some pairs of a file, by their positions."""
-
-    file: PairFile
-    rows: range | list[int]
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
-        return self.file[self.rows[index]]
-
-
 @dataclass(frozen=True, eq=False)
 class Dataset:
     """A data set with its files made and open.
@@ -208,7 +194,8 @@ def open_dataset(name: str, recipe: DatasetRecipe, folder: Path, device: torch.d
         if simulates:
             _simulate(recipe, calibration, path, device, lambda rows: track(f"{name}: simulating", rows))
         else:
-            size = calibration.size if recipe.camera or recipe.bin > 1 else None
+            resized = (recipe.camera or recipe.bin > 1) and KINDS[recipe.kind].place is None
+            size = calibration.size if resized else None
             layout, frames = (
                 Layout(scene_size=size),
                 calibration.frames if recipe.camera else FrameFormat(bin=recipe.bin),

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 from torch import Tensor
@@ -15,6 +15,9 @@ from mwdn.cli.method_options import MethodOptions, read_options
 from mwdn.cli.progress import show_progress
 from mwdn.cli.terminal import Json, results, say, warn
 from mwdn.cli.weights import ask_for_lpips
+from mwdn.data.pairs import PairFile, Part
+from mwdn.data.recorded import Division, check_pairs, other_camera
+from mwdn.errors import ParameterError
 from mwdn.evaluation import Perceptual, Variant
 from mwdn.evaluation.alexnet import SMALLEST
 from mwdn.inference.reconstructor import Reconstructor
@@ -36,6 +39,13 @@ class Refined:
         return self.refinement.measurement(measurement[None])[0], scene
 
 
+def _part(file: PairFile, split: str, name: str) -> Part:
+    rows = Division(split).parts(len(file))[name]
+    if not rows:
+        raise ParameterError(f"The split '{split}' of {len(file):,} pairs has no {name} part. Choose another `--part`.")
+    return Part(file, rows)
+
+
 @no_empty_folder
 def evaluate(  # noqa: PLR0913
     *methods: str,
@@ -43,6 +53,8 @@ def evaluate(  # noqa: PLR0913
     camera: CameraOptions = CameraOptions(),
     protocol: str = "full",
     variant: Variant | None = None,
+    split: str | None = None,
+    part: Literal["test", "validation", "train"] = "test",
     first: int | None = None,
     lpips: bool | None = None,
     out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("results/evaluate"),
@@ -62,6 +74,9 @@ def evaluate(  # noqa: PLR0913
         protocol: full, centre-128 (the paper's), or rows and columns such as 60:270,60:440 (DiffuserCam's).
         variant: raw, clipped to [0, 1], or best-gain (one gain and offset per picture). The default is raw for
             centre-128 and clipped otherwise.
+        split: use one part of the pairs only, as `mwdn train` divides them: paper (8:1:1), diffusercam, phlatcam,
+            random or folds.
+        part: of --split: test, validation or train.
         first: use only this many pairs.
         lpips: LPIPS and feature MSE: download their public weights (234 MiB, once) if they are missing, or leave both
             metrics out. By default they are used if they are there; a terminal asks before a download.
@@ -71,14 +86,13 @@ def evaluate(  # noqa: PLR0913
         **options: options of the methods.
     """
     from mwdn import evaluation
-    from mwdn.data.pairs import PairFile
-    from mwdn.data.recorded import check_pairs, other_camera
 
     method_options = read_options(methods, options, evaluate)
-    part, file = evaluation.Protocol.parse(protocol), PairFile(data)
+    region, file = evaluation.Protocol.parse(protocol), PairFile(data)
     calibration = replace(camera.load(), white_balance=None)  # scenes of pairs are in the camera's own colours
     check_pairs(file, calibration.psf)
-    pairs: Any = file if first is None else evaluation.First(file, first)
+    pairs: Any = file if split is None else _part(file, split, part)
+    pairs = pairs if first is None else evaluation.First(pairs, first)
     pairs = Refined(pairs, calibration.refinement) if calibration.refinement else pairs
     reconstructors = {
         method: Reconstructor(method, calibration, device=device, **own) for method, own in method_options.items()
@@ -87,7 +101,7 @@ def evaluate(  # noqa: PLR0913
     warn(*warnings, other_camera(file, calibration))
     refuse_overwrite(out / evaluation.SHEET, *camera.files)
     refuse_foreign(out, (evaluation.JSON, evaluation.SHEET), b'"protocol"')
-    if min(part.crop(calibration.psf).shape[-2:]) >= SMALLEST:
+    if min(region.crop(calibration.psf).shape[-2:]) >= SMALLEST:
         lpips = ask_for_lpips(lpips)
     perceptual = Perceptual.none("--no-lpips") if lpips is False else Perceptual.load(download=lpips is True)
     check_folder(out)
@@ -97,7 +111,7 @@ def evaluate(  # noqa: PLR0913
         report = evaluation.evaluate(
             reconstructors,
             pairs,
-            part,
+            region,
             variant=variant,
             perceptual=perceptual,
             progress=lambda name, _: progress.update(next(done), name),

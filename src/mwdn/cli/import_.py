@@ -12,7 +12,8 @@ from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.progress import track
 from mwdn.cli.terminal import counted, if_interrupted, notes, say
 from mwdn.data.digicam import DigiCam, import_digicam
-from mwdn.data.importers import Layout, import_pairs
+from mwdn.data.importers import import_pairs
+from mwdn.data.kinds import Layout
 from mwdn.errors import ParameterError
 
 
@@ -23,6 +24,7 @@ def import_(  # noqa: PLR0913
     *,
     out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("pairs.h5"),
     skip_damaged: bool = False,
+    authors: Annotated[bool, Parameter(negative=())] = False,
     layout: Annotated[Layout, Parameter(name="*")] = Layout(),
     frames: Annotated[FrameFormat, Parameter(name="*")] = FrameFormat(),
     digicam: Annotated[DigiCam, Parameter(name="*")] = DigiCam(),
@@ -31,11 +33,13 @@ def import_(  # noqa: PLR0913
     """Convert a public data set, or two folders of pictures, to one file of pairs.
 
     Args:
-        kind: mwdn (the authors' HDF5), diffusercam, phlatcam, folders (captures/ and scenes/), parquet, or digicam
-            (lensless, lensed and the patterns of its mask in masks/).
+        kind: mwdn (the authors' HDF5, or their folder with blur/ and gt/), diffusercam, phlatcam, folders (captures/
+            and scenes/), parquet, pairs (a file of this package), or digicam (lensless, lensed and the patterns of its
+            mask in masks/).
         path: of the data set; for parquet a shard, a folder of shards, or owner/name on the Hugging Face hub.
         out: file of pairs to write, ending in .h5 or .hdf5; an existing file is replaced only on success.
         skip_damaged: skip pairs with a damaged or missing picture, and list them.
+        authors: write the HDF5 of the MWDN authors' code (blur, gt; 8 bits, BGR) instead, for their training.
         layout: where this copy of the data set differs from the usual layout.
         frames: format of the captures, where it differs from the usual one.
         digicam: optics of a camera of the kind digicam.
@@ -45,6 +49,8 @@ def import_(  # noqa: PLR0913
     if kind != "digicam" and digicam != DigiCam():
         options = "`mask_distance_mm`, `source_mm`, `sensor_mm`, `psf_turn`, `background`"
         raise ParameterError(f"Only the kind digicam has {options}. Leave them out.")
+    if kind == "digicam" and authors:
+        raise ParameterError("`authors` is for one camera, but digicam has one for each mask. Leave it out.")
     if kind == "digicam":
         with if_interrupted(lambda: f"Interrupted. Files that are complete are kept: {out.parent}."):
             done = import_digicam(
@@ -56,7 +62,9 @@ def import_(  # noqa: PLR0913
             say(f"{counted(count, 'pair')}{mask} written to {file}, its PSF to {psf}")
         return
     with if_interrupted(lambda: f"Interrupted. Nothing is kept: {out} is written when all pairs are done."):
-        result = import_pairs(kind, path, out, layout=layout, frames=frames, skip_damaged=skip_damaged, track=progress)
+        result = import_pairs(
+            kind, path, out, layout=layout, frames=frames, skip_damaged=skip_damaged, authors=authors, track=progress
+        )
     _name_skipped(result.skipped)
     names = f": {', '.join(result.skipped)}" if result.skipped else ""
     summary = f"{counted(result.count, 'pair')} written to {out}, {len(result.skipped):,} skipped{names}"

@@ -31,7 +31,7 @@ def train(  # noqa: PLR0913
     *,
     camera: CameraOptions = CameraOptions(),
     photos: Path | None = None,
-    pairs: Path | None = None,
+    pairs_file: Annotated[Path | None, Parameter(name="--pairs")] = None,  # `pairs` is the table of --pairs.split
     captures: Annotated[list[Path] | None, Parameter(consume_multiple=True, negative=())] = None,
     out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("runs/train"),
     device: str | None = None,
@@ -52,7 +52,8 @@ def train(  # noqa: PLR0913
         recipe: name of a recipe of the package, see `mwdn recipes`, or a TOML file.
         camera: calibration of the camera.
         photos: folder of photographs, the more the better, to simulate captures of.
-        pairs: HDF5 file of recorded pairs, from `mwdn import`; [pairs] of the recipe splits it.
+        pairs_file: HDF5 file of recorded pairs, from `mwdn import`; [pairs] of the recipe, or --pairs.split random,
+            divides it.
         captures: files or folders of real captures: to learn from, with [selfsupervised]; otherwise to show on the
             contact sheet instead of the recipe's.
         out: folder of the run: best.safetensors for `mwdn reconstruct --method`, validation.png with the images of the
@@ -76,7 +77,7 @@ def train(  # noqa: PLR0913
                 camera.load(),
                 out=out,
                 photos=photos,
-                pairs=pairs,
+                pairs=pairs_file,
                 device=device,
                 exclude=camera.roles,
             )
@@ -107,8 +108,7 @@ def _train(trainer: Trainer, progress: Progressing, board: TensorBoard | None) -
         progress.update(report.step, f"step {report.step:,}, {speed}, loss {report.loss:.4f}")
         if report.validation is not None:
             best = f"loss {-trainer.best:.4f}" if trainer.schedule.best_by == "loss" else f"{trainer.best:.2f} dB"
-            validation = f"{report.validation.psnr:.2f} dB, loss {report.validation.loss:.4f}"
-            progress.print(f"step {report.step}: validation {validation}, best {best}")
+            progress.print(f"step {report.step}: validation {report.validation.psnr:.2f} dB, best {best}")
         if board is not None:
             board(report)
 

@@ -24,7 +24,8 @@ import numpy as np
 import torch
 
 from mwdn.calibration import FrameFormat
-from mwdn.data.importers import Kind, Layout, read_listing, write_pairs
+from mwdn.data.importers import read_listing, write_pairs
+from mwdn.data.kinds import Kind, Layout
 from mwdn.data.pair_writer import Attribute, check_path
 from mwdn.data.shards import COPY_AGAIN, Shard, find_shards
 from mwdn.data.sources import Listing, Source, files_by_stem, list_folders
@@ -145,7 +146,7 @@ def import_digicam(
             [source for source in listing.sources if source.mask == label], listing.refused if number == 0 else {}
         )
         skipped = result.skipped if skip_damaged else None
-        pairs = read_listing(part, KIND, layout.scene_size, frames, skipped=skipped, track=track)
+        pairs = read_listing(part, KIND, layout, frames, skipped=skipped, track=track)
         file = output if len(labels) == 1 else output.with_name(f"{output.stem}-mask-{label}{output.suffix}")
         first = next(pairs, None)
         if first is None:

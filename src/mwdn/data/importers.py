@@ -10,10 +10,12 @@ from typing import TypeVar, cast
 import numpy as np
 
 from mwdn.calibration import FrameFormat
-from mwdn.data.pair_writer import Attribute, PixelType, check_path, quantise
-from mwdn.data.pairs import PairFile
-from mwdn.data.sources import Listing, Source, list_folders, list_hdf5, list_parquet, list_phlatcam
-from mwdn.errors import ImageError, MwdnError, ParameterError, UnknownNameError
+from mwdn.data.authors_file import AuthorsWriter
+from mwdn.data.kinds import KINDS, Kind, Layout
+from mwdn.data.pair_writer import Attribute, PairWriter, PixelType, Shape, check_path, quantise
+from mwdn.data.scene_place import bin_scene, place_scene
+from mwdn.data.sources import Listing, Source
+from mwdn.errors import ImageError, MwdnError, UnknownNameError
 from mwdn.io.files import refuse_overwrite
 from mwdn.types import Frame, Psf, Size
 
@@ -21,64 +23,6 @@ T = TypeVar("T", "Layout", FrameFormat)
 
 Pair = tuple[str, Frame, Frame]
 """A name, a measurement and a scene, both (H, W, C), RGB, row 0 at the top, integers or floats in [0, 1]."""
-
-
-@dataclass(frozen=True)
-class Layout:
-    """Where a data set stores its pairs; ``None`` for the usual place.
-
-    Args:
-        captures: folder, data set or column of the measurements.
-        scenes: folder, data set or column of the ground truth.
-        scene_size: height and width to which scenes are resized, if they are not all of one size.
-
-    Raises:
-        ParameterError: a size is not positive.
-    """
-
-    captures: str | None = None
-    scenes: str | None = None
-    scene_size: Size | None = None
-
-    def __post_init__(self) -> None:
-        if self.scene_size is not None and min(self.scene_size) < 1:
-            height, width = self.scene_size
-            raise ParameterError(f"`scene_size` ({height} x {width}) must be positive: `--scene-size 384 384`.")
-
-
-@dataclass(frozen=True)
-class Kind:
-    """A kind of data set.
-
-    Args:
-        list_pairs: lists the pairs of a path, given the names of its captures and scenes.
-        layout: the usual one.
-        frames: the usual format of captures; scenes have the same channel order and orientation.
-        raw_frames: the usual format of captures with one channel, if those are raw frames of a colour sensor.
-    """
-
-    list_pairs: Callable[[Path, str, str], Listing]
-    layout: Layout
-    frames: FrameFormat = FrameFormat()
-    raw_frames: FrameFormat | None = None
-
-
-KINDS = {
-    # The paper's own data set, written by OpenCV: BGR, channels first.
-    "mwdn": Kind(list_hdf5, Layout("blur", "gt"), FrameFormat(bgr=True)),
-    "diffusercam": Kind(
-        list_folders, Layout("diffuser_images", "ground_truth_lensed"), FrameFormat(bgr=True, upside_down=True)
-    ),
-    # Raw captures of 12 bits; the scenes are ImageNet's originals of all sizes, displayed and compared at 384 x 384.
-    "phlatcam": Kind(
-        list_phlatcam,
-        Layout("imagenet_caps_384_12bit_Feb_19", "orig", scene_size=(384, 384)),
-        raw_frames=FrameFormat(bit_depth=12, mosaic="rggb"),
-    ),
-    "folders": Kind(list_folders, Layout("captures", "scenes")),
-    "parquet": Kind(list_parquet, Layout("lensless", "lensed")),
-}
-"""Every kind that can be imported."""
 
 
 @dataclass
@@ -89,7 +33,7 @@ class Imported:
     skipped: dict[str, str] = field(default_factory=dict)
 
 
-def import_pairs(
+def import_pairs(  # noqa: PLR0913
     kind: str,
     path: str | Path,
     output: str | Path,
@@ -97,6 +41,7 @@ def import_pairs(
     layout: Layout = Layout(),
     frames: FrameFormat = FrameFormat(),
     skip_damaged: bool = False,
+    authors: bool = False,
     track: Callable[[list[Source]], Iterable[Source]] = iter,
 ) -> Imported:
     """Convert a data set to a file of pairs, which appears when all of it is written.
@@ -110,6 +55,7 @@ def import_pairs(
         layout: what differs from the usual layout of the kind.
         frames: what differs from the usual format of the captures.
         skip_damaged: leave out pairs that are damaged or incomplete, and name them in the result.
+        authors: write the file of the MWDN authors' code: 8 bits, `mwdn.data.authors_file`.
         track: wraps the list of pairs to read, for a progress bar.
 
     Raises:
@@ -126,12 +72,17 @@ def import_pairs(
     if first is None:
         reason = f" {len(skipped):,} were skipped; {next(iter(skipped.values()))}" if skipped else ""
         raise ImageError(f"`{path}` has no pair to import.{reason} For the layouts: `mwdn import --help`.")
-    result.count = write_pairs(Path(output), chain([first], pairs), {"source": kind})
+    result.count = write_pairs(Path(output), chain([first], pairs), {"source": kind}, authors=authors)
     return result
 
 
 def write_pairs(
-    output: Path, pairs: Iterable[Pair], attributes: Mapping[str, Attribute], psf: Psf | None = None
+    output: Path,
+    pairs: Iterable[Pair],
+    attributes: Mapping[str, Attribute],
+    psf: Psf | None = None,
+    *,
+    authors: bool = False,
 ) -> int:
     """Write pairs to a file, of which there is at least one; returns how many.
 
@@ -140,20 +91,21 @@ def write_pairs(
         pairs: all of one shape and type.
         attributes: of the file.
         psf: of the camera, as in `PairFile.create`.
+        authors: write the file of the MWDN authors' code, see `mwdn.data.authors_file`, which has neither attributes
+            nor a PSF.
 
     Raises:
         ImageError: the file cannot be written.
     """
     pairs = iter(pairs)
     first = next(pairs)
-    with PairFile.create(
-        output,
-        measurement_shape=first[1].shape,
-        scene_shape=first[2].shape,
-        dtype=cast(PixelType, first[1].dtype.name),
-        attributes=attributes,
-        psf=psf,
-    ) as file:
+    shapes: tuple[Shape, Shape] = first[1].shape, first[2].shape
+    writer = (
+        AuthorsWriter(output, *shapes)
+        if authors
+        else PairWriter(output, shapes, cast(PixelType, first[1].dtype.name), dict(attributes), psf)
+    )
+    with writer as file:
         for _, measurement, scene in chain([first], pairs):
             file.append(measurement, scene)
         return len(file)
@@ -174,7 +126,8 @@ def read_pairs(
 
     Args:
         kind: of `KINDS`.
-        path: of the data set: a file for ``"mwdn"``, a folder for the others.
+        path: of the data set: a file for ``"mwdn"`` and ``"pairs"``, a folder for the others; or a folder with the
+            pictures of ``"mwdn"``.
         layout: what differs from the usual layout of the kind.
         frames: what differs from the usual format of the captures; its channel order and orientation are also those
             of the scenes.
@@ -187,15 +140,17 @@ def read_pairs(
     """
     if kind not in KINDS:
         raise UnknownNameError("kind of data set", kind, KINDS)
-    layout = _override(KINDS[kind].layout, layout)
-    listing = KINDS[kind].list_pairs(Path(path), layout.captures or "", layout.scenes or "")
-    return read_listing(listing, KINDS[kind], layout.scene_size, frames, skipped=skipped, track=track)
+    of_folder = KINDS[kind].of_folder
+    chosen = of_folder if of_folder and Path(path).is_dir() else KINDS[kind]
+    layout = _override(chosen.layout, layout)
+    listing = chosen.list_pairs(Path(path), layout.captures or "", layout.scenes or "")
+    return read_listing(listing, chosen, layout, frames, skipped=skipped, track=track)
 
 
 def read_listing(
     listing: Listing,
     kind: Kind,
-    scene_size: Size | None,
+    layout: Layout,
     frames: FrameFormat,
     *,
     skipped: dict[str, str] | None = None,
@@ -211,7 +166,7 @@ def read_listing(
     first: tuple[Frame, Frame] | None = None
     for source in track(listing.sources):
         try:
-            pair = _convert(source, kind, scene_size, frames)
+            pair = _convert(source, kind, layout, frames)
             first = first or pair
             _check_like_first(first, pair, source.name)
         except MwdnError as error:
@@ -229,22 +184,35 @@ def _override(usual: T, changes: T) -> T:
     return replace(usual, **{name: value for name, (value, default) in values.items() if value != default})
 
 
-def _convert(source: Source, kind: Kind, scene_size: Size | None, changes: FrameFormat) -> tuple[Frame, Frame]:
+def _convert(source: Source, kind: Kind, layout: Layout, changes: FrameFormat) -> tuple[Frame, Frame]:
     """Load a pair as RGB, row 0 at the top, both in the smallest type that is exact for both."""
     stored = source.load()
     capture, scene = stored
     usual = kind.raw_frames if kind.raw_frames is not None and capture.shape[2] == 1 else kind.frames
     frames = _override(usual, changes)
+    full_size = frames.full_size(capture)
     capture = _orient(_correct_levels(capture, frames, source.name), frames)
     if kind.raw_frames is not None and scene.shape[2] == 1:
         scene = scene.repeat(3, axis=2)  # a few of ImageNet's photographs are grey
-    if scene_size is not None:
-        scene = _resize(scene, scene_size)
+    if layout.scene_size is not None:
+        scene = _resize(scene, layout.scene_size)
     scene = _orient(scene, frames)
+    place = _place(kind, layout, (scene.shape[0], scene.shape[1]), full_size)
+    if place is not None:
+        scene = bin_scene(place_scene(scene, full_size, place, source.name), frames.bin)
 
     floats = any(frame.dtype.kind == "f" for frame in stored)
     dtype = np.dtype("float32" if floats else "uint8" if capture.dtype == scene.dtype == np.uint8 else "uint16")
     return quantise(capture, dtype, f"capture of {source.name}"), quantise(scene, dtype, f"scene of {source.name}")
+
+
+def _place(kind: Kind, layout: Layout, scene: Size, frame: Size) -> Size | None:
+    """Where a scene is in the frame; ``None`` if it is as large as it is."""
+    if layout.scene_place is not None or kind.place is None:
+        return layout.scene_place
+    if scene == frame:
+        return 0, 0
+    return kind.place(scene, frame) if scene[0] <= frame[0] and scene[1] <= frame[1] else None
 
 
 def _correct_levels(capture: Frame, frames: FrameFormat, name: str) -> Frame:

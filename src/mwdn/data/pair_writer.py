@@ -90,15 +90,27 @@ class PairWriter:
     def __enter__(self) -> "PairWriter":
         with as_image_error(self.path), ExitStack() as stack:
             file, self._disk = stack.enter_context(create_hdf5(stack.enter_context(atomic(self.path))))
-            file.attrs.update({VERSION_KEY: VERSION, **self._attributes})
-            for name, shape in self._shapes.items():
-                self._data[name] = file.create_dataset(
-                    name, (0, *shape), self.dtype, maxshape=(None, *shape), chunks=(1, *shape), track_times=False
-                )
-            if self._psf is not None:
-                file.create_dataset("psf", data=self._psf, track_times=False)
+            self._set_up(file)
             self._stack = stack.pop_all()
         return self
+
+    def _set_up(self, file: Any) -> None:  # noqa: ANN401
+        """Make the data sets of an `h5py.File`, without rows."""
+        file.attrs.update({VERSION_KEY: VERSION, **self._attributes})
+        for name, shape in self._shapes.items():
+            self._data[name] = self._make_rows(file, name, shape)
+        if self._psf is not None:
+            file.create_dataset("psf", data=self._psf, track_times=False)
+
+    def _make_rows(self, file: Any, name: str, shape: tuple[int, ...]) -> Any:  # noqa: ANN401
+        """A data set (0, *shape) that can grow, one chunk a row."""
+        return file.create_dataset(
+            name, (0, *shape), self.dtype, maxshape=(None, *shape), chunks=(1, *shape), track_times=False
+        )
+
+    def _stored(self, pixels: Frame) -> Frame:
+        """A sample (H, W, C) in the axes and channels of the file."""
+        return pixels
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -137,7 +149,7 @@ class PairWriter:
         for name, pixels in pair.items():
             self._data[name].resize(self._length + 1, axis=0)
             # Past HDF5's cache of chunks, which would write the pair some pairs later; three times as fast.
-            self._data[name].id.write_direct_chunk((self._length, 0, 0, 0), np.ascontiguousarray(pixels))
+            self._data[name].id.write_direct_chunk((self._length, 0, 0, 0), np.ascontiguousarray(self._stored(pixels)))
         if self._disk is not None:
             self._disk.check()
 

@@ -3,6 +3,7 @@
 import operator
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, SupportsIndex
 
@@ -18,6 +19,20 @@ from mwdn.errors import ImageError
 from mwdn.types import Psf
 
 _MAKE_AGAIN = "Make it again, with `mwdn import`."
+
+
+@dataclass(frozen=True)
+class Part:
+    """Some pairs of a file, by their positions."""
+
+    file: "PairFile"
+    rows: range | list[int]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
+        return self.file[self.rows[index]]
 
 
 class _Header(NamedTuple):

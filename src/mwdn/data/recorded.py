@@ -16,7 +16,7 @@ from mwdn.calibration.refinement import Refinement
 from mwdn.data.pair_writer import Attribute
 from mwdn.data.pairs import PairFile
 from mwdn.data.simulated import Batch, Samples
-from mwdn.data.splits import split
+from mwdn.data.splits import Split, split
 from mwdn.errors import ParameterError, ShapeError
 from mwdn.runtime.transfers import to_device
 from mwdn.solvers.alignment import Pose, align
@@ -55,6 +55,11 @@ class Division:
             UnknownNameError: no such split.
             ParameterError: it does not fit the count, or leaves no pair for training.
         """
+        parts = self.parts(count)
+        return parts["train"], parts["validation"]
+
+    def parts(self, count: int) -> Split:
+        """Positions of the pairs for "train", "validation" and "test"; raises as `of`."""
         parts = split(count, self.split, fractions=self.fractions, seed=self.seed, folds=self.folds, fold=self.fold)
         train, validation = parts["train"], parts.get("validation", [])
         if not validation:
@@ -65,7 +70,7 @@ class Division:
                 f"The split '{self.split}' of {count:,} pairs leaves {len(train):,} for training and "
                 f"{len(validation):,} for validation; both need at least one. Choose other `fractions` in [pairs]."
             )
-        return train, validation
+        return parts | {"train": train, "validation": validation}
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,8 +239,9 @@ def check_pairs(file: PairFile, psf: Psf) -> None:
     if file.scene_shape[:2] != (h, w):
         (a, b) = file.scene_shape[:2]
         raise ShapeError(
-            f"The scenes of `{file.path}` ({a} x {b}) must have the size of its measurements ({h} x {w}). "
-            "Make the file again with scenes of that size: `mwdn import --scene-size`."
+            f"The scenes of `{file.path}` ({a} x {b}) must have the size of its measurements ({h} x {w}). Import them "
+            "again: with `--scene-place TOP LEFT` if they show a part of the frame; with `--crop` of the captures if "
+            "these show more; with `--scene-size` only if both show the same."
         )
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from mwdn.data.hdf5 import as_damage, find_rows, names_in, open_hdf5
+from mwdn.data.pairs import PairFile
 from mwdn.data.shards import COPY_AGAIN, Shard, find_shards, natural_order
 from mwdn.errors import ImageError
 from mwdn.io.images import READABLE, read_frame
@@ -116,6 +117,22 @@ def list_hdf5(path: Path, captures: str, scenes: str) -> Listing:
         [Source(f"row {row}", partial(_read_row, path, file, (captures, scenes), row)) for row in range(complete)],
         refused,
     )
+
+
+def list_pair_file(path: Path, captures: str, scenes: str) -> Listing:
+    """List the pairs of a file of this package, (N, H, W, C): `PairFile`.
+
+    Raises:
+        ImageError: no such file, or not one of pairs.
+    """
+    count = len(PairFile(path))  # refuses what is no file of pairs
+    file = open_hdf5(path, COPY_AGAIN)
+
+    def load(row: int) -> tuple[Frame, Frame]:
+        with as_damage(f"Pair {row} of `{path}` cannot be read", COPY_AGAIN):
+            return file[captures][row], file[scenes][row]
+
+    return Listing([Source(f"pair {row}", partial(load, row)) for row in range(count)])
 
 
 def list_parquet(path: Path, captures: str, scenes: str) -> Listing:

@@ -1,0 +1,32 @@
+"""Write the MWDN authors' HDF5 file, as their code reads it; `mwdn import mwdn` reads it."""
+
+from pathlib import Path
+from typing import Any
+
+from mwdn.data.pair_writer import PairWriter, Shape
+from mwdn.types import Frame
+
+AUTHORS_NAMES = {"measurement": "blur", "scene": "gt"}
+"""Their names of a file's data sets."""
+
+
+class AuthorsWriter(PairWriter):
+    """The authors' file that is being written: ``blur`` and ``gt``, (N, 3, H, W), uint8, blue first.
+
+    Their training divides it by position: the first tenth is the test, the second the validation.
+
+    Args:
+        path: ends in .h5 or .hdf5.
+        measurement_shape: (H, W, C) of the measurements.
+        scene_shape: (H, W, C) of the scenes; their code needs that of the measurements.
+    """
+
+    def __init__(self, path: Path, measurement_shape: Shape, scene_shape: Shape) -> None:
+        super().__init__(path, (measurement_shape, scene_shape), "uint8", {}, None)
+
+    def _set_up(self, file: Any) -> None:  # noqa: ANN401
+        for name, (height, width, channels) in self._shapes.items():
+            self._data[name] = self._make_rows(file, AUTHORS_NAMES[name], (channels, height, width))
+
+    def _stored(self, pixels: Frame) -> Frame:
+        return pixels[..., ::-1].transpose(2, 0, 1)
