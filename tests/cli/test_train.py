@@ -166,6 +166,7 @@ def test_the_file_of_pairs_and_the_table_have_one_name(run, camera):
     """`--pairs` is a file and `--pairs.split` a key of the recipe, in either order."""
     assert run("simulate photos --psf psf.npy -o pairs.h5 --count 20 --recipe r.toml")[0] == 0
     line = TRAIN.replace("--photos photos --steps 4", "--pairs pairs.h5 --pairs.split random --best-by loss --steps 1")
+    line += " --network.name unet --network.width 2"
     code, _, err = run(line)
     assert code == 0, err
     assert re.search(r"validation \d+\.\d\d dB, best loss \d", flat(err))
