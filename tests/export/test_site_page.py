@@ -60,6 +60,8 @@ def files(tmp_path_factory):
     other = Calibration.from_file(folder / "other.png", psf_orientation="rotate-180")
     write_capture(folder / "capture.png", own, "coffee", maximum=4095)
     write_capture(folder / "of-the-other.png", other, "cat")
+    for name in ("other.png", "of-the-other.png"):  # of a sensor with pixels of half the size
+        write_frame(folder / f"fine-{name}", read_frame(folder / name).repeat(2, 0).repeat(2, 1))
     (folder / "wrong.png").write_bytes((folder / "capture.png").read_bytes()[:-1000])
     (folder / "photo.jpg").write_bytes(cv2.imencode(".jpg", np.zeros((96, 128, 3), np.uint8))[1].tobytes())
     write_frame(folder / "small.png", np.zeros((64, 64, 3), np.uint8))
@@ -139,6 +141,13 @@ def check_files(page, folder, own, other):
     wait_for(page, "of-the-other.png")
     expected = check_scene(page, other, folder / "of-the-other.png")
     assert page.run("document.querySelectorAll('#captures button').length") == 2
+    page.drop("#psf", folder / "fine-other.png")
+    page.wait(f"{STATE}.classList.contains('wrong')")
+    assert said(page).startswith("of-the-other.png has 48 x 64 pixels")  # the PSF is binned, and so are captures
+    page.drop("#capture", folder / "fine-of-the-other.png")
+    wait_for(page, "fine-of-the-other.png")
+    fine = Calibration.from_file(folder / "fine-other.png", bin=2, psf_orientation="rotate-180")
+    check_scene(page, fine, folder / "fine-of-the-other.png")
 
     # Pictures for people are the package's, within rounding.
     for button, bits in (("save-png", 8), ("save-png16", 16)):

@@ -29,13 +29,13 @@ function say(text, wrong = false) {
 // Work is done one after the other; a failed piece is named and the next goes on.
 function enqueue(work) {
   queue = queue.then(async () => {
-    byId("result").setAttribute("aria-busy", "true");
+    byId("bar").classList.add("busy");
     try {
       await work();
     } catch (error) {
       say(error instanceof FileError || error instanceof PageError ? error.message : `The page failed: ${error.message}`, true);
     } finally {
-      byId("result").setAttribute("aria-busy", "false");
+      byId("bar").classList.remove("busy");
     }
   });
   return queue;
@@ -143,9 +143,14 @@ function choose(capture) {
   return enqueue(() => reconstruct(capture));
 }
 
+// The chosen capture, after a change of its camera; a sample is of the camera of this page only.
 function again() {
   const capture = captures[Number(byId("chosen").dataset.current)];
-  if (capture) choose(capture);
+  if (capture && !(dropped && capture.isSample)) return choose(capture);
+  return dropped && enqueue(async () => {
+    await about(dropped.name, async () => currentPsf());
+    say(`${dropped.name} is the PSF. Drop captures of its camera.`);
+  });
 }
 
 function addButton(place, capture) {
@@ -182,21 +187,13 @@ async function takeCaptures(files) {
 }
 
 async function takePsf([file]) {
-  const frame = await about(file.name, () => readFrame(file));
-  const before = dropped;
-  dropped = { name: file.name, frame };
-  try {
-    await about(file.name, async () => currentPsf());
-  } catch (error) {
-    dropped = before;
-    throw error;
-  }
+  dropped = { name: file.name, frame: await about(file.name, () => readFrame(file)) };
+  const times = dropped.frame.height / HEIGHT;
+  byId("bin").value = Number.isInteger(times) && dropped.frame.width === times * WIDTH ? times : 1;
   byId("psf-name").textContent = file.name;
   byId("psf-name").parentElement.classList.add("full");
   byId("own").hidden = byId("format").hidden = false;
-  const capture = captures[Number(byId("chosen").dataset.current)];
-  if (capture && !capture.isSample) again();
-  else say(`${file.name} is the PSF. Drop captures of its camera.`);
+  again();
 }
 
 function useOwnCamera() {
@@ -260,7 +257,7 @@ async function check(candidate) {
 }
 
 async function start() {
-  if (typeof DecompressionStream === "undefined") throw new PageError("This browser is too old: Chromium 80, Firefox 113 or Safari 16.4 are needed.");
+  if (typeof DecompressionStream === "undefined") throw new PageError("This browser is too old: Chromium 123, Firefox 120 or Safari 17.5 are needed.");
   await loadCamera();
   network = await openNetwork(check, say);
   prepared = own.psf;
@@ -293,4 +290,4 @@ byId("save-png16").onclick = () => enqueue(() => save(byId("save-png16"), "-16bi
 byId("save-npy").onclick = () => enqueue(() => save(byId("save-npy"), ".npy", async () => encodeNpy(shown.scene)));
 // A file that misses its zone must not replace the page.
 for (const name of ["dragover", "drop"]) document.addEventListener(name, (event) => event.preventDefault());
-enqueue(start).then(() => network && captures.length && choose(captures[0]));
+enqueue(start).then(() => network && !byId("chosen").dataset.current && choose(captures[0]));
