@@ -49,7 +49,7 @@ def runtime(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runtime")
     (folder / "dist").mkdir()
     (folder / "package.json").write_text(json.dumps({"name": "onnxruntime-web", "version": web_runtime.VERSION}))
-    for name in web_runtime._NAMES:
+    for name in web_runtime.NAMES:
         (folder / "dist" / name).write_bytes(name.encode())
     return folder
 
@@ -178,7 +178,7 @@ def test_the_runtime_is_checked(runtime, tmp_path, monkeypatch):
         web_runtime.read_runtime(tmp_path)
     other = tmp_path / "other"
     (other / "dist").mkdir(parents=True)
-    for name in web_runtime._NAMES:
+    for name in web_runtime.NAMES:
         (other / "dist" / name).touch()
     (other / "package.json").write_text('{"name": "onnxruntime-web", "version": "1.0.0"}')
     with pytest.raises(ExportError, match=r"must be onnxruntime-web 1\.30\.0, but is onnxruntime-web 1\.0\.0"):

@@ -27,7 +27,8 @@ BINARIES = {"wasm": "ort-wasm-simd-threaded", "webgpu": "ort-wasm-simd-threaded.
 FETCH_S = 600.0
 """Longest time for the archive, 33 MB."""
 
-_NAMES = [*LIBRARIES.values(), *(name + suffix for name in BINARIES.values() for suffix in (".mjs", ".wasm"))]
+NAMES = [*LIBRARIES.values(), *(name + suffix for name in BINARIES.values() for suffix in (".mjs", ".wasm"))]
+"""The files of both."""
 
 
 def read_runtime(folder: Path | None = None) -> dict[str, bytes]:
@@ -47,7 +48,7 @@ def _from_folder(folder: Path) -> dict[str, bytes]:
     try:
         about = json.loads((folder / "package.json").read_bytes())
         found = f"{about['name']} {about['version']}"
-        files = {name: (folder / "dist" / name).read_bytes() for name in _NAMES}
+        files = {name: (folder / "dist" / name).read_bytes() for name in NAMES}
     except (OSError, ValueError, KeyError, TypeError) as error:
         reason = getattr(error, "strerror", None) or "it has another `package.json`"
         raise ExportError(
@@ -69,7 +70,7 @@ def _from_archive(archive: Path) -> dict[str, bytes]:
         )
     try:
         with tarfile.open(archive) as package:
-            members = ((name, package.extractfile(f"package/dist/{name}")) for name in _NAMES)
+            members = ((name, package.extractfile(f"package/dist/{name}")) for name in NAMES)
             return {name: member.read() for name, member in members if member is not None}
     except (tarfile.TarError, zlib.error, KeyError, OSError) as error:
         raise ExportError(f"`{archive}` cannot be read: {error}. Delete it and run the command again.") from error
