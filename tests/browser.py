@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import subprocess
+import tarfile
 import threading
 import urllib.request
 from contextlib import contextmanager
@@ -15,6 +16,15 @@ from pathlib import Path
 from websockets.sync.client import connect
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+AXE = "axe-core@4.14.1"
+LOOKS = {
+    "light": (1280, 900, False),
+    "dark": (1280, 900, True),
+    "phone": (390, 800, False),
+    "dark-phone": (390, 800, True),
+}
+"""Width, height, and whether it is dark."""
+
 PATIENCE_S = 90
 """Longest wait for something on the page; a machine may be busy."""
 
@@ -103,6 +113,29 @@ def open_page(url, profile):
         for thread in readers:
             thread.join()
         process.stderr.close()
+
+
+def fetch_axe(folder):
+    """axe-core as a script, from npm, pinned; it is not kept."""
+    subprocess.run(["npm", "pack", "--silent", AXE], cwd=folder, check=True, stdout=subprocess.DEVNULL, timeout=120)
+    with tarfile.open(next(folder.glob("*.tgz"))) as archive:
+        return archive.extractfile("package/axe.min.js").read().decode()
+
+
+def violations(page, axe, pictures):
+    """What axe-core finds on the page in each look, by rule; screenshots go to ``pictures``-light.png ..."""
+    pictures.parent.mkdir(parents=True, exist_ok=True)
+    page.run(axe + "; true")
+    found = {}
+    for look, (width, height, dark) in LOOKS.items():
+        page.size(width, height, dark=dark)
+        result = json.loads(page.run("axe.run().then(found => JSON.stringify(found))"))
+        assert result["passes"]
+        page.screenshot(f"{pictures}-{look}.png")
+        for violation in result["violations"]:
+            nodes = [node["html"][:120] + node["failureSummary"] for node in violation["nodes"]]
+            found.setdefault(violation["id"], []).append((look, nodes))
+    return found
 
 
 def _debugger(process, readers):

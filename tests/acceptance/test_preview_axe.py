@@ -3,15 +3,12 @@
 axe-core comes from npm, pinned, and is not kept. Screenshots go to results/acceptance/preview; look at them.
 """
 
-import json
 import shutil
-import subprocess
-import tarfile
 from pathlib import Path
 
 import pytest
 
-from browser import CHROMIUM, open_page
+from browser import CHROMIUM, fetch_axe, open_page, violations
 from mwdn.calibration import Calibration
 from mwdn.capture import open_source
 from mwdn.preview.cameras import Cameras
@@ -19,7 +16,6 @@ from mwdn.preview.limits import Limits
 from mwdn.preview.live import Live
 from mwdn.preview.server import make_server
 
-AXE = "axe-core@4.14.1"
 OUT = Path("results/acceptance/preview")
 
 pytestmark = [
@@ -31,10 +27,7 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def axe(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("axe")
-    subprocess.run(["npm", "pack", "--silent", AXE], cwd=folder, check=True, stdout=subprocess.DEVNULL, timeout=120)
-    with tarfile.open(next(folder.glob("*.tgz"))) as archive:
-        return archive.extractfile("package/axe.min.js").read().decode()
+    return fetch_axe(tmp_path_factory.mktemp("axe"))
 
 
 @pytest.fixture(scope="module")
@@ -75,21 +68,4 @@ def test_no_violation(page, axe, show):
     if show:
         show(page)
     name = show.__name__ if show else "empty"
-    OUT.mkdir(parents=True, exist_ok=True)
-    page.run(axe + "; true")
-    found = {}
-    for look, (width, height, dark) in {
-        "light": (1280, 900, False),
-        "dark": (1280, 900, True),
-        "phone": (390, 800, False),
-        "dark-phone": (390, 800, True),
-    }.items():
-        page.size(width, height, dark=dark)
-        result = json.loads(page.run("axe.run().then(found => JSON.stringify(found))"))
-        assert result["passes"]
-        page.screenshot(OUT / f"{name}-{look}.png")
-        for violation in result["violations"]:
-            found.setdefault(violation["id"], []).append(
-                (look, [node["html"][:120] + node["failureSummary"] for node in violation["nodes"]])
-            )
-    assert not found
+    assert not violations(page, axe, OUT / name)

@@ -4,8 +4,10 @@ import base64
 import functools
 import http.server
 import io
+import shutil
 import threading
 from contextlib import contextmanager
+from pathlib import Path
 
 import cv2
 import jaxtyping
@@ -13,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 
-from browser import CHROMIUM, open_page
+from browser import CHROMIUM, fetch_axe, open_page, violations
 from mwdn import Calibration, Camera, Reconstructor, read_frame, to_display, write_picture
 from mwdn.cli.app import main
 from mwdn.data.random import seeded
@@ -211,6 +213,20 @@ def test_from_a_static_host_whose_connection_is_lost(files, tmp_path):
         wait_for(page, "capture.png")
         check_scene(page, own, folder / "capture.png")
         assert not page.errors
+
+
+@pytest.mark.skipif(shutil.which("npm") is None, reason="needs npm, for axe-core")
+def test_axe_finds_no_violation(files, tmp_path):
+    """Screenshots go to results/acceptance/site; look at them."""
+    folder, _, _ = files
+    with open_page((folder / "site" / "index.html").as_uri(), tmp_path / "profile") as page:
+        page.wait(STATE)
+        wait_for(page, "astronaut")
+        page.drop("#psf", folder / "other.png")
+        page.drop("#capture", folder / "of-the-other.png", folder / "capture.png")
+        wait_for(page, "of-the-other.png")
+        page.run("document.getElementById('format').open = true")
+        assert not violations(page, fetch_axe(tmp_path), Path("results/acceptance/site"))
 
 
 def test_a_missing_file_is_named(files, tmp_path):
