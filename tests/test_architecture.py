@@ -201,3 +201,16 @@ def test_a_folder_lists_its_names_once_and_has_them():
         elif names and "__getattr__" not in known and not set(names) <= known:
             wrong.append(f"{place(path)} lists {set(names) - known}, which it does not have")
     assert not wrong
+
+
+def test_no_message_names_a_page_that_a_wheel_lacks():
+    """Messages name `mwdn explain TOPIC` instead."""
+    docstrings = {id(node.value) for tree in TREES.values() for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    named = [
+        place(path, node.lineno)
+        for path, tree in TREES.items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings
+        if re.search(r"docs/[\w-]+\.md", node.value)
+    ]
+    assert not named

@@ -1,22 +1,22 @@
 """Everything that this package raises on purpose.
 
-::
-
-    MwdnError
-    ├── ShapeError (ValueError)        two arrays that do not fit together
-    ├── ParameterError (ValueError)    a number or an option outside its range
-    │   └── UnknownNameError           a name that no method, network or recipe key has
-    ├── ImageError (ValueError)        a picture or frame that cannot be read or written
-    │   ├── FrameShapeError            an array or file with other axes than a frame; also a ShapeError
-    │   └── FrameTypeError             with numbers of another type, or no array at all; also a TypeError
-    ├── PsfError (ValueError)          a PSF that no reconstruction can trust
-    ├── AlignmentError (ValueError)    a displayed picture that cannot be found in a reconstruction
-    ├── CheckpointError (ValueError)   weights that are damaged or belong to something else
-    ├── ExportError                    a method that cannot be exported, or gives other results after export
-    ├── DivergenceError                a loss that is no longer finite
-    ├── CameraError                    a camera that cannot be opened, or delivers no frames any more
-    ├── DisplayError                   a display that does not show what it should
-    └── ProcessError                   another process of a distributed run has ended
+```text
+MwdnError
+├── ShapeError (ValueError)        two arrays that do not fit together
+├── ParameterError (ValueError)    a number or an option outside its range
+│   └── UnknownNameError           a name that no method, network or recipe key has
+├── ImageError (ValueError)        a picture or frame that cannot be read or written
+│   ├── FrameShapeError            an array or file with other axes than a frame; also a ShapeError
+│   └── FrameTypeError             with numbers of another type, or no array at all; also a TypeError
+├── PsfError (ValueError)          a PSF that no reconstruction can trust
+├── AlignmentError (ValueError)    a displayed picture that cannot be found in a reconstruction
+├── CheckpointError (ValueError)   weights that are damaged or belong to something else
+├── ExportError                    a method that cannot be exported, or gives other results after export
+├── DivergenceError                a loss that is no longer finite
+├── CameraError                    a camera that cannot be opened, or delivers no frames any more
+├── DisplayError                   a display that does not show what it should
+└── ProcessError                   another process of a distributed run has ended
+```
 """
 
 import difflib
