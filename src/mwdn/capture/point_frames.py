@@ -84,7 +84,7 @@ def record_point(pairs: CapturedPairs, table: PointTable, shooting: Shooting, *,
     if not math.isfinite(usual_s):
         raise CameraError(
             f"{shooting.camera.name} does not say its exposure, which [point] must change. Set `frames` of [point] to "
-            "0, and photograph a point source: docs/calibrate.md."
+            "0, and photograph a point source: `mwdn calibrate --help`."
         )
     size = screen.height_px, screen.width_px
     for name, level in (("dark", 0), ("white", 255), ("half", HALF)):
@@ -151,5 +151,5 @@ def _check_contrast(pairs: CapturedPairs, dark: Frame, table: PointTable) -> Non
             f"The point on the display adds only {max(part, 0):.1%} of the full scale in {dark.exposure_s:.3g} s; the "
             "rest is the room's light and that of black pixels. Darken the room, raise `size_cm` "
             f"({table.size_cm:g}) of [point], or set its `frames` to 0 and photograph a lamp behind a pinhole: "
-            "docs/calibrate.md."
+            "`mwdn calibrate --help`."
         )

@@ -84,7 +84,7 @@ def _extracted(path: Path, folder: Path, given: BenchFrames) -> BenchFrames:
     if not count or not {"dark", "white", "half"} <= groups.keys():
         raise ParameterError(
             f"`{path}` has no frames of a point source. Set `frames` of [point] in the recipe before the session "
-            "starts (`mwdn capture RECIPE --point.frames 8`), or photograph one: docs/calibrate.md."
+            "starts (`mwdn capture RECIPE --point.frames 8`), or photograph one: `mwdn calibrate --help`."
         )
     points, darks = ([f"{kind}-{number}" for number in range(1, count + 1)] for kind in ("point", "dark"))
     times = [exposures_ms[name] for name in points]
