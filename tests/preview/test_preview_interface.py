@@ -224,6 +224,19 @@ def test_the_document_names_every_route(client):
             assert str(response.status_code) in operations[method]["responses"], (place, response.status_code)
 
 
+def test_method_that_a_path_has_not_is_answered_with_those_that_it_has(client):
+    answer = client.request("TRACE", "/cameras/sample")
+    assert answer.status_code == 405
+    assert set(answer.headers["allow"].split(", ")) == {"GET", "HEAD", "DELETE"}
+    assert client.head("/cameras/sample").status_code == 200
+
+
+def test_job_with_a_wrong_look_is_refused(client, capture):
+    response = client.post("/jobs", files={"capture": capture}, data={"camera": "camera", "exposure": "7"})
+    assert response.status_code == 422
+    assert "exposure" in response.json()["error"]
+
+
 def test_metrics_and_health(client, capture):
     before = client.get("/metrics").text
     order(client, capture)

@@ -30,6 +30,7 @@ from mwdn.preview.openapi import openapi
 from mwdn.preview.psf_report import psf_report
 from mwdn.preview.reconstruction import Order, Reconstructions
 from mwdn.preview.result import MEDIA, Look, encode
+from mwdn.preview.routing import route
 from mwdn.preview.samples import CAMERA, NAMES, sample_png
 from mwdn.preview.uploads import Form, parse_look, read_form
 from mwdn.version import __version__
@@ -88,16 +89,13 @@ class Preview:
             Route("/methods", self.methods),
             Route("/samples", self.samples),
             Route("/samples/{name}", self.sample),
-            Route("/cameras", self.list_cameras),
-            Route("/cameras", self.add_camera, methods=["POST"]),
-            Route("/cameras/{name}", self.camera),
-            Route("/cameras/{name}", self.remove_camera, methods=["DELETE"]),
+            route("/cameras", GET=self.list_cameras, POST=self.add_camera),
+            route("/cameras/{name}", GET=self.camera, DELETE=self.remove_camera),
             Route("/inspect", self.inspect, methods=["POST"]),
             Route("/cameras/{name}/psf", self.camera_psf),
             Route("/reconstruct", self.reconstruct, methods=["POST"]),
             Route("/jobs", self.add_job, methods=["POST"]),
-            Route("/jobs/{id}", self.job),
-            Route("/jobs/{id}", self.cancel, methods=["DELETE"]),
+            route("/jobs/{id}", GET=self.job, DELETE=self.cancel),
             Route("/jobs/{id}/picture", self.picture),
             Route("/jobs/{id}/measurement", self.measurement),
             *LiveRoutes(self.live, self.cameras, self.jobs, self.limits).routes,
@@ -195,6 +193,7 @@ class Preview:
     async def add_job(self, request: Request) -> Response:
         """Start a reconstruction, and answer at once."""
         form = await read_form(request, self.limits, FILES, TEXTS)
+        parse_look(form.texts)  # of no use here, but never wrong without a word
         job = self._submit(form)
         return JSONResponse(job.content(), 202, {"Location": f"/jobs/{job.id}"})
 

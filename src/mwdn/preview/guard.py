@@ -133,7 +133,9 @@ def error_response(error: Exception) -> JSONResponse:
 async def failed(_: Request, error: Exception) -> JSONResponse:
     """Any error of the application as JSON."""
     if isinstance(error, HTTPException):
-        return error_response(RefusedError(error.status_code, f"{error.detail}. See /openapi.json."))
+        response = error_response(RefusedError(error.status_code, f"{error.detail}. See /openapi.json."))
+        response.headers.update(error.headers or {})  # `Allow` of a path that has no such method
+        return response
     if isinstance(error, MwdnError):
         return error_response(error)
     return error_response(RefusedError(500, "An error of mwdn itself. The server's log says more."))
