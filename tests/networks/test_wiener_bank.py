@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from made import trained
 from mwdn.errors import ParameterError
 from mwdn.networks import build
 from mwdn.networks.wiener_bank import CLOSED, NUMBERS, WienerBank
@@ -140,3 +141,19 @@ def test_any_size_with_all_options(generator, size):
         scene = network(measurement, psf**8)
     assert scene.shape == measurement.shape
     assert torch.isfinite(scene).all()
+
+
+def test_no_frame_around_the_picture(generator):
+    """Even estimates: what the U-Net changes at the border is what it changes inside, but for zeros 24 pixels away."""
+    network = trained(build("wiener-bank", width=4, block=24, rounds=1, mean_light="free"), generator).eval()
+    estimates = torch.rand(1, 15, 1, 1, generator=generator).expand(-1, -1, 192, 192)
+    with torch.no_grad():
+        corrected = network.correct(estimates, network.unit(estimates))
+        framed = network._correct(estimates, network.unit(estimates))
+
+    def contrast(picture):
+        folded = torch.nn.functional.avg_pool2d(picture, 2)
+        inside = folded[..., 32:-32, 32:-32].mean((-2, -1), keepdim=True)
+        return float((folded[..., :2] - inside).square().mean().sqrt())
+
+    assert contrast(corrected) < 0.3 * contrast(framed), (contrast(corrected), contrast(framed))

@@ -3,6 +3,7 @@
 import os
 import shlex
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -21,6 +22,7 @@ def benchmark(
     out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("runs/benchmark"),
     device: str | None = None,
     lpips: bool | None = None,
+    seed: int | None = None,
 ) -> None:
     """Train and score every method of a recipe under one protocol, and write one page.
 
@@ -34,11 +36,14 @@ def benchmark(
         device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
         lpips: LPIPS and feature MSE: download their public weights (234 MiB, once) if they are missing, or leave both
             metrics out. By default they are used if they are there; a terminal asks before a download.
+        seed: of the trainings: start weights and order of the pairs; that of the recipe unless given.
     """
     from mwdn.benchmark import Watch, read_benchmark, run
     from mwdn.benchmark.run import PAGE
 
     contents = read_benchmark(recipe)
+    if seed is not None:
+        contents = replace(contents, schedule=replace(contents.schedule, seed=seed))
     lpips = ask_for_lpips(lpips, contents.alexnet, contents.heads)
     is_first = os.environ.get("RANK", "0") == "0"
     with show_progress(enabled=is_first, titles=True) as progress:

@@ -210,6 +210,21 @@ class WienerBank(Network[BankTransfers]):
 
     def correct(self, estimates: Tensor, unit: Tensor) -> Scene:
         """Scene (B, C, H, W) from `estimates` or a crop of them: the U-Net's correction added to the smoothest."""
+        border = self._border(estimates)
+        if border:
+            wide = self._correct(F.pad(estimates, (border,) * 4, mode="reflect"), unit)
+            return wide[..., border:-border, border:-border]
+        return self._correct(estimates, unit)
+
+    def _border(self, estimates: Tensor) -> int:
+        """Pixels by which a frame's estimates are mirrored beyond it, so that the U-Net does not meet its own zeros.
+
+        Those drew a frame around the picture. A block leaves the grid of blocks as it is. Without plug and play, in a
+        network for live pictures, no frame can be seen; the crops of a training have no border of a frame.
+        """
+        return 0 if self.training or not self.rounds else min(self.block, *(n - 1 for n in estimates.shape[-2:]))
+
+    def _correct(self, estimates: Tensor, unit: Tensor) -> Scene:
         first = estimates[:, : self.channels]
         height, width = estimates.shape[-2:]
         below, right = (max(-size % self.fold, 32 * self.fold - size) for size in (height, width))
