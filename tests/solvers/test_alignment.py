@@ -9,6 +9,7 @@ from cameras import contour_psf
 from mwdn.errors import ShapeError
 from mwdn.optics.camera import Camera
 from mwdn.optics.warp import hazed
+from mwdn.solvers import alignment
 from mwdn.solvers.alignment import Pose, align
 from mwdn.solvers.pyramid import Pyramid
 
@@ -123,3 +124,17 @@ def test_dark_capture_of_odd_size_has_no_pose(psf):
     assert pose.turn_degrees.item() == pose.scale.item() == pose.haze.item() == 0.0
     with pytest.raises(ShapeError, match="channels"):
         align(torch.zeros(1, 3, 51, 43), psf.expand(1, 2, -1, -1))
+
+
+def test_what_is_no_fall_off_stays_in_the_residual(generator):
+    """A fall-off of half the bound is taken out, on the sensor; one of four times the bound is not."""
+    size, grid = (30, 40), (36, 44)
+    prediction = torch.zeros(1, 3, *grid)
+    prediction[..., : size[0], : size[1]] = torch.randn(1, 3, *size, generator=generator)
+    x = torch.linspace(-1, 1, size[1]).expand(size)
+    slope = torch.nn.functional.pad(x, (0, grid[1] - size[1], 0, grid[0] - size[0])) * prediction
+    beyond = torch.zeros_like(prediction)
+    beyond[..., 33, 42] = 1.0
+    small, large = (alignment._without_fall_off(c * slope + beyond, prediction, size) for c in (0.12, 1.0))
+    assert small.abs().max() < 1e-4
+    assert torch.equal(large, slope + beyond)

@@ -183,19 +183,24 @@ def _residual(measurement: Tensor, psf: Psf, poses: Tensor) -> Tensor:
     psfs = psf.expand(len(measurement), -1, -1, -1).repeat_interleave(count, 0)
     moved = Pose(*poses.flatten(0, 1).unbind(-1)).move(psfs)
     estimate = solve(measurement.repeat_interleave(count, 0), halve_psf(moved), SMOOTH_LEVELS)
-    grid, size = estimate.psf.bands[-1].grid, (measurement.shape[-2], measurement.shape[-1])
+    grid = estimate.psf.bands[-1].grid
     high = 1 - _low_pass(grid, _HIGH_PASS, measurement.device)
-    r = inverse_spectrum(estimate.residual_spectrum * high, grid, size)
-    b = inverse_spectrum(spectrum(measurement, grid) * high, grid, size)  # the prediction is b - r, high-passed
-    return _without_fall_off(r, b.repeat_interleave(count, 0) - r).reshape(len(measurement), count, -1)
+    r = inverse_spectrum(estimate.residual_spectrum * high, grid, grid)
+    b = inverse_spectrum(spectrum(measurement, grid) * high, grid, grid)  # the prediction is b - r, high-passed
+    size = measurement.shape[-2], measurement.shape[-1]
+    return _without_fall_off(r, b.repeat_interleave(count, 0) - r, size).reshape(len(measurement), count, -1)
 
 
-def _without_fall_off(r: Tensor, p: Tensor) -> Tensor:
-    """The part (N, C, H, W) of a residual r that no fall-off explains: ``r - sum_k a_k q_k p``, a by least squares.
+def _without_fall_off(whole: Tensor, prediction: Tensor, size: Size) -> Tensor:
+    """The part of a residual r that no fall-off explains, on the sensor: ``r - sum_k a_k q_k p``, a by least squares.
 
+    The residual and the high-passed prediction are given on a grid (N, C, rows, columns) that begins with the sensor.
     The polynomials q are smooth, so that the high-passed product with a prediction is q times the high-passed
-    prediction p. A fall-off of more than `_MOST_FALL_OFF` is not a sensor's: such a residual stays as it is.
+    prediction p. A fall-off of more than `_MOST_FALL_OFF` is not a sensor's: such a residual stays as it is, with what
+    the high pass spreads beyond the sensor.
     """
+    height, width = size
+    r, p = whole[..., :height, :width], prediction[..., :height, :width]
     y, x = (torch.linspace(-1, 1, length, device=r.device) for length in r.shape[-2:])
     y, x = torch.meshgrid(y, x, indexing="ij")
     q = torch.stack([torch.ones_like(x), x, y, x * y, x.square() - y.square(), x.square() + y.square()])
@@ -203,8 +208,11 @@ def _without_fall_off(r: Tensor, p: Tensor) -> Tensor:
     normal = A @ A.mT
     ridge = (1e-6 * normal.diagonal(dim1=-2, dim2=-1).mean(-1)).clamp(min=1e-30)[:, None, None]
     a = torch.linalg.solve(normal + ridge * torch.eye(len(q)).to(r), A @ r.flatten(1)[..., None])
-    a = torch.where(a.abs().amax(1, keepdim=True) < _MOST_FALL_OFF, a, 0.0)
-    return r - (a.mT @ A)[:, 0].reshape(r.shape)
+    is_sensor = (a.abs().amax((1, 2)) < _MOST_FALL_OFF)[:, None, None, None]
+    unexplained = F.pad(
+        r - (a.mT @ A)[:, 0].reshape(r.shape), (0, whole.shape[-1] - width, 0, whole.shape[-2] - height)
+    )
+    return torch.where(is_sensor, unexplained, whole)
 
 
 def halve_psf(psf: Psf) -> Tensor:
