@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -13,7 +14,7 @@ from mwdn.capture.display import RigDisplay
 from mwdn.capture.patterns import point
 from mwdn.capture.recipe import read_capture_recipe
 from mwdn.capture.session import Session
-from mwdn.capture.set_up import open_camera
+from mwdn.capture.set_up import open_camera, open_lamp
 from mwdn.errors import CameraError
 from mwdn.optics.displacement import displacement
 
@@ -37,7 +38,8 @@ def recipe(tmp_path):
 def session(recipe, out):
     camera = open_camera(recipe)
     camera.open()
-    return camera, Session(recipe, camera, RigDisplay(camera), out, wait=lambda _: None)
+    lamp = open_lamp(camera, lambda task: None)
+    return camera, Session(recipe, camera, RigDisplay(camera), out, wait=lambda _: None, lamp=lamp)
 
 
 def exact(recipe):
@@ -53,7 +55,11 @@ def exact(recipe):
     return (frames[0] - frames[1]).movedim(-1, 0)[None]
 
 
-def test_a_session_becomes_a_camera_file(tmp_path, run, recipe):
+def test_a_session_with_a_lamp_becomes_a_camera_file(tmp_path, run, recipe):
+    """In a lit room, in front of a display whose black glows."""
+    expected = exact(replace(recipe, point=replace(recipe.point, size_cm=0.1)))
+    lit = replace(recipe.rig, room_light=0.02, display_black=0.001)
+    recipe = replace(recipe, rig=lit, point=replace(recipe.point, lamp=True, ratio=60.0))
     rig, made = session(recipe, tmp_path / "captured.h5")
     assert made.run() == 1
     assert rig.exposure_s == pytest.approx(0.01)  # set back
@@ -61,9 +67,14 @@ def test_a_session_becomes_a_camera_file(tmp_path, run, recipe):
     assert code == 0, err
     assert "12 frames averaged at 2 exposures" in out
     calibration = Calibration.load(tmp_path / "camera.toml")
-    assert displacement(calibration.psf, exact(recipe)).correlation > 0.99
+    assert displacement(calibration.psf, expected).correlation > 0.99
     assert calibration.sensor.full_well == pytest.approx(15_000, rel=0.1)
-    assert float(calibration.dark.mean()) == pytest.approx(0.01, rel=0.05)  # the black level, at the usual exposure
+    assert calibration.sensor.read_noise == pytest.approx(3, abs=1)  # not the noise of the room's light
+    # Black level and room light at the exposure of the pictures, not at the longest of the lamp.
+    with h5py.File(tmp_path / "captured.h5") as file:
+        dark = file["calibration/dark/measurement"][:].mean() / 4095
+        assert file["calibration/dark-2/measurement"][:].mean() / 4095 > 1.1 * dark
+    assert float(calibration.dark.mean()) == pytest.approx(dark, rel=1e-3)
     content = read_camera(tmp_path / "camera.toml")
     assert content["bit_depth"] == 12
     assert "flat_field" not in content  # the mask was in front of the sensor
@@ -83,6 +94,11 @@ def test_it_is_recorded_once_and_not_at_all_unless_asked_for(tmp_path, run, reci
     assert "has no frames of a point source" in err
     rig, made = session(recipe, out)
     made.run()
+    with h5py.File(out) as file:
+        frames = [file[f"calibration/{name}/measurement"][:].mean(0) for name in ("point-1", "dark-1")]
+        assert file["calibration/point-2"].attrs["exposure_s"] / file["calibration/point-1"].attrs["exposure_s"] == 8
+    light = torch.from_numpy((frames[0] - frames[1]).astype(np.float32)).movedim(-1, 0)[None]
+    assert displacement(light, exact(recipe)).correlation > 0.999
     before = rig._number
     session(recipe, out)[1].run()
     again, made = session(recipe, out)
@@ -91,9 +107,14 @@ def test_it_is_recorded_once_and_not_at_all_unless_asked_for(tmp_path, run, reci
 
 
 @pytest.mark.parametrize(
-    ("change", "said"), [({"room_light": 0.02}, "adds only"), ({"display_black": 0.01}, "adds only")]
+    ("rig", "point", "said"),
+    [
+        ({"room_light": 0.02}, {}, r"other light has .*`lamp = true`"),
+        ({"display_black": 0.01}, {}, "other light has"),
+        ({}, {"most_s": 0.5}, "too faint"),
+    ],
 )
-def test_a_point_that_drowns_in_other_light_is_refused(tmp_path, recipe, change, said):
-    _, made = session(replace(recipe, rig=replace(recipe.rig, **change)), tmp_path / "captured.h5")
+def test_a_faint_point_is_refused_with_its_reason(tmp_path, recipe, rig, point, said):
+    recipe = replace(recipe, rig=replace(recipe.rig, **rig), point=replace(recipe.point, **point))
     with pytest.raises(CameraError, match=said):
-        made.run()
+        session(recipe, tmp_path / "captured.h5")[1].run()

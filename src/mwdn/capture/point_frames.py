@@ -4,7 +4,7 @@ They are stored in the session's file, each group (K, H, W, C) of `GROUPS` with 
 
 | group | display | exposure |
 | --- | --- | --- |
-| ``point-1``, ``point-2`` ... | a white point on black | the shortest; each next one `PointTable.ratio` times as long |
+| ``point-1``, ``point-2`` ... | a point on black, or a lamp | the shortest, then each `ratio` times the last |
 | ``dark-1``, ``dark-2`` ... | black | likewise |
 | ``dark`` | black | that of the session's pictures |
 | ``white``, ``half`` | white, and grey of half of its light | likewise |
@@ -53,12 +53,14 @@ class Shooting(NamedTuple):
         screen: pixels and centimetres of the display.
         frame_of: shows a picture and returns the first frame of it.
         grab: the first frame whose exposure began after a moment, in seconds since 1970.
+        lamp: switches the lamp on or off, or has a person do it; returns when it is done.
     """
 
     camera: CameraSource
     screen: Screen
     frame_of: Callable[[Picture], Frame]
     grab: Callable[[float], Frame]
+    lamp: Callable[[bool], None]
 
     def expose(self, exposure_s: float) -> Frame:
         """Set an exposure, and return the first frame that has it."""
@@ -86,15 +88,20 @@ def record_point(pairs: CapturedPairs, table: PointTable, shooting: Shooting, *,
             f"{shooting.camera.name} does not say its exposure, which [point] must change. Set `frames` of [point] to "
             "0, and photograph a point source: `mwdn calibrate --help`."
         )
-    size = screen.height_px, screen.width_px
+    black = grey(0, (screen.height_px, screen.width_px))
     for name, level in (("dark", 0), ("white", 255), ("half", HALF)):
-        first = shooting.frame_of(grey(level, size))
+        first = shooting.frame_of(np.full_like(black, level))
         _add(pairs, name, _series(shooting, first, table.frames), usual_s)
     try:
-        shooting.frame_of(point(screen, table.size_cm))
+        shooting.frame_of(black if table.lamp else point(screen, table.size_cm))
+        if table.lamp:
+            shooting.lamp(True)
         exposures = _exposures(shooting, table, usual_s)
-        for kind, picture in (("point", point(screen, table.size_cm)), ("dark", grey(0, size))):
-            shooting.frame_of(picture)
+        for kind in ("point", "dark"):
+            if kind == "dark":
+                if table.lamp:
+                    shooting.lamp(False)
+                shooting.frame_of(black)
             for number, exposure_s in enumerate(exposures, 1):
                 frames = _series(shooting, shooting.expose(exposure_s), table.frames)
                 if kind == "dark" and number == 1:
@@ -147,9 +154,10 @@ def _check_contrast(pairs: CapturedPairs, dark: Frame, table: PointTable) -> Non
     part = float(np.quantile(light, 1 - BRIGHTEST)) / (2**dark.bit_depth - 1)
     if part < _CONTRAST:
         pairs.remove(GROUPS)
+        level = float(dark.array.mean()) / (2**dark.bit_depth - 1)
+        reason = f"other light has {level:.0%}: darken the room" if level > _CONTRAST else "it is too faint"
+        way_out = "Was the lamp on, and off again?" if table.lamp else "Take a lamp behind a pinhole: `lamp = true`."
         raise CameraError(
-            f"The point on the display adds only {max(part, 0):.1%} of the full scale in {dark.exposure_s:.3g} s; the "
-            "rest is the room's light and that of black pixels. Darken the room, raise `size_cm` "
-            f"({table.size_cm:g}) of [point], or set its `frames` to 0 and photograph a lamp behind a pinhole: "
-            "`mwdn calibrate --help`."
+            f"The point adds only {max(part, 0):.1%} of the full scale in {dark.exposure_s:.3g} s; {reason}. {way_out} "
+            "Or photograph it on your own, `frames = 0` in [point]: `mwdn calibrate --help`."
         )

@@ -74,13 +74,17 @@ class PointTable:
     Args:
         frames: of each kind at each exposure, see `mwdn.capture.point_frames`; 0 for none. An odd number counts as the
             next even one.
-        size_cm: side of the point. It blurs the PSF by its size in the camera's view; a larger one has more light.
+        lamp: whether the point is a lamp behind a pinhole that a person switches on and off, instead of one on the
+            display: brighter than the room and than black pixels.
+        size_cm: side of the point on the display. A larger one has more light, and blurs the PSF by its size in the
+            camera's view.
         exposures: of the point, for high dynamic range.
         ratio: of each exposure to the one before.
         most_s: longest exposure in seconds of the shortest one, if the point stays faint.
     """
 
     frames: int = 0
+    lamp: bool = False
     size_cm: float = 0.1
     exposures: int = 2
     ratio: float = 8.0

@@ -90,8 +90,10 @@ class Rig(CameraSource):
         self.show(_point(screen) if picture is None else picture)
         self._before, self._stale = self._shown, 0
 
-    def show(self, picture: Picture) -> None:
+    def show(self, picture: Picture, *, lamp: float = 0.0) -> None:
         """Show a picture (H, W, 3) of the display's size, with the light of before in the next `latency` frames.
+
+        A lamp in its middle, 0.1 cm wide, has ``lamp`` times the light of as much of a white display.
 
         Raises:
             ShapeError: it has another size.
@@ -99,7 +101,10 @@ class Rig(CameraSource):
         if picture.shape != (self.screen.height_px, self.screen.width_px, 3):
             wanted = f"{self.screen.height_px} x {self.screen.width_px} x 3"
             raise ShapeError(f"`picture` {picture.shape} must have the display's size, {wanted}.")
-        self._before, self._shown, self._stale = self._shown, self._light(picture), self.options.latency
+        light = self._light(picture)
+        if lamp:
+            light = light + lamp * (self._light(_point(self.screen)) - self._light(np.zeros_like(picture)))
+        self._before, self._shown, self._stale = self._shown, light, self.options.latency
         self._frames.clear()
 
     def open(self) -> None:

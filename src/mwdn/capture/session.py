@@ -48,6 +48,7 @@ class Session:
         out: file of pairs, ending in .h5; an existing one of this recipe is continued.
         wait: sleeps so many seconds.
         progress: see `Progress`.
+        lamp: switches the point source of [point] on or off, or has a person do it.
     """
 
     def __init__(
@@ -59,10 +60,11 @@ class Session:
         *,
         wait: Callable[[float], None] = time.sleep,
         progress: Progress = lambda done, total, name: None,
+        lamp: Callable[[bool], None] = lambda on: None,
     ) -> None:
         check_path(out)
         self.recipe, self.camera, self.display, self.out = recipe, camera, display, out
-        self._wait, self._progress = wait, progress
+        self._wait, self._progress, self._lamp = wait, progress, lamp
         self._first: Frame | None = None
         self._screen: Screen = display.screen
         self._place: Place = place_picture(self._screen, recipe.pictures.size, recipe.pictures.fill)
@@ -187,7 +189,7 @@ class Session:
             size = self.recipe.pictures.size
             pairs.add_pattern("grey", frames, [displayed_light(grey(v, size), self._gamma) for v in levels])
         self._gamma = float(pairs.attributes["display_gamma"])
-        shooting = Shooting(self.camera, self._screen, self._frame_of, self._grab)
+        shooting = Shooting(self.camera, self._screen, self._frame_of, self._grab, self._lamp)
         usual_s = self.recipe.camera.exposure_s or (math.nan if self._first is None else self._first.exposure_s)
         record_point(pairs, self.recipe.point, shooting, usual_s=usual_s)
         for name in self.recipe.session.shown:

@@ -5,12 +5,16 @@ from dataclasses import asdict
 
 from mwdn.capture.display import Display, RigDisplay
 from mwdn.capture.page import PageDisplay
+from mwdn.capture.patterns import grey
 from mwdn.capture.recipe import CaptureRecipe
 from mwdn.capture.rig import Rig
 from mwdn.capture.screen import Screen
 from mwdn.capture.source import CameraSource
 from mwdn.capture.sources import open_source, parse_source
 from mwdn.io.toml import to_dataclass
+
+LAMP = 1e5
+"""Luminance of the rig's lamp over that of its white display: a power LED to 300 cd/m^2."""
 
 
 def open_camera(recipe: CaptureRecipe) -> CameraSource:
@@ -27,6 +31,19 @@ def open_camera(recipe: CaptureRecipe) -> CameraSource:
         distance_cm=display.distance_cm,
     )
     return Rig(to_dataclass(type(recipe.rig), "rig", {**asdict(recipe.rig), **options}), screen)
+
+
+def open_lamp(camera: CameraSource, ask: Callable[[str], None]) -> Callable[[bool], None]:
+    """What switches the point source of a session: the simulated rig's, or a person.
+
+    Args:
+        camera: of the session.
+        ask: says what a person has to do; returns when it is done.
+    """
+    if isinstance(camera, Rig):
+        black = grey(0, (camera.screen.height_px, camera.screen.width_px))
+        return lambda on: camera.show(black, lamp=LAMP * on)
+    return lambda on: ask(f"Switch the point source {'on' if on else 'off'}")
 
 
 def open_display(recipe: CaptureRecipe, camera: CameraSource, tell: Callable[[str], None]) -> Display:

@@ -1,5 +1,6 @@
 """`mwdn capture`: show pictures on a display, and record a pair of each."""
 
+import sys
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any
@@ -9,6 +10,7 @@ from cyclopts import Parameter
 from mwdn.cli.progress import show_progress
 from mwdn.cli.recipe_keys import RecipeKeys, recipe_changes
 from mwdn.cli.terminal import counted, if_interrupted, note, say
+from mwdn.errors import ParameterError
 
 
 def capture(
@@ -29,7 +31,7 @@ def capture(
     """
     from mwdn.capture.recipe import read_capture_recipe
     from mwdn.capture.session import Session
-    from mwdn.capture.set_up import open_camera, open_display
+    from mwdn.capture.set_up import open_camera, open_display, open_lamp
 
     contents = read_capture_recipe(recipe, **recipe_changes(changes))
     kept = f"All pairs so far are in {out}. The same command continues."
@@ -38,9 +40,23 @@ def capture(
         camera = stack.enter_context(open_camera(contents))
         display = stack.enter_context(open_display(contents, camera, note))
         progress = stack.enter_context(show_progress())
-        session = Session(contents, camera, display, out, progress=_shown_in(progress))
+        lamp = open_lamp(camera, _ask)
+        session = Session(contents, camera, display, out, progress=_shown_in(progress), lamp=lamp)
         count = session.run()
-    say(f"{counted(count, 'pair')} in {out}", f"Next: mwdn align {out}")
+    if contents.point.frames:
+        say(f"Point, dark and white frames are there, too: mwdn calibrate {out} -o camera.toml")
+    say(f"{counted(count, 'pair')} in {out}", f"Next: mwdn align {out} --camera camera.toml")
+
+
+def _ask(task: str) -> None:
+    """Have a person do something before the session goes on.
+
+    Raises:
+        ParameterError: nobody is there to do it.
+    """
+    note(f"{task}, then press Enter.")
+    if not sys.stdin.readline():
+        raise ParameterError(f"{task}: nobody can press Enter, because this is no terminal. Start it in one.")
 
 
 def _shown_in(progress: Any) -> Any:  # noqa: ANN401

@@ -80,7 +80,18 @@ def refine(camera: Path, pairs: Path | None) -> None:
     report = camera.with_name(f"{camera.stem}-refinement.json")
     write_json(report, _content(selection, pictures, best, {name: values[name] for name in TERMS}))
     write_refinement_page(report.with_suffix(".png"), calibration.psf, refinement, _lines(pictures, best))
-    say(*_lines(pictures, best), f"Look at {report.with_suffix('.png')}; all numbers are in {report}")
+    say(
+        *_lines(pictures, best),
+        *_new_hash(calibration, calibration.refined(refinement)),
+        f"Look at {report.with_suffix('.png')}; all numbers are in {report}",
+    )
+
+
+def _new_hash(before: Calibration, after: Calibration) -> list[str]:
+    """A sentence if the refinement has changed the PSF."""
+    if before.psf_hash == after.psf_hash:
+        return []
+    return [f"PSF {after.psf_hash} with its gain; pairs and weights of {before.psf_hash} are still its own."]
 
 
 def _pictures(calibration: Calibration, selection: Selection, file: "PairFile") -> list[Pictures]:

@@ -91,9 +91,10 @@ def _extracted(path: Path, folder: Path, given: BenchFrames) -> BenchFrames:
     usual = exposures_ms["dark"]
     own: dict[str, Any] = {"flat": given.photographs.flat, "flat_dark": given.photographs.flat_dark}
     if not given.photographs.flat:  # the mask is in front of the sensor: no flat field
+        darkest = min(("dark", *darks), key=lambda name: exposures_ms[name])  # least of the room's light and its noise
         own = {
             "flat": (*groups["white"], *groups["half"]),
-            "flat_dark": tuple(groups["dark"]),
+            "flat_dark": tuple(groups[darkest]),
             "flat_through_mask": True,
         }
     photographs = replace(
