@@ -39,6 +39,10 @@ COMMANDS = {
         "inspect:inspect",
         "Report the quality of a PSF: exposure, background, sharpness, spectrum, noise gain, resolution.",
     ),
+    "interpret": (
+        "interpret:interpret",
+        "Draw what a network did with a capture: PSFs, w and lambda, estimates at each scale, what each filter adds.",
+    ),
     "align": (
         "align:align",
         "Find where displayed pictures are in the camera's frame, and write aligned pairs of a session.",

@@ -1,0 +1,239 @@
+"""What a network did to reconstruct a capture: its PSFs, filters and estimates, scale by scale."""
+
+import copy
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from mwdn.errors import ParameterError
+from mwdn.fourier.convolution import convolve
+from mwdn.fourier.transforms import transfer_function
+from mwdn.networks.blocks import WienerFilter, normalise_psf
+from mwdn.networks.mwdn import Mwdn
+from mwdn.networks.mwdn_cpsf import MwdnCpsf
+from mwdn.networks.wiener import WienerNetwork
+from mwdn.networks.wiener_bank import WienerBank
+from mwdn.networks.wiener_unet import WienerUNet
+from mwdn.optics.psf import checked_psf
+from mwdn.solvers.alignment import align
+from mwdn.types import Measurement, Psf, Scene
+
+Kind = Literal["light", "psf", "features", "change"]
+"""How a picture is to be seen: linear light, a PSF, features of any sign, or a change of the picture around 0."""
+
+EXPLAINED = "mwdn, mwdn-cpsf, wiener, wiener-unet and wiener-bank (universal, universal-small)"
+
+
+class Panel(NamedTuple):
+    """One picture.
+
+    Args:
+        name: in a few words.
+        picture: (1, 1 or 3, H, W).
+        kind: see `Kind`.
+    """
+
+    name: str
+    picture: Tensor
+    kind: Kind = "light"
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """The pictures of one part of a network.
+
+    Args:
+        name: of the part.
+        panels: its pictures.
+        numbers: what was measured of it; ``None`` for a number that it does not have.
+    """
+
+    name: str
+    panels: tuple[Panel, ...]
+    numbers: dict[str, float | None] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Interpretation:
+    """What a network did.
+
+    Args:
+        network: name of its class.
+        rows: part by part, the first for input and output.
+        pose: of the PSF that was aligned to the capture: rotation, scale and so on; empty without alignment.
+    """
+
+    network: str
+    rows: tuple[Row, ...]
+    pose: dict[str, float] = field(default_factory=dict)
+
+    def content(self) -> dict[str, Any]:
+        """All numbers, in values that JSON can hold."""
+        parts = [{"name": row.name, **row.numbers} for row in self.rows if row.numbers]
+        return {"network": self.network, "aligned": self.pose, "parts": parts}
+
+
+@torch.no_grad()
+def interpret(network: object, measurement: Measurement, psf: Psf) -> Interpretation:
+    """Reconstruct one capture and keep what the network computes on the way.
+
+    Args:
+        network: one with Wiener filters, see `EXPLAINED`; on the device of the measurement.
+        measurement: (1, C, H, W).
+        psf: (1, C, H, W), as the network takes it (`mwdn.inference.methods.psf_for`).
+
+    Raises:
+        ParameterError: another network.
+        ShapeError: measurement and PSF do not fit.
+    """
+    if not isinstance(network, Mwdn | MwdnCpsf | WienerNetwork | WienerUNet | WienerBank):
+        raise ParameterError(f"`{type(network).__name__}` has no Wiener filters to look into. Use {EXPLAINED}.")
+    network = copy.deepcopy(network).eval()
+    psf, pose = checked_psf(psf, scale=not network.stored_psf), {}
+    if network.align:
+        aligned = align(measurement, psf)
+        psf = aligned.move(psf)
+        pose = {
+            name: round(float(value), 6)
+            for name, value in vars(aligned).items()
+            if isinstance(value, Tensor) and value.numel() == 1
+        }
+    result = network(measurement, psf)
+    first = Row(
+        "input and output",
+        (Panel("measurement", measurement), Panel("PSF", psf, "psf"), Panel("reconstruction", result)),
+    )
+    if isinstance(network, WienerBank):
+        rows = _bank_rows(network, measurement, psf, result)
+    elif isinstance(network, WienerNetwork | WienerUNet):
+        rows = [_single_row(network, measurement, psf, result)]
+    else:
+        rows = _scale_rows(network, measurement, psf, result)
+    return Interpretation(type(network).__name__, (first, *rows), pose)
+
+
+def _scale_rows(network: Mwdn | MwdnCpsf, measurement: Measurement, psf: Psf, result: Scene) -> list[Row]:
+    """A row for each filter of MWDN and MWDN-CPSF, finest first.
+
+    What a filter contributes is the change of the picture if its features are replaced by their means over the frame:
+    they then say nothing about where anything is, and keep the level that the decoder expects.
+    """
+    size = (measurement.shape[-2], measurement.shape[-1])
+    given = normalise_psf(psf, size, network.channels, stored=network.stored_psf)
+    psfs = network.pyramid(given)
+    *features, bottom = network.encoder(measurement)
+    prepared = network.prepare(psf, size)
+    filtered = [w.deconvolve(x, t) for w, x, t in zip(network.filters, features, prepared, strict=True)]
+    means = [x.mean((-2, -1), keepdim=True).expand_as(x) for x in filtered]
+
+    def decoded(*kept: int) -> Scene:
+        """The picture if only the filters of these scales say where anything is."""
+        return network.decoder([*(filtered[i] if i in kept else means[i] for i in range(len(filtered))), bottom])
+
+    every = range(len(filtered))
+    rows = []
+    for i, wiener in enumerate(network.filters):
+        change = result - decoded(*(j for j in every if j != i))
+        channel = int(filtered[i].std((0, 2, 3)).argmax())
+        used = [Panel("PSF at this scale", F.avg_pool2d(given, 2**i), "psf"), *_used_psfs(network, psfs[i])]
+        panels = (
+            *used,
+            Panel(f"features {channel}", features[i][:, channel : channel + 1], "features"),
+            Panel("deconvolved", filtered[i][:, channel : channel + 1], "features"),
+            Panel("adds to the picture", change, "change"),
+            Panel("from here down", decoded(*every[i:])),
+        )
+        numbers = {**_filter_numbers(wiener, psfs[i]), "share_of_picture": _share(change, result)}
+        rows.append(Row(f"scale 1/{2**i}" if i else "scale 1", panels, numbers))
+    return rows
+
+
+def _used_psfs(network: Mwdn | MwdnCpsf, psf: Tensor) -> list[Panel]:
+    """The PSF that a filter used: one for all channels, or the mean and the strongest of one for each channel."""
+    if isinstance(network, Mwdn):
+        return [Panel("PSF used, colours summed", psf, "psf")]
+    strongest = int(psf.std((0, 2, 3)).argmax())
+    mean = Panel(f"mean of {psf.shape[1]} corrected", psf.mean(1, keepdim=True), "psf")
+    return [mean, Panel(f"corrected PSF {strongest}", psf[:, strongest : strongest + 1], "psf")]
+
+
+def _single_row(network: WienerNetwork | WienerUNet, measurement: Measurement, psf: Psf, result: Scene) -> Row:
+    wiener = network if isinstance(network, WienerNetwork) else network.wiener
+    size = (measurement.shape[-2], measurement.shape[-1])
+    used = normalise_psf(psf, size, stored=wiener.stored_psf)
+    estimate = wiener.reconstruct(measurement, wiener.prepare(psf, size))
+    panels = [Panel("PSF used", used, "psf"), Panel("Wiener estimate", estimate)]
+    numbers = _filter_numbers(wiener.filter, used)
+    if isinstance(network, WienerUNet):
+        panels.append(Panel("U-Net's change", result - estimate, "change"))
+        numbers["share_of_picture"] = _share(estimate, result)
+    return Row("Wiener filter", tuple(panels), numbers)
+
+
+def _bank_rows(network: WienerBank, measurement: Measurement, psf: Psf, result: Scene) -> list[Row]:
+    """The estimates in front of the U-Net, smoothest first, and what the U-Net changes."""
+    channels = network.channels
+    coloured = measurement.expand(-1, channels, -1, -1) if measurement.shape[1] == 1 else measurement
+    estimates = network.estimates(coloured, psf)
+    parts = torch.split(estimates[:, : network.pictures], channels, dim=1)
+    rows = []
+    start = None
+    if network.rounds:
+        plain = copy.copy(network)
+        plain.rounds = 0
+        start = plain.estimates(coloured, psf)[:, :channels]
+    if network.levels:
+        smooth = [Panel("iterations", parts[0] if start is None else start)]
+        numbers: dict[str, float | None] = {"residual": _unexplained(network, coloured, psf, parts[0])}
+        if start is not None:
+            smooth += [
+                Panel(f"after {network.rounds} rounds", parts[0]),
+                Panel("the rounds' change", parts[0] - start, "change"),
+            ]
+        rows.append(Row("iterations", tuple(smooth), numbers))
+    details = parts[1:] if network.levels else parts
+    bank = tuple(
+        Panel(f"lambda {value:g}", picture) for value, picture in zip(network.regularisations, details, strict=False)
+    )
+    rows.append(Row("Wiener bank", bank, {f"lambda_{i + 1}": v for i, v in enumerate(network.regularisations)}))
+    change = result - parts[0]
+    rows.append(
+        Row(
+            "U-Net",
+            (Panel("U-Net's change", change, "change"), Panel("reconstruction", result)),
+            {"share_of_picture": _share(change, result)},
+        )
+    )
+    return rows
+
+
+def _unexplained(network: WienerBank, measurement: Measurement, psf: Psf, scene: Scene) -> float:
+    return _share(measurement - convolve(scene, psf), measurement)
+
+
+def _filter_numbers(wiener: WienerFilter, psf: Tensor) -> dict[str, float | None]:
+    """w, lambda, and what they mean for this PSF (1, 1 or C, H, W).
+
+    ``inverted``: part of all frequencies at which |w H|^2 exceeds lambda, so that more than half of the PSF is undone.
+    ``largest_gain``: of the filter, over all frequencies; 1 / (2 sqrt(lambda)) at most.
+    """
+    weight = None if wiener.weight is None else wiener.weight.item()
+    inverted, gain = [], []
+    for channel in torch.split(psf, 1, dim=1):
+        power = transfer_function(channel * (1 if weight is None else weight), wiener.grid(psf)).abs().square()
+        inverted.append((power > wiener.regularisation).float().mean().item())
+        gain.append((power.sqrt() / (power + wiener.regularisation)).max().item())
+    return {
+        "w": weight,
+        "lambda": wiener.regularisation.item(),
+        "inverted": sum(inverted) / len(inverted),
+        "largest_gain": max(gain),
+    }
+
+
+def _share(change: Tensor, result: Tensor) -> float:
+    """Standard deviation of a change over that of the picture."""
+    return (change.std() / result.std().clamp(min=1e-12)).item()
