@@ -6,14 +6,17 @@ and what it printed are kept in docs/gallery by `python examples/gallery`.
 
 import ast
 import json
+import re
 from pathlib import Path
 from typing import NamedTuple
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPTS = ROOT / "examples" / "gallery"
+INDEX = "gallery/README.md"
 ORDER = ("forward_model", "wiener_or_admm", "cropping", "wrong_psf", "zero_shot")
 
 
@@ -37,7 +40,7 @@ def read_cells(source: str) -> tuple[str, list[Cell]]:
     return title, cells
 
 
-def page(name: str, title: str, cells: list[Cell], printed: str) -> str:
+def describe(name: str, title: str, cells: list[Cell], printed: str) -> str:
     """The Markdown of a script."""
     parts = [f"# {title}"]
     for index, (text, code) in enumerate(cells):
@@ -65,7 +68,7 @@ def notebook(title: str, cells: list[Cell]) -> str:
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """Add the pages to the navigation, after those for the use of a camera."""
-    pages = [{"All": "gallery/index.md"}]
+    pages = [{"All": INDEX}]
     pages += [{read_cells(_source(name))[0]: f"gallery/{name}.md"} for name in ORDER]
     config.nav = [*(config.nav or []), {"Gallery": pages}]
     return config
@@ -73,17 +76,21 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 
 def on_files(files: Files, *, config: MkDocsConfig) -> Files:
     """Write the pages and the notebooks."""
-    listed = ["# Gallery", "Each is a script of a minute on simulated captures of the bundled photographs."]
     for name in ORDER:
         source = _source(name)
         title, cells = read_cells(source)
         printed = (ROOT / "docs" / "gallery" / f"{name}.txt").read_text(encoding="utf-8")
-        contents = {"md": page(name, title, cells, printed), "py": source, "ipynb": notebook(title, cells)}
+        contents = {"md": describe(name, title, cells, printed), "py": source, "ipynb": notebook(title, cells)}
         for suffix, content in contents.items():
             files.append(File.generated(config, f"gallery/{name}.{suffix}", content=content))
-        listed.append(f"[![{title}]({name}.webp){{ width=320 }}]({name}.md)<br>[{title}]({name}.md)")
-    files.append(File.generated(config, "gallery/index.md", content="\n\n".join(listed) + "\n"))
     return files
+
+
+def on_page_markdown(markdown: str, *, page: Page, **_: object) -> str:
+    """The list of scripts leads to their pages; on GitHub, to the scripts."""
+    return (
+        re.sub(r"\.\./\.\./examples/gallery/(\w+)\.py", r"\1.md", markdown) if page.file.src_uri == INDEX else markdown
+    )
 
 
 def _source(name: str) -> str:

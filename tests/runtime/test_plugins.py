@@ -1,5 +1,6 @@
 """Entries of other packages: the example of examples/plugin, and packages that are broken."""
 
+import math
 import sys
 import tomllib
 import warnings
@@ -14,7 +15,7 @@ from mwdn.capture import SOURCES, open_source
 from mwdn.errors import ParameterError, UnknownNameError
 from mwdn.io.pictures import dark_scene
 from mwdn.networks import NETWORKS
-from mwdn.optics import MASKS, sample_camera
+from mwdn.optics import MASKS, Setup, sample_camera
 from mwdn.runtime import plugins
 from mwdn.solvers import SOLVERS
 
@@ -109,6 +110,15 @@ def test_a_mask_is_a_command_of_design(run, tmp_path):
     code, _, err = run(*f"design ring {small} --out {tmp_path / 'ring'}".split())
     assert (code, err) == (0, "")
     assert (tmp_path / "ring" / "psf.tif").is_file()
+
+
+@pytest.mark.usefixtures("example")
+def test_the_ring_is_as_large_as_it_says_and_every_parameter_of_the_network_learns():
+    mask = MASKS["ring"](radius_mm=0.1, width_mm=0.02, pitch_um=1.0).build(Setup(aperture_mm=(0.4, 0.4)))
+    assert mask.values.sum().item() * mask.pitch_um**2 == pytest.approx(2 * math.pi * 100 * 20, rel=0.02)
+    network = mwdn.build("residual", width=2)
+    network(torch.rand(1, 3, 19, 24), torch.rand(1, 3, 19, 24)).sum().backward()
+    assert all(parameter.grad.abs().sum() > 0 for parameter in network.parameters())
 
 
 @pytest.mark.usefixtures("example")
