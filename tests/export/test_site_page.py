@@ -99,7 +99,9 @@ def said(page):
 
 
 def wait_for(page, name):
-    page.wait(f"{STATE}.textContent.startsWith('{name}: 128 × 96 pixels in ') || {STATE}.classList.contains('wrong')")
+    text = f"{STATE}.textContent"
+    page.wait(f"{text}.startsWith('{name}: ') || {STATE}.classList.contains('wrong') && {text}.startsWith('{name} ')")
+    assert said(page).startswith(f"{name}: 128 × 96 pixels in "), said(page)
     assert said(page).endswith("by WebAssembly, on this computer."), said(page)
 
 

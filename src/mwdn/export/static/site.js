@@ -209,6 +209,7 @@ function setUpDropZone(id, take) {
   const zone = input.parentElement;
   const accept = async (files) => {
     if (!files.length) return;
+    say(`Reading ${files[0].name} …`);
     try {
       await take([...files]);
     } catch (error) {
