@@ -147,7 +147,8 @@ def check_files(page, folder, own, other):
     assert page.run("document.querySelectorAll('#captures button').length") == 2
     page.drop("#psf", folder / "fine-other.png")
     page.wait(f"{STATE}.classList.contains('wrong')")
-    assert said(page).startswith("of-the-other.png has 48 x 64 pixels")  # the PSF is binned, and so are captures
+    # The PSF is binned, and so are captures.
+    assert said(page).startswith("of-the-other.png has 96 x 128 pixels, 48 x 64 as a measurement")
     page.drop("#capture", folder / "fine-of-the-other.png")
     wait_for(page, "fine-of-the-other.png")
     fine = Calibration.from_file(folder / "fine-other.png", bin=2, psf_orientation="rotate-180")

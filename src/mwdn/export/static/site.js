@@ -80,7 +80,8 @@ async function measure(capture, psf) {
   const measurement = toMeasurement(capture.frame, captureFormat(capture));
   if (measurement.width !== WIDTH || measurement.height !== HEIGHT) {
     const advice = dropped ? "Correct “Bin” or “Crop” under “Format of the files”." : "Use raw frames of this camera, or drop the PSF of yours.";
-    throw new FileError(`has ${sizeText(measurement)} pixels as a measurement, but the PSF has ${sizeText(psf)}. ${advice}`);
+    const binned = sizeText(measurement) === sizeText(capture.frame) ? "" : `, ${sizeText(measurement)} as a measurement`;
+    throw new FileError(`has ${sizeText(capture.frame)} pixels${binned}, but the PSF has ${sizeText(psf)}. ${advice}`);
   }
   if (measurement.channels === 1 && psf.channels === 3) throw new FileError("is grey, but the PSF has colours. Use raw frames of the same camera.");
   if (!(measurement.data.some((value) => value > 0))) throw new FileError("holds no light.");
