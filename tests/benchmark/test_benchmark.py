@@ -24,6 +24,7 @@ from mwdn.data.pairs import PairFile
 from mwdn.errors import CheckpointError, ParameterError, UnknownNameError
 from mwdn.evaluation import alexnet, bootstrap
 from mwdn.training.recipe import Schedule
+from mwdn.weights.checkpoint import read_metadata
 
 RECIPE = """
 title = "Two networks & a solver"
@@ -294,6 +295,33 @@ def test_epochs_are_steps_of_each_data_set(tmp_path):
     (tmp_path / "r.toml").write_text(endless, encoding="utf-8")
     with pytest.raises(ParameterError, match=r"`epochs`.*`caustic`.*`steps`"):
         read_benchmark(tmp_path / "r.toml")
+
+
+def test_rates_seeds_mismatch_and_the_mean_picture(tmp_path):
+    """Each network is trained at the better of two rates; the mean of the training scenes is a row."""
+    folder = laid_out(tmp_path)
+    text = RECIPE.replace('robustness = { data = "caustic", count = 2, noise = [2], shift_px = [1] }', "")
+    text = text.replace("networks = { wiener = {}, mwdn = {} }", "networks = { mwdn = { schedule = { seed = 7 } } }")
+    text = text.replace('ablation = ["wiener", "mwdn"]', "rates = [1e-3, 1e-2]\ntrial = 0.5\nmean_picture = true")
+    text = text.replace("deviation = { turn_degrees = 1, off_axis = 1 }", "mismatch = { tails = 0.1 }")
+    (folder / "r.toml").write_text(text, encoding="utf-8")
+    benchmark = read_benchmark(folder / "r.toml")
+    run(benchmark, folder / "out", device="cpu", lpips=False)
+    runs = folder / "out" / "runs" / "caustic" / "mwdn"
+    recipes = {
+        part: json.loads((runs / part / "recipe.json").read_text())["recipe"]["schedule"]
+        for part in (".", "rate-0.001", "rate-0.01")
+    }
+    psnr = {part: read_metadata(runs / part / "best.safetensors")["psnr"] for part in recipes}
+    assert {(s["steps"], s["seed"]) for part, s in recipes.items() if part != "."} == {(3, 7)}
+    assert (recipes["."]["steps"], recipes["."]["seed"]) == (6, 7)
+    better = max(("rate-0.001", "rate-0.01"), key=lambda part: psnr[part])
+    assert recipes["."]["learning_rate"] == recipes[better]["learning_rate"]
+    pairs = PairFile(folder / "out" / "data" / "caustic.h5")
+    mean = torch.stack([pairs[row][1] for row in range(4)]).mean(0)
+    expected = [-10 * (pairs[row][1] - mean.clamp(0, 1)).square().mean().log10().item() for row in (6, 7, 8)]
+    assert values(folder / "out")[0]["mean picture"]["psnr"] == pytest.approx(expected, abs=1e-3)
+    assert "mismatch" in json.loads((folder / "out" / "data" / "caustic.json").read_text())
 
 
 def test_a_camera_file_says_what_a_data_set_does_not(tmp_path):

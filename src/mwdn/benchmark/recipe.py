@@ -2,16 +2,15 @@
 
 import json
 import os
-import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from inspect import signature
 from pathlib import Path
 from typing import Any
 
+from mwdn.benchmark.methods import MEAN, Method, check_name, read_methods, scale_width
 from mwdn.benchmark.sets import PRESETS, DatasetRecipe
 from mwdn.calibration.camera_file import read_camera
-from mwdn.errors import ParameterError, UnknownNameError, check_options, shown
+from mwdn.errors import ParameterError, UnknownNameError, shown
 from mwdn.io.toml import find_recipe, read_toml, to_dataclass
 from mwdn.networks import NETWORKS
 from mwdn.optics import Deviation
@@ -22,23 +21,6 @@ from mwdn.training.tables import Plateau
 
 AXES = {"noise": 1.0, **{part.name: 0.0 for part in fields(Deviation)}}
 """What a robustness sweep varies, and its value in the camera of the training; noise is a factor."""
-
-
-@dataclass(frozen=True)
-class Method:
-    """One row of the tables.
-
-    Args:
-        label: its name in the tables.
-        name: of the network or solver.
-        options: to build it with.
-        learned: whether it is a network.
-    """
-
-    label: str
-    name: str
-    options: dict[str, Any]
-    learned: bool
 
 
 @dataclass(frozen=True)
@@ -68,6 +50,10 @@ class Benchmark:
         loss: weights of the loss's parts, for every network.
         plateau: of the schedule "plateau", for every network.
         later_loss: weights of the second phase of that schedule.
+        rates: learning rates to try for each network with `trial` of the steps; the best of the validation then trains
+            to the end. Empty for the schedule's, or the published one.
+        trial: part of the steps for each trial.
+        mean_picture: whether the mean of all training scenes is a row of the tables, whatever the capture.
         published: take a network's optimiser, learning rate and weight decay from its publication if that gives them.
         rate_factor: factor on the published learning rates; less than 1 slows sources that train much longer.
         ablation: labels of the paper's ablation, in its order.
@@ -87,6 +73,9 @@ class Benchmark:
     loss: dict[str, float] = field(default_factory=lambda: {"mse": 1.0})
     plateau: Plateau = Plateau()
     later_loss: dict[str, float] = field(default_factory=dict)
+    rates: tuple[float, ...] = ()
+    trial: float = 0.1
+    mean_picture: bool = False
     published: bool = True
     rate_factor: float = 1.0
     ablation: tuple[str, ...] = ()
@@ -118,8 +107,8 @@ def read_benchmark(path: str | Path) -> Benchmark:
         if key not in keys:
             raise UnknownNameError("key of a benchmark's recipe", key, keys)
     folder, shared = Path(path).parent, content.pop("shared", {})
-    networks = _methods("networks", content.pop("networks", {}), NETWORKS, shared.get("network", {}))
-    methods = [*_methods("solvers", content.pop("solvers", {}), SOLVERS, {}), *networks]
+    networks = read_methods("networks", content.pop("networks", {}), NETWORKS, shared.get("network", {}))
+    methods = [*read_methods("solvers", content.pop("solvers", {}), SOLVERS, {}), *networks]
     tables: dict[str, Any] = {
         "data": {
             name: _dataset_recipe(name, {**shared.get("data", {}), **table}, folder)
@@ -127,6 +116,7 @@ def read_benchmark(path: str | Path) -> Benchmark:
         },
         "schedule": to_dataclass(Schedule, "schedule", content.pop("schedule", {})),
         "loss": checked_weights(content.pop("loss", {"mse": 1.0})),
+        "rates": _rates(content.pop("rates", [])),
         "plateau": to_dataclass(Plateau, "plateau", content.pop("plateau", {})),
         "later_loss": checked_weights(content.pop("later_loss")) if "later_loss" in content else {},
         "robustness": _robustness(content.pop("robustness", {})),
@@ -134,52 +124,11 @@ def read_benchmark(path: str | Path) -> Benchmark:
     for name in ("alexnet", "heads"):
         content[name] = _absolute(content.get(name, ""), folder)
     benchmark = to_dataclass(Benchmark, "the recipe", content)
-    methods = [_scale_width(method, benchmark.width_factor) for method in methods]
+    methods = [scale_width(method, benchmark.width_factor) for method in methods]
+    methods = [Method(MEAN, MEAN, {}, learned=False), *methods] if benchmark.mean_picture else methods
     benchmark = replace(benchmark, **tables, methods=tuple(methods), path=str(path))
     _check(benchmark)
     return benchmark
-
-
-def _methods(table: str, content: dict[str, Any], registry: Mapping[str, Any], shared: dict[str, Any]) -> list[Method]:
-    """Methods of a table with lines such as ``mwdn = {}`` and ``average = { name = "mwdn", psf_pooling = "average" }``.
-
-    Args:
-        table: networks or solvers.
-        content: of the table.
-        registry: classes by name.
-        shared: options for every method that has them; a method's own line takes precedence.
-    """
-    methods = []
-    for label, line in content.items():
-        if not isinstance(line, dict):
-            raise ParameterError(f"`{label}` of [{table}] ({line!r}) must be a table of options: `{label} = {{}}`.")
-        name = line.get("name", label)
-        if name not in registry:
-            raise UnknownNameError(table.removesuffix("s"), name, registry)
-        options = {key: value for key, value in line.items() if key != "name"}
-        check_options(registry[name], f"'{name}'", options)
-        parameters = signature(registry[name]).parameters
-        common = {key: value for key, value in shared.items() if key in parameters}
-        methods.append(Method(label, name, {**common, **options}, table == "networks"))
-    return methods
-
-
-def _check_name(name: str) -> None:
-    if not re.fullmatch(r"[\w+()=, -][\w.+()=, -]{0,99}", name):
-        raise ParameterError(
-            f"The label of a method or data set ({shown(name)}) becomes the name of a folder: it must be 1 to 100 "
-            "letters, digits, spaces and `_-+.,=()`, and not begin with a dot."
-        )
-
-
-def _scale_width(method: Method, factor: float) -> Method:
-    """A network with its default width times a factor, unless the recipe gives its width."""
-    if not factor > 0:
-        raise ParameterError(f"`width_factor` ({factor}) must be positive.")
-    width = signature(NETWORKS[method.name]).parameters.get("width") if method.learned else None
-    if factor == 1 or width is None or "width" in method.options:
-        return method
-    return replace(method, options={**method.options, "width": max(1, round(factor * width.default))})
 
 
 def _dataset_recipe(name: str, table: dict[str, Any], folder: Path) -> DatasetRecipe:
@@ -239,6 +188,12 @@ def _robustness(table: dict[str, Any]) -> Robustness:
     return replace(to_dataclass(Robustness, "robustness", others), sizes=ordered)
 
 
+def _rates(rates: object) -> tuple[float, ...]:
+    if not (isinstance(rates, list) and all(isinstance(rate, int | float) and 0 < rate < 1 for rate in rates)):
+        raise ParameterError(f"`rates` ({shown(rates)}) must be a list of learning rates between 0 and 1.")
+    return tuple(map(float, rates))
+
+
 def _check(benchmark: Benchmark) -> None:
     labels = [method.label for method in benchmark.methods]
     if not labels or not benchmark.data:
@@ -246,7 +201,7 @@ def _check(benchmark: Benchmark) -> None:
             "A benchmark needs methods and data: `[networks]`, `mwdn = {}`; `[data]`, `mwdn-sim = {...}`."
         )
     for name in (*labels, *benchmark.data):
-        _check_name(name)
+        check_name(name)
     for label in labels:
         if labels.count(label) > 1:
             raise ParameterError(
@@ -264,6 +219,8 @@ def _check(benchmark: Benchmark) -> None:
             f"`epochs` of [schedule] needs a number of training pairs, but those of `{endless[0]}` are without end "
             "(`train` is 0). Give `train` or `steps`."
         )
+    if not 0 < benchmark.trial <= 1:
+        raise ParameterError(f"`trial` ({benchmark.trial}) must be a part of the steps, such as 0.1.")
     if not benchmark.rate_factor > 0:
         raise ParameterError(f"`rate_factor` ({benchmark.rate_factor}) must be positive.")
     for name, recipe in benchmark.data.items():

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from mwdn.benchmark.exports import csv_text, json_content
 from mwdn.benchmark.locks import claim_parts, lock
+from mwdn.benchmark.methods import Method
 from mwdn.benchmark.pages import MARK, write_html, write_markdown
-from mwdn.benchmark.recipe import Benchmark, Method
+from mwdn.benchmark.recipe import Benchmark
 from mwdn.benchmark.results import Results
 from mwdn.benchmark.robustness import Sweep, pairs_at, sweep
 from mwdn.benchmark.scoring import MethodResult, identity, make_reconstructor, score

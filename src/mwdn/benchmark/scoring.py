@@ -11,15 +11,17 @@ import torch
 from torch import Tensor
 
 from mwdn import solvers
-from mwdn.benchmark.recipe import Method
+from mwdn.benchmark.methods import MEAN, Method
 from mwdn.benchmark.sets import Dataset
 from mwdn.data.captures import find_captures, read_captures
+from mwdn.data.recorded import RecordedPairs
 from mwdn.errors import ImageError, ParameterError
 from mwdn.evaluation import First, Perceptual, Scores, evaluate
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import atomic_write, file_sha256, write_text
 from mwdn.io.npy import read_array
 from mwdn.io.reading import read_json, unexpected_content
+from mwdn.types import Measurement, Psf, Scene
 from mwdn.version import __version__
 
 TIMED = 3
@@ -48,6 +50,30 @@ class MethodResult:
     captures: Tensor
 
 
+@dataclass(frozen=True, eq=False)
+class MeanPicture:
+    """The same picture for every capture: what a method must beat to have seen anything.
+
+    Args:
+        scene: (1, C, H, W), mean of all training scenes.
+    """
+
+    scene: Scene
+
+    @classmethod
+    def of(cls, dataset: Dataset) -> "MeanPicture":
+        """The mean of a data set's training scenes, of which there are as many as its recipe says."""
+        pairs = dataset.training[0] if dataset.training else None
+        if not isinstance(pairs, RecordedPairs):
+            raise ParameterError(f"`mean_picture` needs a number of training pairs in `{dataset.name}`: give `train`.")
+        total = sum(pairs.file[row][1].double() for row in pairs.rows)
+        return cls((total / len(pairs)).float()[None])  # type: ignore[union-attr]
+
+    def __call__(self, measurement: Measurement, psf: Psf) -> Scene:
+        """The mean, for each measurement."""
+        return self.scene.to(measurement).expand(len(measurement), -1, -1, -1)
+
+
 def make_reconstructor(
     method: Method, checkpoint: Path | None, dataset: Dataset, device: torch.device | str
 ) -> Reconstructor:
@@ -59,6 +85,8 @@ def make_reconstructor(
         dataset: whose calibration is used.
         device: where to compute.
     """
+    if method.name == MEAN:
+        return Reconstructor(MeanPicture.of(dataset), dataset.calibration, device=device)
     if checkpoint is not None:
         return Reconstructor(checkpoint, dataset.calibration, device=device)
     return Reconstructor(solvers.build(method.name, **method.options), dataset.calibration, device=device)

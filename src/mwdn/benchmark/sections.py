@@ -11,8 +11,9 @@ from rich.table import Table
 from torch import Tensor
 
 from mwdn.benchmark import figures, training
+from mwdn.benchmark.methods import Method
 from mwdn.benchmark.pages import Block, Code, Picture, Section
-from mwdn.benchmark.recipe import AXES, Benchmark, Method
+from mwdn.benchmark.recipe import AXES, Benchmark
 from mwdn.benchmark.results import Results, environment
 from mwdn.benchmark.scoring import MethodResult, captured_measurements
 from mwdn.benchmark.sets import Dataset
@@ -231,4 +232,7 @@ def _training_cells(method: Method, benchmark: Benchmark) -> list[str]:
         return ["", "", "", "no training"]
     settings = training.settings(method, benchmark)
     schedule = settings.schedule
-    return [schedule.optimiser, f"{schedule.learning_rate:g}", f"{schedule.weight_decay:g}", settings.source]
+    rate = f"{schedule.learning_rate:g}"
+    if benchmark.rates:
+        rate = f"best of {', '.join(f'{tried:g}' for tried in benchmark.rates)}"
+    return [schedule.optimiser, rate, f"{schedule.weight_decay:g}", settings.source]

@@ -11,7 +11,7 @@ import torch
 from mwdn.calibration import Calibration, FrameFormat
 from mwdn.data.importers import import_pairs
 from mwdn.data.kinds import KINDS, Layout
-from mwdn.data.mismatch import EXACT
+from mwdn.data.mismatch import EXACT, Mismatch
 from mwdn.data.pair_writer import Attribute
 from mwdn.data.pairs import PairFile, Part
 from mwdn.data.photographs import Photographs
@@ -51,6 +51,7 @@ class DatasetRecipe:
         seed: of all that is simulated.
         placement: how a photograph stands in the scene.
         deviation: how the true camera differs from its calibration, which is all that methods are told.
+        mismatch: the same, drawn anew for each pair, in place of one true camera; see `mwdn.data.mismatch.Mismatch`.
         sensor: its noise.
         pairs: recorded ones in place of photographs: a file of ``mwdn import``, or a data set of this ``kind``.
         kind: how they are laid out, see `mwdn.data.kinds.KINDS`; empty for a file of pairs.
@@ -75,6 +76,7 @@ class DatasetRecipe:
     seed: int = 0
     placement: Placement = Placement()
     deviation: Deviation = Deviation()
+    mismatch: Mismatch = EXACT
     sensor: Sensor = Sensor()
     pairs: str = ""
     kind: str = ""
@@ -178,6 +180,7 @@ def open_dataset(name: str, recipe: DatasetRecipe, folder: Path, device: torch.d
     recipe.binned_protocol().crop(calibration.psf)  # refuses a part that does not fit before anything is trained
     simulates = not recipe.pairs
     not_in_pairs = {"camera", "psf", "captures", "protocol"}
+    not_in_pairs |= {"mismatch"} if recipe.mismatch == EXACT else set()  # which earlier files do not have
     identity = {key: value for key, value in asdict(recipe).items() if key not in not_in_pairs}
     if recipe.camera:
         identity["frames"] = repr(calibration.frames)
@@ -218,10 +221,10 @@ def simulated_pairs(
         photographs.to(device),
         psf,
         placement=recipe.placement,
-        mismatch=EXACT,
+        mismatch=recipe.mismatch,
         sensor=recipe.sensor,
         seed=recipe.seed,
-        camera=recipe.deviation.camera(psf),
+        camera=recipe.deviation.camera(psf) if recipe.mismatch == EXACT else None,
     )
 
 

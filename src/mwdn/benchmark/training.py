@@ -11,11 +11,12 @@ from typing import Any, cast
 
 import torch
 
+from mwdn.benchmark.methods import Method
 from mwdn.benchmark.published import PUBLISHED
-from mwdn.benchmark.recipe import Benchmark, Method
+from mwdn.benchmark.recipe import Benchmark
 from mwdn.benchmark.sets import Dataset
 from mwdn.data.recorded import RecordedPairs
-from mwdn.errors import ParameterError
+from mwdn.errors import DivergenceError, ParameterError
 from mwdn.io.files import write_text
 from mwdn.io.reading import LOG_BYTES, parse_json, read_json, read_text, unexpected_content
 from mwdn.networks import NETWORKS
@@ -48,7 +49,7 @@ def settings(method: Method, benchmark: Benchmark) -> Settings:
     """The benchmark's schedule with the optimiser settings that the network's authors published; the budget stays."""
     published = PUBLISHED.get(method.name) if benchmark.published else None
     if published is None:
-        return Settings(benchmark.schedule, "the recipe's")
+        return Settings(replace(benchmark.schedule, **method.schedule), "the recipe's")
     optimiser = str(published.optimiser).lower()
     changes: dict[str, Any] = {"weight_decay": float(published.weight_decay)}
     if optimiser in OPTIMISERS:
@@ -57,7 +58,7 @@ def settings(method: Method, benchmark: Benchmark) -> Settings:
     if published.rate is not None:
         changes["learning_rate"] = float(published.rate) * benchmark.rate_factor
         factor = f"; its rate times {benchmark.rate_factor:g}" if benchmark.rate_factor != 1 else ""
-    return Settings(replace(benchmark.schedule, **changes), f"{published.source}{factor}")
+    return Settings(replace(benchmark.schedule, **changes | method.schedule), f"{published.source}{factor}")
 
 
 def schedule_on(method: Method, benchmark: Benchmark, dataset: Dataset) -> Schedule:
@@ -105,22 +106,10 @@ def train(
     """
     if dataset.training is None:
         raise ParameterError(f"Nothing is trained on `{dataset.name}`: its networks are those of `trained_on`.")
-    training, validation = dataset.training
-    schedule = replace(schedule_on(method, benchmark, dataset), validation=len(validation))
-    network = {"name": method.name, **options(method, dataset.calibration.size)}
-    recipe = Recipe(network, schedule, benchmark.loss, benchmark.plateau, benchmark.later_loss)
-    stored = stored_psf(recipe, dataset.calibration)
-    stored = None if stored is None else stored.to(device)
-    psf = dataset.calibration.psf.to(device) if stored is None else stored
-    trainer = Trainer(
-        recipe,
-        with_stored_psf(supervised_task(training, schedule), stored),
-        out=folder,
-        calibration=dataset.calibration,
-        validator=Validator(recipe, with_stored_psf(SupervisedTask(validation), stored), psf),
-        device=device,
-        alexnet=Path(benchmark.alexnet) if benchmark.alexnet else None,
-    )
+    schedule = replace(schedule_on(method, benchmark, dataset), validation=len(dataset.training[1]))
+    if benchmark.rates:
+        schedule = replace(schedule, learning_rate=_best_rate(method, dataset, benchmark, schedule, folder, device))
+    trainer = _trainer(method, dataset, benchmark, schedule, folder, device)
     seconds_before, start = seconds(folder) or 0.0, time.perf_counter()
 
     def save_time(report: Report) -> None:
@@ -131,6 +120,45 @@ def train(
 
     trainer.run(save_time, samples=samples)
     return folder / "best.safetensors"
+
+
+def _trainer(
+    method: Method, dataset: Dataset, benchmark: Benchmark, schedule: Schedule, folder: Path, device: torch.device
+) -> Trainer:
+    assert dataset.training is not None
+    training, validation = dataset.training
+    network = {"name": method.name, **options(method, dataset.calibration.size)}
+    recipe = Recipe(network, schedule, benchmark.loss, benchmark.plateau, benchmark.later_loss)
+    stored = stored_psf(recipe, dataset.calibration)
+    stored = None if stored is None else stored.to(device)
+    psf = dataset.calibration.psf.to(device) if stored is None else stored
+    return Trainer(
+        recipe,
+        with_stored_psf(supervised_task(training, schedule), stored),
+        out=folder,
+        calibration=dataset.calibration,
+        validator=Validator(recipe, with_stored_psf(SupervisedTask(validation), stored), psf),
+        device=device,
+        alexnet=Path(benchmark.alexnet) if benchmark.alexnet else None,
+    )
+
+
+def _best_rate(
+    method: Method, dataset: Dataset, benchmark: Benchmark, schedule: Schedule, folder: Path, device: torch.device
+) -> float:
+    """The rate that is best on validation after `trial` of the steps; finished trials are not repeated."""
+    steps = max(1, round(benchmark.trial * schedule.steps))
+    every = min(schedule.validate_every, steps)
+    scores = {}
+    for rate in benchmark.rates:
+        short = replace(schedule, learning_rate=rate, steps=steps, epochs=0, validate_every=every)
+        warmup = min(short.warmup, steps // 10)
+        trial = _trainer(method, dataset, benchmark, replace(short, warmup=warmup), folder / f"rate-{rate:g}", device)
+        try:
+            scores[rate] = trial.run()
+        except DivergenceError:
+            scores[rate] = -math.inf
+    return max(scores, key=lambda rate: scores[rate])
 
 
 def seconds(folder: Path) -> float | None:
