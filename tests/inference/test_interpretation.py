@@ -100,16 +100,16 @@ def test_methods_without_filters_are_refused(measurement, psf):
 
 def test_the_command_writes_a_sheet_pictures_and_numbers(run, psf, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    save_network(tmp_path / "n.safetensors", build("mwdn-cpsf", width=2), "mwdn-cpsf", {"width": 2})
+    save_network(tmp_path / "n.safetensors", build("wiener-unet", width=2), "wiener-unet", {"width": 2})
     np.save("psf.npy", (0.9 * psf / psf.max())[0].movedim(0, -1).numpy())
     np.save("capture.npy", np.random.default_rng(0).random((SIZE, SIZE, 3), np.float32))
     code, out, err = run("interpret n.safetensors capture.npy --psf psf.npy -o out --device cpu --json")
     assert code == 0, err
     content = json.loads(out)
     assert content == json.loads((tmp_path / "out/interpretation.json").read_text())
-    assert [part["name"] for part in content["parts"]] == ["scale 1", "scale 1/2", "scale 1/4", "scale 1/8"]
+    assert [part["name"] for part in content["parts"]] == ["Wiener filter"]
     assert (tmp_path / "out/interpretation.png").stat().st_size > 10_000
-    assert len(list((tmp_path / "out/pictures").glob("*.png"))) == 3 + 4 * 7
+    assert len(list((tmp_path / "out/pictures").glob("*.png"))) == 3 + 3
     assert run("interpret n.safetensors capture.npy --psf psf.npy -o out --device cpu")[0] == 0  # again
     code, _, err = run("interpret wiener capture.npy --psf psf.npy -o out")
     assert (code, "no Wiener filters" in " ".join(err.split())) == (2, True), err
