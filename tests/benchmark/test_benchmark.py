@@ -301,13 +301,14 @@ def test_rates_seeds_mismatch_and_the_mean_picture(tmp_path):
     """Each network is trained at the better of two rates; the mean of the training scenes is a row."""
     folder = laid_out(tmp_path)
     text = RECIPE.replace('robustness = { data = "caustic", count = 2, noise = [2], shift_px = [1] }', "")
-    text = text.replace("networks = { wiener = {}, mwdn = {} }", "networks = { mwdn = { schedule = { seed = 7 } } }")
+    text = text.replace("networks = { wiener = {}, mwdn = {} }", "networks = { wiener = { schedule = { seed = 7 } } }")
     text = text.replace('ablation = ["wiener", "mwdn"]', "rates = [1e-3, 1e-2]\ntrial = 0.5\nmean_picture = true")
     text = text.replace("deviation = { turn_degrees = 1, off_axis = 1 }", "mismatch = { tails = 0.1 }")
+    text = text.replace('compared = "mwdn"', "")
     (folder / "r.toml").write_text(text, encoding="utf-8")
     benchmark = read_benchmark(folder / "r.toml")
     run(benchmark, folder / "out", device="cpu", lpips=False)
-    runs = folder / "out" / "runs" / "caustic" / "mwdn"
+    runs = folder / "out" / "runs" / "caustic" / "wiener"
     recipes = {
         part: json.loads((runs / part / "recipe.json").read_text())["recipe"]["schedule"]
         for part in (".", "rate-0.001", "rate-0.01")
