@@ -3,8 +3,6 @@
 import io
 import json
 import socket
-import struct
-import zlib
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from urllib.parse import urlsplit
@@ -18,7 +16,7 @@ from mwdn.calibration import Calibration
 from mwdn.errors import ParameterError
 from mwdn.preview.cameras import Cameras
 from mwdn.preview.server import make_server
-from preview_server import LIMITS, SIDE, npy
+from preview_server import LIMITS, SIDE, hostile
 
 
 def order(client, capture, expect=200, /, files=None, **fields):
@@ -72,34 +70,6 @@ def test_verdicts(client, capture):
     report = json.loads(order(client, capture, trust="true").headers["mwdn-report"])
     assert {verdict["subject"] for verdict in report["verdicts"]} >= {"capture", "picture"}
     assert 0 < report["explained"] <= 1
-
-
-def png_claiming(width, height):
-    """A small PNG that claims many pixels: a bomb."""
-
-    def chunk(kind, data):
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    rows = zlib.compress(b"\0" * 10_000)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
-
-
-def hostile(capture):
-    good = np.load(io.BytesIO(capture)).astype(np.float32) / 65_535
-    nan = good.copy()
-    nan[3, 4] = np.nan
-    return {
-        "empty": (b"", "capture"),
-        "text": (b"#!/bin/sh\nrm -rf /", "PNG"),
-        "truncated": (capture[:-50], "capture"),
-        "bomb": (png_claiming(60_000, 60_000), "pixels"),
-        "many pixels": (npy(np.zeros((SIDE * 3, SIDE * 3), np.uint8)), f"{4 * SIDE**2:,}"),
-        "not a number": (npy(nan), "NaN"),
-        "pickle": (npy(np.array([{}], dtype=object)), "capture"),
-        "dark": (npy(np.zeros((SIDE, SIDE, 3), np.uint16)), "light"),
-        "other size": (npy(np.ones((SIDE - 8, SIDE, 3), np.uint16)), str(SIDE)),
-    }
 
 
 @pytest.mark.parametrize(
