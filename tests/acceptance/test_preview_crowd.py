@@ -71,14 +71,15 @@ class Crowd:
             thread.join(timeout=60)
 
     def _look(self, index):
-        with suppress(ConnectionClosed), connect(self.url, open_timeout=60, close_timeout=1, max_size=2**24) as socket:
+        options = {"open_timeout": 60, "close_timeout": 1, "max_size": 2**24, "ping_interval": None}
+        with suppress(ConnectionClosed), connect(self.url, **options) as socket:
             while not self.ends.is_set():
                 with suppress(TimeoutError):
                     socket.recv(timeout=1)
                     self.frames[index] += 1
                     if index % 2:
                         socket.send('{"shown": true}')
-                if index % 10 == 0:
+                if index % 10 == 9:
                     self.ends.wait(1)  # a viewer that stalls
 
 
