@@ -231,6 +231,7 @@ def test_the_name_of_the_recipe_does_not_matter(done, monkeypatch):
     assert relative.data == absolute.data
 
 
+@pytest.mark.acceptance
 def test_another_method_and_another_set_are_a_line_each(done):
     folder = done.parent
     more = RECIPE.replace("mwdn = {} }", 'mwdn = {}, plain = { name = "unet" } }')
@@ -297,6 +298,7 @@ def test_epochs_are_steps_of_each_data_set(tmp_path):
         read_benchmark(tmp_path / "r.toml")
 
 
+@pytest.mark.acceptance
 def test_rates_seeds_mismatch_and_the_mean_picture(tmp_path):
     """Each network is trained at the better of two rates; the mean of the training scenes is a row."""
     folder = laid_out(tmp_path)

@@ -29,6 +29,7 @@ def choose(page, id, value):
     page.run(f"(e => {{ e.value = {json.dumps(value)}; e.onchange(); }})(document.getElementById('{id}'))")
 
 
+@pytest.mark.acceptance
 def test_live_picture_is_started_used_and_stopped(serve, tmp_path):
     rig = open_source(f"rig,height={SIDE},width={SIDE},fps=20,prepared=4")
     live = Live(rig, Calibration(rig.psf), method="wiener", folder=tmp_path, device="cpu")

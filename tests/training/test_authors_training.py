@@ -92,7 +92,7 @@ def test_four_steps_are_theirs(tmp_path, name, options, alexnet, psf, pairs, gen
     assert moved > 3e-4
     assert nearest <= distance(theirs, again)
     if name == "mwdn":  # most gradients of the other one's PSF encoder are rounding
-        assert nearest < 1e-4 * moved
+        assert nearest < 0.01 * moved
         weights = [f"filters.{i}.linear_weight" for i in range(4)]
         assert all(abs(ours[key] - again[key]) < 1e-5 for key in weights)
         # 20 % of w; its logarithm would move by 0.04 %.
