@@ -180,6 +180,7 @@ def test_the_file_of_pairs_and_the_table_have_one_name(run, camera):
     assert (code, "has no test part" in err) == (2, True)
 
 
+@pytest.mark.acceptance
 def test_tensorboard_and_captures(run, camera):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 

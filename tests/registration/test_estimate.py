@@ -54,6 +54,7 @@ def noisy(pictures, truth, *, noise=0.05, **options):
     return list(seen + noise * torch.from_numpy(generator.standard_normal(seen.shape)).float())
 
 
+@pytest.mark.acceptance
 def test_a_radial_term_is_found_where_there_is_one_and_shading_is_none():
     """The sensor loses up to 60 % of the light towards one corner. ECC alone is off by 0.17 px in both cases."""
     pictures = natural_pictures(2, 160)

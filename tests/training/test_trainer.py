@@ -299,6 +299,7 @@ schedule = { steps = 30, batch = 1, warmup = 2, ema = 0.9, validate_every = 7, v
 """
 
 
+@pytest.mark.acceptance
 def test_killed_runs_end_as_an_unbroken_one(photos, calibration, tmp_path):
     """SIGKILL after a random number of steps, then undisturbed."""
     (tmp_path / "r.toml").write_text(TOML, encoding="utf-8")
