@@ -12,10 +12,10 @@ from collections.abc import Mapping
 from importlib.resources import files
 from typing import Any
 
-MODULES = ("png", "npy", "frames", "psf", "display", "network", "divider", "site")
-"""Each after those that it imports; ``divider`` is that of `mwdn preview`. Their top-level names differ."""
+MODULES = ("png", "npy", "frames", "psf", "display", "network", "divider", "dropping", "site")
+"""Each after those that it imports; those in `_SHARED` are of `mwdn preview`. Their top-level names differ."""
 
-_SHARED = {"divider.js", "page.css", "icon.svg"}
+_SHARED = {"divider.js", "dropping.js", "page.css", "icon.svg"}
 
 
 def read_static(name: str) -> str:

@@ -1,6 +1,7 @@
 // The page: captures become pictures in this browser, nothing leaves it.
 import { setUpDivider, setPicture } from "./divider.js";
 import { applyWhiteBalance, toDisplay } from "./display.js";
+import { setUpDropZone } from "./dropping.js";
 import { averageColours, readFrame, sizeText, toMeasurement } from "./frames.js";
 import { agreement, openNetwork, PageError, unpack } from "./network.js";
 import { encodeNpy } from "./npy.js";
@@ -205,9 +206,8 @@ function useOwnCamera() {
   byId("own").hidden = byId("format").hidden = true;
 }
 
-function setUpDropZone(id, take) {
+function setUpFiles(id, take) {
   const input = byId(id);
-  const zone = input.parentElement;
   const accept = async (files) => {
     if (!files.length) return;
     say(`Reading ${files[0].name} …`);
@@ -217,20 +217,10 @@ function setUpDropZone(id, take) {
       say(error instanceof FileError ? error.message : `The page failed: ${error.message}`, true);
     }
   };
-  input.onchange = async () => {
-    await accept(input.files);
+  setUpDropZone(input, async (files) => {
+    await accept(files);
     input.value = ""; // the same file again is a change, too
-  };
-  zone.ondragover = (event) => {
-    event.preventDefault();
-    zone.classList.add("target");
-  };
-  zone.ondragleave = () => zone.classList.remove("target");
-  zone.ondrop = (event) => {
-    event.preventDefault();
-    zone.classList.remove("target");
-    accept(event.dataTransfer.files);
-  };
+  });
 }
 
 async function planes(name) {
@@ -267,8 +257,8 @@ async function start() {
 }
 
 setUpDivider(byId("stack"), byId("split"), byId("zoom"));
-setUpDropZone("psf", takePsf);
-setUpDropZone("capture", takeCaptures);
+setUpFiles("psf", takePsf);
+setUpFiles("capture", takeCaptures);
 byId("orientation").append(...ORIENTATIONS.map((name) => new Option(name, name)));
 byId("camera-balance").hidden = !camera.white_balance;
 byId("balance").value = camera.white_balance ? "camera" : "";

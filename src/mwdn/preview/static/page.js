@@ -1,6 +1,7 @@
 // The page: what is chosen becomes a reconstruction, at once.
 import { getBlob, getJson, post, remove, RequestError, runJob } from "./requests.js";
 import { setUpDivider, setPicture } from "./divider.js";
+import { setUpDropZone } from "./dropping.js";
 import { pageWords } from "./hints.js";
 import { isLive, setUpLive, stopLive, wish } from "./live.js";
 import { saveBlob } from "./saving.js";
@@ -179,23 +180,10 @@ function take(what, file) {
 }
 
 function setUpDrop(what) {
-  const input = byId(what);
-  const zone = input.parentElement;
-  input.onchange = () => {
-    if (input.files[0]) take(what, input.files[0]);
+  setUpDropZone(byId(what), (files) => {
+    if (files[0]) take(what, files[0]);
     soon(reconstruct, 0);
-  };
-  zone.ondragover = (event) => {
-    event.preventDefault();
-    zone.classList.add("over");
-  };
-  zone.ondragleave = () => zone.classList.remove("over");
-  zone.ondrop = (event) => {
-    event.preventDefault();
-    zone.classList.remove("over");
-    if (event.dataTransfer.files[0]) take(what, event.dataTransfer.files[0]);
-    soon(reconstruct, 0);
-  };
+  });
 }
 
 async function listCameras(selected) {

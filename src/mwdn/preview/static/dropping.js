@@ -1,0 +1,15 @@
+/** A file input in a label onto which files can be dropped: `take` gets the files of either way. */
+export function setUpDropZone(input, take) {
+  const zone = input.parentElement;
+  input.onchange = () => take(input.files);
+  zone.ondragover = (event) => {
+    event.preventDefault();
+    zone.classList.add("target");
+  };
+  zone.ondragleave = () => zone.classList.remove("target");
+  zone.ondrop = (event) => {
+    event.preventDefault();
+    zone.classList.remove("target");
+    take(event.dataTransfer.files);
+  };
+}
