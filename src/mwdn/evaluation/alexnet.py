@@ -28,6 +28,15 @@ CHANNELS = 64, 192, 384, 256, 256
 _Network = TypeVar("_Network", bound=nn.Module)
 
 
+def check_picture(image: Image, smallest: int, network: str, metrics: str) -> None:
+    """Raise a `ShapeError` unless a picture has 1 or 3 channels and sides of ``smallest`` pixels or more."""
+    if image.shape[1] not in (1, 3) or min(image.shape[-2:]) < smallest:
+        raise ShapeError(
+            f"`image` {tuple(image.shape)} must have 1 or 3 channels and at least {smallest} x {smallest} pixels "
+            f"for {network}. Use a larger part, or leave out {metrics}."
+        )
+
+
 class AlexNet(nn.Module):
     """The convolutions of AlexNet, with torchvision's keys in the state dict, ``features.N.weight``.
 
@@ -65,11 +74,7 @@ class AlexNet(nn.Module):
         Raises:
             ShapeError: neither 1 nor 3 channels, or a side shorter than `SMALLEST`.
         """
-        if image.shape[1] not in (1, 3) or min(image.shape[-2:]) < SMALLEST:
-            raise ShapeError(
-                f"`image` {tuple(image.shape)} must have 1 or 3 channels and at least {SMALLEST} x {SMALLEST} pixels "
-                "for AlexNet. Use a larger part, or leave out `feature_mse` and `lpips`."
-            )
+        check_picture(image, SMALLEST, "AlexNet", "`feature_mse` and `lpips`")
         value, outputs = image.expand(-1, 3, -1, -1), []
         for layer in self.features:
             value = layer(value)

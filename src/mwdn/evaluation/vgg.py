@@ -4,8 +4,7 @@ from pathlib import Path
 
 from torch import Tensor, nn
 
-from mwdn.errors import ShapeError
-from mwdn.evaluation.alexnet import PublicWeights, load_weights, locate
+from mwdn.evaluation.alexnet import PublicWeights, check_picture, load_weights, locate
 from mwdn.types import Image
 
 SMALLEST = 8
@@ -45,11 +44,7 @@ class Vgg16(nn.Module):
         Raises:
             ShapeError: neither 1 nor 3 channels, or a side shorter than `SMALLEST`.
         """
-        if image.shape[1] not in (1, 3) or min(image.shape[-2:]) < SMALLEST:
-            raise ShapeError(
-                f"`image` {tuple(image.shape)} must have 1 or 3 channels and at least {SMALLEST} x {SMALLEST} pixels "
-                "for VGG-16. Use a larger part, or leave out `vgg_mse`."
-            )
+        check_picture(image, SMALLEST, "VGG-16", "`vgg_mse`")
         middle = self.features[:9](image.expand(-1, 3, -1, -1))
         return middle, self.features[9:](middle)
 
