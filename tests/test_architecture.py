@@ -33,6 +33,7 @@ FLOORS = [
     "preview",
     "training",
     "export",
+    "bridges",
     "benchmark",
     "cli",
     "__main__",

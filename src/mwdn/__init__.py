@@ -20,6 +20,7 @@ from mwdn.version import __version__ as __version__
 
 if TYPE_CHECKING:  # the names of _MODULES and _PACKAGES, for mypy and editors
     from mwdn import benchmark as benchmark
+    from mwdn import bridges as bridges
     from mwdn import calibration as calibration
     from mwdn import capture as capture
     from mwdn import data as data
@@ -81,8 +82,8 @@ __all__ = [
 ]
 
 _PACKAGES = {
-    *("benchmark", "calibration", "capture", "data", "diagnosis", "errors", "evaluation", "export", "fourier"),
-    *("inference", "io", "networks", "optics", "preview", "registration", "runtime", "solvers", "training"),
+    *("benchmark", "bridges", "calibration", "capture", "data", "diagnosis", "errors", "evaluation", "export"),
+    *("fourier", "inference", "io", "networks", "optics", "preview", "registration", "runtime", "solvers", "training"),
     *("types", "weights"),
 }
 _MODULES = {

@@ -15,6 +15,7 @@ MwdnError
 ├── DivergenceError                a loss that is no longer finite
 ├── CameraError                    a camera that cannot be opened, or delivers no frames any more
 ├── DisplayError                   a display that does not show what it should
+├── MissingPackageError (ImportError)  an optional library that is not installed
 └── ProcessError                   another process of a distributed run has ended
 ```
 """
@@ -60,13 +61,7 @@ class ParameterError(MwdnError, ValueError):
 
 
 class UnknownNameError(ParameterError):
-    """An unknown name; the message offers the nearest known one.
-
-    Args:
-        kind: of the thing looked up, for example ``"network"``.
-        name: the unknown name.
-        known: every known name.
-    """
+    """An unknown ``name`` of a ``kind`` of thing, such as ``"network"``; the message offers the nearest known one."""
 
     def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
         name, known = cut(str(name), 80), sorted(known)
@@ -293,6 +288,10 @@ class CameraError(MwdnError):
 
 class DisplayError(MwdnError):
     """No display is connected, or it does not show what it should."""
+
+
+class MissingPackageError(MwdnError, ImportError):
+    """A library of an extra is not installed, or cannot be imported; the message names the extra."""
 
 
 class ProcessError(MwdnError):
