@@ -235,12 +235,14 @@ def test_the_name_of_the_recipe_does_not_matter(done, monkeypatch):
 def test_another_method_and_another_set_are_a_line_each(done):
     folder = done.parent
     more = RECIPE.replace("mwdn = {} }", 'mwdn = {}, plain = { name = "unet" } }')
+    more = more.replace("iterations = 3 } }", "iterations = 3 }, universal-small = {} }")
     more += 'real = { psf = "psf.npy", pairs = "out/data/caustic.h5", trained_on = "caustic", test = 2 }\n'
     (folder / "more.toml").write_text(more, encoding="utf-8")
     before = (done / "runs" / "caustic" / "mwdn" / "best.safetensors").stat().st_mtime_ns
     results = run(read_benchmark(folder / "more.toml"), done, device="cpu")
     assert (done / "runs" / "caustic" / "mwdn" / "best.safetensors").stat().st_mtime_ns == before
-    assert list(results.methods["real"]) == ["quick", "wiener", "mwdn", "plain"]
+    assert list(results.methods["real"]) == ["quick", "universal-small", "wiener", "mwdn", "plain"]
+    assert results.methods["real"]["universal-small"].scores.learnable > 1e6  # trained, but not here
     assert results.report("real").pictures == 2
     assert not (done / "runs" / "real").exists()
     assert results.training_seconds("real", "plain") == results.training_seconds("caustic", "plain")
@@ -251,6 +253,7 @@ def test_another_method_and_another_set_are_a_line_each(done):
     [
         ("mwdn = {} }", "mwdm = {} }", UnknownNameError, "Did you mean 'mwdn'?"),
         ("mwdn = {} }", "mwdn = { widht = 3 } }", UnknownNameError, "Did you mean 'width'?"),
+        ("iterations = 3 } }", "iterations = 3 }, universal = { width = 3 } }", UnknownNameError, "width"),
         ("mwdn = {} }", "mwdn = 3 }", ParameterError, "must be a table of options"),
         (
             "mwdn = {} }",

@@ -36,9 +36,9 @@ def test_learnable_numbers_of_the_authors_cpsf():
     assert count("mwdn-cpsf", authors_scalars=True) == 21_956_745
 
 
-@pytest.mark.parametrize("name", ["mwdn", "unet"])
+@pytest.mark.parametrize("name", ["mwdn", "unet", "mwdn-cpsf"])
 def test_options_without_weights_of_their_own_keep_the_count(name):
-    options = {"pooling": "average"}
+    options = {"pooling": "average"} | ({"orthonormal": True} if name == "mwdn-cpsf" else {})
     if name == "mwdn":
         options |= {"psf_pooling": "average", "boundary": "circular", "weight": 0.1, "regularisation": 0.5}
     assert count(name, **options) == COUNTS[name]
@@ -205,3 +205,43 @@ def test_authors_start_values_of_cpsf():
     F.mse_loss(network(b, h), torch.rand(2, 3, 16, 16)).backward()
     assert {key for key, value in parameters.items() if value.grad is None} == {"unused_regularisation"}
     assert network.weight.grad.abs().item() > 0
+
+
+# --- Why MWDN-CPSF learns slowly as published, and our option ----------------------------------
+
+
+@torch.no_grad()
+def filtered(side, seed=0, **options):
+    """Standard deviation of the finest features behind their filter over that before, of a new network in training."""
+    torch.manual_seed(seed)
+    network = build("mwdn-cpsf", width=4, **options).train()
+    b, h = torch.rand(4, 3, side, side), torch.rand(1, 3, side, side) ** 8
+    features = network.encoder(b)[0]
+    result = network.filters[0].deconvolve(features, network.prepare(h, (side, side))[0])
+    return (result.std() / features.std()).item()
+
+
+def test_published_filters_of_cpsf_fade_with_the_size():
+    """BatchNorm makes every pixel of a corrected PSF about 1, so |H| is about the root of their number."""
+    small, large = filtered(48), filtered(128)
+    assert large < 0.1
+    assert math.isclose(small / large, 128 / 48, rel_tol=0.3)
+
+
+def test_orthonormal_filters_keep_features_at_any_size():
+    small, large = filtered(48, orthonormal=True), filtered(128, orthonormal=True)
+    assert small > 1
+    assert math.isclose(small, large, rel_tol=0.3)
+
+
+@torch.no_grad()
+def test_orthonormal_is_a_larger_lambda_and_gain(generator):
+    """conj(H / r) B / (|H / r|^2 + lambda) = r conj(H) B / (|H|^2 + lambda r^2), with r^2 pixels at each scale."""
+    ours, papers = (trained(build("mwdn-cpsf", width=2, orthonormal=own), generator) for own in (True, False))
+    papers.load_state_dict(ours.state_dict())
+    h = torch.rand(1, 3, 32, 48, generator=generator)
+    for scale, wiener in enumerate(papers.filters):
+        wiener.log_regularisation += math.log(32 * 48 / 4**scale)
+    prepared = zip(ours.prepare(h, (32, 48)), papers.prepare(h, (32, 48)), strict=True)
+    for scale, (transfer, expected) in enumerate(prepared):
+        torch.testing.assert_close(transfer, math.sqrt(32 * 48) / 2**scale * expected, rtol=1e-4, atol=1e-5)

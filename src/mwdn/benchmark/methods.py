@@ -21,9 +21,9 @@ class Method:
 
     Args:
         label: its name in the tables.
-        name: of the network or solver.
+        name: of the network or solver, or of a bundled network among the solvers.
         options: to build it with.
-        learned: whether it is a network.
+        learned: whether it is a network to be trained.
         schedule: keys of [schedule] with other values for this network, such as its seed.
     """
 

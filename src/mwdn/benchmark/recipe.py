@@ -18,9 +18,18 @@ from mwdn.solvers import SOLVERS
 from mwdn.training.losses import checked_weights
 from mwdn.training.recipe import Recipe, Schedule
 from mwdn.training.tables import Plateau
+from mwdn.weights.bundled import BUNDLED
 
 AXES = {"noise": 1.0, **{part.name: 0.0 for part in fields(Deviation)}}
 """What a robustness sweep varies, and its value in the camera of the training; noise is a factor."""
+
+
+def _no_options() -> None:
+    """The options of a bundled network."""
+
+
+UNTRAINED: dict[str, Any] = {**SOLVERS, **dict.fromkeys(BUNDLED, _no_options)}
+"""Methods of [solvers], which are not trained here, each with a function or class that takes its options."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +117,7 @@ def read_benchmark(path: str | Path) -> Benchmark:
             raise UnknownNameError("key of a benchmark's recipe", key, keys)
     folder, shared = Path(path).parent, content.pop("shared", {})
     networks = read_methods("networks", content.pop("networks", {}), NETWORKS, shared.get("network", {}))
-    methods = [*read_methods("solvers", content.pop("solvers", {}), SOLVERS, {}), *networks]
+    methods = [*read_methods("solvers", content.pop("solvers", {}), UNTRAINED, {}), *networks]
     tables: dict[str, Any] = {
         "data": {
             name: _dataset_recipe(name, {**shared.get("data", {}), **table}, folder)

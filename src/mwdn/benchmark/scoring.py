@@ -10,13 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mwdn import solvers
 from mwdn.benchmark.methods import MEAN, Method
 from mwdn.benchmark.sets import Dataset
 from mwdn.data.captures import find_captures, read_captures
 from mwdn.data.recorded import RecordedPairs
 from mwdn.errors import ImageError, ParameterError
 from mwdn.evaluation import First, Perceptual, Scores, evaluate
+from mwdn.inference.methods import find_method
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import atomic_write, file_sha256, write_text
 from mwdn.io.npy import read_array
@@ -81,7 +81,7 @@ def make_reconstructor(
 
     Args:
         method: solver or network.
-        checkpoint: weights of a network; ``None`` for a solver.
+        checkpoint: weights of a network trained here; ``None`` for a solver or a bundled network.
         dataset: whose calibration is used.
         device: where to compute.
     """
@@ -89,7 +89,7 @@ def make_reconstructor(
         return Reconstructor(MeanPicture.of(dataset), dataset.calibration, device=device)
     if checkpoint is not None:
         return Reconstructor(checkpoint, dataset.calibration, device=device)
-    return Reconstructor(solvers.build(method.name, **method.options), dataset.calibration, device=device)
+    return Reconstructor(find_method(method.name, **method.options), dataset.calibration, device=device)
 
 
 def identity(method: Method, checkpoint: Path | None, dataset: Dataset) -> dict[str, Any]:

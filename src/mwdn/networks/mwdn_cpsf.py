@@ -1,5 +1,7 @@
 """Multi Wiener deconvolution network on corrected PSF (section 3.2.2, fig. 2 of the paper)."""
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -24,9 +26,15 @@ class MwdnCpsf(Network[list[Tensor]]):
         authors_scalars: add two scalars of the authors' code that are not in the paper: a learned weight of the PSF
             before its encoder, and an unused fifth lambda. 21,956,745 learnable parameters.
         authors_form: see `mwdn.networks.Mwdn`.
+        orthonormal: divide each corrected PSF by the square root of its number of pixels N, as an orthonormal Fourier
+            transform would. Ours, not the paper's. BatchNorm gives corrected PSFs values of about 1 at every pixel, so
+            that ``|H|^2`` is about N: lambda is negligible beside it, noise is inverted at all frequencies, and the
+            deconvolved features are smaller than others by sqrt(N), 80 times at 80 x 80, so that the decoder hardly
+            sees them. Divided, ``|H|^2`` is about 1 at any size, and so is the gain. It is the paper's network with
+            lambda N times as large and features sqrt(N) times as large.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         *,
         channels: int = 3,
@@ -36,9 +44,11 @@ class MwdnCpsf(Network[list[Tensor]]):
         boundary: Boundary = "taper",
         authors_scalars: bool = False,
         authors_form: bool = False,
+        orthonormal: bool = False,
     ) -> None:
         super().__init__()
         self.stored_psf = authors_form
+        self.orthonormal = orthonormal
         widths = paper_widths(width)
         self.encoder = Encoder(channels, widths, pooling=pooling)
         self.psf_encoder = Encoder(channels, widths[:-1], pooling=pooling)
@@ -54,7 +64,10 @@ class MwdnCpsf(Network[list[Tensor]]):
 
     def pyramid(self, psf: Psf) -> list[Tensor]:
         """Corrected PSFs, one per feature channel, at scales 1, 1/2, 1/4, 1/8."""
-        return self.psf_encoder(self.weight * psf if hasattr(self, "weight") else psf)
+        psfs = self.psf_encoder(self.weight * psf if hasattr(self, "weight") else psf)
+        if self.orthonormal:
+            psfs = [_orthonormal(psfs.pop(0)) for _ in self.filters]
+        return psfs
 
     def prepare(self, psf: Psf, size: Size) -> list[Tensor]:
         """Transfer functions of each scale's filter, one per feature channel."""
@@ -67,3 +80,8 @@ class MwdnCpsf(Network[list[Tensor]]):
         for scale, (wiener, transfer) in enumerate(zip(self.filters, prepared, strict=True)):
             features[scale] = wiener.deconvolve(features[scale], transfer)
         return self.decoder(features)
+
+
+def _orthonormal(psf: Tensor) -> Tensor:
+    """A PSF over the square root of its number of pixels: the mean of ``|H|^2`` is its mean square (Parseval)."""
+    return psf / math.sqrt(psf.shape[-2] * psf.shape[-1])
