@@ -3,10 +3,11 @@
     mwdn benchmark benchmark-ablation --out runs/ablation-1 --seed 1
     python benchmarks/cpsf.py runs/ablation-1 [--steps 200]
 
-The first table is of new networks in training mode and of trained ones, on four training captures: the median of |H| of
-the PSFs that the filters divide by; the part of the frequencies with |H|^2 > lambda, which are inverted; the contrast of
-the features (standard deviation) before and behind the filter. The second trains variants for ``--steps`` of the recipe's
-1,000, with its pairs, seed and rate; about a minute of processor time for each 200. Writes `benchmarks/results/cpsf.json`.
+The first table is of new networks in training mode and of trained ones, on four training captures: the median of |H|
+of the PSFs that the filters divide by; the part of the frequencies with |H|^2 > lambda, which are inverted; the
+contrast of the features (standard deviation) before and behind the filter. The second trains variants for ``--steps``
+of the recipe's 1,000, with its pairs, seed and rate; about a minute of processor time for each 200. Writes
+`benchmarks/results/cpsf.json`.
 """
 
 import argparse
