@@ -1,6 +1,7 @@
 """An engine computes the same function as its network."""
 
 import copy
+import pickle
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ from made import trained
 from mwdn import Calibration, Camera, Reconstructor, read_frame
 from mwdn.errors import ParameterError
 from mwdn.inference.engine import Engine
-from mwdn.inference.fusion import FusedConvolution, fuse
+from mwdn.inference.fusion import MAX_LAYOUTS, FusedConvolution, fuse
 from mwdn.networks import NETWORKS, build
 
 SIZE = 33, 47
@@ -66,6 +67,19 @@ def test_fused_convolution(packed, dtype, generator):
     assert result.dtype == (dtype or torch.float32)
     tolerance = 1e-5 if dtype is None else 0.03
     torch.testing.assert_close(result.float(), expected, rtol=tolerance, atol=tolerance)
+
+
+def test_packed_weights_follow_the_shape(generator):
+    """The layout for 20 x 20 pixels and one thread is another than the default (on AVX2)."""
+    layer = nn.Sequential(nn.Conv2d(64, 128, 3, padding=1), nn.ReLU())
+    fused = fuse(copy.deepcopy(layer), None)
+    shapes = [(1, 64, 20, 20), (2, 64, 5, 7), (1, 64, 20, 20), (1, 64, 8, 8), (1, 64, 9, 8), (1, 64, 10, 8)]
+    with torch.no_grad():
+        for shape in shapes:
+            image = torch.randn(*shape, generator=generator)
+            for each in (fused, copy.deepcopy(fused), pickle.loads(pickle.dumps(fused))):
+                torch.testing.assert_close(each(image), layer(image), rtol=1e-4, atol=1e-4)
+    assert 0 < len(fused[0].packed) <= MAX_LAYOUTS
 
 
 @pytest.mark.parametrize("channels", [(3, 20), (20, 3)])

@@ -1,8 +1,10 @@
-"""Prefetching, the newest frame of a source, and the memory of both."""
+"""Prefetching, the newest frame and the newest result of a source, and their memory."""
 
 import threading
 import weakref
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,8 @@ import pytest
 import torch
 
 from mwdn import Calibration, Reconstructor
-from mwdn.runtime.streams import latest, prefetch
+from mwdn.runtime.streams import latest, latest_results, prefetch
+from mwdn.runtime.threads import use_threads
 from mwdn.solvers import Wiener
 
 WAIT = 30  # seconds until a test fails that should not have to wait
@@ -155,6 +158,104 @@ def test_source_stops_with_its_consumer():
         assert next(frames) == 0
     assert ended.wait(WAIT)
     assert not any(thread.name.endswith("(run)") for thread in set(threading.enumerate()) - others)
+
+
+# --- Newest result ------------------------------------------------------------------------------------
+
+
+def results_of_each(finish, count, *, begin=lambda frame: None, fail_at=-1):
+    """Results of a source that waits until each frame has begun before it delivers the next."""
+    begun = threading.Semaphore(0)
+
+    def source():
+        for number in range(count):
+            if number == fail_at:
+                raise OSError("source")
+            yield number
+            assert begun.acquire(timeout=WAIT)
+
+    def begin_one(frame):
+        begun.release()
+        begin(frame)
+        return partial(finish, frame)
+
+    return latest_results(begin_one, source(), workers=2)
+
+
+def test_two_frames_are_in_progress_at_the_same_time():
+    """Otherwise the barrier breaks."""
+    together = threading.Barrier(2, timeout=WAIT)
+
+    def finish(frame):
+        together.wait()
+        return frame
+
+    assert list(results_of_each(finish, 2))[-1] == 1
+
+
+def test_result_that_a_later_one_has_overtaken_is_dropped():
+    shown = threading.Event()
+
+    def finish(frame):
+        if frame != 1:
+            assert shown.wait(WAIT)
+        return frame
+
+    with closing(results_of_each(finish, 3)) as results:
+        assert next(results) == 1
+        shown.set()
+        assert list(results) == [2]
+
+
+def test_frames_are_begun_one_at_a_time_in_order():
+    begun, busy = [], threading.Lock()
+
+    def begin(frame):
+        assert busy.acquire(blocking=False)
+        begun.append(frame)
+        busy.release()
+        return lambda: frame
+
+    results = list(latest_results(begin, range(200), workers=3))
+    assert begun == sorted(begun)
+    assert results == sorted(set(results))
+    assert results[-1] == begun[-1] == 199
+
+
+def fail(frame):
+    if frame == 3:
+        raise OSError("work")
+    return frame
+
+
+@pytest.mark.parametrize(
+    "results",
+    [
+        lambda: results_of_each(fail, 4),
+        lambda: results_of_each(lambda frame: frame, 4, begin=fail),
+        lambda: results_of_each(lambda frame: frame, 4, fail_at=3),
+    ],
+    ids=["work", "begin", "source"],
+)
+def test_error_ends_the_results(results, request):
+    with pytest.raises(OSError, match="source" if "source" in request.node.name else "work"):
+        list(results())
+
+
+def test_threads_are_those_of_the_caller_alone():
+    before = torch.get_num_threads()
+
+    def numbers():
+        found = []
+        thread = threading.Thread(target=lambda: found.append(torch.get_num_threads()))
+        use_threads(before + 1)
+        thread.start()
+        thread.join()
+        return [torch.get_num_threads(), *found]
+
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(numbers).result() == [before + 1, before]
+    assert torch.get_num_threads() == before
 
 
 # --- Memory -------------------------------------------------------------------------------------------

@@ -14,6 +14,9 @@ MIN_HALF_CHANNELS = 16
 eight bits a bright measurement would lose the faint contrast that the Wiener filters amplify (up to 20 dB PSNR), and
 the reconstruction its finest steps of brightness (1 to 5 dB)."""
 
+MAX_LAYOUTS = 4
+"""Shapes of features for which a convolution keeps packed weights: a picture in strips has three."""
+
 
 class FusedConvolution(nn.Module):
     """Convolution, BatchNorm and ReLU in one operation.
@@ -24,6 +27,9 @@ class FusedConvolution(nn.Module):
         relu: whether a ReLU follows.
         dtype: precision; ``None`` for float32, which is always used below `MIN_HALF_CHANNELS` channels.
         pack: store the weights in the layout of this CPU's oneDNN, if possible.
+
+    The best layout depends on the features' shape and the number of threads. In another one oneDNN converts the weights
+    at each call, which takes up to four times as long as the convolution (256 to 128 channels of 20 x 20, one thread).
     """
 
     def __init__(
@@ -48,25 +54,37 @@ class FusedConvolution(nn.Module):
         self.relu, self.padding = relu, [int(p) for p in convolution.padding]
         self.weight = weight.to(self.dtype).contiguous(memory_format=torch.channels_last)
         self.bias = bias.to(self.dtype)
-        self.packed = _pack(self.weight, self.padding) if pack else None
+        self.packs = pack and _can_pack(self.weight, self.padding)
+        self.packed: dict[tuple[int, ...], Tensor] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         """Without the packed weights, which fit this machine only."""
-        return {**vars(self), "packed": self.packed is not None}
+        return {**vars(self), "packed": {}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)  # type: ignore[no-untyped-call]
-        self.packed = _pack(self.weight, self.padding) if state["packed"] else None
+        self.packs = self.packs and _can_pack(self.weight, self.padding)
 
     def forward(self, features: Tensor) -> Tensor:
         """Features in channels-last layout and the precision of the weights."""
         features = features.to(self.dtype).contiguous(memory_format=torch.channels_last)
-        if self.packed is None:
+        if not self.packs:
             result = F.conv2d(features, self.weight, self.bias, padding=self.padding)
             return result.relu_() if self.relu else result
         activation = "relu" if self.relu else "none"
         convolve = torch.ops.mkldnn._convolution_pointwise
-        return convolve(features, self.packed, self.bias, self.padding, [1, 1], [1, 1], 1, activation, [], "")
+        weight = self._packed_for(features)
+        return convolve(features, weight, self.bias, self.padding, [1, 1], [1, 1], 1, activation, [], "")
+
+    def _packed_for(self, features: Tensor) -> Tensor:
+        """The weights in the layout for features of this shape."""
+        key = (*features.shape, torch.get_num_threads())
+        packed = self.packed.get(key)
+        if packed is None:
+            if len(self.packed) >= MAX_LAYOUTS:
+                self.packed.clear()
+            packed = self.packed[key] = _pack(self.weight, self.padding, list(features.shape))
+        return packed
 
 
 class Float32Layer(nn.Module):
@@ -81,23 +99,28 @@ class Float32Layer(nn.Module):
         return self.layer(features.float(), **options)
 
 
-def _pack(weight: Tensor, padding: list[int]) -> Tensor | None:
-    """Weights in oneDNN's layout if this torch has the fused operation, else ``None``.
+def _pack(weight: Tensor, padding: list[int], shape: list[int]) -> Tensor:
+    """Weights in oneDNN's layout for features of a shape."""
+    return torch._C._nn.mkldnn_reorder_conv2d_weight(weight.to_mkldnn(), padding, [1, 1], [1, 1], 1, shape)  # type: ignore[call-arg]
+
+
+def _can_pack(weight: Tensor, padding: list[int]) -> bool:
+    """Whether this torch has the fused operation for packed weights.
 
     Both functions belong to torch's compiler and are not public, so a small input is checked first.
     """
     if weight.device.type != "cpu" or not torch.backends.mkldnn.is_available():  # type: ignore[no-untyped-call]
-        return None
+        return False
     try:
-        packed = torch._C._nn.mkldnn_reorder_conv2d_weight(weight.to_mkldnn(), padding, [1, 1], [1, 1], 1)
         probe = weight.new_ones((1, weight.shape[1], 4, 4)).contiguous(memory_format=torch.channels_last)
+        packed = _pack(weight, padding, list(probe.shape))
         bias = torch.zeros_like(weight[:, 0, 0, 0])
         convolve = torch.ops.mkldnn._convolution_pointwise
         result = convolve(probe, packed, bias, padding, [1, 1], [1, 1], 1, "relu", [], "").float()
     except (AttributeError, RuntimeError, TypeError):
-        return None
+        return False
     expected = F.conv2d(probe.float(), weight.float(), padding=padding).relu()
-    return packed if torch.allclose(result, expected, rtol=0.05, atol=0.05 * expected.max().item()) else None
+    return torch.allclose(result, expected, rtol=0.05, atol=0.05 * expected.max().item())
 
 
 def fuse(module: nn.Module, dtype: torch.dtype | None, *, pack: bool = True) -> nn.Module:

@@ -4,10 +4,10 @@ import json
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mwdn.calibration import Calibration
 from mwdn.capture.recording import Recorder, record
@@ -17,13 +17,22 @@ from mwdn.preview.limits import RefusedError
 from mwdn.preview.live_pictures import LivePicture, LivePictures, finite
 from mwdn.preview.live_settings import CAMERA, LiveSettings
 from mwdn.preview.metrics import Metrics
-from mwdn.runtime.streams import latest
+from mwdn.runtime.devices import select_device
+from mwdn.runtime.streams import latest_results
+from mwdn.runtime.threads import usable_processors
 
 RATE_FRAMES = 20
 """Frames over which the rate is averaged."""
 
 RETRY_S = 2.0
 """Seconds after which a camera that failed is opened again."""
+
+
+class _Result(NamedTuple):
+    picture: LivePicture
+    encoded: tuple[bytes, bytes]
+    start: float
+    """Seconds since the epoch at which the work began."""
 
 
 class Live:
@@ -50,7 +59,7 @@ class Live:
     ) -> None:
         self.camera, self.calibration, self.folder, self.metrics = camera, calibration, folder, Metrics()
         self.pictures = LivePictures(calibration, LiveSettings(method), device, count=self._count)
-        self._retry_s = retry_s
+        self._retry_s, self._device = retry_s, select_device(device)
         self._lock, self._changed = threading.Lock(), threading.Event()
         self._wake: dict[int, Callable[[], None]] = {}
         self._thread: threading.Thread | None = None
@@ -125,8 +134,8 @@ class Live:
         while True:
             failed = False
             try:
-                with self.camera, ExitStack() as recording, closing(latest(self._frames(recording))) as frames:
-                    self._reconstruct(frames)
+                with self.camera, ExitStack() as recording, closing(self._results(recording)) as results:
+                    self._show(results)
             except MwdnError as error:
                 failed, self._is_recording = True, False
                 self._publish({"error": str(error)}, b"", b"")
@@ -167,16 +176,34 @@ class Live:
             except MwdnError as error:
                 self._refused = str(error)
 
-    def _reconstruct(self, frames: Iterator[Frame]) -> None:
+    def _results(self, recording: ExitStack) -> Generator["_Result", None, None]:
+        """The newest picture each time.
+
+        On a CPU two frames are in progress at the same time, on half the processors each: that makes more pictures a
+        second than one frame on all of them, because most operations on a small picture gain nothing from a second
+        thread. A GPU works on one.
+        """
+        workers = min(2, usable_processors()) if self._device.type == "cpu" else 1
+        threads = max(1, usable_processors() // workers)
+        return latest_results(self._begin, self._frames(recording), workers=workers, threads=threads)
+
+    def _begin(self, frame: Frame) -> Callable[[], "_Result"]:
+        start, finish = time.time(), self.pictures.begin(frame)
+
+        def work() -> _Result:
+            picture, encoding = finish(), time.perf_counter()
+            encoded = picture.encode()
+            self._count("encode", time.perf_counter() - encoding)
+            return _Result(picture, encoded, start)
+
+        return work
+
+    def _show(self, results: Iterator["_Result"]) -> None:
         times: deque[float] = deque(maxlen=RATE_FRAMES)
         before: Frame | None = None
         dropped = 0
-        for frame in frames:
-            start = time.time()
-            self._picture = picture = self.pictures(frame)
-            encoding = time.perf_counter()
-            encoded = picture.encode()
-            self._count("encode", time.perf_counter() - encoding)
+        for picture, encoded, start in results:
+            self._picture, frame = picture, picture.frame
             lost = frame.dropped if before is None else max(frame.number - before.number - 1, 0)
             dropped, before = dropped + lost, frame
             self.metrics.add("mwdn_live_frames_total")
@@ -195,7 +222,7 @@ class Live:
             "number": frame.number,
             "exposure_s": finite(frame.exposure_s),
             "gain": finite(frame.gain),
-            "refused": self._refused or self.pictures.note,
+            "refused": self._refused or self.pictures.refused or picture.wrong,
             "recorded": self._recorded if self._is_recording else None,
             "recording": self._recording,
             "method": settings.method,

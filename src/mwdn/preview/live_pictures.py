@@ -4,10 +4,10 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from mwdn.calibration import Calibration
 from mwdn.calibration.white_balance import apply_white_balance
@@ -18,6 +18,7 @@ from mwdn.preview.live_encoding import brightest, encode_jpeg
 from mwdn.preview.live_settings import LiveSettings
 from mwdn.preview.result import Result
 from mwdn.solvers.alignment import align
+from mwdn.solvers.warm_start import WarmStart
 from mwdn.types import Measurement, Scene
 
 
@@ -31,6 +32,7 @@ class LivePicture:
         scene: likewise, in the colours of the camera.
         settings: with which it was made.
         calibration: of the camera, with what the camera says about its frames.
+        wrong: what is wrong with the frame.
     """
 
     frame: Frame
@@ -38,6 +40,7 @@ class LivePicture:
     scene: Scene
     settings: LiveSettings
     calibration: Calibration
+    wrong: str = ""
 
     def encode(self) -> tuple[bytes, bytes]:
         """JPEGs of the measurement and the scene."""
@@ -72,13 +75,16 @@ def finite(value: float) -> float | None:
 
 
 class LivePictures:
-    """Reconstructs one frame after the other.
+    """Reconstructs frames.
 
     Args:
         calibration: of the camera.
         settings: at first.
         device: see `Reconstructor`.
-        count: called with a stage and its seconds.
+        count: called with a stage and its seconds, from any thread.
+
+    Attributes:
+        refused: why a wish was refused.
     """
 
     def __init__(
@@ -90,16 +96,11 @@ class LivePictures:
         count: Callable[[str, float], None] = lambda stage, seconds: None,
     ) -> None:
         self._given, self.settings, self.device, self.count = calibration, settings, device, count
-        self._refused = self._wrong = ""
+        self.refused = ""
         self._reconstruct: Reconstructor | None = None
         self._used = settings
         self._ambient: Frame | None = None
         self._takes_ambient = False
-
-    @property
-    def note(self) -> str:
-        """Why a wish was refused, or what is wrong with the last frame."""
-        return self._refused or self._wrong
 
     @property
     def has_ambient(self) -> bool:
@@ -107,8 +108,8 @@ class LivePictures:
         return self._ambient is not None
 
     def change(self, message: dict[str, Any]) -> None:
-        """Take over the settings of a message; what is wrong with it becomes the `note`."""
-        self._refused = ""
+        """Take over the settings of a message; why one is not possible becomes `refused`."""
+        self.refused = ""
         if "ambient" in message:
             self._takes_ambient = message["ambient"]
             if not message["ambient"]:
@@ -116,33 +117,39 @@ class LivePictures:
         try:
             self.settings = self.settings.changed(message, self._given.light)
         except MwdnError as error:
-            self._refused = str(error)
+            self.refused = str(error)
 
-    def __call__(self, frame: Frame) -> LivePicture:
-        """Reconstruct a frame.
+    def begin(self, frame: Frame) -> Callable[[], LivePicture]:
+        """Prepare the reconstruction of a frame with the present settings, for one frame at a time.
+
+        Returns:
+            A function that makes the picture, at the same time as those of other frames; it may raise a `MwdnError`.
 
         Raises:
-            MwdnError: it does not fit the camera, or the method does not.
+            MwdnError: the frame does not fit the camera, or the method does not.
         """
-        start = time.perf_counter()
         reconstruct = self._prepared(frame)
-        measurement = reconstruct.calibration.correct(frame.array)
-        corrected = time.perf_counter()
-        self._wrong = ""
-        try:
-            scene = self._scene(reconstruct, measurement)
-        except ParameterError as error:  # a dark frame must not end the live picture
-            self._wrong, scene = str(error), torch.zeros_like(measurement)
-        self.count("correct", corrected - start)
-        self.count("reconstruct", time.perf_counter() - corrected)
-        return LivePicture(frame, measurement.clamp(min=0), scene, self._used, reconstruct.calibration)
-
-    @torch.inference_mode()
-    def _scene(self, reconstruct: Reconstructor, measurement: Measurement) -> Tensor:
         if reconstruct.align:  # the pose of the first frame holds for those that follow
-            pose = align(measurement.to(reconstruct.device), reconstruct.psf)
-            self._reconstruct = reconstruct = reconstruct.at(pose)
-        return reconstruct.on_device(measurement).cpu().nan_to_num_()
+            with torch.inference_mode():
+                measurement = reconstruct.calibration.correct(frame.array).to(reconstruct.device)
+                self._reconstruct = reconstruct = reconstruct.at(align(measurement, reconstruct.psf))
+        finish = partial(self._finish, frame, reconstruct, self._used)
+        if isinstance(reconstruct.method, WarmStart):  # each frame needs the result of the one before
+            picture = finish()
+            return lambda: picture
+        return finish
+
+    def _finish(self, frame: Frame, reconstruct: Reconstructor, settings: LiveSettings) -> LivePicture:
+        start = time.perf_counter()
+        measurement = reconstruct.calibration.correct(frame.array)
+        self.count("correct", time.perf_counter() - start)
+        start, wrong = time.perf_counter(), ""
+        try:
+            scene = torch.nan_to_num(reconstruct.on_device(measurement).cpu())
+        except ParameterError as error:  # a dark frame must not end the live picture
+            wrong, scene = str(error), torch.zeros_like(measurement)
+        self.count("reconstruct", time.perf_counter() - start)
+        return LivePicture(frame, measurement.clamp(min=0), scene, settings, reconstruct.calibration, wrong)
 
     def _prepared(self, frame: Frame) -> Reconstructor:
         """The method for the settings of now; those of before if it is refused."""
@@ -151,7 +158,7 @@ class LivePictures:
             self._ambient, self._takes_ambient, self._reconstruct = frame, False, None
         elif self._ambient is not None and not _is_alike(self._ambient, frame):
             self._ambient = self._reconstruct = None
-            self._refused = "The exposure has changed: take the frame of the room's light again."
+            self.refused = "The exposure has changed: take the frame of the room's light again."
         if self._reconstruct is None or not settings.is_same_method(self._used):
             try:
                 self._reconstruct = settings.prepare(self._calibration(frame), self.device)
@@ -159,7 +166,7 @@ class LivePictures:
                 if self._reconstruct is None:
                     raise
                 self.settings = settings = replace(self._used, look=settings.look)
-                self._refused = str(error)
+                self.refused = str(error)
         self._used = settings
         return self._reconstruct
 

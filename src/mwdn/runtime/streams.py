@@ -1,11 +1,13 @@
-"""Overlap work in threads: prefetching, and the newest frame of a live source."""
+"""Overlap work in threads: prefetching, the newest frame of a live source, and its newest result."""
 
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from threading import Condition, Thread
-from typing import TypeVar
+from threading import Condition, Lock, Thread
+from typing import Generic, TypeVar
+
+from mwdn.runtime.threads import use_threads
 
 A = TypeVar("A")
 B = TypeVar("B")
@@ -91,3 +93,99 @@ def latest(frames: Iterable[A]) -> Generator[A, None, None]:
     finally:
         closed = True
         source.join(timeout=5)
+
+
+def latest_results(
+    begin: Callable[[A], Callable[[], B]], frames: Iterable[A], *, workers: int, threads: int = 1
+) -> Generator[B, None, None]:
+    """Process the newest frames of a source, several at the same time, and yield the newest result each time.
+
+    A result that a later frame's has overtaken is dropped. Close the generator before the source of the frames, as that
+    of `latest`.
+
+    Args:
+        begin: called with a frame, in the order of the frames, one at a time; the function that it returns is called at
+            the same time as those of other frames.
+        frames: as for `latest`.
+        workers: frames in progress at the same time.
+        threads: on which torch computes each of them.
+
+    Yields:
+        Results in the order of their frames. An error of the source, of ``begin`` or of its function is raised.
+    """
+    team = _Team(begin, latest(frames), workers, threads)
+    try:
+        yield from team.results()
+    finally:
+        team.close()
+
+
+class _Team(Generic[A, B]):
+    """The threads of `latest_results`. One waits for a frame while the others work."""
+
+    def __init__(
+        self, begin: Callable[[A], Callable[[], B]], frames: Generator[A, None, None], workers: int, threads: int
+    ) -> None:
+        self.begin, self.frames, self.threads = begin, frames, threads
+        self.turn, self.changed = Lock(), Condition()
+        self.newest: deque[tuple[int, B]] = deque(maxlen=1)
+        self.ended: list[BaseException | None] = []
+        self.taken, self.closed = 0, False
+        self.workers = [Thread(target=self.run, daemon=True) for _ in range(workers)]
+        for worker in self.workers:
+            worker.start()
+
+    def run(self) -> None:
+        """Work until the frames end, or a worker fails."""
+        error = None
+        try:
+            use_threads(self.threads)
+            while not (self.closed or self.ended):
+                self.process_one()
+        except StopIteration:
+            pass
+        except BaseException as problem:
+            error = problem
+        with self.changed:
+            self.ended.append(error)
+            self.changed.notify()
+
+    def process_one(self) -> None:
+        """The next frame. Raises `StopIteration` after the last."""
+        with self.turn:
+            if self.closed:
+                return
+            finish = self.begin(next(self.frames))
+            self.taken += 1
+            number = self.taken
+        result = finish()
+        del finish  # and the frame: the condition may take a while
+        with self.changed:
+            if not self.newest or self.newest[0][0] < number:
+                self.newest.append((number, result))
+                self.changed.notify()
+
+    def results(self) -> Iterator[B]:
+        """The newest result each time, and the first error after it."""
+        shown = 0
+        while True:
+            with self.changed:
+                self.changed.wait_for(lambda: self.newest or any(self.ended) or len(self.ended) == len(self.workers))
+                if not self.newest:
+                    break
+                number, result = self.newest.popleft()
+            if number > shown:
+                shown = number
+                yield result
+            del result
+        for error in self.ended:
+            if error is not None:
+                raise error
+
+    def close(self) -> None:
+        """End the threads after their frames."""
+        self.closed = True
+        for worker in self.workers:
+            worker.join(timeout=5)
+        if not any(worker.is_alive() for worker in self.workers):  # else one of them waits for a frame
+            self.frames.close()
