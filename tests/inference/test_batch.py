@@ -16,6 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import tifffile
 import torch
 
 from cameras import contour_psf
@@ -24,7 +25,7 @@ from mwdn import Camera, read_frame
 from mwdn.calibration import Calibration, FrameFormat
 from mwdn.errors import ImageError, ParameterError
 from mwdn.evaluation.consistency import consistency
-from mwdn.inference.batch import Batch
+from mwdn.inference.batch import Batch, Job
 from mwdn.inference.outputs import check_outputs, output_name
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.contact_sheets import to_display
@@ -143,7 +144,7 @@ def test_json_of_somebody_else_is_not_replaced(tmp_path, content):
 # --- What is written ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("format", "suffix"), [("tiff", ".tif"), ("npy", ".npy")])
+@pytest.mark.parametrize(("format", "suffix"), [("tiff", ".tif"), ("imagej", ".tif"), ("npy", ".npy")])
 def test_linear_formats_hold_what_the_reconstructor_returns(tmp_path, format, suffix, captures, psf):
     batch = make_batch(psf, tmp_path / "out", format=format)
     jobs = list(batch.run(captures))
@@ -162,6 +163,18 @@ def test_linear_formats_hold_what_the_reconstructor_returns(tmp_path, format, su
         assert beside["psf_hash"] == batch.reconstruct.calibration.psf_hash
         assert beside["explained"] == job.trust.consistency.explained
         assert beside["doubtful"] == job.trust.doubtful
+
+
+def test_the_scale_of_imagej_is_the_pitch_of_the_pixels(tmp_path, captures, psf):
+    calibration = Calibration(psf, FrameFormat(bin=2), pitch_um=4.0)
+    batch = make_batch(calibration, tmp_path, "wiener", format="imagej")
+    for full_size, pitch in ((None, 4.0), ((64, 80), 2.0)):
+        scene = torch.rand(1, 3, *SIZE)
+        job = Job(captures[0], tmp_path / "0.tif", measurement=scene, scene=scene, full_size=full_size)
+        assert batch._finish(job).error is None
+        with tifffile.TiffFile(tmp_path / "0.tif") as file:
+            assert np.divide(*file.pages[0].tags["XResolution"].value) == pytest.approx(1 / pitch)
+            assert file.imagej_metadata["unit"] == "um"
 
 
 @pytest.mark.parametrize(("format", "steps"), [("png", 255), ("png16", 65535)])

@@ -1,4 +1,4 @@
-"""Bridges to other libraries: scipy.
+"""Bridges to other libraries: scipy, DeepInverse.
 
 Each name is imported at its first use, and with it the library that it needs.
 """
@@ -7,11 +7,16 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from mwdn.bridges.deepinverse import DeepInverseSolver, LenslessPhysics
     from mwdn.bridges.linear_operator import linear_operator
 
-__all__ = ["linear_operator"]
+__all__ = ["DeepInverseSolver", "LenslessPhysics", "linear_operator"]
 
-_MODULES = {"linear_operator": "linear_operator"}
+_MODULES = {
+    "DeepInverseSolver": "deepinverse",
+    "LenslessPhysics": "deepinverse",
+    "linear_operator": "linear_operator",
+}
 """Modules that hold the public names."""
 
 

@@ -20,13 +20,13 @@ from mwdn.diagnosis.sizes import mismatch
 from mwdn.diagnosis.trust import Trust, examine_picture
 from mwdn.errors import ImageError, MwdnError, ShapeError
 from mwdn.inference.origin import origin, settings_hash
-from mwdn.inference.outputs import SUMMARY, Format, output_name, read_sidecar, support_name
+from mwdn.inference.outputs import SUMMARY, Format, output_name, read_sidecar, support_name, write_output
 from mwdn.inference.reconstructor import Reconstructor
-from mwdn.io.contact_sheets import contact_sheet, thumbnail, to_display
+from mwdn.io.contact_sheets import contact_sheet, thumbnail
 from mwdn.io.exif import orientation
 from mwdn.io.files import as_image_error, write_json
 from mwdn.io.formats import is_for_viewing
-from mwdn.io.images import read_frame, read_picture, write_linear, write_picture
+from mwdn.io.images import read_frame, read_picture, write_picture
 from mwdn.io.support_picture import support_picture
 from mwdn.runtime import distributed
 from mwdn.runtime.iterations import watch_iterations
@@ -226,24 +226,19 @@ class Batch:
             return job
         trust = self._examine(job.measurement, job.scene, job.pose)
         verdicts = settle_exif((*job.verdicts, *trust.verdicts)) if trust else ()
-        content: dict[str, object] = {
-            "method": self.method,
-            "psf_hash": self.reconstruct.calibration.psf_hash,
-            "origin": job.origin,
-            "bin": self.reconstruct.calibration.frames.bin,
-        }
+        calibration, pitch = self.reconstruct.calibration, self.reconstruct.calibration.pitch_um
+        content: dict[str, object] = {"method": self.method, "psf_hash": calibration.psf_hash, "origin": job.origin}
+        content["bin"] = calibration.frames.bin
         content |= {} if job.room_light is None else {"room_light": round(job.room_light, 4)}
         if trust:
             content |= {**trust.content, "verdicts": [asdict(verdict) for verdict in verdicts]}
         scene, sidecar = to_host(self.reconstruct.balance(job.scene)), job.output.with_suffix(".json")
         if job.full_size:
-            scene = enlarge(scene, self.reconstruct.calibration.frames.bin, job.full_size)
+            scene = enlarge(scene, calibration.frames.bin, job.full_size)
+            pitch = pitch and pitch / calibration.frames.bin
         with as_image_error(sidecar):
             sidecar.unlink(missing_ok=True)  # an old sidecar must not stand beside the new picture
-        if self.format in ("tiff", "npy"):
-            write_linear(job.output, scene)
-        else:
-            write_picture(job.output, to_display(scene), bits=16 if self.format == "png16" else 8)
+        write_output(job.output, scene, self.format, pitch)
         if trust and self.map:
             write_picture(support_name(job.output), support_picture(scene, trust.support.map))
         write_json(sidecar, content)

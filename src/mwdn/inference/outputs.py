@@ -5,13 +5,16 @@ from pathlib import Path
 from typing import Literal
 
 from mwdn.errors import ParameterError
+from mwdn.io.contact_sheets import to_display
 from mwdn.io.files import path_resolver
+from mwdn.io.images import write_imagej, write_linear, write_picture
 from mwdn.io.reading import read_json
+from mwdn.types import Scene
 
-Format = Literal["png", "png16", "tiff", "npy"]
-"""``png`` and ``png16`` are sRGB, for viewing; ``tiff`` and ``npy`` hold the linear float32 values."""
+Format = Literal["png", "png16", "tiff", "imagej", "npy"]
+"""``png`` and ``png16`` are sRGB, for viewing; ``tiff``, ``imagej`` and ``npy`` hold the linear float32 values."""
 
-_SUFFIX = {"png": ".png", "png16": ".png", "tiff": ".tif", "npy": ".npy"}
+_SUFFIX = {"png": ".png", "png16": ".png", "tiff": ".tif", "imagej": ".tif", "npy": ".npy"}
 _SUPPORT = ".support.png"
 SUMMARY = "summary.png"
 """File of the contact sheet."""
@@ -69,6 +72,26 @@ def check_outputs(
                 f"such as `*{Path(capture).suffix}`, or reconstruct them into two folders: `--out`."
             )
         sources[name] = f"`{capture}`"
+
+
+def write_output(path: Path, scene: Scene, format: Format, pixel_um: float | None) -> None:
+    """Write a picture.
+
+    Args:
+        path: with the format's suffix.
+        scene: (1, C, H, W).
+        format: see `Format`.
+        pixel_um: distance between the picture's pixels on the sensor, if it is known.
+
+    Raises:
+        ImageError: it cannot be written.
+    """
+    if format == "imagej":
+        write_imagej(path, scene, pixel_um=pixel_um)
+    elif format in ("tiff", "npy"):
+        write_linear(path, scene)
+    else:
+        write_picture(path, to_display(scene), bits=16 if format == "png16" else 8)
 
 
 def read_sidecar(path: Path) -> dict[str, object]:

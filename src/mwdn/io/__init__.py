@@ -14,6 +14,7 @@ if TYPE_CHECKING:
         srgb_decode,
         srgb_encode,
         write_frame,
+        write_imagej,
         write_linear,
         write_picture,
     )
@@ -25,6 +26,7 @@ __all__ = [
     "srgb_decode",
     "srgb_encode",
     "write_frame",
+    "write_imagej",
     "write_linear",
     "write_picture",
 ]
