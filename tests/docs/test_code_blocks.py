@@ -1,10 +1,11 @@
 """The Python code of README and docs runs, page by page, in a folder with a PSF, a capture and photographs.
 
-A block below `<!-- not run: REASON -->` is not run. Names that a page assumes: `camera`, an iterable of raw frames, and
-`show`.
+A block below `<!-- not run: REASON -->` is not run; one below `<!-- needs: LIBRARY -->` only where that is installed.
+Names that a page assumes: `camera`, an iterable of raw frames, and `show`.
 """
 
 import re
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from mwdn.io.pictures import dark_scene
 from mwdn.optics import sample_camera
 
 ROOT = Path(__file__).resolve().parents[2]
-BLOCK = re.compile(r"(?:<!-- not run: ([^\n]+) -->\n)?```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(r"(?:<!-- (not run|needs): ([^\n]+) -->\n)?```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 PAGES = {
     path.relative_to(ROOT).as_posix(): blocks
     for path in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -28,9 +29,9 @@ SLOW = {"docs/capture.md", "docs/optics.md"}
 
 
 def test_blocks_are_found_and_few_are_left_out():
-    reasons = [reason for blocks in PAGES.values() for reason, _ in blocks]
-    assert len(reasons) > 6
-    assert len(list(filter(None, reasons))) <= 2
+    marks = [mark for blocks in PAGES.values() for mark, *_ in blocks]
+    assert len(marks) > 6
+    assert marks.count("not run") <= 2
 
 
 @pytest.fixture
@@ -52,8 +53,8 @@ def folder(tmp_path, monkeypatch):
 def test_python_code_runs(page, folder):
     shown = []
     names = {"__name__": "page", "camera": 2 * [mwdn.read_frame("capture.png")], "show": shown.append}
-    for reason, code in PAGES[page]:
-        if not reason:
+    for mark, what, code in PAGES[page]:
+        if not mark or (mark == "needs" and find_spec(what)):
             exec(compile(code.replace('"universal"', '"universal-small"'), page, "exec"), names)  # a tenth of its time
     if page == "README.md":
         assert mwdn.read_picture("scene.png").shape == (1, 3, 64, 64)

@@ -67,7 +67,7 @@ def reconstruct(  # noqa: PLR0913
             the path of a checkpoint, or hub:owner/name.
         out: folder for the pictures. Beside each, a .json says how well it explains its capture; summary.png shows
             the first twelve pictures and their captures.
-        format: png and png16 are sRGB for viewing; tiff, imagej (opens in ImageJ, with its scale) and npy hold the linear
+        format: png and png16 are sRGB for viewing; tiff, imagej (for ImageJ, with its scale) and npy hold the linear
             float32 values.
         full_size: interpolate the pictures of binned captures to the captures' size before binning. Without --bin,
             PSF and captures are binned as far as that loses little; --bin 1 refuses.
