@@ -18,9 +18,22 @@ def test_pixel_unshuffle_is_torchs(shape, block, dtype, generator):
         assert result.is_contiguous(memory_format=torch.channels_last)
 
 
-def test_pixel_unshuffle_has_a_gradient(generator):
-    image = torch.rand((2, 3, 8, 4), generator=generator, requires_grad=True)
-    memory_format.pixel_unshuffle(image, 2).square().sum().backward()
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("block", [1, 2, 4])
+@pytest.mark.parametrize("shape", [(1, 16, 3, 2), (2, 48, 5, 7)])
+def test_pixel_shuffle_is_torchs(shape, block, dtype, generator):
+    image = torch.rand(shape, generator=generator).to(dtype)
+    for layout in (image, image.contiguous(memory_format=torch.channels_last), image.mT):
+        result = memory_format.pixel_shuffle(layout, block)
+        assert torch.equal(result, F.pixel_shuffle(layout, block))
+        assert result.is_contiguous()
+
+
+@pytest.mark.parametrize("function", [memory_format.pixel_unshuffle, memory_format.pixel_shuffle])
+def test_pixel_shuffles_have_a_gradient(function, generator):
+    image = torch.rand((2, 4, 8, 4), generator=generator).contiguous(memory_format=torch.channels_last)
+    image.requires_grad_()
+    function(image, 2).square().sum().backward()
     torch.testing.assert_close(image.grad, 2 * image.detach())
 
 

@@ -109,6 +109,18 @@ def _unshuffle_pairs(image: Tensor) -> Tensor:
     return rows.permute(0, 2, 4, 1, 3).contiguous().view(image.dtype).flatten(3).movedim(-1, 1)
 
 
+def pixel_shuffle(image: Tensor, block: int) -> Tensor:
+    """`torch.nn.functional.pixel_shuffle` with contiguous planes: channels to ``block`` x ``block`` pixels.
+
+    From channels-last, two adjacent pixels are copied as one number: 12 x 160 x 160 in 0.2 instead of 1.1 ms.
+    """
+    channels_last = image.is_contiguous(memory_format=torch.channels_last)
+    if block != 2 or not channels_last or image.requires_grad or torch.compiler.is_exporting():
+        return F.pixel_shuffle(image, block).contiguous()
+    pairs = _pairs(image.movedim(1, -1)).unflatten(-1, (-1, 2))  # type: ignore[no-untyped-call]
+    return pairs.permute(0, 3, 1, 4, 2).contiguous().view(image.dtype).flatten(2, 3)
+
+
 def _pixels(image: Tensor) -> Tensor:
     """View (B, H W, C) of a channels-last image; a slice of its channels is copied first."""
     return image.contiguous(memory_format=torch.channels_last).movedim(1, -1).flatten(1, 2)

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.errors import ParameterError
-from mwdn.fourier.memory_format import pixel_unshuffle
+from mwdn.fourier.memory_format import pixel_shuffle, pixel_unshuffle
 from mwdn.fourier.padding import Boundary, pad
 from mwdn.fourier.transforms import inverse_spectrum, spectrum
 from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
@@ -237,7 +237,7 @@ class WienerBank(Network[BankTransfers]):
             light, numbers = evidence[:, : self.channels], evidence[:, self.channels :]
             inputs = torch.cat([inputs, light / unit, numbers], dim=1)
         correction = self._lit(self.decoder(self.encoder(inputs))[..., :rows, :columns])
-        return first + unit * F.pixel_shuffle(correction, self.fold)[..., :height, :width]
+        return first + unit * pixel_shuffle(correction, self.fold)[..., :height, :width]
 
     def _lit(self, output: Tensor) -> Tensor:
         """The U-Net's correction, with as much of its mean light as it may change."""

@@ -103,7 +103,7 @@ class Estimate:
         if downsampling > 1:
             # Two more pixels: one for a side that is not divisible, one to interpolate with.
             image = image[..., : height // downsampling + 2, : width // downsampling + 2]
-            image = F.interpolate(image, scale_factor=downsampling, mode="bilinear")
+            image = enlarge(image, (downsampling * image.shape[-2], downsampling * image.shape[-1]))
         return image[..., :height, :width]
 
     @cached_property
@@ -209,6 +209,14 @@ def halve(image: Tensor) -> Tensor:
     return (a + d + 3 * (b + c)) / 8
 
 
+def enlarge(image: Tensor, size: Size) -> Tensor:
+    """Bilinear interpolation to a larger size.
+
+    Anti-aliasing changes nothing there, but torch's kernel for it works along one axis at a time: a third faster.
+    """
+    return F.interpolate(image, size=size, mode="bilinear", antialias=not torch.compiler.is_compiling())
+
+
 def low_band(transfer: Spectrum, grid: Size, downsampling: int) -> Tensor:
     """Low frequencies of a transfer function: that of a camera whose pixels are ``downsampling`` times as long."""
     rows, columns = grid[0] // downsampling, grid[1] // downsampling
@@ -220,7 +228,7 @@ def _solve(b: Tensor, band: Band, coarser: Tensor, scale: Tensor, size_factor: f
     """Scene on the whole grid after the iterations of one level, started at the coarser scene."""
     # The penalties are stated for a PSF whose colours have a mean square sum of 1, so the scene is times that norm.
     problem = Problem.from_transfer(b, band.transfer)
-    start = F.interpolate(coarser, size=band.grid, mode="bilinear").clamp(min=0) * band.norm
+    start = enlarge(coarser, band.grid).clamp(min=0) * band.norm
     level = band.level
     mu, tau = level.smoothing(scale)
     tau = size_factor * tau

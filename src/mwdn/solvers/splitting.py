@@ -111,9 +111,9 @@ def initial_state(problem: Problem, scene: Tensor | None = None, *, smooth: bool
 def update_copies(state: State, problem: Problem, mu: Penalties, tau: float | Tensor, variation: Variation) -> State:
     """Equations (1) to (3) and (5): shrink the gradient, fit the measurement, clip the sign.
 
-    Each target is value - (z - prox(z)) with z = 2 value - target. What a map takes away is odd in z for (1) and (2),
-    and min(z, 0) = -relu(-z) for (3), so all three start from -z, `reflected`. Off the sensor nothing is measured,
-    (1) gives x = H v + xi, and p1 is H v: it is kept on the sensor alone.
+    Each target is value - (z - prox(z)) with z = 2 value - target. What a map takes away is odd in z for (1) and (2):
+    both start from -z, `reflected`. For (3) it is min(z, 0), so the target is v - min(2 v - p, 0) = max(v, p - v). Off
+    the sensor nothing is measured, (1) gives x = H v + xi, and p1 is H v: it is kept on the sensor alone.
     """
     gradient_target = state.gradient_target
     if gradient_target:
@@ -125,7 +125,7 @@ def update_copies(state: State, problem: Problem, mu: Penalties, tau: float | Te
         del by, bx  # frees a large image's memory
     # z - prox(z) = (z - b) / (1 + mu1)
     data_target = reflected(state.Hv, state.data_target).add_(problem.measurement).div_(1 + mu.data).add_(state.Hv)
-    sign_target = state.v + reflected(state.v, state.sign_target).relu_()
+    sign_target = torch.maximum(state.v, state.sign_target - state.v)
     return state._replace(data_target=data_target, gradient_target=gradient_target, sign_target=sign_target)
 
 
@@ -142,8 +142,8 @@ class Filters(NamedTuple):
     ``V = prior F(p3 + gradient_weight Psi^T p2) + previous V + data F(C^T (p1 - C H v))``.
 
     Args:
-        prior: mu3 D.
-        previous: mu1 |H|^2 D.
+        prior: mu3 D, stored as complex numbers.
+        previous: mu1 |H|^2 D, likewise.
         data: mu1 conj(H) D.
         gradient_weight: mu2 / mu3.
     """
@@ -159,7 +159,10 @@ def make_filters(problem: Problem, mu: Penalties, *, smooth: bool = True) -> Fil
     power = mu.data * problem.transfer.abs().square()
     D = 1 / (power + (mu.gradient * problem.laplacian + mu.sign if smooth else mu.sign))
     data = problem.transfer.conj() * (mu.data * D)
-    return Filters(mu.sign * D, power * D, data, mu.gradient / mu.sign)
+    prior, previous = mu.sign * D, power * D
+    if not torch.compiler.is_compiling():  # torch would make them complex in each product
+        prior, previous = prior.to(data.dtype), previous.to(data.dtype)
+    return Filters(prior, previous, data, mu.gradient / mu.sign)
 
 
 def update_scene(state: State, problem: Problem, filters: Filters) -> State:
