@@ -1,11 +1,13 @@
 """A benchmark from its recipe to its page, killed on the way, on a camera of 48 x 64 pixels."""
 
+import contextlib
 import csv
 import json
 import re
 import signal
 import subprocess
 import sys
+from io import StringIO
 from pathlib import Path
 
 import cv2
@@ -64,9 +66,13 @@ def folder(tmp_path):
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory):
-    """The output of a benchmark that has come to its end; tests may add to it."""
+    """The output of `mwdn benchmark`, come to its end; tests may add to it."""
     folder = laid_out(tmp_path_factory.mktemp("done"))
-    run(read_benchmark(folder / "r.toml"), folder / "out", device="cpu")
+    shown = StringIO()
+    with contextlib.chdir(folder), contextlib.redirect_stdout(shown), pytest.raises(SystemExit) as stopped:
+        main(["benchmark", "r.toml", "--out", "out", "--device", "cpu"])
+    assert stopped.value.code == 0
+    assert "Look at out/index.html" in shown.getvalue()
     (folder / "first.json").write_text((folder / "out" / "benchmark.json").read_text())
     return folder / "out"
 
@@ -166,14 +172,7 @@ def test_two_processes_share_the_networks(folder, expected):
         assert len(log.splitlines()) == 6, label
 
 
-def test_the_page_holds_all_results(folder, monkeypatch, capsys):
-    monkeypatch.chdir(folder)
-    with pytest.raises(SystemExit) as stopped:
-        main(["benchmark", "r.toml", "--out", "out", "--device", "cpu"])
-    shown = capsys.readouterr()
-    assert stopped.value.code == 0, shown.err
-    assert "Look at out/index.html" in shown.out
-    done = folder / "out"
+def test_the_page_holds_all_results(done):
     page = (done / "index.html").read_text()
     assert "<title>Two networks &amp; a solver</title>" in page
     assert not re.search(r'(src|href)="(?!data:|#)', page), "the page must need no other file"

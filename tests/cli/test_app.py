@@ -524,7 +524,7 @@ def test_as_a_process(camera):
     done = subprocess.run([*line, "captures/b.png"], **options)
     assert (done.returncode, done.stderr) == (0, "")
     assert read_frame("results/reconstruct/b.png").shape == (*SIZE, 3)
-    wrong = subprocess.run([*line[:-1], "wienr", "captures/b.png"], **options)
+    wrong = subprocess.run([*line[:5], "recipes", "quick-cpi"], **options)  # starts without torch
     assert wrong.returncode == 2
-    assert wrong.stderr.startswith("Error: No method named 'wienr'. Did you mean 'wiener'?")
+    assert wrong.stderr.startswith("Error: No recipe named 'quick-cpi'. Did you mean 'quick-cpu'?")
     assert len(wrong.stderr.splitlines()) == 1

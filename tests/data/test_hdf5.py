@@ -6,6 +6,8 @@ import h5py
 import numpy as np
 import pytest
 
+from mwdn.capture.recording import Replay, record
+from mwdn.capture.source import Frame
 from mwdn.data import PairFile
 from mwdn.data.sources import list_hdf5
 from mwdn.errors import ImageError
@@ -84,10 +86,13 @@ def test_a_heap_that_never_ends_is_refused(tmp_path):
     """An attribute's text in it: HDF5 2.0 searched forever, beyond any signal."""
     with PairFile.create(tmp_path / "a.h5", measurement_shape=SHAPE[1:], scene_shape=SHAPE[1:], attributes={"a": "b"}):
         pass
-    content = bytearray((tmp_path / "a.h5").read_bytes())
-    start = content.index(b"GCOL") + 16
-    assert int.from_bytes(content[start + 8 : start + 16], "little") == 1  # byte of text
-    content[start + 8] = 129  # where the next object starts, there are zeros: one of size 0
-    (tmp_path / "a.h5").write_bytes(content)
-    with pytest.raises(ImageError, match=r"The attributes of `.*a\.h5` cannot be read"):
-        PairFile(tmp_path / "a.h5")
+    with record(tmp_path / "b.h5", camera="c") as recorder:
+        recorder.append(Frame(array=np.zeros((4, 4, 1), np.uint8), bit_depth=8))
+    for path, read in (("a.h5", PairFile), ("b.h5", lambda path: Replay(path).open())):
+        content = bytearray((tmp_path / path).read_bytes())
+        start = content.index(b"GCOL") + 16
+        assert 0 < int.from_bytes(content[start + 8 : start + 16], "little") < 129  # bytes of text
+        content[start + 8] = 129  # where the next object starts, there are zeros: one of size 0
+        (tmp_path / path).write_bytes(content)
+        with pytest.raises(ImageError, match=rf"The attributes of `.*{path}` cannot be read"):
+            read(tmp_path / path)

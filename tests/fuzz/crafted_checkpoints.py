@@ -5,6 +5,7 @@ import json
 import struct
 import zipfile
 from collections.abc import Iterator
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -23,10 +24,15 @@ def header(content: dict[str, Any] | str, data: bytes = b"") -> bytes:
     return struct.pack("<Q", len(text)) + text + data
 
 
+@cache
+def narrow() -> dict[str, torch.Tensor]:
+    """State of an MWDN, which takes as long to build as most of these files take to be refused."""
+    return build("mwdn", width=2).state_dict()
+
+
 def small(name: str = "mwdn", text: str | None = None, **options: Any) -> bytes:
     """A checkpoint of a narrow network whose metadata says something else."""
-    state = build("mwdn", width=2).state_dict()
-    return save(state, {"mwdn": text or json.dumps({"version": "0", "name": name, "options": options})})
+    return save(narrow(), {"mwdn": text or json.dumps({"version": "0", "name": name, "options": options})})
 
 
 OPTIONS: dict[str, dict[str, Any]] = {
@@ -77,7 +83,7 @@ def own() -> Iterator[tuple[str, bytes]]:
         "offsets the wrong way round": {"data_offsets": [4, 0]},
     }.items():
         yield name, header({"__metadata__": {"mwdn": '{"name": "mwdn", "options": {}}'}, "a": entry | change}, bytes(4))
-    state = build("mwdn", width=2).state_dict()
+    state = narrow()
     key = next(iter(state))
     options = {"mwdn": json.dumps({"name": "mwdn", "options": {"width": 2}})}
     yield "0-d tensor", save(state | {key: torch.tensor(1.0)}, options)
@@ -166,4 +172,10 @@ def valid(random: np.random.Generator) -> tuple[str, bytes]:
     kind = random.integers(0, 3)
     if kind == 0:
         return ".safetensors", small(width=2)
-    return ".pt", stored({"net_state_dict": authors()}, legacy=bool(kind == 2))
+    return ".pt", whole(legacy=bool(kind == 2))
+
+
+@cache
+def whole(*, legacy: bool) -> bytes:
+    """The authors' checkpoint, undamaged."""
+    return stored({"net_state_dict": authors()}, legacy=legacy)

@@ -44,7 +44,7 @@ def sweep(folder, cases, *, duration_s=float("inf")):
 
 def test_damaged_checkpoints(tmp_path):
     """73 of 556 ended in tracebacks of other libraries."""
-    assert sweep(tmp_path, lambda: itertools.islice(damaged(29), 200)) == []
+    assert sweep(tmp_path, lambda: itertools.islice(damaged(29), 120)) == []
 
 
 @pytest.mark.acceptance

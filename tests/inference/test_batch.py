@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 import threading
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -443,10 +444,21 @@ def shop(tmp_path_factory):
     return folder
 
 
-def start(folder, out, *launch, resume=False):
+LINE = "reconstruct in --psf psf.npy --method admm --format npy --device cpu"
+
+
+@contextmanager
+def threads(count):
+    """As many threads as the other processes have: last digits depend on it."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    yield
+    torch.set_num_threads(before)
+
+
+def start(folder, out, *launch):
     """``python`` with the command, or with torchrun and the command."""
-    line = f"-m mwdn reconstruct in --psf psf.npy --method admm --format npy --device cpu --out {out}"
-    line += " --resume" if resume else ""
+    line = f"-m mwdn {LINE} --out {out}"
     here = {"PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"}
     here |= {"GLOO_SOCKET_IFNAME": "lo"} if sys.platform == "linux" else {}
     options = {"cwd": folder, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
@@ -562,7 +574,7 @@ def test_a_machine_goes_on_without_another(shop, single, free_port):
 
 
 @linux
-def test_killed_work_goes_on_where_it_was(shop, single):
+def test_killed_work_goes_on_where_it_was(shop, single, run, monkeypatch):
     process, folder = start(shop, "killed"), shop / "killed"
     while len(list(folder.glob("??.json"))) < 4:
         with pytest.raises(subprocess.TimeoutExpired):
@@ -571,7 +583,9 @@ def test_killed_work_goes_on_where_it_was(shop, single):
     first, _ = process.communicate(timeout=300)
     assert process.returncode == -signal.SIGKILL
     before = whole(folder)
-    second, err = start(shop, "killed", resume=True).communicate(timeout=300)
+    monkeypatch.chdir(shop)
+    with threads(1):
+        _, second, err = run(f"{LINE} --out killed --resume")
     assert f"{COUNT} of {COUNT + 1} captures reconstructed into killed, {len(before) // 2} of them before" in second, (
         err
     )

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from mwdn.capture.recording import FrameRows, add_rows, set_format, write_row
 from mwdn.capture.screen import Picture
 from mwdn.capture.source import Frame
-from mwdn.data.hdf5 import open_hdf5
+from mwdn.data.hdf5 import as_damage, find_rows, open_hdf5
 from mwdn.data.journal import Growing, create_growing, open_growing
 from mwdn.data.pair_writer import VERSION, VERSION_KEY
 from mwdn.errors import ImageError, ParameterError
@@ -64,12 +64,16 @@ class CapturedPairs:
     @property
     def names(self) -> list[str]:
         """Photograph of each pair."""
-        return [name.decode() for name in self._file["photograph"]]
+        return self._texts("photograph")
 
     @property
     def planned(self) -> list[str]:
         """Photographs in the order of the session."""
-        return [name.decode() for name in self._file["planned"]]
+        return self._texts("planned")
+
+    def _texts(self, name: str) -> list[str]:
+        with as_damage(f"`{name}` of `{self.path}` cannot be read", _ADVICE):
+            return [text.decode() for text in self._file[name]]
 
     def plan(self, names: Sequence[str]) -> None:
         """Add photographs to the end of the order."""
@@ -218,7 +222,8 @@ def open_captured(path: Path) -> Iterator[CapturedPairs]:
         ImageError: damaged, of another command, or another process writes it.
     """
     with as_image_error(path), open_growing(path) as growing:
-        missing = {"measurement", "scene", "photograph", "planned"} - set(growing.file)
+        names = "measurement", "photograph", "planned", "scene"
+        missing = [name for name in names if find_rows(path, growing.file, name, _ADVICE) is None]
         if missing:
-            raise ImageError(f"`{path}` has no {', '.join(sorted(missing))}: it is of another command. {_ADVICE}")
+            raise ImageError(f"`{path}` has no {', '.join(missing)}: it is of another command. {_ADVICE}")
         yield CapturedPairs(growing)

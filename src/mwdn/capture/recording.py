@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mwdn.capture.source import TIMEOUT_S, CameraSource, Frame, check_like
-from mwdn.data.hdf5 import as_damage, find_rows, open_hdf5
+from mwdn.data.hdf5 import as_damage, find_rows, open_hdf5, open_hdf5_header, read_attributes
 from mwdn.data.journal import Growing, create_growing
 from mwdn.errors import CameraError, ImageError
 from mwdn.io.files import as_image_error
@@ -181,9 +181,11 @@ class Replay(CameraSource):
         if data is None or data.ndim != 4 or data.dtype not in (np.uint8, np.uint16) or not len(data):
             raise ImageError(f"`{self.path}` holds no raw frames. Give a recording, or pairs of `mwdn capture`.")
         self._data = data
+        with open_hdf5_header(self.path, _ADVICE) as header:  # HDF5 alone searches a damaged heap of texts forever
+            attributes = read_attributes(self.path, header, _ADVICE)
         with as_damage(f"The metadata of `{self.path}` cannot be read", _ADVICE):
-            self._bits = int(file.attrs.get("bit_depth", 8 * data.dtype.itemsize))
-            self._mosaic = str(file.attrs.get("mosaic", "")) or None
+            self._bits = int(attributes.get("bit_depth", 8 * data.dtype.itemsize))
+            self._mosaic = str(attributes.get("mosaic", "")) or None
         columns = {key: find_rows(self.path, file, f"frame_data/{key}", _ADVICE) for key in COLUMNS}
         self._columns = {key: column for key, column in columns.items() if column is not None}
 

@@ -28,7 +28,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from mwdn.data.hdf5 import as_damage
+from mwdn.data.hdf5 import as_damage, open_hdf5_header, read_attributes
 from mwdn.errors import ImageError
 from mwdn.io.files import check_regular
 from mwdn.io.reading import open_regular, read_bytes
@@ -189,12 +189,12 @@ def open_growing(path: Path) -> Iterator[Growing]:
     open_regular(path).close()
     with _alone(path):
         recover(path)
+        with open_hdf5_header(path, advice) as file:
+            if IDENTITY not in read_attributes(path, file, advice):
+                raise ImageError(f"`{path}` was not made by this command: it cannot grow. {advice}")
         with JournalledFile(path, "r+") as disk:
             with as_damage(f"`{path}` is not a complete HDF5 file", advice):
                 file = h5py.File(disk, "r+")
-            if IDENTITY not in file.attrs:
-                file.close()
-                raise ImageError(f"`{path}` was not made by this command: it cannot grow. {advice}")
             with _finished(Growing(path, disk, file)) as growing:
                 yield growing
 
@@ -260,13 +260,16 @@ def _read_journal(journal: Path) -> tuple[bytes, int, Changes] | None:
     body, digest = content[:-_DIGEST], content[-_DIGEST:]
     if hashlib.blake2b(body, digest_size=_DIGEST).digest() != digest or body[:8] != _MAGIC:
         return None
-    _, identity, length, count = _START.unpack_from(body)
-    place, changes = _START.size, []
-    for _ in range(count):
-        at, size = _CHANGE.unpack_from(body, place)
-        place += _CHANGE.size
-        changes.append((at, body[place : place + size]))
-        place += size
+    with as_damage(f"`{journal}` is damaged", "Move it away."):
+        _, identity, length, count = _START.unpack_from(body)
+        place, changes = _START.size, []
+        for _ in range(count):
+            at, size = _CHANGE.unpack_from(body, place)
+            place += _CHANGE.size
+            if at + size > length or place + size > len(body):
+                raise ValueError("a change lies outside of the file")
+            changes.append((at, body[place : place + size]))
+            place += size
     return identity, length, changes
 
 

@@ -4,13 +4,13 @@ import errno
 import json
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
-from mwdn.errors import ImageError, MwdnError, ParameterError, reason
+from mwdn.errors import ImageError, ParameterError, reason
 from mwdn.io.files import atomic_write
 from mwdn.io.reading import open_regular
 from mwdn.io.tiff import read_tiff
@@ -80,28 +80,32 @@ def read_mask(path: str | Path) -> Mask:
     Raises:
         ImageError: the file cannot be read, or `write_mask` did not write it.
     """
+    with open_regular(path) as file:
+        try:
+            return _read_mask(file)
+        except ImageError as error:
+            raise type(error)(f"`{path}` {error}") from error
+        except OSError as error:
+            raise ImageError(f"`{path}` cannot be read: {error.strerror or error}. Copy it again.") from error
+        except Exception as error:  # a foreign file can raise anything in tifffile and json
+            what = f"{type(error).__name__}: {reason(error)}"
+            raise ImageError(f"`{path}` is not a mask written by `mwdn design` ({what}). Give its mask.tif.") from error
+
+
+def _read_mask(file: BinaryIO) -> Mask:
     import tifffile
 
-    try:
-        with open_regular(path) as opened:
-            with tifffile.TiffFile(opened, is_ome=False) as file:
-                about = json.loads(str(file.pages[0].tags["ImageDescription"].value))  # type: ignore[union-attr]
-            if about["format"] != _FORMAT:
-                raise KeyError("format")
-            numbers, _ = read_tiff(opened, lambda shape, dtype: None)
-        if numbers.ndim != 2:
-            raise KeyError("format")
-        values = torch.from_numpy((numbers * about["scale"]).astype(np.float32))
-        if step_um := about["step_um"]:
-            values = (values / step_um).round() * step_um  # exactly as a design computes them
-        return Mask(about["kind"], values, about["pitch_um"], about["index"], step_um)
-    except MwdnError:
-        raise
-    except OSError as error:
-        raise ImageError(f"`{path}` cannot be read: {error.strerror or error}. Check the name.") from error
-    except Exception as error:  # a foreign file can raise anything in tifffile and json
-        what = f"{type(error).__name__}: {reason(error)}"
-        raise ImageError(f"`{path}` is not a mask written by `mwdn design` ({what}). Give its mask.tif.") from error
+    with tifffile.TiffFile(file, is_ome=False) as tiff:
+        about = json.loads(str(tiff.pages[0].tags["ImageDescription"].value))  # type: ignore[union-attr]
+    if about["format"] != _FORMAT:
+        raise KeyError("format")
+    numbers, _ = read_tiff(file, lambda shape, dtype: None)
+    if numbers.ndim != 2:
+        raise KeyError("format")
+    values = torch.from_numpy((numbers * about["scale"]).astype(np.float32))
+    if step_um := about["step_um"]:
+        values = (values / step_um).round() * step_um  # exactly as a design computes them
+    return Mask(about["kind"], values, about["pitch_um"], about["index"], step_um)
 
 
 def write_gds(path: str | Path, mask: Mask) -> None:
