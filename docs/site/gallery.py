@@ -17,7 +17,10 @@ from mkdocs.structure.pages import Page
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPTS = ROOT / "examples" / "gallery"
 INDEX = "gallery/README.md"
-ORDER = ("forward_model", "wiener_or_admm", "cropping", "wrong_psf", "zero_shot")
+ORDER = (
+    *("forward_model", "wiener_or_admm", "cropping", "mask", "poor_light", "ambient_light", "wrong_psf", "zero_shot"),
+    *("features", "live_stream"),
+)
 
 
 class Cell(NamedTuple):

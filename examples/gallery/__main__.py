@@ -10,7 +10,6 @@ import runpy
 from pathlib import Path
 
 import matplotlib
-import torch
 
 from mwdn.io.files import atomic, write_text
 
@@ -32,7 +31,7 @@ def main():
     arguments = parser.parse_args()
     for name in arguments.names or scripts():
         printed, drawn = io.StringIO(), io.BytesIO()
-        with contextlib.redirect_stdout(printed), torch.inference_mode():
+        with contextlib.redirect_stdout(printed):
             figure = runpy.run_path(str(scripts()[name]))["figure"]
         figure.savefig(drawn, format="webp", dpi=110, pil_kwargs={"quality": 82, "method": 6})
         with atomic(arguments.out / f"{name}.webp") as temporary:

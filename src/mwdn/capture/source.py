@@ -107,7 +107,7 @@ class CameraSource(ABC):
         self.close()
 
     def __iter__(self) -> Iterator[Frame]:
-        """All frames, without end; `mwdn.runtime.streams.latest` yields the newest of them each time."""
+        """All frames, without end; `mwdn.runtime.latest` yields the newest of them each time."""
         while True:
             yield self.read()
 

@@ -137,7 +137,7 @@ class Reconstructor:
         (`mwdn.solvers.WarmStart`). Other methods treat frames independently.
 
         All frames are reconstructed. To skip to the newest frame of a live camera:
-        ``stream(mwdn.runtime.streams.latest(camera))``.
+        ``stream(mwdn.runtime.latest(camera))``.
 
         Args:
             frames: raw frames.
