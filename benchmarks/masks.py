@@ -5,7 +5,8 @@
 Photographs fill 137 of 320 pixels, as the paper's display does; the brightest pixel is near saturation in every
 capture, so a mask of higher contrast gets less light. Mismatch: half a degree of rotation, 10 % of even light, field
 dependence (`mwdn-sim`). PSNR of the central 128 x 128 pixels, and the difference of the two masks with its interval
-(bootstrap over the photographs).
+(bootstrap over the photographs). First the ratio of the moduli of their spectra by spatial frequency; ``--count 0``
+prints it alone.
 """
 
 import argparse
@@ -24,6 +25,7 @@ from mwdn.evaluation import Protocol, bootstrap, measure
 from mwdn.io.files import write_json
 from mwdn.optics import Contour, Deviation, Diffuser, Sensor, Setup, unit_sum
 from mwdn.optics.design import design_camera
+from mwdn.optics.psf_spectrum import radial_spectrum
 
 SETTINGS = {
     "15,000 e, exact": (Sensor(15000.0, 3.0), Deviation()),
@@ -58,10 +60,16 @@ def main():
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/masks.json"))
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    setup, record = Setup(wavelengths=13), {}
+    setup, record, spectra = Setup(wavelengths=13), {}, []
     for name, design in (("contour", Contour(size_mm=(3.2, 2.8))), ("diffuser", Diffuser())):
         psf = unit_sum(design_camera(name, design, setup).psf)
-        record[name] = scores(psf, Photographs(arguments.photographs), arguments.count)
+        spectra.append(radial_spectrum(psf))
+        if arguments.count:
+            record[name] = scores(psf, Photographs(arguments.photographs), arguments.count)
+    ratio = spectra[1] / spectra[0]  # entry i is at i / 120 periods a pixel
+    print("diffuser over contour:", ", ".join(f"{i / 120:.2f}: {ratio[i]:.2f}" for i in (2, 4, 6, 8, 12, 24, 36, 48)))
+    if not record:
+        return
     write_json(arguments.out, record)
     print("| setting, method | contour / dB | diffuser / dB | difference / dB |\n" + "| --- " * 4 + "|")
     for key, contour in record["contour"].items():
