@@ -81,9 +81,9 @@ that fill 137 of 320 pixels (`python benchmarks/masks.py ../shared/data/photos/t
 | 15,000 e, rotated by 0.5 degrees, haze, field | Wiener | 19.21 | 20.53 | +1.33 (+0.96 to +1.65) |
 | | pyramid | 29.12 | 29.31 | +0.19 (+0.00 to +0.35) |
 
-Their spectra tell why (`--count 0`): between 0.02 and 0.07 periods a pixel the diffuser's modulus is 1.5 to 4.1 times the
-contour mask's, from 0.1 on it is 0.82 to 0.89 times. Photographs have most of their contrast at low frequencies. A scene
-of fine detail alone may turn the order round, and the contour mask resolves finer angles: not measured.
+Their spectra tell why (`--count 0`): between 0.02 and 0.07 periods a pixel the diffuser's modulus is 1.5 to 4.1 times
+the contour mask's, from 0.1 on it is 0.82 to 0.89 times. Photographs have most of their contrast at low frequencies.
+A scene of fine detail alone may turn the order round, and the contour mask resolves finer angles: not measured.
 
 ## Designed and measured PSF of the paper's camera
 
