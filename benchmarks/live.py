@@ -6,6 +6,7 @@
 simulation is not counted, and `universal-small`; a headless Chromium (`apt install chromium`) opens the page and
 presses *Start*. Latency is from the end of a frame's exposure to the moment at which the page paints its picture, as
 the page measures it. Processor time is that of the two programs with all their processes, over the frames on the page.
+Memory is that at the start and at the end, and of each minute in between (server, browser).
 `--stages` measures the server's stages alone, in this process, with one thread and without a page.
 """
 
@@ -17,8 +18,10 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import urllib.request
+from contextlib import contextmanager
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -116,7 +119,8 @@ def measure(options):
                 browser = next(p for p in processes(os.getpid())[1:] if "chromium" in command(p))
                 before = usage(server.pid), usage(browser), stage_seconds(url)
                 start = time.perf_counter()
-                frames = page.run(COLLECT.replace("SECONDS", str(options.seconds)))
+                with sampled_memory(server.pid, browser) as memory:
+                    frames = collect(page, options.seconds)
                 seconds = time.perf_counter() - start
                 after = usage(server.pid), usage(browser), stage_seconds(url)
                 if options.screenshot:
@@ -124,7 +128,35 @@ def measure(options):
         finally:
             server.terminate()
             server.wait(timeout=60)
-    return summary(options.method, frames, seconds, before, after)
+    result = summary(options.method, frames, seconds, before, after)
+    return result | ({"each_minute_mb": memory} if memory else {})
+
+
+def collect(page, seconds):
+    """Time, latency and number of each frame on the page."""
+    frames, end = [], time.perf_counter() + seconds
+    while (left := end - time.perf_counter()) > 0:
+        # In parts: a page that does not answer for a minute counts as lost.
+        frames += page.run(COLLECT.replace("SECONDS", str(min(30, left))))
+    return frames
+
+
+@contextmanager
+def sampled_memory(*roots):
+    """Resident megabytes of some processes and all below them, each minute."""
+    found, ended = [], threading.Event()
+
+    def sample():
+        while not ended.wait(60):
+            found.append([round(usage(root)[1]) for root in roots])
+
+    thread = threading.Thread(target=sample, daemon=True)
+    thread.start()
+    try:
+        yield found
+    finally:
+        ended.set()
+        thread.join()
 
 
 def command(process):
