@@ -28,8 +28,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from browser import open_page
 
 SIZE = 320
-WARM_UP = 20
-"""Frames before the measurement begins."""
+WARM_UP = 60
+"""Frames before the measurement begins: the rig prepares those of three pictures, half a second each."""
 
 COLLECT = """
 new Promise((done) => {
@@ -96,7 +96,7 @@ def stage_seconds(url):
 def start_server(options, folder):
     """The server in a process of its own, and its address."""
     line = [sys.executable, "-m", "mwdn", "preview", "--port", "0", "--out", str(folder), "--device", "cpu"]
-    rig = f"rig,height={SIZE},width={SIZE},fps={options.fps:g},prepared=8"
+    rig = f"rig,height={SIZE},width={SIZE},fps={options.fps:g},prepared=8,picture_s=0.5"
     server = subprocess.Popen([*line, "--live", rig], stdout=subprocess.PIPE, text=True)
     for said in server.stdout:
         if address := re.search(r"http://\S+/", said):

@@ -9,7 +9,6 @@ from cyclopts import Parameter
 
 from mwdn.calibration import Calibration
 from mwdn.capture import open_source
-from mwdn.capture.photograph_list import read_photograph
 from mwdn.capture.sources import parse_source
 from mwdn.cli.camera import CameraOptions
 from mwdn.cli.terminal import say
@@ -23,8 +22,12 @@ from mwdn.runtime.web_access import LOOPBACK
 OWN = "camera"
 """Name of the command line's camera on the page."""
 
-LIVE_DEFAULTS: dict[str, dict[str, Any]] = {"rig": {"fps": 30.0, "prepared": 8}, "replay": {"realtime": True}}
-"""Options of a live camera unless given: the rig runs at a camera's rate, and a recording at its own."""
+LIVE_DEFAULTS: dict[str, dict[str, Any]] = {
+    "rig": {"fps": 30.0, "prepared": 8, "pictures": str(files("mwdn.io.pictures"))},
+    "replay": {"realtime": True},
+}
+"""Options of a live camera unless given: the rig runs at a camera's rate and plays the package's photographs; a
+recording runs at its own rate."""
 
 
 def preview(  # noqa: PLR0913
@@ -66,16 +69,12 @@ def preview(  # noqa: PLR0913
 
 
 def _open_live(text: str, calibration: Calibration | None, folder: Path, device: str | None) -> Live:
-    """The live camera; the display of a simulated rig shows a photograph."""
+    """The live camera; the display of a simulated rig plays the photographs of the package."""
     from mwdn.capture.rig import Rig
 
     name, _, options = parse_source(text)
     defaults = {key: value for key, value in LIVE_DEFAULTS.get(name, {}).items() if key not in options}
     source = open_source(text, **defaults)
-    if isinstance(source, Rig) and source.playlist is None:
-        screen = source.screen
-        photograph = Path(str(files("mwdn.io.pictures") / "astronaut.jpg"))
-        source.show(read_photograph(photograph, (screen.height_px, screen.width_px)))
     if isinstance(source, Rig):
         calibration = calibration or Calibration(source.psf)
     if calibration is None:

@@ -35,6 +35,7 @@ FILES = (
     "page.css",
     "site.css",
     "icon.svg",
+    "welcome.svg",
     "page.js",
     "camera.js",
     "network.js",
@@ -97,7 +98,8 @@ def export_site(
     camera = _camera(calibration, about | {"name": name}, channels, scenes)
     images = {key: _bytes(image) for key, image in _images(calibration).items()}
     samples = {f"{key}.png": _png(capture) for key, capture in zip(SAMPLES, captures, strict=True)}
-    contents = {key: read_static(key) for key in ("index.html", "page.css", "site.css", "icon.svg", "LICENSES.txt")}
+    texts = [name for name in FILES if not name.endswith(".js")]
+    contents = {name: read_static(name) for name in texts}
     contents |= {
         "page.js": joined_modules(),
         "camera.js": constant("mwdnCamera", camera) + stored(images | samples),

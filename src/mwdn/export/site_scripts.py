@@ -15,7 +15,7 @@ from typing import Any
 MODULES = ("png", "npy", "frames", "psf", "display", "network", "divider", "dropping", "site")
 """Each after those that it imports; those in `_SHARED` are of `mwdn preview`. Their top-level names differ."""
 
-_SHARED = {"divider.js", "dropping.js", "page.css", "icon.svg"}
+_SHARED = {"divider.js", "dropping.js", "page.css", "icon.svg", "welcome.svg"}
 
 
 def read_static(name: str) -> str:

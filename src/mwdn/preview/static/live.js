@@ -54,6 +54,7 @@ function tell(said) {
   shown.count += 1;
   shown.latency_ms = offset === null ? said.latency_ms : Date.now() + offset - 1000 * said.timestamp;
   Object.assign(byId("live-state").dataset, { frame: said.number, count: shown.count, latency: shown.latency_ms.toFixed(1) });
+  byId("live-badge").textContent = `${said.fps.toFixed(1)} fps · ${Math.round(shown.latency_ms)} ms`;
   show(`${said.fps.toFixed(1)} frames a second, ${Math.round(shown.latency_ms)} ms after the exposure, ${said.dropped} dropped${recorded}. ${said.refused}`, Boolean(said.refused));
   byId("live-record").setAttribute("aria-pressed", String(said.recorded !== null));
   byId("live-ambient").setAttribute("aria-pressed", String(said.ambient));
