@@ -1,4 +1,4 @@
-"""Bridges to other libraries: scipy, DeepInverse.
+"""Bridges to other libraries: scipy, DeepInverse, the Hugging Face hub.
 
 Each name is imported at its first use, and with it the library that it needs.
 """
@@ -8,14 +8,17 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mwdn.bridges.deepinverse import DeepInverseSolver, LenslessPhysics
+    from mwdn.bridges.huggingface import from_pretrained, save_pretrained
     from mwdn.bridges.linear_operator import linear_operator
 
-__all__ = ["DeepInverseSolver", "LenslessPhysics", "linear_operator"]
+__all__ = ["DeepInverseSolver", "LenslessPhysics", "from_pretrained", "linear_operator", "save_pretrained"]
 
 _MODULES = {
     "DeepInverseSolver": "deepinverse",
     "LenslessPhysics": "deepinverse",
+    "from_pretrained": "huggingface",
     "linear_operator": "linear_operator",
+    "save_pretrained": "huggingface",
 }
 """Modules that hold the public names."""
 

@@ -19,13 +19,15 @@ _FOLDER = Path(str(files("mwdn") / "weights"))
 
 
 def find_weights(name: str) -> Path | None:
-    """File of a bundled network, or of one on the hub, downloaded once; ``None`` for any other name.
+    """File of a bundled network, of a folder with one, or of one on the hub, downloaded once; ``None`` for other names.
 
     Raises:
         CheckpointError: it is not on the hub, or the hub cannot be reached.
     """
     if name in BUNDLED:
         return _FOLDER / f"{name}.safetensors"
+    if (path := Path(name) / "model.safetensors").is_file():
+        return path
     return _download(name) if name.startswith(HUB) else None
 
 
@@ -34,7 +36,8 @@ def load_network(name: str | Path) -> nn.Module:
     """Load a network on the CPU, in evaluation mode.
 
     Args:
-        name: ``universal`` or ``universal-small``, ``hub:owner/name``, or the path of a checkpoint.
+        name: ``universal`` or ``universal-small``, ``hub:owner/name``, or the path of a checkpoint or of a folder with
+            model.safetensors, as `mwdn.bridges.save_pretrained` writes it.
 
     Raises:
         CheckpointError: no such file, a damaged one, or weights that do not fit their network.

@@ -1,0 +1,124 @@
+"""Trained networks as folders in the layout of the Hugging Face hub: config, weights, model card."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+
+from mwdn.bridges.yaml_text import to_yaml
+from mwdn.errors import CheckpointError, checked
+from mwdn.io.files import as_parameter_error, atomic, refuse_foreign, write_json, write_text
+from mwdn.io.reading import read_json
+from mwdn.weights.bundled import find_weights, load_network
+from mwdn.weights.checkpoint import load_checkpoint, read_metadata
+
+CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
+"""Files of a folder."""
+
+_LIBRARY = "mwdn"
+_TAGS = ["lensless-imaging", "computational-imaging", "deconvolution", "image-reconstruction"]
+
+
+@checked
+def save_pretrained(method: str | Path, folder: str | Path, *, license: str | None = None) -> Path:
+    """Write a trained network as a folder that can be uploaded to the Hugging Face hub.
+
+    ``config.json`` names the network and its options, ``model.safetensors`` is the checkpoint, ``README.md`` the model
+    card with metadata. A card that is already there stays: it may have been edited.
+
+    Args:
+        method: path of a checkpoint of this package, or ``universal`` or ``universal-small``.
+        folder: the folder; its name is the title of the card.
+        license: identifier of the hub, for example ``mit``; left out unless given.
+
+    Returns:
+        The folder.
+
+    Raises:
+        CheckpointError: no usable checkpoint of this package.
+        ParameterError: the folder cannot be written to, or holds files of another origin.
+    """
+    source, folder = find_weights(str(method)) or Path(method), Path(folder)
+    network, metadata = load_checkpoint(source), read_metadata(source)
+    refuse_foreign(folder, (CONFIG, WEIGHTS), b'"library_name": "mwdn"')
+    config = {"library_name": _LIBRARY, "model_type": metadata["name"], **metadata}
+    with as_parameter_error(folder, "Choose another one: `folder`."):
+        write_json(folder / CONFIG, config)
+        with atomic(folder / WEIGHTS) as temporary:
+            shutil.copyfile(source, temporary)
+        if not (folder / CARD).exists():
+            write_text(folder / CARD, _card(folder.resolve().name, network, metadata, license))
+    return folder
+
+
+@checked
+def from_pretrained(name: str | Path) -> nn.Module:
+    """Load a network, on the CPU, in evaluation mode.
+
+    Args:
+        name: a folder of `save_pretrained`, or ``owner/name`` on the Hugging Face hub, which needs the package
+            ``huggingface_hub``.
+
+    Raises:
+        CheckpointError: no such folder or repository, a damaged file, or a config that is not that of the weights.
+        ParameterError: ``config.json`` cannot be read.
+    """
+    folder = Path(name)
+    if not folder.is_dir():
+        return load_network(f"hub:{name}")
+    config, metadata = read_json(folder / CONFIG), read_metadata(folder / WEIGHTS)
+    for key in ("name", "options"):
+        if not isinstance(config, dict) or config.get(key) != metadata[key]:
+            raise CheckpointError(
+                f"`{folder / CONFIG}` and `{WEIGHTS}` must have the same `{key}`. Write the folder anew: "
+                "`mwdn.bridges.save_pretrained`."
+            )
+    return load_checkpoint(folder / WEIGHTS)
+
+
+def _card(title: str, network: nn.Module, metadata: dict[str, Any], license: str | None) -> str:
+    """Model card: metadata in YAML, then text."""
+    about: dict[str, Any] = {"library_name": _LIBRARY, "pipeline_tag": "image-to-image", "tags": _TAGS}
+    about |= {"license": license} if license else {}
+    numbers = sum(parameter.numel() for parameter in network.parameters())
+    rows = {
+        "network": f"`{metadata['name']}`, {numbers:,} parameters",
+        "options": f"`{json.dumps(metadata['options'])}`",
+        "camera": f"PSF `{metadata['psf_hash']}`" if metadata.get("psf_hash") else "any: the PSF is an input",
+        "training step": metadata.get("step"),
+        "validation PSNR": metadata.get("psnr") and f"{metadata['psnr']:.2f} dB",
+        "mwdn": metadata.get("version"),
+    }
+    table = "\n".join(f"| {name} | {value} |" for name, value in rows.items() if value is not None)
+    recipe = json.dumps(metadata["recipe"], indent=2) if "recipe" in metadata else "unknown"
+    return f"---\n{to_yaml(about)}---\n{_TEXT.format(title=title, table=table, recipe=recipe)}"
+
+
+_TEXT = """
+# {title}
+
+Reconstructs the captures of a lensless camera. The PSF of the camera is an input.
+
+| | |
+| --- | --- |
+{table}
+
+```python
+import mwdn
+
+calibration = mwdn.Calibration.from_file("psf.png")
+reconstruct = mwdn.Reconstructor("FOLDER, or hub:OWNER/NAME", calibration)
+scene = reconstruct(mwdn.read_frame("capture.png"))
+mwdn.write_picture("scene.png", mwdn.to_display(scene))
+```
+
+Detail below the noise of a capture is guessed, and a wrong PSF gives a wrong picture.
+
+## Training
+
+```json
+{recipe}
+```
+"""

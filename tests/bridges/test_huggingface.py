@@ -1,0 +1,94 @@
+"""Folders for the Hugging Face hub, by the hub's own parser of model cards."""
+
+import json
+
+import pytest
+import torch
+import yaml
+
+import mwdn
+from mwdn.bridges import from_pretrained, save_pretrained
+from mwdn.bridges.yaml_text import to_yaml
+from mwdn.errors import CheckpointError, ParameterError
+from mwdn.optics import sample_camera
+from mwdn.weights import save_network
+
+
+@pytest.fixture
+def checkpoint(tmp_path):
+    metadata = {"recipe": {"schedule": {"steps": 3}}, "psf_hash": "0123456789abcdef", "step": 3, "psnr": 24.5}
+    network = mwdn.build("mwdn", width=2)
+    save_network(tmp_path / "best.safetensors", network, "mwdn", {"width": 2}, **metadata)
+    return tmp_path / "best.safetensors"
+
+
+def test_a_network_returns_with_the_same_weights(checkpoint, tmp_path):
+    folder = save_pretrained(checkpoint, tmp_path / "lensless")
+    assert {path.name for path in folder.iterdir()} == {"config.json", "model.safetensors", "README.md"}
+    assert (folder / "model.safetensors").read_bytes() == checkpoint.read_bytes()
+    config = json.loads((folder / "config.json").read_text())
+    assert (config["model_type"], config["options"], config["psf_hash"]) == ("mwdn", {"width": 2}, "0123456789abcdef")
+    expected, found = mwdn.load_network(checkpoint).state_dict(), from_pretrained(folder).state_dict()
+    assert expected.keys() == found.keys()
+    assert all(torch.equal(expected[key], found[key]) for key in expected)
+
+
+def test_the_folder_is_a_method(checkpoint, tmp_path):
+    calibration = mwdn.Calibration(sample_camera(3, (32, 32)).expand(1, 3, -1, -1))
+    measurement = torch.rand(1, 3, 32, 32)
+    folder = save_pretrained(checkpoint, tmp_path / "lensless")
+    reconstruct = mwdn.Reconstructor(folder, calibration, device="cpu")
+    assert "0123456789abcdef" in reconstruct.warning
+    expected = mwdn.Reconstructor(checkpoint, calibration, device="cpu")(measurement)
+    torch.testing.assert_close(reconstruct(measurement), expected)
+
+
+def test_the_hub_reads_the_card(checkpoint, tmp_path):
+    ModelCard = pytest.importorskip("huggingface_hub").ModelCard
+    folder = save_pretrained(checkpoint, tmp_path / "lensless", license="mit")
+    card = ModelCard.load(folder / "README.md")
+    assert card.data.to_dict() == {
+        "library_name": "mwdn",
+        "license": "mit",
+        "pipeline_tag": "image-to-image",
+        "tags": ["lensless-imaging", "computational-imaging", "deconvolution", "image-reconstruction"],
+    }
+    assert card.text.strip().startswith("# lensless")
+    assert "24.50 dB" in card.text
+    assert '"steps": 3' in card.text
+
+
+def test_an_edited_card_stays(checkpoint, tmp_path):
+    folder = save_pretrained(checkpoint, tmp_path / "lensless")
+    (folder / "README.md").write_text("mine")
+    save_pretrained(checkpoint, folder)
+    assert (folder / "README.md").read_text() == "mine"
+
+
+def test_files_of_others_stay(checkpoint, tmp_path):
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "config.json").write_text('{"model_type": "bert"}')
+    with pytest.raises(ParameterError, match=r"config\.json"):
+        save_pretrained(checkpoint, tmp_path / "other")
+    assert [path.name for path in (tmp_path / "other").iterdir()] == ["config.json"]
+
+
+def test_a_config_of_another_network_is_refused(checkpoint, tmp_path):
+    folder = save_pretrained(checkpoint, tmp_path / "lensless")
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps(config | {"options": {"width": 3}}))
+    with pytest.raises(CheckpointError, match="`options`"):
+        from_pretrained(folder)
+    (folder / "config.json").unlink()
+    with pytest.raises(ParameterError, match=r"config\.json"):
+        from_pretrained(folder)
+
+
+def test_what_is_no_folder_is_a_name_on_the_hub(tmp_path):
+    with pytest.raises(CheckpointError, match="hub:nothing"):
+        from_pretrained("nothing")
+
+
+def test_yaml_is_read_as_it_was():
+    content = {"a": "yes: #1", "b": [{"c": 1, "d": [1.5, None]}, {"e": {}}], "f": {"g": True, "µ": "é\n"}, "h": []}
+    assert yaml.safe_load(to_yaml(content)) == content
