@@ -1,4 +1,4 @@
-"""Bridges to other libraries: scipy, DeepInverse, the Hugging Face hub.
+"""Bridges to other libraries: scipy, DeepInverse, the Hugging Face hub, bioimage.io.
 
 Each name is imported at its first use, and with it the library that it needs.
 """
@@ -7,15 +7,24 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from mwdn.bridges.bioimage import export_bioimage
     from mwdn.bridges.deepinverse import DeepInverseSolver, LenslessPhysics
     from mwdn.bridges.huggingface import from_pretrained, save_pretrained
     from mwdn.bridges.linear_operator import linear_operator
 
-__all__ = ["DeepInverseSolver", "LenslessPhysics", "from_pretrained", "linear_operator", "save_pretrained"]
+__all__ = [
+    "DeepInverseSolver",
+    "LenslessPhysics",
+    "export_bioimage",
+    "from_pretrained",
+    "linear_operator",
+    "save_pretrained",
+]
 
 _MODULES = {
     "DeepInverseSolver": "deepinverse",
     "LenslessPhysics": "deepinverse",
+    "export_bioimage": "bioimage",
     "from_pretrained": "huggingface",
     "linear_operator": "linear_operator",
     "save_pretrained": "huggingface",

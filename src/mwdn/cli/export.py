@@ -1,5 +1,6 @@
 """`mwdn export`: write a method and its camera as a file for other programs, or as a page for browsers."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -25,7 +26,7 @@ def export(  # noqa: PLR0913
     runtime: Path | None = None,
     **options: MethodOptions,
 ) -> None:
-    """Write a method for one camera as a file for other programs: ONNX, torch's .pt2, or a page (--web).
+    """Write a method for one camera as a file for other programs: ONNX, torch's .pt2, bioimage.io, or a page (--web).
 
     The file is run on simulated captures and is kept only if its results agree with mwdn's.
 
@@ -36,8 +37,8 @@ def export(  # noqa: PLR0913
     Args:
         method: as for `mwdn reconstruct --method`, a network for a page. Neither aligns the PSF to each capture.
         camera: its calibration; the file is for this PSF and this picture size only, a page for any PSF of this size.
-        out: ends in .onnx or .pt2, camera.onnx unless given; an existing file is replaced only on success. A folder for
-            --web, `site` unless given.
+        out: ends in .onnx, .pt2, or .zip (the ONNX as a package of bioimage.io), camera.onnx unless given; an existing
+            file is replaced only on success. A folder for --web, `site` unless given.
         precision: of the convolutions; float16 and int8 (ONNX only) make the file smaller.
         channels: of the captures, 1 or 3; those of the PSF unless given.
         least: PSNR in dB against mwdn's result that the file must reach; 80 for float32, 50 for float16 and 30 for
@@ -50,10 +51,9 @@ def export(  # noqa: PLR0913
     if web is None:
         if runtime is not None:
             raise ParameterError(f"`runtime` ({runtime}) is for pages. Add `--web CAMERA`, or leave it out.")
-        from mwdn.export import exporter as exporting
-
         out = out or Path("camera.onnx")
-        exported = exporting.export(
+        write = _writer(out)
+        exported = write(
             method, camera.load(), out, precision=precision, channels=channels, least=least, **method_options
         )
         _report(exported, out.stat().st_size, MIN_AGREEMENT[precision] if least is None else least)
@@ -61,6 +61,17 @@ def export(  # noqa: PLR0913
     if precision != "float32" or channels is not None:
         raise ParameterError("`precision` and `channels` are for files: a page computes in float32, grey and RGB.")
     _export_page(method, camera, out=out or Path("site"), web=web, runtime=runtime, least=least)
+
+
+def _writer(out: Path) -> Callable[..., Exported]:
+    """The function that writes a file of this suffix."""
+    if out.suffix == ".zip":
+        from mwdn.bridges.bioimage import export_bioimage
+
+        return export_bioimage
+    from mwdn.export import exporter
+
+    return exporter.export
 
 
 @no_empty_folder

@@ -43,7 +43,7 @@ class OnnxGraph:
         self.nodes.append(helper.make_node(operation, input_names, names, name=names[0], **attributes))
         return names
 
-    def name(self, value: str | Tensor | float) -> str:
+    def name(self, value: str | Tensor | float | int) -> str:
         """Name of a computed value, or of a constant; equal constants are stored once."""
         if isinstance(value, str):
             return value

@@ -119,7 +119,7 @@ def _median(g: OnnxGraph, node: fx.Node, x: str, axis: int, keep: bool = False) 
     return tuple(each if keep else g("Squeeze", each, axes) for each in median)  # type: ignore[return-value]
 
 
-def _clamp(g: OnnxGraph, node: fx.Node, x: str, min: float | None = None, max: float | None = None) -> str:
+def _clamp(g: OnnxGraph, node: fx.Node, x: str, min: int | float | None = None, max: int | float | None = None) -> str:
     return g("Clip", x, min, max)
 
 

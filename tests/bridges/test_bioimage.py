@@ -1,0 +1,74 @@
+"""Packages for bioimage.io: their content here, and the test of bioimageio.core where it is installed."""
+
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+pytest.importorskip("onnxruntime", reason="the extra `export` is not installed")
+
+from mwdn import Calibration, Camera, Reconstructor
+from mwdn.errors import ParameterError
+from mwdn.optics import sample_camera
+
+SIZE = (24, 32)
+
+
+@pytest.fixture(scope="module")
+def calibration():
+    return Calibration(sample_camera(11, SIZE).expand(1, 3, -1, -1).contiguous())
+
+
+@pytest.fixture(scope="module")
+def package(calibration, tmp_path_factory):
+    from mwdn.bridges import export_bioimage
+
+    out = tmp_path_factory.mktemp("bioimage") / "camera.zip"
+    assert export_bioimage("wiener", calibration, out, regularisation=1e-3).agreement > 80
+    return out
+
+
+def test_the_description_names_what_is_in_the_package(package, calibration):
+    with zipfile.ZipFile(package) as archive:
+        description = yaml.safe_load(archive.read("rdf.yaml"))
+        tensors = [*description["inputs"], *description["outputs"]]
+        files = [tensor["test_tensor"] for tensor in tensors] + [description["weights"]["onnx"]]
+        assert {file["source"] for file in files} | {"rdf.yaml", "README.md"} == set(archive.namelist())
+    assert [tensor["id"] for tensor in tensors] == ["measurement", "scene"]
+    assert [axis.get("size") for axis in tensors[0]["axes"]] == [None, None, *SIZE]
+    assert calibration.psf_hash in description["name"]
+
+
+def test_the_test_tensors_are_a_capture_and_its_reconstruction(package, calibration):
+    with zipfile.ZipFile(package) as archive:
+        measurement, scene = (np.load(archive.open(f"{name}.npy")) for name in ("measurement", "scene"))
+    expected = Reconstructor("wiener", calibration, device="cpu", regularisation=1e-3)(torch.from_numpy(measurement))
+    np.testing.assert_allclose(scene, expected.numpy(), atol=1e-4)
+    seen = Camera(calibration.psf)(torch.from_numpy(scene)).numpy()
+    assert np.corrcoef(seen.ravel(), measurement.ravel())[0, 1] > 0.9
+
+
+@pytest.mark.acceptance
+def test_the_command_writes_it(run, calibration, tmp_path):
+    np.save(tmp_path / "psf.npy", calibration.psf[0].movedim(0, -1).numpy())
+    out = tmp_path / "camera.zip"
+    code, _, error = run("export", "wiener", "--psf", tmp_path / "psf.npy", "--out", out, "--regularisation", "1e-3")
+    assert code == 0, error
+    assert zipfile.is_zipfile(out)
+
+
+def test_another_suffix_is_refused(calibration, tmp_path):
+    from mwdn.bridges import export_bioimage
+
+    with pytest.raises(ParameterError, match=r"\.zip"):
+        export_bioimage("wiener", calibration, tmp_path / "camera.onnx")
+
+
+@pytest.mark.filterwarnings("ignore")  # it leaves the package open
+def test_bioimageio_reproduces_the_reconstruction(package):
+    """The format, the ONNX against the test tensors, and batches of two; nothing is fetched."""
+    core = pytest.importorskip("bioimageio.core", reason="the extra `bioimage` is not installed")
+    summary = core.test_model(package)
+    assert summary.status == "passed", summary.format()
