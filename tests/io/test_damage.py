@@ -14,6 +14,7 @@ from image_files import HEIGHT, WIDTH, chunk, encoded, noise, put, tiff
 from mwdn.errors import ImageError
 from mwdn.io.decoder_messages import decoder_messages
 from mwdn.io.images import read_frame
+from mwdn.io.tiff_codecs import lzw_size
 
 
 def refusal(path: Path, data: bytes) -> str:
@@ -178,3 +179,9 @@ def test_a_picture_that_would_fill_the_memory_is_refused(tmp_path: Path) -> None
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", 12000, 12000, 16, 2, 0, 0, 0))
     png = b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", bytes(2**20)) + chunk(b"IEND", b"")
     assert "made to fill the memory" in refusal(tmp_path / "a.png", png)
+
+
+def test_an_lzw_code_that_is_its_own_beginning_is_refused():
+    """The first code after a clear code was entry 258, which it would make itself: its links were followed forever."""
+    with pytest.raises(ImageError, match="code is not in its table"):
+        lzw_size(bytes([0b10000000, 0b01000000, 0b10000000]) + bytes(20), 100)  # codes 256 and 258 of 9 bits

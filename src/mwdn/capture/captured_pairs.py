@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from mwdn.capture.recording import FrameRows, add_rows, set_format, write_row
+from mwdn.capture.recording import COLUMNS, FrameRows, add_rows, set_format, write_row
 from mwdn.capture.screen import Picture
 from mwdn.capture.source import Frame
 from mwdn.data.hdf5 import as_damage, find_rows, open_hdf5
@@ -222,7 +222,7 @@ def open_captured(path: Path) -> Iterator[CapturedPairs]:
         ImageError: damaged, of another command, or another process writes it.
     """
     with as_image_error(path), open_growing(path) as growing:
-        names = "measurement", "photograph", "planned", "scene"
+        names = ("measurement", "photograph", "planned", "scene", *(f"frame_data/{key}" for key in COLUMNS))
         missing = [name for name in names if find_rows(path, growing.file, name, _ADVICE) is None]
         if missing:
             raise ImageError(f"`{path}` has no {', '.join(missing)}: it is of another command. {_ADVICE}")

@@ -97,7 +97,7 @@ def _codes(data: Numbers, bit: int, bits: int) -> tuple[Numbers, int]:
 def _lengths(codes: Numbers) -> Numbers:
     """Length of each code's string: entry 258 + k is one byte longer than the string of code k."""
     jump = _parents(codes)
-    if (jump >= np.maximum(np.arange(len(codes)), 1)).any():
+    if (jump >= np.arange(len(codes))).any():  # a link to itself would be followed forever
         raise ImageError("is damaged: an LZW code is not in its table.")
     lengths = (jump >= 0).astype(np.int64)
     while (copies := jump >= 0).any():  # each step follows twice as many links as the one before
