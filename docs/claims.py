@@ -4,9 +4,9 @@
     python docs/claims.py runs/ablation-1 [--captures ../shared/data/mwdn-camera/real-objects] [--out docs]
 
 Mismatch is the deviation of the data set's true camera times 0, 1, 2 and 3: 0 is a camera that matches its
-calibration, 1 the camera of the training. The scenes and the noise are the same for all. Writes
-``claims-curves.png``, ``claims-captures.jpg``, and the numbers to `benchmarks/results/mismatch.json`, from which
-finished methods are not measured again.
+calibration, 1 the camera of the training. Also measured, at 1: cameras and methods with the mirrored PSF. The scenes
+and the noise are the same for all. Writes ``claims-curves.png``, ``claims-captures.jpg``, and the numbers to
+`benchmarks/results/mismatch.json`, from which finished methods are not measured again.
 """
 
 import argparse
@@ -44,6 +44,12 @@ FACTORS = (0.0, 1.0, 2.0, 3.0)  # from 4 on, the corners of the field would get 
 COUNT = 16  # test pictures for each factor
 
 
+def mirrored(dataset: Dataset) -> Dataset:
+    """The data set with a PSF that no network here was trained for: its mirror image, of the same statistics."""
+    psf = dataset.calibration.psf.flip(-1).roll(1, -1)  # the centre stays at width // 2
+    return replace(dataset, calibration=replace(dataset.calibration, psf=psf))
+
+
 def pairs(dataset: Dataset, photographs: Photographs, factor: float) -> tuple[Measurement, Scene]:
     """Test pairs through a camera with the data set's deviation times a factor."""
     deviation = Deviation(**{name: factor * value for name, value in asdict(dataset.recipe.deviation).items()})
@@ -69,21 +75,34 @@ def finished(runs: Path, steps: int) -> dict[str, Path]:
     return {path.name: path / "best.safetensors" for path in done if curve(path)[0][-1][0] == steps}
 
 
-def mismatch(methods: dict[str, Reconstructor], dataset: Dataset, hashes: dict[str, str]) -> dict[str, list[float]]:
-    """Mean PSNR of each method at each factor; methods whose weights have the recorded hash are not measured again."""
+def score(method: Reconstructor, test: tuple[Measurement, Scene], dataset: Dataset) -> float:
+    """Mean PSNR of the test pairs."""
+    measurements, scenes = test
+    pictures = torch.cat([method(each[None]) for each in measurements])
+    return round(fmean(measure(pictures, scenes, dataset.protocol, variant="raw")["psnr"].tolist()), 2)
+
+
+def mismatch(
+    benchmark: Benchmark, dataset: Dataset, weights: dict[str, Path], methods: dict[str, Reconstructor]
+) -> dict[str, list[float]]:
+    """PSNR of each method at each factor, and with the mirrored PSF; recorded results are kept."""
+    hashes = {label: file_sha256(weights[label])[:16] if label in weights else "" for label in methods}
     settings = {"factors": list(FACTORS), "count": COUNT}
     record = json.loads(RECORD.read_text()) if RECORD.exists() else {}
     if {key: record.get(key) for key in settings} != settings:
-        record = {**settings, "psnr": {}, "weights": {}}
-    missing = [label for label in methods if record["weights"].get(label) != hashes[label]]
-    photographs = Photographs(dataset.recipe.test_photos) if missing else None
-    tests = [pairs(dataset, photographs, factor) for factor in FACTORS] if photographs else []
+        record = settings
+    record = {"psnr": {}, "mirrored": {}, "weights": {}} | record
+    known = record["mirrored"].keys() & {label for label in hashes if record["weights"].get(label) == hashes[label]}
+    if missing := [label for label in methods if label not in known]:
+        photographs, other = Photographs(dataset.recipe.test_photos), mirrored(dataset)
+        tests = [pairs(dataset, photographs, factor) for factor in FACTORS]
+        turned, others = pairs(other, photographs, 1.0), reconstructors(benchmark, other, weights)
     for label in missing:
-        results = [(torch.cat([methods[label](each[None]) for each in b]), v) for b, v in tests]
-        scores = [measure(*result, dataset.protocol, variant="raw")["psnr"] for result in results]
-        record["psnr"][label] = [round(fmean(values.tolist()), 2) for values in scores]
+        if record["weights"].get(label) != hashes[label]:
+            record["psnr"][label] = [score(methods[label], test, dataset) for test in tests]
+        record["mirrored"][label] = score(others[label], turned, dataset)
         record["weights"][label] = hashes[label]
-        print(label, record["psnr"][label], flush=True)
+        print(label, record["psnr"][label], record["mirrored"][label], flush=True)
         write_text(RECORD, json.dumps(record, indent=1) + "\n")
     return record["psnr"]
 
@@ -140,8 +159,7 @@ def main() -> None:
     runs = arguments.folder / "runs" / name
     weights = finished(runs, benchmark.schedule.steps)
     methods = reconstructors(benchmark, dataset, weights)
-    hashes = {label: file_sha256(weights[label])[:16] if label in weights else "" for label in methods}
-    psnr = mismatch(methods, dataset, hashes)
+    psnr = mismatch(benchmark, dataset, weights, methods)
     colours = dict(zip(methods, matplotlib.colormaps["tab20"].colors, strict=False))
     figure = Figure(figsize=(13, 5), layout="constrained")
     left, right = figure.subplots(1, 2)
