@@ -187,7 +187,7 @@ def summary(method, frames, seconds, before, after):
     }
 
 
-def measure_stages(repeats=20):
+def measure_stages(repeats=60):
     """Processor milliseconds of each stage for one frame, in one thread; the shortest of some."""
     import torch
 
@@ -207,9 +207,31 @@ def measure_stages(repeats=20):
             "simulate a frame (not in the live picture)": rig.read,
             "correct": lambda: reconstruct.calibration.correct(frame.array),
             "reconstruct": lambda: reconstruct(measurement),
+            **network_parts(reconstruct.engine, measurement),
             "encode": lambda: [encode_jpeg(each, brightest(each)) for each in (measurement, scene)],
         }
-        return {name: round(min(processor_ms(work) for _ in range(repeats)), 2) for name, work in stages.items()}
+        found = {name: round(min(processor_ms(work) for _ in range(repeats)), 2) for name, work in stages.items()}
+    matrix = torch.rand(1024, 1024)
+    product_ms = min(processor_ms(lambda: matrix @ matrix) for _ in range(repeats))
+    return found | {"GFLOP/s of a product of matrices, 1024 x 1024": round(2 * 1024**3 / product_ms / 1e6, 1)}
+
+
+def network_parts(engine, measurement):
+    """Estimates (iterations and Wiener filters) and the U-Net of `universal-small`, from within."""
+    import torch
+
+    network = engine.network
+
+    def inferring(work):
+        with torch.inference_mode():
+            return work()
+
+    estimates = inferring(lambda: network._estimates(measurement, engine.prepared))
+    unit = network.unit(estimates)
+    return {
+        "of it estimates": lambda: inferring(lambda: network._estimates(measurement, engine.prepared)),
+        "of it U-Net": lambda: inferring(lambda: network.correct(estimates, unit)),
+    }
 
 
 def processor_ms(work):

@@ -6,6 +6,9 @@ const byId = (id) => document.getElementById(id);
 const controls = ["live-record", "live-snapshot", "live-exposure", "live-gain"].map(byId);
 const wishes = {}; // of this page, for a server that was started again
 const PATIENCE_MS = 3000; // until the server has followed a wish; then its settings are shown again
+const READABLE_MS = 250; // between changes of the numbers: those of each frame cannot be read, and cost a layout
+let toldAt = -Infinity;
+let refused = "";
 let wishedAt = -Infinity;
 let followed = "";
 let page = null;
@@ -49,11 +52,18 @@ function paint(canvas, picture) {
 }
 
 function tell(said) {
-  const recorded = said.recorded === null ? "" : `, ${said.recorded} frames recorded in ${said.recording}`;
   const offset = clockOffset();
   shown.count += 1;
   shown.latency_ms = offset === null ? said.latency_ms : Date.now() + offset - 1000 * said.timestamp;
   Object.assign(byId("live-state").dataset, { frame: said.number, count: shown.count, latency: shown.latency_ms.toFixed(1) });
+  if (performance.now() - toldAt < READABLE_MS && said.refused === refused) return;
+  toldAt = performance.now();
+  refused = said.refused;
+  tellInWords(said);
+}
+
+function tellInWords(said) {
+  const recorded = said.recorded === null ? "" : `, ${said.recorded} frames recorded in ${said.recording}`;
   byId("live-badge").textContent = `${said.fps.toFixed(1)} fps · ${Math.round(shown.latency_ms)} ms`;
   show(`${said.fps.toFixed(1)} frames a second, ${Math.round(shown.latency_ms)} ms after the exposure, ${said.dropped} dropped${recorded}. ${said.refused}`, Boolean(said.refused));
   byId("live-record").setAttribute("aria-pressed", String(said.recorded !== null));
