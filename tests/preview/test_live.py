@@ -159,6 +159,15 @@ def test_camera_that_is_disconnected_is_opened_again(live, viewer):
     assert until(viewer, lambda said: "error" not in said)["number"] >= 0
 
 
+def test_defect_is_told_and_does_not_end_the_live_picture(live, viewer, monkeypatch):
+    _, served = live
+    until(viewer, lambda said: "error" not in said)
+    with monkeypatch.context() as broken:
+        broken.setattr(served.pictures, "begin", lambda frame: 1 / 0)
+        assert "ZeroDivisionError" in until(viewer, lambda said: "error" in said)["error"]
+    until(viewer, lambda said: "error" not in said)
+
+
 @pytest.mark.parametrize("live", [",read_noise=0"], indirect=True)
 def test_frames_without_light_do_not_end_the_picture(live, viewer):
     _, served = live

@@ -1,6 +1,7 @@
 """The live picture: one camera and one reconstruction for all viewers; the newest frame wins, nothing queues."""
 
 import json
+import logging
 import threading
 import time
 from collections import deque
@@ -20,6 +21,8 @@ from mwdn.preview.metrics import Metrics
 from mwdn.runtime.devices import select_device
 from mwdn.runtime.streams import latest_results
 from mwdn.runtime.threads import usable_processors
+
+LOG = logging.getLogger("mwdn.preview")
 
 RATE_FRAMES = 20
 """Frames over which the rate is averaged."""
@@ -136,9 +139,13 @@ class Live:
             try:
                 with self.camera, ExitStack() as recording, closing(self._results(recording)) as results:
                     self._show(results)
-            except MwdnError as error:
+            except Exception as error:
                 failed, self._is_recording = True, False
-                self._publish({"error": str(error)}, b"", b"")
+                said = str(error)
+                if not isinstance(error, MwdnError):  # a defect of this package must not end the live picture for good
+                    LOG.exception("live picture")
+                    said = f"An error of mwdn itself: {type(error).__name__}. The server's log says more."
+                self._publish({"error": said}, b"", b"")
             self._changed.clear()
             if failed and self._wake and not self._is_stopped:
                 self._changed.wait(self._retry_s)
