@@ -223,8 +223,8 @@ class Live:
             self._publish(said | {"dropped": dropped} | self._about(picture), *encoded)
 
     def _about(self, picture: LivePicture) -> dict[str, Any]:
-        """For JSON: the frame, and the settings that all viewers share."""
-        frame, settings = picture.frame, self.pictures.settings
+        """For JSON: the frame, and the settings of its picture, which all viewers share."""
+        frame, settings = picture.frame, picture.settings
         return {
             "number": frame.number,
             "exposure_s": finite(frame.exposure_s),
