@@ -1,4 +1,4 @@
-"""Bridges to other libraries: scipy, DeepInverse, the Hugging Face hub, bioimage.io.
+"""Bridges to other libraries: scipy, DeepInverse, SCICO, the Hugging Face hub, bioimage.io, napari.
 
 Each name is imported at its first use, and with it the library that it needs.
 """
@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from mwdn.bridges.deepinverse import DeepInverseSolver, LenslessPhysics
     from mwdn.bridges.huggingface import from_pretrained, save_pretrained
     from mwdn.bridges.linear_operator import linear_operator
+    from mwdn.bridges.scico import scico_operator
 
 __all__ = [
     "DeepInverseSolver",
@@ -19,6 +20,7 @@ __all__ = [
     "from_pretrained",
     "linear_operator",
     "save_pretrained",
+    "scico_operator",
 ]
 
 _MODULES = {
@@ -28,6 +30,7 @@ _MODULES = {
     "from_pretrained": "huggingface",
     "linear_operator": "linear_operator",
     "save_pretrained": "huggingface",
+    "scico_operator": "scico",
 }
 """Modules that hold the public names."""
 
