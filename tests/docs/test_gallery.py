@@ -36,10 +36,11 @@ def _no_window():
 
 
 def run_small(path, size):
-    """Names of a script that was run with another SIZE, and few STEPS if it trains."""
+    """Names of a script that was run with another SIZE, and few STEPS and FRAMES."""
     source, count = re.subn(r"^SIZE = \d+", f"SIZE = {size}", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
     assert count == 1
-    source = re.sub(r"^STEPS = \d+", "STEPS = 3", source, flags=re.MULTILINE)
+    source = re.sub(r"^STEPS = \d+", "STEPS = 1", source, flags=re.MULTILINE)
+    source = re.sub(r"^FRAMES = \d+", "FRAMES = 3", source, flags=re.MULTILINE)
     names = {"__name__": "gallery"}
     exec(compile(source, str(path), "exec"), names)
     return names
