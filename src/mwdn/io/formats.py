@@ -70,6 +70,8 @@ def read(path: Path, *, photograph: bool) -> Frame:
             raise type(error)(f"`{path}` {error}") from error
         except OSError as error:
             raise ImageError(f"`{path}` cannot be read: {error.strerror or reason(error)}. {COPY_AGAIN}") from error
+        except MemoryError as error:
+            raise ImageError(f"`{path}` does not fit into the memory that is left. Close programs, or crop it.") from error
         except Exception as error:  # a damaged file makes tifffile, numpy and OpenCV raise anything
             what = f"{type(error).__name__}: {reason(error)}"
             raise ImageError(f"`{path}` cannot be read, it may be damaged ({what}). {COPY_AGAIN}") from error
@@ -255,13 +257,14 @@ def _decode(kind: str, data: bytes, photograph: bool) -> Frame:
     import cv2
 
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH if photograph else cv2.IMREAD_UNCHANGED
+    set_level = cv2.setLogLevel if hasattr(cv2, "setLogLevel") else cv2.utils.logging.setLogLevel  # of OpenCV 4, 5
     try:
         with decoder_messages() as lines:
-            level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # its lines are C++
+            level = set_level(0)  # silent: its lines are C++
             try:
                 pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
             finally:
-                cv2.utils.logging.setLogLevel(level)
+                set_level(level)
     except cv2.error as error:
         raise ImageError(f"cannot be decoded as {kind}: {one_line(error.err)}. {COPY_AGAIN}") from error
     # libjpeg warns of nothing but damage and unknown extensions; libpng also of odd colour profiles.
