@@ -26,6 +26,9 @@ COMMANDS = re.compile(r"^```sh\n(.*?)^```\n(?:\n```text\n(.*?)^```\n)?", re.MULT
 PICTURE = re.compile(r'!\[[^\]]*\]\(([\w-]+\.webp) "([^"]+)"\)')
 NUMBER = re.compile(r"\b[0-9a-f]{8,}\b|-?\d[\d.,:]*(?:e-?\d+)?")
 """A hash, or a number."""
+PROGRESS = re.compile(r"[A-Z]\w+: +\d+%")
+"""A line that a long command prints once in a while."""
+
 END = "--- end of block"
 WIDTH = 1000
 """Pixels; a wider picture is reduced."""
@@ -52,7 +55,7 @@ def run(page: str, folder: Path) -> list[str]:
     *printed, rest = done.stdout.split(f"{END}\n")
     if done.returncode or len(printed) != len(blocks):
         raise RuntimeError(f"block {len(printed) + 1} ended with {done.returncode}:\n{rest}")
-    return ["\n".join(line.rstrip() for line in text.splitlines()) for text in printed]
+    return ["\n".join(line.rstrip() for line in text.splitlines() if not PROGRESS.match(line)) for text in printed]
 
 
 def filled(page: str, printed: list[str]) -> str:
