@@ -71,7 +71,7 @@ def read(path: Path, *, photograph: bool) -> Frame:
         except OSError as error:
             raise ImageError(f"`{path}` cannot be read: {error.strerror or reason(error)}. {COPY_AGAIN}") from error
         except MemoryError as error:
-            raise ImageError(f"`{path}` does not fit into the memory that is left. Close programs, or crop it.") from error
+            raise ImageError(f"`{path}` does not fit into the memory that is left. Crop it.") from error
         except Exception as error:  # a damaged file makes tifffile, numpy and OpenCV raise anything
             what = f"{type(error).__name__}: {reason(error)}"
             raise ImageError(f"`{path}` cannot be read, it may be damaged ({what}). {COPY_AGAIN}") from error
