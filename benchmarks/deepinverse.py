@@ -44,7 +44,7 @@ def find(name, weights):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path)
-    parser.add_argument("--methods", nargs="+", default=["tv", "admm", "universal-small", "universal"])
+    parser.add_argument("--methods", nargs="*", default=["tv", "admm", "universal-small", "universal"])
     parser.add_argument("--ram", type=Path)
     parser.add_argument("--first", type=int, default=8)
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/deepinverse.json"))
