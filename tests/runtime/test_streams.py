@@ -243,19 +243,18 @@ def test_error_ends_the_results(results, request):
 
 
 def test_threads_are_those_of_the_caller_alone():
-    before = torch.get_num_threads()
+    def new_thread():
+        with ThreadPoolExecutor(1) as pool:
+            return pool.submit(torch.get_num_threads).result()
 
-    def numbers():
-        found = []
-        thread = threading.Thread(target=lambda: found.append(torch.get_num_threads()))
-        use_threads(before + 1)
-        thread.start()
-        thread.join()
-        return [torch.get_num_threads(), *found]
+    def use(count):
+        use_threads(count)
+        return torch.get_num_threads()
 
-    with ThreadPoolExecutor(1) as pool:
-        assert pool.submit(numbers).result() == [before + 1, before]
-    assert torch.get_num_threads() == before
+    mine, new, counts = torch.get_num_threads(), new_thread(), [3, 4, 5, 3]
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(use, counts)) == counts
+    assert (torch.get_num_threads(), new_thread()) == (mine, new)
 
 
 # --- Memory -------------------------------------------------------------------------------------------

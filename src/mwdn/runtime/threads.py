@@ -1,9 +1,13 @@
 """The number of threads on which torch computes what one thread asks for."""
 
 import os
-from threading import Thread
+from concurrent.futures import ThreadPoolExecutor
+from threading import Lock
 
 import torch
+
+_LOCK = Lock()
+"""Two threads at once would take each other's number for that of new threads."""
 
 
 def usable_processors() -> int:
@@ -16,11 +20,13 @@ def usable_processors() -> int:
 def use_threads(count: int) -> None:
     """Let torch compute on ``count`` threads what the calling thread asks for; other threads keep their number.
 
-    `torch.set_num_threads` changes the calling thread, and the number with which new threads start. The second is set
-    back, by a thread that ends at once.
+    `torch.set_num_threads` changes the calling thread, and the number with which new threads start. A thread of its own
+    reads the second before, and another sets it back.
     """
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    restore = Thread(target=torch.set_num_threads, args=(before,))
-    restore.start()
-    restore.join()
+    with _LOCK:
+        with ThreadPoolExecutor(1) as fresh:
+            before = fresh.submit(torch.get_num_threads).result()
+        torch.get_num_threads()  # or else torch takes up the number of new threads at this thread's first operation
+        torch.set_num_threads(count)
+        with ThreadPoolExecutor(1) as fresh:
+            fresh.submit(torch.set_num_threads, before).result()
