@@ -191,7 +191,7 @@ def test_psf_of_another_size(run, camera):
             "`--variation` (none) must be anisotropic, isotropic or",
         ),
         ("captures --psf psf.png --regularisation 1", "Options of the method 'universal': none"),
-        ("captures --psf psf.png --format jpeg", "`--format` (jpeg) must be png, png16, tiff or npy."),
+        ("captures --psf psf.png --format jpeg", "`--format` (jpeg) must be png, png16, tiff, imagej or npy."),
         ("captures --psf psf.png --bin two", "`--bin` (two) must be a whole number."),
         ("captures --psf psf.png --gamma foo", "`--gamma` (foo) must be srgb, a number or none."),
         ("captures --psf psf.png --white-balance foo", "`--white-balance` (foo) must be grey-world, psf, three"),
