@@ -76,6 +76,18 @@ def test_an_anchor_of_one_over_the_learning_rate_holds_the_start(camera):
     assert max(changes("run-10000.0-2").values()) < 1e-6
 
 
+def test_a_share_of_the_start_is_mixed_into_what_was_learned(camera):
+    """w = share w_start + (1 - share) w_learned, for every weight of the same run without a share."""
+    trainer(camera, steps=2).run()
+    trainer(camera, steps=2, start_share=0.75).run()
+    start, plain, mixed = (
+        load_checkpoint(f"{path}.safetensors").state_dict() for path in ("start", "run-2/last", "run-2-0.75/last")
+    )
+    for name, value in mixed.items():
+        expected = 0.75 * start[name] + 0.25 * plain[name] if value.is_floating_point() else plain[name]
+        torch.testing.assert_close(value, expected, rtol=1e-5, atol=1e-6)
+
+
 def test_the_start_is_kept_if_nothing_is_better(camera):
     """A learning rate that destroys the weights."""
     trainer(camera, learning_rate=0.5, anchor=1e-9).run()
@@ -97,9 +109,10 @@ def test_validation_has_no_units(camera):
     torch.testing.assert_close((fitted - units).square().mean().log10(), -first[0] / 10 + 2 * torch.tensor(2.0).log10())
 
 
-def test_an_anchor_needs_a_start():
-    with pytest.raises(ParameterError, match="`anchor`"):
-        Schedule(anchor=1.0)
+@pytest.mark.parametrize("name", ["anchor", "start_share"])
+def test_what_holds_the_start_needs_one(name):
+    with pytest.raises(ParameterError, match=f"`{name}` .* needs the weights of `start`"):
+        Schedule(**{name: 0.5})
 
 
 def test_the_recipe_fits_the_bundled_network():

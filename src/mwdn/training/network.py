@@ -1,5 +1,6 @@
 """The network of a run: its initial weights, and the moving average of its weights."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -74,13 +75,20 @@ def grown(weights: dict[str, Tensor], network: nn.Module) -> dict[str, Tensor]:
 
 
 @torch.no_grad()
-def update_average(average: nn.Module, network: nn.Module, *, decay: float) -> None:
-    """Update an exponential moving average of a network's weights; integers (BatchNorm's counters) are copied."""
-    for mean, value in zip(average.state_dict().values(), network.state_dict().values(), strict=True):
-        if value.is_floating_point():
-            mean.lerp_(value, 1 - decay)
-        else:
+def update_average(
+    average: nn.Module, network: nn.Module, *, decay: float, start: Mapping[str, Tensor] | None = None, share: float = 0.0
+) -> None:
+    """Update an exponential moving average of a network's weights; integers (BatchNorm's counters) are copied.
+
+    The average is of ``(1 - share)`` times the weights and ``share`` times those of ``start``, by name.
+    """
+    for (name, value), mean in zip(network.state_dict().items(), average.state_dict().values(), strict=True):
+        if not value.is_floating_point():
             mean.copy_(value)
+        elif start and share:
+            mean.lerp_(value.lerp(start[name], share), 1 - decay)
+        else:
+            mean.lerp_(value, 1 - decay)
 
 
 def name_and_options(recipe: Recipe) -> tuple[str, dict[str, Any]]:

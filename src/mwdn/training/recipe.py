@@ -23,11 +23,10 @@ from mwdn.training.tables import Plateau, Sheet
 LR_SCHEDULES = ("cosine", "constant", "plateau")
 BEST_BY = ("psnr", "loss")
 OPTIMISERS = ("adam", "adamw")
-LATER_SCHEDULE = ("anchor", "filter_rate", "best_by")
 LATER = {
     "mismatch": REAL,
     "pairs": ("folds", "fold", "aligned", "best_gain"),
-    "schedule": ("anchor", "filter_rate", "best_by"),
+    "schedule": ("anchor", "start_share", "filter_rate", "best_by"),
 }
 """Keys of tables that the first recipes did not have."""
 
@@ -66,6 +65,9 @@ class Schedule:
             them from.
         anchor: decay towards the weights of `start`, times the learning rate. The start is validated, too, and kept as
             the best if no step improves on it.
+        start_share: share of the weights of `start` in those that are validated and saved; the rest is the moving
+            average of what was learned. It forgets less of `start` (Wortsman et al., "Robust fine-tuning of zero-shot
+            models", CVPR 2022).
         filter_rate: learning rate of the logarithms of the filters' w and lambda over that of the other parameters. At
             1 they hardly move: Adam changes a number by about the learning rate a step, and 4 may be needed.
         best_by: which validation has the best weights: that of the highest "psnr", or of the lowest "loss" (with the
@@ -93,6 +95,7 @@ class Schedule:
     denoiser: str = ""
     fixed_norms: bool = False
     anchor: float = 0.0
+    start_share: float = 0.0
     filter_rate: float = 1.0
     best_by: str = "psnr"
 
@@ -112,10 +115,12 @@ class Schedule:
             raise ParameterError("`learning_rate` (inf) must be finite.")
         if self.crop and not self.pool:
             raise ParameterError(f"`crop` ({self.crop}) applies to cached samples: set `pool`, or leave `crop` out.")
-        if self.anchor and not self.start:
-            raise ParameterError(f"`anchor` ({self.anchor}) pulls towards the weights of `start`, which is missing.")
-        if not 0 <= self.ema < 1:
-            raise ParameterError(f"`ema` ({self.ema}) must be in [0, 1).")
+        for name in ("anchor", "start_share"):
+            if getattr(self, name) and not self.start:
+                raise ParameterError(f"`{name}` ({getattr(self, name)}) needs the weights of `start`, which is missing.")
+        for name in ("ema", "start_share"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ParameterError(f"`{name}` ({getattr(self, name)}) must be in [0, 1).")
         for kind, names in (("lr_schedule", LR_SCHEDULES), ("optimiser", OPTIMISERS), ("best_by", BEST_BY)):
             if getattr(self, kind) not in names:
                 raise UnknownNameError(kind, getattr(self, kind), names)

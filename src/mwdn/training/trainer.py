@@ -81,9 +81,9 @@ class Trainer:
         self.distance = Loss(recipe.loss, alexnet=alexnet).to(self.device)
         self.optimiser = make_optimiser(self.network, self.schedule)
         self.lr_schedule = make_lr_schedule(recipe)
-        # Made before a saved run resumes: these are the weights of `start`.
-        learned = [parameter for parameter in self.network.parameters() if parameter.requires_grad]
-        self.anchors = [(each, each.detach().clone()) for each in learned] if self.schedule.anchor else []
+        # Copied before a saved run resumes: these are the weights of `start`.
+        held = self.schedule.anchor > 0 or self.schedule.start_share > 0
+        self.start = {name: value.clone() for name, value in self.network.state_dict().items()} if held else {}
         self.bfloat16 = self.schedule.bfloat16 and has_bfloat16(self.device)
         self.step, self.best = 0, -math.inf
 
@@ -195,15 +195,17 @@ class Trainer:
         self._pull_to_start()
         self.step += 1
         # The decay grows from 0 to the schedule's, or else a young average would remember the initial weights.
-        update_average(self.average, self.network, decay=min(self.schedule.ema, self.step / (self.step + 10)))
+        decay = min(self.schedule.ema, self.step / (self.step + 10))
+        update_average(self.average, self.network, decay=decay, start=self.start, share=self.schedule.start_share)
         return total, dict(zip(parts, totals, strict=True))
 
     @torch.no_grad()
     def _pull_to_start(self) -> None:
         """Decay towards the start weights, apart from the gradient as AdamW's decay towards 0."""
         amount = min(1.0, self.schedule.anchor * self.lr_schedule.rate(self.step))
-        for parameter, start in self.anchors:
-            parameter.lerp_(start, amount)
+        for name, parameter in self.network.named_parameters() if amount else ():
+            if parameter.requires_grad:
+                parameter.lerp_(self.start[name], amount)
 
     def _loss(self, numbers: range) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of the samples of these numbers in training mode, and its parts."""
