@@ -76,7 +76,12 @@ def grown(weights: dict[str, Tensor], network: nn.Module) -> dict[str, Tensor]:
 
 @torch.no_grad()
 def update_average(
-    average: nn.Module, network: nn.Module, *, decay: float, start: Mapping[str, Tensor] | None = None, share: float = 0.0
+    average: nn.Module,
+    network: nn.Module,
+    *,
+    decay: float,
+    start: Mapping[str, Tensor] | None = None,
+    share: float = 0.0,
 ) -> None:
     """Update an exponential moving average of a network's weights; integers (BatchNorm's counters) are copied.
 

@@ -117,7 +117,9 @@ class Schedule:
             raise ParameterError(f"`crop` ({self.crop}) applies to cached samples: set `pool`, or leave `crop` out.")
         for name in ("anchor", "start_share"):
             if getattr(self, name) and not self.start:
-                raise ParameterError(f"`{name}` ({getattr(self, name)}) needs the weights of `start`, which is missing.")
+                raise ParameterError(
+                    f"`{name}` ({getattr(self, name)}) needs the weights of `start`, which is missing."
+                )
         for name in ("ema", "start_share"):
             if not 0 <= getattr(self, name) < 1:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) must be in [0, 1).")
