@@ -187,11 +187,18 @@ def test_the_exposure_to_use_next():
     assert measure_exposure(bench.point(1.0)).peak < 1 / 16
 
 
+def test_narrow_spots_are_as_alike_between_pixels():
+    """At whole pixels, spots of this width that are displaced by (0.5, 0.5) have a correlation of exp(-1/8) = 0.88."""
+    y, x = torch.arange(40.0)[:, None], torch.arange(50.0)
+    spots = [torch.exp(-((y - 20 - d) ** 2 + (x - 25 - r) ** 2) / 2)[None, None] for d, r in ((0, 0), (3.5, -1.5))]
+    assert displacement(spots[1], spots[0]) == pytest.approx((3.5, -1.5, 1.0), abs=2e-3)
+
+
 def test_displacement_between_pixels(bench):
     image = bench.light
     for down, right in ((3, -7), (0, 0), (-12, 5)):
         found = displacement(shifted(image, down, right), image)
-        assert found[:2] == pytest.approx((down, right), abs=0.1)
+        assert found[:2] == pytest.approx((down, right), abs=0.01)
     half = (image + shifted(image, 1, 0)) / 2
-    assert displacement(half, image).down == pytest.approx(0.5, abs=0.05)
+    assert displacement(half, image).down == pytest.approx(0.5, abs=0.01)
     assert torch.equal(shifted(image, 200, 0), torch.zeros_like(image))

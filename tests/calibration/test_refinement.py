@@ -14,7 +14,7 @@ from mwdn.calibration.camera_file import write_camera
 from mwdn.calibration.pair_model import PairModel, Terms
 from mwdn.calibration.psf_identity import psf_identity
 from mwdn.calibration.refinement import Refinement, polynomials, smooth_field
-from mwdn.calibration.term_selection import select_terms
+from mwdn.calibration.term_selection import PARTS, left_out, select_terms
 from mwdn.data.pairs import PairFile
 from mwdn.data.recorded import other_camera
 from mwdn.errors import ParameterError
@@ -110,6 +110,14 @@ def test_with_a_displaced_envelope_the_calibration_as_it_was_stays(psf):
     assert not selection.fit(selection.taken[0].terms).refinement()
     with_it = next(step for step in selection.taken if step.term == "envelope")
     assert selection.fit(with_it.terms).refinement().envelope_shift[0] == pytest.approx(0.05, abs=0.015)
+
+
+@pytest.mark.parametrize("count", [2, PARTS, 23])
+def test_each_pair_is_left_out_once_and_some_are_kept(count):
+    parts = left_out(count)
+    assert sorted(pair for part in parts for pair in part) == list(range(count))
+    assert len(parts) == min(count, PARTS)
+    assert max(map(len, parts)) < count
 
 
 def test_one_pair_is_too_few(psf, generator):

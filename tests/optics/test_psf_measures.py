@@ -90,8 +90,8 @@ def test_glow_and_border_of_lines_on_a_level(generator):
 def test_likeness_is_the_best_correlation_over_all_displacements(generator):
     first, second = torch.rand(2, 1, 1, 13, 16, generator=generator)
     a, b = ((psf[0, 0] - psf.mean()).double().numpy() for psf in (first, second))
-    expected = correlate2d(a, b).max() / np.sqrt((a**2).sum() * (b**2).sum())
-    assert psf_measures.likeness(first, second) == pytest.approx(expected, rel=1e-5)
+    whole_pixels = correlate2d(a, b).max() / np.sqrt((a**2).sum() * (b**2).sum())
+    assert whole_pixels <= psf_measures.likeness(first, second) < 1.1 * whole_pixels
     psf = gaussian_psf((40, 40), 2.0, (14, 20))
     assert psf_measures.likeness(psf, psf) == pytest.approx(1, abs=1e-5)
     assert psf_measures.likeness(psf, gaussian_psf((40, 40), 2.0)) == pytest.approx(1, abs=1e-2)

@@ -1,7 +1,8 @@
 """Choose the terms of a `Refinement` by leaving pairs out.
 
 In each round, each term is tried at each order beyond the one it has, on top of the terms taken so far. A term is
-measured on pairs that it was not fitted to: each pair in turn is left out, and only its own gain and offset are fitted.
+measured on pairs that it was not fitted to: each part of them (`left_out`) in turn is left out, and only the gain and
+offset of its pairs are fitted.
 The best term is taken if it lowers the mean unexplained part by `LEAST` and that of more than half of the pairs. The
 field dependence, which no solver uses, comes last: fitted together, it would take what the other terms can explain.
 """
@@ -23,6 +24,9 @@ HIGHEST = {"envelope": 1, "psf_gain": 3, "sensor_field": 2, "stray_light": 2, "f
 KERNELS = Terms(psf_gain=3, field_dependence=2).kernels
 
 LEAST_PAIRS = 2
+
+PARTS = 10
+"""Most parts of the pairs that are left out in turn; the time is in proportion to parts times pairs."""
 
 MOVES = 3
 """Gauss-Newton steps on the envelope's displacement."""
@@ -75,10 +79,15 @@ class Selection:
         """The calibration as it was, and the terms that were taken, in their order."""
         return [step for step in self.steps if step.taken]
 
-    def fit(self, terms: Terms, *, without: int | None = None) -> Fit:
-        """Fit to all pairs, or to all but one."""
+    def fit(self, terms: Terms, *, without: range = range(0)) -> Fit:
+        """Fit to all pairs, or to all but some."""
         model = self.displaced if terms.envelope and self.displaced is not None else self.model
-        return model.fit(terms, [pair for pair in range(len(model)) if pair != without])
+        return model.fit(terms, [pair for pair in range(len(model)) if pair not in without])
+
+
+def left_out(count: int) -> list[range]:
+    """The pairs that are left out in turn: each alone, or `PARTS` parts of more pairs."""
+    return [range(first, count, PARTS) for first in range(min(count, PARTS))]
 
 
 def select_terms(
@@ -138,12 +147,11 @@ def _displaced(model: PairModel, terms: Terms, psf: Psf, pairs: Callable[[], Pai
 def _tried(model: PairModel, term: str, order: int, terms: Terms) -> Step:
     everything = range(len(model))
     start = model.fit(terms, everything)
-    unexplained = [
-        model.unexplained(
-            model.fit(terms, [other for other in everything if other != pair], start=start, steps=2), pair
-        )
-        for pair in everything
-    ]
+    unexplained = [0.0] * len(model)
+    for part in left_out(len(model)):
+        fit = model.fit(terms, [pair for pair in everything if pair not in part], start=start, steps=2)
+        for pair in part:
+            unexplained[pair] = model.unexplained(fit, pair)
     return Step(term, order, tuple(unexplained), taken=not term, terms=terms)
 
 

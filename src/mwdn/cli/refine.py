@@ -10,7 +10,7 @@ from mwdn.calibration import Calibration
 from mwdn.calibration.camera_file import read_camera, write_camera
 from mwdn.calibration.pair_model import Terms
 from mwdn.calibration.refinement import TERMS
-from mwdn.calibration.term_selection import LEAST_PAIRS, Selection, Step, select_terms
+from mwdn.calibration.term_selection import LEAST_PAIRS, Selection, Step, left_out, select_terms
 from mwdn.cli.progress import show_progress
 from mwdn.cli.terminal import counted, say
 from mwdn.errors import ParameterError
@@ -104,11 +104,16 @@ def _pictures(calibration: Calibration, selection: Selection, file: "PairFile") 
     with show_progress() as progress:
         progress.start("Reconstructing left-out pairs", len(steps) * len(file))
         for number, step in enumerate(steps):
+            refinements = {
+                pair: refinement
+                for part in left_out(len(file))
+                for refinement in [selection.fit(step.terms, without=part).refinement()]
+                for pair in part
+            }
             scores = []
             for pair, (b, v) in enumerate(_all(file)):
-                terms = selection.fit(step.terms, without=pair).refinement()
-                reconstruct = Reconstructor(METHOD, calibration.refined(terms))
-                scene = reconstruct(terms.measurement(b))
+                reconstruct = Reconstructor(METHOD, calibration.refined(refinements[pair]))
+                scene = reconstruct(refinements[pair].measurement(b))
                 scores.append(measure(scene, v, Protocol(), variant="best-gain", perceptual=perceptual))
                 progress.update(number * len(file) + pair + 1, step.term or "as calibrated")
             names = ("psnr", "ssim", "lpips")

@@ -71,6 +71,8 @@ def long_options(arguments: Iterable[Argument]) -> list[str]:
 
 def _missing(error: MissingArgumentError, argument: Argument) -> str:
     name = error.keyword or next((token.keyword for token in argument.tokens if token.keyword), None)
+    if name is not None and get_origin(argument.hint) is dict:  # a key of a recipe
+        return f"`{name}` must be followed by its value: `{name} VALUE`; a switch takes `true` or `false`."
     if name is not None:
         return f"`{name}` must be followed by {type_in_words(_one_word(argument.hint))}."
     return f"`{_name(argument)}` is missing. {_see_help(error)}"

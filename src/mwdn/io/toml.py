@@ -100,9 +100,9 @@ def to_dataclass(cls: type[T], name: str, table: dict[str, Any]) -> T:
             raise UnknownNameError(f"key of [{name}]", key, defaults)
         if not _same_type(_as_tuple(value), defaults[key]):
             example = json.dumps(defaults[key])
-            raise ParameterError(
-                f"`{key}` of [{name}] ({shown(value)}) must be of the same kind as its default, {example}."
-            )
+            is_switch = isinstance(defaults[key], bool)
+            wanted = "true or false" if is_switch else f"of the same kind as its default, {example}"
+            raise ParameterError(f"`{key}` of [{name}] ({shown(value)}) must be {wanted}.")
     try:
         for key, value in table.items():
             check_numbers(value, key)  # whole numbers first: a float cannot hold one of 400 digits

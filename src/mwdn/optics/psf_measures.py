@@ -8,6 +8,7 @@ from torch import Tensor
 
 from mwdn.fourier.convolution import correlate
 from mwdn.fourier.transforms import fast_length, frequency_grid, gaussian_transfer, inverse_spectrum, spectrum
+from mwdn.optics.displacement import displacement
 from mwdn.optics.noise import noise_level
 from mwdn.optics.psf_spectrum import ring_means
 from mwdn.types import Psf, Size
@@ -211,8 +212,4 @@ def likeness(psf: Psf, other: Psf) -> float:
 
     The channels are averaged and the mean is subtracted first.
     """
-    planes = [one.mean((0, 1)) - one.mean() for one in (psf, other)]
-    grid = fast_length(2 * psf.shape[-2]), fast_length(2 * psf.shape[-1])
-    first, second = (spectrum(plane[None, None], grid) for plane in planes)
-    best = inverse_spectrum(first * second.conj(), grid, grid).max()
-    return float(best / (planes[0].norm() * planes[1].norm()).clamp(min=1e-30))
+    return displacement(psf, other).correlation
