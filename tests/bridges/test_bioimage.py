@@ -1,4 +1,7 @@
-"""Packages for bioimage.io: their content here, and the test of bioimageio.core where it is installed."""
+"""Packages for bioimage.io: their content here, and the test of bioimageio.core where it is installed.
+
+An export takes four seconds of processor time, most of it torch's tracing: acceptance tests.
+"""
 
 import zipfile
 
@@ -30,6 +33,7 @@ def package(calibration, tmp_path_factory):
     return out
 
 
+@pytest.mark.acceptance
 def test_the_description_names_what_is_in_the_package(package, calibration):
     with zipfile.ZipFile(package) as archive:
         description = yaml.safe_load(archive.read("rdf.yaml"))
@@ -41,6 +45,7 @@ def test_the_description_names_what_is_in_the_package(package, calibration):
     assert calibration.psf_hash in description["name"]
 
 
+@pytest.mark.acceptance
 def test_the_test_tensors_are_a_capture_and_its_reconstruction(package, calibration):
     with zipfile.ZipFile(package) as archive:
         measurement, scene = (np.load(archive.open(f"{name}.npy")) for name in ("measurement", "scene"))
@@ -66,6 +71,7 @@ def test_another_suffix_is_refused(calibration, tmp_path):
         export_bioimage("wiener", calibration, tmp_path / "camera.onnx")
 
 
+@pytest.mark.acceptance
 @pytest.mark.filterwarnings("ignore")  # it leaves the package open
 def test_bioimageio_reproduces_the_reconstruction(package):
     """The format, the ONNX against the test tensors, and batches of two; nothing is fetched."""
