@@ -451,7 +451,7 @@ def test_command(tmp_path, capsys):
     np.save(tmp_path / "psf.npy", camera().psf[0].movedim(0, -1).numpy())
     out = tmp_path / "camera.onnx"
     with pytest.raises(SystemExit) as ended:
-        main(["export", "fista", "--psf", str(tmp_path / "psf.npy"), "--out", str(tmp_path / "camera.zip")])
+        main(["export", "fista", "--psf", str(tmp_path / "psf.npy"), "--out", str(tmp_path / "camera.tar")])
     assert ended.value.code == 2
     with pytest.raises(SystemExit) as ended:
         main(["export", "wiener", "--regularisation", "1e-3", "--psf", str(tmp_path / "psf.npy"), "--out", str(out)])

@@ -124,7 +124,7 @@ def test_mistyped_names_get_the_nearest(read, text, said):
         (NETWORK + "[schedule]\nsteps = -1", "`steps` (-1) must be positive."),
         (NETWORK + "[schedule]\nsteps = 1.5", "`steps` of [schedule] (1.5) must be of the same kind"),
         (NETWORK + '[schedule]\nbatch = "4"', "`batch` of [schedule] ('4') must be of the same kind"),
-        (NETWORK + "[schedule]\nbfloat16 = 1", "`bfloat16` of [schedule] (1) must be of the same kind"),
+        (NETWORK + "[schedule]\nbfloat16 = 1", "`bfloat16` of [schedule] (1) must be true or false"),
         (NETWORK + "[schedule]\nema = 1", "`ema` (1.0) must be in [0, 1)."),
         (NETWORK + "[schedule]\nlearning_rate = nan", "`learning_rate` (nan) must be finite."),
         (NETWORK + "[schedule]\nlearning_rate = inf", "`learning_rate` (inf) must be finite."),

@@ -58,7 +58,7 @@ COMMANDS = {
     ),
     "export": (
         "export:export",
-        "Write a method for one camera as a file for other programs: ONNX, torch's .pt2, or a page (--web).",
+        "Write a method for one camera as a file (ONNX, torch's .pt2, bioimage.io) or as a page (--web).",
     ),
     "benchmark": (
         "benchmark:benchmark",

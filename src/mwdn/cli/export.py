@@ -26,7 +26,7 @@ def export(  # noqa: PLR0913
     runtime: Path | None = None,
     **options: MethodOptions,
 ) -> None:
-    """Write a method for one camera as a file for other programs: ONNX, torch's .pt2, bioimage.io, or a page (--web).
+    """Write a method for one camera as a file (ONNX, torch's .pt2, bioimage.io) or as a page (--web).
 
     The file is run on simulated captures and is kept only if its results agree with mwdn's.
 
