@@ -14,6 +14,7 @@ PACKAGE = ROOT / "src" / "mwdn"
 
 FLOORS = [
     "errors",
+    "first_use",
     "types",
     "version",
     "fourier",

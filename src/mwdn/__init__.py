@@ -16,6 +16,7 @@ import warnings
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from mwdn.first_use import at_first_use
 from mwdn.version import __version__ as __version__
 
 if TYPE_CHECKING:  # the names of _MODULES and _PACKAGES, for mypy and editors
@@ -113,6 +114,8 @@ _MODULES = {
 }
 """Modules that hold the public names."""
 
+_first_use = at_first_use(__name__, _MODULES)
+
 _RENAMED = {"for_people": "to_display"}
 
 
@@ -124,10 +127,7 @@ def __getattr__(name: str) -> Any:  # noqa: ANN401
         return __getattr__(new)
     if name in _PACKAGES:
         return import_module(f"mwdn.{name}")
-    if name not in _MODULES:
-        raise AttributeError(f"module 'mwdn' has no attribute '{name}'")
-    value = globals()[name] = getattr(import_module(f"mwdn.{_MODULES[name]}"), name)
-    return value
+    return _first_use(name)
 
 
 def __dir__() -> list[str]:

@@ -3,8 +3,9 @@
 Each name is imported at its first use, and with it the library that it needs.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from mwdn.first_use import at_first_use
 
 if TYPE_CHECKING:
     from mwdn.bridges.bioimage import export_bioimage
@@ -34,10 +35,4 @@ _MODULES = {
 }
 """Modules that hold the public names."""
 
-
-def __getattr__(name: str) -> Any:  # noqa: ANN401
-    """Import a public name at its first use (PEP 562)."""
-    if name not in _MODULES:
-        raise AttributeError(f"module 'mwdn.bridges' has no attribute '{name}'")
-    value = globals()[name] = getattr(import_module(f"mwdn.bridges.{_MODULES[name]}"), name)
-    return value
+__getattr__ = at_first_use(__name__, _MODULES)

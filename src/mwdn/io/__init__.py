@@ -3,8 +3,9 @@
 Each name is imported at its first use: pictures need torch, text does not.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from mwdn.first_use import at_first_use
 
 if TYPE_CHECKING:
     from mwdn.io.formats import as_frame
@@ -31,11 +32,4 @@ __all__ = [
     "write_picture",
 ]
 
-
-def __getattr__(name: str) -> Any:  # noqa: ANN401
-    """Import a public name at its first use (PEP 562)."""
-    if name not in __all__:
-        raise AttributeError(f"module 'mwdn.io' has no attribute '{name}'")
-    module = import_module("mwdn.io.formats" if name == "as_frame" else "mwdn.io.images")
-    value = globals()[name] = getattr(module, name)
-    return value
+__getattr__ = at_first_use(__name__, dict.fromkeys(__all__, "images") | {"as_frame": "formats"})

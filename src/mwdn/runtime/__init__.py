@@ -3,8 +3,9 @@
 Each name is imported at its first use, so that the command line can import `keep_memory` without torch.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from mwdn.first_use import at_first_use
 
 if TYPE_CHECKING:
     from mwdn.runtime.devices import has_bfloat16, select_device, without_tf32
@@ -34,8 +35,4 @@ _MODULES = {
     "without_tf32": "devices",
 }
 
-
-def __getattr__(name: str) -> Any:  # noqa: ANN401
-    if name not in _MODULES:
-        raise AttributeError(f"module 'mwdn.runtime' has no attribute '{name}'")
-    return getattr(import_module(f"mwdn.runtime.{_MODULES[name]}"), name)
+__getattr__ = at_first_use(__name__, _MODULES)
