@@ -31,7 +31,6 @@ from mwdn.evaluation.distances import log_mse
 from mwdn.io.files import atomic
 from mwdn.solvers import align
 from mwdn.solvers.plug_and_play import plug_and_play
-from mwdn.solvers.pyramid import Band, PsfPyramid
 from mwdn.training.network import update_average
 from mwdn.training.recipe import read_recipe
 from universal import CALIBRATIONS, camera, captures
@@ -40,13 +39,6 @@ SIZES = ("256x256", "240x320", "320x320", "256x256", "270x480")
 KEPT, SIDE, CROP = 6, 144, 128
 PSFS = ("mwdn-camera 320x320", "DiffuserCam 270x480")
 ROWS = [(psf, light, kind) for psf in PSFS for light in (2000.0, 15000.0) for kind in ("exact", "mismatched")]
-
-
-def solved(network, measurement, psf):
-    """The pyramid's estimate, from which plug and play starts."""
-    transfers = network.prepare(psf, measurement.shape[-2:]).levels
-    bands = tuple(Band(level, *transfer) for level, transfer in zip(network.levels, transfers, strict=True))
-    return PsfPyramid(bands).solve(measurement)
 
 
 def training_pairs(data):
@@ -69,7 +61,7 @@ def training_pairs(data):
 def harvest(network, pairs, number):
     """Crops (level, handed scene, true scene) of some rounds of one capture, in the units of plug and play."""
     measurement, scene, psf = pairs.batch([number])
-    estimate = solved(network, measurement, psf)
+    estimate = network.iterate(measurement, network.prepare(psf, measurement.shape[-2:]))
     norm = estimate.psf.bands[-1].norm
     height, width = scene.shape[-2:]
     brightest = (estimate.grid_scene * norm)[..., :height, :width].amax((1, 2, 3), keepdim=True).clamp(min=1e-30)
@@ -136,10 +128,12 @@ def measured(network, data, count):
         simulated = captures(calibration.psf, photographs, recipe, light, range(count), exact=kind == "exact")
         for measurement, scene in simulated:
             aligned = align(measurement[None], calibration.psf).move(calibration.psf)
-            estimate = plug_and_play(solved(network, measurement[None], aligned), network.denoiser, network.rounds)
-            values.append(float(-10 * torch.log10((estimate.scene[0].clamp(0, 1) - scene).square().mean())))
-        result[f"{psf}, {light:,.0f} e, {kind}"] = round(fmean(values), 2)
-        print(psf, light, kind, result[f"{psf}, {light:,.0f} e, {kind}"], flush=True)
+            start = network.iterate(measurement[None], network.prepare(aligned, measurement.shape[-2:]))
+            estimate = plug_and_play(start, network.denoiser, network.rounds)
+            values.append(float(mwdn.psnr(estimate.scene.clamp(0, 1), scene[None])))
+        row = f"{psf}, {light:,.0f} e, {kind}"
+        result[row] = round(fmean(values), 2)
+        print(row, result[row], flush=True)
     return result
 
 

@@ -160,8 +160,7 @@ class WienerBank(Network[BankTransfers]):
         b = measurement.float()
         if not self.levels:
             return torch.cat([*self._filter(b, prepared.filters, BOUNDARY), b], dim=1)
-        bands = [Band(level, *transfer) for level, transfer in zip(self.levels, prepared.levels, strict=True)]
-        estimate = PsfPyramid(tuple(bands)).solve(b)
+        estimate = self.iterate(b, prepared)
         if self.rounds:
             estimate = plug_and_play(estimate, self.denoiser, self.rounds)
         if self.finest == 1:
@@ -170,6 +169,11 @@ class WienerBank(Network[BankTransfers]):
             details = self._filter(estimate.residual, prepared.filters, "zero")
         evidence = [self.evidence(estimate, details[0])] if self.has_evidence else []
         return torch.cat([estimate.scene, *(estimate.scene + detail for detail in details), b, *evidence], dim=1)
+
+    def iterate(self, measurement: Measurement, prepared: BankTransfers) -> Estimate:
+        """The iterations' estimate of the scene, before plug and play and the bank."""
+        bands = [Band(level, *transfer) for level, transfer in zip(self.levels, prepared.levels, strict=True)]
+        return PsfPyramid(tuple(bands)).solve(measurement)
 
     def evidence(self, estimate: Estimate, detail: Tensor) -> Tensor:
         """What speaks for and against the PSF: (B, C + 3, H, W).
