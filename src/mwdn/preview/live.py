@@ -236,7 +236,7 @@ class Live:
             "options": settings.options,
             "align": settings.align,
             "room_light": settings.room_light,
-            "ambient": self.pictures.has_ambient,
+            "ambient": picture.has_ambient,
         }
 
     def _count(self, stage: str, seconds: float) -> None:

@@ -32,6 +32,7 @@ class LivePicture:
         scene: likewise, in the colours of the camera.
         settings: with which it was made.
         calibration: of the camera, with what the camera says about its frames.
+        has_ambient: whether a frame of the room's light was subtracted.
         wrong: what is wrong with the frame.
     """
 
@@ -40,6 +41,7 @@ class LivePicture:
     scene: Scene
     settings: LiveSettings
     calibration: Calibration
+    has_ambient: bool = False
     wrong: str = ""
 
     def encode(self) -> tuple[bytes, bytes]:
@@ -102,11 +104,6 @@ class LivePictures:
         self._ambient: Frame | None = None
         self._takes_ambient = False
 
-    @property
-    def has_ambient(self) -> bool:
-        """Whether a frame of the room's light is subtracted."""
-        return self._ambient is not None
-
     def change(self, message: dict[str, Any]) -> None:
         """Take over the settings of a message; why one is not possible becomes `refused`."""
         self.refused = ""
@@ -133,13 +130,15 @@ class LivePictures:
             with torch.inference_mode():
                 measurement = reconstruct.calibration.correct(frame.array).to(reconstruct.device)
                 self._reconstruct = reconstruct = reconstruct.at(align(measurement, reconstruct.psf))
-        finish = partial(self._finish, frame, reconstruct, self._used)
+        finish = partial(self._finish, frame, reconstruct, self._used, has_ambient=self._ambient is not None)
         if isinstance(reconstruct.method, WarmStart):  # each frame needs the result of the one before
             picture = finish()
             return lambda: picture
         return finish
 
-    def _finish(self, frame: Frame, reconstruct: Reconstructor, settings: LiveSettings) -> LivePicture:
+    def _finish(
+        self, frame: Frame, reconstruct: Reconstructor, settings: LiveSettings, *, has_ambient: bool
+    ) -> LivePicture:
         start = time.perf_counter()
         measurement = reconstruct.calibration.correct(frame.array)
         self.count("correct", time.perf_counter() - start)
@@ -149,7 +148,8 @@ class LivePictures:
         except ParameterError as error:  # a dark frame must not end the live picture
             wrong, scene = str(error), torch.zeros_like(measurement)
         self.count("reconstruct", time.perf_counter() - start)
-        return LivePicture(frame, measurement.clamp(min=0), scene, settings, reconstruct.calibration, wrong)
+        shown, calibration = measurement.clamp(min=0), reconstruct.calibration
+        return LivePicture(frame, shown, scene, settings, calibration, has_ambient=has_ambient, wrong=wrong)
 
     def _prepared(self, frame: Frame) -> Reconstructor:
         """The method for the settings of now; those of before if it is refused."""
