@@ -4,11 +4,9 @@ import json
 
 import pytest
 import torch
-import yaml
 
 import mwdn
 from mwdn.bridges import from_pretrained, save_pretrained
-from mwdn.bridges.yaml_text import to_yaml
 from mwdn.errors import CheckpointError, ParameterError
 from mwdn.optics import sample_camera
 from mwdn.weights import save_network
@@ -87,8 +85,3 @@ def test_a_config_of_another_network_is_refused(checkpoint, tmp_path):
 def test_what_is_no_folder_is_a_name_on_the_hub(tmp_path):
     with pytest.raises(CheckpointError, match="hub:nothing"):
         from_pretrained("nothing")
-
-
-def test_yaml_is_read_as_it_was():
-    content = {"a": "yes: #1", "b": [{"c": 1, "d": [1.5, None]}, {"e": {}}], "f": {"g": True, "µ": "é\n"}, "h": []}
-    assert yaml.safe_load(to_yaml(content)) == content

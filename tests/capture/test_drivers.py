@@ -22,7 +22,7 @@ from mwdn.capture.screen import Screen
 from mwdn.capture.session import Session
 from mwdn.capture.v4l2 import V4l2Camera
 from mwdn.data import PairFile
-from mwdn.errors import CameraError, ParameterError
+from mwdn.errors import CameraError, MissingPackageError, ParameterError
 
 FAKE_CAMERA = "arv-fake-gv-camera-0.8"
 
@@ -143,7 +143,7 @@ def test_a_gentl_producer_must_be_named(monkeypatch):
 def test_a_missing_driver_says_what_to_install(monkeypatch, source, module, extra):
     aravis._library.cache_clear()
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(CameraError) as caught, open_source(source):
+    with pytest.raises(MissingPackageError) as caught, open_source(source):
         pass
     assert extra in str(caught.value)
     aravis._library.cache_clear()

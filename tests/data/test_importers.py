@@ -12,7 +12,7 @@ from PIL import Image as Pillow
 from mwdn.calibration import FrameFormat
 from mwdn.data import PairFile, import_pairs, read_pairs
 from mwdn.data.kinds import Layout
-from mwdn.errors import ImageError, ParameterError, UnknownNameError
+from mwdn.errors import ImageError, MissingPackageError, ParameterError, UnknownNameError
 
 RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
 
@@ -314,7 +314,7 @@ def test_damaged_rows_and_shards(shards, tmp_path):
 
 def test_the_hub_needs_its_package(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    with pytest.raises(ImageError, match=r"`owner/name` is not on this machine.*pip install 'mwdn\[hub\]'"):
+    with pytest.raises(MissingPackageError, match=r"`owner/name` is not on this machine.*pip install 'mwdn\[hub\]'"):
         import_pairs("parquet", "owner/name", tmp_path / "pairs.h5")
     for name in ("no/such/folder", "data/a.parquet"):
         with pytest.raises(ImageError, match="does not exist"):
@@ -345,8 +345,8 @@ def test_the_hubs_files_are_read(shards, tmp_path, monkeypatch):
 
 def test_parquet_needs_its_package(tmp_path, monkeypatch):
     write(tmp_path / "a.parquet", b"PAR1")
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(ImageError, match=r"`pyarrow` must be installed: `pip install 'mwdn\[parquet\]'`"):
+    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
+    with pytest.raises(MissingPackageError, match=r"the package pyarrow.*`pip install 'mwdn\[parquet\]'`"):
         import_pairs("parquet", tmp_path / "a.parquet", tmp_path / "pairs.h5")
 
 

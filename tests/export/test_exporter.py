@@ -18,7 +18,7 @@ from made import trained
 from mwdn import Calibration, Reconstructor, read_frame, to_display
 from mwdn.calibration import FrameFormat
 from mwdn.cli.app import main
-from mwdn.errors import ExportError, ParameterError
+from mwdn.errors import ExportError, MissingPackageError, ParameterError
 from mwdn.export import export, read_about, run_file
 from mwdn.export.dft import column_matrices, inverse_row_matrix, row_matrix
 from mwdn.export.exporter import MIN_AGREEMENT, agreement, simulate_captures
@@ -442,8 +442,8 @@ def test_the_file_says_how_raw_frames_become_measurements(tmp_path):
 
 
 def test_the_extra_is_named(monkeypatch, tmp_path):
-    monkeypatch.setattr("mwdn.export.model_file.find_spec", lambda name: None)
-    with pytest.raises(ExportError, match=r"needs the package onnx and onnxruntime: `pip install 'mwdn\[export\]'`"):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(MissingPackageError, match=r"onnxruntime.*`pip install 'mwdn\[export\]'`"):
         export(network("wiener"), camera(), tmp_path / "camera.onnx")
 
 

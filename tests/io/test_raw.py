@@ -9,7 +9,7 @@ import pytest
 
 from image_files import dng, put
 from mwdn import Calibration, FrameFormat
-from mwdn.errors import ImageError, ParameterError
+from mwdn.errors import ImageError, MissingPackageError, ParameterError
 from mwdn.io.images import read_frame, read_picture, write_frame
 from mwdn.io.raw import Mosaic, read_raw
 
@@ -124,5 +124,5 @@ def test_other_files_and_uses_are_named(tmp_path: Path, mosaic: np.ndarray) -> N
 
 def test_without_rawpy_the_extra_is_named(tmp_path: Path, mosaic: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rawpy", None)
-    with pytest.raises(ImageError, match=r"a\.dng`.*pip install 'mwdn\[raw\]'"):
+    with pytest.raises(MissingPackageError, match=r"a\.dng`.*pip install 'mwdn\[raw\]'"):
         read_frame(put(tmp_path / "a.dng", dng(mosaic)))

@@ -1,5 +1,6 @@
 """The ONNX of one camera as a package of bioimage.io: ``rdf.yaml``, weights, test tensors, documentation, as a zip."""
 
+import json
 import re
 import tempfile
 import zipfile
@@ -9,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from mwdn.bridges.yaml_text import to_yaml
 from mwdn.calibration import Calibration
 from mwdn.errors import ParameterError
 from mwdn.export.exporter import Exported, Precision, export, simulate_captures
@@ -66,7 +66,8 @@ def export_bioimage(
         np.save(folder / "measurement.npy", measurement.numpy())
         np.save(folder / "scene.npy", scene.numpy())
         (folder / "README.md").write_text(_documentation(exported), encoding="utf-8")
-        (folder / "rdf.yaml").write_text(to_yaml(_description(exported, folder, measurement, scene)), encoding="utf-8")
+        description = json.dumps(_description(exported, folder, measurement, scene), indent=2, ensure_ascii=False)
+        (folder / "rdf.yaml").write_text(description, encoding="utf-8")  # JSON is YAML
         package = folder / "package.zip"
         with zipfile.ZipFile(package, "w", zipfile.ZIP_DEFLATED) as archive:
             for name in ("rdf.yaml", "README.md", "measurement.npy", "scene.npy", "weights.onnx"):

@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from mwdn.bridges.forward_model import ForwardModel
-from mwdn.bridges.requirement import require
 from mwdn.errors import SMALLEST_LIGHT, check_options
 from mwdn.fourier import convolve, correlate
 from mwdn.optics import Camera, Sensor
+from mwdn.runtime.requirement import require
 from mwdn.types import Image, Measurement, Psf, Scene, Size
 
 _physics: Any = require("deepinv.physics", "deepinverse")

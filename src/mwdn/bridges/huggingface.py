@@ -7,7 +7,6 @@ from typing import Any
 
 from torch import nn
 
-from mwdn.bridges.yaml_text import to_yaml
 from mwdn.errors import CheckpointError, checked
 from mwdn.io.files import as_parameter_error, atomic, refuse_foreign, write_json, write_text
 from mwdn.io.reading import read_json
@@ -93,7 +92,9 @@ def _card(title: str, network: nn.Module, metadata: dict[str, Any], license: str
     }
     table = "\n".join(f"| {name} | {value} |" for name, value in rows.items() if value is not None)
     recipe = json.dumps(metadata["recipe"], indent=2) if "recipe" in metadata else "unknown"
-    return f"---\n{to_yaml(about)}---\n{_TEXT.format(title=title, table=table, recipe=recipe)}"
+    # JSON is YAML: each value on the line of its key.
+    header = "".join(f"{key}: {json.dumps(value, ensure_ascii=False)}\n" for key, value in about.items())
+    return f"---\n{header}---\n{_TEXT.format(title=title, table=table, recipe=recipe)}"
 
 
 _TEXT = """

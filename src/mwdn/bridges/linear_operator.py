@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from mwdn.bridges.forward_model import ForwardModel, Shape
-from mwdn.bridges.requirement import require
 from mwdn.errors import ParameterError, checked
 from mwdn.optics import Camera, FieldCamera
+from mwdn.runtime.requirement import require
 from mwdn.types import Size
 
 

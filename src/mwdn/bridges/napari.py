@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from mwdn.bridges.requirement import require
 from mwdn.calibration import Calibration
 from mwdn.data.pairs import PairFile
 from mwdn.errors import ParameterError
@@ -15,6 +14,7 @@ from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.contact_sheets import to_display
 from mwdn.io.images import read_frame, srgb_encode
 from mwdn.io.raw import RAW
+from mwdn.runtime.requirement import require
 from mwdn.types import FloatFrame, Frame
 from mwdn.weights.bundled import BUNDLED
 

@@ -3,10 +3,10 @@
 from typing import Any
 
 from mwdn.bridges.forward_model import ForwardModel
-from mwdn.bridges.requirement import require
 from mwdn.errors import checked
 from mwdn.fourier.transforms import fast_length
 from mwdn.optics import Camera
+from mwdn.runtime.requirement import require
 from mwdn.types import Size
 
 

@@ -177,7 +177,7 @@ def _library() -> Any:  # noqa: ANN401
     """Aravis's bindings.
 
     Raises:
-        CameraError: not installed.
+        MissingPackageError: not installed.
     """
     _find_gi()
     gi = load_driver("aravis", "gi")

@@ -13,8 +13,11 @@ import numpy as np
 from mwdn.capture.display import Display
 from mwdn.capture.page_hub import MESSAGE_BYTES, Hub
 from mwdn.capture.screen import Picture, Screen
-from mwdn.errors import DisplayError, reason
+from mwdn.errors import DisplayError
+from mwdn.runtime.requirement import require
 from mwdn.runtime.web_access import LOOPBACK, check_token, listen
+
+LIBRARIES = ("starlette", "websockets", "uvicorn")
 
 SHOW_S = 30.0
 """Seconds in which a picture must be shown: a page that was closed meanwhile can be opened again."""
@@ -34,7 +37,7 @@ class PageDisplay(Display):
 
     Raises:
         ParameterError: no token where one is needed, or the address cannot be used.
-        DisplayError: the extra `page` is not installed.
+        MissingPackageError: the extra `page` is not installed.
     """
 
     def __init__(
@@ -48,6 +51,7 @@ class PageDisplay(Display):
         token: str = "",
         show_s: float = SHOW_S,
     ) -> None:
+        self._uvicorn = [require(name, "page", purpose="The display page") for name in LIBRARIES][-1]
         check_token(host, token)
         self._cm = {"width_cm": width_cm, "height_cm": height_cm, "distance_cm": distance_cm}
         Screen(width_px=1, height_px=1, **self._cm)
@@ -61,22 +65,15 @@ class PageDisplay(Display):
         self._start()
 
     def _start(self) -> None:
-        try:
-            import uvicorn
-
-            app = self._hub.app()
-        except ImportError as error:
-            self._socket.close()
-            raise DisplayError(f"The display page needs: pip install 'mwdn[page]' ({reason(error)}).") from error
-        config = uvicorn.Config(
-            app,
+        config = self._uvicorn.Config(
+            self._hub.app(),
             ws="websockets-sansio",
             ws_max_size=MESSAGE_BYTES,
             log_level="error",
             lifespan="on",
             timeout_graceful_shutdown=1,
         )
-        self._server = uvicorn.Server(config)
+        self._server = self._uvicorn.Server(config)
         self._thread = threading.Thread(target=self._server.run, args=([self._socket],), daemon=True)
         self._thread.start()
         if not self._hub.started.wait(30):

@@ -72,7 +72,8 @@ class CameraSource(ABC):
         """Connect to the camera and start it.
 
         Raises:
-            CameraError: its driver is not installed; the camera is missing, or used by another program.
+            MissingPackageError: its driver is not installed.
+            CameraError: the camera is missing, or used by another program.
         """
 
     def configure(self, exposure_s: float | None = None, gain: float | None = None) -> None:

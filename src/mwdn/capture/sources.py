@@ -7,9 +7,10 @@ from importlib import import_module
 from typing import Any, NamedTuple
 
 from mwdn.capture.source import CameraSource
-from mwdn.errors import CameraError, UnknownNameError, check_options, reason
+from mwdn.errors import CameraError, UnknownNameError, check_options
 from mwdn.io.toml import parse_value
 from mwdn.runtime.plugins import Registry
+from mwdn.runtime.requirement import require
 
 
 class Kind(NamedTuple):
@@ -65,7 +66,7 @@ def open_source(text: str, **options: Any) -> CameraSource:  # noqa: ANN401
     Raises:
         UnknownNameError: no such kind of camera, or option.
         ParameterError: an option has another type or is outside its range.
-        CameraError: its driver is not installed, or the address is missing.
+        CameraError: the address is missing.
     """
     name, address, given = parse_source(text)
     if name not in SOURCES:
@@ -102,11 +103,8 @@ def load_driver(name: str, module: str) -> Any:  # noqa: ANN401
         module: to import.
 
     Raises:
-        CameraError: it is not installed.
+        MissingPackageError: it is not installed.
     """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return import_module(module)
-    except (ImportError, ValueError) as error:  # ValueError: gi, for another version of a library
-        raise CameraError(f"Cameras of the kind `{name}` need {SOURCES[name].requires} ({reason(error)}).") from error
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return require(module, name, purpose=f"The camera `{name}`", install=SOURCES[name].requires)

@@ -11,6 +11,7 @@ from mwdn.data.hdf5 import as_damage
 from mwdn.errors import ImageError
 from mwdn.io.images import decode_frame
 from mwdn.io.reading import open_regular
+from mwdn.runtime.requirement import require
 from mwdn.types import Frame
 
 SMALLEST_PICTURE = 67
@@ -30,6 +31,7 @@ def find_shards(path: Path, patterns: tuple[str, ...] = ("*.parquet",)) -> list[
         patterns: files to download from the hub.
 
     Raises:
+        MissingPackageError: the package of the hub is not installed.
         ImageError: nothing there, or the hub cannot be reached.
     """
     folder = path if path.exists() else _download(path, patterns)
@@ -54,14 +56,12 @@ class Shard:
         columns: those with encoded pictures.
 
     Raises:
+        MissingPackageError: pyarrow is not installed.
         ImageError: it is damaged, lacks a column, or claims more than it can hold.
     """
 
     def __init__(self, path: Path, columns: Sequence[str]) -> None:
-        try:
-            from pyarrow import parquet
-        except ModuleNotFoundError as error:
-            raise _missing("pyarrow", "parquet") from error
+        parquet = require("pyarrow.parquet", "parquet", purpose=f"`{path}`")
         self.path, self.columns = path, list(columns)
         open_regular(path).close()
         with as_damage(f"`{path}` is not a complete parquet file", COPY_AGAIN):
@@ -128,13 +128,10 @@ class Shard:
 def _download(name: Path, patterns: tuple[str, ...]) -> Path:
     if not re.fullmatch(r"[\w.-]+/[\w.-]+", name.as_posix()) or name.suffix == ".parquet":
         raise ImageError(f"`{name}` does not exist. Name a shard, a folder of shards, or `owner/name` on the hub.")
-    try:
-        from huggingface_hub import snapshot_download
-    except ModuleNotFoundError as error:
-        raise _missing("huggingface_hub", "hub", f"`{name}` is not on this machine. To download it, ") from error
+    hub = require("huggingface_hub", "hub", purpose=f"`{name}` is not on this machine. Its download")
     try:
         return Path(
-            snapshot_download(
+            hub.snapshot_download(
                 name.as_posix(),
                 repo_type="dataset",
                 allow_patterns=list(patterns) if len(patterns) > 1 else patterns[0],
@@ -145,7 +142,3 @@ def _download(name: Path, patterns: tuple[str, ...]) -> Path:
         raise ImageError(
             f"`{name}` cannot be downloaded from the hub: {reason}. Download it and name its folder."
         ) from error
-
-
-def _missing(package: str, extra: str, purpose: str = "") -> ImageError:
-    return ImageError(f"{purpose}`{package}` must be installed: `pip install 'mwdn[{extra}]'`.")

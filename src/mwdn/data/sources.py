@@ -144,7 +144,8 @@ def list_parquet(path: Path, captures: str, scenes: str) -> Listing:
         scenes: column of the ground truth.
 
     Raises:
-        ImageError: nothing there, or ``pyarrow`` (for the hub ``huggingface_hub``) is not installed.
+        MissingPackageError: ``pyarrow`` (for the hub ``huggingface_hub``) is not installed.
+        ImageError: nothing there.
     """
     shards = find_shards(path)
     sources: list[Source] = []

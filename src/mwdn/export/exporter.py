@@ -17,7 +17,7 @@ from torch.utils._pytree import tree_flatten, tree_unflatten
 
 from mwdn.calibration import Calibration
 from mwdn.errors import ExportError, ParameterError
-from mwdn.export.model_file import as_export_error, publish, require_packages, run_file, write_file
+from mwdn.export.model_file import as_export_error, publish, run_file, write_file
 from mwdn.inference.fusion import fuse
 from mwdn.inference.methods import Method, as_method, psf_for
 from mwdn.inference.reconstructor import Reconstructor
@@ -25,6 +25,7 @@ from mwdn.io.files import refuse_overwrite
 from mwdn.io.pictures import dark_scene
 from mwdn.networks.network import Network, as_network
 from mwdn.optics import Camera, Sensor
+from mwdn.runtime.requirement import require
 from mwdn.types import Measurement, Psf, Scene
 from mwdn.version import __version__
 
@@ -111,8 +112,9 @@ def export(
         **options: of a solver given by its name, for example ``regularisation=1e-4``.
 
     Raises:
-        ExportError: the method cannot be written in this format, the file's results agree too little, onnx or
-            onnxruntime is not installed, or the file cannot be written.
+        ExportError: the method cannot be written in this format, the file's results agree too little, or the file
+            cannot be written.
+        MissingPackageError: onnx or onnxruntime is not installed.
         ParameterError: another suffix or precision, ``out`` is a symbolic link, or options of a
             method that is not given by its name.
         UnknownNameError: no such method or option.
@@ -187,7 +189,8 @@ def _check(out: Path, precision: str, channels: int | None) -> None:
     if out.is_dir():
         raise ParameterError(f"`{out}` must be a file, but is a folder.")
     if out.suffix == ".onnx":
-        require_packages("onnx", "onnxruntime")
+        for module in ("onnx", "onnxruntime"):
+            require(module, "export", purpose="ONNX")
 
 
 def _about(name: str, calibration: Calibration, channels: int, precision: str) -> dict[str, str]:

@@ -6,7 +6,6 @@ import shutil
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 
 import torch
@@ -15,6 +14,7 @@ from torch.export import ExportedProgram
 from mwdn.errors import ExportError
 from mwdn.export.onnx_program import to_onnx
 from mwdn.io.files import atomic
+from mwdn.runtime.requirement import require
 from mwdn.types import Measurement, Scene
 
 ABOUT = "mwdn.json"
@@ -63,14 +63,13 @@ def run_file(file: Path, measurement: Measurement) -> Scene:
     """Reconstruct a batch with an exported file, on the CPU.
 
     Raises:
-        ExportError: onnxruntime is not installed, or the file cannot be read or run.
+        MissingPackageError: onnxruntime is not installed.
+        ExportError: the file cannot be read or run.
     """
     if file.suffix == ".pt2":
         with as_export_error(file), torch.no_grad():
             return torch.export.load(file).module()(measurement)
-    require_packages("onnxruntime")
-    import onnxruntime
-
+    onnxruntime = require("onnxruntime", "export", purpose="ONNX")
     with as_export_error(file):
         session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
         return torch.from_numpy(session.run(["scene"], {"measurement": measurement.numpy()})[0])
@@ -98,17 +97,6 @@ def publish(file: Path, out: Path) -> None:
             shutil.copyfile(file, temporary)
     except OSError as error:
         raise ExportError(f"`{out}` cannot be written: {error.strerror or error}. Choose another folder.") from error
-
-
-def require_packages(*packages: str) -> None:
-    """Check that packages of the extra ``export`` are installed.
-
-    Raises:
-        ExportError: one is missing.
-    """
-    missing = [package for package in packages if find_spec(package) is None]
-    if missing:
-        raise ExportError(f"ONNX needs the package {' and '.join(missing)}: `pip install 'mwdn[export]'`.")
 
 
 @contextmanager

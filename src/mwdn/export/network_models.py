@@ -14,10 +14,11 @@ from torch import Tensor, nn
 from torch.utils._pytree import TreeSpec, tree_flatten, tree_unflatten
 
 from mwdn.errors import ExportError
-from mwdn.export.model_file import as_export_error, require_packages
+from mwdn.export.model_file import as_export_error
 from mwdn.export.onnx_program import to_onnx
 from mwdn.inference.fusion import fuse
 from mwdn.networks.network import Network, as_network
+from mwdn.runtime.requirement import require
 from mwdn.types import Measurement, Psf, Scene, Size
 
 
@@ -67,9 +68,11 @@ def network_models(network: Network[Any], size: Size, channels: int) -> NetworkM
         channels: of both, 1 or 3.
 
     Raises:
-        ExportError: an operation has no ONNX form, or onnx is not installed.
+        MissingPackageError: onnx or onnxruntime is not installed.
+        ExportError: an operation has no ONNX form.
     """
-    require_packages("onnx", "onnxruntime")
+    for module in ("onnx", "onnxruntime"):
+        require(module, "export", purpose="ONNX")
     network = copy.deepcopy(network).cpu().eval().requires_grad_(False)
     psf = torch.full((1, channels, *size), 1 / (size[0] * size[1]))
     with torch.no_grad():
@@ -87,9 +90,7 @@ def run_models(models: NetworkModels, psf: Psf, measurements: Measurement) -> Sc
     Raises:
         ExportError: the models cannot be run.
     """
-    require_packages("onnxruntime")
-    import onnxruntime
-
+    onnxruntime = require("onnxruntime", "export", purpose="ONNX")
     providers = ["CPUExecutionProvider"]
     with as_export_error(Path("network.onnx")):
         prepare, reconstruct = (onnxruntime.InferenceSession(model, providers=providers) for model in models)

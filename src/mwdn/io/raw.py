@@ -10,6 +10,7 @@ from mwdn.errors import ImageError, cut, one_line, reason
 from mwdn.io.decoder_messages import decoder_messages
 from mwdn.io.headers import COPY_AGAIN, MAX_BYTES, check_decoded
 from mwdn.io.reading import read_bytes
+from mwdn.runtime.requirement import require
 from mwdn.types import Frame
 
 RAW = frozenset({".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef"})
@@ -45,12 +46,10 @@ def read_raw(path: str | Path) -> RawFrame:
     """Read the numbers of the sensor from a raw file, without demosaicing, white balance or gamma.
 
     Raises:
-        ImageError: rawpy is not installed, the file cannot be read, or its mosaic is not of 2 x 2 pixels.
+        MissingPackageError: rawpy is not installed.
+        ImageError: the file cannot be read, or its mosaic is not of 2 x 2 pixels.
     """
-    try:
-        import rawpy
-    except ImportError as error:
-        raise ImageError(f"`{path}` is a camera's raw file, which needs rawpy: pip install 'mwdn[raw]'.") from error
+    rawpy = require("rawpy", "raw", purpose=f"`{path}`, a camera's raw file,")
     data = read_bytes(path, most=MAX_BYTES)
     try:
         with decoder_messages() as lines, rawpy.imread(io.BytesIO(data)) as file:

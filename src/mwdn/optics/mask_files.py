@@ -15,6 +15,7 @@ from mwdn.io.files import atomic_write
 from mwdn.io.reading import open_regular
 from mwdn.io.tiff import read_tiff
 from mwdn.optics.masks import Mask
+from mwdn.runtime.requirement import require
 
 _FORMAT = "mwdn mask 1"
 _DEEPEST = 256
@@ -120,13 +121,10 @@ def write_gds(path: str | Path, mask: Mask) -> None:
         mask: of either kind.
 
     Raises:
-        ParameterError: gdstk is not installed.
+        MissingPackageError: gdstk is not installed.
         ImageError: the file cannot be written.
     """
-    try:
-        import gdstk
-    except ImportError as error:
-        raise ParameterError("GDSII needs gdstk: pip install 'mwdn[fabrication]'.") from error
+    gdstk = require("gdstk", "fabrication", purpose="GDSII")
     level = _levels(mask)
     rows, columns = level.shape
     library = gdstk.Library("mwdn", unit=1e-6, precision=1e-9)

@@ -7,8 +7,8 @@ import threading
 from typing import Any
 from urllib.parse import quote
 
-from mwdn.errors import ParameterError, reason
 from mwdn.preview.limits import Limits
+from mwdn.runtime.requirement import require
 from mwdn.runtime.web_access import LOOPBACK, check_token, listen
 
 CONNECTIONS = 512
@@ -28,7 +28,8 @@ class PreviewServer:
         token: secret that requests must know.
 
     Raises:
-        ParameterError: no token where one is needed, the address cannot be used, or the extra is not installed.
+        MissingPackageError: the extra is not installed.
+        ParameterError: no token where one is needed, or the address cannot be used.
     """
 
     def __init__(self, preview: Any, *, host: str = "127.0.0.1", port: int = 0, token: str = "") -> None:  # noqa: ANN401
@@ -96,11 +97,10 @@ def make_server(
     Raises:
         ParameterError: as for `PreviewServer`.
     """
-    try:
-        from mwdn.preview.application import Preview
-    except ImportError as error:
-        raise ParameterError(f"The page needs: pip install 'mwdn[page]' ({reason(error)}).") from error
-    return PreviewServer(Preview(cameras, limits, device=device, live=live), host=host, port=port, token=token)
+    application = require("mwdn.preview.application", "page", purpose="The page")
+    return PreviewServer(
+        application.Preview(cameras, limits, device=device, live=live), host=host, port=port, token=token
+    )
 
 
 def log_to_stderr() -> None:

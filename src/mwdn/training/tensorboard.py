@@ -4,9 +4,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from mwdn.errors import ParameterError
 from mwdn.io.files import as_parameter_error
 from mwdn.io.images import srgb_encode
+from mwdn.runtime.requirement import require
 from mwdn.training.report import Report
 
 
@@ -18,16 +18,14 @@ class TensorBoard:
         step: of the saved state. Events of later steps are hidden: a resumed run repeats them.
 
     Raises:
-        ParameterError: TensorBoard is not installed, or the folder cannot be written to.
+        MissingPackageError: TensorBoard is not installed.
+        ParameterError: the folder cannot be written to.
     """
 
     def __init__(self, folder: Path, step: int = 0) -> None:
-        try:
-            from torch.utils.tensorboard import SummaryWriter
-        except ModuleNotFoundError as error:
-            raise ParameterError(
-                "The package tensorboard must be installed: `pip install 'mwdn[tensorboard]'`."
-            ) from error
+        require("tensorboard", "tensorboard", purpose="`--tensorboard`")
+        from torch.utils.tensorboard import SummaryWriter
+
         with as_parameter_error(folder):
             self._writer: Any = SummaryWriter(str(folder), purge_step=step + 1)
 

@@ -7,6 +7,7 @@ import torch
 from torch import nn
 
 from mwdn.errors import CheckpointError, checked
+from mwdn.runtime.requirement import require
 from mwdn.weights.checkpoint import load_checkpoint, read_metadata, save_network
 
 BUNDLED = ("universal", "universal-small")
@@ -49,11 +50,10 @@ def _download(name: str) -> Path:
     owner, repository, file = (*name.removeprefix(HUB).split("/", 2), "", "")[:3]
     if not (owner and repository):
         raise CheckpointError(f"`{name}` must be hub:owner/name or hub:owner/name/file.safetensors.")
-    try:
-        from huggingface_hub import hf_hub_download
-        from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
-    except ImportError as error:
-        raise CheckpointError(f"`{name}` needs the package huggingface-hub: `pip install 'mwdn[hub]'`.") from error
+    require("huggingface_hub", "hub", purpose=f"`{name}`")
+    from huggingface_hub import hf_hub_download
+    from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
+
     try:
         return Path(hf_hub_download(f"{owner}/{repository}", file or "model.safetensors"))
     except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError, OSError, ValueError) as error:
