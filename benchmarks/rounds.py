@@ -41,11 +41,11 @@ PSFS = ("mwdn-camera 320x320", "DiffuserCam 270x480")
 ROWS = [(psf, light, kind) for psf in PSFS for light in (2000.0, 15000.0) for kind in ("exact", "mismatched")]
 
 
-def training_pairs(data):
+def training_pairs(data, sizes=SIZES):
     recipe = read_recipe("universal-exact")
     recipe = replace(
         recipe,
-        cameras=replace(recipe.cameras, sizes=SIZES),
+        cameras=replace(recipe.cameras, sizes=sizes),
         placement=replace(recipe.placement, exposure=(0.04, 1.0)),
         mismatch=replace(recipe.mismatch, exact=0.6),
     )
@@ -79,6 +79,18 @@ def harvest(network, pairs, number):
 
     plug_and_play(estimate, denoise, network.rounds)
     return kept
+
+
+def harvested(network, data, folder, count):
+    """Samples of as many captures, each kept in the folder once it is made."""
+    pairs, samples = training_pairs(data), []
+    for number in range(count):
+        path = folder / f"{number:05}.pt"
+        if not path.exists():
+            with atomic(path) as temporary:
+                torch.save(harvest(network, pairs, number), temporary)
+        samples += torch.load(path)
+    return samples
 
 
 def batch(samples, generator):
@@ -144,22 +156,17 @@ def main():
     parser.add_argument("--captures", type=int, default=600)
     parser.add_argument("--steps", type=int, default=1200)
     parser.add_argument("--count", type=int, default=3, help="captures a row")
+    parser.add_argument("--learned", type=Path, help="measure these weights of a denoiser; nothing is learned")
     parser.add_argument("--shares", type=float, nargs="+", default=[0.0, 0.3, 1.0])
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     mwdn.keep_memory()
     folder, network = arguments.folder, mwdn.load_network("universal").float().eval()
     folder.mkdir(parents=True, exist_ok=True)
-    pairs, samples = training_pairs(arguments.data), []
-    for number in range(arguments.captures):
-        path = folder / f"{number:05}.pt"
-        if not path.exists():
-            with atomic(path) as temporary:
-                torch.save(harvest(network, pairs, number), temporary)
-        samples += torch.load(path)
     bundled = {name: value.clone() for name, value in network.denoiser.state_dict().items()}
-    learned_path = folder / f"denoiser-{arguments.captures}-{arguments.steps}.pt"
+    learned_path = arguments.learned or folder / f"denoiser-{arguments.captures}-{arguments.steps}.pt"
     if not learned_path.exists():
+        samples = harvested(network, arguments.data, folder, arguments.captures)
         average = mwdn.load_network("universal").float().eval().denoiser
         with atomic(learned_path) as temporary:
             torch.save(learn(network.denoiser, average, samples, arguments.steps), temporary)
