@@ -4,10 +4,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from cyclopts import Parameter
+from torch import Tensor
 
 from mwdn.calibration import Calibration
 from mwdn.cli.camera import CameraOptions
@@ -19,6 +20,7 @@ from mwdn.data.captures import read_capture
 from mwdn.data.pair_writer import SUFFIXES, check_path
 from mwdn.errors import ParameterError
 from mwdn.inference.reconstructor import Reconstructor
+from mwdn.io.contact_sheets import contact_sheet
 from mwdn.io.files import check_folder, refuse_overwrite
 from mwdn.io.images import read_frame, write_picture
 from mwdn.registration.captured import SRGB, CapturedPairs, as_gamma, as_light
@@ -30,6 +32,7 @@ from mwdn.registration.projection import Points, Projection
 from mwdn.registration.registration import Place, read_projection, write_registration
 from mwdn.registration.views import Views
 from mwdn.registration.warp import warp_pictures
+from mwdn.types import Image, Scene
 
 
 @no_empty_folder
@@ -165,32 +168,52 @@ def _align_frame(task: _Task, capture: Path, picture: Path | None, out: Path) ->
     page, sidecar = out / f"{capture.stem}.align.png", out / f"{capture.stem}.align.json"
     task.check_outputs(page, sidecar)
     measurement = read_capture(capture, task.calibration)
-    scene = task.prepare(task.calibration)(measurement)
-    size = scene.shape[-2], scene.shape[-1]
-    found = None
+    reconstructor = task.prepare(task.calibration)
+    scene = reconstructor(measurement)
     if picture is None:
-        corners = (
-            task.corners if task.corners is not None else find_outline(Views.of(list(scene), list(scene)).roots[0])
-        )
-        place = Place.of(corners)
-        shape = max(2, round(place.height)), max(2, round(place.width))
-        projection = through_corners(corners, shape, size)
-        content = {**projection.to_dict(), "start": "outline" if task.corners is None else "points"}
-        sheet = draw_outline(scene, corners)
+        linear = Reconstructor("wiener", reconstructor.calibration, device=reconstructor.device)(measurement)
+        projection, content, sheet = _outline(scene, linear, task.corners)
     else:
         shown = as_light(read_frame(picture, upright=True), task.gamma or SRGB)[None]
-        if task.given is None:
-            found = estimate(Views.of(list(shown), list(scene)), corners=task.corners)
-            projection, content = found.projection, found.content()
-        else:
-            projection = task.given.for_picture((shown.shape[-2], shown.shape[-1]))
-            content = projection.to_dict()
-        warped = warp_pictures(shown, projection)
-        sheet = overlay(scene, warped, projection.corners(), found and found.residuals)
+        projection, content, sheet = _known_picture(task, shown, scene)
     write_picture(page, sheet)
     write_registration(sidecar, content)
     say(_quality(projection, content), f"Look at {page}")
     return content
+
+
+class _Placed(NamedTuple):
+    """Where the picture is, for the .json and as a picture."""
+
+    projection: Projection
+    content: dict[str, Any]
+    sheet: Tensor
+
+
+def _outline(scene: Scene, linear: Scene, corners: Points | None) -> _Placed:
+    """The outline of a display whose picture is not known, unless its corners are given."""
+    start = "outline" if corners is None else "points"
+    if corners is None:
+        views = Views.of([*scene, *linear], [*scene, *linear])
+        corners = find_outline(views.roots[0], views.reconstructions[1])
+    place = Place.of(corners)
+    shape = max(2, round(place.height)), max(2, round(place.width))
+    projection = through_corners(corners, shape, (scene.shape[-2], scene.shape[-1]))
+    drawn = [draw_outline(image, corners) for image in (scene, linear)]
+    sheet = contact_sheet([drawn], ["reconstruction", "Wiener filter"], height=drawn[0].shape[-2])
+    return _Placed(projection, {**projection.to_dict(), "start": start}, sheet)
+
+
+def _known_picture(task: _Task, shown: Image, scene: Scene) -> _Placed:
+    """The displayed picture in the reconstruction, unless its homography is given."""
+    if task.given is None:
+        found = estimate(Views.of(list(shown), list(scene)), corners=task.corners)
+        projection, content = found.projection, found.content()
+    else:
+        found, projection = None, task.given.for_picture((shown.shape[-2], shown.shape[-1]))
+        content = projection.to_dict()
+    sheet = overlay(scene, warp_pictures(shown, projection), projection.corners(), found and found.residuals)
+    return _Placed(projection, content, sheet)
 
 
 def _quality(projection: Projection, content: Mapping[str, Any]) -> str:
