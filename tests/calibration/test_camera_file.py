@@ -3,6 +3,7 @@
 import os
 import shutil
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import get_args
 
@@ -15,7 +16,9 @@ from cameras import contour_psf
 from mwdn import Calibration
 from mwdn.calibration import FrameFormat, PsfFormat
 from mwdn.calibration.camera_file import KEYS, read_camera, write_camera
+from mwdn.calibration.camera_parts import draft_of, write_camera_with_parts
 from mwdn.errors import ImageError, MwdnError, ParameterError, PsfError, UnknownNameError
+from mwdn.io.images import read_frame
 from mwdn.io.toml import read_toml
 from mwdn.optics.orientation import Orientation
 
@@ -226,3 +229,23 @@ def test_only_camera_files_are_replaced(folder):
     for orientation in get_args(Orientation)[:2]:
         write_camera(folder / "camera.toml", {"psf": folder / "lab/psf.png", "psf_orientation": orientation})
     assert read_camera(folder / "camera.toml")["psf_orientation"] == "flip-top-bottom"
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_draft_takes_the_place_of_a_camera_file_with_its_pictures_at_the_end(tmp_path, fails):
+    path, (old, new) = tmp_path / "camera.toml", np.arange(2 * 16, dtype=np.uint16).reshape(2, 4, 4, 1)
+    write_camera_with_parts(path, {}, {"psf": old})
+    before = {file.name for file in tmp_path.iterdir()}
+    with suppress(OSError), draft_of(path) as draft:
+        write_camera_with_parts(draft, {"bit_depth": 12}, {"psf": new, "dark": old})
+        assert (read_frame(read_camera(path)["psf"]) == old).all()
+        if fails:
+            raise OSError
+    if fails:
+        assert {file.name for file in tmp_path.iterdir()} == before
+        return
+    camera = read_camera(path)
+    assert (read_frame(camera["psf"]) == new).all()
+    assert (read_frame(camera["dark"]) == old).all()
+    assert {file.name for file in tmp_path.iterdir()} == {path.name, camera["psf"].name, camera["dark"].name}
+    assert camera["bit_depth"] == 12

@@ -139,8 +139,16 @@ def test_calibrate_with_pairs(psf, generator, run, tmp_path, monkeypatch):
     with PairFile.create("pairs.h5", measurement_shape=(*SIZE, 3), scene_shape=(*SIZE, 3)) as file:
         for light, scene in pairs(psf, Refinement(sensor_field=FIELD), generator, count=3, noise=0.002):
             file.append(light[0], scene[0])
+    (tmp_path / "camera.toml").write_text('psf = "psf.npy"\npsf_sha256 = "of an earlier one"\n')
+
+    def killed_before_the_end(*arguments, **options):
+        assert "earlier" in (tmp_path / "camera.toml").read_text()
+        return select_terms(*arguments, **options)
+
+    monkeypatch.setattr("mwdn.cli.refine.select_terms", killed_before_the_end)
     code, out, err = run("calibrate psf.npy --background 0 --pairs pairs.h5 -o camera.toml")
     assert code == 0, err
+    assert not list(tmp_path.glob(".*"))
     assert "sensor field of order 2" in out
     report = json.loads((tmp_path / "camera-refinement.json").read_text())
     assert report["tried"][0]["term"] == ""

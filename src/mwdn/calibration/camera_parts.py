@@ -2,16 +2,18 @@
 
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import torch
 
-from mwdn.calibration.camera_file import write_camera
+from mwdn.calibration.camera_file import read_camera, write_camera
 from mwdn.errors import ParameterError
+from mwdn.io.files import as_parameter_error
 from mwdn.io.images import write_frame
 from mwdn.io.toml import read_toml
 from mwdn.types import Frame
@@ -52,10 +54,45 @@ def write_camera_with_parts(
         for file in written:
             file.unlink(missing_ok=True)
         raise
-    for file in before - _own_parts(path):
+    _remove(before - _own_parts(path))
+    return dict(content)
+
+
+@contextmanager
+def draft_of(path: Path) -> Iterator[Path]:
+    """A camera file that is made in several steps, in a hidden folder beside ``path``.
+
+    At the end it takes the place of ``path``, at once, with the pictures that this module has written for it. Until
+    then, and if anything fails, ``path`` stays as it is.
+
+    Raises:
+        ParameterError: the folder cannot be written.
+    """
+    before = _own_parts(path)
+    with as_parameter_error(path.parent):
+        folder = TemporaryDirectory(prefix=f".{path.stem}-", dir=path.parent)
+    with folder as name:
+        draft = Path(name) / path.name
+        yield draft
+        moved = {file: path.with_name(file.name) for file in _own_parts(draft)}
+        content = {key: _renamed(value, moved) for key, value in read_camera(draft).items() if key != "psf_sha256"}
+        with as_parameter_error(path.parent):
+            for file, new in moved.items():
+                file.replace(new)
+        write_camera(path, content)
+    _remove(before - _own_parts(path))
+
+
+def _renamed(value: Any, moved: Mapping[Path, Path]) -> Any:  # noqa: ANN401
+    if isinstance(value, tuple):
+        return tuple(_renamed(each, moved) for each in value)
+    return moved.get(value, value) if isinstance(value, Path) else value
+
+
+def _remove(files: set[Path]) -> None:
+    for file in files:
         with suppress(OSError):
             file.unlink()
-    return dict(content)
 
 
 def _write(path: Path, key: str, frame: Frame, written: list[Path]) -> Path:

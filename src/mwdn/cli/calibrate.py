@@ -1,7 +1,9 @@
 """`mwdn calibrate`: a PSF and everything else about a camera, as one file for the other commands."""
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -9,7 +11,7 @@ from cyclopts import Parameter
 
 from mwdn.calibration import Calibration, FrameFormat, PsfFormat
 from mwdn.calibration.camera_file import check_camera_path, read_camera, write_camera
-from mwdn.calibration.camera_parts import write_camera_with_parts
+from mwdn.calibration.camera_parts import draft_of, write_camera_with_parts
 from mwdn.calibration.corrections import Corrections
 from mwdn.calibration.photographs import Photographed, develop, expanded
 from mwdn.calibration.report import inspect_psf
@@ -96,16 +98,33 @@ def calibrate(  # noqa: PLR0913
         if photographs.are_one_picture(pictures):
             options = CameraOptions(pictures[0], frames, psf_format=psf_format, ambient=ambient)
             dark = next(iter(expanded(photographs.dark_files)), None)
-            _of_one_picture(replace(options, dark=dark), kept, own, out)
-            refine(out, pairs)
+            refuse_overwrite(out, options.psf, dark, ambient)
+            _written(out, pairs, partial(_of_one_picture, replace(options, dark=dark), kept, own))
             return
         _refuse_psf_format(psf_format)
         known = Corrections.read(kept.get("flat_field"), kept.get("hot_pixels"))
         for file in (*expanded(pictures), *expanded(photographs.dark_files), *expanded(photographs.flat)):
             refuse_overwrite(out, file)
         done = develop(photographs.of(pictures), frames, known)
-        _of_photographs(done, {**kept, **own}, out, has_dark=bool(photographs.dark_files))
-        refine(out, pairs)
+        has_dark = bool(photographs.dark_files)
+        _written(out, pairs, partial(_of_photographs, done, {**kept, **own}, has_dark=has_dark))
+
+
+def _written(out: Path, pairs: Path | None, write: Callable[[Path], tuple[str, Calibration]]) -> None:
+    """Write the camera file, refined if there are pairs: it appears when it is complete.
+
+    Args:
+        out: the camera file.
+        pairs: to refine it with.
+        write: writes it to a path; returns the PSF's verdict and the calibration.
+    """
+    if pairs is None:
+        _finish(*write(out), out)
+        return
+    interrupted = f"Interrupted. {out} is written when the refinement is done: nothing has changed."
+    with if_interrupted(lambda: interrupted), draft_of(out) as draft:
+        _finish(*write(draft), out)
+        refine(draft, pairs, out.with_name(f"{out.stem}-refinement.json"))
 
 
 def _kept(camera: Path | None) -> dict[str, Any]:
@@ -118,9 +137,10 @@ def _kept(camera: Path | None) -> dict[str, Any]:
     return values
 
 
-def _of_one_picture(options: CameraOptions, kept: dict[str, Any], own: dict[str, Any], out: Path) -> None:
-    """Write a camera file that names the PSF's picture as it is."""
-    refuse_overwrite(out, options.psf, options.dark, options.ambient)
+def _of_one_picture(
+    options: CameraOptions, kept: dict[str, Any], own: dict[str, Any], out: Path
+) -> tuple[str, Calibration]:
+    """Write a camera file that names the PSF's picture as it is. The PSF's verdict, and the calibration."""
     if options.psf != kept.get("psf"):
         kept = {
             key: value for key, value in kept.items() if key not in ("psf_corrected", "distance_psfs", "field_psfs")
@@ -138,11 +158,13 @@ def _of_one_picture(options: CameraOptions, kept: dict[str, Any], own: dict[str,
     own_resolution = at_psf_resolution(options).load(corrections)
     report = inspect_psf(own_resolution, own_resolution.frames.read(options.psf_file))
     write_camera(out, {**kept, "psf": options.psf_file, "dark": options.dark, **own})
-    _finish(headline(report), calibration, out)
+    return headline(report), calibration
 
 
-def _of_photographs(done: Photographed, content: dict[str, Any], out: Path, *, has_dark: bool) -> None:
-    """Write a camera file with the pictures made of photographs."""
+def _of_photographs(
+    done: Photographed, content: dict[str, Any], out: Path, *, has_dark: bool
+) -> tuple[str, Calibration]:
+    """Write a camera file with the pictures made of photographs. The PSF's verdict, and the calibration."""
     content = {key: value for key, value in content.items() if value is not None or key not in done.content}
     if content.get("white_balance") == "flat":
         content["white_balance"] = _flat_balance(done.flat_colour)
@@ -159,7 +181,7 @@ def _of_photographs(done: Photographed, content: dict[str, Any], out: Path, *, h
     check_white_balance(calibration.white_balance, calibration.light)
     note(*done.notes)
     say(*done.results)
-    _finish(headline(inspect_psf(calibration, calibration.frames.read(written["psf"]))), calibration, out)
+    return headline(inspect_psf(calibration, calibration.frames.read(written["psf"]))), calibration
 
 
 def _flat_balance(colour: tuple[float, ...]) -> tuple[float, float, float]:

@@ -54,14 +54,17 @@ def check_pair_file(pairs: Path) -> None:
             raise ParameterError(f"`pairs` ({len(file)}) must be {LEAST_PAIRS} or more: each in turn is left out.")
 
 
-def refine(camera: Path, pairs: Path | None) -> None:
-    """Find the terms of a camera file's refinement, write them to it, and a report beside it. Nothing without pairs.
+def refine(camera: Path, pairs: Path, report: Path) -> None:
+    """Find the terms of a camera file's refinement and write them to it.
+
+    Args:
+        camera: the camera file.
+        pairs: captured by this camera.
+        report: numbers of the refinement, ending in .json; a page (.png) is written beside it.
 
     Raises:
         MwdnError: the pairs do not fit the camera, or a file cannot be written. The camera file stays as it was.
     """
-    if pairs is None:
-        return
     from mwdn.calibration.refinement_page import write_refinement_page
     from mwdn.data.pairs import PairFile
     from mwdn.data.recorded import check_pairs
@@ -77,7 +80,6 @@ def refine(camera: Path, pairs: Path | None) -> None:
     values |= {name: getattr(refinement, name) or None for name in TERMS}
     values.pop("psf_sha256", None)
     write_camera(camera, values)
-    report = camera.with_name(f"{camera.stem}-refinement.json")
     write_json(report, _content(selection, pictures, best, {name: values[name] for name in TERMS}))
     write_refinement_page(report.with_suffix(".png"), calibration.psf, refinement, _lines(pictures, best))
     say(
