@@ -48,7 +48,7 @@ lowest:  ## the tests with the lowest versions that pyproject.toml allows
 	$(PYTHON) -m venv .venv-lowest
 	.venv-lowest/bin/pip install --quiet --disable-pip-version-check -c constraints-lowest.txt -e \
 		'.[parquet,fabrication,tensorboard,hub,scipy,export,raw,page]' \
-		pytest pytest-xdist beartype scikit-image torchmetrics httpx2
+		pytest pytest-xdist beartype scikit-image torchmetrics httpx2 hypothesis
 	$(TESTS) .venv-lowest/bin/python -m pytest -n auto --dist worksteal
 
 # Tools in environments of their own: cffconvert needs jsonschema 3, cyclonedx-bom needs a newer one.
