@@ -165,6 +165,23 @@ def test_a_camera_that_stays_away_ends_the_session_and_the_next_one_goes_on(tmp_
     check_pairs(out, recipe, 7)
 
 
+def test_frames_of_another_size_end_the_session_and_the_next_one_goes_on(tmp_path, recipe):
+    class Binning(Rig):
+        reads = 0
+
+        def read(self):
+            self.reads += 1
+            frame = super().read()
+            return frame if self.reads < 45 else replace(frame, array=frame.array[::2, ::2].copy())
+
+    out, screen = tmp_path / "pairs.h5", open_camera(recipe).screen
+    with pytest.raises(CameraError, match="16, 16.*32, 32.*Set the camera as it was"):
+        session(recipe, out, Binning(recipe.rig, screen)).run()
+    assert 0 < len(PairFile(out)) < 7
+    assert session(recipe, out).run() == 7
+    check_pairs(out, recipe, 7)
+
+
 def test_a_drift_of_the_light_is_warned_of(tmp_path):
     recipe = read_capture_recipe(write(tmp_path, rig="drift = 0.03"), display={"gamma": 2.2})
     with pytest.warns(UserWarning, match=r"display's light has changed by"):
@@ -292,6 +309,14 @@ def test_gamma_is_fitted_to_grey_steps(generator):
     for wrong in ([5.0] * 9, light[::-1], [7 + 100 * (level / 255) ** 0.2 for level in levels]):
         with pytest.raises(DisplayError):
             fit_gamma(levels, wrong)
+
+
+def test_a_folder_is_relative_to_its_recipe_or_to_the_current_one_if_it_is_an_option(tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    path = write(tmp_path)
+    assert read_capture_recipe(path).photographs == tmp_path / "photos"
+    assert read_capture_recipe(path, pictures={"folder": "../photos"}).photographs.samefile(tmp_path / "photos")
 
 
 def test_wrong_recipes_are_named(tmp_path):

@@ -91,7 +91,10 @@ def average_frames(
     rejected = _outlying(frames, format, names, kind, dark) if len(frames) > 1 else {}
     kept = [number for number, name in enumerate(names) if name not in rejected]
     if 2 * len(kept) < len(frames) or (len(frames) == 2 and rejected):
-        raise ParameterError(f"The {kind} frames disagree: {_listed(rejected)}. Take them again, three or more.")
+        exposures = "; if they have several exposures, give those: `exposures`" if kind == "PSF" else ""
+        raise ParameterError(
+            f"The {kind} frames disagree: {_listed(rejected)}. Take them again, three or more{exposures}."
+        )
     scales = _scales([frames[i] for i in kept], format, kind, dark)
     noise = _noise([frames[i] for i in kept], format, scales, dark)
     parts, left_out = [], 0

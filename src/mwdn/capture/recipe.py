@@ -174,7 +174,7 @@ class CaptureRecipe:
         session: see `SessionTable`.
         point: see `PointTable`.
         rig: see `RigOptions`; for ``source = "rig"``.
-        folder: of the recipe, to which paths in it are relative.
+        folder: to which paths are relative: that of the recipe.
     """
 
     camera: CameraTable = CameraTable()
@@ -201,7 +201,7 @@ def read_capture_recipe(path: str | Path, **changes: Any) -> CaptureRecipe:  # n
 
     Args:
         path: name of a recipe of the package, or TOML file with the tables of `CaptureRecipe`.
-        **changes: replace values: ``pictures={"count": 50}``.
+        **changes: replace values: ``pictures={"count": 50}``. Their folder is relative to the current one.
 
     Raises:
         ParameterError: the file cannot be read, or a value is outside its range.
@@ -217,7 +217,8 @@ def read_capture_recipe(path: str | Path, **changes: Any) -> CaptureRecipe:  # n
                 raise ParameterError(f"`{table}` ({values!r}) must be a table: [{table}].")
         content[table] = {**content.get(table, {}), **changes.get(table, {})}
     tables = {name: to_dataclass(TABLES[name], name, table) for name, table in content.items()}
-    recipe = CaptureRecipe(**tables, folder=path.parent)
+    is_given = "folder" in changes.get("pictures", {})
+    recipe = CaptureRecipe(**tables, folder=Path() if is_given else path.parent)
     if (recipe.camera.source.split(",")[0] == "rig") != (recipe.display.kind == "rig"):
         raise ParameterError(
             "The rig's camera sees the rig's display alone: [camera] source and [display] kind \"rig\"."

@@ -166,8 +166,8 @@ def _check(result: Refined, residuals: Residuals) -> None:
         )
     if len(residuals.points) < _FEWEST_PARTS:
         raise AlignmentError(
-            f"Only {len(residuals.points)} parts of the picture can be placed, and {_FEWEST_PARTS} are needed. "
-            "Use more pictures, or one with more detail."
+            f"Parts of the picture that can be placed: {len(residuals.points)}, and {_FEWEST_PARTS} are needed. "
+            f"Use more pictures, or one with more detail. {way_out}"
         )
     corners = result.projection.corners()
     most = max(WORST_PX, 0.02 * float(np.ptp(corners, axis=0).max()))
