@@ -175,7 +175,7 @@ def test_frames_of_another_size_end_the_session_and_the_next_one_goes_on(tmp_pat
             return frame if self.reads < 45 else replace(frame, array=frame.array[::2, ::2].copy())
 
     out, screen = tmp_path / "pairs.h5", open_camera(recipe).screen
-    with pytest.raises(CameraError, match="16, 16.*32, 32.*Set the camera as it was"):
+    with pytest.raises(CameraError, match=r"16, 16.*32, 32.*Set the camera as it was"):
         session(recipe, out, Binning(recipe.rig, screen)).run()
     assert 0 < len(PairFile(out)) < 7
     assert session(recipe, out).run() == 7
