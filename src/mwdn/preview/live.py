@@ -18,7 +18,6 @@ from mwdn.preview.limits import RefusedError
 from mwdn.preview.live_pictures import LivePicture, LivePictures, finite
 from mwdn.preview.live_settings import CAMERA, LiveSettings
 from mwdn.preview.metrics import Metrics
-from mwdn.runtime.devices import select_device
 from mwdn.runtime.streams import latest_results
 from mwdn.runtime.threads import usable_processors
 
@@ -62,13 +61,14 @@ class Live:
     ) -> None:
         self.camera, self.calibration, self.folder, self.metrics = camera, calibration, folder, Metrics()
         self.pictures = LivePictures(calibration, LiveSettings(method), device, count=self._count)
-        self._retry_s, self._device = retry_s, select_device(device)
+        self._retry_s = retry_s
         self._lock, self._changed = threading.Lock(), threading.Event()
         self._wake: dict[int, Callable[[], None]] = {}
         self._thread: threading.Thread | None = None
         self._pending: dict[str, float] = {}
         self._is_recording = self._is_stopped = False
-        self._recorded, self._recording, self._refused = 0, "", ""
+        self._recorded: int | None = None  # frames of the recording that runs
+        self._recording = self._refused = ""
         self._newest: bytes | None = None
         self._picture: LivePicture | None = None
 
@@ -157,19 +157,19 @@ class Live:
     def _frames(self, recording: ExitStack) -> Iterator[Frame]:
         """All frames; settings change between them, and each is recorded if that is wanted."""
         recorder: Recorder | None = None
+        self._recorded = None
         while self._wake and not self._is_stopped:
             self._configure()
             frame = self.camera.read()
             if self._is_recording and recorder is None:
                 self._recording = time.strftime("recording-%Y%m%d-%H%M%S.h5", time.gmtime())
                 recorder = recording.enter_context(record(self.folder / self._recording, camera=self.camera.name))
-                self._recorded = 0
             if not self._is_recording and recorder is not None:
-                recorder = None
+                recorder = self._recorded = None
                 recording.close()
             if recorder is not None:
                 recorder.append(frame)
-                self._recorded += 1
+                self._recorded = len(recorder)
             yield frame
         recording.close()
 
@@ -186,24 +186,21 @@ class Live:
     def _results(self, recording: ExitStack) -> Generator["_Result", None, None]:
         """The newest picture each time.
 
-        On a CPU two frames are in progress at the same time, on half the processors each: that makes more pictures a
-        second than one frame on all of them, because most operations on a small picture gain nothing from a second
-        thread. A GPU works on one.
+        One frame is reconstructed at a time, on all processors: two frames at once would make no more pictures a
+        second, and each would be twice as late. The picture before is encoded meanwhile.
         """
-        workers = min(2, usable_processors()) if self._device.type == "cpu" else 1
-        threads = max(1, usable_processors() // workers)
-        return latest_results(self._begin, self._frames(recording), workers=workers, threads=threads)
+        return latest_results(self._begin, self._frames(recording), workers=2, threads=usable_processors())
 
     def _begin(self, frame: Frame) -> Callable[[], "_Result"]:
-        start, finish = time.time(), self.pictures.begin(frame)
+        start, picture = time.time(), self.pictures.make(frame)
 
-        def work() -> _Result:
-            picture, encoding = finish(), time.perf_counter()
+        def encode() -> _Result:
+            encoding = time.perf_counter()
             encoded = picture.encode()
             self._count("encode", time.perf_counter() - encoding)
             return _Result(picture, encoded, start)
 
-        return work
+        return encode
 
     def _show(self, results: Iterator["_Result"]) -> None:
         times: deque[float] = deque(maxlen=RATE_FRAMES)
@@ -230,7 +227,7 @@ class Live:
             "exposure_s": finite(frame.exposure_s),
             "gain": finite(frame.gain),
             "refused": self._refused or self.pictures.refused or picture.wrong,
-            "recorded": self._recorded if self._is_recording else None,
+            "recorded": self._recorded,
             "recording": self._recording,
             "method": settings.method,
             "options": settings.options,

@@ -172,9 +172,7 @@ def update_scene(state: State, problem: Problem, filters: Filters) -> State:
         prior = divergence(state.gradient_target).mul_(filters.gradient_weight).add_(prior)
     V = spectrum(prior, problem.grid).mul_(filters.prior).addcmul_(filters.previous, state.V)
     del prior
-    correction = spectrum(state.data_target - state.Hv, problem.grid)
-    V.add_(correction.mul_(filters.data))
-    del correction
+    V.addcmul_(spectrum(state.data_target - state.Hv, problem.grid), filters.data)
     Hv = inverse_spectrum(problem.transfer * V, problem.grid, problem.sensor)
     return state._replace(v=inverse_spectrum(V, problem.grid, problem.grid), V=V, Hv=Hv)
 

@@ -6,7 +6,7 @@ const WORDS = { good: "good", doubt: "doubtful", unknown: "cannot tell", bad: "b
 
 // "psf, little explained" as a title.
 function titled(text) {
-  const words = text.replace("psf", "PSF").replaceAll("-", " ");
+  const words = text.replace("psf", "PSF").replace("little-", "detail ").replaceAll("-", " ");
   return words[0].toUpperCase() + words.slice(1);
 }
 
