@@ -8,7 +8,7 @@ from torch.nn import functional as F
 
 from cameras import contour_psf
 from mwdn import Calibration, Reconstructor, fourier
-from mwdn.optics.room_light import even_light, sloping_light
+from mwdn.optics.room_light import even_light, sloping_light, spot_light
 from mwdn.solvers import Pyramid, find_room_light
 
 SIZE = 48, 64
@@ -40,6 +40,15 @@ def test_known_light_over_a_scene_on_dark(psf, scene, light, error):
     assert float(off) < error
     assert float(found.share) == pytest.approx(float(light.mean() / (measurement + light).mean()), abs=0.05)
     assert (found.background >= 0).all()
+
+
+@pytest.mark.parametrize(("centre", "sigma", "error"), [((0.4, 0.6), 0.15, 0.05), ((0.7, 0.2), 0.11, 0.15)])
+def test_a_known_spot_in_three_colours(psf, scene, centre, sigma, error):
+    """Though its light is the brightest on the sensor."""
+    colour = torch.tensor([1.3, 1.0, 0.7])[:, None, None]
+    measurement, light = lit(scene, psf, 0.3 * colour * spot_light(SIZE, centre, sigma))
+    found = find_room_light(measurement + light, psf)
+    assert float((found.background - light).norm() / light.norm()) < error
 
 
 def test_a_scene_on_dark_keeps_its_light(psf, scene):

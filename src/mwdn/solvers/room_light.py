@@ -1,10 +1,11 @@
 """Find the light of the room in a capture: smooth light on the sensor that has not come from the scene.
 
-The capture b is a scene v through the PSF, and a background B c of even light and a slope:
+The capture b is a scene v through the PSF, and a background B c of even light and a slope, after a spot of light has
+been subtracted (`mwdn.solvers.light_spot`):
 
 1. ``b = C H v + B c + noise`` with ``v >= 0`` and ``B c >= 0``. C crops to the sensor.
-2. ``r(c) = b - B c - C H v(c)``, where v(c) is the best scene for this background, after `ITERATIONS` of ADMM from a
-   dark scene. ``E(c) = |r(c)|^2 / pixels``, in units of the mean measurement.
+2. ``r(c) = b - B c - C H v(c)``, where v(c) is the best scene for this background (`mwdn.solvers.unexplained`).
+   ``E(c) = |r(c)|^2 / pixels``, in units of the mean measurement.
 
 Scenes can imitate smooth light, by a veil and by light from outside the frame, so E is flat where c has too little of
 it. Too much of it cannot be compensated, because light is not negative: beyond the true background E rises steeply.
@@ -14,8 +15,9 @@ under the capture, by Gauss-Newton steps that eliminate the scene (variable proj
 3. ``d = argmin |S^-1 d|^2`` such that ``|r + J d|^2 / pixels <= E(0) + (t |J_0|)^2``, then ``c <- c + d``. The finite
    differences ``J = dr / dc`` have a new scene for each c; J_0 is that of the even term at the first step.
 
-A wider choice of backgrounds, with bumps, would take the light of an object in the middle of the frame: one capture
-cannot tell them apart. Everything happens in coarse pixels, for each colour by itself.
+A wider choice of backgrounds, with bumps, would take the light of an object in the middle of the frame: with the six
+cosines up to a whole period in place of these three, photographs that fill the frame lose half of their light, and E is
+as small as at the truth. Everything happens in coarse pixels, for each colour by itself; a spot has one shape in all.
 """
 
 import math
@@ -29,32 +31,28 @@ from mwdn.errors import checked
 from mwdn.fourier.convolution import check_fit
 from mwdn.optics.psf import checked_psf
 from mwdn.solvers.alignment import halve_psf
+from mwdn.solvers.light_spot import find_spot
 from mwdn.solvers.pyramid import halve
-from mwdn.solvers.splitting import Penalties, Problem, initial_state, make_filters, update_copies, update_scene
+from mwdn.solvers.unexplained import DELTA, energy, unexplained
 from mwdn.types import Measurement, Psf, Size
 
 PIXELS = 4000
 """The capture is halved until it has at most so many pixels."""
 
-ITERATIONS = 40
-"""Of ADMM for each scene. With 20 the best scenes are not reached; with 60 photographs that fill the frame lose twice
-as much of their own light."""
-
 STEPS = 3
 """Gauss-Newton steps: an object on dark needs one, a photograph that fills the frame all three."""
 
 TOLERANCE = 0.02
-"""The t of equation (3): light by which the background may exceed what fits, as a part of the mean measurement."""
+"""The t of equation (3): light by which the background may exceed what fits, as a part of the mean measurement. With
+0.03 photographs that fill the frame lose a tenth more of their light."""
 
 FAINT = 0.08
-"""Smaller shares of the light stay in the measurement: as much is found without a room's light in photographs that fill
-the frame."""
+"""Smaller shares of even and sloping light stay in the measurement: as much is found without a room's light in
+photographs that fill the frame."""
 
 ABOVE = 0.002
 """Weight of light above the largest plane below a capture; that below it has a weight of 1."""
 
-_PENALTIES = Penalties(0.15, 0.0, 0.6)
-_DELTA = -0.05, 0.05, 0.05  # finite differences; less even light, because more is impossible at first
 _SPREAD = 1.0, 0.15, 0.15  # S: changes of the even light are taken first
 
 
@@ -63,7 +61,7 @@ class RoomLight(NamedTuple):
 
     Args:
         background: (B, C, H, W), not negative, in units of the measurement: subtract it.
-        share: (B,), part of each measurement's light, 0 or `FAINT` to 1.
+        share: (B,), part of each measurement's light, 0 to 1.
     """
 
     background: Measurement
@@ -73,7 +71,7 @@ class RoomLight(NamedTuple):
 @checked
 @torch.no_grad()
 def find_room_light(measurement: Measurement, psf: Psf) -> RoomLight:
-    """Find even light and a slope of light in each capture, from the capture alone.
+    """Find even light, a slope and a narrow spot of light in each capture, from the capture alone.
 
     Args:
         measurement: (B, C, H, W), a tensor as `mwdn.Calibration.correct` returns it.
@@ -94,35 +92,39 @@ def find_room_light(measurement: Measurement, psf: Psf) -> RoomLight:
     while b.shape[-2] * b.shape[-1] > PIXELS:
         b, psf = halve(b), halve_psf(psf)
     mean = b.mean((-2, -1), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
-    psf = psf.expand(batch, channels, -1, -1).reshape(-1, 1, *psf.shape[-2:])
-    c = _search((b / mean).reshape(-1, 1, *b.shape[-2:]), psf / psf.sum((-2, -1), keepdim=True))
-    background = _light(c, size).reshape(batch, channels, *size).mul_(mean).clamp_(min=0)
-    share = background.mean((1, 2, 3)) / mean.mean((1, 2, 3))
-    share = torch.where((share >= FAINT) & (share < 1), share, 0.0)  # NaN is none
+    psf = psf.expand(batch, channels, -1, -1)
+    y, psf = b / mean, psf / psf.sum((-2, -1), keepdim=True)
+    spot = find_spot(y, psf)
+    y = y - spot.light((y.shape[-2], y.shape[-1]))
+    c = _search(y.reshape(-1, 1, *y.shape[-2:]), psf.reshape(-1, 1, *psf.shape[-2:]))
+    plane = (c @ _planes(size, c.device).flatten(1)).reshape(batch, channels, *size).mul_(mean).clamp_(min=0)
+    whole = mean.mean((1, 2, 3))
+    plane = torch.where((plane.mean((1, 2, 3)) >= FAINT * whole)[:, None, None, None], plane, 0.0)
+    background = plane + spot.light(size) * mean
+    share = background.mean((1, 2, 3)) / whole
+    share = torch.where((share > 0) & (share < 1), share, 0.0)  # NaN is none
     return RoomLight(torch.where(share[:, None, None, None] > 0, background, 0.0).to(measurement.dtype), share)
 
 
-def _light(c: Tensor, size: Size) -> Tensor:
-    """``B c`` (n, 1, H, W) of coefficients (n, 3): even light, and cosines of half a period down and to the right."""
+def _planes(size: Size, device: torch.device) -> Tensor:
+    """Even light, and cosines of half a period down and to the right: (3, H, W), each of mean square 1."""
     down, right = (
-        math.sqrt(2) * torch.cos((torch.arange(length, device=c.device) + 0.5) * (math.pi / length)) for length in size
+        math.sqrt(2) * torch.cos((torch.arange(length, device=device) + 0.5) * (math.pi / length)) for length in size
     )
-    even, rows, columns = c[:, None, None, :].unbind(-1)
-    return (even + rows * down[:, None] + columns * right)[:, None]
+    return torch.stack([torch.ones(size, device=device), down[:, None].expand(size), right.expand(size)])
 
 
 def _search(b: Measurement, psf: Psf) -> Tensor:
     """Equation (3) for measurements (n, 1, h, w) of mean 1 through PSFs (n, 1, h, w): coefficients (n, 3)."""
-    size, count = (b.shape[-2], b.shape[-1]), len(_DELTA) + 1
-    delta = b.new_tensor(_DELTA)
-    c = _largest_plane(b)
-    limit = _residual(b, psf).square().mean(1)
+    size = b.shape[-2], b.shape[-1]
+    B, count = _planes(size, b.device), 4
+    delta = b.new_tensor([-DELTA, DELTA, DELTA])  # less even light, because more is impossible at first
+    c = _largest_plane(b, B)
+    limit = energy(unexplained(b, psf))
     offsets = torch.cat([delta.new_zeros(1, 3), delta.diag()])
     for step in range(STEPS):
-        trials = _light((c[:, None] + offsets).flatten(0, 1), size)
-        r = _residual(b.repeat_interleave(count, 0) - trials, psf.repeat_interleave(count, 0)).reshape(
-            len(b), count, -1
-        )
+        trials = ((c[:, None] + offsets) @ B.flatten(1)).reshape(-1, count, *size)
+        r = unexplained(b - trials, psf.expand(-1, count, -1, -1))
         J = (r[:, 1:] - r[:, :1]) / delta[:, None]
         if step == 0:
             limit = limit + TOLERANCE**2 * J[:, 0].square().mean(1)
@@ -150,26 +152,16 @@ def _gauss_newton_step(J: Tensor, r: Tensor, limit: Tensor) -> Tensor:
     return torch.where((energy > limit)[:, None], spread * d, 0.0)
 
 
-def _largest_plane(b: Measurement) -> Tensor:
+def _largest_plane(b: Measurement, B: Tensor) -> Tensor:
     """Coefficients (n, 3) of the largest plane of light below captures (n, 1, h, w), whose noise is smoothed.
 
     Asymmetric least squares: what is above the plane hardly counts.
     """
     y = F.avg_pool2d(F.pad(b, (1, 1, 1, 1), mode="replicate"), 3, 1).flatten(1)
-    X = torch.cat([_light(one[None], (b.shape[-2], b.shape[-1])) for one in torch.eye(3, device=b.device)]).flatten(1)
+    X = B.flatten(1)
     weight, c = torch.ones_like(y), y
     for _ in range(15):
         XW = X * weight[:, None]
         c = torch.linalg.solve(XW @ X.mT, XW @ y[..., None])[..., 0]
         weight = torch.where(c @ X < y, ABOVE, 1.0)
     return c
-
-
-def _residual(b: Measurement, psf: Psf) -> Tensor:
-    """Equation (2) of measurements without their background, (n, pixels)."""
-    norm = psf.square().sum((-2, -1), keepdim=True).sqrt()  # the penalties are for a PSF of unit norm
-    problem = Problem.from_psf(b, psf / norm)
-    filters, state = make_filters(problem, _PENALTIES, smooth=False), initial_state(problem, smooth=False)
-    for _ in range(ITERATIONS):
-        state = update_scene(update_copies(state, problem, _PENALTIES, 0.0, "colour"), problem, filters)
-    return (b - state.Hv).flatten(1)

@@ -1,0 +1,44 @@
+"""What no scene explains of a capture, at the size at which `mwdn.solvers.room_light` looks for a background."""
+
+import torch
+from torch import Tensor
+
+from mwdn.solvers.splitting import Penalties, Problem, initial_state, make_filters, update_copies, update_scene
+from mwdn.types import Measurement, Psf
+
+ITERATIONS = 40
+"""Of ADMM for each scene. With 20 the best scenes are not reached; with 60 photographs that fill the frame lose twice
+as much of their own light."""
+
+DELTA = 0.05
+"""Light by which backgrounds differ in finite differences, as a part of the mean measurement."""
+
+_PENALTIES = Penalties(0.15, 0.0, 0.6)
+
+
+def unexplained(b: Measurement, psf: Psf) -> Tensor:
+    """``b - C H v`` with the best scene ``v >= 0`` after `ITERATIONS` from a dark one: (B, C, pixels).
+
+    Args:
+        b: (B, C, h, w), of mean 1, less a background.
+        psf: (B, C, h, w).
+    """
+    planes, h = b.reshape(-1, 1, *b.shape[-2:]), psf.reshape(-1, 1, *psf.shape[-2:])
+    norm = h.square().sum((-2, -1), keepdim=True).sqrt()  # the penalties are for a PSF of unit norm
+    problem = Problem.from_psf(planes, h / norm)
+    filters, state = make_filters(problem, _PENALTIES, smooth=False), initial_state(problem, smooth=False)
+    for _ in range(ITERATIONS):
+        state = update_scene(update_copies(state, problem, _PENALTIES, 0.0, "colour"), problem, filters)
+    return (planes - state.Hv).reshape(*b.shape[:2], -1)
+
+
+def energy(r: Tensor) -> Tensor:
+    """Mean square (B,) of what is unexplained (B, C, pixels), over all colours."""
+    return r.square().mean((1, 2))
+
+
+def differences(b: Measurement, psf: Psf, lights: Tensor) -> Tensor:
+    """Finite differences (B, T, pixels) of `unexplained`, of the mean colour, for more of each light (T, h, w)."""
+    trials = b.mean(1, keepdim=True) - DELTA * torch.cat([torch.zeros_like(lights[:1]), lights])
+    r = unexplained(trials, psf.mean(1, keepdim=True).expand(-1, trials.shape[1], -1, -1))
+    return (r[:, 1:] - r[:, :1]) / DELTA
