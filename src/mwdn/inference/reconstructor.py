@@ -44,8 +44,8 @@ class Reconstructor:
         white_balance: of the pictures, see `mwdn.calibration.white_balance`; that of the calibration unless given.
         ensemble: average a network's results for the measurement and its three mirror images, see
             `mwdn.inference.ensemble.Ensemble`. It takes four times as long; for a network that takes any PSF.
-        room_light: whether to find and subtract even or sloping light of the room in each measurement first, see
-            `mwdn.solvers.room_light`.
+        room_light: whether to find and subtract even light, a slope and a narrow spot of light of the room in each
+            measurement first, see `mwdn.solvers.room_light`.
         **options: of a solver given by its name, for example ``regularisation=1e-4``.
 
     It can be copied and pickled if its method can.
