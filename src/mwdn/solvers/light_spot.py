@@ -7,7 +7,8 @@ the energy ``|r|^2``. The spot that explains most in all colours together is tak
 shapes: thousands of them cost less than one iteration of the solver. (The code keeps J transposed, one row a cosine.)
 
 A scene imitates the smoothest part of a spot, which is therefore not in r. It follows from the rest through the shape:
-a spot has five numbers, not one for each cosine. The narrower it is, the better it is known.
+a spot has five numbers, not one for each cosine. The narrower it is, the better it is known; a spot as wide as the PSF
+is not seen.
 """
 
 import math
