@@ -438,28 +438,36 @@ def test_without_trust(run, camera):
 # --- The others ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("pictures", [PICTURES[-1:], pytest.param(PICTURES, marks=pytest.mark.acceptance)])
-def test_demo(run, tmp_path, pictures):
-    """With one picture here; each takes ten seconds."""
+@pytest.mark.parametrize(
+    ("pictures", "methods"),
+    [(PICTURES[-1:], ("admm", "wiener")), pytest.param(PICTURES, METHODS, marks=pytest.mark.acceptance)],
+)
+def test_demo(run, tmp_path, monkeypatch, pictures, methods):
+    """With one picture and the classical methods here; a picture by all of them takes ten seconds."""
+    monkeypatch.setattr("mwdn.cli.demo.METHODS", methods)
     options = [word for name in pictures for word in ("--pictures", name)]
     code, out, err = run("demo", "--out", tmp_path / "demo", *options)
     assert (code, err) == (0, "")
     assert names(tmp_path / "demo") == ["comparison.png", "index.html", "psf.png"]
     rows = {
-        words[0]: dict(zip(METHODS, map(float, words[1:]), strict=True))
+        words[0]: dict(zip(methods, map(float, words[1:]), strict=True))
         for words in (re.findall(r"[\w.]+", line) for line in out.splitlines() if line.startswith("│"))
     }
     assert set(rows) == set(pictures)
-    assert all(row["universal"] > 24.5 for row in rows.values()), rows
+    assert all(row.get("universal", 25) > 24.5 for row in rows.values()), rows
     assert all(row["admm"] > 24 for row in rows.values()), rows
-    assert all(row["admm"] > row["fista"] > row["wiener"] > 15 for row in rows.values()), rows
+    assert all(row["admm"] > row.get("fista", 23.5) > row["wiener"] > 15 for row in rows.values()), rows
     page = (tmp_path / "demo" / "index.html").read_text(encoding="utf-8")
     assert all(f"<th>{name}</th>" in page for name in rows)
     assert all(f"<td>{value:.2f}</td>" in page for row in rows.values() for value in row.values())
     assert 'src="psf.png"' in page
     assert 'src="comparison.png"' in page
     assert str(tmp_path / "demo" / "index.html") in out  # on one line, to be clicked or copied
-    assert read_frame(tmp_path / "demo" / "comparison.png").shape == (26 + len(pictures) * 246, 7 * 246, 3)
+    assert read_frame(tmp_path / "demo" / "comparison.png").shape == (
+        26 + len(pictures) * 246,
+        (2 + len(methods)) * 246,
+        3,
+    )
 
 
 def test_completion_knows_commands_and_options(run, tmp_path, monkeypatch):

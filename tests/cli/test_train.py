@@ -19,7 +19,7 @@ from mwdn.networks import build
 from mwdn.weights.checkpoint import save_network
 
 RECIPE = """
-network = { name = "wiener-bank", width = 4 }
+network = { name = "wiener-bank", width = 4, finest = 0, align = false }
 schedule = { steps = 9, batch = 2, validate_every = 2, validation = 2, bfloat16 = false }
 placement = { extent = [0.4, 0.4] }
 """
@@ -69,7 +69,7 @@ def test_any_key_of_the_recipe_by_its_name(run, camera):
     schedule = recipe["schedule"]
     assert [schedule[key] for key in ("learning_rate", "seed", "crop", "pool")] == [3e-4, -2, 16, 8]
     assert (recipe["mismatch"]["blur_px"], recipe["placement"]["extent"]) == (1.0, [0.3, 0.5])
-    assert recipe["network"] == {"name": "wiener-bank", "width": 6}
+    assert recipe["network"] == {"name": "wiener-bank", "width": 6, "finest": 0, "align": False}
     for wrong, said in (
         ("--learnin-rate 1", "No key of [schedule] named 'learnin_rate'. Did you mean 'learning_rate'?"),
         ("--sensor.iso 100", "No key of [sensor] named 'iso'"),

@@ -181,7 +181,7 @@ def test_a_learned_wiener_filter_reaches_its_optimum(generator):
     best = []
     with torch.no_grad():
         network.filter.log_weight.fill_(0)
-        for log_ratio in torch.arange(-8, 6, 0.25):
+        for log_ratio in torch.arange(-8, 6, 0.5):
             network.filter.log_regularisation.fill_(log_ratio)
             estimate = network(measurement, psf)
             gain = (estimate * scene).sum() / estimate.square().sum()
