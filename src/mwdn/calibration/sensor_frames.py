@@ -14,7 +14,7 @@ from mwdn.calibration.frame_operations import demosaic
 from mwdn.calibration.hot_pixels import find_dead_pixels, find_hot_pixels
 from mwdn.calibration.photon_transfer import SAME_LIGHT, PhotonTransfer, photon_transfer
 from mwdn.errors import ParameterError
-from mwdn.types import Image
+from mwdn.types import Frame, Image
 
 LEAST_RESPONSE = 0.1
 """Smallest value of a flat field: a pixel with less light is replaced, not amplified."""
@@ -151,21 +151,8 @@ def _with_flats(sensor: SensorFrames, files: SensorFiles, frames: FrameFormat) -
         dark = average_frames(darks, frames, names=[path.name for path in dark_paths], kind="dark").image
     else:
         notes.append("Without dark frames the flat field holds the black level, too: `--dark`.")
-    levels = [float(frames.normalise(frame).mean()) - (0.0 if dark is None else float(dark.mean())) for frame in flats]
-    total, weight = None, 0.0
-    for start, stop in _runs(levels):
-        average = average_frames(flats[start:stop], frames, names=names[start:stop], kind="flat", dark=dark)
-        notes += average.rejected.values()
-        if float(average.saturated.float().mean()) > 1e-3:
-            notes.append(f"`{names[start]}` is saturated, and left out of the flat field.")
-            continue
-        # Frames of more light have less noise, relative to their level, with the square root of the electrons.
-        part = average.count * levels[start]
-        total = part * average.image / levels[start] + (0.0 if total is None else total)
-        weight += part
-    if total is None or weight <= 0:
-        raise ParameterError("All flat frames are saturated or dark. Expose them to about half of the full scale.")
-    flat = total / weight
+    flat, left_out = _mean_flat(flats, names, frames, dark)
+    notes += left_out
     defects = (torch.zeros(1, 1, *flat.shape[-2:]) > 0) if defects is None else defects
     defects = defects | find_dead_pixels(flat.mean((0, 1)), cell=frames.cell)
     colour = demosaic(flat, frames.mosaic) if frames.mosaic else flat
@@ -178,6 +165,31 @@ def _with_flats(sensor: SensorFrames, files: SensorFiles, frames: FrameFormat) -
     response = relative_response(flat, frames.cell) if files.flat_field else sensor.corrections.flat
     corrections = Corrections(response, defects)
     return replace(sensor, corrections=corrections, transfer=transfer, flat_colour=tint, notes=tuple(notes))
+
+
+def _mean_flat(
+    flats: Sequence[Frame], names: Sequence[str], frames: FrameFormat, dark: Image | None
+) -> tuple[Image, list[str]]:
+    """Mean of flat frames over their levels, and a sentence for each that is left out.
+
+    Raises:
+        ParameterError: all are saturated or dark.
+    """
+    levels = [float(frames.normalise(frame).mean()) - (0.0 if dark is None else float(dark.mean())) for frame in flats]
+    total, weight, notes = None, 0.0, list[str]()
+    for start, stop in _runs(levels):
+        average = average_frames(flats[start:stop], frames, names=names[start:stop], kind="flat", dark=dark)
+        notes += average.rejected.values()
+        if float(average.saturated.float().mean()) > 1e-3:
+            notes.append(f"`{names[start]}` is saturated, and left out of the flat field.")
+            continue
+        # Frames of more light have less noise, relative to their level, with the square root of the electrons.
+        part = average.count * levels[start]
+        total = part * average.image / levels[start] + (0.0 if total is None else total)
+        weight += part
+    if total is None or weight <= 0:
+        raise ParameterError("All flat frames are saturated or dark. Expose them to about half of the full scale.")
+    return total / weight, notes
 
 
 def _runs(levels: Sequence[float]) -> list[tuple[int, int]]:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from mwdn.capture.screen import Picture, Place, Screen
+from mwdn.capture.screen import Picture, Screen
 from mwdn.errors import ParameterError, UnknownNameError
 
 SQUARES = 7
@@ -106,14 +106,3 @@ def pattern(name: str, size: tuple[int, int]) -> Picture:
     if name not in PATTERNS:
         raise UnknownNameError("pattern", name, PATTERNS)
     return PATTERNS[name](size)
-
-
-def on_display(name: str, screen: Screen, place: Place) -> Picture:
-    """A canvas with a pattern at the place of the pictures; ``"dark"``, ``"white"`` and ``"point"`` for the whole."""
-    from mwdn.capture.screen import put
-
-    if name == "point":
-        return point(screen)
-    if name in ("dark", "white"):
-        return pattern(name, (screen.height_px, screen.width_px))
-    return put(pattern(name, (place.height, place.width)), place, screen)
