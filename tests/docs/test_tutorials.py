@@ -1,4 +1,4 @@
-"""The tutorials have their transcripts and pictures; walking them again is an acceptance test."""
+"""The tutorials and the pages of the commands have their transcripts and pictures; walking them again is an acceptance test."""
 
 import importlib.util
 import re
@@ -14,7 +14,7 @@ PAGES = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
 
 @pytest.fixture(scope="module")
 def tutorials():
-    spec = importlib.util.spec_from_file_location("tutorials", ROOT / "docs" / "tutorials.py")
+    spec = importlib.util.spec_from_file_location("walk", ROOT / "docs" / "walk.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

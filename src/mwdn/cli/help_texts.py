@@ -28,8 +28,12 @@ class HelpTexts(DefaultFormatter):
 
     def __call__(self, console: Console, options: ConsoleOptions, panel: HelpPanel) -> None:
         """Print one panel: the options, or the arguments."""
+        super().__call__(console, options, self.panel_as_typed(panel))
+
+    def panel_as_typed(self, panel: HelpPanel) -> HelpPanel:
+        """The panel with the texts that are printed."""
         own = {name for entry in panel.entries for name in entry.names}
-        super().__call__(console, options, panel.copy(entries=[self._as_typed(entry, own) for entry in panel.entries]))
+        return panel.copy(entries=[self._as_typed(entry, own) for entry in panel.entries])
 
     def _as_typed(self, entry: HelpEntry, own: Collection[str]) -> HelpEntry:
         from rich.markdown import Markdown  # takes 0.1 s
