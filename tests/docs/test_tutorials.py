@@ -1,4 +1,4 @@
-"""The tutorials and the pages of the commands have their transcripts and pictures; walking them again is an acceptance test."""
+"""Tutorials have their transcripts and pictures; walking them and the commands' pages is an acceptance test."""
 
 import importlib.util
 import re
@@ -53,10 +53,11 @@ def test_commands_of_another_page_come_first_and_are_not_shown(tutorials, tmp_pa
     assert tutorials.run("```sh\ncat file\n```\n", tmp_path, "```sh\necho before\necho text > file\n```\n") == ["text"]
 
 
+WALKED = [*(f"tutorials/{path.stem}" for path in PAGES if path.stem != "index"), *(f"commands/{n}" for n in COMMANDS)]
+
+
 @pytest.mark.acceptance
-@pytest.mark.parametrize(
-    "name", [*(f"tutorials/{path.stem}" for path in PAGES if path.stem != "index"), *(f"commands/{n}" for n in COMMANDS)]
-)
+@pytest.mark.parametrize("name", WALKED)
 def test_walked_again_a_page_differs_in_numbers_only(tutorials, name):
     if name == "commands/doctor":
         pytest.skip("its output describes the machine")
