@@ -30,10 +30,12 @@ COMMANDS = re.compile(r"^```sh\n(.*?)^```\n(?:\n```text\n(.*?)^```\n)?", re.MULT
 PICTURE = re.compile(r'!\[[^\]]*\]\(([\w-]+\.webp) "([^"]+)"\)')
 NUMBER = re.compile(r"-?\b[0-9a-f]{8,}\b|-?\d[\d.,:]*(?:e-?\d+)?")
 """A hash, or a number."""
-PROGRESS = re.compile(r"[A-Z]\w+: +\d+%")
+PROGRESS = re.compile(r"[\w :-]+: +\d+%")
 """A line that a long command prints once in a while."""
 
 END = "--- end of block"
+PLACE = "/camera"
+"""Stands for the folder of the walk in what is printed."""
 WIDTH = 1000
 """Pixels; a wider picture is reduced."""
 
@@ -65,7 +67,7 @@ def run(page: str, folder: Path, first: str = "") -> list[str]:
     *printed, rest = done.stdout.split(f"{END}\n")
     if done.returncode or len(printed) != len(before) + len(blocks):
         raise RuntimeError(f"block {len(printed) + 1} ended with {done.returncode}:\n{rest}")
-    return [_without_progress(text) for text in printed[len(before) :]]
+    return [_without_progress(text.replace(str(folder), PLACE)) for text in printed[len(before) :]]
 
 
 def _without_progress(text: str) -> str:
