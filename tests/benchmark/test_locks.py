@@ -32,7 +32,7 @@ def at_work(folder, seconds):
 
 def test_each_part_is_done_once_and_all_wait_for_the_last(tmp_path):
     workers = [at_work(tmp_path, 0.2) for _ in range(2)]
-    said = [worker.communicate(timeout=120) for worker in workers]
+    said = [worker.communicate(timeout=600) for worker in workers]
     assert [error for _, error in said] == ["", ""]
     assert all(sorted(out.split()) == ["a", "b", "c", "d"] for out, _ in said)
 

@@ -93,7 +93,7 @@ def import_module(name):
 app.import_module = import_module
 main({line.split()})
 """
-    done = subprocess.run([sys.executable, "-c", begin], capture_output=True, text=True, check=False, timeout=120)
+    done = subprocess.run([sys.executable, "-c", begin], capture_output=True, text=True, check=False, timeout=600)
     assert (done.returncode, len(done.stderr.splitlines())) == (code, 1)
     assert done.stderr.startswith("Interrupted.")
     assert done.stderr.endswith(f"{message}\n")
@@ -107,7 +107,7 @@ def test_nobody_reads_the_output(line):
     command = [sys.executable, "-m", "mwdn", *line.split()]
     wrong = line == "nonsense"  # the error goes to a closed pipe
     done = subprocess.run(
-        command, stdout=pipe, stderr=pipe if wrong else subprocess.PIPE, text=True, check=False, timeout=120
+        command, stdout=pipe, stderr=pipe if wrong else subprocess.PIPE, text=True, check=False, timeout=600
     )
     os.close(pipe)
     assert (done.returncode, done.stderr or "") == (141, "")
@@ -119,6 +119,6 @@ def test_no_room_for_the_output(line):
     """As in `mwdn recipes quick-cpu > mine.toml` on a full disk, which ended in a traceback and left half a file."""
     with FULL.open("w") as full:
         command = [sys.executable, "-m", "mwdn", *line.split()]
-        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False, timeout=120)
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False, timeout=600)
     message = "Error: The output cannot be written: No space left on device. Make room.\n"
     assert (done.returncode, done.stderr) == (2, message)

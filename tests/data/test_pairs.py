@@ -186,7 +186,7 @@ def test_a_forked_process_opens_the_file_anew(pairs):
     queue = context.Queue()
     process = context.Process(target=_child, args=(file, queue))
     process.start()
-    assert queue.get(timeout=60) == (False, True, False)
+    assert queue.get(timeout=600) == (False, True, False)
     process.join()
     assert bool(file._file)
 
