@@ -20,7 +20,8 @@ def commands(page):
     text = page.read_text(encoding="utf-8")
     lines = [line for block in BLOCK.findall(text) for line in block.replace("\\\n", " ").splitlines()]
     lines += re.findall(r"`(mwdn [^`]*)`", text) if page.name == "reproduce.md" else []
-    return [END.sub("", line.strip()) for line in lines if line.strip().startswith("mwdn ")]
+    right = [line.strip() for line in lines if "|| echo" not in line]  # the others show an error
+    return [END.sub("", line) for line in right if line.startswith("mwdn ")]
 
 
 def test_commands_are_found():
