@@ -127,7 +127,7 @@ def test_dark_capture_of_odd_size_has_no_pose(psf):
 
 
 def test_what_is_no_fall_off_stays_in_the_residual(generator):
-    """A fall-off of half the bound is taken out, on the sensor; one of four times the bound is not."""
+    """A fall-off of half the bound is taken out, on the sensor; where one pose has four times the bound, none is."""
     size, grid = (30, 40), (36, 44)
     prediction = torch.zeros(1, 3, *grid)
     prediction[..., : size[0], : size[1]] = torch.randn(1, 3, *size, generator=generator)
@@ -135,6 +135,7 @@ def test_what_is_no_fall_off_stays_in_the_residual(generator):
     slope = torch.nn.functional.pad(x, (0, grid[1] - size[1], 0, grid[0] - size[0])) * prediction
     beyond = torch.zeros_like(prediction)
     beyond[..., 33, 42] = 1.0
-    small, large = (alignment._without_fall_off(c * slope + beyond, prediction, size) for c in (0.12, 1.0))
-    assert small.abs().max() < 1e-4
-    assert torch.equal(large, slope + beyond)
+    poses = torch.cat([c * slope + beyond for c in (0.12, 0.1, 0.12, 1.0)])  # two of each of two captures
+    residuals = alignment._without_fall_off(poses, prediction.expand(4, -1, -1, -1), size, 2)
+    assert residuals[:2].abs().max() < 1e-4
+    assert torch.equal(residuals[2:], poses[2:])

@@ -188,16 +188,17 @@ def _residual(measurement: Tensor, psf: Psf, poses: Tensor) -> Tensor:
     r = inverse_spectrum(estimate.residual_spectrum * high, grid, grid)
     b = inverse_spectrum(spectrum(measurement, grid) * high, grid, grid)  # the prediction is b - r, high-passed
     size = measurement.shape[-2], measurement.shape[-1]
-    return _without_fall_off(r, b.repeat_interleave(count, 0) - r, size).reshape(len(measurement), count, -1)
+    return _without_fall_off(r, b.repeat_interleave(count, 0) - r, size, count).reshape(len(measurement), count, -1)
 
 
-def _without_fall_off(whole: Tensor, prediction: Tensor, size: Size) -> Tensor:
+def _without_fall_off(whole: Tensor, prediction: Tensor, size: Size, count: int) -> Tensor:
     """The part of a residual r that no fall-off explains, on the sensor: ``r - sum_k a_k q_k p``, a by least squares.
 
     The residual and the high-passed prediction are given on a grid (N, C, rows, columns) that begins with the sensor.
     The polynomials q are smooth, so that the high-passed product with a prediction is q times the high-passed
-    prediction p. A fall-off of more than `_MOST_FALL_OFF` is not a sensor's: such a residual stays as it is, with what
-    the high pass spreads beyond the sensor.
+    prediction p. A fall-off of more than `_MOST_FALL_OFF` is not a sensor's: if one of a capture's ``count`` poses has
+    it, its residuals stay as they are, with what the high pass spreads beyond the sensor. All poses or none, because
+    differences between residuals must come from the poses.
     """
     height, width = size
     r, p = whole[..., :height, :width], prediction[..., :height, :width]
@@ -208,11 +209,11 @@ def _without_fall_off(whole: Tensor, prediction: Tensor, size: Size) -> Tensor:
     normal = A @ A.mT
     ridge = (1e-6 * normal.diagonal(dim1=-2, dim2=-1).mean(-1)).clamp(min=1e-30)[:, None, None]
     a = torch.linalg.solve(normal + ridge * torch.eye(len(q)).to(r), A @ r.flatten(1)[..., None])
-    is_sensor = (a.abs().amax((1, 2)) < _MOST_FALL_OFF)[:, None, None, None]
+    is_sensor = (a.abs().amax((1, 2)) < _MOST_FALL_OFF).reshape(-1, count).all(1)
     unexplained = F.pad(
         r - (a.mT @ A)[:, 0].reshape(r.shape), (0, whole.shape[-1] - width, 0, whole.shape[-2] - height)
     )
-    return torch.where(is_sensor, unexplained, whole)
+    return torch.where(is_sensor.repeat_interleave(count)[:, None, None, None], unexplained, whole)
 
 
 def halve_psf(psf: Psf) -> Tensor:
