@@ -46,7 +46,7 @@ def with_ones(name, **options):
         ("pyramid", "d96460b3dc29312a"),
         ("wiener", "cf039080f5e5de60"),
         ("fista", "e077e8b3def31bac"),
-        ("universal", "216a0ac508ad3bcc"),
+        ("universal", "9f429ec8a73b2796"),
         ("universal-small", "77c994ba8a8c4766"),
     ],
 )
