@@ -64,12 +64,13 @@ def test_light_is_proportional_to_exposure_and_gain_and_saturates():
     camera = rig(white=0.4, **CLEAN)
     camera.show(white())
     frame = camera.read()
-    assert frame.array.max() == pytest.approx(0.4 * 65535, abs=2)
+    # The shot noise of 1e9 electrons is 2 counts.
+    assert frame.array.max() == pytest.approx(0.4 * 65535, abs=10)
     assert (frame.exposure_s, frame.gain, frame.bit_depth, frame.mosaic) == (EXPOSURE_S, 1.0, 16, None)
     camera.configure(2 * EXPOSURE_S)
-    assert camera.read().array.max() == pytest.approx(0.8 * 65535, abs=2)
+    assert camera.read().array.max() == pytest.approx(0.8 * 65535, abs=10)
     camera.configure(EXPOSURE_S, gain=2.0)
-    assert camera.read().array.max() == pytest.approx(0.8 * 65535, abs=2)
+    assert camera.read().array.max() == pytest.approx(0.8 * 65535, abs=10)
     camera.configure(gain=4.0)
     assert camera.read().array.max() == 65535
 

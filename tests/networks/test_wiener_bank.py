@@ -157,19 +157,3 @@ def test_no_frame_around_the_picture(generator):
         return float((folded[..., :2] - inside).square().mean().sqrt())
 
     assert contrast(corrected) < 0.3 * contrast(framed), (contrast(corrected), contrast(framed))
-
-
-@pytest.mark.parametrize("psf_channels", [1, 3])
-def test_colours_on_threads_of_their_own_are_those_of_one_thread(generator, request, psf_channels):
-    before = torch.get_num_threads()
-    request.addfinalizer(lambda: torch.set_num_threads(before))
-    network = build("wiener-bank", width=2, finest=4).eval()
-    psf = torch.rand(1, psf_channels, 64, 48, generator=generator) ** 8
-    measurement = torch.rand(2, 3, 64, 48, generator=generator)
-    estimates = []
-    for threads in (1, 2, 3):
-        torch.set_num_threads(threads)
-        with torch.inference_mode():
-            estimates.append(network.estimates(measurement, psf))
-    for each in estimates[1:]:
-        torch.testing.assert_close(each, estimates[0], rtol=1e-4, atol=1e-5)

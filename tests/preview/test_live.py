@@ -163,7 +163,7 @@ def test_defect_is_told_and_does_not_end_the_live_picture(live, viewer, monkeypa
     _, served = live
     until(viewer, lambda said: "error" not in said)
     with monkeypatch.context() as broken:
-        broken.setattr(served.pictures, "make", lambda frame: 1 / 0)
+        broken.setattr(served.pictures, "begin", lambda frame: 1 / 0)
         assert "ZeroDivisionError" in until(viewer, lambda said: "error" in said)["error"]
     until(viewer, lambda said: "error" not in said)
 

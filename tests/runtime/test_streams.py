@@ -12,9 +12,8 @@ import pytest
 import torch
 
 from mwdn import Calibration, Reconstructor
-from mwdn.runtime.iterations import iterations, watch_iterations
 from mwdn.runtime.streams import latest, latest_results, prefetch
-from mwdn.runtime.threads import in_threads, use_threads
+from mwdn.runtime.threads import use_threads
 from mwdn.solvers import Wiener
 
 WAIT = 30  # seconds until a test fails that should not have to wait
@@ -256,18 +255,6 @@ def test_threads_are_those_of_the_caller_alone():
     with ThreadPoolExecutor(4) as pool:
         assert list(pool.map(use, counts)) == counts
     assert (torch.get_num_threads(), new_thread()) == (mine, new)
-
-
-def test_parts_run_on_one_thread_each_and_the_first_one_reports():
-    def part(number):
-        for _ in iterations(2):
-            pass
-        return number, torch.get_num_threads(), torch.is_inference_mode_enabled()
-
-    reported = []
-    with torch.inference_mode(), watch_iterations(reported.append):
-        assert in_threads(part, [0, 1, 2]) == [(0, 1, True), (1, 1, True), (2, 1, True)]
-    assert reported == [0.5, 1.0]
 
 
 # --- Memory -------------------------------------------------------------------------------------------

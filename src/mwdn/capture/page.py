@@ -51,7 +51,8 @@ class PageDisplay(Display):
         token: str = "",
         show_s: float = SHOW_S,
     ) -> None:
-        self._uvicorn = [require(name, "page", purpose="The display page") for name in LIBRARIES][-1]
+        for name in LIBRARIES:
+            require(name, "page", purpose="The display page")
         check_token(host, token)
         self._cm = {"width_cm": width_cm, "height_cm": height_cm, "distance_cm": distance_cm}
         Screen(width_px=1, height_px=1, **self._cm)
@@ -65,7 +66,9 @@ class PageDisplay(Display):
         self._start()
 
     def _start(self) -> None:
-        config = self._uvicorn.Config(
+        import uvicorn
+
+        config = uvicorn.Config(
             self._hub.app(),
             ws="websockets-sansio",
             ws_max_size=MESSAGE_BYTES,
@@ -73,7 +76,7 @@ class PageDisplay(Display):
             lifespan="on",
             timeout_graceful_shutdown=1,
         )
-        self._server = self._uvicorn.Server(config)
+        self._server = uvicorn.Server(config)
         self._thread = threading.Thread(target=self._server.run, args=([self._socket],), daemon=True)
         self._thread.start()
         if not self._hub.started.wait(30):

@@ -18,6 +18,7 @@ from mwdn.preview.limits import RefusedError
 from mwdn.preview.live_pictures import LivePicture, LivePictures, finite
 from mwdn.preview.live_settings import CAMERA, LiveSettings
 from mwdn.preview.metrics import Metrics
+from mwdn.runtime.devices import select_device
 from mwdn.runtime.streams import latest_results
 from mwdn.runtime.threads import usable_processors
 
@@ -61,7 +62,7 @@ class Live:
     ) -> None:
         self.camera, self.calibration, self.folder, self.metrics = camera, calibration, folder, Metrics()
         self.pictures = LivePictures(calibration, LiveSettings(method), device, count=self._count)
-        self._retry_s = retry_s
+        self._retry_s, self._device = retry_s, select_device(device)
         self._lock, self._changed = threading.Lock(), threading.Event()
         self._wake: dict[int, Callable[[], None]] = {}
         self._thread: threading.Thread | None = None
@@ -186,21 +187,24 @@ class Live:
     def _results(self, recording: ExitStack) -> Generator["_Result", None, None]:
         """The newest picture each time.
 
-        One frame is reconstructed at a time, on all processors: two frames at once would make no more pictures a
-        second, and each would be twice as late. The picture before is encoded meanwhile.
+        On a CPU two frames are in progress at the same time, on half the processors each: 18 to 21 frames a second
+        against 12 of one frame on both of two processors, because most operations on a small picture gain nothing from
+        a second thread. A GPU works on one.
         """
-        return latest_results(self._begin, self._frames(recording), workers=2, threads=usable_processors())
+        workers = min(2, usable_processors()) if self._device.type == "cpu" else 1
+        threads = max(1, usable_processors() // workers)
+        return latest_results(self._begin, self._frames(recording), workers=workers, threads=threads)
 
     def _begin(self, frame: Frame) -> Callable[[], "_Result"]:
-        start, picture = time.time(), self.pictures.make(frame)
+        start, finish = time.time(), self.pictures.begin(frame)
 
-        def encode() -> _Result:
-            encoding = time.perf_counter()
+        def work() -> _Result:
+            picture, encoding = finish(), time.perf_counter()
             encoded = picture.encode()
             self._count("encode", time.perf_counter() - encoding)
             return _Result(picture, encoded, start)
 
-        return encode
+        return work
 
     def _show(self, results: Iterator["_Result"]) -> None:
         times: deque[float] = deque(maxlen=RATE_FRAMES)

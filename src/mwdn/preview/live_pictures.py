@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -17,6 +18,7 @@ from mwdn.preview.live_encoding import brightest, encode_jpeg
 from mwdn.preview.live_settings import LiveSettings
 from mwdn.preview.result import Result
 from mwdn.solvers.alignment import align
+from mwdn.solvers.warm_start import WarmStart
 from mwdn.types import Measurement, Scene
 
 
@@ -114,35 +116,40 @@ class LivePictures:
         except MwdnError as error:
             self.refused = str(error)
 
-    def make(self, frame: Frame) -> LivePicture:
-        """Reconstruct a frame with the present settings.
+    def begin(self, frame: Frame) -> Callable[[], LivePicture]:
+        """Prepare the reconstruction of a frame with the present settings, for one frame at a time.
+
+        Returns:
+            A function that makes the picture, at the same time as those of other frames; it may raise a `MwdnError`.
 
         Raises:
             MwdnError: the frame does not fit the camera, or the method does not.
         """
         reconstruct = self._prepared(frame)
+        if reconstruct.align:  # the pose of the first frame holds for those that follow
+            with torch.inference_mode():
+                measurement = reconstruct.calibration.correct(frame.array).to(reconstruct.device)
+                self._reconstruct = reconstruct = reconstruct.at(align(measurement, reconstruct.psf))
+        finish = partial(self._finish, frame, reconstruct, self._used, has_ambient=self._ambient is not None)
+        if isinstance(reconstruct.method, WarmStart):  # each frame needs the result of the one before
+            picture = finish()
+            return lambda: picture
+        return finish
+
+    def _finish(
+        self, frame: Frame, reconstruct: Reconstructor, settings: LiveSettings, *, has_ambient: bool
+    ) -> LivePicture:
         start = time.perf_counter()
         measurement = reconstruct.calibration.correct(frame.array)
         self.count("correct", time.perf_counter() - start)
-        if reconstruct.align:  # the pose of the first frame holds for those that follow
-            with torch.inference_mode():
-                pose = align(measurement.to(reconstruct.device), reconstruct.psf)
-            self._reconstruct = reconstruct = reconstruct.at(pose)
         start, wrong = time.perf_counter(), ""
         try:
             scene = torch.nan_to_num(reconstruct.on_device(measurement).cpu())
         except ParameterError as error:  # a dark frame must not end the live picture
             wrong, scene = str(error), torch.zeros_like(measurement)
         self.count("reconstruct", time.perf_counter() - start)
-        return LivePicture(
-            frame,
-            measurement.clamp(min=0),
-            scene,
-            self._used,
-            reconstruct.calibration,
-            has_ambient=self._ambient is not None,
-            wrong=wrong,
-        )
+        shown, calibration = measurement.clamp(min=0), reconstruct.calibration
+        return LivePicture(frame, shown, scene, settings, calibration, has_ambient=has_ambient, wrong=wrong)
 
     def _prepared(self, frame: Frame) -> Reconstructor:
         """The method for the settings of now; those of before if it is refused."""

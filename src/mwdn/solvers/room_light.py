@@ -117,14 +117,14 @@ def _planes(size: Size, device: torch.device) -> Tensor:
 def _search(b: Measurement, psf: Psf) -> Tensor:
     """Equation (3) for measurements (n, 1, h, w) of mean 1 through PSFs (n, 1, h, w): coefficients (n, 3)."""
     size = b.shape[-2], b.shape[-1]
-    B, count = _planes(size, b.device), 4
+    B = _planes(size, b.device)
     delta = b.new_tensor([-DELTA, DELTA, DELTA])  # less even light, because more is impossible at first
     c = _largest_plane(b, B)
     limit = energy(unexplained(b, psf))
     offsets = torch.cat([delta.new_zeros(1, 3), delta.diag()])
     for step in range(STEPS):
-        trials = ((c[:, None] + offsets) @ B.flatten(1)).reshape(-1, count, *size)
-        r = unexplained(b - trials, psf.expand(-1, count, -1, -1))
+        trials = ((c[:, None] + offsets) @ B.flatten(1)).reshape(-1, len(offsets), *size)
+        r = unexplained(b - trials, psf.expand(-1, len(offsets), -1, -1))
         J = (r[:, 1:] - r[:, :1]) / delta[:, None]
         if step == 0:
             limit = limit + TOLERANCE**2 * J[:, 0].square().mean(1)
