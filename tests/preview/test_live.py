@@ -14,6 +14,8 @@ from mwdn.capture import open_source
 from mwdn.io.formats import as_frame
 from mwdn.preview.cameras import Cameras
 from mwdn.preview.live import Live
+from mwdn.preview.live_pictures import LivePictures
+from mwdn.preview.live_settings import LiveSettings
 from mwdn.preview.server import make_server
 from preview_server import LIMITS, SIDE
 
@@ -188,3 +190,20 @@ def test_wrong_messages_end_the_connection(live, message):
         viewer.send(message)
         with pytest.raises(ConnectionClosed):
             until(viewer, lambda said: False)
+
+
+def test_wish_made_while_another_is_refused_stays(monkeypatch):
+    with open_source(f"rig,height={SIDE},width={SIDE}") as rig:
+        frame, pictures = rig.read(), LivePictures(Calibration(rig.psf), LiveSettings("wiener"), "cpu")
+    pictures.begin(frame)()
+    prepare = LiveSettings.prepare
+
+    def prepare_slowly(settings, *arguments):
+        pictures.change({"method": "fista"})  # of another viewer
+        return prepare(settings, *arguments)
+
+    pictures.change({"options": {"regularisation": -1}})
+    with monkeypatch.context() as patch:
+        patch.setattr(LiveSettings, "prepare", prepare_slowly)
+        assert pictures.begin(frame)().settings.method == "wiener"
+    assert pictures.begin(frame)().settings.method == "fista"

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from threading import Lock
 from typing import Any
 
 import torch
@@ -99,22 +100,21 @@ class LivePictures:
     ) -> None:
         self._given, self.settings, self.device, self.count = calibration, settings, device, count
         self.refused = ""
+        self._lock = Lock()  # of what `change` writes while a frame is prepared
+        self._takes_ambient: bool | None = None
         self._reconstruct: Reconstructor | None = None
         self._used = settings
         self._ambient: Frame | None = None
-        self._takes_ambient = False
 
     def change(self, message: dict[str, Any]) -> None:
-        """Take over the settings of a message; why one is not possible becomes `refused`."""
-        self.refused = ""
-        if "ambient" in message:
-            self._takes_ambient = message["ambient"]
-            if not message["ambient"]:
-                self._ambient = self._reconstruct = None
-        try:
-            self.settings = self.settings.changed(message, self._given.light)
-        except MwdnError as error:
-            self.refused = str(error)
+        """Take over the settings of a message, from any thread; why one is not possible becomes `refused`."""
+        with self._lock:
+            self.refused = ""
+            self._takes_ambient = message.get("ambient", self._takes_ambient)
+            try:
+                self.settings = self.settings.changed(message, self._given.light)
+            except MwdnError as error:
+                self.refused = str(error)
 
     def begin(self, frame: Frame) -> Callable[[], LivePicture]:
         """Prepare the reconstruction of a frame with the present settings, for one frame at a time.
@@ -153,9 +153,10 @@ class LivePictures:
 
     def _prepared(self, frame: Frame) -> Reconstructor:
         """The method for the settings of now; those of before if it is refused."""
-        settings = self.settings
-        if self._takes_ambient:
-            self._ambient, self._takes_ambient, self._reconstruct = frame, False, None
+        with self._lock:
+            settings, takes_ambient, self._takes_ambient = self.settings, self._takes_ambient, None
+        if takes_ambient is not None:
+            self._ambient, self._reconstruct = frame if takes_ambient else None, None
         elif self._ambient is not None and not _is_alike(self._ambient, frame):
             self._ambient = self._reconstruct = None
             self.refused = "The exposure has changed: take the frame of the room's light again."
@@ -165,8 +166,10 @@ class LivePictures:
             except MwdnError as error:
                 if self._reconstruct is None:
                     raise
-                self.settings = settings = replace(self._used, look=settings.look)
-                self.refused = str(error)
+                wished, settings = settings, replace(self._used, look=settings.look)
+                with self._lock:
+                    if self.settings is wished:  # a newer wish is for the next frame
+                        self.settings, self.refused = settings, str(error)
         self._used = settings
         return self._reconstruct
 
