@@ -222,7 +222,9 @@ def test_a_file_of_other_settings_is_not_mixed(tmp_path, recipe):
     for changed in (
         replace(recipe, display=replace(recipe.display, distance_cm=30.0)),
         replace(recipe, pictures=replace(recipe.pictures, fill=0.5)),
+        replace(recipe, pictures=replace(recipe.pictures, size=(40, 40))),
         replace(recipe, rig=replace(recipe.rig, bit_depth=10)),
+        replace(recipe, rig=replace(recipe.rig, height=recipe.rig.height // 2)),
     ):
         with pytest.raises(ParameterError, match="was begun with"):
             session(changed, out).run()

@@ -6,7 +6,7 @@ from displayed import board, dots, mean_error, natural_pictures, placed, seen_fr
 from cameras import contour_psf
 from mwdn import Camera, Sensor
 from mwdn.errors import AlignmentError
-from mwdn.registration import Views, estimate
+from mwdn.registration import Projection, Views, estimate
 from mwdn.solvers import Admm
 
 CAMERA = (128, 128)
@@ -92,3 +92,12 @@ def test_a_symmetric_picture_is_refused():
     truth = placed((80, 80), CAMERA)
     with pytest.raises(AlignmentError, match="in several ways"):
         estimate(Views.of(tensors([picture]), noisy([picture], truth)))
+
+
+def test_a_picture_mostly_outside_of_the_frame_is_refused():
+    astronaut = natural_pictures(1, 160)[0]
+    inside = placed((160, 160), CAMERA, fill=1.0, turn=0)
+    away = np.array([[1, 0, -70.0], [0, 1, -20.0], [0, 0, 1]]) @ inside.homography
+    truth = Projection.from_homography(away, (160, 160), CAMERA)
+    with pytest.raises(AlignmentError, match="lies outside"):
+        estimate(Views.of(tensors([astronaut]), noisy([astronaut], truth)), corners=truth.corners())

@@ -53,6 +53,12 @@ def test_derivative_by_finite_differences(points):
         assert slope[..., k] == pytest.approx(difference, rel=1e-4, abs=1e-4)
 
 
+def test_share_outside_of_the_frame():
+    assert placed(**SIZES).outside == 0
+    half = np.array([[1, 0, 140.0], [0, 1, 0], [0, 0, 1]])  # columns 140 to 259 of 200
+    assert Projection.from_homography(half, **SIZES).outside == pytest.approx(0.5, abs=0.02)
+
+
 def test_another_resolution_covers_the_same_place():
     projection = placed(**SIZES)
     assert projection.for_picture((180, 240)).corners() == pytest.approx(projection.corners())

@@ -52,6 +52,11 @@ class CapturedPairs:
         """Of the file: display, camera, format of the frames."""
         return dict(self._file.attrs)
 
+    @property
+    def kinds(self) -> dict[str, tuple[int | str, ...]]:
+        """Height, width, channels and type of ``measurement`` and ``scene``."""
+        return {name: (*self._file[name].shape[1:], str(self._file[name].dtype)) for name in ("measurement", "scene")}
+
     def set_attributes(self, values: Mapping[str, Any]) -> None:
         """Add attributes, and make everything so far permanent."""
         with self._disk():

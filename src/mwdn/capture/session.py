@@ -84,7 +84,7 @@ class Session:
         self._first = self._grab(time.time())
         if self.out.exists():
             with open_captured(self.out) as pairs:
-                self._check_same(pairs.attributes)
+                self._check_same({**pairs.attributes, **pairs.kinds})
                 return self._capture(pairs)
         self._check_room(len(self._names([])) or 1)
         with create_captured(self.out, self._first, self.recipe.pictures.size, self._attributes()) as pairs:
@@ -259,10 +259,12 @@ class Session:
         }
 
     def _check_same(self, stored: Mapping[str, Any]) -> None:
-        """Check that a file was begun with this display, place and kind of frames."""
+        """Check that a file was begun with this display, place, pictures and kind of frames."""
         frame = self._first
         now = {**asdict(self._screen), **{f"place_{key}": value for key, value in asdict(self._place).items()}}
+        now["scene"] = (*self.recipe.pictures.size, 3, "uint16")
         if frame is not None:
+            now["measurement"] = (*frame.array.shape, str(frame.array.dtype))
             now |= {"bit_depth": frame.bit_depth, "mosaic": frame.mosaic or ""}
         for name, value in now.items():
             if stored.get(name) != value:

@@ -222,7 +222,8 @@ def _quality(projection: Projection, content: Mapping[str, Any]) -> str:
     fit = ""
     if "residual_px" in content:
         fit = f"; residual {content['residual_px']:.2f} px, correlation {content['correlation']:.3f}{radial}"
-    return f"Picture found: {Place.of(projection.corners())}{fit}."
+    cut = f" {projection.outside:.0%} of it lies outside of the frame." if projection.outside > 0.01 else ""
+    return f"Picture found: {Place.of(projection.corners())}{fit}.{cut}"
 
 
 def _corners(points: str) -> Points:

@@ -27,6 +27,9 @@ WORST = 0.6
 WORST_PX = 1.5
 """Largest residual that is accepted; for large pictures 2 % of their side."""
 
+MOST_OUTSIDE = 0.5
+"""Largest share of the picture outside of the camera's frame that is accepted."""
+
 _CLOSE = 0.04
 """Starts whose correlation is this close to the best after coarse refinement are compared again in detail."""
 
@@ -168,6 +171,11 @@ def _check(result: Refined, residuals: Residuals) -> None:
         raise AlignmentError(
             f"Parts of the picture that can be placed: {len(residuals.points)}, and {_FEWEST_PARTS} are needed. "
             f"Use more pictures, or one with more detail. {way_out}"
+        )
+    if result.projection.outside > MOST_OUTSIDE:
+        raise AlignmentError(
+            f"{result.projection.outside:.0%} of the picture lies outside of the camera's frame, and at most "
+            f"{MOST_OUTSIDE:.0%} may. Show a smaller one, or turn the camera to it. {way_out}"
         )
     corners = result.projection.corners()
     most = max(WORST_PX, 0.02 * float(np.ptp(corners, axis=0).max()))

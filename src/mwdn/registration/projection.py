@@ -140,6 +140,15 @@ class Projection:
         """Pixels of the camera (4, 2) of the picture's outer corners, clockwise from its own top left."""
         return self.to_camera(picture_corners(self.picture_size))
 
+    @property
+    def outside(self) -> float:
+        """Share of the picture outside of the camera's frame, 0 to 1."""
+        (h, w), (H, W) = self.picture_size, self.camera_size
+        y, x = np.meshgrid(np.linspace(0, h - 1, 64), np.linspace(0, w - 1, 64), indexing="ij")
+        u, v = np.moveaxis(self.to_camera(np.stack([x, y], -1)), -1, 0)
+        inside = (u > -0.5) & (u < W - 0.5) & (v > -0.5) & (v < H - 0.5)
+        return 1 - float(inside.mean())
+
     def to_dict(self) -> dict[str, Any]:
         """Numbers for JSON; `from_dict` reads them."""
         return {
