@@ -58,6 +58,7 @@ def show_picture(page):
 
 def show_live(page):
     page.run("document.getElementById('live-start').click()")
+    page.wait("document.getElementById('progress').hidden")  # the check of the picture before is given up
     page.wait("Number(document.getElementById('live-state').dataset.count) > 2")
     page.run("document.getElementById('live-snapshot').click()")
     page.wait("document.getElementById('snapshots').children.length === 1")

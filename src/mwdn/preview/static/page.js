@@ -231,7 +231,10 @@ async function start() {
   const [listed, samples] = await Promise.all([getJson("/methods"), getJson("/samples"), listCameras()]);
   methods = listed.methods;
   setUpLive(listed.live, {
-    started: () => isTouched && wishLive(), // else the settings of the server hold
+    started: () => {
+      running?.abort();
+      if (isTouched) wishLive(); // else the settings of the server hold
+    },
     follow: followLive,
     use: (frame, job) => guarded(() => useSnapshot(frame, job)),
   });
