@@ -29,6 +29,7 @@ docs: .venv/.ready  ## the documentation site at http://127.0.0.1:8000/, built a
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs serve
 
 acceptance: .venv/.ready  ## reconstruct real captures (MWDN_DATA or ../shared/data) into results/acceptance
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[acceptance]'
 	$(BIN)/python -m pytest -m acceptance -s
 
 package: .venv/.ready  ## wheel and sdist in dist/; two builds of one commit are equal
