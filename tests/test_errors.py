@@ -1,3 +1,5 @@
+import re
+
 """Options of every method, checked against their annotations, with errors that name option and value."""
 
 import pytest
@@ -125,9 +127,9 @@ def test_a_class_of_the_user_is_checked_too():
 def test_many_known_names_are_cut_off():
     """The 26 keys of [mismatch], say."""
     message = str(UnknownNameError("key of [mismatch]", "gamma_errop", [f"gamma_error_{n}" for n in range(40)]))
-    assert len(message) == 300
+    assert 280 < len(message) <= 300
     assert "Did you mean 'gamma_error_" in message
-    assert message.endswith(" ....")
+    assert re.search(r", gamma_error_\d+, \.\.\.$", message)  # whole names
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -69,7 +69,8 @@ class UnknownNameError(ParameterError):
         nearest = difflib.get_close_matches(name.lower(), spelling, n=1)
         hint = f" Did you mean '{spelling[nearest[0]]}'?" if nearest else ""
         start = f"No {kind} named '{name}'.{hint} Known: "
-        super().__init__(f"{start}{cut(', '.join(known), LONGEST - len(start) - 1)}.")
+        text = f"{start}{', '.join(known)}."
+        super().__init__(text if len(text) <= LONGEST else text[: LONGEST - 3].rpartition(", ")[0] + ", ...")
 
 
 def check_options(of: Callable[..., Any], what: str, options: Mapping[str, Any]) -> None:
