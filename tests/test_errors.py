@@ -1,6 +1,7 @@
-import re
 
 """Options of every method, checked against their annotations, with errors that name option and value."""
+
+import re
 
 import pytest
 import torch
