@@ -1,4 +1,3 @@
-
 """Options of every method, checked against their annotations, with errors that name option and value."""
 
 import re
