@@ -68,9 +68,17 @@ class Page:
         node = self.command("DOM.querySelector", nodeId=root, selector=selector)["nodeId"]
         self.command("DOM.setFileInputFiles", files=[str(file) for file in files], nodeId=node)
 
-    def press(self, key, code):
+    def press(self, key, code, text=""):
         for kind in ("keyDown", "keyUp"):
-            self.command("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code)
+            self.command("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code, text=text)
+
+    def tab_to(self, condition, most=60):
+        """Press Tab until a JavaScript condition holds for the element with the focus, `e`."""
+        for _ in range(most):
+            self.press("Tab", 9)
+            if self.run(f"(e => {condition})(document.activeElement)"):
+                return
+        raise AssertionError(f"no element with {condition} in {most} steps of Tab")
 
     def size(self, width, height, *, dark=False):
         self.command(

@@ -42,8 +42,8 @@ def serve():
 
     servers = []
 
-    def start(cameras=None, **options):
-        server = make_server(cameras or Cameras(LIMITS), LIMITS, device="cpu", **options)
+    def start(cameras=None, limits=LIMITS, **options):
+        server = make_server(cameras or Cameras(limits), limits, device="cpu", **options)
         server.start()
         servers.append(server)
         return server

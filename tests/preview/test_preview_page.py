@@ -5,6 +5,7 @@ import pytest
 from browser import CHROMIUM, open_page
 from mwdn.calibration import Calibration
 from mwdn.preview.cameras import Cameras
+from mwdn.preview.limits import Limits
 from preview_server import LIMITS
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt install chromium")
@@ -51,4 +52,23 @@ def test_dropped_files_become_a_picture(serve, psf, psf_file, capture, tmp_path)
             "(e.labels?.length || e.ariaLabel || e.textContent.trim()))"
         )
         assert named  # for screen readers
+        assert not page.errors
+
+
+def test_keyboard_alone_is_enough(serve, tmp_path):
+    server = serve(Cameras(Limits()), limits=Limits())
+    with open_page(server.url, tmp_path / "profile") as page:
+        page.wait("document.querySelectorAll('#samples button').length === 3")
+        page.run("document.getElementById('trust').checked = false")
+        page.tab_to("e.textContent === 'cat'")
+        page.press("Enter", 13, "\r")
+        page.wait("document.getElementById('scene').naturalWidth > 0 && document.getElementById('cancel').hidden")
+        page.tab_to("e.id === 'method'")
+        assert page.run("getComputedStyle(document.activeElement).outlineStyle") != "none"  # one sees where one is
+        page.press("a", 65, "a")  # a list takes the first entry of this letter
+        page.wait("document.getElementById('state').textContent.startsWith('admm')")
+        page.tab_to("e.id === 'split'")
+        page.press("ArrowLeft", 37)
+        assert page.run("document.getElementById('stack').style.getPropertyValue('--split')") == "49%"
+        page.tab_to("e.id === 'save-png'")
         assert not page.errors
