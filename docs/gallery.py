@@ -44,10 +44,13 @@ the open part of the paper's mask, at every 30 nm of the band: a minute instead 
 
 PAGE = """# Masks
 
-Made by `python docs/gallery.py`: every mask on the same sensor (1280 x 1280 pixels of 2.4 um, binned by 4) in white
-light, the same scene captured through `Camera` and `Sensor` (15,000 electrons, brightest pixel at 90 %), and
-reconstructed without any training. The scene fills the same fraction of each sensor: masks nearer to the sensor have a
-wider field, so the scene is larger for them.
+Six kinds of masks, compared by `python docs/gallery.py`. Every mask has the same sensor (1280 x 1280 pixels of 2.4 um,
+binned by 4) and white light. The same scene is captured through `Camera` and `Sensor` (15,000 electrons, brightest
+pixel at 90 %), and reconstructed by two methods without training.
+
+The scene fills the same fraction of each sensor. A mask nearer to the sensor has a wider field, so its scene covers a
+larger angle. [Design a camera](optics.md) explains the kinds and their parameters, and how to compute the PSF of your
+own mask. Terms are in the [glossary](glossary.md#the-camera).
 
 ![mask, PSF, spectrum, measurement, Wiener and ADMM for each mask](masks.jpg)
 
@@ -61,16 +64,15 @@ wider field, so the scene is larger for them.
 - *Wiener*, *ADMM*: PSNR in dB with the exact PSF; real cameras add calibration errors. One scene and one noise sample:
   differences below a dB are not significant.
 
-Frequencies that the spectrum does not pass can be recovered only with prior knowledge of pictures. A PSF of few bright
-spots (pinholes) gives the best picture where light is plentiful, and needs the longest exposure.
-
-[optics.md](optics.md) explains how to design a mask, and how to compute the PSF of your own.
+A method can recover frequencies that the mask does not pass only by prior knowledge of pictures. A PSF of few bright
+spots (pinholes) gives the best picture if there is plenty of light, but it needs the longest exposure.
 
 ## Contour mask or diffuser
 
-The paper prefers the contour mask for its contrast. Here the diffuser is ahead, in the table and over six photographs
-that fill 137 of 320 pixels (`python benchmarks/masks.py ../shared/data/photos/test`,
-[record](../benchmarks/results/masks.json); the central 128 x 128, the difference with its interval):
+The paper prefers the contour mask for its contrast. Here the diffuser is ahead, in the table above and over six
+photographs. These fill 137 of 320 pixels, as the paper's display does. The table has the PSNR in dB of the central
+128 x 128 pixels, and the difference with its interval over the photographs
+(`python benchmarks/masks.py ../shared/data/photos/test`, [record](../benchmarks/results/masks.json)):
 
 | light and PSF | method | contour | diffuser | difference |
 | --- | --- | --- | --- | --- |
@@ -81,21 +83,29 @@ that fill 137 of 320 pixels (`python benchmarks/masks.py ../shared/data/photos/t
 | 15,000 e, rotated by 0.5 degrees, haze, field | Wiener | 19.21 | 20.53 | +1.33 (+0.96 to +1.65) |
 | | pyramid | 29.12 | 29.31 | +0.19 (+0.00 to +0.35) |
 
-Their spectra tell why (`--count 0`): between 0.02 and 0.07 periods a pixel the diffuser's modulus is 1.5 to 4.1 times
-the contour mask's, from 0.1 on it is 0.82 to 0.89 times. Photographs have most of their contrast at low frequencies.
-A scene of fine detail alone may turn the order round, and the contour mask resolves finer angles: not measured.
+The spectra of the two PSFs explain it (the same command with `--count 0` prints them):
+
+| periods a pixel | modulus of the diffuser over that of the contour mask |
+| --- | --- |
+| 0.02 to 0.07 | 1.5 to 4.1 |
+| 0.1 and more | 0.82 to 0.89 |
+
+Photographs have most of their contrast at low frequencies, where the diffuser passes more. The contour mask resolves
+finer angles, so it may be better for scenes that have only fine detail. This was not measured.
 
 ## Designed and measured PSF of the paper's camera
 
-The contour mask's PSF, and its curves beside those of the measured one:
+The PSF of the designed contour mask, and its curves beside those of the paper's measured PSF:
 
 ![designed PSF, and its curves beside the measured ones](paper-camera.jpg)
 
-The ring from the even line spacing (a period of 11 to 12 pixels) and the fall towards high frequencies (the line width)
-agree. The design lacks the even haze that fills the aperture's shadow in the measured PSF: about half of its light.
-With that fraction left undeflected (chosen so that the medians of the spectra agree) the modulus is 0.6 to 1.15 times
-the measured one from 0.05 periods a pixel on, lowest below the ring, and the autocorrelation differs by at most 0.07.
-Etching errors and reflections are likely sources of the haze.
+- **What agrees**: the ring in the spectrum, from the even line spacing (a period of 11 to 12 pixels), and the fall
+  towards high frequencies, from the line width.
+- **What differs**: about half of the light of the measured PSF fills the shadow of the aperture evenly. The design
+  lacks this haze. Etching errors and reflections are its likely sources.
+- **With the haze added**: if this fraction of the designed PSF's light is left undeflected, the modulus is 0.6 to 1.15
+  times the measured one from 0.05 periods a pixel on, lowest below the ring. The autocorrelation differs by at most
+  0.07. The fraction was chosen so that the medians of the spectra agree.
 """
 
 
