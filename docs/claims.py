@@ -1,12 +1,16 @@
 """Pictures of docs/claims.md: learning curves, PSNR against mismatch, and real captures, of one folder of a benchmark.
 
     mwdn benchmark benchmark-ablation --out runs/ablation-1 --seed 1
-    python docs/claims.py runs/ablation-1 [--captures ../shared/data/mwdn-camera/real-objects] [--out docs]
+    mwdn recipes benchmark-ablation | sed 's/bin = 4/bin = 4, deviation = {}/' > exact.toml
+    mwdn benchmark exact.toml --out runs/exact --seed 1
+    python docs/claims.py runs/ablation-1 [--exact runs/exact] [--captures ../shared/data/mwdn-camera/real-objects]
+                                          [--out docs]
 
 Mismatch is the deviation of the data set's true camera times 0, 1, 2 and 3: 0 is a camera that matches its
 calibration, 1 the camera of the training. Also measured, at 1: cameras and methods with the mirrored PSF. The scenes
-and the noise are the same for all. Writes ``claims-curves.png``, ``claims-captures.jpg``, and the numbers to
-`benchmarks/results/mismatch.json`, from which finished methods are not measured again.
+and the noise are the same for all. Networks of `--exact` were trained without mismatch; their labels end in ", exact".
+Writes ``claims-curves.png``, ``claims-captures.jpg``, and the numbers to `benchmarks/results/mismatch.json`, from which
+finished methods are not measured again.
 """
 
 import argparse
@@ -42,6 +46,7 @@ matplotlib.use("agg")
 RECORD = Path(__file__).resolve().parent.parent / "benchmarks" / "results" / "mismatch.json"
 FACTORS = (0.0, 1.0, 2.0, 3.0)  # from 4 on, the corners of the field would get negative light
 COUNT = 16  # test pictures for each factor
+EXACT = ", exact"  # behind the name of a network that was trained without mismatch
 
 
 def mirrored(dataset: Dataset) -> Dataset:
@@ -73,6 +78,12 @@ def finished(runs: Path, steps: int) -> dict[str, Path]:
     """Best weights of each network whose training is at its end."""
     done = [path for path in sorted(runs.iterdir()) if (path / "log.jsonl").exists()]
     return {path.name: path / "best.safetensors" for path in done if curve(path)[0][-1][0] == steps}
+
+
+def renamed(benchmark: Benchmark, weights: dict[str, Path], suffix: str) -> tuple[Benchmark, dict[str, Path]]:
+    """The networks that have weights, and these weights, with a suffix to each label."""
+    methods = tuple(replace(m, label=m.label + suffix) for m in benchmark.methods if m.label in weights)
+    return replace(benchmark, methods=methods), {label + suffix: path for label, path in weights.items()}
 
 
 def score(method: Reconstructor, test: tuple[Measurement, Scene], dataset: Dataset) -> float:
@@ -150,6 +161,7 @@ def main() -> None:
     """Measure and draw."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path)
+    parser.add_argument("--exact", type=Path)
     parser.add_argument("--captures", type=Path, default=Path("../shared/data/mwdn-camera/real-objects"))
     parser.add_argument("--out", type=Path, default=Path("docs"))
     arguments = parser.parse_args()
@@ -158,12 +170,17 @@ def main() -> None:
     dataset = open_dataset(name, recipe, arguments.folder / "data", torch.device("cpu"), lambda title, rows: rows)
     runs = arguments.folder / "runs" / name
     weights = finished(runs, benchmark.schedule.steps)
+    own = list(weights)
+    if arguments.exact:
+        exact = finished(arguments.exact / "runs" / name, benchmark.schedule.steps)
+        others, exact = renamed(benchmark, exact, EXACT)
+        benchmark, weights = replace(benchmark, methods=(*benchmark.methods, *others.methods)), weights | exact
     methods = reconstructors(benchmark, dataset, weights)
     psnr = mismatch(benchmark, dataset, weights, methods)
-    colours = dict(zip(methods, matplotlib.colormaps["tab20"].colors, strict=False))
+    colours = dict(zip(methods, [*matplotlib.colormaps["tab20"].colors] * 2, strict=False))
     figure = Figure(figsize=(13, 5), layout="constrained")
     left, right = figure.subplots(1, 2)
-    draw_learning(left, runs, {label: colours[label] for label in weights}, benchmark.schedule.batch)
+    draw_learning(left, runs, {label: colours[label] for label in own}, benchmark.schedule.batch)
     draw_mismatch(right, {label: psnr[label] for label in methods}, colours)
     for axes in (left, right):
         axes.grid(alpha=0.3)
