@@ -41,7 +41,7 @@ wheel-test: package  ## the tests against the wheel
 	$(PYTHON) -m venv .wheel/.venv
 	.wheel/.venv/bin/pip install --quiet --disable-pip-version-check -c constraints.txt \
 		"$$(ls -t dist/*.whl | head -1)[test,docs]"
-	cd .wheel && $(TESTS) .venv/bin/python -m pytest -n auto --dist worksteal --ignore tests/test_architecture.py \
+	cd .wheel && env -u PYTHONPATH $(TESTS) .venv/bin/python -m pytest -n auto --dist worksteal --ignore tests/test_architecture.py \
 		--ignore tests/docs/test_assets.py \
 		--deselect tests/docs/test_site.py::test_every_public_name_has_its_place_in_the_reference
 
