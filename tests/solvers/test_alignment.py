@@ -135,7 +135,7 @@ def test_what_is_no_fall_off_stays_in_the_residual(generator):
     slope = torch.nn.functional.pad(x, (0, grid[1] - size[1], 0, grid[0] - size[0])) * prediction
     beyond = torch.zeros_like(prediction)
     beyond[..., 33, 42] = 1.0
-    poses = torch.cat([c * slope + beyond for c in (0.12, 0.1, 0.12, 1.0)])  # two of each of two captures
+    poses = torch.cat([c * slope + beyond for c in (0.25, 0.2, 0.25, 2.0)])  # two of each of two captures
     residuals = alignment._without_fall_off(poses, prediction.expand(4, -1, -1, -1), size, 2)
     assert residuals[:2].abs().max() < 1e-4
     assert torch.equal(residuals[2:], poses[2:])

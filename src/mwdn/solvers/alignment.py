@@ -75,7 +75,7 @@ SMOOTH_LEVELS = (
     Level(1, 8, Penalties(0.1, 1.5, 1.5), 0.02, min_smoothing=0.2),
 )
 _HIGH_PASS = 0.03  # cycles per pixel: below, most of the residual is ambient light and unconverged iterations
-_MOST_FALL_OFF = 0.25  # of any polynomial: of x^2 + y^2, which is 2 in the corners, half of the light lost there
+_MOST_FALL_OFF = 0.5  # of any polynomial: of x^2 + y^2, which is 2 in the corners, all of the light lost there
 _REACH = 16  # pixels, three standard deviations of the Gaussian of `_HIGH_PASS`
 _PRIOR = (0.5, 0.01)  # standard deviations S of a calibration's errors: degrees and relative magnification
 _DELTA = (0.1, 0.002)  # finite differences
