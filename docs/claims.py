@@ -1,7 +1,8 @@
 """Pictures of docs/claims.md: learning curves, PSNR against mismatch, and real captures, of one folder of a benchmark.
 
     mwdn benchmark benchmark-ablation --out runs/ablation-1 --seed 1
-    mwdn recipes benchmark-ablation | sed 's/bin = 4/bin = 4, deviation = {}/' > exact.toml
+    mwdn recipes benchmark-ablation |
+        sed 's/bin = 4/&, deviation = { turn_degrees = 0, background = 0, off_axis = 0 }/' > exact.toml
     mwdn benchmark exact.toml --out runs/exact --seed 1
     python docs/claims.py runs/ablation-1 [--exact runs/exact] [--captures ../shared/data/mwdn-camera/real-objects]
                                           [--out docs]
