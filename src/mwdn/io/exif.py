@@ -6,6 +6,7 @@ from typing import BinaryIO
 
 from mwdn.errors import ImageError
 from mwdn.io.reading import open_regular
+from mwdn.types import Frame
 
 TURNS = {
     2: "flip-left-right",
@@ -33,11 +34,25 @@ def orientation(path: str | Path) -> int:
     """
     try:
         with open_regular(path) as file:
-            start = _find_tiff(file)
-            found = 1 if start is None else _read_tag(file, start)
-    except (OSError, ImageError, struct.error):  # missing, or cut off: whoever reads the pixels says so
+            return orientation_in(file)
+    except (OSError, ImageError):  # whoever reads the pixels says what is wrong
+        return 1
+
+
+def orientation_in(file: BinaryIO) -> int:
+    """As `orientation`, of an open file."""
+    try:
+        start = _find_tiff(file)
+        found = 1 if start is None else _read_tag(file, start)
+    except (ImageError, struct.error):  # cut off
         return 1
     return found if found in TURNS else 1
+
+
+def upright(frame: Frame, orientation: int) -> Frame:
+    """A picture (H, W, C) of this orientation, turned as `TURNS` says."""
+    frame = frame.swapaxes(0, 1) if 5 <= orientation <= 8 else frame
+    return frame[:: -1 if orientation in (3, 4, 7, 8) else 1, :: -1 if orientation in (2, 3, 6, 7) else 1]
 
 
 def _find_tiff(file: BinaryIO) -> int | None:

@@ -14,6 +14,7 @@ import numpy as np
 
 from mwdn.errors import FrameShapeError, FrameTypeError, ImageError, cut, one_line, reason, shown
 from mwdn.io.decoder_messages import decoder_messages
+from mwdn.io.exif import orientation_in, upright
 from mwdn.io.headers import COPY_AGAIN, START, check_decoded, check_whole, picture_claim
 from mwdn.io.npy import read_npy
 from mwdn.io.raw import is_raw, read_raw
@@ -87,9 +88,11 @@ def _read(file: BinaryIO, photograph: bool) -> Frame:
         case "TIFF":
             stored, orientation = read_tiff(file, _frame_shape)
             frame = _to_frame(stored, _frame_shape(stored.shape, stored.dtype), copy=False, photograph=photograph)
-            frame = _upright(frame, orientation) if photograph else frame
+            frame = upright(frame, orientation) if photograph else frame
         case _:
             frame = decode(kind, _content(kind, file), photograph)
+            file.seek(0)
+            frame = upright(frame, orientation_in(file)) if photograph else frame
     if not np.isfinite(frame).all():
         raise ImageError("holds NaN or infinity. Capture it again, or replace them with `numpy.nan_to_num`.")
     return frame
@@ -226,11 +229,6 @@ def _read_raw(path: Path, photograph: bool) -> Frame:
     return read_raw(path).frame
 
 
-def _upright(frame: Frame, orientation: int) -> Frame:
-    frame = frame.swapaxes(0, 1) if 5 <= orientation <= 8 else frame
-    return frame[:: -1 if orientation in (3, 4, 7, 8) else 1, :: -1 if orientation in (2, 3, 6, 7) else 1]
-
-
 def decode(kind: str, data: bytes, photograph: bool) -> Frame:
     """Read a whole PNG, JPEG, WebP, BMP, PGM or PPM.
 
@@ -256,7 +254,9 @@ def decode(kind: str, data: bytes, photograph: bool) -> Frame:
 def _decode(kind: str, data: bytes, photograph: bool) -> Frame:
     import cv2
 
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH if photograph else cv2.IMREAD_UNCHANGED
+    # OpenCV turns JPEG and PNG, version 4 no WebP: `upright` turns all.
+    as_shown = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    flags = as_shown if photograph else cv2.IMREAD_UNCHANGED
     set_level = cv2.setLogLevel if hasattr(cv2, "setLogLevel") else cv2.utils.logging.setLogLevel  # of OpenCV 4, 5
     try:
         with decoder_messages() as lines:
