@@ -219,7 +219,8 @@ class Live:
             now = time.time()
             times.append(now)
             rate = (len(times) - 1) / (times[-1] - times[0]) if times[-1] > times[0] else 0.0
-            taken = frame.timestamp if self.camera.live and frame.timestamp else start
+            # No frame is exposed after it has come: the rig without a rate does not wait for its exposure.
+            taken = min(frame.timestamp, start) if self.camera.live and frame.timestamp else start
             said = {"fps": round(rate, 1), "timestamp": taken, "latency_ms": round(1000 * (now - taken))}
             self._publish(said | {"dropped": dropped} | self._about(picture), *encoded)
 
