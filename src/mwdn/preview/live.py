@@ -187,9 +187,9 @@ class Live:
     def _results(self, recording: ExitStack) -> Generator["_Result", None, None]:
         """The newest picture each time.
 
-        On a CPU two frames are in progress at the same time, on half the processors each: 18 to 21 frames a second
-        against 12 of one frame on both of two processors, because most operations on a small picture gain nothing from
-        a second thread. A GPU works on one.
+        On a CPU two frames are in progress at the same time, on half the processors each: 18 frames a second against 12
+        of one frame on both of two processors, because most operations on a small picture gain nothing from a second
+        thread (docs/performance.md). A GPU works on one.
         """
         workers = min(2, usable_processors()) if self._device.type == "cpu" else 1
         threads = max(1, usable_processors() // workers)
