@@ -4,10 +4,11 @@
                                                 [--psfs "mwdn-camera 320x320" ...] [--calibrations real-like]
 
 Four measured PSFs; 15,000 and 2,000 electrons at saturation; test photographs placed and mismatched by the recipe
-mismatched, or seen by cameras with all that real ones have, recipe real-like. Scored as in `mwdn evaluate` (full,
-clipped). Prints a table of means, with the confidence interval of the first method's gain over the last, and writes the
-numbers of each picture, a few at a time. Numbers already in the record are not measured again, so a stopped run
-continues; `--again` measures the named methods again. One process per core, of one thread each.
+mismatched, or seen by cameras with all that real ones have, recipe real-like. Hot pixels are replaced as in a capture's
+file. Scored as in `mwdn evaluate` (full, clipped). Prints a table of means, with the confidence interval of the first
+method's gain over the last, and writes the numbers of each picture, a few at a time. Numbers already in the record are
+not measured again, so a stopped run continues; `--again` measures the named methods again. One process per core, of one
+thread each.
 
 The method `fine-tuned` is, for each PSF, the network in `TUNED` that the recipe finetune made of `universal`.
 """
@@ -25,6 +26,7 @@ import torch
 
 import mwdn
 from mwdn import Calibration, Reconstructor
+from mwdn.calibration.corrections import Corrections
 from mwdn.data.mismatch import EXACT
 from mwdn.data.photographs import Photographs
 from mwdn.data.simulated import SimulatedPairs
@@ -66,7 +68,8 @@ def captures(psf, photographs, recipe, full_well, numbers, *, exact):
         seed=11,
     )
     batches = [source.batch([number]) for number in numbers]
-    return [(pair.measurement[0], pair.scene[0]) for pair in batches]
+    correct = Corrections().of_capture  # replaces hot pixels, as `Calibration.correct` does
+    return [(correct(pair.measurement)[0], pair.scene[0]) for pair in batches]
 
 
 def measured(methods, made, calibration):

@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from mwdn.calibration.isolated_pixels import find_isolated_pixels
 from mwdn.calibration.pixel_repair import PixelRepair
 from mwdn.errors import ImageError, ShapeError
 from mwdn.io.images import read_frame
@@ -65,6 +66,14 @@ class Corrections:
         if cell not in self._repairs:
             self._repairs[cell] = PixelRepair(self.defects[0, 0], cell)
         return self._repairs[cell](image)
+
+    def of_capture(self, image: Image, cell: int = 1) -> Image:
+        """`__call__` for a capture (1, C, H, W). Without a map, hot pixels are sought in the capture itself."""
+        image = self(image, cell)
+        if self.defects is not None:
+            return image
+        hot = find_isolated_pixels(image, cell=cell)
+        return PixelRepair(hot[0, 0], cell)(image) if hot.any() else image
 
     @cached_property
     def _repairs(self) -> dict[int, PixelRepair]:

@@ -1,5 +1,6 @@
 """How to turn the numbers of a raw frame into a measurement."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Literal
@@ -111,14 +112,14 @@ class FrameFormat:
         return read_frame(path, bgr=self.bgr), self
 
     def to_measurement(
-        self, frame: Frame, dark: Tensor | None = None, corrections: Corrections = Corrections()
+        self, frame: Frame, dark: Tensor | None = None, correct: Callable[[Image, int], Image] = Corrections()
     ) -> Measurement:
         """Turn a raw frame into a measurement.
 
         Args:
             frame: (H, W, C), from `read`.
             dark: frame to subtract, from `normalise`: taken without light, or with the room's light alone.
-            corrections: flat field and hot pixels.
+            correct: what is corrected in raw pixels (1, C, H, W) of a ``cell``: `Corrections`.
 
         Returns:
             (1, C, height, width), linear light, row 0 at the top; 1 is saturation.
@@ -130,7 +131,7 @@ class FrameFormat:
         image = self.normalise(frame)
         if dark is not None:
             image = subtract_dark(image, dark)
-        image = corrections(image, self.cell)
+        image = correct(image, self.cell)
         if self.crop is not None:
             image = crop_centre(image, self.crop, self.cell)
         if self.mosaic is not None:

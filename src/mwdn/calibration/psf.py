@@ -283,7 +283,7 @@ class Calibration:
         offset = self.dark if self.ambient is None else self.ambient
         frame = as_frame(frame, finite=False)
         check_float_scale(frame, self.frames.bit_depth)
-        return self.refinement.measurement(self.frames.to_measurement(frame, offset, self.corrections))
+        return self.refinement.measurement(self.frames.to_measurement(frame, offset, self.corrections.of_capture))
 
     def check_fit(self, measurement: Measurement) -> None:
         """Raise a `ShapeError` unless the measurement (1, C, H, W) has the PSF's size, and colours if the PSF has."""
