@@ -40,7 +40,7 @@ def saturation(frame: Frame, calibration: Calibration) -> Verdict:
     part = calibration.saturated_part(frame)
     text = f"{part:.1%} of the capture's pixels are saturated"
     if part > SATURATED_PART:
-        return Verdict("capture", "saturation", "doubt", f"{text}, and no PSF explains them.")
+        return Verdict("capture", "saturation", "doubt", f"{text}: how bright their light was is not known.")
     return Verdict("capture", "saturation", "good", f"{text}.")
 
 

@@ -22,6 +22,7 @@ from mwdn.fourier.convolution import check_fit, convolve
 from mwdn.optics.noise import noise_level
 from mwdn.optics.psf import checked_psf
 from mwdn.solvers.alignment import Pose, align, fine_detail
+from mwdn.solvers.saturation import saturated_pixels
 from mwdn.types import Measurement, Psf, Scene
 
 
@@ -63,7 +64,8 @@ def consistency(measurement: Measurement, psf: Psf, scene: Scene, *, pose: Pose 
     """Compare a measurement with the forward model of its reconstruction.
 
     The scene passes the PSF in its best pose (rotation, scale and haze, `mwdn.solvers.alignment`) and the PSF as it is;
-    the better one counts. The gain and an even background are free in each channel.
+    the better one counts. The gain and an even background are free in each channel. Saturated pixels
+    (`mwdn.solvers.saturation`) contradict only a scene that leaves them darker.
 
     A merely displaced PSF goes unnoticed: it displaces the reconstruction and explains the measurement as well.
 
@@ -89,7 +91,8 @@ def consistency(measurement: Measurement, psf: Psf, scene: Scene, *, pose: Pose 
     measurement, scene = measurement.float() / unit, scene.float() / unit
     aligned = pose.move(psf)
     d = fine_detail(measurement)
-    s = fine_detail(convolve(scene.expand(2, -1, -1, -1), torch.cat([aligned, psf.float()])))
+    light = convolve(scene.expand(2, -1, -1, -1), torch.cat([aligned, psf.float()]))
+    s = fine_detail(torch.where(saturated_pixels(measurement), light.minimum(measurement), light))
     d_energy, s_energy = (detail.square().sum((-2, -1)).clamp(min=1e-30) for detail in (d, s))
     explained = (s * d).sum((-2, -1)).clamp(min=0).square() / s_energy
     return Consistency(

@@ -6,7 +6,7 @@ crops to the sensor, b is the measurement, each pixel weighted by W (`certainty`
 1. v fits b near z. C keeps this from being one division in the Fourier domain; one iteration of ADMM (penalty 1,
    as in `mwdn.solvers.splitting`, p the target on the sensor) approximates it:
 
-   ``p = C H v + W / (1 + W) (b - (2 C H v - p))``
+   ``p = C H v + W / (1 + W) (b - (2 C H v - p))``, the difference at least 0 where b is saturated
    ``V = (|H|^2 V + conj(H) F(C^T (p - C H v)) + rho F(z)) / (|H|^2 + rho)``
 
 2. ``z = denoise(max(v, 0), sigma)``, its noise level sigma lower in each round.
@@ -24,7 +24,7 @@ from torch.nn import functional as F
 from mwdn.fourier.transforms import inverse_spectrum, spectrum
 from mwdn.solvers.levels import REFERENCE_NOISE, brightness, smoothing_scale
 from mwdn.solvers.pyramid import Estimate
-from mwdn.solvers.splitting import Problem, reflected
+from mwdn.solvers.splitting import Problem, deficit
 
 Denoiser = Callable[[Tensor, Tensor], Tensor]
 """From an image (B, C, H, W), whose brightest pixel is about 1, and its noise level (B, 1, 1, 1) to the clean image."""
@@ -69,7 +69,7 @@ def plug_and_play(
         K. Zhang et al., "Plug-and-play image restoration with deep denoiser prior", TPAMI 44 (2022).
     """
     band = estimate.psf.bands[-1]
-    problem = Problem.from_transfer(estimate.measurement.float(), band.transfer)
+    problem = Problem.from_transfer(estimate.measurement.float(), band.transfer, estimate.saturated)
     grid, (height, width) = problem.grid, problem.sensor
     z = (estimate.grid_scene * band.norm).expand(*estimate.measurement.shape[:2], *grid)
     brightest = z[..., :height, :width].amax((1, 2, 3), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
@@ -84,7 +84,7 @@ def plug_and_play(
     for step in range(rounds):
         sigma = scale * first * (last / first) ** (step / max(1, rounds - 1))
         rho = prior_weight * (noise / (sigma * brightest)).square()
-        target = reflected(Hv, target).add_(problem.measurement).mul_(W / (1 + W)).add_(Hv)
+        target = deficit(problem, Hv, target).mul_(W / (1 + W)).add_(Hv)
         V = V.mul_(power).add_(spectrum(target - Hv, grid).mul_(adjoint))
         V = V.add_(spectrum(z, grid).mul_(rho)).mul_(1 / (power + rho))
         Hv = inverse_spectrum(problem.transfer * V, grid, problem.sensor)

@@ -15,8 +15,12 @@ from mwdn.fourier.transforms import fast_length, inverse_spectrum, spectrum, tra
 from mwdn.optics.psf import checked_psf
 from mwdn.runtime.iterations import iterations
 from mwdn.solvers.levels import LEVELS, REFERENCE_SIDE, Level, brightness, relative_noise, smoothing_scale
+from mwdn.solvers.saturation import saturated_pixels
 from mwdn.solvers.splitting import Problem, initial_state, make_filters, update_copies, update_scene
 from mwdn.types import Measurement, Psf, Scene, Size, Spectrum
+
+MIXED = 0.1
+"""Part of a coarse pixel that is saturated, from which on its light counts as the least that it was."""
 
 
 @checked
@@ -28,7 +32,8 @@ class Pyramid:
 
     The sensor crops the pattern, which loses mostly the low frequencies of the scene. They need many iterations but
     few pixels: an image of half the size holds half the band, and depends on the PSF's low frequencies alone. The
-    finest level smooths by total variation; a last step adds the Wiener estimate of the residual.
+    finest level smooths by total variation; a last step adds the Wiener estimate of the residual. The light of a
+    saturated pixel (`mwdn.solvers.saturation`) is at least what the pixel holds.
 
     Called with a measurement (B, C, H, W) and a PSF, it returns the part (B, C, H, W) of the scene that faces the
     sensor.
@@ -84,18 +89,24 @@ class Estimate:
         return relative_noise(self.measurement)
 
     @cached_property
+    def saturated(self) -> Tensor:
+        """`saturated_pixels` of the measurement, (B, C, H, W)."""
+        return saturated_pixels(self.measurement)
+
+    @cached_property
     def scene(self) -> Scene:
         """The part (B, C, H, W) that faces the sensor."""
         return self._on_sensor(self.grid_scene)
 
     @cached_property
     def residual(self) -> Measurement:
-        """The measurement minus the forward model of the scene, (B, C, H, W)."""
+        """The measurement minus the forward model of the scene, (B, C, H, W); not below 0 where it is saturated."""
         finest = self.psf.bands[-1]
         downsampling, (height, width) = finest.level.downsampling, self.measurement.shape[-2:]
         sensor = -(-height // downsampling), -(-width // downsampling)
         V = finest.transfer * finest.norm * spectrum(self.grid_scene, finest.grid)
-        return self.measurement - self._on_sensor(inverse_spectrum(V, finest.grid, sensor))
+        residual = self.measurement - self._on_sensor(inverse_spectrum(V, finest.grid, sensor))
+        return torch.where(self.saturated, residual.clamp(min=0), residual)
 
     def _on_sensor(self, image: Tensor) -> Tensor:
         """Enlarge an image from the finest level's pixels to the sensor's, and crop it."""
@@ -169,14 +180,16 @@ class PsfPyramid:
         smooth = any(band.level.regularisation for band in self.bands)
         scale = smoothing_scale(relative_noise(measurement)) if smooth else torch.ones_like(unit)
         size_factor = math.sqrt(size[0] * size[1]) / REFERENCE_SIDE
-        sizes = {1: b}
-        while max(sizes) < self.bands[0].level.downsampling:
-            sizes[2 * max(sizes)] = halve(sizes[max(sizes)])
+        sizes, saturated = {1: b}, {1: saturated_pixels(b).float()}
+        while (side := max(sizes)) < self.bands[0].level.downsampling:
+            sizes[2 * side], saturated[2 * side] = halve(sizes[side]), halve(saturated[side])
         scene: Tensor = b.new_zeros((1, 1, 1, 1))
         work = [band.level.iterations / band.level.downsampling**2 for band in self.bands]  # in proportion to time
         for number, band in enumerate(self.bands):
             done = [sum(work[:end]) / max(sum(work), 1e-9) for end in (number, number + 1)]
-            scene = _solve(sizes[band.level.downsampling], band, scene, scale, size_factor, done)
+            side = band.level.downsampling
+            problem = Problem.from_transfer(sizes[side], band.transfer, saturated[side] > MIXED)
+            scene = _solve(problem, band, scene, scale, size_factor, done)
         return Estimate(measurement, scene.clamp(min=0) * unit, self)
 
 
@@ -224,17 +237,18 @@ def low_band(transfer: Spectrum, grid: Size, downsampling: int) -> Tensor:
     return low[..., : columns // 2 + 1].mT.contiguous().mT  # the memory layout of `spectrum`
 
 
-def _solve(b: Tensor, band: Band, coarser: Tensor, scale: Tensor, size_factor: float, done: list[float]) -> Tensor:
+def _solve(
+    problem: Problem, band: Band, coarser: Tensor, scale: Tensor, size_factor: float, done: list[float]
+) -> Tensor:
     """Scene on the whole grid after the iterations of one level, started at the coarser scene."""
     # The penalties are stated for a PSF whose colours have a mean square sum of 1, so the scene is times that norm.
-    problem = Problem.from_transfer(b, band.transfer)
     start = enlarge(coarser, band.grid).clamp(min=0) * band.norm
     level = band.level
     mu, tau = level.smoothing(scale)
     tau = size_factor * tau
     smooth = level.regularisation > 0
     filters = make_filters(problem, mu, smooth=smooth)
-    state = initial_state(problem, start.expand(*b.shape[:2], *band.grid), smooth=smooth)
+    state = initial_state(problem, start.expand(*problem.measurement.shape[:2], *band.grid), smooth=smooth)
     for _ in iterations(level.iterations, start=done[0], end=done[1]):
         state = update_copies(state, problem, mu, tau, "colour")
         state = update_scene(state, problem, filters)

@@ -45,12 +45,16 @@ TEXTBOOK = Penalties(1e-6, 1e-5, 4e-5)
 
 
 class Problem(NamedTuple):
-    """The constants of the iteration: b, H, |Psi|^2. The grid holds every scene point that reaches the sensor."""
+    """The constants of the iteration: b, H, |Psi|^2. The grid holds every scene point that reaches the sensor.
+
+    Where b is ``saturated``, bool, the light was at least b: the data term of a pixel is zero if C x is larger.
+    """
 
     measurement: Measurement
     transfer: Spectrum
     laplacian: Tensor
     grid: Size
+    saturated: Tensor | None = None
 
     @classmethod
     def from_psf(cls, measurement: Measurement, psf: Psf) -> "Problem":
@@ -64,14 +68,14 @@ class Problem(NamedTuple):
         return cls.from_transfer(measurement.float(), transfer_function(psf, (height, width)))
 
     @classmethod
-    def from_transfer(cls, measurement: Tensor, transfer: Tensor) -> "Problem":
+    def from_transfer(cls, measurement: Tensor, transfer: Tensor, saturated: Tensor | None = None) -> "Problem":
         """Problem of a PSF's transfer function, (B, C, height, width // 2 + 1) on a grid of even width."""
         height, width = transfer.shape[-2], 2 * (transfer.shape[-1] - 1)
         # |Psi|^2 of periodic forward differences is 4 sin^2 along each axis.
         rows = torch.arange(height, device=transfer.device)[:, None] * (math.pi / height)
         columns = torch.arange(width // 2 + 1, device=transfer.device) * (math.pi / width)
         laplacian = 4 * rows.sin().square() + 4 * columns.sin().square()
-        return cls(measurement, transfer, laplacian, (height, width))
+        return cls(measurement, transfer, laplacian, (height, width), saturated)
 
     @property
     def sensor(self) -> Size:
@@ -124,9 +128,15 @@ def update_copies(state: State, problem: Problem, mu: Penalties, tau: float | Te
         gradient_target = gy.add_(by), gx.add_(bx)
         del by, bx  # frees a large image's memory
     # z - prox(z) = (z - b) / (1 + mu1)
-    data_target = reflected(state.Hv, state.data_target).add_(problem.measurement).div_(1 + mu.data).add_(state.Hv)
+    data_target = deficit(problem, state.Hv, state.data_target).div_(1 + mu.data).add_(state.Hv)
     sign_target = torch.maximum(state.v, state.sign_target - state.v)
     return state._replace(data_target=data_target, gradient_target=gradient_target, sign_target=sign_target)
+
+
+def deficit(problem: Problem, Hv: Measurement, target: Measurement) -> Measurement:
+    """``b - z`` with ``z = 2 H v - target``; not below 0 where b is saturated."""
+    missing = reflected(Hv, target).add_(problem.measurement)
+    return missing if problem.saturated is None else torch.where(problem.saturated, missing.clamp(min=0), missing)
 
 
 def reflected(value: Tensor, target: Tensor) -> Tensor:

@@ -1,0 +1,27 @@
+"""Pixels that the light has saturated: what they hold is the least that the light was."""
+
+import torch
+from torch import Tensor
+
+from mwdn.types import Measurement
+
+PLATEAU = 0.98, 0.995
+"""Parts of a colour's maximum. In a saturated capture more pixels are above the second than between the two; in others
+many times fewer, for the brightest light is rare."""
+
+LEAST_SATURATED = 5e-4
+"""Smallest fraction of saturated pixels: fewer are peaks of the light, or hot pixels."""
+
+
+def saturated_pixels(measurement: Measurement) -> Tensor:
+    """Where a measurement (B, C, H, W) is saturated, bool, found by the plateau at the maximum of each colour.
+
+    So neither the scale of the measurement matters nor the black level that was subtracted. A capture without a
+    plateau, or with fewer than 50 levels of grey, has none.
+    """
+    most = measurement.amax((-2, -1), keepdim=True)
+    sample = measurement[..., ::2]
+    above, at = ((sample >= part * most).float().mean((-2, -1), keepdim=True) for part in PLATEAU)
+    below = above - at
+    is_plateau = (at > below) & (below > 0) & (at >= LEAST_SATURATED)
+    return measurement >= torch.where(is_plateau, PLATEAU[1] * most, torch.inf)
