@@ -57,7 +57,7 @@ def interrupted(line, sign, number=signal.SIGINT):
 
 
 def test_reconstruct(here):
-    code, lines = interrupted("reconstruct captures --method wiener -o out", " explains ")
+    code, lines = interrupted("reconstruct captures --method wiener -o out", " saturated")
     assert code == 130
     done = re.fullmatch(r"Interrupted: (\d+) of 500 captures (is|are) done\. .*--resume.*\n", lines[-1])
     assert 0 < int(done[1]) <= len(list((here / "out").glob("*.json"))) < COPIES
