@@ -75,12 +75,14 @@ def main():
     for name, conditioned in conditions:
         calibration = camera(arguments.data, name)
         for title, made, protocol in conditioned:
-            row = next((row for row in rows if row["captures"] == title), None)
+            row = next(
+                (row for row in rows if (row["captures"], len(row["at_the_maximum"])) == (title, len(made))), None
+            )
             if row is None:
                 share = [float((b >= 0.995 * b.amax((-2, -1), keepdim=True)).float().mean()) for b, _ in made]
                 values = {each: scores(Reconstructor(each, calibration), made, protocol) for each in METHODS}
                 row = {"captures": title, "at_the_maximum": share, "values": values}
-                rows.append(row)
+                rows = [*(other for other in rows if other["captures"] != title), row]
                 keep(rows, arguments.out)
             means = " | ".join(f"{fmean(row['values'][method]):.2f}" for method in METHODS)
             print(f"| {title} | {fmean(row['at_the_maximum']):.1%} | {means} |", flush=True)

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from mwdn import Calibration, convolve, read_frame
+from mwdn.calibration.isolated_pixels import find_isolated_pixels
 from mwdn.cli.app import main
 
 pytestmark = pytest.mark.acceptance
@@ -41,6 +42,23 @@ def test_objects_of_the_papers_camera(data: Path, pattern: str, psf: str, count:
         border = np.r_[scene[:20].ravel(), scene[-20:].ravel()].mean()
         middle = scene.shape[0] // 2
         assert scene[middle - 40 : middle + 40, middle - 40 : middle + 40].mean() > 3 * border
+
+
+def test_one_pixel_of_all_real_captures_is_hot(data: Path) -> None:
+    """Captures are sharp, but no light in them is taken for a hot pixel."""
+    camera = data / "mwdn-camera"
+    files = [
+        *sorted((camera / "real-objects").glob("*.png")),
+        camera / "display_capture.tif",
+        data / "diffusercam-tutorial" / "rawdata_hand_sample.tif",
+        *sorted((data / "diffusercam" / "diffuser_images").glob("*.npy")),
+    ]
+    found = {}
+    for file in files:
+        frame = torch.from_numpy(read_frame(file).astype(np.float32)).movedim(-1, 0)[None]
+        found[file.stem] = int(find_isolated_pixels(frame).sum())
+    assert len(files) == 20
+    assert {name: count for name, count in found.items() if count} == {"scene2": 1}
 
 
 def test_hand_at_full_size(data: Path) -> None:

@@ -112,14 +112,14 @@ class FrameFormat:
         return read_frame(path, bgr=self.bgr), self
 
     def to_measurement(
-        self, frame: Frame, dark: Tensor | None = None, correct: Callable[[Image, int], Image] = Corrections()
+        self, frame: Frame, dark: Tensor | None = None, corrections: Callable[[Image, int], Image] = Corrections()
     ) -> Measurement:
         """Turn a raw frame into a measurement.
 
         Args:
             frame: (H, W, C), from `read`.
             dark: frame to subtract, from `normalise`: taken without light, or with the room's light alone.
-            correct: what is corrected in raw pixels (1, C, H, W) of a ``cell``: `Corrections`.
+            corrections: flat field and hot pixels, in raw pixels (1, C, H, W): `Corrections`, or its `of_capture`.
 
         Returns:
             (1, C, height, width), linear light, row 0 at the top; 1 is saturation.
@@ -131,7 +131,7 @@ class FrameFormat:
         image = self.normalise(frame)
         if dark is not None:
             image = subtract_dark(image, dark)
-        image = correct(image, self.cell)
+        image = corrections(image, self.cell)
         if self.crop is not None:
             image = crop_centre(image, self.crop, self.cell)
         if self.mosaic is not None:

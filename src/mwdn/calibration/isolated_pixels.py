@@ -45,7 +45,8 @@ def find_isolated_pixels(capture: Image, *, cell: int = 1) -> Tensor:
     deviation = noise * (level / planes.mean().clamp(min=1e-12)).clamp(min=1).sqrt()
     excess = (planes[channel, y, x] - level) / deviation.clamp(min=1e-12)
     hot = excess > ISOLATED[1]
-    found = torch.zeros_like(planes, dtype=torch.bool)
-    if (excess > ISOLATED[0]).sum() <= 2 * hot.sum() <= 2 * MOST_ISOLATED * planes.numel():
-        found[channel[hot], y[hot], x[hot]] = True
-    return F.pixel_shuffle(found.float()[None], cell).amax(1, keepdim=True) > 0
+    count, suspected = int(hot.sum()), int((excess > ISOLATED[0]).sum())
+    found = torch.zeros_like(planes)
+    if count >= suspected / 2 and count <= MOST_ISOLATED * planes.numel():
+        found[channel[hot], y[hot], x[hot]] = 1.0
+    return F.pixel_shuffle(found[None], cell).amax(1, keepdim=True) > 0

@@ -20,7 +20,7 @@ from mwdn.solvers.splitting import Problem, initial_state, make_filters, update_
 from mwdn.types import Measurement, Psf, Scene, Size, Spectrum
 
 MIXED = 0.1
-"""Part of a coarse pixel that is saturated, from which on its light counts as the least that it was."""
+"""Saturated part of a coarse pixel above which its value is taken as a lower bound of the light."""
 
 
 @checked
@@ -77,21 +77,18 @@ class Estimate:
         grid_scene: (B, C, rows, columns), the scene on the whole grid of the finest level, not negative, for a PSF of
             unit sum.
         psf: of the iterations.
+        saturated: (B, C, H, W), `saturated_pixels` of the measurement.
     """
 
     measurement: Measurement
     grid_scene: Tensor
     psf: "PsfPyramid"
+    saturated: Tensor
 
     @cached_property
     def noise(self) -> Tensor:
         """`relative_noise` of the measurement, (B, 1, 1, 1)."""
         return relative_noise(self.measurement)
-
-    @cached_property
-    def saturated(self) -> Tensor:
-        """`saturated_pixels` of the measurement, (B, C, H, W)."""
-        return saturated_pixels(self.measurement)
 
     @cached_property
     def scene(self) -> Scene:
@@ -180,17 +177,18 @@ class PsfPyramid:
         smooth = any(band.level.regularisation for band in self.bands)
         scale = smoothing_scale(relative_noise(measurement)) if smooth else torch.ones_like(unit)
         size_factor = math.sqrt(size[0] * size[1]) / REFERENCE_SIDE
-        sizes, saturated = {1: b}, {1: saturated_pixels(b).float()}
+        saturated = saturated_pixels(b)
+        sizes, parts = {1: b}, {1: saturated.float()}
         while (side := max(sizes)) < self.bands[0].level.downsampling:
-            sizes[2 * side], saturated[2 * side] = halve(sizes[side]), halve(saturated[side])
+            sizes[2 * side], parts[2 * side] = halve(sizes[side]), halve(parts[side])
         scene: Tensor = b.new_zeros((1, 1, 1, 1))
         work = [band.level.iterations / band.level.downsampling**2 for band in self.bands]  # in proportion to time
         for number, band in enumerate(self.bands):
             done = [sum(work[:end]) / max(sum(work), 1e-9) for end in (number, number + 1)]
             side = band.level.downsampling
-            problem = Problem.from_transfer(sizes[side], band.transfer, saturated[side] > MIXED)
+            problem = Problem.from_transfer(sizes[side], band.transfer, parts[side] > MIXED)
             scene = _solve(problem, band, scene, scale, size_factor, done)
-        return Estimate(measurement, scene.clamp(min=0) * unit, self)
+        return Estimate(measurement, scene.clamp(min=0) * unit, self, saturated)
 
 
 def solve(measurement: Measurement, psf: Psf, levels: tuple[Level, ...] = LEVELS) -> Estimate:

@@ -1,4 +1,4 @@
-"""Pixels that the light has saturated: what they hold is the least that the light was."""
+"""Saturated pixels, whose values are a lower bound of the light."""
 
 import torch
 from torch import Tensor
