@@ -1,12 +1,16 @@
 """Light of a room on the sensor: what it costs, and what --ambient and --room-light bring back.
 
-    python benchmarks/ambient.py ../shared/data [--methods pyramid universal-small] [--psfs "mwdn-camera 320x320"]
+    python benchmarks/ambient.py ../shared/data [--methods universal-small universal] [--psfs "mwdn-camera 320x320"]
                                               [--filling 2] [--dark 2]
 
 Test photographs that fill the frame and objects on dark, 15,000 electrons at saturation, exact PSF. The light is a
 share of the mean measurement: even 20 %, a slope of 0 to 50 %, Gaussian spots of 30 % with a standard deviation of 0.4
-(wide) and 0.15 (narrow) of the frame's width. PSNR over the whole frame, clipped, means. `ambient` subtracts a noisy
-frame of the room's light alone. Prints the table and writes the numbers of each picture.
+(wide) and 0.15 (narrow) of the frame's width. PSNR over the whole frame, clipped, means. Prints the table and writes
+the numbers of each picture.
+
+`ambient` subtracts a noisy frame of the room's light alone. Two rows say what no method can recover. `exact` subtracts
+the light itself, so that only its photon noise remains. `dark room` has no such light, but the exposure of the capture
+that has: a bright spot saturates earlier, so the scene gets less light.
 """
 
 import argparse
@@ -24,7 +28,7 @@ from mwdn.optics.room_light import even_light, sloping_light, spot_light
 from mwdn.optics.sensor import Sensor
 from universal import PSFS, camera, keep
 
-HANDLINGS = ("nothing", "room-light", "ambient")
+HANDLINGS = ("nothing", "room-light", "ambient", "exact", "dark room")
 
 
 def lights(size):
@@ -61,8 +65,10 @@ def scores(reconstructors, calibration, picture, *, fills):
         generator = torch.Generator().manual_seed(1)
         capture = sensor.expose((clean + room) * gain, generator=generator) / gain
         frame = sensor.expose((clean * 0 + room) * gain, generator=generator) / gain
+        dark = sensor.expose(clean * gain, generator=generator) / gain
+        measurements = dict(zip(HANDLINGS, (capture, capture, capture - frame, capture - room, dark), strict=True))
         values[name] = {
-            handling: round(float(psnr(one(capture - frame * (handling == "ambient")).clamp(0, 1), truth)), 3)
+            handling: round(float(psnr(one(measurements[handling]).clamp(0, 1), truth)), 3)
             for handling, one in reconstructors.items()
         }
     return values
@@ -86,7 +92,7 @@ def main():
         for method in arguments.methods:
             plain = Reconstructor(method, calibration)
             lit = Reconstructor(method, calibration, room_light=True)
-            ways = dict(zip(HANDLINGS, (plain, lit, plain), strict=True))
+            ways = dict(zip(HANDLINGS, (plain, lit, plain, plain, plain), strict=True))
             for kind, numbers in (
                 ("filling", range(arguments.filling)),
                 ("dark", range(arguments.filling, arguments.filling + arguments.dark)),
