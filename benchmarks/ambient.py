@@ -90,7 +90,7 @@ def main():
     for name in arguments.psfs:
         calibration = camera(arguments.data, name)
         for method in arguments.methods:
-            plain = Reconstructor(method, calibration)
+            plain = Reconstructor(method, calibration, room_light=False)
             lit = Reconstructor(method, calibration, room_light=True)
             ways = dict(zip(HANDLINGS, (plain, lit, plain, plain, plain), strict=True))
             for kind, numbers in (

@@ -82,6 +82,15 @@ def test_scale_and_batch_do_not_matter(psf, scene):
     assert math.isclose(float(alone.share), float(found.share[0]), rel_tol=1e-3)
 
 
+def test_a_frame_that_is_not_finite_has_none(psf, scene):
+    measurement, light = lit(scene, psf, 0.3 * even_light(SIZE))
+    frames = torch.cat([measurement + light, measurement + math.inf])
+    found = find_room_light(frames, psf)
+    assert float(found.share[0]) == pytest.approx(float(find_room_light(frames[:1], psf).share), rel=1e-3)
+    assert float(found.share[1]) == 0.0
+    assert (found.background[1] == 0).all()
+
+
 def test_a_reconstructor_subtracts_it(psf, scene):
     measurement, light = lit(scene, psf, 0.3 * even_light(SIZE))
     calibration = Calibration(psf / psf.sum((-2, -1), keepdim=True))

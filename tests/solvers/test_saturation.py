@@ -9,11 +9,12 @@ from torch.nn import functional as F
 from cameras import contour_psf
 from mwdn import convolve
 from mwdn.inference.methods import find_method
+from mwdn.optics.room_light import sloping_light, spot_light
 from mwdn.solvers import Admm, Penalties, Pyramid
 from mwdn.solvers.plug_and_play import plug_and_play
 from mwdn.solvers.proximal import Variation
 from mwdn.solvers.pyramid import solve
-from mwdn.solvers.saturation import saturated_pixels
+from mwdn.solvers.saturation import saturated_pixels, subtract_light
 from mwdn.solvers.splitting import Problem, initial_state, update_copies
 
 SIZE = 96, 128
@@ -31,6 +32,27 @@ def camera(generator):
 def overexposed(light):
     """A twentieth of its pixels saturated."""
     return light.clamp(max=float(light.quantile(0.95)))
+
+
+def test_saturated_pixels_stay_a_bound_below_other_light(generator):
+    """A slope is subtracted: the plateau is the least that remains of it, never more than the scene's light."""
+    _, _, light = camera(generator)
+    room = 0.2 * light.mean() * sloping_light(SIZE, 0.6)
+    capture = overexposed(light + room)
+    rest = subtract_light(capture, room.expand_as(capture))
+    was, now = saturated_pixels(capture), saturated_pixels(rest)
+    assert was.any()
+    assert now[was].all()
+    assert (rest[now] <= light[now] + 1e-6).all()
+    torch.testing.assert_close(rest[~now], light[~now])
+    assert torch.equal(subtract_light(capture, torch.zeros_like(capture)), capture)
+
+
+def test_a_lamp_that_saturates_by_itself_is_no_bound_of_the_scene():
+    lamp = spot_light(SIZE, (0.3, 0.3), 0.1)[None, None]
+    capture = (0.3 + lamp / lamp.max()).clamp(max=0.8)
+    rest = subtract_light(capture, lamp / lamp.max())
+    assert (rest[lamp < 0.1 * lamp.max()] > 0.29).all()
 
 
 @pytest.mark.parametrize("gain", [1e-6, 1.0, 50.0])

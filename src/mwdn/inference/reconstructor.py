@@ -21,6 +21,7 @@ from mwdn.networks.blocks import check_channels
 from mwdn.networks.network import Network, as_network
 from mwdn.runtime.devices import select_device
 from mwdn.runtime.transfers import to_device, to_host
+from mwdn.solvers.saturation import subtract_light
 from mwdn.types import ArrayPicture, FloatFrame, Frame, Measurement, Scene
 
 PIXELS_PER_CHUNK = {"cpu": 2**17, "cuda": 2**24}
@@ -45,7 +46,8 @@ class Reconstructor:
         ensemble: average a network's results for the measurement and its three mirror images, see
             `mwdn.inference.ensemble.Ensemble`. It takes four times as long; for a network that takes any PSF.
         room_light: whether to find and subtract even light, a slope and a narrow spot of light of the room in each
-            measurement first, see `mwdn.solvers.room_light`.
+            measurement first, see `mwdn.solvers.room_light`. ``None`` does so where a network aligns, as ``universal``
+            does, and the calibration has no ambient frame.
         **options: of a solver given by its name, for example ``regularisation=1e-4``.
 
     It can be copied and pickled if its method can.
@@ -73,7 +75,7 @@ class Reconstructor:
         precision: Precision = "fast",
         white_balance: WhiteBalance | None = None,
         ensemble: bool = False,
-        room_light: bool = False,
+        room_light: bool | None = None,
         **options: Any,  # noqa: ANN401
     ) -> None:
         given = {"method": method, "align": align, "device": device, "precision": precision, "ensemble": ensemble}
@@ -86,7 +88,7 @@ class Reconstructor:
             )
         self.device = select_device(device)
         self.pixels_per_chunk = PIXELS_PER_CHUNK.get(self.device.type, PIXELS_PER_CHUNK["cpu"])
-        self.calibration, self.room_light = calibration, room_light
+        self.calibration = calibration
         self.white_balance = calibration.white_balance if white_balance is None else white_balance
         check_white_balance(self.white_balance, calibration.light)
         self.warning = None
@@ -96,7 +98,10 @@ class Reconstructor:
         self.method: Method = as_method(method, **options)
         method = self.method
         self.warning = self.warning or background_warning(self.name, method, calibration)
-        self.align = method.align if align is None and isinstance(method, Network) else bool(align)
+        aligns = isinstance(method, Network) and method.align
+        self.align = aligns if align is None else align
+        unknown = aligns and self.align and calibration.ambient is None
+        self.room_light = unknown if room_light is None else room_light
         self.psf = psf_for(method, calibration).to(self.device)
         self.engine: Engine[Any] | Ensemble[Any] | None = None
         if isinstance(method, nn.Module):
@@ -170,11 +175,11 @@ class Reconstructor:
             yield measurement, to_host(self.balance(scene))
 
     def without_room_light(self, measurement: Measurement) -> tuple[Measurement, Tensor | None]:
-        """The measurement less the light of the room, and its share (B,); as it is and `None` without that option."""
+        """The measurement less the light of the room, and its share (B,); as it is and `None` if it is not sought."""
         if not self.room_light:
             return measurement, None
         found = solvers.find_room_light(measurement, self.psf)
-        return measurement - found.background, found.share
+        return subtract_light(measurement, found.background), found.share
 
     def _reconstruct(self, measurement: Measurement) -> Scene:
         if self.align:

@@ -228,7 +228,7 @@ class Preview:
             options=checked_options(method, form.json("options")),
             align=form.flag("align"),
             trust=trust is not False,
-            room_light=form.flag("room_light") is True,
+            room_light=form.flag("room_light"),
             ambient=form.files.get("ambient", b""),
         )
         job = self.jobs.submit(partial(self.reconstructions.run, order=order), size=sum(map(len, form.files.values())))

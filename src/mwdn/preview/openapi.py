@@ -117,7 +117,10 @@ def _order() -> dict[str, Any]:
         method={"type": "string", "default": "universal-small"},
         options=_json('Of the method: `{"iterations": 50}`.'),
         align={"enum": ["true", "false"], "description": "Fit the pose of the PSF first."},
-        room_light={"enum": ["true", "false"], "description": "Find and subtract the room's light."},
+        room_light={
+            "enum": ["true", "false"],
+            "description": "Find and subtract the room's light; default: universal.",
+        },
         trust={"enum": ["true", "false"], "default": "true", "description": "Check the picture."},
         format={"enum": list(get_args(PictureFormat)), "default": "png"},
         exposure=_exposure(),

@@ -44,7 +44,7 @@ class Order:
         options: of the method.
         align: as for `Reconstructor`.
         trust: check the picture, which takes a second or two.
-        room_light: find and subtract the room's light, see `mwdn.Reconstructor`.
+        room_light: as for `Reconstructor`.
         ambient: the file of a frame of the room's light alone, taken as the capture; empty if there is none.
     """
 
@@ -54,7 +54,7 @@ class Order:
     options: dict[str, Any] = field(default_factory=dict)
     align: bool | None = None
     trust: bool = True
-    room_light: bool = False
+    room_light: bool | None = None
     ambient: bytes = b""
 
 

@@ -90,6 +90,8 @@ def find_room_light(measurement: Measurement, psf: Psf) -> RoomLight:
     check_fit(measurement, psf, "measurement")
     psf, b = checked_psf(psf).float(), measurement.float()
     batch, channels = b.shape[:2]
+    finite = b.isfinite().flatten(1).all(1)
+    b = torch.where(finite[:, None, None, None], b, 1.0)
     size = b.shape[-2], b.shape[-1]
     while b.shape[-2] * b.shape[-1] > PIXELS:
         b, psf = halve(b), halve_psf(psf)
@@ -104,7 +106,7 @@ def find_room_light(measurement: Measurement, psf: Psf) -> RoomLight:
     plane = torch.where((plane.mean((1, 2, 3)) >= FAINT * whole)[:, None, None, None], plane, 0.0)
     background = plane + spot.light(size) * mean
     share = background.mean((1, 2, 3)) / whole
-    share = torch.where((share > 0) & (share < 1), share, 0.0)  # NaN is none
+    share = torch.where(finite & (share > 0) & (share < 1), share, 0.0)  # NaN is none
     return RoomLight(torch.where(share[:, None, None, None] > 0, background, 0.0).to(measurement.dtype), share)
 
 

@@ -25,3 +25,14 @@ def saturated_pixels(measurement: Measurement) -> Tensor:
     below = above - at
     is_plateau = (at > below) & (below > 0) & (at >= LEAST_SATURATED)
     return measurement >= torch.where(is_plateau, PLATEAU[1] * most, torch.inf)
+
+
+def subtract_light(measurement: Measurement, light: Tensor) -> Measurement:
+    """A measurement less some light (B, C, H, W), whose saturated pixels stay a plateau: a lower bound of the rest.
+
+    The bound is the least that remains of a saturated pixel. Pixels of which more than half is this light do not count:
+    it alone may have saturated them.
+    """
+    rest = measurement - light
+    known = saturated_pixels(measurement) & (light > 0) & (light < measurement / 2)
+    return rest.minimum(torch.where(known, rest, torch.inf).amin((-2, -1), keepdim=True))

@@ -57,7 +57,7 @@ function orderFields(method = byId("method").value, trust = byId("trust").checke
   const options = method === byId("method").value ? readSliders() : {};
   const align = byId("align").checked ? "true" : "";
   const room = byId("room-light").value;
-  const light = { room_light: room === "found" ? "true" : "", ambient: room === "frame" ? chosen.ambient : null };
+  const light = { room_light: String(room === "found"), ambient: room === "frame" ? chosen.ambient : null };
   return { ...cameraFields(), ...light, capture: chosen.capture, method, align, trust: String(trust), options: JSON.stringify(options) };
 }
 
