@@ -10,6 +10,7 @@ import torch
 from mwdn import Calibration, convolve, read_frame
 from mwdn.calibration.isolated_pixels import find_isolated_pixels
 from mwdn.cli.app import main
+from mwdn.solvers import find_room_light
 
 pytestmark = pytest.mark.acceptance
 OUT = Path("results/acceptance")
@@ -42,6 +43,27 @@ def test_objects_of_the_papers_camera(data: Path, pattern: str, psf: str, count:
         border = np.r_[scene[:20].ravel(), scene[-20:].ravel()].mean()
         middle = scene.shape[0] // 2
         assert scene[middle - 40 : middle + 40, middle - 40 : middle + 40].mean() > 3 * border
+
+
+def test_no_room_light_is_found_in_real_captures(data: Path) -> None:
+    """Nor where the brightest tenth of a capture is cut off: `universal` looks for it by default."""
+    camera, diffusercam, tutorial = data / "mwdn-camera", data / "diffusercam", data / "diffusercam-tutorial"
+    small, large = (Calibration.from_file(camera / name) for name in ("psf_320.png", "psf_480.tif"))
+    other = Calibration.from_file(tutorial / "psf_sample.tif", bin=4)
+    options = {"background": 0.0, "upside_down": True, "bgr": True}
+    pairs = Calibration.from_file(diffusercam / "psf_recovered_270x480.npy", **options)
+    captures = [
+        *((small, file) for file in sorted((camera / "real-objects").glob("object_*"))),
+        *((large, file) for file in sorted((camera / "real-objects").glob("scene*"))),
+        (large, camera / "display_capture.tif"),
+        (other, tutorial / "rawdata_hand_sample.tif"),
+        *((pairs, file) for file in sorted((diffusercam / "diffuser_images").glob("*.npy"))),
+    ]
+    assert len(captures) == 20
+    for calibration, file in captures:
+        measurement = calibration.correct(calibration.frames.read(file))
+        for b in (measurement, measurement.clamp(max=float(measurement.quantile(0.9)))):
+            assert float(find_room_light(b, calibration.psf).share) == 0.0, file.stem
 
 
 def test_one_pixel_of_all_real_captures_is_hot(data: Path) -> None:

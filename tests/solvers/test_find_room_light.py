@@ -10,6 +10,7 @@ from cameras import contour_psf
 from mwdn import Calibration, Reconstructor, fourier
 from mwdn.optics.room_light import even_light, sloping_light, spot_light
 from mwdn.solvers import Pyramid, find_room_light
+from mwdn.solvers.unexplained import energy, unexplained
 
 SIZE = 48, 64
 
@@ -32,7 +33,14 @@ def lit(scene, psf, light):
     return measurement, light * measurement.mean((1, 2, 3), keepdim=True)
 
 
-@pytest.mark.parametrize(("light", "error"), [(0.3 * even_light(SIZE), 0.04), (0.25 * sloping_light(SIZE, 0.6), 0.04)])
+@pytest.mark.parametrize(
+    ("light", "error"),
+    [
+        (0.3 * even_light(SIZE), 0.04),
+        (0.25 * sloping_light(SIZE, 0.0), 0.04),
+        (0.25 * sloping_light(SIZE, 0.6), 0.04),
+    ],
+)
 def test_known_light_over_a_scene_on_dark(psf, scene, light, error):
     measurement, light = lit(scene, psf, light)
     found = find_room_light(measurement + light, psf)
@@ -56,6 +64,17 @@ def test_a_scene_on_dark_keeps_its_light(psf, scene):
     found = find_room_light(fourier.convolve(scene, psf), psf)
     assert float(found.share) == 0.0
     assert (found.background == 0).all()
+
+
+@pytest.mark.parametrize("kept", [0.98, 0.9, 0.7])
+def test_light_that_is_cut_off_is_not_unexplained(psf, scene, kept):
+    """The brightest pixels are saturated. The scene that explains the others is brighter there."""
+    measurement = fourier.convolve(scene, psf)
+    limit = float(measurement.quantile(kept))
+    cut, saturated = measurement.clamp(max=limit) / measurement.mean(), measurement >= limit
+    as_light, as_bound = (energy(unexplained(cut, psf, mask)) for mask in (saturated & False, saturated))
+    assert float(as_bound) < 0.05 * float(as_light)
+    assert float(find_room_light(cut, psf).share) == 0.0
 
 
 def test_a_scene_that_fills_the_frame_loses_little(psf, generator):

@@ -100,8 +100,8 @@ class Reconstructor:
         self.warning = self.warning or background_warning(self.name, method, calibration)
         aligns = isinstance(method, Network) and method.align
         self.align = aligns if align is None else align
-        unknown = aligns and self.align and calibration.ambient is None
-        self.room_light = unknown if room_light is None else room_light
+        sought = aligns and self.align and calibration.ambient is None
+        self.room_light = sought if room_light is None else room_light
         self.psf = psf_for(method, calibration).to(self.device)
         self.engine: Engine[Any] | Ensemble[Any] | None = None
         if isinstance(method, nn.Module):

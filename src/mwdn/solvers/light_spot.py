@@ -93,17 +93,20 @@ class Spot(NamedTuple):
         return Spot(*(torch.where(condition[:, None], *both) for both in zip(self, other, strict=True)))
 
 
-def find_spot(b: Measurement, psf: Psf) -> Spot:
-    """The spot in captures (B, C, h, w) of mean 1, through PSFs (B, C, h, w); of amplitude 0 where there is none."""
+def find_spot(b: Measurement, psf: Psf, saturated: Tensor) -> Spot:
+    """The spot in captures (B, C, h, w) of mean 1, ``saturated`` in places, through PSFs (B, C, h, w).
+
+    Its amplitude is 0 where there is none.
+    """
     basis = cosines((b.shape[-2], b.shape[-1]), b.device)
     size, spot = basis.size, Spot(b.new_ones(len(b), 3), b.new_zeros(b.shape[:2]))
     best = none = spot
-    r = unexplained(b, psf)
+    r = unexplained(b, psf, saturated)
     without = least = energy(r)
     for _ in range(STEPS):
-        J = differences(b - spot.light(size), psf, basis.light)
+        J = differences(b - spot.light(size), psf, saturated, basis.light)
         spot = best_spot(r - basis.coefficients(spot.light(size)) @ J, J, basis)
-        r = unexplained(b - spot.light(size), psf)
+        r = unexplained(b - spot.light(size), psf, saturated)
         best, before, least = spot.where(energy(r) < least, best), least, torch.minimum(energy(r), least)
         if not ((without > PROMISING * least) & (before > 1.02 * least)).any():
             break

@@ -3,7 +3,8 @@
 The capture b is a scene v through the PSF, and a background B c of even light and a slope, after a spot of light has
 been subtracted (`mwdn.solvers.light_spot`):
 
-1. ``b = C H v + B c + noise`` with ``v >= 0`` and ``B c >= 0``. C crops to the sensor.
+1. ``b = C H v + B c + noise`` with ``v >= 0`` and ``B c >= 0``. C crops to the sensor. Where b is saturated, the right
+   side may be larger.
 2. ``r(c) = b - B c - C H v(c)``, where v(c) is the best scene for this background (`mwdn.solvers.unexplained`).
    ``E(c) = |r(c)|^2 / pixels``, in units of the mean measurement.
 
@@ -33,7 +34,8 @@ from mwdn.fourier.convolution import check_fit
 from mwdn.optics.psf import checked_psf
 from mwdn.solvers.alignment import halve_psf
 from mwdn.solvers.light_spot import find_spot
-from mwdn.solvers.pyramid import halve
+from mwdn.solvers.pyramid import MIXED, halve
+from mwdn.solvers.saturation import saturated_pixels
 from mwdn.solvers.unexplained import DELTA, energy, unexplained
 from mwdn.types import Measurement, Psf, Size
 
@@ -93,14 +95,16 @@ def find_room_light(measurement: Measurement, psf: Psf) -> RoomLight:
     finite = b.isfinite().flatten(1).all(1)
     b = torch.where(finite[:, None, None, None], b, 1.0)
     size = b.shape[-2], b.shape[-1]
+    parts = saturated_pixels(b).float()
     while b.shape[-2] * b.shape[-1] > PIXELS:
-        b, psf = halve(b), halve_psf(psf)
+        b, psf, parts = halve(b), halve_psf(psf), halve(parts)
+    saturated = parts > MIXED
     mean = b.mean((-2, -1), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
     psf = psf.expand(batch, channels, -1, -1)
     y, psf = b / mean, psf / psf.sum((-2, -1), keepdim=True)
-    spot = find_spot(y, psf)
+    spot = find_spot(y, psf, saturated)
     y = y - spot.light((y.shape[-2], y.shape[-1]))
-    c = _search(y.reshape(-1, 1, *y.shape[-2:]), psf.reshape(-1, 1, *psf.shape[-2:]))
+    c = _search(*(each.reshape(-1, 1, *each.shape[-2:]) for each in (y, psf, saturated)))
     plane = (c @ _planes(size, c.device).flatten(1)).reshape(batch, channels, *size).mul_(mean).clamp_(min=0)
     whole = mean.mean((1, 2, 3))
     plane = torch.where((plane.mean((1, 2, 3)) >= FAINT * whole)[:, None, None, None], plane, 0.0)
@@ -116,17 +120,17 @@ def _planes(size: Size, device: torch.device) -> Tensor:
     return torch.stack([torch.ones(size, device=device), down[:, None].expand(size), right.expand(size)])
 
 
-def _search(b: Measurement, psf: Psf) -> Tensor:
-    """Equation (3) for measurements (n, 1, h, w) of mean 1 through PSFs (n, 1, h, w): coefficients (n, 3)."""
+def _search(b: Measurement, psf: Psf, saturated: Tensor) -> Tensor:
+    """Equation (3) for measurements (n, 1, h, w) of mean 1, ``saturated`` in places, through PSFs: c (n, 3)."""
     size = b.shape[-2], b.shape[-1]
     B = _planes(size, b.device)
     delta = b.new_tensor([-DELTA, DELTA, DELTA])  # less even light, because more is impossible at first
     c = _largest_plane(b, B)
-    limit = energy(unexplained(b, psf))
+    limit = energy(unexplained(b, psf, saturated))
     offsets = torch.cat([delta.new_zeros(1, 3), delta.diag()])
     for step in range(STEPS):
         trials = ((c[:, None] + offsets) @ B.flatten(1)).reshape(-1, len(offsets), *size)
-        r = unexplained(b - trials, psf.expand(-1, len(offsets), -1, -1))
+        r = unexplained(b - trials, *(each.expand(-1, len(offsets), -1, -1) for each in (psf, saturated)))
         J = (r[:, 1:] - r[:, :1]) / delta[:, None]
         if step == 0:
             limit = limit + TOLERANCE**2 * J[:, 0].square().mean(1)

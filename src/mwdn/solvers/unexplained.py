@@ -16,20 +16,23 @@ DELTA = 0.05
 _PENALTIES = Penalties(0.15, 0.0, 0.6)
 
 
-def unexplained(b: Measurement, psf: Psf) -> Tensor:
+def unexplained(b: Measurement, psf: Psf, saturated: Tensor) -> Tensor:
     """``b - C H v`` with the best scene ``v >= 0`` after `ITERATIONS` from a dark one: (B, C, pixels).
 
     Args:
         b: (B, C, h, w), of mean 1, less a background.
         psf: (B, C, h, w).
+        saturated: (B, C, h, w), bool: there the light was at least b, and a brighter scene contradicts nothing.
     """
     planes, h = b.reshape(-1, 1, *b.shape[-2:]), psf.reshape(-1, 1, *psf.shape[-2:])
     norm = h.square().sum((-2, -1), keepdim=True).sqrt()  # the penalties are for a PSF of unit norm
-    problem = Problem.from_psf(planes, h / norm)
+    saturated = saturated.reshape(planes.shape)
+    problem = Problem.from_psf(planes, h / norm)._replace(saturated=saturated)
     filters, state = make_filters(problem, _PENALTIES, smooth=False), initial_state(problem, smooth=False)
     for _ in range(ITERATIONS):
         state = update_scene(update_copies(state, problem, _PENALTIES, 0.0, "colour"), problem, filters)
-    return (planes - state.Hv).reshape(*b.shape[:2], -1)
+    r = planes - state.Hv
+    return torch.where(saturated, r.clamp(min=0), r).reshape(*b.shape[:2], -1)
 
 
 def energy(r: Tensor) -> Tensor:
@@ -37,8 +40,9 @@ def energy(r: Tensor) -> Tensor:
     return r.square().mean((1, 2))
 
 
-def differences(b: Measurement, psf: Psf, lights: Tensor) -> Tensor:
+def differences(b: Measurement, psf: Psf, saturated: Tensor, lights: Tensor) -> Tensor:
     """Finite differences (B, T, pixels) of `unexplained`, of the mean colour, for more of each light (T, h, w)."""
     trials = b.mean(1, keepdim=True) - DELTA * torch.cat([torch.zeros_like(lights[:1]), lights])
-    r = unexplained(trials, psf.mean(1, keepdim=True).expand(-1, trials.shape[1], -1, -1))
+    psf, saturated = psf.mean(1, keepdim=True), saturated.any(1, keepdim=True)
+    r = unexplained(trials, *(each.expand(-1, trials.shape[1], -1, -1) for each in (psf, saturated)))
     return (r[:, 1:] - r[:, :1]) / DELTA
