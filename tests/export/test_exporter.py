@@ -30,6 +30,7 @@ from mwdn.io.images import srgb_encode, write_frame
 from mwdn.networks import NETWORKS, build
 from mwdn.solvers import SOLVERS
 from mwdn.solvers import build as build_solver
+from mwdn.solvers.saturation import saturated_pixels
 
 pytest.importorskip("onnx", reason="The extra is missing: pip install 'mwdn[export]'")
 pytest.importorskip("onnxruntime", reason="The extra is missing: pip install 'mwdn[export]'")
@@ -68,6 +69,13 @@ class Rectified(nn.Module):
 
     def forward(self, measurement, psf):
         return self.convolution(measurement).relu()
+
+
+class Saturated(nn.Module):
+    """Marks saturated pixels, as `pyramid` does."""
+
+    def forward(self, measurement, psf):
+        return torch.where(saturated_pixels(measurement), 2.0, measurement)
 
 
 @pytest.fixture(scope="module")
@@ -275,6 +283,16 @@ def test_the_example_says_in_one_line_what_is_wrong(arguments, message, unchange
         example(monkeypatch, *arguments)
     assert "\n" not in str(ended.value)
     assert not list(tmp_path.glob("scene.*"))
+
+
+def test_saturated_pixels_are_found_in_the_file(tmp_path, generator):
+    """The first capture is cut off at 70 % of its maximum, the second one is not."""
+    seen = random_batch(generator)
+    seen[0] = seen[0].clamp(max=0.7)
+    done = export(Saturated(), camera(), tmp_path / "camera.onnx")
+    marked = run_file(done.path, seen) == 2
+    assert torch.equal(marked[0], seen[0] >= 0.995 * 0.7)
+    assert not marked[1].any()
 
 
 @pytest.mark.acceptance

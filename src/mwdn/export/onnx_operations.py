@@ -1,4 +1,4 @@
-"""Conversion of torch's real operations to ONNX, as far as this package's networks and solvers use them.
+"""Conversion of torch's operations on real tensors to ONNX: arithmetic, reductions, shapes. Layers: `onnx_layers`.
 
 A handler takes the graph, the node of torch and its arguments: names for computed values, tensors and numbers for
 constants. It adds operations to the graph and returns the name of the result.
@@ -14,7 +14,7 @@ from mwdn.errors import ExportError
 from mwdn.export.onnx_graph import OnnxGraph, Pair
 
 _aten = torch.ops.aten
-_TYPES = {torch.float32: 1, torch.float16: 10}  # numbers of onnx.TensorProto
+TYPES = {torch.float32: 1, torch.float16: 10}  # numbers of onnx.TensorProto
 Handler = Callable[..., Any]
 
 
@@ -33,25 +33,25 @@ def filled(arguments: Sequence[Any], *defaults: Any) -> tuple[Any, ...]:  # noqa
     return (*arguments, *defaults[len(arguments) :])
 
 
-def _reshape_target(shape: Sequence[Any]) -> list[int]:
+def reshape_target(shape: Sequence[Any]) -> list[int]:
     """Shape for a Reshape, with -1 for a free batch size."""
     return [length if isinstance(length, int) else -1 for length in shape]
 
 
-def _shape(g: OnnxGraph, shape: Sequence[Any]) -> str:
+def shape_name(g: OnnxGraph, shape: Sequence[Any]) -> str:
     """Name of a shape whose first axis may depend on the batch size."""
     if all(isinstance(length, int) for length in shape):
         return g.integers(shape)
     times = int(shape[0].node.expr.as_coeff_Mul()[0])  # colours moved into the batch
     batch = g("Mul", g("Shape", "measurement", start=0, end=1), g.integers([times]))
-    return g("Concat", batch, g.integers(_reshape_target(shape)[1:]), axis=0)
+    return g("Concat", batch, g.integers(reshape_target(shape)[1:]), axis=0)
 
 
 def _plain(operation: str) -> Handler:
     """An operation with the same meaning in ONNX; mixed precisions are promoted as in torch."""
 
     def handler(g: OnnxGraph, node: fx.Node, *arguments: Any) -> str:  # noqa: ANN401
-        return g(operation, *(_as(g, value(node).dtype, *each) for each in zip(arguments, node.args, strict=True)))
+        return g(operation, *(as_type(g, value(node).dtype, *each) for each in zip(arguments, node.args, strict=True)))
 
     return handler
 
@@ -66,11 +66,23 @@ def _sum(operation: str) -> Handler:
     return handler
 
 
-def _as(g: OnnxGraph, dtype: torch.dtype, x: Any, argument: Any) -> Any:  # noqa: ANN401
+def as_type(g: OnnxGraph, dtype: torch.dtype, x: Any, argument: Any) -> Any:  # noqa: ANN401
     """A number or result, cast to a precision."""
     if not isinstance(argument, fx.Node):
         return torch.tensor(x, dtype=dtype)
-    return x if value(argument).dtype == dtype else g("Cast", x, to=_TYPES[dtype])
+    return x if value(argument).dtype == dtype else g("Cast", x, to=TYPES[dtype])
+
+
+def _compare(operation: str) -> Handler:
+    def handler(g: OnnxGraph, node: fx.Node, a: str, b: Any) -> str:  # noqa: ANN401
+        return g(operation, a, as_type(g, source(node).dtype, b, node.args[1]))
+
+    return handler
+
+
+def _where(g: OnnxGraph, node: fx.Node, condition: str, *given: Any) -> str:  # noqa: ANN401
+    values = zip(given, node.args[1:], strict=True)
+    return g("Where", condition, *(as_type(g, value(node).dtype, *each) for each in values))
 
 
 def _identity(g: OnnxGraph, node: fx.Node, x: Any, **_: Any) -> Any:  # noqa: ANN401
@@ -99,7 +111,9 @@ def _deviation(g: OnnxGraph, node: fx.Node, x: str, axes: list[int], correction:
 
 def _concatenation(g: OnnxGraph, node: fx.Node, parts: list[Any], axis: int = 0) -> str:
     arguments: Any = node.args[0]
-    return g("Concat", *(_as(g, value(node).dtype, *each) for each in zip(parts, arguments, strict=True)), axis=axis)
+    return g(
+        "Concat", *(as_type(g, value(node).dtype, *each) for each in zip(parts, arguments, strict=True)), axis=axis
+    )
 
 
 def _stack(g: OnnxGraph, node: fx.Node, parts: list[str], axis: int = 0) -> str:
@@ -107,7 +121,7 @@ def _stack(g: OnnxGraph, node: fx.Node, parts: list[str], axis: int = 0) -> str:
 
 
 def _full(g: OnnxGraph, node: fx.Node, x: str, fill: float, **_: Any) -> str:  # noqa: ANN401
-    return g("Expand", fill, _shape(g, value(node).shape))
+    return g("Expand", fill, shape_name(g, value(node).shape))
 
 
 def _median(g: OnnxGraph, node: fx.Node, x: str, axis: int, keep: bool = False) -> tuple[str, str]:
@@ -164,64 +178,19 @@ def _flip(g: OnnxGraph, node: fx.Node, x: str, axes: list[int]) -> str:
 
 
 def _reshape(g: OnnxGraph, node: fx.Node, x: str, *_: Any) -> str:  # noqa: ANN401
-    return g("Reshape", x, g.integers(_reshape_target(value(node).shape)))
+    return g("Reshape", x, g.integers(reshape_target(value(node).shape)))
 
 
 def _expand(g: OnnxGraph, node: fx.Node, x: str, *_: Any, **__: Any) -> str:  # noqa: ANN401
-    return g("Expand", x, _shape(g, value(node).shape))
+    return g("Expand", x, shape_name(g, value(node).shape))
 
 
 def _zeros(g: OnnxGraph, node: fx.Node, *_: Any, **__: Any) -> str:  # noqa: ANN401
-    return g("Expand", 0.0, _shape(g, value(node).shape))
+    return g("Expand", 0.0, shape_name(g, value(node).shape))
 
 
 def _cast(g: OnnxGraph, node: fx.Node, x: str, *_: Any, **__: Any) -> str:  # noqa: ANN401
-    return _as(g, value(node).dtype, x, node.args[0])
-
-
-def _convolution(g: OnnxGraph, node: fx.Node, x: str, *others: Any) -> str:  # noqa: ANN401
-    weight, bias, stride, padding, dilation, groups = filled(others, None, None, (1, 1), (0, 0), (1, 1), 1)
-    return g("Conv", x, weight, bias, strides=stride, pads=[*padding, *padding], dilations=dilation, group=groups)
-
-
-def _convolution_transpose(g: OnnxGraph, node: fx.Node, x: str, *others: Any) -> str:  # noqa: ANN401
-    defaults = None, None, (1, 1), (0, 0), (0, 0), 1, (1, 1)
-    weight, bias, stride, padding, more, groups, dilation = filled(others, *defaults)
-    shape = {"strides": stride, "pads": [*padding, *padding], "output_padding": more, "dilations": dilation}
-    return g("ConvTranspose", x, weight, bias, group=groups, **shape)
-
-
-def _pool(operation: str) -> Handler:
-    def handler(g: OnnxGraph, node: fx.Node, x: str, size: list[int], stride: Any = (), *others: Any) -> str:  # noqa: ANN401
-        if any(each not in ([0, 0], [1, 1], False) for each in others):
-            raise ExportError(f"`{node.target}` with padding cannot be written as ONNX. Export to .pt2 instead.")
-        return g(operation, x, kernel_shape=size, strides=stride or size)
-
-    return handler
-
-
-def _group_norm(g: OnnxGraph, node: fx.Node, x: str, groups: int, weight: Any, bias: Any, *others: Any) -> str:  # noqa: ANN401
-    # In float32, as in torch: squares summed over a picture exceed the range of float16.
-    one, epsilon, dtype = torch.ones(groups), (*others, 1e-5)[0], value(node).dtype
-    grouped = g("Reshape", _as(g, torch.float32, x, node.args[0]), g.integers([0, groups, -1]))
-    normal = g("InstanceNormalization", grouped, one, torch.zeros(groups), epsilon=epsilon)
-    spread = g("Reshape", normal, g.integers(_reshape_target(value(node).shape)))
-    result = g("Add", g("Mul", spread, weight.float()[:, None, None]), bias.float()[:, None, None])
-    return result if dtype == torch.float32 else g("Cast", result, to=_TYPES[dtype])
-
-
-def _upsample(g: OnnxGraph, node: fx.Node, x: str, size: Any, corners: bool, *_: Any) -> str:  # noqa: ANN401
-    # All four lengths: onnxruntime 1.31 loses the axes of a Resize when it moves it (to NHWC, for int8).
-    mode = "align_corners" if corners else "half_pixel"
-    wanted = _shape(g, value(node).shape)
-    return g("Resize", x, None, None, wanted, mode="linear", coordinate_transformation_mode=mode)
-
-
-def _unshuffle(g: OnnxGraph, node: fx.Node, x: str, block: int) -> str:
-    # SpaceToDepth has another order of channels.
-    _, channels, height, width = source(node).shape
-    split = g("Reshape", x, g.integers([-1, channels, height // block, block, width // block, block]))
-    return _reshape(g, node, g("Transpose", split, perm=[0, 1, 3, 5, 2, 4]))
+    return as_type(g, value(node).dtype, x, node.args[0])
 
 
 def _transpose(g: OnnxGraph, node: fx.Node, x: str, one: int, other: int) -> str:
@@ -247,31 +216,27 @@ REAL: dict[Any, Handler] = {
     **dict.fromkeys((_aten.new_zeros.default, _aten.zeros_like.default), _zeros),
     **dict.fromkeys((_aten._to_copy.default, _aten.to.dtype), _cast),
     _aten.abs.default: _plain("Abs"),
+    **dict.fromkeys((_aten.ge.Tensor, _aten.ge.Scalar), _compare("GreaterOrEqual")),
+    **dict.fromkeys((_aten.gt.Tensor, _aten.gt.Scalar), _compare("Greater")),
     _aten.add.Tensor: _sum("Add"),
     _aten.amax.default: _reduce("ReduceMax"),
-    _aten.avg_pool2d.default: _pool("AveragePool"),
+    **dict.fromkeys((_aten.__and__.Tensor, _aten.bitwise_and.Tensor), lambda g, node, a, b: g("And", a, b)),
     _aten.cat.default: _concatenation,
     _aten.clamp.default: _clamp,
     _aten.complex.default: lambda g, node, real, imaginary: Pair(real, imaginary),
-    _aten.conv2d.default: _convolution,
-    _aten.conv_transpose2d.input: _convolution_transpose,
     _aten.div.Tensor: _plain("Div"),
     _aten.exp.default: _plain("Exp"),
     _aten.expand.default: _expand,
     _aten.flip.default: _flip,
     _aten.full_like.default: _full,
-    _aten.group_norm.default: _group_norm,
     _aten.linalg_vector_norm.default: _norm,
     _aten.log.default: _plain("Log"),
-    _aten.lt.Tensor: lambda g, node, a, b: g("Less", a, b),
-    _aten.max_pool2d.default: _pool("MaxPool"),
+    **dict.fromkeys((_aten.lt.Tensor, _aten.lt.Scalar), _compare("Less")),
     _aten.maximum.default: _plain("Max"),
     _aten.mean.dim: _reduce("ReduceMean"),
     _aten.median.dim: _median,
     _aten.mul.Tensor: _plain("Mul"),
     _aten.pad.default: _pad,
-    _aten.pixel_shuffle.default: lambda g, node, x, block: g("DepthToSpace", x, blocksize=block, mode="CRD"),
-    _aten.pixel_unshuffle.default: _unshuffle,
     _aten.pow.Scalar: _plain("Pow"),
     _aten.pow.Tensor_Scalar: _plain("Pow"),
     _aten.reciprocal.default: _plain("Reciprocal"),
@@ -289,7 +254,6 @@ REAL: dict[Any, Handler] = {
     _aten.sum.dim_IntList: _reduce("ReduceSum"),
     _aten.transpose.int: _transpose,
     _aten.unbind.int: _unbind,
-    _aten.upsample_bilinear2d.vec: _upsample,
-    _aten.where.self: lambda g, node, *given: g("Where", *given),
+    **dict.fromkeys((_aten.where.self, _aten.where.ScalarOther, _aten.where.ScalarSelf), _where),
 }
-"""Handlers of real operations."""
+"""Handlers of operations on real tensors."""

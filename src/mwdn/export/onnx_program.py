@@ -16,6 +16,7 @@ from torch.export import ExportedProgram
 from mwdn.errors import ExportError
 from mwdn.export import dft
 from mwdn.export.onnx_graph import OnnxGraph, Pair
+from mwdn.export.onnx_layers import LAYERS
 from mwdn.export.onnx_operations import REAL, Handler, filled, source, value
 
 if TYPE_CHECKING:
@@ -85,7 +86,7 @@ def _convert(g: OnnxGraph, step: fx.Node, arguments: Any, options: Any) -> Any: 
         return None  # the batch size, which the shapes hold
     if step.target is operator.getitem or (step.target is _aten.select.int and isinstance(arguments[0], Pair)):
         return arguments[0][arguments[-1]]
-    handlers = _TRANSFORMS if step.target in _AXIS else REAL
+    handlers = _TRANSFORMS if step.target in _AXIS else REAL | LAYERS
     if step.target not in _AXIS and any(_is_complex(source) for source in step.all_input_nodes):
         handlers = _ON_PAIRS
     if step.target not in handlers:
