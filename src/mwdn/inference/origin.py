@@ -27,9 +27,6 @@ _OPTIONS = {
 }
 """What counts of a network besides its weights; all public attributes of any other module."""
 
-_FIRST_NAMES = {"downsampling": "shrink", "only_if_noisy": "poor", "min_smoothing": "least"}
-"""Fields of `mwdn.solvers.levels.Level` that have been renamed."""
-
 
 def settings_hash(reconstruct: Reconstructor, format: str, *, full_size: bool = False) -> str:
     """Hash of the method with its weights, the calibration, format and size of files and this package's version."""
@@ -109,10 +106,8 @@ def _digest(*parts: object) -> str:
 
 
 def _text(part: object) -> str:
-    """`repr`, with the names that a solver's fields had when the first hashes were written."""
+    """`repr`, with the fields that ADMM had when the first hashes were written."""
     text = repr(part)
-    for name, first_name in _FIRST_NAMES.items():
-        text = text.replace(f"{name}=", f"{first_name}=")
     if isinstance(part, Admm):
         text = text.removesuffix(")") + ", tolerance=0.0, balance_every=0)"
     return text

@@ -1,6 +1,5 @@
 """A bank of Wiener filters followed by a U-Net; not from the paper."""
 
-from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import torch
@@ -18,10 +17,17 @@ from mwdn.networks.network import Network
 from mwdn.solvers.levels import LEVELS, REFERENCE_NOISE, Level, brightness
 from mwdn.solvers.plug_and_play import plug_and_play
 from mwdn.solvers.pyramid import Band, Estimate, PsfPyramid
+from mwdn.solvers.splitting import Penalties
 from mwdn.types import Measurement, Psf, Scene, Size
 
-COARSE_ITERATIONS = {8: 12, 4: 18, 2: 8}
-"""Iterations at each downsampling where the bank restores the detail: a quarter less time, for a tenth of a decibel."""
+COARSE_LEVELS = (
+    Level(16, 16, Penalties(0.0375, 1.0, 0.15), 0.01),
+    Level(8, 4, Penalties(0.15, 0.0, 0.6)),
+    Level(4, 18, Penalties(0.15, 0.0, 0.6)),
+    Level(2, 8, Penalties(0.2, 0.0, 0.9)),
+)
+"""Levels where the bank restores the detail. Total variation at the coarsest decides how the light is shared between the
+scene in the frame and around it; the others do without, which takes less time."""
 
 BOUNDARY: Boundary = "taper"
 """Boundary handling where the bank filters the measurement itself."""
@@ -258,13 +264,8 @@ class WienerBank(Network[BankTransfers]):
 
 def pyramid_levels(finest: int) -> tuple[Level, ...]:
     """Levels of the iterations from the coarsest to a downsampling of ``finest``; none for 0."""
-    levels = tuple(level for level in LEVELS if finest and level.downsampling >= finest)
-    if finest <= 1:
-        return levels
-    # Without total variation: the bank restores the detail.
-    return tuple(
-        replace(level, regularisation=0.0, iterations=COARSE_ITERATIONS[level.downsampling]) for level in levels
-    )
+    levels = LEVELS if finest == 1 else COARSE_LEVELS
+    return tuple(level for level in levels if finest and level.downsampling >= finest)
 
 
 def block_means(picture: Tensor, block: int) -> Tensor:
