@@ -4,11 +4,11 @@
                                                 [--psfs "mwdn-camera 320x320" ...] [--calibrations real-like]
 
 Four measured PSFs; 15,000 and 2,000 electrons at saturation; test photographs placed and mismatched by the recipe
-mismatched, or seen by cameras with all that real ones have, recipe real-like. Hot pixels are replaced as in a capture's
-file. Scored as in `mwdn evaluate` (full, clipped). Prints a table of means, with the confidence interval of the first
-method's gain over the last, and writes the numbers of each picture, a few at a time. Numbers already in the record are
-not measured again, so a stopped run continues; `--again` measures the named methods again. One process per core, of one
-thread each.
+mismatched, or seen by cameras with all that real ones have, recipe real-like. `filling`: photographs that fill the
+frame, exact PSF. Hot pixels are replaced as in a capture's file. Scored as in `mwdn evaluate` (full, clipped). Prints a
+table of means, with the confidence interval of the first method's gain over the last, and writes the numbers of each
+picture, a few at a time. Numbers already in the record are not measured again, so a stopped run continues; `--again`
+measures the named methods again. One process per core, of one thread each.
 
 The method `fine-tuned` is, for each PSF, the network in `TUNED` that the recipe finetune made of `universal`.
 """
@@ -45,7 +45,12 @@ PSFS = {
 }
 TUNED = {name: f"runs/finetune-{path.partition('/')[0]}/best.safetensors" for name, (path, _) in PSFS.items()}
 FULL_WELLS = (15_000.0, 2_000.0)
-CALIBRATIONS = {"exact": "mismatched", "mismatched": "mismatched", "real-like": "real-like"}
+CALIBRATIONS = {
+    "exact": "mismatched",
+    "mismatched": "mismatched",
+    "real-like": "real-like",
+    "filling": "mismatched",
+}
 """How well the PSF is known, and the recipe of the captures."""
 KEYS = ("psf", "full_well", "calibration")
 METRICS = ("psnr", "ssim", "lpips")
@@ -116,7 +121,10 @@ def scores(data, which, numbers, methods):
     name, full_well, known = which
     calibration, recipe = camera(data, name), read_recipe(CALIBRATIONS[known])
     photographs = Photographs(data / "photos" / "test")
-    made = captures(calibration.psf, photographs, recipe, full_well, numbers, exact=known == "exact")
+    if known == "filling":
+        recipe = replace(recipe, placement=replace(recipe.placement, extent=(2.0, 2.0), aspect=1.0, offset=0.0))
+    is_exact = known in ("exact", "filling")
+    made = captures(calibration.psf, photographs, recipe, full_well, numbers, exact=is_exact)
     return measured({each: TUNED[name] if each == "fine-tuned" else each for each in methods}, made, calibration)
 
 
