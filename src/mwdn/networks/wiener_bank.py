@@ -21,8 +21,7 @@ from mwdn.solvers.splitting import Penalties
 from mwdn.types import Measurement, Psf, Scene, Size
 
 COARSE_LEVELS = (
-    Level(16, 16, Penalties(0.0375, 1.0, 0.15), 0.01),
-    Level(8, 4, Penalties(0.15, 0.0, 0.6)),
+    Level(8, 20, Penalties(0.0375, 1.0, 0.15), 0.01),
     Level(4, 18, Penalties(0.15, 0.0, 0.6)),
     Level(2, 8, Penalties(0.2, 0.0, 0.9)),
 )
