@@ -25,8 +25,8 @@ COARSE_LEVELS = (
     Level(4, 18, Penalties(0.15, 0.0, 0.6)),
     Level(2, 8, Penalties(0.2, 0.0, 0.9)),
 )
-"""Levels where the bank restores the detail. Total variation at the coarsest decides how the light is shared between the
-scene in the frame and around it; the others do without, which takes less time."""
+"""Levels where the bank restores the detail. Total variation at the coarsest decides how the light is shared between
+the scene in the frame and around it; the others do without, which takes less time."""
 
 BOUNDARY: Boundary = "taper"
 """Boundary handling where the bank filters the measurement itself."""
