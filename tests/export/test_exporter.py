@@ -23,7 +23,7 @@ from mwdn.errors import ExportError, MissingPackageError, ParameterError
 from mwdn.export import export, read_about, run_file
 from mwdn.export.dft import column_matrices, inverse_row_matrix, row_matrix
 from mwdn.export.exporter import MIN_AGREEMENT, agreement, simulate_captures
-from mwdn.export.onnx_operations import REAL
+from mwdn.export.onnx_program import REAL
 from mwdn.fourier.filtering import filter_image
 from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
 from mwdn.io.images import srgb_encode, write_frame

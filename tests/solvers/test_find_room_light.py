@@ -77,6 +77,12 @@ def test_light_that_is_cut_off_is_not_unexplained(psf, scene, kept):
     assert float(find_room_light(cut, psf).share) == 0.0
 
 
+def test_a_scene_that_fills_the_frame_loses_little(psf, generator):
+    """Its darkest light looks like the room's: an eighth of all light is the bound."""
+    scene = F.interpolate(torch.rand(1, 3, 6, 8, generator=generator) ** 2, size=SIZE, mode="bilinear")
+    assert float(find_room_light(fourier.convolve(scene, psf), psf).share) < 1 / 8
+
+
 @pytest.mark.parametrize("light", [0 * even_light(SIZE), 0.2 * even_light(SIZE), 0.25 * sloping_light(SIZE, 0.6)])
 def test_a_scene_that_fills_the_frame_keeps_its_light(psf, generator, light):
     """With the light of a room, too: what is subtracted there is mostly the scene's own."""

@@ -7,7 +7,7 @@ from torch import fx
 
 from mwdn.errors import ExportError
 from mwdn.export.onnx_graph import OnnxGraph
-from mwdn.export.onnx_operations import TYPES, Handler, as_type, filled, reshape_target, shape_name, source, value
+from mwdn.export.onnx_operations import TYPES, Handler, as_type, filled, reshape, shape_name, source, value
 
 _aten = torch.ops.aten
 
@@ -38,7 +38,7 @@ def _group_norm(g: OnnxGraph, node: fx.Node, x: str, groups: int, weight: Any, b
     one, epsilon, dtype = torch.ones(groups), (*others, 1e-5)[0], value(node).dtype
     grouped = g("Reshape", as_type(g, torch.float32, x, node.args[0]), g.integers([0, groups, -1]))
     normal = g("InstanceNormalization", grouped, one, torch.zeros(groups), epsilon=epsilon)
-    spread = g("Reshape", normal, g.integers(reshape_target(value(node).shape)))
+    spread = reshape(g, node, normal)
     result = g("Add", g("Mul", spread, weight.float()[:, None, None]), bias.float()[:, None, None])
     return result if dtype == torch.float32 else g("Cast", result, to=TYPES[dtype])
 
@@ -54,8 +54,7 @@ def _unshuffle(g: OnnxGraph, node: fx.Node, x: str, block: int) -> str:
     # SpaceToDepth has another order of channels.
     _, channels, height, width = source(node).shape
     split = g("Reshape", x, g.integers([-1, channels, height // block, block, width // block, block]))
-    swapped = g("Transpose", split, perm=[0, 1, 3, 5, 2, 4])
-    return g("Reshape", swapped, g.integers(reshape_target(value(node).shape)))
+    return reshape(g, node, g("Transpose", split, perm=[0, 1, 3, 5, 2, 4]))
 
 
 LAYERS: dict[Any, Handler] = {

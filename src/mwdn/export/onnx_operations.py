@@ -33,7 +33,7 @@ def filled(arguments: Sequence[Any], *defaults: Any) -> tuple[Any, ...]:  # noqa
     return (*arguments, *defaults[len(arguments) :])
 
 
-def reshape_target(shape: Sequence[Any]) -> list[int]:
+def _reshape_target(shape: Sequence[Any]) -> list[int]:
     """Shape for a Reshape, with -1 for a free batch size."""
     return [length if isinstance(length, int) else -1 for length in shape]
 
@@ -44,7 +44,7 @@ def shape_name(g: OnnxGraph, shape: Sequence[Any]) -> str:
         return g.integers(shape)
     times = int(shape[0].node.expr.as_coeff_Mul()[0])  # colours moved into the batch
     batch = g("Mul", g("Shape", "measurement", start=0, end=1), g.integers([times]))
-    return g("Concat", batch, g.integers(reshape_target(shape)[1:]), axis=0)
+    return g("Concat", batch, g.integers(_reshape_target(shape)[1:]), axis=0)
 
 
 def _plain(operation: str) -> Handler:
@@ -177,8 +177,9 @@ def _flip(g: OnnxGraph, node: fx.Node, x: str, axes: list[int]) -> str:
     return g("Slice", x, start, end, g.integers(axes), step)
 
 
-def _reshape(g: OnnxGraph, node: fx.Node, x: str, *_: Any) -> str:  # noqa: ANN401
-    return g("Reshape", x, g.integers(reshape_target(value(node).shape)))
+def reshape(g: OnnxGraph, node: fx.Node, x: str, *_: Any) -> str:  # noqa: ANN401
+    """A value in the shape of the node's result."""
+    return g("Reshape", x, g.integers(_reshape_target(value(node).shape)))
 
 
 def _expand(g: OnnxGraph, node: fx.Node, x: str, *_: Any, **__: Any) -> str:  # noqa: ANN401
@@ -209,15 +210,13 @@ def _split(g: OnnxGraph, node: fx.Node, x: str, size: int, axis: int = 0) -> lis
     return g.several("Split", len(lengths), x, g.integers(lengths), axis=axis)
 
 
-REAL: dict[Any, Handler] = {
+OPERATIONS: dict[Any, Handler] = {
     **dict.fromkeys((_aten.alias.default, _aten.clone.default, _aten.detach.default), _identity),
-    **dict.fromkeys((_aten.view.default, _aten._unsafe_view.default, _aten.reshape.default), _reshape),
-    _aten.unsqueeze.default: _reshape,
+    **dict.fromkeys((_aten.view.default, _aten._unsafe_view.default, _aten.reshape.default), reshape),
+    _aten.unsqueeze.default: reshape,
     **dict.fromkeys((_aten.new_zeros.default, _aten.zeros_like.default), _zeros),
     **dict.fromkeys((_aten._to_copy.default, _aten.to.dtype), _cast),
     _aten.abs.default: _plain("Abs"),
-    **dict.fromkeys((_aten.ge.Tensor, _aten.ge.Scalar), _compare("GreaterOrEqual")),
-    **dict.fromkeys((_aten.gt.Tensor, _aten.gt.Scalar), _compare("Greater")),
     _aten.add.Tensor: _sum("Add"),
     _aten.amax.default: _reduce("ReduceMax"),
     **dict.fromkeys((_aten.__and__.Tensor, _aten.bitwise_and.Tensor), lambda g, node, a, b: g("And", a, b)),
@@ -229,6 +228,8 @@ REAL: dict[Any, Handler] = {
     _aten.expand.default: _expand,
     _aten.flip.default: _flip,
     _aten.full_like.default: _full,
+    **dict.fromkeys((_aten.ge.Tensor, _aten.ge.Scalar), _compare("GreaterOrEqual")),
+    **dict.fromkeys((_aten.gt.Tensor, _aten.gt.Scalar), _compare("Greater")),
     _aten.linalg_vector_norm.default: _norm,
     _aten.log.default: _plain("Log"),
     **dict.fromkeys((_aten.lt.Tensor, _aten.lt.Scalar), _compare("Less")),
@@ -256,4 +257,4 @@ REAL: dict[Any, Handler] = {
     _aten.unbind.int: _unbind,
     **dict.fromkeys((_aten.where.self, _aten.where.ScalarOther, _aten.where.ScalarSelf), _where),
 }
-"""Handlers of operations on real tensors."""
+"""Handlers of arithmetic, reductions and shapes."""

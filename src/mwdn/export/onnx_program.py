@@ -17,10 +17,13 @@ from mwdn.errors import ExportError
 from mwdn.export import dft
 from mwdn.export.onnx_graph import OnnxGraph, Pair
 from mwdn.export.onnx_layers import LAYERS
-from mwdn.export.onnx_operations import REAL, Handler, filled, source, value
+from mwdn.export.onnx_operations import OPERATIONS, Handler, filled, source, value
 
 if TYPE_CHECKING:
     import onnx
+
+REAL = OPERATIONS | LAYERS
+"""Handlers of operations on real tensors."""
 
 _aten = torch.ops.aten
 _ROWS, _COLUMNS = _aten.fft_rfft.default, _aten.fft_fft.default
@@ -86,7 +89,7 @@ def _convert(g: OnnxGraph, step: fx.Node, arguments: Any, options: Any) -> Any: 
         return None  # the batch size, which the shapes hold
     if step.target is operator.getitem or (step.target is _aten.select.int and isinstance(arguments[0], Pair)):
         return arguments[0][arguments[-1]]
-    handlers = _TRANSFORMS if step.target in _AXIS else REAL | LAYERS
+    handlers = _TRANSFORMS if step.target in _AXIS else REAL
     if step.target not in _AXIS and any(_is_complex(source) for source in step.all_input_nodes):
         handlers = _ON_PAIRS
     if step.target not in handlers:
