@@ -5,7 +5,7 @@
 
 Four measured PSFs; 15,000 and 2,000 electrons at saturation; test photographs placed and mismatched by the recipe
 mismatched, or seen by cameras with all that real ones have, recipe real-like. `filling`: photographs that fill the
-frame, exact PSF. Hot pixels are replaced as in a capture's file. Scored as in `mwdn evaluate` (full, clipped). Prints a
+frame, exact PSF or mismatched. Hot pixels are replaced as in a capture's file. Scored as in `mwdn evaluate` (full, clipped). Prints a
 table of means, with the confidence interval of the first method's gain over the last, and writes the numbers of each
 picture, a few at a time. Numbers already in the record are not measured again, so a stopped run continues; `--again`
 measures the named methods again. One process per core, of one thread each.
@@ -50,6 +50,7 @@ CALIBRATIONS = {
     "mismatched": "mismatched",
     "real-like": "real-like",
     "filling": "mismatched",
+    "filling mismatched": "mismatched",
 }
 """How well the PSF is known, and the recipe of the captures."""
 KEYS = ("psf", "full_well", "calibration")
@@ -121,7 +122,7 @@ def scores(data, which, numbers, methods):
     name, full_well, known = which
     calibration, recipe = camera(data, name), read_recipe(CALIBRATIONS[known])
     photographs = Photographs(data / "photos" / "test")
-    if known == "filling":
+    if known.startswith("filling"):
         recipe = replace(recipe, placement=replace(recipe.placement, extent=(2.0, 2.0), aspect=1.0, offset=0.0))
     is_exact = known in ("exact", "filling")
     made = captures(calibration.psf, photographs, recipe, full_well, numbers, exact=is_exact)
