@@ -86,12 +86,15 @@ MIN_GAIN = 1e-3
 smaller gain is noise."""
 
 # At a quarter of the size: haze has low frequencies only, the slowest to converge. With 20 iterations each, a frame
-# that is filled hid its haze and lost 1 to 3 dB.
-_HAZES = (0.0, 0.02, 0.04, 0.07, 0.1, 0.14, 0.2)
-_HAZE_LEVELS = tuple(replace(level, downsampling=level.downsampling // 4) for level in LEVELS[:2])
-_HAZE_RISE = 0.014
-"""Rise of E over its minimum that ends the flat part. At this value, the best of 0.5 to 3 %, 16 exact captures through
-two measured PSFs give no haze, and 16 others gain 95 % of the decibels that their best haze gains."""
+# that is filled hid its haze and lost 1 to 3 dB. Strong smoothing keeps noise and detail out of what the haze explains.
+_HAZES = (0.0, 0.02, 0.04, 0.07, 0.1, 0.14)
+_HAZE_LEVELS = tuple(
+    replace(level, downsampling=level.downsampling // 4, regularisation=4 * level.regularisation)
+    for level in LEVELS[:2]
+)
+_HAZE_RISE = 1.05
+"""E over its minimum that ends the flat part. At this value, of 1.03 to 1.15, 40 captures through three measured PSFs,
+exact and under 10 % of haze, come within 0.05 dB of their best haze, and 24 that fill the frame within 0.25 dB."""
 
 
 @torch.no_grad()
@@ -151,11 +154,7 @@ def _better(theta: Tensor, r: Tensor, best: Tensor, least: Tensor) -> tuple[Tens
 
 
 def _estimate_haze(measurement: Measurement, psf: Psf) -> Tensor:
-    """Haze (B,) under the PSF (B, C, h, w) of each capture: the end of the flat part of E(haze).
-
-    Beyond the true haze h0, E is about the parabola ``E0 + E''/2 (h - h0)^2``, with ``E'' = 2 E(h) / h^2`` at the
-    largest h. Where it has risen by f E0, at ``h - h0 = sqrt(2 f E0 / E'')``, its slope is ``sqrt(2 f E0 E'')``.
-    """
+    """Haze (B,) under the PSF (B, C, h, w) of each capture: where E(haze) leaves its flat part, interpolated."""
     hazes = measurement.new_tensor(_HAZES)
     psfs = hazed(psf.repeat_interleave(len(hazes), 0), hazes.repeat(len(psf))[:, None, None, None])
     estimate = solve(measurement.repeat_interleave(len(hazes), 0), psfs, _HAZE_LEVELS)
@@ -163,10 +162,12 @@ def _estimate_haze(measurement: Measurement, psf: Psf) -> Tensor:
     low = _low_pass(grid, 4 * _HIGH_PASS, measurement.device)
     residual = inverse_spectrum(estimate.residual_spectrum * low, grid, grid)
     energy = residual.square().sum((1, 2, 3)).reshape(-1, len(hazes))
-    slope = (energy.diff() / hazes.diff()).cummax(1).values
-    curvature = 2 * energy[:, -1:] / hazes[-1] ** 2
-    flat = slope < (2 * _HAZE_RISE * energy.amin(1, keepdim=True) * curvature).sqrt()
-    return hazes[flat.sum(1)]
+    limit = _HAZE_RISE * energy.amin(1, keepdim=True)
+    last = (energy < limit).long().cumsum(1).argmax(1, keepdim=True)  # the first of the largest sums: the last True
+    after = (last + 1).clamp(max=len(hazes) - 1)
+    low_energy, high_energy = energy.gather(1, last), energy.gather(1, after)
+    part = (limit - low_energy) / (high_energy - low_energy).clamp(min=torch.finfo(energy.dtype).tiny)
+    return torch.lerp(hazes[last], hazes[after], part.clamp(max=1))[:, 0]
 
 
 def fine_detail(image: Image) -> Image:
