@@ -1,6 +1,7 @@
 """A PSF from a file, and raw frames to measurements."""
 
 import re
+from dataclasses import replace
 from typing import get_args
 
 import cv2
@@ -12,11 +13,13 @@ from PIL import Image
 
 from cameras import contour_psf
 from mwdn.calibration import Calibration, FrameFormat
+from mwdn.calibration.corrections import Corrections
 from mwdn.calibration.psf_levels import estimate_background
 from mwdn.errors import ImageError, ParameterError, PsfError, ShapeError, UnknownNameError
 from mwdn.fourier.convolution import convolve
 from mwdn.io.images import srgb_encode
 from mwdn.optics.orientation import Orientation, turn
+from mwdn.optics.saturation import saturated_pixels
 
 SIZE = 48, 40
 
@@ -200,6 +203,26 @@ def test_ambient_light_is_subtracted_from_captures_alone(tmp_path, caustic):
     np.testing.assert_allclose(measurement[0, 0], light[..., 0] / 65535, atol=1e-6)
     with pytest.raises(ShapeError, match=r"`ambient` \(1, 24, 40\), must have the size of the frame \(1, 48, 40\)"):
         Calibration.from_array(light, ambient=room[:24]).correct(light)
+
+
+@pytest.mark.parametrize("correction", ["ambient", "flat"])
+def test_saturated_pixels_stay_a_bound_after_a_correction(correction, generator):
+    """An uneven room, or an uneven response, would spread their values, and solvers would take each for the light."""
+    size = 144, 160
+    psf = contour_psf(size, cell=24, generator=generator)
+    light = 2.5 * psf / psf.max()
+    slope, even = torch.linspace(0.7, 1.3, size[1]).expand(1, 1, *size), torch.ones(1, 1, *size)
+    room, flat = (0.1 * slope, even) if correction == "ambient" else (0 * even, slope)
+    frame = (65535 * (flat * light + room).clamp(max=1)).round()[0, 0].numpy().astype(np.uint16)
+    calibration = replace(
+        Calibration.from_array(psf[0, 0].numpy(), background=0.0), ambient=room, corrections=Corrections(flat)
+    )
+    measurement, was = calibration.correct(frame), torch.from_numpy(frame == 65535)[None, None]
+    now = saturated_pixels(measurement)
+    assert was.sum() > 200
+    assert now[was].all()
+    assert (measurement[now] <= light[now] + 2e-5).all()
+    torch.testing.assert_close(measurement[~now], light[~now], atol=2e-5, rtol=0)
 
 
 @pytest.mark.parametrize("gamma", ["srgb", 2.2])

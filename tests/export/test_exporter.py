@@ -28,9 +28,9 @@ from mwdn.fourier.filtering import filter_image
 from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
 from mwdn.io.images import srgb_encode, write_frame
 from mwdn.networks import NETWORKS, build
+from mwdn.optics.saturation import saturated_pixels
 from mwdn.solvers import SOLVERS
 from mwdn.solvers import build as build_solver
-from mwdn.solvers.saturation import saturated_pixels
 
 pytest.importorskip("onnx", reason="The extra is missing: pip install 'mwdn[export]'")
 pytest.importorskip("onnxruntime", reason="The extra is missing: pip install 'mwdn[export]'")

@@ -10,11 +10,11 @@ from cameras import contour_psf
 from mwdn import convolve
 from mwdn.inference.methods import find_method
 from mwdn.optics.room_light import sloping_light, spot_light
+from mwdn.optics.saturation import saturated_pixels, subtract_light
 from mwdn.solvers import Admm, Penalties, Pyramid
 from mwdn.solvers.plug_and_play import plug_and_play
 from mwdn.solvers.proximal import Variation
 from mwdn.solvers.pyramid import solve
-from mwdn.solvers.saturation import saturated_pixels, subtract_light
 from mwdn.solvers.splitting import Problem, initial_state, update_copies
 
 SIZE = 96, 128

@@ -15,6 +15,7 @@ from mwdn.errors import ParameterError, checked
 from mwdn.io.formats import as_frame
 from mwdn.io.images import read_frame, srgb_decode, srgb_encode
 from mwdn.io.raw import Mosaic, is_raw, read_raw
+from mwdn.optics.saturation import keep_plateau
 from mwdn.types import Frame, Image, Measurement, Size
 
 Gamma = Literal["srgb"] | float
@@ -122,16 +123,16 @@ class FrameFormat:
             corrections: flat field and hot pixels, in raw pixels (1, C, H, W): `Corrections`, or its `of_capture`.
 
         Returns:
-            (1, C, height, width), linear light, row 0 at the top; 1 is saturation.
+            (1, C, height, width), linear light, row 0 at the top; 1 is saturation. Saturated pixels are a plateau.
 
         Raises:
             ParameterError: a pixel value exceeds the bit depth, or the frame is smaller than ``bin``.
             ShapeError: the dark frame, the crop or the mosaic does not fit the frame.
         """
-        image = self.normalise(frame)
-        if dark is not None:
-            image = subtract_dark(image, dark)
-        image = corrections(image, self.cell)
+        raw = self.normalise(frame)
+        image = corrections(raw if dark is None else subtract_dark(raw, dark), self.cell)
+        if image is not raw and self.saturated(frame)[0]:
+            image = keep_plateau(raw, image)
         if self.crop is not None:
             image = crop_centre(image, self.crop, self.cell)
         if self.mosaic is not None:

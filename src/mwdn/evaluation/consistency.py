@@ -21,8 +21,8 @@ from mwdn.errors import ShapeError, check_batch
 from mwdn.fourier.convolution import check_fit, convolve
 from mwdn.optics.noise import noise_level
 from mwdn.optics.psf import checked_psf
+from mwdn.optics.saturation import saturated_pixels
 from mwdn.solvers.alignment import Pose, align, fine_detail
-from mwdn.solvers.saturation import saturated_pixels
 from mwdn.types import Measurement, Psf, Scene
 
 
@@ -53,7 +53,7 @@ class Consistency:
         changes = [
             f"turned by {self.turn_degrees:.2f} degrees" * (abs(self.turn_degrees) > 0.2),
             f"scaled by {self.scale:+.1%}" * (abs(self.scale) > 0.005),
-            f"under {self.haze:.0%} of haze" * (self.haze > 0),
+            f"under {self.haze:.0%} of haze" * (self.haze >= 0.005),
         ]
         pose = ", ".join(filter(None, changes))
         return summary + (f"; fits best with the PSF {pose}" if pose else "")
@@ -65,7 +65,7 @@ def consistency(measurement: Measurement, psf: Psf, scene: Scene, *, pose: Pose 
 
     The scene passes the PSF in its best pose (rotation, scale and haze, `mwdn.solvers.alignment`) and the PSF as it is;
     the better one counts. The gain and an even background are free in each channel. Saturated pixels
-    (`mwdn.solvers.saturation`) contradict only a scene that leaves them darker.
+    (`mwdn.optics.saturation`) contradict only a scene that leaves them darker.
 
     A merely displaced PSF goes unnoticed: it displaces the reconstruction and explains the measurement as well.
 

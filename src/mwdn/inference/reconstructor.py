@@ -19,9 +19,9 @@ from mwdn.inference.methods import Method, as_method, background_warning, psf_fo
 from mwdn.io.formats import as_frame
 from mwdn.networks.blocks import check_channels
 from mwdn.networks.network import Network, as_network
+from mwdn.optics.saturation import subtract_light
 from mwdn.runtime.devices import select_device
 from mwdn.runtime.transfers import to_device, to_host
-from mwdn.solvers.saturation import subtract_light
 from mwdn.types import ArrayPicture, FloatFrame, Frame, Measurement, Scene
 
 PIXELS_PER_CHUNK = {"cpu": 2**17, "cuda": 2**24}

@@ -13,9 +13,9 @@ from mwdn.errors import ParameterError, checked
 from mwdn.fourier.convolution import check_fit
 from mwdn.fourier.transforms import fast_length, inverse_spectrum, spectrum, transfer_function
 from mwdn.optics.psf import checked_psf
+from mwdn.optics.saturation import saturated_pixels
 from mwdn.runtime.iterations import iterations
 from mwdn.solvers.levels import LEVELS, REFERENCE_SIDE, Level, brightness, relative_noise, smoothing_scale
-from mwdn.solvers.saturation import saturated_pixels
 from mwdn.solvers.splitting import Problem, initial_state, make_filters, update_copies, update_scene
 from mwdn.types import Measurement, Psf, Scene, Size, Spectrum
 
@@ -33,7 +33,7 @@ class Pyramid:
     The sensor crops the pattern, which loses mostly the low frequencies of the scene. They need many iterations but
     few pixels: an image of half the size holds half the band, and depends on the PSF's low frequencies alone. The
     finest level smooths by total variation; a last step adds the Wiener estimate of the residual. The light of a
-    saturated pixel (`mwdn.solvers.saturation`) is at least what the pixel holds.
+    saturated pixel (`mwdn.optics.saturation`) is at least what the pixel holds.
 
     Called with a measurement (B, C, H, W) and a PSF, it returns the part (B, C, H, W) of the scene that faces the
     sensor.

@@ -34,11 +34,11 @@ from torch.nn import functional as F
 from mwdn.errors import checked
 from mwdn.fourier.convolution import check_fit
 from mwdn.optics.psf import checked_psf
+from mwdn.optics.saturation import saturated_pixels, subtract_light
 from mwdn.solvers.alignment import halve_psf
 from mwdn.solvers.levels import LEVELS
 from mwdn.solvers.light_spot import find_spot
 from mwdn.solvers.pyramid import MIXED, halve, solve
-from mwdn.solvers.saturation import saturated_pixels, subtract_light
 from mwdn.solvers.unexplained import DELTA, energy, unexplained
 from mwdn.types import Measurement, Psf, Size
 

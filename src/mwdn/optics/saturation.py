@@ -28,11 +28,19 @@ def saturated_pixels(measurement: Measurement) -> Tensor:
 
 
 def subtract_light(measurement: Measurement, light: Tensor) -> Measurement:
-    """A measurement less some light (B, C, H, W), whose saturated pixels stay a plateau: a lower bound of the rest.
+    """A measurement less some light (B, C, H, W), whose saturated pixels stay a plateau (`keep_plateau`)."""
+    return keep_plateau(measurement, measurement - light)
 
-    The bound is the least that remains of a saturated pixel. Pixels of which more than half is this light do not count:
-    it alone may have saturated them.
+
+def keep_plateau(saturating: Measurement, corrected: Measurement) -> Measurement:
+    """A corrected measurement (B, C, H, W) whose saturated pixels are a plateau again: a lower bound of their light.
+
+    A flat field or a frame that is subtracted gives saturated pixels different values. The bound is the least of them.
+    Pixels that lose more than half do not count: what was subtracted may have saturated them by itself.
+
+    Args:
+        saturating: (B, C, H, W), the measurement before the correction.
+        corrected: (B, C, H, W).
     """
-    rest = measurement - light
-    known = saturated_pixels(measurement) & (light > 0) & (light < measurement / 2)
-    return rest.minimum(torch.where(known, rest, torch.inf).amin((-2, -1), keepdim=True))
+    known = saturated_pixels(saturating) & (corrected != saturating) & (corrected > saturating / 2)
+    return corrected.minimum(torch.where(known, corrected, torch.inf).amin((-2, -1), keepdim=True))
