@@ -5,10 +5,10 @@
 
 Four measured PSFs; 15,000 and 2,000 electrons at saturation; test photographs placed and mismatched by the recipe
 mismatched, or seen by cameras with all that real ones have, recipe real-like. `filling`: photographs that fill the
-frame, exact PSF or mismatched. Hot pixels are replaced as in a capture's file. Scored as in `mwdn evaluate` (full, clipped). Prints a
-table of means, with the confidence interval of the first method's gain over the last, and writes the numbers of each
-picture, a few at a time. Numbers already in the record are not measured again, so a stopped run continues; `--again`
-measures the named methods again. One process per core, of one thread each.
+frame, exact PSF or mismatched. Hot pixels are replaced as in a capture's file. Scored as in `mwdn evaluate` (full,
+clipped). Prints a table of means, with the confidence interval of the first method's gain over the last, and writes the
+numbers of each picture, a few at a time. Numbers already in the record are not measured again, so a stopped run
+continues; `--again` measures the named methods again. One process per core, of one thread each.
 
 The method `fine-tuned` is, for each PSF, the network in `TUNED` that the recipe finetune made of `universal`.
 """
