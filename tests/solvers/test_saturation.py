@@ -48,6 +48,16 @@ def test_saturated_pixels_stay_a_bound_below_other_light(generator):
     assert torch.equal(subtract_light(capture, torch.zeros_like(capture)), capture)
 
 
+def test_a_hot_pixel_of_the_dark_frame_is_no_bound(generator):
+    _, _, light = camera(generator)
+    capture = overexposed(light)
+    dark = torch.full_like(capture, 0.01 * float(capture.max()))
+    row, column = saturated_pixels(capture)[0, 0].nonzero()[0].tolist()
+    dark[..., row, column] = 0.4 * capture.max()
+    rest = subtract_light(capture, dark)
+    assert rest.max() == pytest.approx(0.99 * float(capture.max()), rel=0.005)
+
+
 def test_a_lamp_that_saturates_by_itself_is_no_bound_of_the_scene():
     lamp = spot_light(SIZE, (0.3, 0.3), 0.1)[None, None]
     capture = (0.3 + lamp / lamp.max()).clamp(max=0.8)

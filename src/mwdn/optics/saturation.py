@@ -2,6 +2,7 @@
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from mwdn.types import Measurement
 
@@ -35,12 +36,14 @@ def subtract_light(measurement: Measurement, light: Tensor) -> Measurement:
 def keep_plateau(saturating: Measurement, corrected: Measurement) -> Measurement:
     """A corrected measurement (B, C, H, W) whose saturated pixels are a plateau again: a lower bound of their light.
 
-    A flat field or a frame that is subtracted gives saturated pixels different values. The bound is the least of them.
-    Pixels that lose more than half do not count: what was subtracted may have saturated them by itself.
+    A flat field or a frame that is subtracted gives saturated pixels different values. The bound is the least of them,
+    each taken as the largest of 3 x 3 pixels, for a hot pixel of a dark frame is no bound. Pixels that lose more than
+    half do not count: what was subtracted may have saturated them by itself.
 
     Args:
         saturating: (B, C, H, W), the measurement before the correction.
         corrected: (B, C, H, W).
     """
     known = saturated_pixels(saturating) & (corrected != saturating) & (corrected > saturating / 2)
-    return corrected.minimum(torch.where(known, corrected, torch.inf).amin((-2, -1), keepdim=True))
+    values = F.max_pool2d(torch.where(known, corrected, -torch.inf), 3, stride=1, padding=1)
+    return corrected.minimum(torch.where(known, values, torch.inf).amin((-2, -1), keepdim=True))
