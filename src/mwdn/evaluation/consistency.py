@@ -53,7 +53,7 @@ class Consistency:
         changes = [
             f"turned by {self.turn_degrees:.2f} degrees" * (abs(self.turn_degrees) > 0.2),
             f"scaled by {self.scale:+.1%}" * (abs(self.scale) > 0.005),
-            f"under {self.haze:.0%} of haze" * (self.haze >= 0.005),
+            f"under {self.haze:.0%} of haze" * (self.haze >= 0.02),
         ]
         pose = ", ".join(filter(None, changes))
         return summary + (f"; fits best with the PSF {pose}" if pose else "")
