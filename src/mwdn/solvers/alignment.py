@@ -165,8 +165,8 @@ def _estimate_haze(measurement: Measurement, psf: Psf) -> Tensor:
     limit = _HAZE_RISE * energy.amin(1, keepdim=True)
     last = (energy < limit).long().cumsum(1).argmax(1, keepdim=True)  # the first of the largest sums: the last True
     after = (last + 1).clamp(max=len(hazes) - 1)
-    low_energy, high_energy = energy.gather(1, last), energy.gather(1, after)
-    part = (limit - low_energy) / (high_energy - low_energy).clamp(min=torch.finfo(energy.dtype).tiny)
+    below, above = energy.gather(1, last), energy.gather(1, after)
+    part = (limit - below) / (above - below).clamp(min=torch.finfo(energy.dtype).tiny)
     return torch.lerp(hazes[last], hazes[after], part.clamp(max=1))[:, 0]
 
 
