@@ -225,6 +225,19 @@ def test_saturated_pixels_stay_a_bound_after_a_correction(correction, generator)
     torch.testing.assert_close(measurement[~now], light[~now], atol=2e-5, rtol=0)
 
 
+def test_a_hot_pixel_that_is_replaced_is_no_bound_of_saturated_ones(generator):
+    """It is as bright as they are; what replaces it says nothing of their light."""
+    psf = contour_psf((144, 160), cell=24, generator=generator)
+    frame = (65535 * (2.5 * psf / psf.max() + 0.6).clamp(max=1)).round()[0, 0].numpy().astype(np.uint16)
+    row, column = np.unravel_index(cv2.blur(frame, (9, 9)).argmin(), frame.shape)
+    hot, defects = frame.copy(), torch.zeros(1, 1, 144, 160, dtype=torch.bool)
+    hot[row, column], defects[..., row, column] = 65535, True
+    calibration = Calibration.from_array(psf[0, 0].numpy(), background=0.0)
+    calibration = replace(calibration, corrections=Corrections(defects=defects))
+    assert calibration.correct(hot)[0, 0, row, column] < 0.7
+    torch.testing.assert_close(calibration.correct(hot), calibration.correct(frame), atol=0.1, rtol=0)
+
+
 @pytest.mark.parametrize("gamma", ["srgb", 2.2])
 def test_psf_has_a_gamma_of_its_own(gamma, caustic):
     linear = caustic[..., None].astype(np.float32)

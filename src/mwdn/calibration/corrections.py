@@ -11,6 +11,7 @@ from mwdn.calibration.isolated_pixels import find_isolated_pixels
 from mwdn.calibration.pixel_repair import PixelRepair
 from mwdn.errors import ImageError, ShapeError
 from mwdn.io.images import read_frame
+from mwdn.optics.saturation import keep_plateau
 from mwdn.types import Image
 
 
@@ -60,7 +61,7 @@ class Corrections:
                     f"The flat field {tuple(self.flat.shape[1:])} must have the size of the frame "
                     f"{tuple(image.shape[1:])}. Take frames with the same camera settings."
                 )
-            image = image / self.flat
+            image = keep_plateau(image, image / self.flat)
         if self.defects is None:
             return image
         if cell not in self._repairs:

@@ -129,10 +129,11 @@ class FrameFormat:
             ParameterError: a pixel value exceeds the bit depth, or the frame is smaller than ``bin``.
             ShapeError: the dark frame, the crop or the mosaic does not fit the frame.
         """
-        raw = self.normalise(frame)
-        image = corrections(raw if dark is None else subtract_dark(raw, dark), self.cell)
-        if image is not raw and self.saturated(frame)[0]:
-            image = keep_plateau(raw, image)
+        image = self.normalise(frame)
+        if dark is not None:
+            rest = subtract_dark(image, dark)
+            image = keep_plateau(image, rest) if self.saturated(frame)[0] else rest
+        image = corrections(image, self.cell)
         if self.crop is not None:
             image = crop_centre(image, self.crop, self.cell)
         if self.mosaic is not None:

@@ -37,13 +37,15 @@ def keep_plateau(saturating: Measurement, corrected: Measurement) -> Measurement
     """A corrected measurement (B, C, H, W) whose saturated pixels are a plateau again: a lower bound of their light.
 
     A flat field or a frame that is subtracted gives saturated pixels different values. The bound is the least of them,
-    each taken as the largest of 3 x 3 pixels, for a hot pixel of a dark frame is no bound. Pixels that lose more than
-    half do not count: what was subtracted may have saturated them by itself.
+    each taken as the largest of 3 x 3 pixels. Hot pixels are no bound: a pixel counts only with a saturated one
+    beside it. Pixels that lose more than half do not count: what was subtracted may have saturated them by itself.
 
     Args:
         saturating: (B, C, H, W), the measurement before the correction.
         corrected: (B, C, H, W).
     """
-    known = saturated_pixels(saturating) & (corrected != saturating) & (corrected > saturating / 2)
+    saturated = saturated_pixels(saturating)
+    together = F.avg_pool2d(saturated.float(), 3, stride=1, padding=1, divisor_override=1) > 1.5
+    known = saturated & together & (corrected != saturating) & (corrected > saturating / 2)
     values = F.max_pool2d(torch.where(known, corrected, -torch.inf), 3, stride=1, padding=1)
     return corrected.minimum(torch.where(known, values, torch.inf).amin((-2, -1), keepdim=True))
