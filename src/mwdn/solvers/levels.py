@@ -21,6 +21,7 @@ class Level:
         regularisation: tau, weight of the total variation; 0 for none, whatever the gradient's mu. Both tau and the
             gradient's mu are multiplied by `smoothing_scale`.
         min_smoothing: lower limit of `smoothing_scale`. In real captures the errors of the PSF exceed the noise.
+        relaxation: alpha of the over-relaxation (`mwdn.solvers.splitting`), 1 to 2.
     """
 
     downsampling: int
@@ -28,6 +29,7 @@ class Level:
     penalties: Penalties
     regularisation: float = 0.0
     min_smoothing: float = 1.0
+    relaxation: float = 1.0
 
     def smoothing(self, smoothing_scale: Tensor) -> tuple[Penalties, Tensor]:
         """Penalties mu and weight tau for the noise of each sample."""

@@ -248,6 +248,6 @@ def _solve(
     filters = make_filters(problem, mu, smooth=smooth)
     state = initial_state(problem, start.expand(*problem.measurement.shape[:2], *band.grid), smooth=smooth)
     for _ in iterations(level.iterations, start=done[0], end=done[1]):
-        state = update_copies(state, problem, mu, tau, "colour")
+        state = update_copies(state, problem, mu, tau, "colour", level.relaxation)
         state = update_scene(state, problem, filters)
     return state.v / band.norm

@@ -14,6 +14,10 @@ The code keeps neither copies nor multipliers but the targets of (4), ``p1 = x -
 ``p3 = w - rho``. With (5) the multiplier is ``v - p`` for the last target p (H v and Psi v in place of v for p1 and
 p2), so the argument of the proximal map in (1) to (3) is ``z = v + (v - p) = 2 v - p`` and the next target is
 ``prox(z) - (v - p) = v - (z - prox(z))``: the value less what the map takes away.
+
+Over-relaxation goes further in the same direction: ``p + alpha (v - (z - prox(z)) - p)``. An alpha of 1.5 to 1.8 saves
+up to half of the iterations (S. Boyd et al., Distributed optimization and statistical learning via the alternating
+direction method of multipliers, 2011, section 3.4.3).
 """
 
 import math
@@ -84,15 +88,17 @@ class Problem(NamedTuple):
 
 
 class State(NamedTuple):
-    """The scene v, its spectrum, H v on the sensor, and the targets p1, p2, p3 of equation (4).
+    """The scene v, H v as a spectrum and on the sensor, and the targets p1, p2, p3 of equation (4).
 
-    A problem without total variation has an empty gradient target.
+    p1 is kept on the sensor, where it is needed pixel by pixel, and as the spectrum of the whole grid. A problem without
+    total variation has an empty gradient target.
     """
 
     v: Tensor
-    V: Spectrum
+    HV: Spectrum
     Hv: Measurement
     data_target: Measurement
+    data_spectrum: Spectrum
     gradient_target: Gradient | tuple[()]
     sign_target: Tensor
 
@@ -107,17 +113,25 @@ def initial_state(problem: Problem, scene: Tensor | None = None, *, smooth: bool
     """
     b = problem.measurement
     v = b.new_zeros((*b.shape[:2], *problem.grid)) if scene is None else scene
-    V = spectrum(v, problem.grid)
-    Hv = inverse_spectrum(problem.transfer * V, problem.grid, problem.sensor)
-    return State(v, V, Hv, data_target=Hv, gradient_target=gradient(v) if smooth else (), sign_target=v)
+    HV = problem.transfer * spectrum(v, problem.grid)
+    Hv = inverse_spectrum(HV, problem.grid, problem.sensor)
+    return State(v, HV, Hv, Hv, HV, gradient_target=gradient(v) if smooth else (), sign_target=v)
 
 
-def update_copies(state: State, problem: Problem, mu: Penalties, tau: float | Tensor, variation: Variation) -> State:
+def update_copies(  # noqa: PLR0913
+    state: State,
+    problem: Problem,
+    mu: Penalties,
+    tau: float | Tensor,
+    variation: Variation,
+    relaxation: float = 1.0,
+) -> State:
     """Equations (1) to (3) and (5): shrink the gradient, fit the measurement, clip the sign.
 
-    Each target is value - (z - prox(z)) with z = 2 value - target. What a map takes away is odd in z for (1) and (2):
-    both start from -z, `reflected`. For (3) it is min(z, 0), so the target is v - min(2 v - p, 0) = max(v, p - v). Off
-    the sensor nothing is measured, (1) gives x = H v + xi, and p1 is H v: it is kept on the sensor alone.
+    Each target is value - (z - prox(z)) with z = 2 value - target, over-relaxed by alpha = ``relaxation``. What a map
+    takes away is odd in z for (1) and (2): both start from -z, `reflected`. For (3) it is min(z, 0), so the target is
+    v - min(2 v - p, 0) = max(v, p - v). Off the sensor nothing is measured: (1) gives x = H v + xi, and the target is
+    H v.
     """
     gradient_target = state.gradient_target
     if gradient_target:
@@ -125,12 +139,23 @@ def update_copies(state: State, problem: Problem, mu: Penalties, tau: float | Te
         by, bx = dual_projection(
             (reflected(gy, gradient_target[0]), reflected(gx, gradient_target[1])), tau / mu.gradient, variation
         )
-        gradient_target = gy.add_(by), gx.add_(bx)
-        del by, bx  # frees a large image's memory
-    # z - prox(z) = (z - b) / (1 + mu1)
-    data_target = deficit(problem, state.Hv, state.data_target).div_(1 + mu.data).add_(state.Hv)
+        old = gradient_target
+        gradient_target = relaxed(old[0], gy.add_(by), relaxation), relaxed(old[1], gx.add_(bx), relaxation)
+        del by, bx, old  # frees a large image's memory
+    # prox(z) - z = (b - z) / (1 + mu1), on the sensor alone
+    step = deficit(problem, state.Hv, state.data_target).div_(1 + mu.data)
     sign_target = torch.maximum(state.v, state.sign_target - state.v)
-    return state._replace(data_target=data_target, gradient_target=gradient_target, sign_target=sign_target)
+    return state._replace(
+        data_target=relaxed(state.data_target, state.Hv + step, relaxation),
+        data_spectrum=relaxed(state.data_spectrum, spectrum(step, problem.grid).add_(state.HV), relaxation),
+        gradient_target=gradient_target,
+        sign_target=relaxed(state.sign_target, sign_target, relaxation),
+    )
+
+
+def relaxed(old: Tensor, new: Tensor, relaxation: float) -> Tensor:
+    """``old + relaxation (new - old)``."""
+    return new if relaxation == 1 else torch.lerp(old, new, relaxation)
 
 
 def deficit(problem: Problem, Hv: Measurement, target: Measurement) -> Measurement:
@@ -147,19 +172,15 @@ def reflected(value: Tensor, target: Tensor) -> Tensor:
 class Filters(NamedTuple):
     """Factors of equation (4), constant as long as the penalties are.
 
-    Off the sensor p1 is H v, so ``H^T p1 = H^T H v + H^T C^T (p1 - C H v)`` and the new spectrum is
-
-    ``V = prior F(p3 + gradient_weight Psi^T p2) + previous V + data F(C^T (p1 - C H v))``.
+    The new spectrum is ``V = prior F(p3 + gradient_weight Psi^T p2) + data F(p1)``.
 
     Args:
         prior: mu3 D, stored as complex numbers.
-        previous: mu1 |H|^2 D, likewise.
         data: mu1 conj(H) D.
         gradient_weight: mu2 / mu3.
     """
 
     prior: Tensor
-    previous: Tensor
     data: Spectrum
     gradient_weight: float | Tensor
 
@@ -169,10 +190,10 @@ def make_filters(problem: Problem, mu: Penalties, *, smooth: bool = True) -> Fil
     power = mu.data * problem.transfer.abs().square()
     D = 1 / (power + (mu.gradient * problem.laplacian + mu.sign if smooth else mu.sign))
     data = problem.transfer.conj() * (mu.data * D)
-    prior, previous = mu.sign * D, power * D
-    if not torch.compiler.is_compiling():  # torch would make them complex in each product
-        prior, previous = prior.to(data.dtype), previous.to(data.dtype)
-    return Filters(prior, previous, data, mu.gradient / mu.sign)
+    prior = mu.sign * D
+    if not torch.compiler.is_compiling():  # torch would make it complex in each product
+        prior = prior.to(data.dtype)
+    return Filters(prior, data, mu.gradient / mu.sign)
 
 
 def update_scene(state: State, problem: Problem, filters: Filters) -> State:
@@ -180,17 +201,17 @@ def update_scene(state: State, problem: Problem, filters: Filters) -> State:
     prior = state.sign_target
     if state.gradient_target:
         prior = divergence(state.gradient_target).mul_(filters.gradient_weight).add_(prior)
-    V = spectrum(prior, problem.grid).mul_(filters.prior).addcmul_(filters.previous, state.V)
+    V = spectrum(prior, problem.grid).mul_(filters.prior).addcmul_(state.data_spectrum, filters.data)
     del prior
-    V.addcmul_(spectrum(state.data_target - state.Hv, problem.grid), filters.data)
-    Hv = inverse_spectrum(problem.transfer * V, problem.grid, problem.sensor)
-    return state._replace(v=inverse_spectrum(V, problem.grid, problem.grid), V=V, Hv=Hv)
+    HV = problem.transfer * V
+    Hv = inverse_spectrum(HV, problem.grid, problem.sensor)
+    return state._replace(v=inverse_spectrum(V, problem.grid, problem.grid), HV=HV, Hv=Hv)
 
 
 def rescale(state: State, old: Penalties, new: Penalties) -> State:
-    """Targets for new penalties with the same multipliers.
+    """Targets for new penalties with the same multipliers, before an update without over-relaxation.
 
-    The unscaled multiplier ``mu (v - p)`` stays, so the new target is ``p + (v - p) (1 - old / new)``.
+    That needs no data target off the sensor, so its spectrum stays. The unscaled multiplier ``mu (v - p)`` stays, so the new target is ``p + (v - p) (1 - old / new)``.
     """
     data, slope, sign = (1 - before / after for before, after in zip(old, new, strict=True))
     target = state.gradient_target
