@@ -320,7 +320,7 @@ def test_a_picture_is_reported_while_the_next_one_is_reconstructed(tmp_path, psf
     assert reported == [(number, True, None) for number in range(3)]
 
 
-@pytest.mark.parametrize(("method", "iterations"), [(Admm(iterations=4), 4), ("pyramid", 146), ("universal-small", 0)])
+@pytest.mark.parametrize(("method", "iterations"), [(Admm(iterations=4), 4), ("pyramid", 164), ("universal-small", 0)])
 def test_progress_counts_the_iterations_of_solvers(tmp_path, psf, captures, method, iterations):
     done = []
     list(make_batch(psf, tmp_path / "out", method).run(captures[:2], progress=done.append))

@@ -20,7 +20,6 @@ compensates too much haze, for light is not negative: E at low frequencies is fl
 steeply. The estimate is the largest haze of the flat part. Blur cannot be estimated: a sharper PSF always fits better.
 """
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -31,7 +30,7 @@ from mwdn.fourier.convolution import check_fit
 from mwdn.fourier.transforms import frequency_grid, inverse_spectrum, spectrum
 from mwdn.optics.psf import checked_psf
 from mwdn.optics.warp import hazed, warp
-from mwdn.solvers.levels import LEVELS, Level
+from mwdn.solvers.levels import Level
 from mwdn.solvers.pyramid import halve, solve
 from mwdn.solvers.splitting import Penalties
 from mwdn.types import Image, Measurement, Psf, Size
@@ -88,9 +87,9 @@ smaller gain is noise."""
 # At a quarter of the size: haze has low frequencies only, the slowest to converge. With 20 iterations each, a frame
 # that is filled hid its haze and lost 1 to 3 dB. Strong smoothing keeps noise and detail out of what the haze explains.
 _HAZES = (0.0, 0.02, 0.04, 0.07, 0.1, 0.14)
-_HAZE_LEVELS = tuple(
-    replace(level, downsampling=level.downsampling // 4, regularisation=4 * level.regularisation)
-    for level in LEVELS[:2]
+_HAZE_LEVELS = (
+    Level(2, 80, Penalties(0.015, 0.4, 0.06), 0.04),
+    Level(1, 40, Penalties(0.05, 1.3, 0.2), 0.04),
 )
 _LEAST_HAZE = 0.001  # less is none: E rises by 5 % shortly after its minimum at no haze
 _HAZE_RISE = 1.05
