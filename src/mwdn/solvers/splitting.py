@@ -154,8 +154,8 @@ def update_copies(
 
 
 def relaxed(old: Tensor, new: Tensor, relaxation: float) -> Tensor:
-    """``old + relaxation (new - old)``."""
-    return new if relaxation == 1 else torch.lerp(old, new, relaxation)
+    """``old + relaxation (new - old)``, written into ``new``."""
+    return new if relaxation == 1 else new.lerp_(old, 1 - relaxation)
 
 
 def deficit(problem: Problem, Hv: Measurement, target: Measurement) -> Measurement:
