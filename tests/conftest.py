@@ -2,6 +2,7 @@
 
 import os
 import random
+import signal
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -13,6 +14,10 @@ import pytest
 # Where other work shares the machine, threads that wait by spinning take the core from the one they wait for:
 # the small arrays of a solver then need 200 times as long. Read once, when torch starts.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+# A shell starts background jobs with Ctrl-C ignored, and so would every test of an interrupted run be.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Before anything imports mwdn: from here on each call checks the shapes and types in its signature.
 jaxtyping.install_import_hook("mwdn", "beartype.beartype")
