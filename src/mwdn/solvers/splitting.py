@@ -130,8 +130,8 @@ def update_copies(
 
     Each target is value - (z - prox(z)) with z = 2 value - target, over-relaxed by alpha = ``relaxation``. What a map
     takes away is odd in z for (1) and (2): both start from -z, `reflected`. For (3) it is min(z, 0), so the target is
-    v - min(2 v - p, 0) = max(v, p - v). Off the sensor nothing is measured: (1) gives x = H v + xi, and the target is
-    H v.
+    v - min(2 v - p, 0) = max(v, p - v). Off the sensor nothing is measured: (1) gives x = H v + xi, so before
+    over-relaxation the target is H v.
     """
     gradient_target = state.gradient_target
     if gradient_target:
