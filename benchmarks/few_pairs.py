@@ -100,7 +100,7 @@ def scores(picture, scene, protocol, perceptual):
 @torch.no_grad()
 def of_network(network, sample):
     estimates = sample.estimates[None].float()
-    return network.correct(estimates, sample.unit[None].float())
+    return network.undistort(network.correct(estimates, sample.unit[None].float()))
 
 
 def main():

@@ -13,7 +13,7 @@ from mwdn import Calibration, convolve
 from mwdn.calibration.camera_file import write_camera
 from mwdn.calibration.pair_model import PairModel, Terms
 from mwdn.calibration.psf_identity import psf_identity
-from mwdn.calibration.refinement import Refinement, polynomials, smooth_field
+from mwdn.calibration.refinement import Refinement, smooth_field
 from mwdn.calibration.term_selection import PARTS, left_out, select_terms
 from mwdn.data.pairs import PairFile
 from mwdn.data.recorded import other_camera
@@ -21,6 +21,7 @@ from mwdn.errors import ParameterError
 from mwdn.inference.methods import psf_warning
 from mwdn.io.images import write_frame
 from mwdn.networks import build
+from mwdn.optics.polynomials import polynomials
 from mwdn.weights.checkpoint import save_network
 
 SIZE = 64, 80

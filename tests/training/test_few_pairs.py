@@ -5,14 +5,19 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch.nn import functional as F
 
 from cameras import contour_psf
+from mwdn import Reconstructor
 from mwdn.calibration import Calibration
 from mwdn.data.pairs import PairFile
 from mwdn.data.recorded import Division
 from mwdn.errors import ParameterError
+from mwdn.evaluation.metrics import best_gain
 from mwdn.fourier.convolution import convolve
 from mwdn.networks import build
+from mwdn.optics.distortion import distort, undistort
+from mwdn.optics.polynomials import polynomials
 from mwdn.solvers.alignment import Pose
 from mwdn.training.experiment import prepare
 from mwdn.training.network import grown
@@ -25,6 +30,8 @@ SCHEDULE = Schedule(
     steps=3, pool=200, batch=2, learning_rate=1e-2, warmup=0, validate_every=3, ema=0.0, weight_decay=0.0,
     anchor=1.0, fixed_norms=True, start="start.safetensors",
 )  # fmt: skip
+LARGE = 96, 96
+DISTORTION = torch.tensor([[0.01, 0.0, 0.01, 0.015, -0.01, 0.01], [-0.01, 0.01, -0.01, 0.0, 0.01, -0.02]])
 RECIPE = Recipe({"name": "wiener-bank", **OPTIONS}, SCHEDULE, pairs=Division("folds", aligned=True, best_gain=True))
 
 
@@ -120,3 +127,60 @@ def test_the_recipe_fits_the_bundled_network():
     network = build(**recipe.network)
     assert recipe.schedule.start in BUNDLED
     network.load_state_dict(grown(load_network(recipe.schedule.start).state_dict(), network))
+
+
+@pytest.fixture
+def distorted(tmp_path, monkeypatch, generator):
+    """A calibration, and five pairs whose scenes another camera saw: displaced by up to 2 pixels."""
+    monkeypatch.chdir(tmp_path)
+    psf = contour_psf(LARGE, cell=24, generator=generator).expand(1, 3, -1, -1).contiguous()
+    with PairFile.create("pairs.h5", measurement_shape=(*LARGE, 3), scene_shape=(*LARGE, 3)) as file:
+        for number in range(5):
+            scene = F.avg_pool2d(torch.rand(1, 3, LARGE[0] + 4, LARGE[1] + 4, generator=generator), 5, 1)
+            scene[..., 20 + 9 * number :, 30:60] *= 0.3
+            file.append(0.8 * convolve(distort(scene, DISTORTION), psf)[0], scene[0])
+    options = OPTIONS | {"regularisations": (1e-3,)}
+    save_network("start.safetensors", build("wiener-bank", **options).eval(), "wiener-bank", options)
+    recipe = replace(RECIPE, network={"name": "wiener-bank", **options, "distortion": 2})
+    return recipe, Calibration(psf)
+
+
+def test_distorted_scenes_are_learned_from_and_reconstructed(distorted):
+    recipe, calibration = distorted
+    pairs = Path("pairs.h5")
+    run = prepare(recipe, calibration, out=Path("run"), pairs=pairs, device="cpu")
+    run.run()
+    found = load_checkpoint("run/last.safetensors").state_dict()["distortion"]
+    difference = torch.einsum("ck,khw->chw", found - DISTORTION, polynomials(2, LARGE).float()) * (LARGE[0] - 1) / 2
+    assert difference.norm(dim=0)[8:-8, 8:-8].max() < 0.4
+    assert torch.equal(run.network.distortion, found)
+    assert torch.equal(run.average.distortion, found)
+
+    measurement, scene = PairFile(pairs)[4]
+    reconstruct = Reconstructor("run/best.safetensors", calibration, align=False, room_light=False, device="cpu")
+    result, seen = reconstruct(measurement[None]), reconstruct.on_device(measurement[None])
+    torch.testing.assert_close(result, undistort(seen, found))
+    inner = ..., slice(8, -8), slice(8, -8)
+
+    def error(picture):
+        return float((best_gain(picture, scene[None]) - scene)[inner].square().mean())
+
+    assert error(result) < 0.85 * error(seen)  # the rest is not displacement
+
+
+def test_a_resumed_run_keeps_the_distortion(distorted, monkeypatch):
+    recipe, calibration = distorted
+
+    def stopped(report):
+        raise KeyboardInterrupt
+
+    def run(folder, callback=lambda report: None):
+        prepare(recipe, calibration, out=Path(folder), pairs=Path("pairs.h5"), device="cpu").run(callback)
+
+    recipe = replace(recipe, schedule=replace(recipe.schedule, validate_every=1))
+    run("whole")
+    with pytest.raises(KeyboardInterrupt):
+        run("stopped", stopped)
+    run("stopped")
+    whole, resumed = (load_checkpoint(f"{name}/last.safetensors").state_dict() for name in ("whole", "stopped"))
+    assert all(torch.equal(value, resumed[name]) for name, value in whole.items())

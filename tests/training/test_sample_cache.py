@@ -2,11 +2,11 @@
 
 import pytest
 import torch
-from torch import nn
 
 from mwdn.data.simulated import Batch, Samples
 from mwdn.errors import ParameterError
 from mwdn.networks import build
+from mwdn.networks.network import Network
 from mwdn.training.sample_cache import SampleCache
 
 
@@ -25,7 +25,7 @@ class Counted(Samples):
         return Batch(picture, picture + 100, torch.ones(1, 1, *self.size))
 
 
-class Same(nn.Module):
+class Same(Network):
     def estimates(self, measurement, psf):
         return measurement
 

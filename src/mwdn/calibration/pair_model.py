@@ -18,9 +18,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from mwdn.calibration.refinement import Refinement, polynomials
+from mwdn.calibration.refinement import Refinement
 from mwdn.fourier.convolution import convolve
 from mwdn.optics.aperture import displaced_envelope
+from mwdn.optics.polynomials import coefficient_count, polynomials
 from mwdn.types import Measurement, Psf, Scene, Size
 
 BLOCKS = 32
@@ -57,7 +58,7 @@ class Terms:
     @property
     def kernels(self) -> list[tuple[int, int]]:
         """(m, k) of each kernel but the first, (0, 0)."""
-        over_psf = [(m, 0) for m in range(1, _count(self.psf_gain))]
+        over_psf = [(m, 0) for m in range(1, coefficient_count(self.psf_gain))]
         over_scene = [(m, k) for k in (1, 2) for m in range((0, 1, 3)[self.field_dependence])]
         return over_psf + over_scene
 
@@ -88,7 +89,7 @@ class Fit:
 
     def refinement(self) -> Refinement:
         """Without the field dependence, which no solver uses."""
-        over_psf = _count(self.terms.psf_gain) - 1
+        over_psf = coefficient_count(self.terms.psf_gain) - 1
         return Refinement(
             psf_gain=_rows(1.0, self.gain[:, :over_psf]) if over_psf else (),
             envelope_shift=self.shift,
@@ -156,7 +157,7 @@ class PairModel:
     def start(self, terms: Terms) -> Fit:
         """No change at all."""
         colours, zeros = self.b.shape[1], torch.zeros
-        field, stray = (_count(order) - 1 for order in (terms.sensor_field, terms.stray_light))
+        field, stray = (coefficient_count(order) - 1 for order in (terms.sensor_field, terms.stray_light))
         kernels = zeros(colours, len(self._columns(terms)), dtype=torch.float64)
         return Fit(terms, kernels, zeros(field).double(), zeros(colours, stray).double(), self.shift)
 
@@ -232,11 +233,6 @@ class PairModel:
             square += float(residual.square().sum())
             total += float((self.b[pair, c] - self.b[pair, c].mean()).square().sum())
         return (square / max(total, 1e-30)) ** 0.5
-
-
-def _count(order: int) -> int:
-    """Coefficients of a polynomial of two variables."""
-    return (order + 1) * (order + 2) // 2
 
 
 def _rows(first: float, rest: Tensor) -> tuple[tuple[float, ...], ...]:

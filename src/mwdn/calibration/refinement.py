@@ -9,7 +9,6 @@ the aperture's shadow E against the mask's pattern (`mwdn.optics.aperture`). S, 
 frames of any size.
 """
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -17,6 +16,7 @@ from torch import Tensor
 
 from mwdn.errors import ParameterError, checked
 from mwdn.optics.aperture import displaced_envelope
+from mwdn.optics.polynomials import polynomial_order, polynomials
 from mwdn.types import Image, Measurement, Psf, Size
 
 Coefficients = tuple[tuple[float, ...], ...]
@@ -53,7 +53,7 @@ class Refinement:
         for name in ("psf_gain", "sensor_field", "stray_light"):
             rows: Coefficients = getattr(self, name)
             lengths = {len(row) for row in rows}
-            if rows and (len(rows) not in (1, 3) or len(lengths) != 1 or _order(*lengths) is None):
+            if rows and (len(rows) not in (1, 3) or len(lengths) != 1 or polynomial_order(*lengths) is None):
                 raise ParameterError(
                     f"`{name}` ({len(rows)} rows of {sorted(lengths)}) must have 1 or 3 rows of equal length: 1, 3, 6, "
                     "10, 15 ... coefficients of a polynomial."
@@ -102,21 +102,8 @@ class Refinement:
         return smooth_field(rows, (image.shape[-2], image.shape[-1])).to(image)
 
 
-def polynomials(order: int, size: Size) -> Tensor:
-    """Monomials 1, y, x, y^2, y x, x^2 ... up to a total order, for y and x from -1 to 1: (K, height, width)."""
-    y, x = (torch.linspace(-1, 1, length, dtype=torch.float64) for length in size)
-    y, x = y[:, None].expand(size), x.expand(size)
-    return torch.stack([y ** (total - k) * x**k for total in range(order + 1) for k in range(total + 1)])
-
-
 def smooth_field(rows: Coefficients, size: Size) -> Tensor:
     """Polynomials over a frame, (1, rows, height, width)."""
     coefficients = torch.tensor(rows, dtype=torch.float64)
-    order = _order(coefficients.shape[1]) or 0
+    order = polynomial_order(coefficients.shape[1]) or 0
     return torch.einsum("ck,khw->chw", coefficients, polynomials(order, size))[None].float()
-
-
-def _order(count: int) -> int | None:
-    """Order of a polynomial with so many coefficients, (n + 1) (n + 2) / 2; ``None`` for another count."""
-    order = (math.isqrt(8 * count + 1) - 3) // 2
-    return order if (order + 1) * (order + 2) // 2 == count else None

@@ -56,7 +56,8 @@ class _Reconstruct(nn.Module):
     def forward(self, measurement: Measurement, *prepared: Tensor) -> Scene:
         parts = iter(prepared)
         tensors = [torch.complex(next(parts), next(parts)) if both else next(parts) for both in self.is_complex]
-        return self.network.reconstruct(measurement, tree_unflatten(tensors, self.layout)).float()
+        scene = self.network.reconstruct(measurement, tree_unflatten(tensors, self.layout)).float()
+        return self.network.undistort(scene)
 
 
 def network_models(network: Network[Any], size: Size, channels: int) -> NetworkModels:

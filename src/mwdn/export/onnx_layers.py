@@ -50,6 +50,11 @@ def _upsample(g: OnnxGraph, node: fx.Node, x: str, size: Any, corners: bool, *_:
     return g("Resize", x, None, None, wanted, mode="linear", coordinate_transformation_mode=mode)
 
 
+def _grid_sample(g: OnnxGraph, node: fx.Node, x: str, grid: str, mode: int, padding: int, corners: bool) -> str:
+    modes, paddings = ("bilinear", "nearest", "bicubic"), ("zeros", "border", "reflection")
+    return g("GridSample", x, grid, mode=modes[mode], padding_mode=paddings[padding], align_corners=int(corners))
+
+
 def _unshuffle(g: OnnxGraph, node: fx.Node, x: str, block: int) -> str:
     # SpaceToDepth has another order of channels.
     _, channels, height, width = source(node).shape
@@ -61,6 +66,7 @@ LAYERS: dict[Any, Handler] = {
     _aten.avg_pool2d.default: _pool("AveragePool"),
     _aten.conv2d.default: _convolution,
     _aten.conv_transpose2d.input: _convolution_transpose,
+    _aten.grid_sampler.default: _grid_sample,
     _aten.group_norm.default: _group_norm,
     _aten.max_pool2d.default: _pool("MaxPool"),
     _aten.pixel_shuffle.default: lambda g, node, x, block: g("DepthToSpace", x, blocksize=block, mode="CRD"),

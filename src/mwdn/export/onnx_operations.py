@@ -80,6 +80,10 @@ def _compare(operation: str) -> Handler:
     return handler
 
 
+def _lerp(g: OnnxGraph, node: fx.Node, start: str, end: str, weight: float) -> str:
+    return g("Add", start, g("Mul", g("Sub", end, start), torch.tensor(float(weight))))
+
+
 def _where(g: OnnxGraph, node: fx.Node, condition: str, *given: Any) -> str:  # noqa: ANN401
     values = zip(given, node.args[1:], strict=True)
     return g("Where", condition, *(as_type(g, value(node).dtype, *each) for each in values))
@@ -230,6 +234,7 @@ OPERATIONS: dict[Any, Handler] = {
     _aten.full_like.default: _full,
     **dict.fromkeys((_aten.ge.Tensor, _aten.ge.Scalar), _compare("GreaterOrEqual")),
     **dict.fromkeys((_aten.gt.Tensor, _aten.gt.Scalar), _compare("Greater")),
+    _aten.lerp.Scalar: _lerp,
     _aten.linalg_vector_norm.default: _norm,
     _aten.log.default: _plain("Log"),
     **dict.fromkeys((_aten.lt.Tensor, _aten.lt.Scalar), _compare("Less")),

@@ -174,6 +174,10 @@ def _add(g: OnnxGraph, node: fx.Node, a: Pair, b: Pair) -> Pair:
     return Pair(*(g("Add", *each) for each in zip(a, b, strict=True)))
 
 
+def _lerp(g: OnnxGraph, node: fx.Node, start: Pair, end: Pair, weight: float) -> Pair:
+    return Pair(*(REAL[node.target](g, node, *each, weight) for each in zip(start, end, strict=True)))
+
+
 def _concatenate(g: OnnxGraph, node: fx.Node, pairs: list[Pair], axis: int = 0) -> Pair:
     return Pair(*(g("Concat", *parts, axis=axis) for parts in zip(*pairs, strict=True)))
 
@@ -185,6 +189,7 @@ _ON_PAIRS: dict[Any, Handler] = {
     _aten.abs.default: lambda g, node, a: g("Sqrt", g("Add", g("Mul", a[0], a[0]), g("Mul", a[1], a[1]))),
     _aten.add.Tensor: _add,
     _aten.cat.default: _concatenate,
+    _aten.lerp.Scalar: _lerp,
     _aten.view_as_real.default: lambda g, node, pair: pair,  # of which one part is selected
     _aten.addcmul.default: lambda g, node, a, b, c: _add(g, node, a, _multiply(g, node, b, c)),
     _aten.div.Tensor: lambda g, node, a, b: Pair(*(g("Div", part, b) for part in a)),

@@ -232,7 +232,7 @@ class Batch:
         content |= {} if job.room_light is None else {"room_light": round(job.room_light, 4)}
         if trust:
             content |= {**trust.content, "verdicts": [asdict(verdict) for verdict in verdicts]}
-        scene, sidecar = to_host(self.reconstruct.balance(job.scene)), job.output.with_suffix(".json")
+        scene, sidecar = to_host(self.reconstruct.finish(job.scene)), job.output.with_suffix(".json")
         if job.full_size:
             scene = enlarge(scene, calibration.frames.bin, job.full_size)
             pitch = pitch and pitch / calibration.frames.bin

@@ -172,7 +172,7 @@ class Reconstructor:
                 due = False
             with torch.inference_mode():
                 scene = reconstruct._in_chunks(measurement)
-            yield measurement, to_host(self.balance(scene))
+            yield measurement, to_host(self.finish(scene))
 
     def without_room_light(self, measurement: Measurement) -> tuple[Measurement, Tensor | None]:
         """The measurement less the light of the room, and its share (B,); as it is and `None` if it is not sought."""
@@ -238,17 +238,25 @@ class Reconstructor:
 
     @torch.inference_mode()
     def _to_host(self, measurement: Measurement) -> Scene:
-        return to_host(self.balance(self.on_device(measurement)))
+        return to_host(self.finish(self.on_device(measurement)))
+
+    def finish(self, scene: Scene) -> Scene:
+        """Apply `undistort` and `balance` to the result of `on_device`."""
+        return self.balance(self.undistort(scene))
+
+    def undistort(self, scene: Scene) -> Scene:
+        """Apply `mwdn.networks.network.Network.undistort` if the method is a network."""
+        return self.method.undistort(scene) if isinstance(self.method, Network) else scene
 
     def balance(self, scene: Scene) -> Scene:
-        """Apply the white balance to the result of `on_device`."""
+        """Apply the white balance."""
         if self.white_balance is None:
             return scene
         return apply_white_balance(scene, self.white_balance, self.calibration.light)
 
     @torch.inference_mode()
     def on_device(self, measurement: Measurement) -> Scene:
-        """Reconstruct a batch and leave the result on `device`, in the colours of the camera: without `balance`.
+        """Reconstruct a batch and leave the result on `device`, as the camera sees it: without `finish`.
 
         Raises:
             ShapeError: as for a call.

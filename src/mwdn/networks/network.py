@@ -65,6 +65,17 @@ class Network(nn.Module, Generic[Prepared]):
         """
         raise NotImplementedError
 
+    def undistort(self, scene: Scene) -> Scene:
+        """The result of `reconstruct` in the geometry of the scenes that the network learned from.
+
+        It is the same unless these were distorted as the camera sees them. `mwdn.Reconstructor` calls this.
+        """
+        return scene
+
+    def distort(self, scene: Scene) -> Scene:
+        """The inverse: a scene as `reconstruct` shows it."""
+        return scene
+
     def forward(self, measurement: Measurement, psf: Psf) -> Scene:
         """Scene (B, C, H, W): `prepare`, then `reconstruct`.
 

@@ -14,6 +14,8 @@ from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
 from mwdn.networks.blocks import Decoder, Encoder, check_channels, normalise_psf, paper_widths
 from mwdn.networks.drunet import Drunet
 from mwdn.networks.network import Network
+from mwdn.optics.distortion import distort, undistort
+from mwdn.optics.polynomials import coefficient_count
 from mwdn.solvers.levels import LEVELS, REFERENCE_NOISE, Level, brightness
 from mwdn.solvers.plug_and_play import plug_and_play
 from mwdn.solvers.pyramid import Band, Estimate, PsfPyramid
@@ -90,7 +92,13 @@ class WienerBank(Network[BankTransfers]):
             ``finest`` 1. The denoiser is trained separately on noisy pictures and frozen here; 0 for none.
         mean_light: see `MeanLight`; needs iterations unless ``kept``.
         evidence: whether the U-Net also sees what speaks against the PSF (`WienerBank.evidence`); needs iterations.
+        distortion: order of the polynomials of the recorded scenes' distortion; 0 for none.
+
+    Attributes:
+        distortion: coefficients (2, K) for `mwdn.optics.distortion`, measured before the training; or ``None``.
     """
+
+    distortion: Tensor | None
 
     def __init__(  # noqa: PLR0913
         self,
@@ -105,6 +113,7 @@ class WienerBank(Network[BankTransfers]):
         rounds: int = 0,
         mean_light: MeanLight = "kept",
         evidence: bool = False,
+        distortion: int = 0,
     ) -> None:
         super().__init__()
         if not regularisations or min(regularisations) <= 0:
@@ -117,8 +126,9 @@ class WienerBank(Network[BankTransfers]):
             raise ParameterError(
                 f"`mean_light` ({mean_light}) and `evidence` ({evidence}) need iterations: `finest` 1, 2, 4 or 8."
             )
-        minima = (("width", width, 1), ("fold", fold, 1), ("block", block, 1), ("rounds", rounds, 0))
-        for name, value, minimum in minima:
+        positive = {"width": width, "fold": fold, "block": block}
+        for name, value in (positive | {"rounds": rounds, "distortion": distortion}).items():
+            minimum = int(name in positive)
             if value < minimum:
                 raise ParameterError(f"`{name}` ({value}) must be at least {minimum}.")
         self.channels, self.fold, self.regularisations = channels, fold, regularisations
@@ -127,6 +137,7 @@ class WienerBank(Network[BankTransfers]):
         self.rounds = rounds
         if rounds:
             self.denoiser = Drunet(channels=channels).requires_grad_(False)
+        self.register_buffer("distortion", torch.zeros(2, coefficient_count(distortion)) if distortion else None)
         self.mean_light = mean_light
         self.pictures = channels * (len(regularisations) + (2 if self.levels else 1))
         evidence_channels = channels + NUMBERS if evidence else 0
@@ -158,6 +169,14 @@ class WienerBank(Network[BankTransfers]):
         check_channels(measurement, self.channels)
         estimates = self._estimates(measurement, prepared)
         return self.correct(estimates, self.unit(estimates))
+
+    def undistort(self, scene: Scene) -> Scene:
+        """The result of `reconstruct` in the geometry of the scenes that the network learned from."""
+        return scene if self.distortion is None else undistort(scene, self.distortion)
+
+    def distort(self, scene: Scene) -> Scene:
+        """The inverse: a scene as `reconstruct` shows it."""
+        return scene if self.distortion is None else distort(scene, self.distortion)
 
     def estimates(self, measurement: Measurement, psf: Psf) -> Tensor:
         """Estimates of the scene, smoothest first, the measurement, and the evidence if any: (B, channels, H, W)."""

@@ -113,13 +113,14 @@ class Reconstructions:
             raise ImageError("The reconstruction holds NaN or infinity. Scale the capture, or use another method.")
         report = _report(order, reconstruct, time.perf_counter() - start)
         report["room_light"] = None if share is None else round(float(share), 4)
-        job.result = Result(measurement, scene, calibration.light, report)
+        shown = reconstruct.undistort(scene)
+        job.result = Result(measurement, shown, calibration.light, report)
         if order.trust:
             job.advance(0.9)
             job.state = "checking"
             with torch.inference_mode():
                 found = _check(frame, measurement, reconstruct, scene, for_viewing=for_viewing)
-            job.result = Result(measurement, scene, calibration.light, report | found)
+            job.result = Result(measurement, shown, calibration.light, report | found)
 
 
 def _without_light(reconstruct: Reconstructor, measurement: Measurement) -> Reconstructor:

@@ -11,7 +11,10 @@ from mwdn.errors import CheckpointError, ParameterError
 from mwdn.inference.methods import psf_for
 from mwdn.networks import Network, build
 from mwdn.networks.empty import build_empty
+from mwdn.optics.polynomials import polynomial_order
+from mwdn.runtime import distributed
 from mwdn.training.recipe import Recipe
+from mwdn.training.sample_cache import SampleCache
 from mwdn.types import Psf
 from mwdn.weights.bundled import load_network
 from mwdn.weights.checkpoint import first_difference, load_checkpoint
@@ -59,9 +62,10 @@ def stored_psf(recipe: Recipe, calibration: Calibration) -> Psf | None:
 def grown(weights: dict[str, Tensor], network: nn.Module) -> dict[str, Tensor]:
     """Weights for a network with more inputs or outputs behind those there are; the new ones are zero.
 
-    Weights of a network that is wider inside, so in several axes at once, stay as they are.
+    Weights of a network that is wider inside, so in several axes at once, stay as they are. Buffers that there are not,
+    such as the distortion of recorded scenes, are those of the network.
     """
-    result = dict(weights)
+    result = dict(network.named_buffers()) | weights
     for name, wanted in network.state_dict().items():
         value = weights.get(name)
         if value is None or value.shape == wanted.shape or value.ndim != wanted.ndim:
@@ -72,6 +76,29 @@ def grown(weights: dict[str, Tensor], network: nn.Module) -> dict[str, Tensor]:
         result[name] = torch.zeros_like(wanted)
         result[name][tuple(slice(length) for length in value.shape)] = value
     return result
+
+
+@torch.no_grad()
+def measure_distortion(
+    cache: SampleCache | None, network: nn.Module, average: nn.Module, start: dict[str, Tensor]
+) -> None:
+    """Measure the distortion of the cached scenes, for a network that corrects it: the mean of all processes.
+
+    Args:
+        cache: of the training's samples.
+        network: gets the coefficients.
+        average: of its weights, likewise; computes the reconstructions.
+        start: weights to hold to, likewise; may be empty.
+    """
+    distortion = getattr(network, "distortion", None)
+    if cache is None or distortion is None:
+        return
+    measured = cache.measure_distortion(average, polynomial_order(distortion.shape[1]) or 0).to(distortion)
+    measured = distributed.all_reduce_sum(measured) / distributed.world_size()
+    for each in (network, average):
+        each.get_buffer("distortion").copy_(measured)
+    if start:
+        start["distortion"] = measured
 
 
 @torch.no_grad()

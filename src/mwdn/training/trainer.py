@@ -21,7 +21,7 @@ from mwdn.runtime.devices import has_bfloat16
 from mwdn.runtime.interrupts import deferred_interrupt
 from mwdn.training.batch_norm import freeze_cancelled, synchronise
 from mwdn.training.losses import Loss
-from mwdn.training.network import build_network, name_and_options, update_average
+from mwdn.training.network import build_network, measure_distortion, name_and_options, update_average
 from mwdn.training.recipe import Recipe
 from mwdn.training.report import Report
 from mwdn.training.run_folder import MAKE_ROOM, RunFolder, run_identity
@@ -124,6 +124,8 @@ class Trainer:
         with self.folder.lock():
             try:
                 self._fill_cache(samples)
+                if self.step == 0:
+                    measure_distortion(self.task.cache, self.network, self.average, self.start)
                 if self.step == 0 and self.schedule.anchor:
                     self.save(self.validate())
                 self._train(callback)

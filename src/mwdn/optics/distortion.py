@@ -1,0 +1,47 @@
+"""Distortion of pictures: where a scene's light lies in the reconstruction, as polynomials over the frame.
+
+The scene at p is seen at ``p + d(p)``. In each direction d is a polynomial of the place, which goes from -1 to 1 over
+the frame, in halves of the frame's height or width: it fits pictures of any size.
+"""
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from mwdn.optics.polynomials import frame_places, monomials, polynomial_order
+from mwdn.types import Image, Scene
+
+_INVERSIONS = 5
+"""Fixed-point steps; each makes the error smaller by the derivative of d, a few hundredths."""
+
+
+def undistort(picture: Image, coefficients: Tensor) -> Scene:
+    """The scene at its own places: ``T(p) = I(p + d(p))``, bicubic; what lies outside repeats the border.
+
+    Args:
+        picture: I, (B, C, H, W).
+        coefficients: (2, K), of the displacement d down and right.
+    """
+    y, x = frame_places((picture.shape[-2], picture.shape[-1]))
+    down, right = _displacement(coefficients, y, x)
+    return _look_up(picture, y + down, x + right)
+
+
+def distort(scene: Scene, coefficients: Tensor) -> Image:
+    """The scene as a reconstruction shows it, the inverse of `undistort`: ``I(q) = T(p)`` with ``p = q - d(p)``."""
+    y, x = place = frame_places((scene.shape[-2], scene.shape[-1]))
+    for _ in range(_INVERSIONS):
+        down, right = _displacement(coefficients, *place)
+        place = y - down, x - right
+    return _look_up(scene, *place)
+
+
+def _displacement(coefficients: Tensor, y: Tensor, x: Tensor) -> Tensor:
+    """D at these places, (2, *shape of y and x)."""
+    order = polynomial_order(coefficients.shape[1]) or 0
+    return torch.einsum("ck,k...->c...", coefficients.to(y), monomials(order, y, x))
+
+
+def _look_up(picture: Image, y: Tensor, x: Tensor) -> Image:
+    grid = torch.stack([x, y], -1).to(picture).expand(picture.shape[0], -1, -1, -1)
+    return F.grid_sample(picture, grid, mode="bicubic", padding_mode="border", align_corners=True)
