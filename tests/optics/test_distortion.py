@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from mwdn.optics.distortion import distort, undistort
+from mwdn.optics.distortion import distort, largest_displacement, undistort
 from mwdn.optics.polynomials import coefficient_count, polynomial_order, polynomials
 
 
@@ -51,6 +51,13 @@ def test_no_distortion_changes_nothing_and_a_size_does_not_matter():
     torch.testing.assert_close(undistort(picture, coefficients)[..., :-1], picture[..., 1:], atol=1e-5, rtol=0)
     wide = torch.rand(1, 1, 20, 61, generator=torch.Generator().manual_seed(1))
     torch.testing.assert_close(undistort(wide, coefficients)[..., :-2], wide[..., 2:], atol=1e-5, rtol=0)
+
+
+def test_the_largest_displacement_is_in_pixels():
+    coefficients = torch.zeros(2, 6)
+    coefficients[0, 0], coefficients[1, 5] = 0.03, -0.04  # everywhere; at the left and right border
+    assert largest_displacement(coefficients, (101, 101)) == pytest.approx(2.5)
+    assert largest_displacement(coefficients, (101, 201)) == pytest.approx(math.hypot(1.5, 4))
 
 
 @pytest.mark.parametrize("order", range(6))

@@ -16,6 +16,7 @@ from mwdn.cli.terminal import counted, if_interrupted, note, notes, say
 from mwdn.data.captures import list_captures
 from mwdn.io.files import refuse_overwrite
 from mwdn.io.listing import unused_photographs
+from mwdn.optics.distortion import largest_displacement
 from mwdn.runtime import distributed
 from mwdn.training import experiment
 from mwdn.training.recipe import read_recipe
@@ -104,6 +105,8 @@ def _train(trainer: Trainer, progress: Progressing, board: TensorBoard | None) -
             start_training()
 
     def show_step(report: Report) -> None:
+        if report.step == 1 and (line := _distortion(trainer)):
+            progress.print(line)
         speed = f"{report.pictures_per_s:.1f} pictures/s"
         progress.update(report.step, f"step {report.step:,}, {speed}, loss {report.loss:.4f}")
         if report.validation is not None:
@@ -115,6 +118,16 @@ def _train(trainer: Trainer, progress: Progressing, board: TensorBoard | None) -
     if trainer.task.cache is None:
         start_training()
     trainer.run(show_step, samples=show_samples)
+
+
+def _distortion(trainer: Trainer) -> str:
+    """What was measured of the scenes of recorded pairs; empty if they fit."""
+    coefficients, cache = getattr(trainer.network, "distortion", None), trainer.task.cache
+    if coefficients is None or cache is None or not coefficients.any():
+        return ""
+    height, width = next(iter(cache.samples.values())).scene.shape[-2:]
+    largest = largest_displacement(coefficients.cpu(), (height, width))
+    return f"The scenes are distorted against the reconstructions, by {largest:.1f} pixels at most; this is corrected."
 
 
 def _kept(trainer: Trainer) -> str:

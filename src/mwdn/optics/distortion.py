@@ -9,9 +9,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.optics.polynomials import frame_places, monomials, polynomial_order
-from mwdn.types import Image, Scene
+from mwdn.types import Image, Scene, Size
 
-_INVERSIONS = 5
+_INVERSIONS = 3
 """Fixed-point steps; each makes the error smaller by the derivative of d, a few hundredths."""
 
 
@@ -34,6 +34,13 @@ def distort(scene: Scene, coefficients: Tensor) -> Image:
         down, right = _displacement(coefficients, *place)
         place = y - down, x - right
     return _look_up(scene, *place)
+
+
+def largest_displacement(coefficients: Tensor, size: Size) -> float:
+    """Largest length of d over a frame, in pixels."""
+    height, width = size
+    down, right = _displacement(coefficients, *frame_places(size))
+    return float(torch.hypot(down * (height - 1) / 2, right * (width - 1) / 2).max())
 
 
 def _displacement(coefficients: Tensor, y: Tensor, x: Tensor) -> Tensor:

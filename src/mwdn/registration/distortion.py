@@ -54,7 +54,8 @@ def measure_distortion(pictures: Sequence[Tensor], scenes: Sequence[Tensor], ord
     none = torch.zeros(2, coefficient_count(order), dtype=torch.float64, device=pictures[0].device)
     for part in (0, 1):
         half, other = ([level[first::2] for level in levels] for first in (part, 1 - part))
-        if not other[-1] or _unexplained(other[-1], _fit(half, none)) >= _unexplained(other[-1], none):
+        is_better = other[-1] and _unexplained(other[-1], _fit(half, none)) < _unexplained(other[-1], none)
+        if not is_better:  # nor for NaN
             return none
     return _fit(levels, none)
 
