@@ -177,10 +177,11 @@ def test_a_resumed_run_keeps_the_distortion(distorted, monkeypatch):
     def run(folder, callback=lambda report: None):
         prepare(recipe, calibration, out=Path(folder), pairs=Path("pairs.h5"), device="cpu").run(callback)
 
-    recipe = replace(recipe, schedule=replace(recipe.schedule, validate_every=1))
+    recipe = replace(recipe, schedule=replace(recipe.schedule, validate_every=1, start_share=0.3))
     run("whole")
     with pytest.raises(KeyboardInterrupt):
         run("stopped", stopped)
     run("stopped")
     whole, resumed = (load_checkpoint(f"{name}/last.safetensors").state_dict() for name in ("whole", "stopped"))
+    assert whole["distortion"].any()
     assert all(torch.equal(value, resumed[name]) for name, value in whole.items())

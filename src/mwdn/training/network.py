@@ -79,16 +79,13 @@ def grown(weights: dict[str, Tensor], network: nn.Module) -> dict[str, Tensor]:
 
 
 @torch.no_grad()
-def measure_distortion(
-    cache: SampleCache | None, network: nn.Module, average: nn.Module, start: dict[str, Tensor]
-) -> None:
+def measure_distortion(cache: SampleCache | None, network: nn.Module, average: nn.Module) -> None:
     """Measure the distortion of the cached scenes, for a network that corrects it: the mean of all processes.
 
     Args:
         cache: of the training's samples.
         network: gets the coefficients.
         average: of its weights, likewise; computes the reconstructions.
-        start: weights to hold to, likewise; may be empty.
     """
     distortion = getattr(network, "distortion", None)
     if cache is None or distortion is None:
@@ -97,8 +94,6 @@ def measure_distortion(
     measured = distributed.all_reduce_sum(measured) / distributed.world_size()
     for each in (network, average):
         each.get_buffer("distortion").copy_(measured)
-    if start:
-        start["distortion"] = measured
 
 
 @torch.no_grad()
@@ -112,12 +107,13 @@ def update_average(
 ) -> None:
     """Update an exponential moving average of a network's weights; integers (BatchNorm's counters) are copied.
 
-    The average is of ``(1 - share)`` times the weights and ``share`` times those of ``start``, by name.
+    The average is of ``(1 - share)`` times the weights and ``share`` times those of ``start``, by name; of the weights
+    alone if ``start`` has none of that name.
     """
     for (name, value), mean in zip(network.state_dict().items(), average.state_dict().values(), strict=True):
         if not value.is_floating_point():
             mean.copy_(value)
-        elif start and share:
+        elif start and share and name in start:
             mean.lerp_(value.lerp(start[name], share), 1 - decay)
         else:
             mean.lerp_(value, 1 - decay)

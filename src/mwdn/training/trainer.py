@@ -83,7 +83,8 @@ class Trainer:
         self.lr_schedule = make_lr_schedule(recipe)
         # Copied before a saved run resumes: these are the weights of `start`.
         held = self.schedule.anchor > 0 or self.schedule.start_share > 0
-        self.start = {name: value.clone() for name, value in self.network.state_dict().items()} if held else {}
+        weights = self.network.state_dict().items() if held else ()
+        self.start = {name: value.clone() for name, value in weights if name != "distortion"}  # that is measured
         self.bfloat16 = self.schedule.bfloat16 and has_bfloat16(self.device)
         self.step, self.best = 0, -math.inf
 
@@ -125,7 +126,7 @@ class Trainer:
             try:
                 self._fill_cache(samples)
                 if self.step == 0:
-                    measure_distortion(self.task.cache, self.network, self.average, self.start)
+                    measure_distortion(self.task.cache, self.network, self.average)
                 if self.step == 0 and self.schedule.anchor:
                     self.save(self.validate())
                 self._train(callback)
