@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mwdn.errors import ParameterError, checked
 from mwdn.optics.aperture import displaced_envelope
-from mwdn.optics.polynomials import polynomial_order, polynomials
+from mwdn.optics.polynomials import frame_places, polynomial, polynomial_order
 from mwdn.types import Image, Measurement, Psf, Size
 
 Coefficients = tuple[tuple[float, ...], ...]
@@ -104,6 +104,4 @@ class Refinement:
 
 def smooth_field(rows: Coefficients, size: Size) -> Tensor:
     """Polynomials over a frame, (1, rows, height, width)."""
-    coefficients = torch.tensor(rows, dtype=torch.float64)
-    order = polynomial_order(coefficients.shape[1]) or 0
-    return torch.einsum("ck,khw->chw", coefficients, polynomials(order, size))[None].float()
+    return polynomial(torch.tensor(rows, dtype=torch.float64), *frame_places(size))[None].float()

@@ -16,7 +16,7 @@ from mwdn.cli.terminal import counted, if_interrupted, note, notes, say
 from mwdn.data.captures import list_captures
 from mwdn.io.files import refuse_overwrite
 from mwdn.io.listing import unused_photographs
-from mwdn.optics.distortion import largest_displacement
+from mwdn.optics.distortion import displacements_px
 from mwdn.runtime import distributed
 from mwdn.training import experiment
 from mwdn.training.recipe import read_recipe
@@ -126,8 +126,9 @@ def _distortion(trainer: Trainer) -> str:
     if coefficients is None or cache is None or not coefficients.any():
         return ""
     height, width = next(iter(cache.samples.values())).scene.shape[-2:]
-    largest = largest_displacement(coefficients.cpu(), (height, width))
-    return f"The scenes are distorted against the reconstructions, by {largest:.1f} pixels at most; this is corrected."
+    off = displacements_px(coefficients.cpu(), (height, width))
+    mean = off.square().mean().sqrt()
+    return f"The scenes are distorted by {mean:.1f} pixels (root mean square), {off.max():.1f} at most: corrected."
 
 
 def _kept(trainer: Trainer) -> str:

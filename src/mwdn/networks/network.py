@@ -66,9 +66,9 @@ class Network(nn.Module, Generic[Prepared]):
         raise NotImplementedError
 
     def undistort(self, scene: Scene) -> Scene:
-        """The result of `reconstruct` in the geometry of the scenes that the network learned from.
+        """The result of `reconstruct` in the geometry of the scenes that the network was trained on.
 
-        It is the same unless these were distorted as the camera sees them. `mwdn.Reconstructor` calls this.
+        Unchanged unless those scenes were distorted against the reconstructions. `mwdn.Reconstructor` applies this.
         """
         return scene
 

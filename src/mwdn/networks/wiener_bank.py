@@ -171,12 +171,12 @@ class WienerBank(Network[BankTransfers]):
         return self.correct(estimates, self.unit(estimates))
 
     def undistort(self, scene: Scene) -> Scene:
-        """The result of `reconstruct` in the geometry of the scenes that the network learned from."""
+        """The result of `reconstruct` in the geometry of the scenes that the network was trained on."""
         return scene if self.distortion is None else undistort(scene, self.distortion)
 
     def distort(self, scene: Scene) -> Scene:
         """The inverse: a scene as `reconstruct` shows it."""
-        return scene if self.distortion is None else distort(scene, self.distortion)
+        return scene if self.distortion is None else distort(scene.float(), self.distortion)
 
     def estimates(self, measurement: Measurement, psf: Psf) -> Tensor:
         """Estimates of the scene, smoothest first, the measurement, and the evidence if any: (B, channels, H, W)."""

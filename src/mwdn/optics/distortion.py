@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from mwdn.optics.polynomials import frame_places, monomials, polynomial_order
+from mwdn.optics.polynomials import frame_places, polynomial
 from mwdn.types import Image, Scene, Size
 
 _INVERSIONS = 3
-"""Fixed-point steps; each makes the error smaller by the derivative of d, a few hundredths."""
+"""Fixed-point steps; each multiplies the error by the derivative of d, a few hundredths."""
 
 
 def undistort(picture: Image, coefficients: Tensor) -> Scene:
@@ -23,7 +23,7 @@ def undistort(picture: Image, coefficients: Tensor) -> Scene:
         coefficients: (2, K), of the displacement d down and right.
     """
     y, x = frame_places((picture.shape[-2], picture.shape[-1]))
-    down, right = _displacement(coefficients, y, x)
+    down, right = polynomial(coefficients, y, x)
     return _look_up(picture, y + down, x + right)
 
 
@@ -31,22 +31,16 @@ def distort(scene: Scene, coefficients: Tensor) -> Image:
     """The scene as a reconstruction shows it, the inverse of `undistort`: ``I(q) = T(p)`` with ``p = q - d(p)``."""
     y, x = place = frame_places((scene.shape[-2], scene.shape[-1]))
     for _ in range(_INVERSIONS):
-        down, right = _displacement(coefficients, *place)
+        down, right = polynomial(coefficients, *place)
         place = y - down, x - right
     return _look_up(scene, *place)
 
 
-def largest_displacement(coefficients: Tensor, size: Size) -> float:
-    """Largest length of d over a frame, in pixels."""
+def displacements_px(coefficients: Tensor, size: Size) -> Tensor:
+    """Length of d at each pixel of a frame, (height, width), in pixels."""
     height, width = size
-    down, right = _displacement(coefficients, *frame_places(size))
-    return float(torch.hypot(down * (height - 1) / 2, right * (width - 1) / 2).max())
-
-
-def _displacement(coefficients: Tensor, y: Tensor, x: Tensor) -> Tensor:
-    """D at these places, (2, *shape of y and x)."""
-    order = polynomial_order(coefficients.shape[1]) or 0
-    return torch.einsum("ck,k...->c...", coefficients.to(y), monomials(order, y, x))
+    down, right = polynomial(coefficients, *frame_places(size))
+    return torch.hypot(down * (height - 1) / 2, right * (width - 1) / 2)
 
 
 def _look_up(picture: Image, y: Tensor, x: Tensor) -> Image:

@@ -18,6 +18,12 @@ def monomials(order: int, y: Tensor, x: Tensor) -> Tensor:
     return torch.stack([y ** (total - k) * x**k for total in range(order + 1) for k in range(total + 1)])
 
 
+def polynomial(coefficients: Tensor, y: Tensor, x: Tensor) -> Tensor:
+    """Polynomials with rows (N, K) of coefficients of `monomials`, (N, *shape of y and x)."""
+    terms = monomials(polynomial_order(coefficients.shape[1]) or 0, y, x)
+    return torch.einsum("nk,k...->n...", coefficients.to(terms), terms)
+
+
 def frame_places(size: Size) -> tuple[Tensor, Tensor]:
     """Rows y and columns x of a frame's pixels from -1 to 1, (height, width) each, float64."""
     y, x = (torch.linspace(-1, 1, length, dtype=torch.float64) for length in size)

@@ -5,7 +5,7 @@ gain a_n of each picture,
 
 1. ``E(c) = sum_n sum_p (I_n(p + d(p)) - a_n T_n(p))^2,  d(p) = sum_k c_k P_k(p)``
 
-by Gauss-Newton steps. I and T are detail: square roots of light less their local means, for shading displaces nothing.
+by Gauss-Newton steps. I and T are detail: square roots of light less their local means, so that shading has no effect.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ BLURS = 2.0, 1.0
 the first is found."""
 
 LOCAL = 1 / 16
-"""Side of the square of a local mean, of the frame's shorter side. Without it shading displaces by pixels."""
+"""Side of the square of a local mean, of the frame's shorter side. What is coarser is mostly shading."""
 
 MARGIN = 1 / 20
 """Rim of the frame that is not compared, of its shorter side: light from outside is not in the scene."""

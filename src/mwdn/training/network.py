@@ -80,12 +80,12 @@ def grown(weights: dict[str, Tensor], network: nn.Module) -> dict[str, Tensor]:
 
 @torch.no_grad()
 def measure_distortion(cache: SampleCache | None, network: nn.Module, average: nn.Module) -> None:
-    """Measure the distortion of the cached scenes, for a network that corrects it: the mean of all processes.
+    """Measure the distortion of the cached scenes if the network corrects one; the mean over all processes.
 
     Args:
         cache: of the training's samples.
-        network: gets the coefficients.
-        average: of its weights, likewise; computes the reconstructions.
+        network: receives the coefficients.
+        average: of its weights; computes the reconstructions and receives the coefficients, too.
     """
     distortion = getattr(network, "distortion", None)
     if cache is None or distortion is None:

@@ -14,7 +14,7 @@ from mwdn.training.sample_files import Sample, SampleFiles
 from mwdn.types import Image, Scene
 
 MEASURED = 20
-"""Pairs whose distortion is measured."""
+"""At most so many pairs measure the distortion."""
 
 Progress = Callable[[int, int], None]
 """Called with the number of samples that are done, and how many there are."""
@@ -99,7 +99,7 @@ class SampleCache:
 
     @torch.no_grad()
     def measure_distortion(self, network: Any, order: int) -> Tensor:  # noqa: ANN401
-        """Distortion of the scenes of the samples that there are, (2, K); of `MEASURED` of them at most."""
+        """Distortion (2, K) of the scenes of the samples computed so far, from at most `MEASURED` of them."""
         rows = sorted(self.samples)[:: -(-len(self.samples) // MEASURED)]
         pictures = [self.reconstruct_whole(network, [row])[0] for row in rows]
         return measure_distortion(pictures, [self.samples[row].scene for row in rows], order)
@@ -120,7 +120,7 @@ class SampleCache:
         """A cached sample, mirrored, transposed and cropped."""
         epoch, place = divmod(number, self.size)
         estimates, unit, scene = self._cached(network, self._row(epoch, place))
-        scene = network.distort(scene[None].float())[0]
+        scene = network.distort(scene[None])[0]
         # The eight symmetries of a square in turn; a frame that is not square is never transposed.
         symmetry = epoch + place
         axes = [axis for axis, bit in ((-1, 1), (-2, 2)) if symmetry & bit]

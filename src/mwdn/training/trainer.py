@@ -127,8 +127,8 @@ class Trainer:
                 self._fill_cache(samples)
                 if self.step == 0:
                     measure_distortion(self.task.cache, self.network, self.average)
-                if self.step == 0 and self.schedule.anchor:
-                    self.save(self.validate())
+                    if self.schedule.anchor:
+                        self.save(self.validate())
                 self._train(callback)
             except DivergenceError:
                 self.folder.remove_samples()
