@@ -8,7 +8,7 @@
    its samples have white noise of that level instead.
 3. Measure: PSNR after plug and play, before the U-Net, of each share of the learned weights in the mixture.
 
-All three resume. On one core 600 captures take 25 minutes, 1,200 steps 8, each share 2 with three captures a row.
+All three resume. On one core 600 captures take 25 minutes, 1,200 steps 8, each share 4 with three captures a row.
 """
 
 import argparse
@@ -33,12 +33,13 @@ from mwdn.solvers import align
 from mwdn.solvers.plug_and_play import plug_and_play
 from mwdn.training.network import update_average
 from mwdn.training.recipe import read_recipe
-from universal import CALIBRATIONS, camera, captures
+from universal import camera, captures, recipe_of
 
 SIZES = ("256x256", "240x320", "320x320", "256x256", "270x480")
 KEPT, SIDE, CROP = 6, 144, 128
 PSFS = ("mwdn-camera 320x320", "DiffuserCam 270x480")
-ROWS = [(psf, light, kind) for psf in PSFS for light in (2000.0, 15000.0) for kind in ("exact", "mismatched")]
+KINDS = "exact", "mismatched", "real-like", "filling mismatched"
+ROWS = [(psf, light, kind) for psf in PSFS for light in (2000.0, 15000.0) for kind in KINDS]
 
 
 def training_pairs(data, sizes=SIZES):
@@ -136,8 +137,8 @@ def measured(network, data, count):
     """Mean PSNR in dB of each row after plug and play."""
     photographs, result = Photographs(data / "photos/test"), {}
     for psf, light, kind in ROWS:
-        calibration, recipe, values = camera(data, psf), read_recipe(CALIBRATIONS[kind]), []
-        simulated = captures(calibration.psf, photographs, recipe, light, range(count), exact=kind == "exact")
+        calibration, values = camera(data, psf), []
+        simulated = captures(calibration.psf, photographs, recipe_of(kind), light, range(count), exact=kind == "exact")
         for measurement, scene in simulated:
             aligned = align(measurement[None], calibration.psf).move(calibration.psf)
             start = network.iterate(measurement[None], network.prepare(aligned, measurement.shape[-2:]))

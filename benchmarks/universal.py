@@ -63,6 +63,14 @@ def camera(data, name):
     return Calibration.from_file(data / path, **options)
 
 
+def recipe_of(known):
+    """The recipe of the captures of a calibration."""
+    recipe = read_recipe(CALIBRATIONS[known])
+    if known.startswith("filling"):
+        recipe = replace(recipe, placement=replace(recipe.placement, extent=(2.0, 2.0), aspect=1.0, offset=0.0))
+    return recipe
+
+
 def captures(psf, photographs, recipe, full_well, numbers, *, exact):
     psf = psf.expand(-1, 3, -1, -1)
     source = SimulatedPairs(
@@ -120,12 +128,9 @@ def scores(data, which, numbers, methods):
     torch.set_num_threads(1)
     mwdn.keep_memory()
     name, full_well, known = which
-    calibration, recipe = camera(data, name), read_recipe(CALIBRATIONS[known])
-    photographs = Photographs(data / "photos" / "test")
-    if known.startswith("filling"):
-        recipe = replace(recipe, placement=replace(recipe.placement, extent=(2.0, 2.0), aspect=1.0, offset=0.0))
+    calibration, photographs = camera(data, name), Photographs(data / "photos" / "test")
     is_exact = known in ("exact", "filling")
-    made = captures(calibration.psf, photographs, recipe, full_well, numbers, exact=is_exact)
+    made = captures(calibration.psf, photographs, recipe_of(known), full_well, numbers, exact=is_exact)
     return measured({each: TUNED[name] if each == "fine-tuned" else each for each in methods}, made, calibration)
 
 
