@@ -31,7 +31,7 @@ from mwdn.io.contact_sheets import contact_sheet
 from mwdn.io.files import atomic
 from mwdn.io.images import write_picture
 from mwdn.io.toml import parse_value
-from mwdn.optics.distortion import displacements_px
+from mwdn.optics.distortion import displacement_px
 from mwdn.training.recipe import read_recipe
 from mwdn.training.sample_cache import SampleCache
 from mwdn.training.sample_files import Sample
@@ -154,9 +154,9 @@ def main():
                 arguments.sheets.mkdir(parents=True, exist_ok=True)
                 sheet = contact_sheet(lines, [*pictures, "scene"])
                 write_picture(arguments.sheets / f"{learn}-{fold}.png", sheet)
-            off = displacements_px(network.distortion, samples[0].scene.shape[-2:])
+            mean, largest = displacement_px(network.distortion, samples[0].scene.shape[-2:])
             print(key, {row: {n: v["psnr"] for n, v in each.items()} for row, each in values.items()})
-            print(f"  scenes off by {off.square().mean().sqrt():.2f} px (RMS), {off.max():.1f} at most", flush=True)
+            print(f"  scenes distorted by {mean:.2f} px (root mean square), {largest:.1f} at most", flush=True)
     summarise(record)
 
 

@@ -19,12 +19,15 @@ from mwdn.data.photographs import Photographs
 from mwdn.io.files import atomic
 from mwdn.optics.warp import hazed
 from mwdn.solvers import align
-from mwdn.training.recipe import read_recipe
-from universal import CALIBRATIONS, camera, captures
+from universal import camera, captures, recipe_of
 
 PSFS = "mwdn-camera 320x320", "DiffuserCam 270x480", "PhlatCam 384x640"
 HAZES = 0.0, 0.02, 0.04, 0.1
 LIGHTS = 15000.0, 2000.0
+
+
+def row_name(psf, light, haze):
+    return f"{psf}, {light:,.0f} e, {haze:.0%} haze"
 
 
 @torch.no_grad()
@@ -34,12 +37,10 @@ def measured(network, psf, haze, pairs):
     for measurement, scene in pairs:
         pose = align(measurement[None], psf)
         true = pose._replace(haze=torch.tensor([haze]))
-        psnr = [
-            float(mwdn.psnr(network(measurement[None], each.move(psf)).clamp(0, 1), scene[None]))
-            for each in (pose, true)
-        ]
+        pictures = [network(measurement[None], each.move(psf)).clamp(0, 1) for each in (pose, true)]
+        psnr, best = (float(mwdn.psnr(picture, scene[None])) for picture in pictures)
         found.append(round(float(pose.haze), 4))
-        costs.append(round(psnr[0] - psnr[1], 3))
+        costs.append(round(psnr - best, 3))
     return {"haze": found, "cost": costs}
 
 
@@ -51,15 +52,14 @@ def main():
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     mwdn.keep_memory()
-    network, recipe = mwdn.load_network("universal").eval(), read_recipe(CALIBRATIONS["exact"])
+    network, recipe = mwdn.load_network("universal").eval(), recipe_of("exact")
     photographs = Photographs(arguments.data / "photos/test")
     record = json.loads(arguments.out.read_text()) if arguments.out.exists() else {}
     for name in PSFS:
         psf = camera(arguments.data, name).psf
         for haze in HAZES:
             for light in LIGHTS:
-                key = f"{name}, {light:,.0f} e, {haze:.0%} haze"
-                if key in record:
+                if (key := row_name(name, light, haze)) in record:
                     continue
                 pairs = captures(hazed(psf, haze), photographs, recipe, light, range(arguments.count), exact=True)
                 row = record[key] = measured(network, psf, haze, pairs)
@@ -71,13 +71,12 @@ def main():
 
 def summarise(record):
     """Table over the PSFs: mean haze found and mean cost, in good and in low light."""
-    print(
-        "| true haze | found, good light | cost / dB | found, low light | cost / dB |\n| --- | --- | --- | --- | --- |"
-    )
+    print("| true haze | found, good light | cost / dB | found, low light | cost / dB |")
+    print("| --- " * 5 + "|")
     for haze in HAZES:
         cells = []
         for light in LIGHTS:
-            rows = [record[f"{name}, {light:,.0f} e, {haze:.0%} haze"] for name in PSFS]
+            rows = [record[row_name(name, light, haze)] for name in PSFS]
             found, cost = (fmean(value for row in rows for value in row[key]) for key in ("haze", "cost"))
             cells += [f"{found:.1%}", f"{cost:+.2f}"]
         print(f"| {haze:.0%} | {' | '.join(cells)} |")

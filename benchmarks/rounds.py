@@ -6,7 +6,8 @@
    `universal`; six of the twelve scenes that each capture hands to the denoiser are kept beside the true scene.
 2. Learn: the bundled denoiser goes on learning from these, with the noise level that plug and play told it; 15 % of
    its samples have white noise of that level instead.
-3. Measure: PSNR after plug and play, before the U-Net, of each share of the learned weights in the mixture.
+3. Measure: PSNR after plug and play, before the U-Net, of each share of the learned weights in the mixture. The folder
+   gets `universal` with each mixture, for `benchmarks/universal.py --methods` and `mwdn evaluate`.
 
 All three resume. On one core 600 captures take 25 minutes, 1,200 steps 8, each share 4 with three captures a row.
 """
@@ -33,6 +34,8 @@ from mwdn.solvers import align
 from mwdn.solvers.plug_and_play import plug_and_play
 from mwdn.training.network import update_average
 from mwdn.training.recipe import read_recipe
+from mwdn.weights.bundled import find_weights
+from mwdn.weights.checkpoint import read_metadata, save_network
 from universal import camera, captures, recipe_of
 
 SIZES = ("256x256", "240x320", "320x320", "256x256", "270x480")
@@ -164,6 +167,7 @@ def main():
     mwdn.keep_memory()
     folder, network = arguments.folder, mwdn.load_network("universal").float().eval()
     folder.mkdir(parents=True, exist_ok=True)
+    options = read_metadata(find_weights("universal"))["options"]
     bundled = {name: value.clone() for name, value in network.denoiser.state_dict().items()}
     learned_path = arguments.learned or folder / f"denoiser-{arguments.captures}-{arguments.steps}.pt"
     if not learned_path.exists():
@@ -178,6 +182,7 @@ def main():
         key = f"{learned_path.stem}, share {share}, {arguments.count} captures a row"
         if key not in record:
             network.denoiser.load_state_dict({name: bundled[name].lerp(learned[name], share) for name in bundled})
+            save_network(folder / f"{learned_path.stem}-{share}.safetensors", network, "wiener-bank", options)
             record[key] = measured(network, arguments.data, arguments.count)
             with atomic(record_path) as temporary:
                 temporary.write_text(json.dumps(record, indent=1) + "\n")

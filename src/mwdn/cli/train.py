@@ -16,7 +16,7 @@ from mwdn.cli.terminal import counted, if_interrupted, note, notes, say
 from mwdn.data.captures import list_captures
 from mwdn.io.files import refuse_overwrite
 from mwdn.io.listing import unused_photographs
-from mwdn.optics.distortion import displacements_px
+from mwdn.optics.distortion import displacement_px
 from mwdn.runtime import distributed
 from mwdn.training import experiment
 from mwdn.training.recipe import read_recipe
@@ -126,9 +126,8 @@ def _distortion(trainer: Trainer) -> str:
     if coefficients is None or cache is None or not coefficients.any():
         return ""
     height, width = next(iter(cache.samples.values())).scene.shape[-2:]
-    off = displacements_px(coefficients.cpu(), (height, width))
-    mean = off.square().mean().sqrt()
-    return f"The scenes are distorted by {mean:.1f} pixels (root mean square), {off.max():.1f} at most: corrected."
+    mean, largest = displacement_px(coefficients.cpu(), (height, width))
+    return f"The scenes are distorted by {mean:.1f} px (root mean square), {largest:.1f} px at most; this is corrected."
 
 
 def _kept(trainer: Trainer) -> str:

@@ -36,11 +36,12 @@ def distort(scene: Scene, coefficients: Tensor) -> Image:
     return _look_up(scene, *place)
 
 
-def displacements_px(coefficients: Tensor, size: Size) -> Tensor:
-    """Length of d at each pixel of a frame, (height, width), in pixels."""
+def displacement_px(coefficients: Tensor, size: Size) -> tuple[float, float]:
+    """Length of d over a frame in pixels: root mean square, maximum."""
     height, width = size
     down, right = polynomial(coefficients, *frame_places(size))
-    return torch.hypot(down * (height - 1) / 2, right * (width - 1) / 2)
+    length = torch.hypot(down * (height - 1) / 2, right * (width - 1) / 2)
+    return float(length.square().mean().sqrt()), float(length.max())
 
 
 def _look_up(picture: Image, y: Tensor, x: Tensor) -> Image:

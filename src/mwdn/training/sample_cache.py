@@ -14,7 +14,7 @@ from mwdn.training.sample_files import Sample, SampleFiles
 from mwdn.types import Image, Scene
 
 MEASURED = 20
-"""At most so many pairs measure the distortion."""
+"""Largest number of pairs that measure the distortion."""
 
 Progress = Callable[[int, int], None]
 """Called with the number of samples that are done, and how many there are."""
