@@ -15,7 +15,8 @@ from mwdn.errors import ParameterError
 from mwdn.optics.noise import noise_level
 from mwdn.solvers import Penalties
 from mwdn.solvers.levels import LEVELS, Level
-from mwdn.solvers.pyramid import Pyramid, halve, low_band, solve
+from mwdn.solvers.pyramid import Pyramid, even_light, halve, low_band, solve
+from mwdn.solvers.splitting import Problem
 from mwdn.solvers.wiener import Wiener
 
 FINE = Penalties(0.5, 0.0, 0.5)
@@ -41,6 +42,30 @@ def test_an_evenly_lit_wall_is_even(seed):
     b = b + 0.005 * b.max() * torch.randn(b.shape, generator=random)
     blocks = F.avg_pool2d(solve(b, psf / psf.sum()).scene, 16)
     assert 0.8 < blocks.min() <= blocks.max() < 1.15
+
+
+def test_even_light_is_that_of_an_evenly_lit_frame(generator):
+    """Where only the frame is lit, and evenly, the iterations start at the solution; each colour has its own light."""
+    size, psf = (48, 64), contour_psf((48, 64), generator=generator)
+    colours = torch.tensor([0.2, 1.0, 0.5])[:, None, None]
+    b = Camera(psf).forward(colours.expand(1, 3, *size))
+    problem = Problem.from_psf(b, psf.expand(1, 3, -1, -1))
+    light = even_light(problem)
+    torch.testing.assert_close(light[..., : size[0], : size[1]], colours.expand(1, 3, *size), rtol=1e-4, atol=1e-4)
+    assert light.sum((-2, -1)) == pytest.approx(light[..., : size[0], : size[1]].sum((-2, -1)))
+
+
+def test_a_lit_start_ends_at_the_same_scene_and_gets_there_sooner(generator):
+    size, psf = (32, 40), contour_psf((32, 40), cell=8, generator=generator)
+    scene = F.interpolate(torch.rand(1, 1, 4, 5, generator=generator), size=size, mode="bilinear")
+    b = Camera(psf).forward(scene)
+
+    def solved(iterations, *, lit):
+        return solve(b, psf, (Level(1, iterations, Penalties(0.06, 1.5, 0.24), 0.01, lit=lit),)).scene
+
+    end, lit_end = solved(2000, lit=False), solved(2000, lit=True)
+    torch.testing.assert_close(lit_end, end, rtol=0, atol=2e-3)
+    assert (solved(10, lit=True) - end).norm() < 0.8 * (solved(10, lit=False) - end).norm()
 
 
 def test_halving_keeps_place_and_light():

@@ -165,17 +165,15 @@ def _on_both(target: Any) -> Handler:  # noqa: ANN401
 def _multiply(g: OnnxGraph, node: fx.Node, a: Any, b: Any) -> Pair:  # noqa: ANN401
     if not (isinstance(a, Pair) and isinstance(b, Pair)):
         pair, factor = (a, b) if isinstance(a, Pair) else (b, a)
+        factor = torch.tensor(factor) if isinstance(factor, float) else factor
         return Pair(g("Mul", pair.real, factor), g("Mul", pair.imaginary, factor))
     real = g("Sub", g("Mul", a.real, b.real), g("Mul", a.imaginary, b.imaginary))
     return Pair(real, g("Add", g("Mul", a.real, b.imaginary), g("Mul", a.imaginary, b.real)))
 
 
-def _add(g: OnnxGraph, node: fx.Node, a: Pair, b: Pair) -> Pair:
-    return Pair(*(g("Add", *each) for each in zip(a, b, strict=True)))
-
-
-def _lerp(g: OnnxGraph, node: fx.Node, start: Pair, end: Pair, weight: float) -> Pair:
-    return Pair(*(REAL[node.target](g, node, *each, weight) for each in zip(start, end, strict=True)))
+def _add(g: OnnxGraph, node: fx.Node, a: Pair, b: Pair, *, alpha: float = 1) -> Pair:
+    scaled = b if alpha == 1 else _multiply(g, node, b, torch.tensor(float(alpha)))
+    return Pair(*(g("Add", *each) for each in zip(a, scaled, strict=True)))
 
 
 def _concatenate(g: OnnxGraph, node: fx.Node, pairs: list[Pair], axis: int = 0) -> Pair:
@@ -189,7 +187,6 @@ _ON_PAIRS: dict[Any, Handler] = {
     _aten.abs.default: lambda g, node, a: g("Sqrt", g("Add", g("Mul", a[0], a[0]), g("Mul", a[1], a[1]))),
     _aten.add.Tensor: _add,
     _aten.cat.default: _concatenate,
-    _aten.lerp.Scalar: _lerp,
     _aten.view_as_real.default: lambda g, node, pair: pair,  # of which one part is selected
     _aten.addcmul.default: lambda g, node, a, b, c: _add(g, node, a, _multiply(g, node, b, c)),
     _aten.div.Tensor: lambda g, node, a, b: Pair(*(g("Div", part, b) for part in a)),

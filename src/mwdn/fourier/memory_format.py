@@ -104,9 +104,12 @@ def pixel_unshuffle(image: Tensor, block: int) -> Tensor:
 
 
 def _unshuffle_pairs(image: Tensor) -> Tensor:
-    """Fast path of `pixel_unshuffle`: two adjacent pixels are copied as one number (3 x 960 x 960: half the time)."""
-    rows = _pairs(image).unflatten(2, (-1, 2))  # type: ignore[no-untyped-call]
-    return rows.permute(0, 2, 4, 1, 3).contiguous().view(image.dtype).flatten(3).movedim(-1, 1)
+    """Fast path of `pixel_unshuffle`: whole rows first, then two adjacent pixels as one number.
+
+    12 x 320 x 320 in 0.3 ms; with both in one copy 0.7, as `torch` does it 2.8.
+    """
+    rows = image.unflatten(2, (-1, 2)).transpose(1, 2).flatten(2, 3)  # type: ignore[no-untyped-call]
+    return _pairs(rows).mT.contiguous().view(image.dtype).movedim(-1, 1)
 
 
 def pixel_shuffle(image: Tensor, block: int) -> Tensor:

@@ -12,7 +12,7 @@ from mwdn.types import Measurement
 
 @dataclass(frozen=True)
 class Level:
-    """One size of the pyramid: ADMM that starts at the coarser level's scene, with zero multipliers.
+    """One size of the pyramid: ADMM that starts with zero multipliers.
 
     Args:
         downsampling: side of the level's pixels, in pixels of the measurement; a power of two.
@@ -22,6 +22,8 @@ class Level:
             gradient's mu are multiplied by `smoothing_scale`.
         min_smoothing: lower limit of `smoothing_scale`. In real captures the errors of the PSF exceed the noise.
         relaxation: alpha of the over-relaxation (`mwdn.solvers.splitting`), 1 to 2.
+        lit: whether the level starts at even light in the frame (`mwdn.solvers.pyramid.even_light`). Otherwise it
+            starts at the coarser level's scene, and the coarsest level at black.
     """
 
     downsampling: int
@@ -30,6 +32,7 @@ class Level:
     regularisation: float = 0.0
     min_smoothing: float = 1.0
     relaxation: float = 1.0
+    lit: bool = False
 
     def smoothing(self, smoothing_scale: Tensor) -> tuple[Penalties, Tensor]:
         """Penalties mu and weight tau for the noise of each sample."""

@@ -235,13 +235,22 @@ def low_band(transfer: Spectrum, grid: Size, downsampling: int) -> Tensor:
     return low[..., : columns // 2 + 1].mT.contiguous().mT  # the memory layout of `spectrum`
 
 
+def even_light(problem: Problem) -> Tensor:
+    """Even light in the frame, black around it, (B, C, *grid): as bright in each colour as fits the measurement."""
+    b, (rows, columns), (height, width) = problem.measurement, problem.grid, problem.sensor
+    V = spectrum(torch.full_like(b, 1.0), problem.grid)
+    seen = inverse_spectrum(problem.transfer * V, problem.grid, problem.sensor)
+    light = (seen * b).sum((-2, -1), keepdim=True) / seen.square().sum((-2, -1), keepdim=True).clamp(min=1e-30)
+    return F.pad(light.clamp(min=0).expand_as(b), (0, columns - width, 0, rows - height))
+
+
 def _solve(
     problem: Problem, band: Band, coarser: Tensor, scale: Tensor, size_factor: float, done: list[float]
 ) -> Tensor:
     """Scene on the whole grid after the iterations of one level, started at the coarser scene."""
     # The penalties are stated for a PSF whose colours have a mean square sum of 1, so the scene is times that norm.
-    start = enlarge(coarser, band.grid).clamp(min=0) * band.norm
     level = band.level
+    start = even_light(problem) if level.lit else enlarge(coarser, band.grid).clamp(min=0) * band.norm
     mu, tau = level.smoothing(scale)
     tau = size_factor * tau
     smooth = level.regularisation > 0
