@@ -12,6 +12,7 @@ from made import trained
 from mwdn.errors import ParameterError
 from mwdn.inference.interpretation import interpret
 from mwdn.networks import build
+from mwdn.solvers import align
 from mwdn.solvers.admm import Admm
 from mwdn.weights.checkpoint import save_network
 
@@ -90,6 +91,13 @@ def test_the_bank_and_its_unet(options, measurement, psf, generator):
     torch.testing.assert_close(panels(rows["U-Net"])["U-Net's change"], whole - first)
     assert list(panels(rows["Wiener bank"])) == ["lambda 0.001", "lambda 0.0001", "lambda 2e-05"]
     assert ("iterations" in rows) == (options["finest"] > 0)
+
+
+def test_alignment_is_reported(measurement, psf, generator):
+    network = build("wiener-bank", width=4, finest=4)
+    result = interpret(network, measurement, psf)
+    assert result.content()["aligned"] == result.pose == align(measurement, psf).numbers()
+    assert set(result.pose) == {"turn_degrees", "scale", "haze", "envelope_down", "envelope_right"}
 
 
 def test_methods_without_filters_are_refused(measurement, psf):

@@ -47,7 +47,7 @@ def with_ones(name, **options):
         ("wiener", "cf039080f5e5de60"),
         ("fista", "e077e8b3def31bac"),
         ("universal", "0c6b9258a9c42cdd"),
-        ("universal-small", "361feb1d5bf15d2c"),
+        ("universal-small", "3cd8c746a62dd002"),
     ],
 )
 def test_hash_of_a_method_stays_the_same(method, expected, capture):

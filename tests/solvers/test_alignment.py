@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 import torch
 from scipy.ndimage import affine_transform
+from torch.nn import functional as F
 
 from cameras import contour_psf
 from mwdn.errors import ShapeError
+from mwdn.optics.aperture import displaced_envelope
 from mwdn.optics.camera import Camera
+from mwdn.optics.drawing import contour_lines
 from mwdn.optics.warp import hazed
 from mwdn.solvers import alignment
 from mwdn.solvers.alignment import Pose, align
@@ -104,6 +107,40 @@ def test_haze_is_found_where_the_scene_fills_the_frame():
     assert (with_haze - scene).square().mean() < 0.8 * (without - scene).square().mean()
 
 
+def through_aperture(down=0.0, right=0.0):
+    """Lines all over the frame, dimmer to its borders; the dimming is displaced by fractions of the height."""
+    size, random = (224, 256), torch.Generator().manual_seed(4)
+    field = F.interpolate(torch.randn(1, 1, 14, 16, generator=random), size=size, mode="bicubic", align_corners=True)
+    y = (torch.arange(size[0]) - size[0] / 2)[:, None] / size[0] - down
+    x = (torch.arange(size[1]) - size[1] / 2) / size[0] - right
+    psf = contour_lines(field, 1.2) * torch.exp(-(y.square() + x.square()) / (2 * 0.18**2))
+    return psf / psf.sum()
+
+
+@pytest.mark.parametrize("degrees", [0.0, 0.4])
+def test_displaced_aperture_is_found_and_removed(degrees):
+    """Mask and aperture are not equally far from the sensor: light that comes at an angle parts their shadows."""
+    psf, true = through_aperture(), turned(through_aperture(0.03, -0.02), degrees, 1.0)
+    blocks = torch.rand(1, 3, 7, 8, generator=torch.Generator().manual_seed(5))
+    scene = F.pad(blocks.repeat_interleave(12, 2).repeat_interleave(12, 3), (80, 80, 70, 70))
+    measurement = captured(true, scene)
+    pose = align(measurement, psf)
+    torch.testing.assert_close(pose.envelope, torch.tensor([[0.03, -0.02]]), rtol=0, atol=0.012)  # a third too short
+    torch.testing.assert_close(pose.turn_degrees, torch.tensor([degrees]), rtol=0, atol=0.1)
+    errors = [
+        (Pyramid()(measurement, p.move(psf)) - scene).square().mean() for p in (pose, pose._replace(envelope=None))
+    ]
+    assert errors[0] < 0.6 * errors[1]
+    assert not align(captured(psf, scene), psf).envelope.any()
+
+
+def test_envelope_moves_before_haze_and_keeps_the_sum(psf):
+    shift = torch.tensor([[0.05, -0.02]])
+    moved = Pose(torch.zeros(1), torch.zeros(1), 0.1, shift).move(psf)
+    expected = displaced_envelope(psf, shift * SIZE[0], blur=alignment._ENVELOPE_BLUR)
+    torch.testing.assert_close(moved, hazed(expected / expected.sum(), 0.1))
+
+
 def test_each_capture_has_its_own_pose_at_any_brightness(psf, scenes):
     measurement = torch.cat([captured(turned(psf, 1.0, 1.0), scenes[:1]), captured(psf, scenes[1:])])
     together = align(measurement * torch.tensor([7.0, 0.1])[:, None, None, None], psf)
@@ -144,7 +181,7 @@ def test_what_is_no_fall_off_stays_in_the_residual(generator):
     prediction = torch.zeros(1, 3, *grid)
     prediction[..., : size[0], : size[1]] = torch.randn(1, 3, *size, generator=generator)
     x = torch.linspace(-1, 1, size[1]).expand(size)
-    slope = torch.nn.functional.pad(x, (0, grid[1] - size[1], 0, grid[0] - size[0])) * prediction
+    slope = F.pad(x, (0, grid[1] - size[1], 0, grid[0] - size[0])) * prediction
     beyond = torch.zeros_like(prediction)
     beyond[..., 33, 42] = 1.0
     poses = torch.cat([c * slope + beyond for c in (0.25, 0.2, 0.25, 2.0)])  # two of each of two captures

@@ -12,6 +12,7 @@ This is a statement about the picture. Whether the PSF is right is another quest
 method: `mwdn.diagnosis.orientation`.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -36,6 +37,8 @@ class Consistency:
         turn_degrees: rotation of the PSF that fits best.
         scale: its relative magnification; positive for objects nearer than the point of the calibration.
         haze: estimated fraction of the light that is spread evenly under that PSF.
+        envelope_down: displacement of the aperture's shadow in that PSF, over its shorter side.
+        envelope_right: likewise.
     """
 
     explained: float
@@ -43,6 +46,8 @@ class Consistency:
     turn_degrees: float
     scale: float
     haze: float
+    envelope_down: float = 0.0
+    envelope_right: float = 0.0
 
     @property
     def sentence(self) -> str:
@@ -50,9 +55,11 @@ class Consistency:
         # The noise estimate of a raw mosaic counts its cells as noise.
         noise = f" ({self.possible:.0%} is not noise)" if self.explained <= self.possible else ""
         summary = f"the picture reproduces {self.explained:.0%} of the capture's detail{noise}"
+        displacement = math.hypot(self.envelope_down, self.envelope_right)
         changes = [
             f"turned by {self.turn_degrees:.2f} degrees" * (abs(self.turn_degrees) > 0.2),
             f"scaled by {self.scale:+.1%}" * (abs(self.scale) > 0.005),
+            f"its aperture displaced by {displacement:.1%} of the frame" * (displacement > 0.005),
             f"under {self.haze:.0%} of haze" * (self.haze >= 0.02),
         ]
         pose = ", ".join(filter(None, changes))
@@ -63,7 +70,7 @@ class Consistency:
 def consistency(measurement: Measurement, psf: Psf, scene: Scene, *, pose: Pose | None = None) -> Consistency:
     """Compare a measurement with the forward model of its reconstruction.
 
-    The scene passes the PSF in its best pose (rotation, scale and haze, `mwdn.solvers.alignment`) and the PSF as it is;
+    The scene passes the PSF in its best pose (`mwdn.solvers.alignment`) and the PSF as it is;
     the better one counts. The gain and an even background are free in each channel. Saturated pixels
     (`mwdn.optics.saturation`) contradict only a scene that leaves them darker.
 
@@ -98,9 +105,7 @@ def consistency(measurement: Measurement, psf: Psf, scene: Scene, *, pose: Pose 
     return Consistency(
         explained=float(explained.sum(1).max() / d_energy.sum()),
         possible=float(not_noise(measurement, d)),
-        turn_degrees=float(pose.turn_degrees),
-        scale=float(pose.scale),
-        haze=float(pose.haze),
+        **pose.numbers(),
     )
 
 

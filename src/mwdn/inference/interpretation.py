@@ -95,12 +95,7 @@ def interpret(network: object, measurement: Measurement, psf: Psf) -> Interpreta
     psf, pose = checked_psf(psf, scale=not network.stored_psf), {}
     if network.align:
         aligned = align(measurement, psf)
-        psf = aligned.move(psf)
-        pose = {
-            name: round(float(value), 6)
-            for name, value in vars(aligned).items()
-            if isinstance(value, Tensor) and value.numel() == 1
-        }
+        psf, pose = aligned.move(psf), aligned.numbers()
     result = network(measurement, psf)
     first = Row(
         "input and output",

@@ -24,7 +24,7 @@ from mwdn.types import Measurement, Psf, Scene, Size
 
 COARSE_LEVELS = (
     Level(8, 22, Penalties(0.04, 1.0, 0.08), 0.01, relaxation=1.85, lit=True),
-    Level(4, 10, Penalties(0.15, 0.0, 0.3), relaxation=1.8),
+    Level(4, 12, Penalties(0.15, 0.0, 0.6), relaxation=1.8),
     Level(2, 8, Penalties(0.2, 0.0, 0.9)),
 )
 """Levels where the bank restores the detail. Total variation at the coarsest decides how the light is shared between

@@ -18,7 +18,7 @@ DIMMEST = 0.1
 """Part of the envelope's maximum below which the pattern is not known well enough to be lit up."""
 
 
-def displaced_envelope(psf: Psf, shift: Tensor) -> Psf:
+def displaced_envelope(psf: Psf, shift: Tensor, *, blur: float = ENVELOPE_BLUR) -> Psf:
     """Displace the aperture's shadow against the mask's pattern.
 
     A PSF is pattern x envelope, h = p E. The mask casts the pattern from a distance d_m in front of the sensor, the
@@ -29,11 +29,12 @@ def displaced_envelope(psf: Psf, shift: Tensor) -> Psf:
     Args:
         psf: (B, C, h, w).
         shift: (B, 2), of the envelope, down and right, in pixels.
+        blur: see `ENVELOPE_BLUR`. A narrow one takes the pattern's lines for the envelope, a wide one loses its edge.
 
     Returns:
         (B, C, h, w); the light that the displaced aperture lets through, so the sum changes.
     """
-    envelope = gaussian_blur(psf, ENVELOPE_BLUR * min(psf.shape[-2:])).clamp(min=0)
+    envelope = gaussian_blur(psf, blur * min(psf.shape[-2:])).clamp(min=0)
     moved = [
         warp(one[None], torch.eye(2), (down, right))
         for one, (down, right) in zip(envelope, shift.tolist(), strict=True)
