@@ -31,7 +31,7 @@ FAKE_CAMERA = "arv-fake-gv-camera-0.8"
 def has_aravis():
     try:
         aravis._library()
-    except CameraError as error:
+    except (CameraError, MissingPackageError) as error:
         pytest.skip(str(error))
 
 
