@@ -12,20 +12,21 @@ from pathlib import Path
 import torch
 
 import mwdn
-from mwdn import Reconstructor
+from mwdn import Calibration, Reconstructor
 from mwdn.evaluation.consistency import consistency
 from mwdn.io.files import write_json
 from mwdn.solvers import align
-from universal import PSFS, camera
+from universal import camera
 
-CAPTURES = {
-    "mwdn-camera 320x320": "mwdn-camera/real-objects/object_*.png",
-    "mwdn-camera 480x480": "mwdn-camera/real-objects/scene*.png",
-    "display": "mwdn-camera/display_capture.tif",
-    "DiffuserCam tutorial 300x400": "diffusercam-tutorial/rawdata_hand_sample.tif",
-    "DiffuserCam 270x480": "diffusercam/diffuser_images/*.npy",
-}
 LARGE = "mwdn-camera/psf_480.tif"
+CAPTURES = {
+    "mwdn-camera/real-objects/object_*.png": "mwdn-camera 320x320",
+    "mwdn-camera/real-objects/scene*.png": LARGE,
+    "mwdn-camera/display_capture.tif": LARGE,
+    "diffusercam-tutorial/rawdata_hand_sample.tif": "DiffuserCam tutorial 300x400",
+    "diffusercam/diffuser_images/*.npy": "DiffuserCam 270x480",
+}
+"""The PSF of each capture: of benchmarks/universal.py, or a file."""
 
 
 @torch.no_grad()
@@ -50,16 +51,13 @@ def main():
     mwdn.keep_memory()
     record = {}
     print("| capture | down, right / px | explained without | with |\n| --- | --- | --- | --- |")
-    for name, pattern in CAPTURES.items():
-        known = name in PSFS
-        calibration = camera(arguments.data, name) if known else mwdn.Calibration.from_file(arguments.data / LARGE)
+    for pattern, psf in CAPTURES.items():
+        calibration = Calibration.from_file(arguments.data / psf) if psf == LARGE else camera(arguments.data, psf)
         reconstruct = Reconstructor("universal", calibration)
         for capture in sorted(arguments.data.glob(pattern)):
-            shift, without, explained = measured(reconstruct, capture)
-            record[capture.stem] = {"shift_px": shift, "without": without, "with": explained}
-            print(
-                f"| {capture.stem} | {shift[0]:+.1f}, {shift[1]:+.1f} | {without:.3f} | {explained:.3f} |", flush=True
-            )
+            (down, right), without, explained = measured(reconstruct, capture)
+            record[capture.stem] = {"shift_px": [down, right], "without": without, "with": explained}
+            print(f"| {capture.stem} | {down:+.1f}, {right:+.1f} | {without:.3f} | {explained:.3f} |", flush=True)
     write_json(arguments.out, record)
 
 

@@ -55,6 +55,8 @@ def test_sentences():
     assert plain == "the picture reproduces 84% of the capture's detail (96% is not noise)"
     moved = Consistency(0.84, 0.96, 0.5, 0.0, 0.07).sentence
     assert moved == f"{plain}; fits best with the PSF turned by 0.50 degrees, under 7% of haze"
+    displaced = Consistency(0.84, 0.96, 0.0, 0.0, 0.0, envelope_down=0.012, envelope_right=-0.016).sentence
+    assert displaced == f"{plain}; fits best with the PSF behind an aperture displaced by 2.0% of the frame"
 
 
 def test_one_capture_at_a_time(capture):

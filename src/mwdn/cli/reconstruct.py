@@ -71,8 +71,8 @@ def reconstruct(  # noqa: PLR0913
             float32 values.
         full_size: interpolate the pictures of binned captures to the captures' size before binning. Without --bin,
             PSF and captures are binned as far as that loses little; --bin 1 refuses.
-        align: estimate pose and haze of the PSF from each capture, for a camera that has changed since its
-            calibration; by default for universal, and not for solvers.
+        align: estimate the pose of the PSF from each capture (rotation, scale, displaced aperture, haze), for a camera
+            that has changed since its calibration; by default for universal, and not for solvers.
         ensemble: average a network's pictures of the capture and its three mirror images: four times the time; on
             average 0.2 dB for universal-small, 0.02 dB for universal.
         room_light: find even light, a slope or a narrow spot of light of the room in each capture and subtract it, if

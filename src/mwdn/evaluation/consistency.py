@@ -59,7 +59,7 @@ class Consistency:
         changes = [
             f"turned by {self.turn_degrees:.2f} degrees" * (abs(self.turn_degrees) > 0.2),
             f"scaled by {self.scale:+.1%}" * (abs(self.scale) > 0.005),
-            f"its aperture displaced by {displacement:.1%} of the frame" * (displacement > 0.005),
+            f"behind an aperture displaced by {displacement:.1%} of the frame" * (displacement > 0.005),
             f"under {self.haze:.0%} of haze" * (self.haze >= 0.02),
         ]
         pose = ", ".join(filter(None, changes))

@@ -172,7 +172,7 @@ def _multiply(g: OnnxGraph, node: fx.Node, a: Any, b: Any) -> Pair:  # noqa: ANN
 
 
 def _add(g: OnnxGraph, node: fx.Node, a: Pair, b: Pair, *, alpha: float = 1) -> Pair:
-    scaled = b if alpha == 1 else _multiply(g, node, b, torch.tensor(float(alpha)))
+    scaled = b if alpha == 1 else _multiply(g, node, b, float(alpha))
     return Pair(*(g("Add", *each) for each in zip(a, scaled, strict=True)))
 
 

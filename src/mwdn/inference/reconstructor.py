@@ -37,8 +37,8 @@ class Reconstructor:
     Args:
         method: a solver, a network, the name of a solver or of a bundled network, or the path of a checkpoint.
         calibration: of the camera.
-        align: whether to fit pose and haze of the PSF to each measurement first (`mwdn.align`), for a camera
-            that has changed since its calibration. ``None`` does as the network was trained: ``universal`` aligns;
+        align: whether to fit the pose of the PSF to each measurement first (`mwdn.align`), for a camera that has
+            changed since its calibration. ``None`` does as the network was trained: ``universal`` aligns;
             ``universal-small`` and solvers do not.
         device: a GPU if there is one, unless given.
         precision: of a network, see `mwdn.inference.engine.Precision`; solvers are always exact.

@@ -28,8 +28,8 @@ COARSE_LEVELS = (
     Level(2, 8, Penalties(0.2, 0.0, 0.9)),
 )
 """Levels where the bank restores the detail. Total variation at the coarsest decides how the light is shared between
-the scene in the frame and around it: without it photographs that fill the frame lose 0.7 dB. 22 iterations from even
-light reach what 40 from black do. The other levels do without total variation, which takes less time. At half the size
+the scene in the frame and around it, which takes many iterations where photographs fill the frame: 22 from even light
+reach what 40 from black do. The other levels do without total variation, which takes less time. At half the size
 over-relaxation loses 0.2 to 0.7 dB."""
 
 BOUNDARY: Boundary = "taper"
