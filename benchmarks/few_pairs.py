@@ -32,6 +32,7 @@ from mwdn.io.files import atomic
 from mwdn.io.images import write_picture
 from mwdn.io.toml import parse_value
 from mwdn.optics.distortion import displacement_px
+from mwdn.optics.shading import shading
 from mwdn.training.recipe import read_recipe
 from mwdn.training.sample_cache import SampleCache
 from mwdn.training.sample_files import Sample
@@ -101,7 +102,7 @@ def scores(picture, scene, protocol, perceptual):
 @torch.no_grad()
 def of_network(network, sample):
     estimates = sample.estimates[None].float()
-    return network.undistort(network.correct(estimates, sample.unit[None].float()))
+    return network.as_recorded(network.correct(estimates, sample.unit[None].float()))
 
 
 def main():
@@ -156,7 +157,9 @@ def main():
                 write_picture(arguments.sheets / f"{learn}-{fold}.png", sheet)
             mean, largest = displacement_px(network.distortion, samples[0].scene.shape[-2:])
             print(key, {row: {n: v["psnr"] for n, v in each.items()} for row, each in values.items()})
-            print(f"  scenes distorted by {mean:.2f} px (root mean square), {largest:.1f} at most", flush=True)
+            least, most = shading(network.shading, samples[0].scene.shape[-2:]).aminmax()
+            print(f"  scenes distorted by {mean:.2f} px (root mean square), {largest:.1f} at most,", end=" ")
+            print(f"shaded by {least:.2f} to {most:.2f}", flush=True)
     summarise(record)
 
 

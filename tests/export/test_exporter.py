@@ -308,12 +308,13 @@ def test_alignment_is_off_in_the_file_alone(tmp_path):
     assert agreement(run_file(done.path, seen), expected) >= 100
 
 
-def test_over_relaxed_iterations_and_distorted_scenes(tmp_path, generator):
+def test_over_relaxed_iterations_and_recorded_scenes(tmp_path, generator):
     """As in `universal-small` and in a network of `few-pairs`, with two iterations of one level."""
-    bank = network("wiener-bank", finest=8, regularisations=(1e-3,), align=False, distortion=2)
+    bank = network("wiener-bank", finest=8, regularisations=(1e-3,), align=False, distortion=2, shading=2)
     bank.levels = (replace(bank.levels[0], iterations=2),)
     assert bank.levels[0].relaxation > 1
     bank.distortion.copy_(0.05 * torch.randn(2, 6, generator=generator))
+    bank.shading.copy_(0.2 * torch.randn(3, 6, generator=generator))
     done = export(bank, camera(), tmp_path / "camera.onnx", least=100)
     seen = simulate_captures(camera(), ("coffee",), 3)
     assert agreement(run_file(done.path, seen), Reconstructor(bank, camera(), precision="exact")(seen)) >= 100

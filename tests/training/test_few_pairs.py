@@ -18,6 +18,7 @@ from mwdn.fourier.convolution import convolve
 from mwdn.networks import build
 from mwdn.optics.distortion import distort, undistort
 from mwdn.optics.polynomials import polynomials
+from mwdn.optics.shading import shade, shading
 from mwdn.solvers.alignment import Pose
 from mwdn.training.experiment import prepare
 from mwdn.training.network import grown
@@ -32,6 +33,9 @@ SCHEDULE = Schedule(
 )  # fmt: skip
 LARGE = 96, 96
 DISTORTION = torch.tensor([[0.01, 0.0, 0.01, 0.015, -0.01, 0.01], [-0.01, 0.01, -0.01, 0.0, 0.01, -0.02]])
+SHADING = torch.tensor(
+    [[0.1, -0.3, 0.2, 0.4, 0.0, 0.3], [0.0, -0.3, 0.2, 0.4, 0.0, 0.3], [-0.2, -0.3, 0.2, 0.4, 0.0, 0.3]]
+)
 RECIPE = Recipe({"name": "wiener-bank", **OPTIONS}, SCHEDULE, pairs=Division("folds", aligned=True, best_gain=True))
 
 
@@ -168,8 +172,36 @@ def test_distorted_scenes_are_learned_from_and_reconstructed(distorted):
     assert error(result) < 0.85 * error(seen)  # the rest is not displacement
 
 
-def test_a_resumed_run_keeps_the_distortion(distorted):
+def test_unevenly_lit_scenes_are_learned_from_and_reconstructed(distorted):
+    """As above, but the scenes are recorded in other light instead."""
     recipe, calibration = distorted
+    with PairFile.create("shaded.h5", measurement_shape=(*LARGE, 3), scene_shape=(*LARGE, 3)) as file:
+        for measurement, scene in PairFile(Path("pairs.h5")):
+            file.append(measurement, 0.3 * shade(distort(scene[None], DISTORTION), SHADING)[0])
+    network = recipe.network | {"distortion": 0, "shading": 2}
+    run = prepare(replace(recipe, network=network), calibration, out=Path("run"), pairs=Path("shaded.h5"), device="cpu")
+    run.run()
+    assert run.average.distortion is None
+    found = run.average.shading
+    assert torch.equal(run.network.shading, found)
+    quotient = shading(found, LARGE) / shading(SHADING, LARGE)
+    quotient = quotient / quotient.mean()
+    assert quotient.max() / quotient.min() < 0.5 * shading(SHADING, LARGE).max() / shading(SHADING, LARGE).min()
+
+    measurement, scene = PairFile(Path("shaded.h5"))[4]
+    reconstruct = Reconstructor("run/best.safetensors", calibration, align=False, room_light=False, device="cpu")
+    result, seen = reconstruct(measurement[None]), reconstruct.on_device(measurement[None])
+    torch.testing.assert_close(result, shade(seen, found))
+
+    def error(picture):
+        return float((best_gain(picture, scene[None]) - scene).square().mean())
+
+    assert error(result) < 0.85 * error(seen)
+
+
+def test_a_resumed_run_keeps_what_was_measured(distorted):
+    recipe, calibration = distorted
+    recipe = replace(recipe, network=recipe.network | {"shading": 1})
 
     def stopped(report):
         raise KeyboardInterrupt
@@ -184,4 +216,5 @@ def test_a_resumed_run_keeps_the_distortion(distorted):
     run("stopped")
     whole, resumed = (load_checkpoint(f"{name}/last.safetensors").state_dict() for name in ("whole", "stopped"))
     assert whole["distortion"].any()
+    assert whole["shading"].any()
     assert all(torch.equal(value, resumed[name]) for name, value in whole.items())

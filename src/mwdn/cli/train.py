@@ -1,5 +1,6 @@
 """`mwdn train` and `mwdn simulate`."""
 
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -17,6 +18,7 @@ from mwdn.data.captures import list_captures
 from mwdn.io.files import refuse_overwrite
 from mwdn.io.listing import unused_photographs
 from mwdn.optics.distortion import displacement_px
+from mwdn.optics.shading import shading
 from mwdn.runtime import distributed
 from mwdn.training import experiment
 from mwdn.training.recipe import read_recipe
@@ -105,8 +107,9 @@ def _train(trainer: Trainer, progress: Progressing, board: TensorBoard | None) -
             start_training()
 
     def show_step(report: Report) -> None:
-        if report.step == 1 and (line := _distortion(trainer)):
-            progress.print(line)
+        if report.step == 1:
+            for line in _measured(trainer):
+                progress.print(line)
         speed = f"{report.pictures_per_s:.1f} pictures/s"
         progress.update(report.step, f"step {report.step:,}, {speed}, loss {report.loss:.4f}")
         if report.validation is not None:
@@ -120,14 +123,19 @@ def _train(trainer: Trainer, progress: Progressing, board: TensorBoard | None) -
     trainer.run(show_step, samples=show_samples)
 
 
-def _distortion(trainer: Trainer) -> str:
-    """What was measured of the scenes of recorded pairs; empty if they fit."""
-    coefficients, cache = getattr(trainer.network, "distortion", None), trainer.task.cache
-    if coefficients is None or cache is None or not coefficients.any():
-        return ""
+def _measured(trainer: Trainer) -> Iterator[str]:
+    """What was measured of the scenes of recorded pairs; nothing of what fits."""
+    network, cache = trainer.network, trainer.task.cache
+    if cache is None:
+        return
     height, width = next(iter(cache.samples.values())).scene.shape[-2:]
-    mean, largest = displacement_px(coefficients.cpu(), (height, width))
-    return f"The scenes are distorted by {mean:.1f} px (root mean square), {largest:.1f} px at most; this is corrected."
+    distortion, uneven = (getattr(network, name, None) for name in ("distortion", "shading"))
+    if distortion is not None and distortion.any():
+        mean, largest = displacement_px(distortion.cpu(), (height, width))
+        yield f"The scenes are distorted by {mean:.1f} px (root mean square), {largest:.1f} px at most; corrected."
+    if uneven is not None and uneven.any():
+        least, most = shading(uneven.cpu(), (height, width)).aminmax()
+        yield f"The scenes' light is {least:.2f} to {most:.2f} times that of the reconstructions; corrected."
 
 
 def _kept(trainer: Trainer) -> str:

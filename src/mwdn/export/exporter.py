@@ -84,7 +84,7 @@ class FixedPsf(nn.Module):
         if not isinstance(self.method, Network):
             return self.method(measurement, self.psf).float()
         prepared = tree_unflatten([getattr(self, name) for name in self.names], self.layout)
-        return self.method.undistort(self.method.reconstruct(measurement, prepared).float())
+        return self.method.as_recorded(self.method.reconstruct(measurement, prepared).float())
 
 
 def export(
@@ -132,7 +132,7 @@ def export(
         about["alignment"] = "off: the PSF is taken as it is"
     measurement = simulate_captures(calibration, ("astronaut",), channels)
     exact = Reconstructor(method, calibration, align=False, device="cpu", precision="exact")
-    expected = exact.undistort(exact.on_device(measurement))
+    expected = exact.as_recorded(exact.on_device(measurement))
     with torch.no_grad(), tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / out.name
         module = FixedPsf(method, psf_for(method, calibration), dtype=torch.float16 if precision == "float16" else None)

@@ -57,7 +57,7 @@ class _Reconstruct(nn.Module):
         parts = iter(prepared)
         tensors = [torch.complex(next(parts), next(parts)) if both else next(parts) for both in self.is_complex]
         scene = self.network.reconstruct(measurement, tree_unflatten(tensors, self.layout)).float()
-        return self.network.undistort(scene)
+        return self.network.as_recorded(scene)
 
 
 def network_models(network: Network[Any], size: Size, channels: int) -> NetworkModels:

@@ -86,7 +86,7 @@ def export_site(
     models = network_models(network, calibration.size, channels)
     captures = _sample_captures(calibration)
     exact = Reconstructor(network, calibration, align=False, device="cpu", precision="exact")
-    scenes = exact.undistort(exact.on_device(captures.float() / 65535))
+    scenes = exact.as_recorded(exact.on_device(captures.float() / 65535))
     reached = _compare(models, calibration, captures, scenes, channels)
     required = MIN_AGREEMENT["float32"] if least is None else least
     if not reached >= required:  # NaN is too little

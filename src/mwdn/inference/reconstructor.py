@@ -241,12 +241,12 @@ class Reconstructor:
         return to_host(self.finish(self.on_device(measurement)))
 
     def finish(self, scene: Scene) -> Scene:
-        """Apply `undistort` and `balance` to the result of `on_device`."""
-        return self.balance(self.undistort(scene))
+        """Apply `as_recorded` and `balance` to the result of `on_device`."""
+        return self.balance(self.as_recorded(scene))
 
-    def undistort(self, scene: Scene) -> Scene:
-        """Apply `mwdn.networks.network.Network.undistort` if the method is a network."""
-        return self.method.undistort(scene) if isinstance(self.method, Network) else scene
+    def as_recorded(self, scene: Scene) -> Scene:
+        """Apply `mwdn.networks.network.Network.as_recorded` if the method is a network."""
+        return self.method.as_recorded(scene) if isinstance(self.method, Network) else scene
 
     def balance(self, scene: Scene) -> Scene:
         """Apply the white balance."""

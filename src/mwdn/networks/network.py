@@ -65,15 +65,15 @@ class Network(nn.Module, Generic[Prepared]):
         """
         raise NotImplementedError
 
-    def undistort(self, scene: Scene) -> Scene:
-        """The result of `reconstruct` in the geometry of the scenes that the network was trained on.
+    def as_recorded(self, scene: Scene) -> Scene:
+        """The result of `reconstruct` as the camera shows it that recorded the scenes of the training pairs.
 
-        Unchanged unless those scenes were distorted against the reconstructions. `mwdn.Reconstructor` applies this.
+        Unchanged unless their geometry or light was measured before the training. `mwdn.Reconstructor` applies this.
         """
         return scene
 
-    def distort(self, scene: Scene) -> Scene:
-        """The inverse: a scene as `reconstruct` shows it."""
+    def as_reconstructed(self, scene: Scene) -> Scene:
+        """The inverse: a recorded scene as `reconstruct` shows it."""
         return scene
 
     def forward(self, measurement: Measurement, psf: Psf) -> Scene:

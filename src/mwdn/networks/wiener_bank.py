@@ -16,21 +16,11 @@ from mwdn.networks.drunet import Drunet
 from mwdn.networks.network import Network
 from mwdn.optics.distortion import distort, undistort
 from mwdn.optics.polynomials import coefficient_count
-from mwdn.solvers.levels import LEVELS, REFERENCE_NOISE, Level, brightness
+from mwdn.optics.shading import shade
+from mwdn.solvers.levels import LEVELS, REFERENCE_NOISE, brightness, pyramid_levels
 from mwdn.solvers.plug_and_play import plug_and_play
 from mwdn.solvers.pyramid import Band, Estimate, PsfPyramid
-from mwdn.solvers.splitting import Penalties
 from mwdn.types import Measurement, Psf, Scene, Size
-
-COARSE_LEVELS = (
-    Level(8, 22, Penalties(0.04, 1.0, 0.08), 0.01, relaxation=1.85, lit=True),
-    Level(4, 12, Penalties(0.15, 0.0, 0.6), relaxation=1.8),
-    Level(2, 8, Penalties(0.2, 0.0, 0.9)),
-)
-"""Levels where the bank restores the detail. Total variation at the coarsest decides how the light is shared between
-the scene in the frame and around it, which takes many iterations where photographs fill the frame: 22 from even light
-reach what 40 from black do. The other levels do without total variation, which takes less time. At half the size
-over-relaxation loses 0.2 to 0.7 dB."""
 
 BOUNDARY: Boundary = "taper"
 """Boundary handling where the bank filters the measurement itself."""
@@ -93,12 +83,16 @@ class WienerBank(Network[BankTransfers]):
         mean_light: see `MeanLight`; needs iterations unless ``kept``.
         evidence: whether the U-Net also sees what speaks against the PSF (`WienerBank.evidence`); needs iterations.
         distortion: order of the polynomials of the recorded scenes' distortion; 0 for none.
+        shading: order of the polynomials of the recorded scenes' shading, 0 for a gain of each colour; ``None`` for
+            none.
 
     Attributes:
         distortion: coefficients (2, K) for `mwdn.optics.distortion`, measured before the training; or ``None``.
+        shading: coefficients (C, K) for `mwdn.optics.shading`, measured after it, before the training; or ``None``.
     """
 
     distortion: Tensor | None
+    shading: Tensor | None
 
     def __init__(  # noqa: PLR0913
         self,
@@ -114,6 +108,7 @@ class WienerBank(Network[BankTransfers]):
         mean_light: MeanLight = "kept",
         evidence: bool = False,
         distortion: int = 0,
+        shading: int | None = None,
     ) -> None:
         super().__init__()
         if not regularisations or min(regularisations) <= 0:
@@ -127,7 +122,7 @@ class WienerBank(Network[BankTransfers]):
                 f"`mean_light` ({mean_light}) and `evidence` ({evidence}) need iterations: `finest` 1, 2, 4 or 8."
             )
         positive = {"width": width, "fold": fold, "block": block}
-        for name, value in (positive | {"rounds": rounds, "distortion": distortion}).items():
+        for name, value in (positive | {"rounds": rounds, "distortion": distortion, "shading": shading or 0}).items():
             minimum = int(name in positive)
             if value < minimum:
                 raise ParameterError(f"`{name}` ({value}) must be at least {minimum}.")
@@ -138,6 +133,7 @@ class WienerBank(Network[BankTransfers]):
         if rounds:
             self.denoiser = Drunet(channels=channels).requires_grad_(False)
         self.register_buffer("distortion", torch.zeros(2, coefficient_count(distortion)) if distortion else None)
+        self.register_buffer("shading", None if shading is None else torch.zeros(channels, coefficient_count(shading)))
         self.mean_light = mean_light
         self.pictures = channels * (len(regularisations) + (2 if self.levels else 1))
         evidence_channels = channels + NUMBERS if evidence else 0
@@ -170,12 +166,14 @@ class WienerBank(Network[BankTransfers]):
         estimates = self._estimates(measurement, prepared)
         return self.correct(estimates, self.unit(estimates))
 
-    def undistort(self, scene: Scene) -> Scene:
-        """The result of `reconstruct` in the geometry of the scenes that the network was trained on."""
-        return scene if self.distortion is None else undistort(scene, self.distortion)
+    def as_recorded(self, scene: Scene) -> Scene:
+        """The result of `reconstruct` in the geometry and the light of the scenes that the network was trained on."""
+        scene = scene if self.distortion is None else undistort(scene, self.distortion)
+        return scene if self.shading is None else shade(scene, self.shading)
 
-    def distort(self, scene: Scene) -> Scene:
-        """The inverse: a scene as `reconstruct` shows it."""
+    def as_reconstructed(self, scene: Scene) -> Scene:
+        """The inverse: a recorded scene as `reconstruct` shows it."""
+        scene = scene if self.shading is None else shade(scene.float(), -self.shading)
         return scene if self.distortion is None else distort(scene.float(), self.distortion)
 
     def estimates(self, measurement: Measurement, psf: Psf) -> Tensor:
@@ -280,12 +278,6 @@ class WienerBank(Network[BankTransfers]):
             return correction - means
         gate = torch.sigmoid(block_means(output[:, -1:], block) - CLOSED)
         return correction - (1 - gate) * means
-
-
-def pyramid_levels(finest: int) -> tuple[Level, ...]:
-    """Levels of the iterations from the coarsest to a downsampling of ``finest``; none for 0."""
-    levels = LEVELS if finest == 1 else COARSE_LEVELS
-    return tuple(level for level in levels if finest and level.downsampling >= finest)
 
 
 def block_means(picture: Tensor, block: int) -> Tensor:

@@ -144,7 +144,7 @@ class LivePictures:
         self.count("correct", time.perf_counter() - start)
         start, wrong = time.perf_counter(), ""
         try:
-            scene = torch.nan_to_num(reconstruct.undistort(reconstruct.on_device(measurement)).cpu())
+            scene = torch.nan_to_num(reconstruct.as_recorded(reconstruct.on_device(measurement)).cpu())
         except ParameterError as error:  # a dark frame must not end the live picture
             wrong, scene = str(error), torch.zeros_like(measurement)
         self.count("reconstruct", time.perf_counter() - start)

@@ -113,7 +113,7 @@ class Reconstructions:
             raise ImageError("The reconstruction holds NaN or infinity. Scale the capture, or use another method.")
         report = _report(order, reconstruct, time.perf_counter() - start)
         report["room_light"] = None if share is None else round(float(share), 4)
-        shown = reconstruct.undistort(scene)
+        shown = reconstruct.as_recorded(scene)
         job.result = Result(measurement, shown, calibration.light, report)
         if order.trust:
             job.advance(0.9)

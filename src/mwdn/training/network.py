@@ -12,12 +12,17 @@ from mwdn.inference.methods import psf_for
 from mwdn.networks import Network, build
 from mwdn.networks.empty import build_empty
 from mwdn.optics.polynomials import polynomial_order
+from mwdn.registration.distortion import measure_distortion
+from mwdn.registration.shading import measure_shading
 from mwdn.runtime import distributed
 from mwdn.training.recipe import Recipe
 from mwdn.training.sample_cache import SampleCache
 from mwdn.types import Psf
 from mwdn.weights.bundled import load_network
 from mwdn.weights.checkpoint import first_difference, load_checkpoint
+
+MEASURED_BUFFERS = {"distortion": measure_distortion, "shading": measure_shading}
+"""Buffers of a network that are measured from recorded scenes, in this order: the shading of undistorted pictures."""
 
 
 def build_network(recipe: Recipe) -> nn.Module:
@@ -63,7 +68,7 @@ def grown(weights: dict[str, Tensor], network: nn.Module) -> dict[str, Tensor]:
     """Weights for a network with more inputs or outputs behind those there are; the new ones are zero.
 
     Weights of a network that is wider inside, so in several axes at once, stay as they are. Buffers that there are not,
-    such as the distortion of recorded scenes, are those of the network.
+    such as `MEASURED_BUFFERS`, are those of the network.
     """
     result = dict(network.named_buffers()) | weights
     for name, wanted in network.state_dict().items():
@@ -79,21 +84,22 @@ def grown(weights: dict[str, Tensor], network: nn.Module) -> dict[str, Tensor]:
 
 
 @torch.no_grad()
-def measure_distortion(cache: SampleCache | None, network: nn.Module, average: nn.Module) -> None:
-    """Measure the distortion of the cached scenes if the network corrects one; the mean over all processes.
+def measure_scenes(cache: SampleCache | None, network: nn.Module, average: nn.Module) -> None:
+    """Measure what the network corrects of `MEASURED_BUFFERS`, from the cached scenes; the mean over all processes.
 
     Args:
         cache: of the training's samples.
         network: receives the coefficients.
         average: of its weights; computes the reconstructions and receives the coefficients, too.
     """
-    distortion = getattr(network, "distortion", None)
-    if cache is None or distortion is None:
-        return
-    measured = cache.measure_distortion(average, polynomial_order(distortion.shape[1]) or 0).to(distortion)
-    measured = distributed.all_reduce_sum(measured) / distributed.world_size()
-    for each in (network, average):
-        each.get_buffer("distortion").copy_(measured)
+    for name, measure in MEASURED_BUFFERS.items():
+        coefficients = getattr(network, name, None)
+        if cache is None or coefficients is None:
+            continue
+        measured = cache.measured(measure, average, polynomial_order(coefficients.shape[1]) or 0).to(coefficients)
+        measured = distributed.all_reduce_sum(measured) / distributed.world_size()
+        for each in (network, average):
+            each.get_buffer(name).copy_(measured)
 
 
 @torch.no_grad()

@@ -1,6 +1,6 @@
 """A cache of samples with what a network computes of them before its learned part."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
@@ -9,12 +9,14 @@ from torch import Tensor, nn
 from mwdn.data.random import seeded
 from mwdn.data.simulated import Samples, full_precision
 from mwdn.errors import ParameterError
-from mwdn.registration.distortion import measure_distortion
 from mwdn.training.sample_files import Sample, SampleFiles
 from mwdn.types import Image, Scene
 
 MEASURED = 20
-"""Largest number of pairs that measure the distortion."""
+"""Largest number of pairs that measure distortion and shading."""
+
+Measure = Callable[[Sequence[Tensor], Sequence[Tensor], int], Tensor]
+"""From reconstructions and scenes, (C, H, W) each, and an order to coefficients: `mwdn.registration.distortion`."""
 
 Progress = Callable[[int, int], None]
 """Called with the number of samples that are done, and how many there are."""
@@ -95,14 +97,14 @@ class SampleCache:
         """Reconstructions in the order of the numbers, neither mirrored nor cropped: for validation."""
         samples = [self._cached(network, number % self.size) for number in numbers]
         estimates, units, _ = (torch.stack(part).float() for part in zip(*samples, strict=True))
-        return network.undistort(network.correct(estimates, units))
+        return network.as_recorded(network.correct(estimates, units))
 
     @torch.no_grad()
-    def measure_distortion(self, network: Any, order: int) -> Tensor:  # noqa: ANN401
-        """Distortion (2, K) of the scenes of the samples computed so far, from at most `MEASURED` of them."""
+    def measured(self, measure: Measure, network: Any, order: int) -> Tensor:  # noqa: ANN401
+        """What the scenes of the samples computed so far tell, at most `MEASURED`, beside their reconstructions."""
         rows = sorted(self.samples)[:: -(-len(self.samples) // MEASURED)]
         pictures = [self.reconstruct_whole(network, [row])[0] for row in rows]
-        return measure_distortion(pictures, [self.samples[row].scene for row in rows], order)
+        return measure(pictures, [self.samples[row].scene for row in rows], order)
 
     def reconstruct(self, network: Any, numbers: range | list[int]) -> tuple[Image, Scene]:  # noqa: ANN401
         """Reconstructions of the samples of these numbers, and their scenes."""
@@ -120,7 +122,7 @@ class SampleCache:
         """A cached sample, mirrored, transposed and cropped."""
         epoch, place = divmod(number, self.size)
         estimates, unit, scene = self._cached(network, self._row(epoch, place))
-        scene = network.distort(scene[None])[0]
+        scene = network.as_reconstructed(scene[None])[0]
         # The eight symmetries of a square in turn; a frame that is not square is never transposed.
         symmetry = epoch + place
         axes = [axis for axis, bit in ((-1, 1), (-2, 2)) if symmetry & bit]

@@ -21,7 +21,7 @@ from mwdn.runtime.devices import has_bfloat16
 from mwdn.runtime.interrupts import deferred_interrupt
 from mwdn.training.batch_norm import freeze_cancelled, synchronise
 from mwdn.training.losses import Loss
-from mwdn.training.network import build_network, measure_distortion, name_and_options, update_average
+from mwdn.training.network import MEASURED_BUFFERS, build_network, measure_scenes, name_and_options, update_average
 from mwdn.training.recipe import Recipe
 from mwdn.training.report import Report
 from mwdn.training.run_folder import MAKE_ROOM, RunFolder, run_identity
@@ -84,7 +84,7 @@ class Trainer:
         # Copied before a saved run resumes: these are the weights of `start`.
         held = self.schedule.anchor > 0 or self.schedule.start_share > 0
         weights = self.network.state_dict().items() if held else ()
-        self.start = {name: value.clone() for name, value in weights if name != "distortion"}  # that is measured
+        self.start = {name: value.clone() for name, value in weights if name not in MEASURED_BUFFERS}
         self.bfloat16 = self.schedule.bfloat16 and has_bfloat16(self.device)
         self.step, self.best = 0, -math.inf
 
@@ -126,7 +126,7 @@ class Trainer:
             try:
                 self._fill_cache(samples)
                 if self.step == 0:
-                    measure_distortion(self.task.cache, self.network, self.average)
+                    measure_scenes(self.task.cache, self.network, self.average)
                     if self.schedule.anchor:
                         self.save(self.validate())
                 self._train(callback)
