@@ -28,21 +28,23 @@ RIDGE = 0.03
 
 
 def measure_shading(pictures: Sequence[Tensor], scenes: Sequence[Tensor], order: int) -> Tensor:
-    """Coefficients (C, K) for `mwdn.optics.shading`; zeros unless each half of the pairs fits the other better.
+    """Coefficients (C, K) for `mwdn.optics.shading`, of the order whose fit to half of the pairs suits the others best.
 
     Args:
         pictures: reconstructions in the geometry of the scenes, (C, H, W) each, linear light of any scale.
         scenes: (C, H, W) each, of any scale and offset.
-        order: of the polynomials.
+        order: largest order of the polynomials. Coefficients of higher orders than the best are zeros; all are if none
+            suits the other half better than no shading.
     """
     pairs = [(_blocks(picture), _blocks(scene)) for picture, scene in zip(pictures, scenes, strict=True)]
     P = _blocks(polynomials(order, (pictures[0].shape[-2], pictures[0].shape[-1])).to(pictures[0].device))
-    none = torch.zeros(len(pictures[0]), coefficient_count(order)).to(P)
-    for part in (0, 1):
-        half, other = pairs[part::2], pairs[1 - part :: 2]
-        if not (other and _unexplained(other, P, _fit(half, P)) < _unexplained(other, P, none)):  # nor for NaN
-            return none
-    return _fit(pairs, P)
+    halves = pairs[::2], pairs[1::2]
+    best, least = 0, _unexplained(pairs, P[:0], torch.zeros(len(pictures[0]), 0).to(P))
+    for count in (coefficient_count(each) for each in range(order + 1) if halves[1]):
+        left = sum(_unexplained(other, P[:count], _fit(half, P[:count])) for half, other in (halves, halves[::-1]))
+        if left < least:  # not for NaN
+            best, least = count, left
+    return F.pad(_fit(pairs, P[:best]), (0, len(P) - best))
 
 
 def _blocks(picture: Tensor) -> Tensor:
