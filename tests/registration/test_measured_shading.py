@@ -79,5 +79,7 @@ def test_shading_is_a_positive_gain_and_its_inverse_the_negative():
     assert (shaded >= 0).all()
     torch.testing.assert_close(shade(shaded, -coefficients), picture)
     torch.testing.assert_close(shade(picture, torch.zeros(3, 1)), picture)
+    grey = shade(picture[:, :1], coefficients)
+    torch.testing.assert_close(grey, (shaded / picture).prod(1, keepdim=True) ** (1 / 3) * picture[:, :1])
     corner = coefficients @ torch.tensor([1.0, -1, -1, 1, 1, 1])  # 1, y, x, y^2, y x, x^2 at the top left
     torch.testing.assert_close(shaded[..., 0, 0], picture[..., 0, 0] * corner.exp())

@@ -133,6 +133,23 @@ def test_the_recipe_fits_the_bundled_network():
     network.load_state_dict(grown(load_network(recipe.schedule.start).state_dict(), network))
 
 
+def test_a_grey_camera_is_learned_from_as_equal_colours(camera):
+    grey = Calibration(camera.psf.mean(1, keepdim=True))
+    with PairFile.create("grey.h5", measurement_shape=(32, 32, 1), scene_shape=(32, 32, 1)) as file:
+        for measurement, scene in PairFile(Path("pairs.h5")):
+            file.append(measurement.mean(0, keepdim=True), scene.mean(0, keepdim=True))
+    recipe = replace(RECIPE, network=RECIPE.network | {"shading": 0})
+    run = prepare(recipe, grey, out=Path("grey"), pairs=Path("grey.h5"), device="cpu")
+    run.run()
+    assert run.task.loss(run.network, run.distance, range(2))[0].isfinite()
+    measurement, scene = PairFile(Path("grey.h5"))[4]
+    reconstruct = Reconstructor("grey/last.safetensors", grey, align=False, room_light=False, device="cpu")
+    assert reconstruct(measurement[None]).shape == scene[None].shape
+    with pytest.raises(ParameterError, match=r"`channels` of \[network\] \(3\) must be 1, as many as the measurements"):
+        prepare(replace(recipe, network={"name": "unet"}), grey, out=Path("no"), pairs=Path("grey.h5"), device="cpu")
+    assert not Path("no").exists()
+
+
 @pytest.fixture
 def distorted(tmp_path, monkeypatch, generator):
     """A calibration, and five pairs whose scenes another camera saw: displaced by up to 3 pixels."""

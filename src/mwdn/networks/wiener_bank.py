@@ -177,7 +177,12 @@ class WienerBank(Network[BankTransfers]):
         return scene if self.distortion is None else distort(scene.float(), self.distortion)
 
     def estimates(self, measurement: Measurement, psf: Psf) -> Tensor:
-        """Estimates of the scene, smoothest first, the measurement, and the evidence if any: (B, channels, H, W)."""
+        """Estimates of the scene, smoothest first, the measurement, and the evidence if any: (B, channels, H, W).
+
+        Of a grey camera's measurement with equal colours.
+        """
+        if measurement.shape[1] == 1:
+            measurement = measurement.expand(-1, self.channels, -1, -1)
         return self._estimates(measurement, self.prepare(psf, (measurement.shape[-2], measurement.shape[-1])))
 
     def _estimates(self, measurement: Measurement, prepared: BankTransfers) -> Tensor:

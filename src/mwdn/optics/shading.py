@@ -17,5 +17,7 @@ def shading(coefficients: Tensor, size: Size) -> Tensor:
 
 
 def shade(picture: Image, coefficients: Tensor) -> Image:
-    """The picture (B, C, H, W) times `shading`."""
+    """The picture (B, C, H, W) times `shading`; a grey picture times the geometric mean of the colours'."""
+    if picture.shape[1] == 1:
+        coefficients = coefficients.mean(0, keepdim=True)
     return picture * shading(coefficients, (picture.shape[-2], picture.shape[-1])).to(picture)

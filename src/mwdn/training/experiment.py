@@ -16,10 +16,11 @@ from mwdn.data.mismatch import EXACT
 from mwdn.data.noisy import NoisyScenes
 from mwdn.data.pair_writer import Attribute, check_path
 from mwdn.data.photographs import Photographs
-from mwdn.data.recorded import HELD_OUT, record, recorded_pairs
+from mwdn.data.recorded import HELD_OUT, RecordedPairs, record, recorded_pairs
 from mwdn.data.simulated import Samples, SimulatedPairs
 from mwdn.data.unpaired import UnpairedCaptures
 from mwdn.errors import ParameterError, checked
+from mwdn.networks.empty import build_empty
 from mwdn.optics.sensor import Sensor
 from mwdn.runtime import distributed
 from mwdn.training.network import stored_psf
@@ -155,6 +156,7 @@ def recorded_pairs_of(recipe: Recipe, pairs: Path, psf: Psf, *, refinement: Refi
         raise ParameterError("[denoising] makes its own pairs from photographs: give `--photos`, not `--pairs`.")
     seed = recipe.schedule.seed
     training, validation = recorded_pairs(pairs, psf, recipe.pairs, seed=seed, device=psf.device, refinement=refinement)
+    _check_channels(recipe, training)
     best_gain = recipe.pairs.best_gain
     if recipe.schedule.pool and recipe.pairs.aligned:
         task, held_out = few_pairs_tasks(training, validation, recipe.schedule, best_gain=best_gain)
@@ -162,6 +164,17 @@ def recorded_pairs_of(recipe: Recipe, pairs: Path, psf: Psf, *, refinement: Refi
         task = replace(supervised_task(training, recipe.schedule), best_gain=best_gain)
         held_out = SupervisedTask(validation, best_gain=best_gain)
     return TrainingData(task, held_out, len(training), len(validation))
+
+
+def _check_channels(recipe: Recipe, pairs: RecordedPairs) -> None:
+    network, colours = build_empty(**recipe.network), pairs.file.measurement_shape[2]
+    channels = getattr(network, "channels", colours)
+    takes_grey = hasattr(network, "estimates")  # as equal colours
+    if channels != colours and not (takes_grey and colours == 1):
+        raise ParameterError(
+            f"`channels` of [network] ({channels}) must be {colours}, as many as the measurements of "
+            f"`{pairs.file.path}` have."
+        )
 
 
 def captures_alone(recipe: Recipe, captures: Measurement, psf: Psf) -> TrainingData:

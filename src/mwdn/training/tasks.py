@@ -107,6 +107,7 @@ class SupervisedTask:
             reconstruction = reconstruct_aligned(network, measurement, psf)
         else:
             reconstruction = self.cache.reconstruct_whole(network, numbers)
+        scene = scene.expand_as(reconstruction)  # of a grey camera: equal colours
         reconstruction = self._in_units(reconstruction, scene)
         psnr = -10 * torch.log10((reconstruction.clamp(0, 1) - scene).square().mean((1, 2, 3)))
         parts = distance(reconstruction, scene)[1]
