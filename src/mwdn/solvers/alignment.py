@@ -113,7 +113,7 @@ MIN_ENVELOPE_GAIN = 0.02
 """The same for the displacement of the envelope, up to a noise of `_GOOD_LIGHT`; beyond it falls as 1 / noise, because
 noise raises E and hides what a displacement explains. 160 captures through four measured PSFs that are not displaced,
 on dark or filling the frame, exact or mismatched, are below: at 0.019 at most in good light, 0.005 in low light. Of 20
-real-like ones 16 are above in good light, 14 in low light."""
+real-like ones 17 are above in good light, 12 in low light."""
 
 _GOOD_LIGHT = 0.02  # noise over the measurement's root mean square: at 15,000 electrons 0.009 to 0.018
 

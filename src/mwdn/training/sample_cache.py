@@ -16,7 +16,7 @@ MEASURED = 20
 """Largest number of pairs that measure distortion and shading."""
 
 Measure = Callable[[Sequence[Tensor], Sequence[Tensor], int], Tensor]
-"""From reconstructions and scenes, (C, H, W) each, and an order to coefficients: `mwdn.registration.distortion`."""
+"""From reconstructions and scenes, (C, H, W) each, and an order to coefficients, as `measure_shading` does."""
 
 Progress = Callable[[int, int], None]
 """Called with the number of samples that are done, and how many there are."""
