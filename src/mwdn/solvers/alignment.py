@@ -103,6 +103,7 @@ _ENVELOPE_BLUR = 0.06  # see `displaced_envelope`: wider than in [mismatch], whi
 _ENVELOPE_PRIOR = (0.015, 0.015)  # of the envelope: down and right, over the shorter side
 _ENVELOPE_DELTA = (0.004, 0.004)
 _ENVELOPE_PARTS = (1.5, 1.0, 0.5, 0.25)  # of its step, which is often too long in real captures
+_LEAST_SIDE = 200  # pixels: at half of 160, the paper's PSF is so coarse that exact captures seem displaced: -1 dB each
 _MOST_SCALE = 0.02  # relative magnification of an object that is about as far away as the calibration's source
 _CORRELATED = 20.0  # pixels of the residual that count as one independent sample
 MIN_GAIN = 1e-3
@@ -158,8 +159,9 @@ def align(measurement: Measurement, psf: Psf, *, steps: int = 2, min_gain: float
     psf = psf.expand(len(half), -1, -1, -1)
     pose = _estimate_pose(half, psf, steps, min_gain)
     least_gain = MIN_ENVELOPE_GAIN * (_GOOD_LIGHT / relative_noise(measurement)).clamp(max=1).flatten()
-    envelope = _estimate_envelope(half, halve_psf(pose.move(psf)), least_gain)
-    pose = pose._replace(envelope=torch.where((pose.scale.abs() <= _MOST_SCALE)[:, None], envelope, 0.0))
+    if min(measurement.shape[-2:]) >= _LEAST_SIDE:
+        envelope = _estimate_envelope(half, halve_psf(pose.move(psf)), least_gain)
+        pose = pose._replace(envelope=torch.where((pose.scale.abs() <= _MOST_SCALE)[:, None], envelope, 0.0))
     return pose._replace(haze=_estimate_haze(halve(half), halve_psf(halve_psf(pose.move(psf)))))
 
 
