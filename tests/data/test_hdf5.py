@@ -9,6 +9,7 @@ import pytest
 from mwdn.capture.recording import Replay, record
 from mwdn.capture.source import Frame
 from mwdn.data import PairFile
+from mwdn.data.hdf5 import read_attributes
 from mwdn.data.sources import list_hdf5
 from mwdn.errors import ImageError
 
@@ -96,3 +97,19 @@ def test_a_heap_that_never_ends_is_refused(tmp_path):
         (tmp_path / path).write_bytes(content)
         with pytest.raises(ImageError, match=rf"The attributes of `.*{path}` cannot be read"):
             read(tmp_path / path)
+
+
+def test_an_attribute_of_numbers_of_any_length_is_left_out(tmp_path):
+    """HDF5 reads as many as the file says; damage made such an attribute of a text's, and a crash."""
+    with PairFile.create(tmp_path / "a.h5", measurement_shape=(3, 3, 3), scene_shape=(3, 3, 3)) as file:
+        file.append(*np.zeros((2, 3, 3, 3), np.float32))
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        numbers = np.empty((), h5py.vlen_dtype(np.uint8))
+        numbers[()] = np.arange(3, dtype=np.uint8)
+        kind = h5py.h5t.py_create(numbers.dtype, logical=True)
+        h5py.h5a.create(file.id, b"numbers", kind, h5py.h5s.create(h5py.h5s.SCALAR)).write(numbers)
+        file.attrs["name"] = "a text"
+        attributes = read_attributes(tmp_path / "a.h5", file, "")
+    assert attributes["name"] == "a text"
+    assert "numbers" not in attributes
+    assert len(PairFile(tmp_path / "a.h5")) == 1

@@ -224,11 +224,14 @@ def read_attributes(path: Path, file: Any, advice: str) -> dict[str, Numbers]:  
     Raises:
         ImageError: they are damaged.
     """
+    import h5py
+
     attributes = {}
     with as_damage(f"The attributes of `{path}` cannot be read", advice):
         for name in file.attrs:
             stored = file.attrs.get_id(name)
-            if stored.shape == () and (stored.dtype.kind in "biufSU" or stored.dtype.metadata):
+            # HDF5 crashes on a sequence of numbers whose length is damaged: a type that damage makes of a text's.
+            if stored.shape == () and (stored.dtype.kind in "biufSU" or h5py.check_string_dtype(stored.dtype)):
                 value = file.attrs[name]
                 value = value.item() if hasattr(value, "item") else value
                 if isinstance(value, Numbers):
