@@ -138,6 +138,10 @@ def test_a_grey_camera_is_learned_from_as_equal_colours(camera):
     with PairFile.create("grey.h5", measurement_shape=(32, 32, 1), scene_shape=(32, 32, 1)) as file:
         for measurement, scene in PairFile(Path("pairs.h5")):
             file.append(measurement.mean(0, keepdim=True), scene.mean(0, keepdim=True))
+    many = Path("many.h5")
+    with PairFile.create(many, measurement_shape=(32, 32, 1), scene_shape=(32, 32, 1)) as file:
+        for _ in range(10):
+            file.append(torch.rand(1, 32, 32), torch.rand(1, 32, 32))
     recipe = replace(RECIPE, network=RECIPE.network | {"shading": 0})
     run = prepare(recipe, grey, out=Path("grey"), pairs=Path("grey.h5"), device="cpu")
     run.run()
@@ -148,6 +152,7 @@ def test_a_grey_camera_is_learned_from_as_equal_colours(camera):
     with pytest.raises(ParameterError, match=r"`channels` of \[network\] \(3\) must be 1, as many as the measurements"):
         prepare(replace(recipe, network={"name": "unet"}), grey, out=Path("no"), pairs=Path("grey.h5"), device="cpu")
     assert not Path("no").exists()
+    prepare(Recipe({"name": "wiener"}, Schedule(steps=1)), grey, out=Path("any"), pairs=many, device="cpu").run()
 
 
 @pytest.fixture

@@ -170,7 +170,7 @@ def _check_channels(recipe: Recipe, pairs: RecordedPairs) -> None:
     network, colours = build_empty(**recipe.network), pairs.file.measurement_shape[2]
     channels = getattr(network, "channels", colours)
     takes_grey = hasattr(network, "estimates")  # as equal colours
-    if channels != colours and not (takes_grey and colours == 1):
+    if channels not in (0, colours) and not (takes_grey and colours == 1):  # 0 is any number
         raise ParameterError(
             f"`channels` of [network] ({channels}) must be {colours}, as many as the measurements of "
             f"`{pairs.file.path}` have."

@@ -154,6 +154,7 @@ class SampleCache:
             measurement, scene, psf = self.pairs.batch([row])
             estimates = network.estimates(measurement, psf)
             unit = network.unit(estimates)[0]
-            scene = scene.expand(-1, network.channels, -1, -1)  # of a grey camera: equal colours
+            if scene.shape[1] == 1 < network.channels:  # a grey camera: equal colours
+                scene = scene.expand(-1, network.channels, -1, -1)
             self.samples[row] = Sample(estimates[0].half().contiguous(), unit, scene[0].half().contiguous())
         return self.samples[row]
