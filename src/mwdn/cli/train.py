@@ -132,10 +132,10 @@ def _measured(trainer: Trainer) -> Iterator[str]:
     distortion, uneven = (getattr(network, name, None) for name in ("distortion", "shading"))
     if distortion is not None and distortion.any():
         mean, largest = displacement_px(distortion.cpu(), (height, width))
-        yield f"The scenes are distorted by {mean:.1f} px (root mean square), {largest:.1f} px at most; corrected."
+        yield f"Distortion of the scenes, corrected: {mean:.1f} px (root mean square), {largest:.1f} px at most."
     if uneven is not None and uneven.any():
         least, most = shading(uneven.cpu(), (height, width)).aminmax()
-        yield f"The scenes' light is {least:.2f} to {most:.2f} times that of the reconstructions; corrected."
+        yield f"Shading of the scenes, corrected: {least:.2f} to {most:.2f} times the reconstructions' light."
 
 
 def _kept(trainer: Trainer) -> str:

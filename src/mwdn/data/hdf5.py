@@ -228,7 +228,7 @@ def read_attributes(path: Path, file: Any, advice: str) -> dict[str, Numbers]:  
 
     attributes = {}
     with as_damage(f"The attributes of `{path}` cannot be read", advice):
-        for name in (each for each in file.attrs if isinstance(each, str)):  # bytes are not UTF-8
+        for name in (each for each in file.attrs if isinstance(each, str)):  # not UTF-8: bytes
             stored = file.attrs.get_id(name)
             # HDF5 crashes on a sequence of numbers whose length is damaged: a type that damage makes of a text's.
             if stored.shape == () and (stored.dtype.kind in "biufSU" or h5py.check_string_dtype(stored.dtype)):

@@ -158,8 +158,8 @@ def align(measurement: Measurement, psf: Psf, *, steps: int = 2, min_gain: float
     half = half / half.abs().amax((1, 2, 3), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
     psf = psf.expand(len(half), -1, -1, -1)
     pose = _estimate_pose(half, psf, steps, min_gain)
-    least_gain = MIN_ENVELOPE_GAIN * (_GOOD_LIGHT / relative_noise(measurement)).clamp(max=1).flatten()
     if min(measurement.shape[-2:]) >= _LEAST_SIDE:
+        least_gain = MIN_ENVELOPE_GAIN * (_GOOD_LIGHT / relative_noise(measurement)).clamp(max=1).flatten()
         envelope = _estimate_envelope(half, halve_psf(pose.move(psf)), least_gain)
         pose = pose._replace(envelope=torch.where((pose.scale.abs() <= _MOST_SCALE)[:, None], envelope, 0.0))
     return pose._replace(haze=_estimate_haze(halve(half), halve_psf(halve_psf(pose.move(psf)))))
