@@ -27,6 +27,7 @@ from mwdn.training.trainer import Trainer
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU here")
 
 SIZE = 96, 128
+NETWORKS = "mwdn", "mwdn-cpsf", "unet", "flatnet", "ifin"
 CPU, GPU = torch.device("cpu"), torch.device("cuda", 0)
 
 
@@ -76,10 +77,10 @@ def test_there_and_back(shape, generator):
 
 
 @pytest.mark.parametrize("precision", ["exact", "fast"])
-@pytest.mark.parametrize("method", ["mwdn", "mwdn-cpsf", "unet", "universal", "universal-small", *solvers.SOLVERS])
+@pytest.mark.parametrize("method", [*NETWORKS, "universal", "universal-small", *solvers.SOLVERS])
 def test_reconstructions(method, precision, calibration, batches):
     """Of each shape, the first batch is computed, the second recorded as a CUDA graph, the others replayed."""
-    if method in ("mwdn", "mwdn-cpsf", "unet"):
+    if method in NETWORKS:
         method = build(method, width=8).eval()
     here = Reconstructor(method, calibration, device=CPU, precision="exact")
     there = Reconstructor(method, calibration, device=GPU, precision=precision)

@@ -143,7 +143,9 @@ def fuse(module: nn.Module, dtype: torch.dtype | None, *, pack: bool = True) -> 
         return StripEncoder(module) if isinstance(module, Encoder) else StripDecoder(module)
     if _can_fuse(module):
         return FusedConvolution(module, None, relu=False, dtype=dtype, pack=pack)
-    return Float32Layer(module) if isinstance(module, nn.Conv2d | nn.ConvTranspose2d | nn.Linear) else module
+    # torch's GroupNorm takes features in bfloat16, but not in float16, with weights in float32.
+    unchanged = (nn.Conv2d, nn.ConvTranspose2d, nn.Linear, *([nn.GroupNorm] if dtype is torch.float16 else []))
+    return Float32Layer(module) if isinstance(module, unchanged) else module
 
 
 def _fuse_layers(layers: list[nn.Module], dtype: torch.dtype | None, *, pack: bool) -> list[nn.Module]:
