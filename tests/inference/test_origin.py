@@ -46,7 +46,7 @@ def with_ones(name, **options):
         ("pyramid", "2ba267f9aaf23f39"),
         ("wiener", "cf039080f5e5de60"),
         ("fista", "e077e8b3def31bac"),
-        ("universal", "0c6b9258a9c42cdd"),
+        ("universal", "8e4891e56b144c42"),
         ("universal-small", "3cd8c746a62dd002"),
     ],
 )

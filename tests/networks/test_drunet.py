@@ -53,3 +53,14 @@ def test_halving_and_doubling_are_convolutions_of_stride_2(network, generator):
 
 def test_denoisers_are_built_by_name():
     assert set(DENOISERS) == {"drunet"}
+
+
+def test_another_condition_without_weight_changes_nothing(generator):
+    """Weights of a denoiser that is told its level alone, in one that is told more."""
+    from mwdn.training.network import grown
+
+    one, two = (build("drunet", widths=(4, 6, 8), blocks=1, conditions=count).eval() for count in (1, 2))
+    two.load_state_dict(grown(one.state_dict(), two))
+    picture, level = torch.rand(2, 3, 24, 20, generator=generator), torch.tensor([0.1, 0.2]).reshape(2, 1, 1, 1)
+    with torch.no_grad():
+        torch.testing.assert_close(two(picture, torch.cat([level, 3 * level], 1)), one(picture, level))

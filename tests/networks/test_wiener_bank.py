@@ -6,10 +6,11 @@ import torch
 from made import trained
 from mwdn.errors import ParameterError
 from mwdn.networks import build
-from mwdn.networks.wiener_bank import CLOSED, NUMBERS, WienerBank
+from mwdn.networks.evidence import BENIGN_DOUBT, DOUBT_BLOCKS, LARGEST_DOUBT, against_psf, doubt_of_psf
+from mwdn.networks.wiener_bank import CLOSED, WienerBank
 from mwdn.optics import Camera
 from mwdn.solvers.levels import relative_noise
-from mwdn.solvers.pyramid import solve
+from mwdn.solvers.pyramid import Estimate, solve
 
 
 @pytest.mark.parametrize("fold", [1, 2, 4])
@@ -93,7 +94,7 @@ def evidence_of(measurement, psf) -> torch.Tensor:
     """Noise and doubts as the network is told them."""
     network = build("wiener-bank", width=2, regularisations=(1e-3,), evidence=True).eval()
     with torch.no_grad():
-        numbers = network.estimates(measurement, psf)[:, -NUMBERS:]
+        numbers = network.estimates(measurement, psf)[:, -1 - len(DOUBT_BLOCKS) :]
     assert (numbers == numbers[..., :1, :1]).all()  # constant maps
     return numbers[0, :, 0, 0]
 
@@ -120,11 +121,38 @@ def test_evidence_of_noise_alone(generator):
     psf = torch.zeros(1, 3, 128, 128)
     psf[..., 64, 64] = 1
     estimate = solve(measurement, psf)
-    network = build("wiener-bank", width=2, evidence=True)
-    numbers = network.evidence(estimate, estimate.detail(1e-3))[0, -NUMBERS:, 0, 0]
+    doubt = against_psf(estimate, estimate.detail(1e-3), 8)[0, -1, 0, 0]
     residual, noise = estimate.residual, relative_noise(measurement) * measurement.square().mean().sqrt()
     expected = residual.unfold(-1, 16, 16).unfold(-3, 16, 16).mean((-1, -2)).square().mean().sqrt() * 16 / noise
-    assert numbers[2].exp() == pytest.approx(float(expected), rel=0.01)
+    assert doubt.exp() == pytest.approx(float(expected), rel=0.01)
+
+
+class Doubted(Estimate):
+    """An estimate of given doubts."""
+
+    def __init__(self, *doubts):
+        object.__setattr__(self, "doubts", torch.tensor(doubts).reshape(-1, 1, 1, 1))
+
+    def doubt(self, side):
+        return self.doubts
+
+
+def test_the_denoiser_is_told_a_clear_doubt_alone():
+    none, whole = BENIGN_DOUBT
+    told = doubt_of_psf(Doubted(0.5, none, (none + whole) / 2, whole, 1e6)).flatten()
+    middle, large = torch.tensor([(none + whole) / 2, whole]).log()
+    torch.testing.assert_close(told, torch.tensor([0.0, 0.0, middle / 2, large, torch.tensor(LARGEST_DOUBT).log()]))
+
+
+def test_the_denoiser_is_told_the_doubt_times_its_level(generator):
+    """One that returns what it is told: each sample of a batch has its own doubt."""
+    network = build("wiener-bank", width=2, rounds=1, evidence=True).eval()
+    network.denoiser = torch.nn.Module()
+    network.denoiser.forward = lambda image, conditions: conditions
+    conditions = network.denoise(Doubted(1.0, 8.0))(torch.rand(2, 3, 8, 8), torch.full((2, 1, 1, 1), 0.5))
+    assert conditions.shape == (2, 2, 1, 1)
+    torch.testing.assert_close(conditions[:, 0], torch.full((2, 1, 1), 0.5))
+    torch.testing.assert_close(conditions[:, 1].flatten(), 0.5 * doubt_of_psf(Doubted(1.0, 8.0)).flatten())
 
 
 @pytest.mark.parametrize("options", [{"evidence": True}, {"mean_light": "gated"}, {"mean_light": "free"}])

@@ -1,14 +1,16 @@
 """Initial weights of a run."""
 
+import pytest
 import torch
 
 from mwdn.networks import build
 from mwdn.training.network import grown
 
 
-def test_new_inputs_and_outputs_start_without_effect(generator):
+@pytest.mark.parametrize("parts", [{"finest": 8}, {"rounds": 2}])
+def test_new_inputs_and_outputs_start_without_effect(generator, parts):
     """A bank without evidence in one with it: the same scene."""
-    options = {"width": 2, "finest": 8, "regularisations": (1e-3,), "block": 8}
+    options = {"width": 2, "regularisations": (1e-3,), "block": 8, **parts}
     old = build("wiener-bank", **options).eval()
     new = build("wiener-bank", **options, evidence=True, mean_light="gated").eval()
     new.load_state_dict(grown(old.state_dict(), new))

@@ -273,3 +273,12 @@ def resize(image: Tensor, size: Size) -> Tensor:
     if tuple(image.shape[-2:]) == tuple(size):
         return image
     return F.interpolate(image, size=size, mode="bilinear", align_corners=False, antialias=True)
+
+
+def block_means(picture: Tensor, block: int) -> Tensor:
+    """Means of blocks, interpolated bilinearly to the picture's size, (B, C, H, W)."""
+    height, width = picture.shape[-2:]
+    below, right = -height % block, -width % block
+    padded = F.pad(picture, (0, right, 0, below), mode="replicate") if below or right else picture
+    means = F.avg_pool2d(padded, block)
+    return F.interpolate(means, scale_factor=block, mode="bilinear")[..., :height, :width]

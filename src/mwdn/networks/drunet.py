@@ -47,6 +47,7 @@ class Drunet(nn.Module):
         widths: feature channels at each scale, finest first; the reference has 64, 128, 256, 512.
         blocks: residual blocks at each scale of encoder and decoder; the reference has 4.
         fold: block size of the pixel unshuffling at the input.
+        conditions: numbers that the network is told, each as a constant map: the noise level, and others in its unit.
 
     References:
         K. Zhang et al., "Plug-and-play image restoration with deep denoiser prior", TPAMI 44 (2022); K. Zhang et al.,
@@ -54,11 +55,17 @@ class Drunet(nn.Module):
     """
 
     def __init__(
-        self, *, channels: int = 3, widths: tuple[int, ...] = (32, 64, 96, 128), blocks: int = 2, fold: int = 2
+        self,
+        *,
+        channels: int = 3,
+        widths: tuple[int, ...] = (32, 64, 96, 128),
+        blocks: int = 2,
+        fold: int = 2,
+        conditions: int = 1,
     ) -> None:
         super().__init__()
         self.fold = fold
-        self.head = convolution((channels + 1) * fold**2, widths[0], 3)
+        self.head = convolution((channels + conditions) * fold**2, widths[0], 3)
         *left, self.centre = (_scale(width, blocks) for width in widths)
         self.encoder = nn.ModuleList(left)
         self.decoder = nn.ModuleList(_scale(width, blocks) for width in widths[:-1])
@@ -73,11 +80,11 @@ class Drunet(nn.Module):
 
         Args:
             picture: brightest pixel about 1.
-            level: standard deviation of the noise, (1 or B, 1, 1, 1).
+            level: standard deviation of the noise, (1 or B, 1, 1, 1); (1 or B, ``conditions``, 1, 1) if there are more.
         """
         height, width = picture.shape[-2:]
         step = self.fold * 2 ** len(self.down)
-        x = torch.cat([picture, level.to(picture).expand(picture.shape[0], 1, height, width)], dim=1)
+        x = torch.cat([picture, level.to(picture).expand(picture.shape[0], -1, height, width)], dim=1)
         x = F.pad(x, (0, -width % step, 0, -height % step), mode="replicate")
         x, skips = self.head(pixel_unshuffle(x, self.fold)), []
         for scale, down in zip(self.encoder, self.down, strict=True):

@@ -11,14 +11,15 @@ from mwdn.fourier.memory_format import pixel_shuffle, pixel_unshuffle
 from mwdn.fourier.padding import Boundary, pad
 from mwdn.fourier.transforms import inverse_spectrum, spectrum
 from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
-from mwdn.networks.blocks import Decoder, Encoder, check_channels, normalise_psf, paper_widths
+from mwdn.networks.blocks import Decoder, Encoder, block_means, check_channels, normalise_psf, paper_widths
 from mwdn.networks.drunet import Drunet
+from mwdn.networks.evidence import MAPS, against_psf, doubt_of_psf
 from mwdn.networks.network import Network
 from mwdn.optics.distortion import distort, undistort
 from mwdn.optics.polynomials import coefficient_count
 from mwdn.optics.shading import shade
-from mwdn.solvers.levels import LEVELS, REFERENCE_NOISE, brightness, pyramid_levels
-from mwdn.solvers.plug_and_play import plug_and_play
+from mwdn.solvers.levels import LEVELS, pyramid_levels
+from mwdn.solvers.plug_and_play import Denoiser, plug_and_play
 from mwdn.solvers.pyramid import Band, Estimate, PsfPyramid
 from mwdn.types import Measurement, Psf, Scene, Size
 
@@ -35,12 +36,6 @@ MeanLight = Literal["kept", "free", "gated"]
 
 CLOSED = 2.0
 """A gate of output 0 lets ``sigmoid(-2)`` = 12 % through."""
-
-DOUBT_BLOCKS = 4, 16
-"""Sides in pixels of the blocks over which the residual is averaged to compare it with the noise."""
-
-NUMBERS = 1 + len(DOUBT_BLOCKS)
-"""Of the evidence: the noise, and a doubt for each of `DOUBT_BLOCKS`."""
 
 
 class BankTransfers(NamedTuple):
@@ -81,7 +76,8 @@ class WienerBank(Network[BankTransfers]):
         rounds: rounds of plug and play (`mwdn.solvers.plug_and_play`) between the iterations and the bank, for
             ``finest`` 1. The denoiser is trained separately on noisy pictures and frozen here; 0 for none.
         mean_light: see `MeanLight`; needs iterations unless ``kept``.
-        evidence: whether the U-Net also sees what speaks against the PSF (`WienerBank.evidence`); needs iterations.
+        evidence: whether U-Net and denoiser are also told what speaks against the PSF (`mwdn.networks.evidence`);
+            needs iterations.
         distortion: order of the polynomials of the recorded scenes' distortion; 0 for none.
         shading: order of the polynomials of the recorded scenes' shading, 0 for a gain of each colour; ``None`` for
             none.
@@ -131,12 +127,12 @@ class WienerBank(Network[BankTransfers]):
         self.levels = pyramid_levels(finest)
         self.rounds = rounds
         if rounds:
-            self.denoiser = Drunet(channels=channels).requires_grad_(False)
+            self.denoiser = Drunet(channels=channels, conditions=1 + evidence).requires_grad_(False)
         self.register_buffer("distortion", torch.zeros(2, coefficient_count(distortion)) if distortion else None)
         self.register_buffer("shading", None if shading is None else torch.zeros(channels, coefficient_count(shading)))
         self.mean_light = mean_light
         self.pictures = channels * (len(regularisations) + (2 if self.levels else 1))
-        evidence_channels = channels + NUMBERS if evidence else 0
+        evidence_channels = channels + MAPS if evidence else 0
         self.has_evidence = evidence
         self.encoder = Encoder(self.pictures * fold**2 + evidence_channels, paper_widths(width))
         self.decoder = Decoder(channels * fold**2 + (mean_light == "gated"), paper_widths(width))
@@ -189,44 +185,33 @@ class WienerBank(Network[BankTransfers]):
         b = measurement.float()
         if not self.levels:
             return torch.cat([*self._filter(b, prepared.filters, BOUNDARY), b], dim=1)
-        estimate = self.iterate(b, prepared)
-        if self.rounds:
-            estimate = plug_and_play(estimate, self.denoiser, self.rounds)
-        if self.finest == 1:
-            details = [estimate.detail(value) for value in self.regularisations]
-        else:
-            details = self._filter(estimate.residual, prepared.filters, "zero")
-        evidence = [self.evidence(estimate, details[0])] if self.has_evidence else []
-        return torch.cat([estimate.scene, *(estimate.scene + detail for detail in details), b, *evidence], dim=1)
+        return self.filtered(self.refined(self.iterate(b, prepared)), prepared)
 
     def iterate(self, measurement: Measurement, prepared: BankTransfers) -> Estimate:
         """The iterations' estimate of the scene, before plug and play and the bank."""
         bands = [Band(level, *transfer) for level, transfer in zip(self.levels, prepared.levels, strict=True)]
         return PsfPyramid(tuple(bands)).solve(measurement)
 
-    def evidence(self, estimate: Estimate, detail: Tensor) -> Tensor:
-        """What speaks for and against the PSF: (B, C + 3, H, W).
+    def refined(self, estimate: Estimate) -> Estimate:
+        """The iterations' estimate after plug and play."""
+        return plug_and_play(estimate, self.denoise(estimate), self.rounds) if self.rounds else estimate
 
-        1. The back-projected residual, averaged over blocks: light that the estimate lacks, or has too much of.
-        2. ``log(n / n0)``: the noise n of the measurement over its root mean square, n0 = `REFERENCE_NOISE`.
-        3. ``log(d)`` for each of `DOUBT_BLOCKS`: d is the root mean square of the residual's mean in blocks of s x s
-           pixels, over ``n / s``, which white noise would leave. With a right PSF d is 1 to 3, with a wrong one
-           5 to 100.
+    def filtered(self, estimate: Estimate, prepared: BankTransfers) -> Tensor:
+        """The `estimates`: those of the bank added to the refined one, its measurement, and the evidence."""
+        if self.finest == 1:
+            details = [estimate.detail(value) for value in self.regularisations]
+        else:
+            details = self._filter(estimate.residual, prepared.filters, "zero")
+        evidence = [against_psf(estimate, details[0], self.block)] if self.has_evidence else []
+        scenes = [estimate.scene, *(estimate.scene + detail for detail in details)]
+        return torch.cat([*scenes, estimate.measurement, *evidence], dim=1)
 
-        Args:
-            estimate: of the iterations.
-            detail: first Wiener estimate of its residual.
-        """
-        scale = brightness(estimate.measurement)
-        noise = estimate.noise.clamp(min=REFERENCE_NOISE / 10)
-        doubts = [
-            F.avg_pool2d(estimate.residual, side, ceil_mode=True).square().mean((1, 2, 3), keepdim=True).sqrt()
-            * (side / (noise * scale))
-            for side in DOUBT_BLOCKS
-        ]
-        numbers = [(value + 1e-3).log() for value in (noise / REFERENCE_NOISE, *doubts)]
-        size = detail.shape[-2:]
-        return torch.cat([block_means(detail, self.block), *(n.expand(-1, -1, *size) for n in numbers)], dim=1)
+    def denoise(self, estimate: Estimate) -> Denoiser:
+        """The denoiser of plug and play. With evidence it is told sigma times the doubt beside its level sigma."""
+        if not self.has_evidence:
+            return self.denoiser
+        told = doubt_of_psf(estimate)
+        return lambda image, level: self.denoiser(image, torch.cat([level, level * told], dim=1))
 
     def _filter(self, picture: Tensor, transfers: tuple[Tensor, ...], boundary: Boundary) -> list[Tensor]:
         """Wiener filters of the bank, applied to one spectrum."""
@@ -267,8 +252,8 @@ class WienerBank(Network[BankTransfers]):
         inputs = pixel_unshuffle(estimates[:, : self.pictures], self.fold).div_(unit)
         if self.has_evidence:
             evidence = F.avg_pool2d(estimates[:, self.pictures :], self.fold)
-            light, numbers = evidence[:, : self.channels], evidence[:, self.channels :]
-            inputs = torch.cat([inputs, light / unit, numbers], dim=1)
+            light, maps = evidence[:, : self.channels], evidence[:, self.channels :]
+            inputs = torch.cat([inputs, light / unit, maps], dim=1)
         correction = self._lit(self.decoder(self.encoder(inputs))[..., :rows, :columns])
         return first + unit * pixel_shuffle(correction, self.fold)[..., :height, :width]
 
@@ -283,12 +268,3 @@ class WienerBank(Network[BankTransfers]):
             return correction - means
         gate = torch.sigmoid(block_means(output[:, -1:], block) - CLOSED)
         return correction - (1 - gate) * means
-
-
-def block_means(picture: Tensor, block: int) -> Tensor:
-    """Means of blocks, interpolated bilinearly to the picture's size, (B, C, H, W)."""
-    height, width = picture.shape[-2:]
-    below, right = -height % block, -width % block
-    padded = F.pad(picture, (0, right, 0, below), mode="replicate") if below or right else picture
-    means = F.avg_pool2d(padded, block)
-    return F.interpolate(means, scale_factor=block, mode="bilinear")[..., :height, :width]

@@ -15,7 +15,15 @@ from mwdn.fourier.transforms import fast_length, inverse_spectrum, spectrum, tra
 from mwdn.optics.psf import checked_psf
 from mwdn.optics.saturation import saturated_pixels
 from mwdn.runtime.iterations import iterations
-from mwdn.solvers.levels import LEVELS, REFERENCE_SIDE, Level, brightness, relative_noise, smoothing_scale
+from mwdn.solvers.levels import (
+    LEVELS,
+    REFERENCE_NOISE,
+    REFERENCE_SIDE,
+    Level,
+    brightness,
+    relative_noise,
+    smoothing_scale,
+)
 from mwdn.solvers.splitting import Problem, initial_state, make_filters, update_copies, update_scene
 from mwdn.types import Measurement, Psf, Scene, Size, Spectrum
 
@@ -118,6 +126,15 @@ class Estimate:
     def residual_spectrum(self) -> Tensor:
         """Spectrum of the residual, zero off the sensor, on the grid of the finest level."""
         return spectrum(self.residual, self.psf.bands[-1].grid)
+
+    def doubt(self, side: int) -> Tensor:
+        """How much the residual contradicts the PSF, (B, 1, 1, 1).
+
+        The root mean square of the residual's mean in blocks of s x s pixels, over ``n / s``, which white noise n would
+        leave. 1 to 3 with a right PSF, 3 to 100 with a wrong one.
+        """
+        means = brightness(F.avg_pool2d(self.residual, side, ceil_mode=True))
+        return means * (side / (self.noise.clamp(min=REFERENCE_NOISE / 10) * brightness(self.measurement)))
 
     def detail(self, regularisation: float | Tensor) -> Scene:
         """Wiener deconvolution of the residual, to add to the scene. The finest level must have the full size.
