@@ -29,9 +29,10 @@ from mwdn.evaluation.metrics import best_gain, psnr
 from mwdn.io.files import atomic
 from mwdn.io.images import read_frame
 from mwdn.networks import build
-from mwdn.training.network import grown, update_average
+from mwdn.training.network import update_average
 from mwdn.training.recipe import Schedule, read_recipe
 from mwdn.training.schedule import learning_rate, make_optimiser, set_rate
+from mwdn.weights.growth import grown
 
 OPTIONS = {"width": 16, "regularisations": (1e-3, 5e-5), "finest": 4, "align": False}
 VARIANTS = {

@@ -30,10 +30,10 @@ from mwdn.data.simulated import Batch, SimulatedPairs
 from mwdn.evaluation.distances import log_mse, ssim
 from mwdn.networks import build
 from mwdn.networks.blocks import block_means
-from mwdn.training.network import grown
 from mwdn.training.recipe import read_recipe
 from mwdn.weights.bundled import find_weights
 from mwdn.weights.checkpoint import read_metadata, save_network
+from mwdn.weights.growth import grown
 
 SIZES = ((192, 192), (256, 256), (176, 224), (240, 320), (320, 320), (270, 480))
 SHARES = {"calibrated": 0.4, "real": 0.35, "filling": 0.25}

@@ -57,7 +57,7 @@ def test_denoisers_are_built_by_name():
 
 def test_another_condition_without_weight_changes_nothing(generator):
     """Weights of a denoiser that is told its level alone, in one that is told more."""
-    from mwdn.training.network import grown
+    from mwdn.weights.growth import grown
 
     one, two = (build("drunet", widths=(4, 6, 8), blocks=1, conditions=count).eval() for count in (1, 2))
     two.load_state_dict(grown(one.state_dict(), two))

@@ -21,10 +21,10 @@ from mwdn.optics.polynomials import polynomials
 from mwdn.optics.shading import shade, shading
 from mwdn.solvers.alignment import Pose
 from mwdn.training.experiment import prepare
-from mwdn.training.network import grown
 from mwdn.training.recipe import Recipe, Schedule, read_recipe
 from mwdn.weights.bundled import BUNDLED, load_network
 from mwdn.weights.checkpoint import load_checkpoint, save_network
+from mwdn.weights.growth import grown
 
 OPTIONS = {"width": 2, "regularisations": (1e-2, 1e-4), "mean_light": "free"}
 SCHEDULE = Schedule(

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from mwdn.networks import build
-from mwdn.training.network import grown
+from mwdn.weights.growth import grown
 
 
 @pytest.mark.parametrize("parts", [{"finest": 8}, {"rounds": 2}])

@@ -74,6 +74,17 @@ def test_bundling_with_another_denoiser(tmp_path):
             torch.testing.assert_close(one, another, rtol=1e-3, atol=1e-6)
 
 
+def test_bundling_with_a_denoiser_that_is_told_less(tmp_path):
+    """`universal`'s own denoiser is also told what contradicts the PSF; the new one ignores it."""
+    whole, denoiser = build("wiener-bank", width=2, rounds=1, evidence=True), build("drunet")
+    save_network(tmp_path / "a.safetensors", whole, "wiener-bank", {"width": 2, "rounds": 1, "evidence": True})
+    save_network(tmp_path / "b.safetensors", denoiser, "drunet", {})
+    bundle(tmp_path / "a.safetensors", tmp_path / "c.safetensors", tmp_path / "b.safetensors")
+    head = load_checkpoint(tmp_path / "c.safetensors").denoiser.head.weight
+    torch.testing.assert_close(head[:, :16], denoiser.head.weight, rtol=1e-3, atol=1e-6)
+    assert not head[:, 16:].any()
+
+
 @pytest.mark.parametrize(("line", "message"), [("", "are required: checkpoint"), ("no.tar a.safetensors", "`no.tar`")])
 def test_bundling_by_a_wrong_call_is_one_message(capsys, monkeypatch, line, message):
     """Both ended in a traceback."""

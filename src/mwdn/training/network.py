@@ -20,6 +20,7 @@ from mwdn.training.sample_cache import SampleCache
 from mwdn.types import Psf
 from mwdn.weights.bundled import load_network
 from mwdn.weights.checkpoint import first_difference, load_checkpoint
+from mwdn.weights.growth import grown
 
 MEASURED_BUFFERS = {"distortion": measure_distortion, "shading": measure_shading}
 """Buffers of a network that are measured from recorded scenes, in this order: the shading of undistorted pictures."""
@@ -62,25 +63,6 @@ def stored_psf(recipe: Recipe, calibration: Calibration) -> Psf | None:
             "`aligned` of [pairs] out of the recipe."
         )
     return psf_for(network, calibration)
-
-
-def grown(weights: dict[str, Tensor], network: nn.Module) -> dict[str, Tensor]:
-    """Weights for a network with more inputs or outputs behind those there are; the new ones are zero.
-
-    Weights of a network that is wider inside, so in several axes at once, stay as they are. Buffers that there are not,
-    such as `MEASURED_BUFFERS`, are those of the network.
-    """
-    result = dict(network.named_buffers()) | weights
-    for name, wanted in network.state_dict().items():
-        value = weights.get(name)
-        if value is None or value.shape == wanted.shape or value.ndim != wanted.ndim:
-            continue
-        pairs = [(old, new) for old, new in zip(value.shape, wanted.shape, strict=True) if old != new]
-        if len(pairs) > 1 or pairs[0][0] > pairs[0][1]:
-            return weights
-        result[name] = torch.zeros_like(wanted)
-        result[name][tuple(slice(length) for length in value.shape)] = value
-    return result
 
 
 @torch.no_grad()

@@ -9,6 +9,7 @@ from torch import nn
 from mwdn.errors import CheckpointError, checked
 from mwdn.runtime.requirement import require
 from mwdn.weights.checkpoint import load_checkpoint, read_metadata, save_network
+from mwdn.weights.growth import grown
 
 BUNDLED = ("universal", "universal-small")
 """Bundled networks, for any camera. Model card: `mwdn/weights/README.md`."""
@@ -70,7 +71,7 @@ def bundle(checkpoint: Path, out: Path, denoiser: Path | None = None) -> None:
     Args:
         checkpoint: of a network.
         out: the file to write.
-        denoiser: checkpoint of a denoiser to replace the network's own.
+        denoiser: checkpoint of a denoiser to replace the network's own; it may be told less (the noise level alone).
 
     Raises:
         CheckpointError: a checkpoint cannot be used, or a weight exceeds the range of float16.
@@ -79,7 +80,8 @@ def bundle(checkpoint: Path, out: Path, denoiser: Path | None = None) -> None:
     network = load_checkpoint(checkpoint)
     if denoiser is not None:
         try:
-            network.get_submodule("denoiser").load_state_dict(load_checkpoint(denoiser).state_dict())
+            own = network.get_submodule("denoiser")
+            own.load_state_dict(grown(load_checkpoint(denoiser).state_dict(), own))
         except (AttributeError, RuntimeError) as error:
             raise CheckpointError(f"`{checkpoint}` has no denoiser like that of `{denoiser}`: {error}") from error
     network = network.half()
