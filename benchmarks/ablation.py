@@ -16,7 +16,6 @@ from mwdn import Calibration
 from mwdn.data.photographs import Photographs
 from mwdn.evaluation import Perceptual, Protocol, evaluate
 from mwdn.inference.methods import find_method
-from mwdn.networks import wiener_bank
 from mwdn.solvers import Pyramid, align
 from mwdn.training.recipe import read_recipe
 from universal import FULL_WELLS, captures
@@ -43,7 +42,8 @@ def parts(psf):
         "PSF not aligned": lambda b: network(b, psf),
         "haze not found": lambda b: network(b, align(b, psf)._replace(haze=0.0).move(psf)),
         "no plug and play": changed(network, rounds=0),
-        "U-Net free to change the mean light": changed(wiener_bank, block_means=lambda picture, block: 0),
+        "U-Net free to change the mean light": changed(network, mean_light="free"),
+        "U-Net that keeps the mean light": changed(network, mean_light="kept"),
         "no U-Net: plug and play, PSF aligned": aligned(lambda *known: network.estimates(*known)[:, :3]),
         "neither: pyramid, PSF aligned": aligned(Pyramid()),
         "neither: pyramid, PSF not aligned": lambda b: Pyramid()(b, psf),

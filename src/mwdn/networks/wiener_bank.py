@@ -259,10 +259,10 @@ class WienerBank(Network[BankTransfers]):
 
     def _lit(self, output: Tensor) -> Tensor:
         """The U-Net's correction, with as much of its mean light as it may change."""
-        if self.mean_light == "free" or not self.levels:
-            return output
-        block = max(1, self.block // self.fold)
         correction = output[:, : self.channels * self.fold**2]
+        if self.mean_light == "free" or not self.levels:
+            return correction
+        block = max(1, self.block // self.fold)
         means = block_means(correction, block)  # for each channel; otherwise the block pattern shows in dark areas
         if self.mean_light == "kept":
             return correction - means
