@@ -41,7 +41,6 @@ SHARES = {"calibrated": 0.4, "real": 0.35, "filling": 0.25}
 RATES = {"denoiser": 2e-4, "unet": 4e-4}
 COARSE = {"calibrated": 1.0, "real": 0.3, "filling": 1.0}
 """Weight of the error's mean light after plug and play: what real cameras take away, no denoiser can know."""
-BLOCK, BORDER = 24, 24
 
 
 def recipes():
@@ -96,10 +95,11 @@ def losses(network, batch, coarse, recompute):
         start = network.iterate(batch.measurement, prepared)
     refined = checkpoint(network.refined, start, use_reentrant=False) if recompute else network.refined(start)
     error = refined.scene - batch.scene
-    error = error - (1 - coarse) * block_means(error, BLOCK)
+    error = error - (1 - coarse) * block_means(error, network.block)
     estimates = network.filtered(refined, prepared)
-    wide = F.pad(estimates, (BORDER,) * 4, mode="reflect")
-    result = network.correct(wide, network.unit(estimates))[..., BORDER:-BORDER, BORDER:-BORDER]
+    border = network.block  # as `WienerBank.correct` does in evaluation mode
+    wide = F.pad(estimates, (border,) * 4, mode="reflect")
+    result = network.correct(wide, network.unit(estimates))[..., border:-border, border:-border]
     parts = log_mse(error, torch.zeros_like(error)), log_mse(result, batch.scene), 1 - ssim(result, batch.scene)
     return [part.mean() for part in parts]
 

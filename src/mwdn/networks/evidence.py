@@ -15,12 +15,12 @@ MAPS = 2 + len(DOUBT_BLOCKS)
 """Maps of `against_psf` beside the light: the place, the noise, and a doubt for each of `DOUBT_BLOCKS`."""
 
 LARGEST_DOUBT = 20.0
-"""Real captures have 3 to 20 at a side of 16, simulated ones of the training 1 to 15."""
+"""Ten real captures of two cameras have 3 to 21 at a side of 16."""
 
 BENIGN_DOUBT = 2.0, 5.0
-"""The denoiser is told no doubt up to the first, and all of it from the second on. In an exact camera an error of 1 to
-3 % in the haze that `mwdn.solvers.align` finds causes doubts of 2 to 3. Told of them, the denoiser makes the scene too
-bright and loses 0.2 to 0.4 dB."""
+"""The denoiser is told no doubt up to the first, and all of it from the second on. Where the PSF is exact,
+`mwdn.solvers.align` finds up to 2.5 % of haze, which causes doubts of 2 to 3. Told of them, the denoiser makes the
+scene too bright and loses 0.2 to 0.3 dB."""
 
 
 def doubt_of_psf(estimate: Estimate) -> Tensor:

@@ -131,7 +131,7 @@ class Estimate:
         """How much the residual contradicts the PSF, (B, 1, 1, 1).
 
         The root mean square of the residual's mean in blocks of s x s pixels, over ``n / s``, which white noise n would
-        leave. 1 to 3 with a right PSF, 3 to 100 with a wrong one.
+        leave. 1 to 3 with a right PSF, 5 to 100 with a wrong one.
         """
         means = brightness(F.avg_pool2d(self.residual, side, ceil_mode=True))
         return means * (side / (self.noise.clamp(min=REFERENCE_NOISE / 10) * brightness(self.measurement)))
