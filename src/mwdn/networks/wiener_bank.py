@@ -251,9 +251,10 @@ class WienerBank(Network[BankTransfers]):
         rows, columns = (-(-size // self.fold) for size in (height, width))
         inputs = pixel_unshuffle(estimates[:, : self.pictures], self.fold).div_(unit)
         if self.has_evidence:
-            evidence = F.avg_pool2d(estimates[:, self.pictures :], self.fold)
+            evidence = estimates[:, self.pictures :, :: self.fold, :: self.fold]  # smooth
             light, maps = evidence[:, : self.channels], evidence[:, self.channels :]
-            inputs = torch.cat([inputs, light / unit, maps], dim=1)
+            evidence = torch.cat([light / unit, maps], dim=1).contiguous(memory_format=torch.channels_last)
+            inputs = torch.cat([inputs, evidence], dim=1)
         correction = self._lit(self.decoder(self.encoder(inputs))[..., :rows, :columns])
         return first + unit * pixel_shuffle(correction, self.fold)[..., :height, :width]
 

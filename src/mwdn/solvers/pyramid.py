@@ -86,17 +86,14 @@ class Estimate:
             unit sum.
         psf: of the iterations.
         saturated: (B, C, H, W), `saturated_pixels` of the measurement.
+        noise: `relative_noise` of the measurement, (B, 1, 1, 1).
     """
 
     measurement: Measurement
     grid_scene: Tensor
     psf: "PsfPyramid"
     saturated: Tensor
-
-    @cached_property
-    def noise(self) -> Tensor:
-        """`relative_noise` of the measurement, (B, 1, 1, 1)."""
-        return relative_noise(self.measurement)
+    noise: Tensor
 
     @cached_property
     def scene(self) -> Scene:
@@ -191,8 +188,9 @@ class PsfPyramid:
         # tau is stated for a measurement of unit mean square.
         unit = brightness(measurement)
         b = measurement.float() / unit
+        noise = relative_noise(measurement)
         smooth = any(band.level.regularisation for band in self.bands)
-        scale = smoothing_scale(relative_noise(measurement)) if smooth else torch.ones_like(unit)
+        scale = smoothing_scale(noise) if smooth else torch.ones_like(unit)
         size_factor = math.sqrt(size[0] * size[1]) / REFERENCE_SIDE
         saturated = saturated_pixels(b)
         sizes, parts = {1: b}, {1: saturated.float()}
@@ -205,7 +203,7 @@ class PsfPyramid:
             side = band.level.downsampling
             problem = Problem.from_transfer(sizes[side], band.transfer, parts[side] > MIXED)
             scene = _solve(problem, band, scene, scale, size_factor, done)
-        return Estimate(measurement, scene.clamp(min=0) * unit, self, saturated)
+        return Estimate(measurement, scene.clamp(min=0) * unit, self, saturated, noise)
 
 
 def solve(measurement: Measurement, psf: Psf, levels: tuple[Level, ...] = LEVELS) -> Estimate:
