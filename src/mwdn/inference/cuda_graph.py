@@ -1,5 +1,6 @@
 """CUDA graphs: record a computation on a GPU once and replay it."""
 
+import logging
 from collections.abc import Callable
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 class CudaGraph:
     """A computation recorded for one shape; a replay launches its hundreds of kernels at once.
 
-    A computation that cannot be recorded runs normally.
+    A computation that cannot be recorded runs normally, after a warning that says why.
     """
 
     def __init__(self, calculate: Callable[[Tensor], Tensor], measurement: Tensor) -> None:
@@ -28,8 +29,9 @@ class CudaGraph:
             # torch's default capture stream belongs to the first GPU used. Other threads may use the GPU meanwhile.
             with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
                 self.result = calculate(self.measurement)
-        except RuntimeError:  # cannot be recorded
+        except RuntimeError as error:
             torch.cuda.set_stream(current)  # a failed capture leaves its stream current
+            logging.getLogger(__name__).warning("Not recorded as a CUDA graph, so slower: %s", error)
             return
         self.graph = graph
 
