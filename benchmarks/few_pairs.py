@@ -7,7 +7,8 @@
 Each fold is tested by the last weights, not the best: no choice depends on the pairs it is tested on. A fold learns
 from the first pairs that are not left out. `universal` itself and ADMM are measured on the same pairs. Every pair is
 aligned and estimated once and kept beside the file of pairs. Scores are those of `mwdn evaluate --variant best-gain`.
-Results are written after each fold, and folds that are already in the record are not measured again.
+Results are written after each fold, and folds that are already in the record are not measured again. `undistorted` are
+the pictures of `universal` and ADMM in the geometry of the scenes, as the pairs that are learned from show it.
 
 `--calibrated` refines the calibration first, as `mwdn calibrate --pairs` does, from the pairs that a fold learns from.
 """
@@ -31,7 +32,7 @@ from mwdn.io.contact_sheets import contact_sheet
 from mwdn.io.files import atomic
 from mwdn.io.images import write_picture
 from mwdn.io.toml import parse_value
-from mwdn.optics.distortion import displacement_px
+from mwdn.optics.distortion import displacement_px, undistort
 from mwdn.optics.shading import shading
 from mwdn.training.recipe import read_recipe
 from mwdn.training.sample_cache import SampleCache
@@ -144,6 +145,8 @@ def main():
                 measurement, scene = file[row]
                 before, after = of_network(universal, samples[row]), of_network(network, samples[row])
                 pictures = {"universal": before, "few-pairs": after, "admm": admm(measurement[None])}
+                for name in ("universal", "admm"):
+                    pictures[f"{name} undistorted"] = undistort(pictures[name].float(), network.distortion)
                 values[row] = {name: scores(picture, scene, protocol, perceptual) for name, picture in pictures.items()}
                 lines.append(
                     [*(shown(picture, scene, protocol) for picture in pictures.values()), protocol.crop(scene[None])]
@@ -175,11 +178,10 @@ def summarise(record):
         groups.setdefault(f"{pairs}, {learn}, {steps}", []).extend(values.values())
     for name, pictures in groups.items():
         means = {m: [round(fmean(p[m][k] for p in pictures), 3) for k in METRICS] for m in pictures[0]}
-        gain = bootstrap([p["few-pairs"]["psnr"] - p["admm"]["psnr"] for p in pictures])
-        print(
-            f"{name}: {len(pictures)} pictures {means}, "
-            f"gain over ADMM {gain[0]:+.2f} ({gain[1]:+.2f} to {gain[2]:+.2f})"
-        )
+        print(f"{name}: {len(pictures)} pictures {means}")
+        for one, other in (("few-pairs", "admm"), ("universal", "admm"), ("universal undistorted", "admm undistorted")):
+            gain = bootstrap([p[one]["psnr"] - p[other]["psnr"] for p in pictures if one in p])
+            print("  {} over {}: {:+.2f} ({:+.2f} to {:+.2f})".format(one, other, *gain))
 
 
 if __name__ == "__main__":
