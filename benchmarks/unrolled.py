@@ -114,12 +114,15 @@ def losses(network, loss, batch, recompute):
     with torch.no_grad():
         prepared = network.prepare(batch.psf, batch.measurement.shape[-2:])
         start = network.iterate(batch.measurement, prepared)
-    estimate, refined = start, start.scene.new_zeros(())
-    if network.rounds:
+    refined = start.scene.new_zeros(())
+    if network.rounds and network.denoiser.training:
         estimate = checkpoint(network.refined, start, use_reentrant=False) if recompute else network.refined(start)
         error = estimate.scene - batch.scene
         error = error - (1 - batch.coarse) * block_means(error, network.block)
         refined = log_mse(error, torch.zeros_like(error)).mean()
+    else:
+        with torch.no_grad():
+            estimate = network.refined(start)
     estimates = network.filtered(estimate, prepared)
     border = network.block if network.rounds else 0  # as `WienerBank.correct` does in evaluation mode
     wide = F.pad(estimates, (border,) * 4, mode="reflect")
@@ -205,7 +208,7 @@ def learn(network, loss, average, batches, arguments, save):
         torch.cuda.set_stream(torch.cuda.Stream())  # the default one cannot be recorded
     unet = [value for name, value in network.named_parameters() if not name.startswith("denoiser.")]
     groups = {"unet": unet}
-    if network.rounds:
+    if network.rounds and not arguments.only_unet:
         groups["denoiser"] = list(network.denoiser.parameters())
     rates = {name: torch.zeros((), device=device) if is_gpu else 0.0 for name in groups}
     optimiser = torch.optim.Adam(
@@ -219,6 +222,8 @@ def learn(network, loss, average, batches, arguments, save):
     if arguments.keep_statistics:
         for module in network.modules():
             module.train(not isinstance(module, nn.BatchNorm2d))
+    if network.rounds and arguments.only_unet:
+        network.denoiser.requires_grad_(False).eval()
     steps, began, saved = {}, time.monotonic(), 0.0
     for step, batch in enumerate(batches, 1):
         now = time.monotonic() - began
@@ -265,6 +270,7 @@ def main():
     parser.add_argument("--every", type=int, default=50, help="steps between lines")
     parser.add_argument("--seconds", type=float, default=0.0)
     parser.add_argument("--shares", type=float, nargs=3, default=list(SHARES.values()), help=f"of {', '.join(SHARES)}")
+    parser.add_argument("--only-unet", action="store_true", help="the denoiser stays as it is")
     parser.add_argument("--keep-statistics", action="store_true", help="BatchNorm keeps those of the start")
     parser.add_argument("--eager", action="store_true", help="no CUDA graphs")
     parser.add_argument("--workers", type=int, default=0)

@@ -47,7 +47,7 @@ def with_ones(name, **options):
         ("wiener", "cf039080f5e5de60"),
         ("fista", "e077e8b3def31bac"),
         ("universal", "8e4891e56b144c42"),
-        ("universal-small", "3cd8c746a62dd002"),
+        ("universal-small", "4ead5eae505e824c"),
     ],
 )
 def test_hash_of_a_method_stays_the_same(method, expected, capture):
