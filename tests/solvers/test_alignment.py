@@ -134,6 +134,16 @@ def test_displaced_aperture_is_found_and_removed(degrees):
     assert not align(captured(psf, scene), psf).envelope.any()
 
 
+@pytest.mark.parametrize(("down", "saturated", "found"), [(0.0, 0.5, False), (0.03, 0.1, True)])
+def test_overexposure_is_not_taken_for_a_displaced_aperture(down, saturated, found):
+    """Clipped lines do not contradict a displacement. Without a margin the first has one of 2 %."""
+    blocks = torch.rand(1, 3, 7, 8, generator=torch.Generator().manual_seed(5))
+    scene = F.pad(blocks.repeat_interleave(12, 2).repeat_interleave(12, 3), (80, 80, 70, 70))
+    measurement = captured(through_aperture(down, 0.0), scene)
+    clipped = measurement.clamp(max=float(measurement.quantile(1 - saturated)))
+    assert align(clipped, through_aperture()).envelope.any() == found
+
+
 def test_envelope_moves_before_haze_and_keeps_the_sum(psf):
     shift = torch.tensor([[0.05, -0.02]])
     moved = Pose(torch.zeros(1), torch.zeros(1), 0.1, shift).move(psf)

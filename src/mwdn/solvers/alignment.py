@@ -37,6 +37,7 @@ from mwdn.fourier.convolution import check_fit
 from mwdn.fourier.transforms import frequency_grid, inverse_spectrum, spectrum
 from mwdn.optics.aperture import displaced_envelope
 from mwdn.optics.psf import checked_psf
+from mwdn.optics.saturation import saturated_pixels
 from mwdn.optics.warp import hazed, warp
 from mwdn.solvers.levels import Level, relative_noise
 from mwdn.solvers.pyramid import halve, solve
@@ -114,7 +115,10 @@ MIN_ENVELOPE_GAIN = 0.02
 """The same for the displacement of the envelope, up to a noise of `_GOOD_LIGHT`; beyond it falls as 1 / noise, because
 noise raises E and hides what a displacement explains. 160 captures through four measured PSFs that are not displaced,
 on dark or filling the frame, exact or mismatched, are below: at 0.019 at most in good light, 0.005 in low light. Of 20
-real-like ones 17 are above in good light, 12 in low light."""
+real-like ones 17 are above in good light, 12 in low light.
+
+A third of the saturated part is added: clipped lines do not contradict a displacement. Exact captures of which 5, 25
+and 41 % are saturated gain 0.02, 0.03 and 0.13 by a wrong one, which costs 3 to 4 dB; real-like ones 0.06 to 0.8."""
 
 _GOOD_LIGHT = 0.02  # noise over the measurement's root mean square: at 15,000 electrons 0.009 to 0.018
 
@@ -160,6 +164,7 @@ def align(measurement: Measurement, psf: Psf, *, steps: int = 2, min_gain: float
     pose = _estimate_pose(half, psf, steps, min_gain)
     if min(measurement.shape[-2:]) >= _LEAST_SIDE:
         least_gain = MIN_ENVELOPE_GAIN * (_GOOD_LIGHT / relative_noise(measurement)).clamp(max=1).flatten()
+        least_gain = least_gain + saturated_pixels(measurement).float().mean((1, 2, 3)) / 3
         envelope = _estimate_envelope(half, halve_psf(pose.move(psf)), least_gain)
         pose = pose._replace(envelope=torch.where((pose.scale.abs() <= _MOST_SCALE)[:, None], envelope, 0.0))
     return pose._replace(haze=_estimate_haze(halve(half), halve_psf(halve_psf(pose.move(psf)))))
