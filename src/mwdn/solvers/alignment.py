@@ -115,10 +115,8 @@ MIN_ENVELOPE_GAIN = 0.02
 """The same for the displacement of the envelope, up to a noise of `_GOOD_LIGHT`; beyond it falls as 1 / noise, because
 noise raises E and hides what a displacement explains. 160 captures through four measured PSFs that are not displaced,
 on dark or filling the frame, exact or mismatched, are below: at 0.019 at most in good light, 0.005 in low light. Of 20
-real-like ones 17 are above in good light, 12 in low light.
-
-A third of the saturated part is added: clipped lines do not contradict a displacement. Exact captures of which 5, 25
-and 41 % are saturated gain 0.02, 0.03 and 0.13 by a wrong one, which costs 3 to 4 dB; real-like ones 0.06 to 0.8."""
+real-like ones 17 are above in good light, 12 in low light. A third of the saturated part is added: clipped lines do not
+contradict a wrong one. Where 5 and 41 % are saturated, exact captures gain 0.02 and 0.13, and lose 3 to 4 dB."""
 
 _GOOD_LIGHT = 0.02  # noise over the measurement's root mean square: at 15,000 electrons 0.009 to 0.018
 
@@ -157,10 +155,9 @@ def align(measurement: Measurement, psf: Psf, *, steps: int = 2, min_gain: float
         applications, Inverse Problems 19, R1 (2003).
     """
     check_fit(measurement, psf, "measurement")
-    psf = checked_psf(psf)
     half = halve(measurement.float())
     half = half / half.abs().amax((1, 2, 3), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
-    psf = psf.expand(len(half), -1, -1, -1)
+    psf = checked_psf(psf).expand(len(half), -1, -1, -1)
     pose = _estimate_pose(half, psf, steps, min_gain)
     if min(measurement.shape[-2:]) >= _LEAST_SIDE:
         least_gain = MIN_ENVELOPE_GAIN * (_GOOD_LIGHT / relative_noise(measurement)).clamp(max=1).flatten()
@@ -242,8 +239,7 @@ def _estimate_haze(measurement: Measurement, psf: Psf) -> Tensor:
     after = (last + 1).clamp(max=len(hazes) - 1)
     below, above = energy.gather(1, last), energy.gather(1, after)
     part = (limit - below) / (above - below).clamp(min=torch.finfo(energy.dtype).tiny)
-    haze = torch.lerp(hazes[last], hazes[after], part.clamp(max=1))[:, 0]
-    return F.threshold(haze, _LEAST_HAZE, 0.0)
+    return F.threshold(torch.lerp(hazes[last], hazes[after], part.clamp(max=1))[:, 0], _LEAST_HAZE, 0.0)
 
 
 def fine_detail(image: Image) -> Image:
