@@ -180,7 +180,7 @@ def summarise(record):
         means = {m: [round(fmean(p[m][k] for p in pictures), 3) for k in METRICS] for m in pictures[0]}
         print(f"{name}: {len(pictures)} pictures {means}")
         for one, other in (("few-pairs", "admm"), ("universal", "admm"), ("universal undistorted", "admm undistorted")):
-            gain = bootstrap([p[one]["psnr"] - p[other]["psnr"] for p in pictures if one in p])
+            gain = bootstrap([p[one]["psnr"] - p[other]["psnr"] for p in pictures])
             print("  {} over {}: {:+.2f} ({:+.2f} to {:+.2f})".format(one, other, *gain))
 
 
