@@ -1,5 +1,7 @@
 """The noise of a measurement, estimated from the measurement alone."""
 
+import numpy as np
+import torch
 from torch import Tensor
 
 from mwdn.errors import check_batch
@@ -40,5 +42,14 @@ def noise_level(image: Image, *, parts: int = 16) -> Tensor:
     corner = detail[..., : rows * height, : columns * width]
     pixels = corner.reshape(*b.shape[:2], rows, height, columns, width).transpose(-3, -2).flatten(-2)
     sample = pixels[..., :: max(1, rows * columns * height * width // SAMPLED)]
-    deviation = sample.abs().median(dim=-1).values / (2 * 0.6745)
+    deviation = median(sample.abs()) / (2 * 0.6745)
     return deviation.square().mean((-2, -1), keepdim=True).sqrt()
+
+
+def median(values: Tensor) -> Tensor:
+    """``values.median(dim=-1).values``. On a CPU numpy takes a fifth of torch's time."""
+    traced = torch.compiler.is_compiling() or torch.compiler.is_exporting() or type(values) is not Tensor
+    if traced or values.requires_grad or values.device.type != "cpu":
+        return values.median(dim=-1).values
+    middle = (values.shape[-1] - 1) // 2
+    return torch.from_numpy(np.partition(values.numpy(), middle)[..., middle])
