@@ -1,5 +1,7 @@
 """The estimate of a measurement's noise, and its median."""
 
+import math
+
 import pytest
 import torch
 
@@ -7,9 +9,17 @@ from mwdn.optics.noise import median, noise_level
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 134])
-def test_median_is_torchs(count):
-    values = torch.randn(2, 3, 16, count)
-    assert torch.equal(median(values), values.median(-1).values)
+@pytest.mark.parametrize("inference", [False, True])
+def test_median_is_torchs(count, inference):
+    with torch.inference_mode(inference):
+        values = torch.randn(2, 3, 16, count)
+        assert torch.equal(median(values), values.median(-1).values)
+
+
+def test_median_with_nan_is_nan():
+    with torch.inference_mode():
+        values = torch.tensor([[1.0, math.nan, 2.0], [3.0, 1.0, 2.0]])
+        torch.testing.assert_close(median(values), torch.tensor([math.nan, 2.0]), equal_nan=True)
 
 
 def test_median_has_torchs_gradient():

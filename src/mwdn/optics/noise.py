@@ -47,9 +47,9 @@ def noise_level(image: Image, *, parts: int = 16) -> Tensor:
 
 
 def median(values: Tensor) -> Tensor:
-    """``values.median(dim=-1).values``. On a CPU numpy takes a fifth of torch's time."""
-    traced = torch.compiler.is_compiling() or torch.compiler.is_exporting() or type(values) is not Tensor
-    if traced or values.requires_grad or values.device.type != "cpu":
+    """``values.median(dim=-1).values``. In inference mode on a CPU numpy takes a fifth of torch's time."""
+    plain = type(values) is Tensor and values.is_inference() and not torch.compiler.is_compiling()
+    if not plain or values.device.type != "cpu" or values.isnan().any():  # numpy's NaN are the largest values
         return values.median(dim=-1).values
     middle = (values.shape[-1] - 1) // 2
     return torch.from_numpy(np.partition(values.numpy(), middle)[..., middle])
