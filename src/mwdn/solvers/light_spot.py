@@ -44,8 +44,11 @@ bright scene went on beyond the frame on all sides."""
 PROMISING = 1.5
 """The search ends after a step if the energy has fallen by less than this factor."""
 
-SLIGHT = 0.001
-"""And by the square of this part of the mean measurement."""
+SLIGHT = 0.028
+"""The fainter a spot, the larger this factor must be: the energy that the spot explains, times the factor, must exceed
+the square of this part of the mean measurement. Where the PSF is wrong, what is unexplained looks like a faint spot in
+the middle of the scene: in 96 captures of real-like cameras the root of the product is at most 0.024 without a spot,
+but for one with 0.037, and 0.033 to 0.22 where one is found."""
 
 
 class Cosines(NamedTuple):
@@ -98,19 +101,36 @@ def find_spot(b: Measurement, psf: Psf, saturated: Tensor) -> Spot:
 
     Its amplitude is 0 where there is none.
     """
+    none = Spot(b.new_ones(len(b), 3), b.new_zeros(b.shape[:2]))
+    spot, without, least = _fit(b, psf, saturated, none, promising=PROMISING)
+    enough = (without - least) * without > SLIGHT**2 * least
+    return spot.where((without > EVIDENCE * least) & enough, none)
+
+
+def refine_spot(b: Measurement, psf: Psf, saturated: Tensor, spot: Spot) -> Spot:
+    """A spot that was found in the same captures at half of this size, fitted again.
+
+    Spots of 30 % over photographs that fill the frame are then wrong by 0.5 to 0.8 % of the mean measurement in place
+    of 4.2 to 6.9, over objects on dark by 0.2 to 0.5 % in place of 0.8 to 0.9. Where there is no spot, none is looked
+    for.
+    """
+    refined, _, _ = _fit(b, psf, saturated, spot, promising=1.0)
+    return refined.where((spot.amplitude > 0).any(1), spot)
+
+
+def _fit(b: Measurement, psf: Psf, saturated: Tensor, spot: Spot, *, promising: float) -> tuple[Spot, Tensor, Tensor]:
+    """The spot with the least unexplained energy, of `STEPS` from one; that energy (B,) before and after."""
     basis = cosines((b.shape[-2], b.shape[-1]), b.device)
-    size, spot = basis.size, Spot(b.new_ones(len(b), 3), b.new_zeros(b.shape[:2]))
-    best = none = spot
-    r = unexplained(b, psf, saturated)
-    without = least = energy(r)
+    best, r = spot, unexplained(b - spot.light(basis.size), psf, saturated)
+    start = least = energy(r)
     for _ in range(STEPS):
-        J = differences(b - spot.light(size), psf, saturated, basis.light)
-        spot = best_spot(r - basis.coefficients(spot.light(size)) @ J, J, basis)
-        r = unexplained(b - spot.light(size), psf, saturated)
+        J = differences(b - spot.light(basis.size), psf, saturated, basis.light)
+        spot = best_spot(r - basis.coefficients(spot.light(basis.size)) @ J, J, basis)
+        r = unexplained(b - spot.light(basis.size), psf, saturated)
         best, before, least = spot.where(energy(r) < least, best), least, torch.minimum(energy(r), least)
-        if not ((without > PROMISING * least) & (before > 1.02 * least)).any():
+        if not ((start > promising * least) & (before > 1.02 * least)).any():
             break
-    return best.where(without > EVIDENCE * least + SLIGHT**2, none)
+    return best, start, least
 
 
 def grid(device: torch.device) -> Tensor:
@@ -133,7 +153,7 @@ def best_spot(r: Tensor, J: Tensor, basis: Cosines) -> Spot:
     G, q, steps = J @ J.mT, -r @ J.mT, r.new_tensor(_STEP)
     shape, amplitude = _best_of(grid(r.device).expand(len(r), -1, -1), G, q, basis)
     offsets = torch.cartesian_prod(*r.new_tensor([-1.0, 0.0, 1.0]).expand(3, -1))
-    for halving in range(1, 5):
+    for halving in range(1, 7):
         near = shape[:, None] + steps * offsets / 2**halving
         shape, amplitude = _best_of(near.clamp(min=r.new_tensor([-1.0, -1.0, SIGMAS[0]])), G, q, basis)
     return Spot(shape, amplitude)

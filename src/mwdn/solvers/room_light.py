@@ -21,7 +21,7 @@ cosines up to a whole period in place of these three planes, photographs that fi
 and E is as small as at the truth. Where the frame is filled, even three planes take the scene's own light. Smooth light
 can be told from a scene only where the scene is dark: a plane counts only if it leaves a part of the frame dark
 (`DARK_PART`). Everything but this test happens in coarse pixels, for each colour by itself; a spot has one shape in
-all.
+all, and is fitted again in pixels of half the side.
 """
 
 import math
@@ -37,7 +37,7 @@ from mwdn.optics.psf import checked_psf
 from mwdn.optics.saturation import saturated_pixels, subtract_light
 from mwdn.solvers.alignment import halve_psf
 from mwdn.solvers.levels import LEVELS
-from mwdn.solvers.light_spot import find_spot
+from mwdn.solvers.light_spot import find_spot, refine_spot
 from mwdn.solvers.pyramid import MIXED, halve, solve
 from mwdn.solvers.unexplained import DELTA, energy, unexplained
 from mwdn.types import Measurement, Psf, Size
@@ -62,6 +62,9 @@ DARK_PART = 0.3
 subtracted. Without it, photographs that fill the frame lose 2 dB under even light, and through one PSF 3 to 5 dB
 without any light of a room. Through three measured PSFs most of them leave less than 0.2 dark, objects on dark at
 least 0.32."""
+
+GIVE_BACKS = 3
+"""Times that light is given back from the plane to the scene. Objects on dark gain 0.2 to 0.8 dB."""
 
 ABOVE = 0.002
 """Weight of light above the largest plane below a capture; that below it has a weight of 1."""
@@ -100,30 +103,36 @@ def find_room_light(measurement: Measurement, psf: Psf) -> RoomLight:
     """
     check_fit(measurement, psf, "measurement")
     psf, b = checked_psf(psf).float(), measurement.float()
-    batch, channels = b.shape[:2]
     finite = b.isfinite().flatten(1).all(1)
     b = torch.where(finite[:, None, None, None], b, 1.0)
     size = b.shape[-2], b.shape[-1]
-    full, full_psf, parts = b, psf, saturated_pixels(b).float()
-    while b.shape[-2] * b.shape[-1] > PIXELS:
-        b, psf, parts = halve(b), halve_psf(psf), halve(parts)
-    saturated = parts > MIXED
     mean = b.mean((-2, -1), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
-    psf = psf.expand(batch, channels, -1, -1)
-    y, psf = b / mean, psf / psf.sum((-2, -1), keepdim=True)
-    spot = find_spot(y, psf, saturated)
+    y, h, saturated = _halved(b / mean, psf, PIXELS)
+    spot = find_spot(y, h, saturated)
+    if spot.amplitude.any():
+        spot = refine_spot(*_halved(b / mean, psf, 4 * PIXELS), spot)
     y = y - spot.light((y.shape[-2], y.shape[-1]))
-    c = _search(*(each.reshape(-1, 1, *each.shape[-2:]) for each in (y, psf, saturated)))
-    plane = (c @ _planes(size, c.device).flatten(1)).reshape(batch, channels, *size).mul_(mean).clamp_(min=0)
+    c = _search(*(each.reshape(-1, 1, *each.shape[-2:]) for each in (y, h, saturated)))
+    plane = (c @ _planes(size, c.device).flatten(1)).reshape(b.shape).mul_(mean).clamp_(min=0)
     whole = mean.mean((1, 2, 3))
     light = spot.light(size) * mean
     counts = plane.mean((1, 2, 3)) >= FAINT * whole
     if counts.any():
-        counts &= _dark_part(subtract_light(full, light + plane), full_psf) >= DARK_PART
+        counts &= _dark_part(subtract_light(b, light + plane), psf) >= DARK_PART
+        plane = _give_back(b, light, plane, psf)
     background = torch.where(counts[:, None, None, None], plane, 0.0) + light
     share = background.mean((1, 2, 3)) / whole
     share = torch.where(finite & (share > 0) & (share < 1), share, 0.0)  # NaN is none
     return RoomLight(torch.where(share[:, None, None, None] > 0, background, 0.0).to(measurement.dtype), share)
+
+
+def _halved(y: Measurement, psf: Psf, pixels: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Captures of at most so many pixels, a PSF of sum 1 for each, and where they are saturated: all (B, C, h, w)."""
+    parts = saturated_pixels(y).float()
+    while y.shape[-2] * y.shape[-1] > pixels:
+        y, psf, parts = halve(y), halve_psf(psf), halve(parts)
+    psf = psf / psf.sum((-2, -1), keepdim=True)
+    return y, psf.expand(*y.shape[:2], -1, -1), parts > MIXED
 
 
 def _dark_part(measurement: Measurement, psf: Psf) -> Tensor:
@@ -131,6 +140,20 @@ def _dark_part(measurement: Measurement, psf: Psf) -> Tensor:
     scene = solve(measurement, psf, LEVELS[:1]).scene.mean(1)
     blocks = F.adaptive_avg_pool2d(scene, 12).flatten(1)
     return (blocks < blocks.mean(1, keepdim=True) / 4).float().mean(1)
+
+
+def _give_back(b: Measurement, light: Tensor, plane: Tensor, psf: Psf) -> Tensor:
+    """The plane (B, C, H, W) less what no scene explains of it: ``c <- c + B^T r / pixels``, r as in equation (2).
+
+    The search keeps a tolerance of too much light, which leaves r negative. Of too little light a scene would explain
+    the rest, so that r is zero.
+    """
+    for _ in range(GIVE_BACKS):
+        r = solve(subtract_light(b, light + plane), psf, LEVELS[:1]).residual
+        B, fine = (_planes((each.shape[-2], each.shape[-1]), b.device).flatten(1) for each in (r, plane))
+        c = r.flatten(2) @ B.T / B.shape[1]
+        plane = (plane + (c @ fine).reshape(plane.shape)).clamp(min=0)
+    return plane
 
 
 def _planes(size: Size, device: torch.device) -> Tensor:
