@@ -16,6 +16,9 @@ under the capture, by Gauss-Newton steps that eliminate the scene (variable proj
 3. ``d = argmin |S^-1 d|^2`` such that ``|r + J d|^2 / pixels <= E(0) + (t |J_0|)^2``, then ``c <- c + d``. The finite
    differences ``J = dr / dc`` have a new scene for each c; J_0 is that of the even term at the first step.
 
+4. ``c <- c + B^T r(c) / pixels``, three times, gives back the light that equation (3) tolerates. There r is that of
+`mwdn.solvers.pyramid`'s coarsest level, negative where too much has been subtracted.
+
 A wider choice of backgrounds, with bumps, would take the light of an object in the middle of the frame: with the six
 cosines up to a whole period in place of these three planes, photographs that fill the frame lose half of their light,
 and E is as small as at the truth. Where the frame is filled, even three planes take the scene's own light. Smooth light
@@ -119,6 +122,7 @@ def find_room_light(measurement: Measurement, psf: Psf) -> RoomLight:
     counts = plane.mean((1, 2, 3)) >= FAINT * whole
     if counts.any():
         counts &= _dark_part(subtract_light(b, light + plane), psf) >= DARK_PART
+    if counts.any():
         plane = _give_back(b, light, plane, psf)
     background = torch.where(counts[:, None, None, None], plane, 0.0) + light
     share = background.mean((1, 2, 3)) / whole
@@ -143,11 +147,7 @@ def _dark_part(measurement: Measurement, psf: Psf) -> Tensor:
 
 
 def _give_back(b: Measurement, light: Tensor, plane: Tensor, psf: Psf) -> Tensor:
-    """The plane (B, C, H, W) less what no scene explains of it: ``c <- c + B^T r / pixels``, r as in equation (2).
-
-    The search keeps a tolerance of too much light, which leaves r negative. Of too little light a scene would explain
-    the rest, so that r is zero.
-    """
+    """The plane (B, C, H, W) after equation (4), beside the spot's light."""
     for _ in range(GIVE_BACKS):
         r = solve(subtract_light(b, light + plane), psf, LEVELS[:1]).residual
         B, fine = (_planes((each.shape[-2], each.shape[-1]), b.device).flatten(1) for each in (r, plane))
