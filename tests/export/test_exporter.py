@@ -310,7 +310,8 @@ def test_alignment_is_off_in_the_file_alone(tmp_path):
 
 def test_over_relaxed_iterations_and_recorded_scenes(tmp_path, generator):
     """As in `universal-small` and in a network of `few-pairs`, with two iterations of one level."""
-    bank = network("wiener-bank", finest=8, regularisations=(1e-3,), align=False, distortion=2, shading=2)
+    options = {"align": False, "distortion": 2, "shading": 2, "evidence": True, "mean_light": "gated"}
+    bank = network("wiener-bank", finest=8, regularisations=(1e-3,), **options)
     bank.levels = (replace(bank.levels[0], iterations=2),)
     assert bank.levels[0].relaxation > 1
     bank.distortion.copy_(0.05 * torch.randn(2, 6, generator=generator))

@@ -24,11 +24,14 @@ def _convolution_transpose(g: OnnxGraph, node: fx.Node, x: str, *others: Any) ->
     return g("ConvTranspose", x, weight, bias, group=groups, **shape)
 
 
-def _pool(operation: str) -> Handler:
-    def handler(g: OnnxGraph, node: fx.Node, x: str, size: list[int], stride: Any = (), *others: Any) -> str:  # noqa: ANN401
-        if any(each not in ([0, 0], [1, 1], False) for each in others):
+def _pool(operation: str, *before: list[int]) -> Handler:
+    """Pooling whose options are ``before`` (padding, and dilation of maxima), ceil_mode, and others."""
+
+    def handler(g: OnnxGraph, node: fx.Node, x: str, size: list[int], stride: Any = (), *options: Any) -> str:  # noqa: ANN401
+        *given, ceil_mode = filled(options[: len(before) + 1], *before, False)
+        if given != list(before) or any(options[len(before) + 1 :]):
             raise ExportError(f"`{node.target}` with padding cannot be written as ONNX. Export to .pt2 instead.")
-        return g(operation, x, kernel_shape=size, strides=stride or size)
+        return g(operation, x, kernel_shape=size, strides=stride or size, ceil_mode=int(ceil_mode))
 
     return handler
 
@@ -63,12 +66,12 @@ def _unshuffle(g: OnnxGraph, node: fx.Node, x: str, block: int) -> str:
 
 
 LAYERS: dict[Any, Handler] = {
-    _aten.avg_pool2d.default: _pool("AveragePool"),
+    _aten.avg_pool2d.default: _pool("AveragePool", [0, 0]),
     _aten.conv2d.default: _convolution,
     _aten.conv_transpose2d.input: _convolution_transpose,
     _aten.grid_sampler.default: _grid_sample,
     _aten.group_norm.default: _group_norm,
-    _aten.max_pool2d.default: _pool("MaxPool"),
+    _aten.max_pool2d.default: _pool("MaxPool", [0, 0], [1, 1]),
     _aten.pixel_shuffle.default: lambda g, node, x, block: g("DepthToSpace", x, blocksize=block, mode="CRD"),
     _aten.pixel_unshuffle.default: _unshuffle,
     _aten.upsample_bilinear2d.vec: _upsample,
