@@ -1,7 +1,7 @@
 """Light of a room on the sensor: what it costs, and what --ambient and --room-light bring back.
 
     python benchmarks/ambient.py ../shared/data [--methods universal-small universal] [--psfs "mwdn-camera 320x320"]
-                                              [--filling 2] [--dark 2]
+                                              [--filling 2] [--dark 2] [--spots]
 
 Test photographs that fill the frame and objects on dark, 15,000 electrons at saturation, exact PSF. The light is a
 share of the mean measurement: even 20 %, a slope of 0 to 50 %, Gaussian spots of 30 % with a standard deviation of 0.4
@@ -10,10 +10,12 @@ the numbers of each picture.
 
 `ambient` subtracts a noisy frame of the room's light alone. Two rows say what no method can recover. `exact` subtracts
 the light itself, so that only its photon noise remains. `dark room` has no such light, but the exposure of the capture
-that has: a bright spot saturates earlier, so the scene gets less light.
+that has: a bright spot saturates earlier, so the scene gets less light. `--spots` reconstructs nothing: it says which
+narrow spots are found, and with which error (root mean square over the mean measurement).
 """
 
 import argparse
+import itertools
 import json
 from pathlib import Path
 from statistics import fmean
@@ -26,6 +28,7 @@ from mwdn import Camera, Reconstructor, psnr
 from mwdn.data.photographs import Photographs
 from mwdn.optics.room_light import even_light, sloping_light, spot_light
 from mwdn.optics.sensor import Sensor
+from mwdn.solvers import find_room_light
 from universal import PSFS, camera, keep
 
 HANDLINGS = ("nothing", "room-light", "ambient", "exact", "dark room")
@@ -74,6 +77,20 @@ def scores(reconstructors, calibration, picture, *, fills):
     return values
 
 
+def spots(calibration, picture, *, fills):
+    """Lines of a table: narrow spots of some shares of the mean measurement, what is found and its error."""
+    clean = Camera(calibration.psf.expand(-1, 3, -1, -1)).forward(scene(picture, calibration.size, fills=fills))
+    for share in (0.01, 0.02, 0.03, 0.05, 0.3):
+        room = share * spot_light(calibration.size, (0.4, 0.6), 0.15) * clean.mean()
+        gain = 0.8 / float((clean + room).max())
+        capture = (
+            Sensor(full_well=15_000).expose((clean + room) * gain, generator=torch.Generator().manual_seed(1)) / gain
+        )
+        found = find_room_light(capture, calibration.psf)
+        error = ((found.background - room) / capture.mean((-2, -1), keepdim=True)).square().mean().sqrt()
+        yield f"{'filling' if fills else 'dark'} | {share} | {float(found.share):.3f} | {float(error):.4f}"
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path)
@@ -81,10 +98,18 @@ def main():
     parser.add_argument("--psfs", nargs="+", choices=PSFS, default=["mwdn-camera 320x320"])
     parser.add_argument("--filling", type=int, default=2)
     parser.add_argument("--dark", type=int, default=2)
+    parser.add_argument("--spots", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/ambient.json"))
     arguments = parser.parse_args()
     mwdn.keep_memory()
     photographs = Photographs(arguments.data / "photos" / "test", limit=arguments.filling + arguments.dark)
+    if arguments.spots:
+        print("| PSF | scene | spot | found | error |\n|" + " --- |" * 5)
+        for name, number in itertools.product(arguments.psfs, range(arguments.filling + arguments.dark)):
+            picture = photographs.light(torch.tensor([number]))
+            for line in spots(camera(arguments.data, name), picture, fills=number < arguments.filling):
+                print(f"| {name} | {line} |", flush=True)
+        return
     rows = json.loads(arguments.out.read_text()) if arguments.out.exists() else []
     print("| PSF | method | scenes | handling |", " | ".join(lights((2, 2))), "|\n|" + " --- |" * 9)
     for name in arguments.psfs:

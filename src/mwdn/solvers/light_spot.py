@@ -111,8 +111,8 @@ def refine_spot(b: Measurement, psf: Psf, saturated: Tensor, spot: Spot) -> Spot
     """A spot that was found in the same captures at half of this size, fitted again.
 
     Spots of 30 % over photographs that fill the frame are then wrong by 0.5 to 0.8 % of the mean measurement in place
-    of 4.2 to 6.9, over objects on dark by 0.2 to 0.5 % in place of 0.8 to 0.9. Where there is no spot, none is looked
-    for.
+    of 4.2 to 6.9, over objects on dark by 0.2 to 0.5 % in place of 0.8 to 0.9 (``benchmarks/ambient.py --spots``).
+    Where there is no spot, none is looked for.
     """
     refined, _, _ = _fit(b, psf, saturated, spot, promising=1.0)
     return refined.where((spot.amplitude > 0).any(1), spot)

@@ -15,9 +15,8 @@ under the capture, by Gauss-Newton steps that eliminate the scene (variable proj
 
 3. ``d = argmin |S^-1 d|^2`` such that ``|r + J d|^2 / pixels <= E(0) + (t |J_0|)^2``, then ``c <- c + d``. The finite
    differences ``J = dr / dc`` have a new scene for each c; J_0 is that of the even term at the first step.
-
-4. ``c <- c + B^T r(c) / pixels``, three times, gives back the light that equation (3) tolerates. There r is that of
-`mwdn.solvers.pyramid`'s coarsest level, negative where too much has been subtracted.
+4. ``c <- c + B^T r(c) / pixels``, three times, gives back the light that equation (3) tolerates. Here v(c) is the scene
+   of the coarsest of `mwdn.solvers.levels.LEVELS`; r is negative where too much has been subtracted.
 
 A wider choice of backgrounds, with bumps, would take the light of an object in the middle of the frame: with the six
 cosines up to a whole period in place of these three planes, photographs that fill the frame lose half of their light,
@@ -41,9 +40,9 @@ from mwdn.optics.saturation import saturated_pixels, subtract_light
 from mwdn.solvers.alignment import halve_psf
 from mwdn.solvers.levels import LEVELS
 from mwdn.solvers.light_spot import find_spot, refine_spot
-from mwdn.solvers.pyramid import MIXED, halve, solve
+from mwdn.solvers.pyramid import MIXED, PsfPyramid, halve
 from mwdn.solvers.unexplained import DELTA, energy, unexplained
-from mwdn.types import Measurement, Psf, Size
+from mwdn.types import Measurement, Psf, Scene, Size
 
 PIXELS = 4000
 """The capture is halved until it has at most so many pixels."""
@@ -121,9 +120,9 @@ def find_room_light(measurement: Measurement, psf: Psf) -> RoomLight:
     light = spot.light(size) * mean
     counts = plane.mean((1, 2, 3)) >= FAINT * whole
     if counts.any():
-        counts &= _dark_part(subtract_light(b, light + plane), psf) >= DARK_PART
-    if counts.any():
-        plane = _give_back(b, light, plane, psf)
+        coarsest = PsfPyramid.from_psf(psf, size, LEVELS[:1])
+        counts &= _dark_part(coarsest.solve(subtract_light(b, light + plane)).scene) >= DARK_PART
+        plane = _give_back(b, light, plane, coarsest) if counts.any() else plane
     background = torch.where(counts[:, None, None, None], plane, 0.0) + light
     share = background.mean((1, 2, 3)) / whole
     share = torch.where(finite & (share > 0) & (share < 1), share, 0.0)  # NaN is none
@@ -139,17 +138,16 @@ def _halved(y: Measurement, psf: Psf, pixels: int) -> tuple[Tensor, Tensor, Tens
     return y, psf.expand(*y.shape[:2], -1, -1), parts > MIXED
 
 
-def _dark_part(measurement: Measurement, psf: Psf) -> Tensor:
+def _dark_part(scene: Scene) -> Tensor:
     """Part (B,) of the frame, in 12 x 12 blocks, where a scene is darker than a quarter of its mean."""
-    scene = solve(measurement, psf, LEVELS[:1]).scene.mean(1)
-    blocks = F.adaptive_avg_pool2d(scene, 12).flatten(1)
+    blocks = F.adaptive_avg_pool2d(scene.mean(1), 12).flatten(1)
     return (blocks < blocks.mean(1, keepdim=True) / 4).float().mean(1)
 
 
-def _give_back(b: Measurement, light: Tensor, plane: Tensor, psf: Psf) -> Tensor:
+def _give_back(b: Measurement, light: Tensor, plane: Tensor, coarsest: PsfPyramid) -> Tensor:
     """The plane (B, C, H, W) after equation (4), beside the spot's light."""
     for _ in range(GIVE_BACKS):
-        r = solve(subtract_light(b, light + plane), psf, LEVELS[:1]).residual
+        r = coarsest.solve(subtract_light(b, light + plane)).residual
         B, fine = (_planes((each.shape[-2], each.shape[-1]), b.device).flatten(1) for each in (r, plane))
         c = r.flatten(2) @ B.T / B.shape[1]
         plane = (plane + (c @ fine).reshape(plane.shape)).clamp(min=0)
