@@ -4,17 +4,19 @@
         [--device cuda] [--workers 12] [--start CHECKPOINT] [--seconds 480] [--out runs/unrolled/universal.safetensors]
 
 Each batch has captures through random cameras of three kinds (`SHARES`): nearly as calibrated, as real ones are, and
-scenes that fill the frame. The network reconstructs them; the gradient of both errors, after plug and play and after
-the U-Net, flows back through the twelve rounds. `universal-small` has no rounds, so only its U-Net learns. The loss is
-that of the network's recipe. The learning rate falls to nearly zero at `--steps` or `--seconds`. The file gets the
-moving average of the weights. `--pixels` is the size of a batch: a step of 600,000 takes 0.13 s on an H200, one of
-75,000 10 s on a core of a CPU.
+scenes that fill the frame. Half of the batches are dim (`DIM`). The network reconstructs them; the gradient of both
+errors, after plug and play and after the U-Net, flows back through the twelve rounds. `universal-small` has no rounds,
+so only its U-Net learns. The loss is that of the network's recipe. The learning rate falls to nearly zero at `--steps`
+or `--seconds`. The file gets the moving average of the weights. `--pixels` is the size of a batch: a step of 600,000
+takes 0.13 s on an H200, one of 75,000 10 s on a core of a CPU.
 """
 
 import argparse
 import copy
 import math
+import random
 import time
+from collections import deque
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -33,6 +35,7 @@ from mwdn.data.simulated import SimulatedPairs
 from mwdn.evaluation.distances import log_mse
 from mwdn.networks import build
 from mwdn.networks.blocks import block_means
+from mwdn.optics.warp import hazed
 from mwdn.training.losses import Loss
 from mwdn.training.recipe import read_recipe
 from mwdn.weights.bundled import find_weights
@@ -42,6 +45,11 @@ from mwdn.weights.growth import grown
 SIZES = ((192, 192), (256, 256), (176, 224), (240, 320), (320, 320), (270, 480))
 SHARES = {"calibrated": 0.4, "real": 0.35, "filling": 0.25}
 """Of each kind in a batch; rounded, so a third of each in a batch of three."""
+DIM = (0.04, 0.3)
+"""Peak light of the scenes in every other batch of a size, over full scale: 600 to 4,500 electrons."""
+TOO_MUCH_HAZE = 0.4, 0.03
+"""Part of the calibrated and filling captures whose PSF has haze that the camera has not, and the most of it:
+`mwdn.solvers.align` finds up to 0.025 where there is none."""
 RATES = {"denoiser": 2e-4, "unet": 4e-4}
 COARSE = {"calibrated": 1.0, "real": 0.3, "filling": 1.0}
 """Weight of the error's mean light after plug and play: what real cameras take away, no denoiser can know."""
@@ -95,15 +103,34 @@ class Captures(Dataset):
         size = SIZES[number % len(SIZES)]
         count = max(3, self.pixels // (size[0] * size[1]))
         parts, wanted = [], numbers(count, self.shares)
+        is_dim = number // len(SIZES) % 2 == 1
         for seed, (kind, (placement, mismatch)) in enumerate(self.recipes.items()):
+            placement = replace(placement, exposure=DIM) if is_dim else placement
             size_only = torch.full((1, 3, *size), 1.0)
             pairs = SimulatedPairs(self.photographs, size_only, placement, mismatch, self.sensor, seed=51 + seed)
             cameras = CameraPairs(pairs, Cameras((f"{size[0]}x{size[1]}",)), count)
             start = 100 * (self.first + number)
             if wanted[kind]:
-                parts.append(cameras.batch(range(start, start + wanted[kind])))
+                batch = cameras.batch(range(start, start + wanted[kind]))
+                parts.append(batch if kind == "real" else too_hazy(batch, start + seed))
         coarse = torch.cat([torch.full((each, 1, 1, 1), COARSE[kind]) for kind, each in wanted.items()])
         return Mixed(*(torch.cat(each) for each in zip(*parts, strict=True)), coarse)
+
+
+def too_hazy(batch, seed):
+    """The batch, some of whose PSFs are given haze that its cameras have not: `TOO_MUCH_HAZE`."""
+    some, most = TOO_MUCH_HAZE
+    chosen, amount = torch.rand(2, len(batch.psf), 1, 1, 1, generator=torch.Generator().manual_seed(seed))
+    return batch._replace(psf=hazed(batch.psf, most * amount * (chosen < some)))
+
+
+def repeated(batches, times, kept=60):
+    """Each new batch, then ``times - 1`` of the last ``kept`` at random: simulating takes longer than a step."""
+    drawn, recent = random.Random(1), deque(maxlen=kept)
+    for batch in batches:
+        recent.append(batch)
+        yield batch
+        yield from drawn.choices(recent, k=times - 1)
 
 
 def losses(network, loss, batch, recompute):
@@ -195,7 +222,8 @@ def described(arguments):
         for share, (kind, (placement, mismatch)) in zip(arguments.shares, kinds, strict=True)
     }
     sizes = [f"{height}x{width}" for height, width in SIZES]
-    schedule = {key: getattr(arguments, key) for key in ("start", "pixels", "rate", "ema")} | {"rates": RATES}
+    schedule = {key: getattr(arguments, key) for key in ("start", "pixels", "rate", "ema", "repeats")}
+    schedule |= {"rates": RATES, "dim": DIM, "too_much_haze": TOO_MUCH_HAZE}
     loss = read_recipe(RECIPES[arguments.network]).loss
     return {"cameras": {"sizes": sizes}, "kinds": kinds, "loss": loss, "schedule": schedule}
 
@@ -273,6 +301,7 @@ def main():
     parser.add_argument("--only-unet", action="store_true", help="the denoiser stays as it is")
     parser.add_argument("--keep-statistics", action="store_true", help="BatchNorm keeps those of the start")
     parser.add_argument("--eager", action="store_true", help="no CUDA graphs")
+    parser.add_argument("--repeats", type=int, default=1, help="steps for each simulated batch")
     parser.add_argument("--workers", type=int, default=0)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path)
@@ -300,7 +329,7 @@ def main():
         about = {"psf_hash": None, "pairs": "simulated across cameras", "recipe": described(arguments), "step": step}
         save_network(out, kept, "wiener-bank", options, **about)
 
-    learn(network, loss, average, loaded, arguments, save)
+    learn(network, loss, average, repeated(loaded, arguments.repeats), arguments, save)
 
 
 if __name__ == "__main__":

@@ -28,6 +28,16 @@ pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU he
 
 SIZE = 96, 128
 NETWORKS = "mwdn", "mwdn-cpsf", "unet", "flatnet", "ifin"
+TRAINED = (
+    {"name": "wiener-bank", "width": 4, "regularisations": (1e-2, 1e-4)},
+    {"name": "mwdn-cpsf", "width": 8},
+    {"name": "le-admm-u", "width": 4},
+    {"name": "mmcn", "width": 4},
+    {"name": "updn", "width": 2},
+    {"name": "flatnet", "width": 8, "size": SIZE},
+    {"name": "svdeconv", "width": 8, "size": SIZE},
+    {"name": "ifin", "width": 8},
+)
 CPU, GPU = torch.device("cpu"), torch.device("cuda", 0)
 
 
@@ -99,11 +109,16 @@ def test_samples(calibration, photographs, mismatch):
     assert psnr(there.measurement.cpu(), here.measurement) > 20
 
 
-def test_training(calibration, photographs, tmp_path):
-    """Steps with recorded pairs in float32 have the losses that they have here; in bfloat16 nearly."""
+@pytest.mark.parametrize("network", TRAINED, ids=lambda network: network["name"])
+def test_training(network, calibration, photographs, tmp_path, monkeypatch):
+    """Steps with recorded pairs in float32, replayed as a CUDA graph, have the losses that they have here.
+
+    In bfloat16 nearly.
+    """
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
     record(tmp_path / "pairs.h5", [(SimulatedPairs(photographs, calibration.psf), range(8))], calibration.psf)
     recipe = Recipe(
-        {"name": "wiener-bank", "width": 4, "regularisations": (1e-2, 1e-4)},
+        network,
         Schedule(steps=4, batch=2, learning_rate=2e-3, warmup=2, validate_every=2, validation=2),
     )
 
@@ -113,6 +128,8 @@ def test_training(calibration, photographs, tmp_path):
         task, values = supervised_task(pairs, changed.schedule), []
         trainer = Trainer(changed, task, out=tmp_path / folder, calibration=calibration, device=device)
         trainer.run(lambda report: values.append(report.loss))
+        assert all(graph.graph is not None for graph, _ in trainer.gradient.graphs.values())
+        assert len(trainer.gradient.graphs) == (device == GPU)
         return values
 
     expected = losses(CPU, "here", bfloat16=False)

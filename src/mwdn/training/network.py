@@ -5,6 +5,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from mwdn.calibration import Calibration
 from mwdn.errors import CheckpointError, ParameterError
@@ -98,13 +99,15 @@ def update_average(
     The average is of ``(1 - share)`` times the weights and ``share`` times those of ``start``, by name; of the weights
     alone if ``start`` has none of that name.
     """
+    means, values = [], []
     for (name, value), mean in zip(network.state_dict().items(), average.state_dict().values(), strict=True):
-        if not value.is_floating_point():
-            mean.copy_(value)
-        elif start and share and name in start:
-            mean.lerp_(value.lerp(start[name], share), 1 - decay)
+        if value.is_floating_point():
+            means.append(mean)
+            values.append(value.lerp(start[name], share) if start and share and name in start else value)
         else:
-            mean.lerp_(value, 1 - decay)
+            mean.copy_(value)
+    # All at once: hundreds of small operations take long on a GPU.
+    get_ema_multi_avg_fn(decay)(means, values, None)  # type: ignore[no-untyped-call]
 
 
 def name_and_options(recipe: Recipe) -> tuple[str, dict[str, Any]]:

@@ -91,18 +91,20 @@ class SupervisedTask:
 
     def loss(self, network: nn.Module, distance: Loss, numbers: range) -> tuple[Tensor, dict[str, Tensor]]:
         """Distance of the reconstructions and the scenes of these numbers, and its parts."""
-        source = self if self.cache is None else self.cache
-        reconstruction, scene = source.reconstruct(network, numbers)
+        if self.cache is None:
+            return self.batch_loss(network, distance, self.batch(numbers))
+        reconstruction, scene = self.cache.reconstruct(network, numbers)
         return distance(self._in_units(reconstruction.float(), scene), scene)
 
-    def reconstruct(self, network: nn.Module, numbers: range) -> tuple[Image, Scene]:
-        """Reconstructions of the samples of these numbers, and their scenes."""
-        measurement, scene, psf = self._batch(numbers)
-        return network(measurement.contiguous(memory_format=torch.channels_last), psf), scene
+    def batch_loss(self, network: nn.Module, distance: Loss, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+        """The same for a batch."""
+        measurement, scene, psf = batch
+        reconstruction = network(measurement.contiguous(memory_format=torch.channels_last), psf)
+        return distance(self._in_units(reconstruction.float(), scene), scene)
 
     def score(self, network: nn.Module, distance: Loss, numbers: range) -> Scores:
         """PSNR and loss of the reconstructions; the loss always has its initial weights."""
-        measurement, scene, psf = self._batch(numbers)
+        measurement, scene, psf = self.batch(numbers)
         if self.cache is None:
             reconstruction = reconstruct_aligned(network, measurement, psf)
         else:
@@ -118,7 +120,8 @@ class SupervisedTask:
         """Names the samples in an error message."""
         return self.pairs.describe(numbers)
 
-    def _batch(self, numbers: range) -> Batch:
+    def batch(self, numbers: range) -> Batch:
+        """Measurements, scenes and PSFs of these numbers."""
         batch = self.pairs.batch(numbers)
         return batch if self.stored_psf is None else batch._replace(psf=self.stored_psf)
 

@@ -15,11 +15,11 @@ from mwdn.errors import DivergenceError, MwdnError, ParameterError
 from mwdn.io.files import as_parameter_error
 from mwdn.io.images import write_picture
 from mwdn.networks import build
-from mwdn.networks.activation_checkpointing import batch_norms, checkpoint_activations
+from mwdn.networks.activation_checkpointing import checkpoint_activations
 from mwdn.runtime import distributed
-from mwdn.runtime.devices import has_bfloat16
 from mwdn.runtime.interrupts import deferred_interrupt
 from mwdn.training.batch_norm import freeze_cancelled, synchronise
+from mwdn.training.gradient import Gradient
 from mwdn.training.losses import Loss
 from mwdn.training.network import MEASURED_BUFFERS, build_network, measure_scenes, name_and_options, update_average
 from mwdn.training.recipe import Recipe
@@ -85,7 +85,7 @@ class Trainer:
         held = self.schedule.anchor > 0 or self.schedule.start_share > 0
         weights = self.network.state_dict().items() if held else ()
         self.start = {name: value.clone() for name, value in weights if name not in MEASURED_BUFFERS}
-        self.bfloat16 = self.schedule.bfloat16 and has_bfloat16(self.device)
+        self.gradient = Gradient(self.network, task, self.distance, self.schedule, self.device)
         self.step, self.best = 0, -math.inf
 
         # 2. Resume a run that was stopped.
@@ -184,10 +184,8 @@ class Trainer:
         share = distributed.shard(batch)
         weight = len(share) / len(batch)  # losses are means over samples
         set_rate(self.optimiser, self.lr_schedule.rate(self.step))
-        loss, parts = self._loss(share)
-        self.optimiser.zero_grad(set_to_none=True)
-        torch.autograd.backward(weight * loss)  # before the loss is read, which waits for a GPU
-        terms = weight * torch.stack([loss.detach(), *parts.values()]).double()
+        values = self._gradient(share, weight)
+        terms = weight * torch.stack(list(values.values())).double()
         total, *totals = distributed.all_reduce_sum(terms).tolist()
         if not math.isfinite(total):
             raise self._diverged(f"step {self.step} ({self.task.describe(batch)})")
@@ -200,7 +198,7 @@ class Trainer:
         # The decay grows from 0 to the schedule's, or else a young average would remember the initial weights.
         decay = min(self.schedule.ema, self.step / (self.step + 10))
         update_average(self.average, self.network, decay=decay, start=self.start, share=self.schedule.start_share)
-        return total, dict(zip(parts, totals, strict=True))
+        return total, dict(zip(list(values)[1:], totals, strict=True))
 
     @torch.no_grad()
     def _pull_to_start(self) -> None:
@@ -210,16 +208,11 @@ class Trainer:
             if parameter.requires_grad:
                 parameter.lerp_(self.start[name], amount)
 
-    def _loss(self, numbers: range) -> tuple[Tensor, dict[str, Tensor]]:
-        """Loss of the samples of these numbers in training mode, and its parts."""
+    def _gradient(self, numbers: range, weight: float) -> dict[str, Tensor]:
+        """`Gradient` of the samples of these numbers."""
         self.distance.weights = self.lr_schedule.loss_weights
-        self.network.train()
-        if self.schedule.fixed_norms:
-            for norm in batch_norms(self.network):
-                norm.eval()
         try:
-            with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
-                return self.task.loss(self.network, self.distance, numbers)
+            return self.gradient(numbers, weight)
         except (RuntimeError, ValueError) as error:
             if self.step or isinstance(error, MwdnError):
                 raise

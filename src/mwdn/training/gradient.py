@@ -1,0 +1,90 @@
+"""The gradient of a batch. On a GPU forward and backward pass are recorded once as a CUDA graph and replayed."""
+
+from collections.abc import Hashable
+
+import torch
+from torch import Tensor, nn
+
+from mwdn.inference.cuda_graph import CudaGraph
+from mwdn.networks.activation_checkpointing import batch_norms
+from mwdn.runtime import distributed
+from mwdn.runtime.devices import has_bfloat16
+from mwdn.training.losses import Loss
+from mwdn.training.recipe import Schedule
+from mwdn.training.tasks import SupervisedTask, Task
+
+
+class Gradient:
+    """Computes the loss of samples, and leaves its gradient in ``grad`` of the network's parameters.
+
+    A step of a small network is thousands of kernels, which take Python longer to launch than a GPU to compute. So on a
+    GPU the loss of a `SupervisedTask` without a cache is recorded, once for each shape of its batches.
+
+    Args:
+        network: in training mode when it is called.
+        task: what to learn, and from which samples.
+        distance: the loss. A graph is recorded anew when its weights change.
+        schedule: of the training.
+        device: where the network and the samples are.
+    """
+
+    def __init__(
+        self, network: nn.Module, task: Task, distance: Loss, schedule: Schedule, device: torch.device
+    ) -> None:
+        self.network, self.task, self.distance, self.device = network, task, distance, device
+        self.bfloat16 = schedule.bfloat16 and has_bfloat16(device)
+        self.norms = batch_norms(network) if schedule.fixed_norms else []
+        self.is_recorded = device.type == "cuda" and distributed.world_size() == 1 and not schedule.checkpointing
+        self.graphs: dict[Hashable, tuple[CudaGraph, list[Tensor | None]]] = {}
+        self.names: tuple[str, ...] = ()
+
+    def __call__(self, numbers: range, weight: float = 1.0) -> dict[str, Tensor]:
+        """Compute the gradient of the samples of these numbers.
+
+        Args:
+            numbers: of the samples.
+            weight: factor of the loss in the gradient.
+
+        Returns:
+            The loss, as "loss", and its parts, without ``weight``, scalars without gradient.
+        """
+        self.network.train()
+        for norm in self.norms:
+            norm.eval()
+        if self.is_recorded and isinstance(self.task, SupervisedTask) and self.task.cache is None:
+            values = self._graph(self.task, numbers)
+        else:
+            self.network.zero_grad(set_to_none=True)
+            with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
+                loss, parts = self.task.loss(self.network, self.distance, numbers)
+            values = self._backward(loss, parts, weight)
+        return dict(zip(self.names, values, strict=True))
+
+    def _graph(self, task: SupervisedTask, numbers: range) -> Tensor:
+        """The same from a graph, which is recorded for the first batch of its shapes."""
+        batch = task.batch(numbers)
+
+        def calculate(*parts: Tensor) -> Tensor:
+            self.network.zero_grad(set_to_none=True)  # when recorded: a replay writes each gradient to the same memory
+            with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16, cache_enabled=False):
+                return self._backward(*task.batch_loss(self.network, self.distance, type(batch)(*parts)), 1.0)
+
+        key = (*(part.shape for part in batch), *self.distance.weights.items())
+        if key not in self.graphs:
+            buffers = list(self.network.buffers())
+            before = [buffer.clone() for buffer in buffers]
+            graph = CudaGraph(calculate, *batch)
+            self.graphs[key] = graph, [parameter.grad for parameter in self.network.parameters()]
+            for buffer, value in zip(buffers, before, strict=True):
+                buffer.copy_(value)  # BatchNorm has counted the warm-up
+        graph, gradients = self.graphs[key]
+        values = graph(*batch)
+        if graph.graph is not None:
+            for parameter, gradient in zip(self.network.parameters(), gradients, strict=True):
+                parameter.grad = gradient  # each graph has memory of its own
+        return values
+
+    def _backward(self, loss: Tensor, parts: dict[str, Tensor], weight: float) -> Tensor:
+        torch.autograd.backward(weight * loss)
+        self.names = "loss", *parts
+        return torch.stack([loss.detach(), *parts.values()])
