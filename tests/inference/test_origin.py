@@ -46,7 +46,7 @@ def with_ones(name, **options):
         ("pyramid", "2ba267f9aaf23f39"),
         ("wiener", "cf039080f5e5de60"),
         ("fista", "e077e8b3def31bac"),
-        ("universal", "8e4891e56b144c42"),
+        ("universal", "44f5c439ffe3a629"),
         ("universal-small", "4ead5eae505e824c"),
     ],
 )

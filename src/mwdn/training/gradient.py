@@ -5,6 +5,7 @@ from collections.abc import Hashable
 import torch
 from torch import Tensor, nn
 
+from mwdn.data.simulated import Batch
 from mwdn.inference.cuda_graph import CudaGraph
 from mwdn.networks.activation_checkpointing import batch_norms
 from mwdn.runtime import distributed
@@ -67,7 +68,7 @@ class Gradient:
         def calculate(*parts: Tensor) -> Tensor:
             self.network.zero_grad(set_to_none=True)  # when recorded: a replay writes each gradient to the same memory
             with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16, cache_enabled=False):
-                return self._backward(*task.batch_loss(self.network, self.distance, type(batch)(*parts)), 1.0)
+                return self._backward(*task.batch_loss(self.network, self.distance, Batch(*parts)), 1.0)
 
         key = (*(part.shape for part in batch), *self.distance.weights.items())
         if key not in self.graphs:
