@@ -14,9 +14,7 @@ takes 0.13 s on an H200, one of 75,000 10 s on a core of a CPU.
 import argparse
 import copy
 import math
-import random
 import time
-from collections import deque
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -124,15 +122,6 @@ def too_hazy(batch, seed):
     return batch._replace(psf=hazed(batch.psf, most * amount * (chosen < some)))
 
 
-def repeated(batches, times, kept=60):
-    """Each new batch, then ``times - 1`` of the last ``kept`` at random: simulating takes longer than a step."""
-    drawn, recent = random.Random(1), deque(maxlen=kept)
-    for batch in batches:
-        recent.append(batch)
-        yield batch
-        yield from drawn.choices(recent, k=times - 1)
-
-
 def losses(network, loss, batch, recompute):
     """The loss, and its parts: mean logarithm of the square error after plug and play, and the `Loss` after the U-Net.
 
@@ -222,7 +211,7 @@ def described(arguments):
         for share, (kind, (placement, mismatch)) in zip(arguments.shares, kinds, strict=True)
     }
     sizes = [f"{height}x{width}" for height, width in SIZES]
-    schedule = {key: getattr(arguments, key) for key in ("start", "pixels", "rate", "ema", "repeats")}
+    schedule = {key: getattr(arguments, key) for key in ("start", "pixels", "rate", "ema")}
     schedule |= {"rates": RATES, "dim": DIM, "too_much_haze": TOO_MUCH_HAZE}
     loss = read_recipe(RECIPES[arguments.network]).loss
     return {"cameras": {"sizes": sizes}, "kinds": kinds, "loss": loss, "schedule": schedule}
@@ -301,7 +290,6 @@ def main():
     parser.add_argument("--only-unet", action="store_true", help="the denoiser stays as it is")
     parser.add_argument("--keep-statistics", action="store_true", help="BatchNorm keeps those of the start")
     parser.add_argument("--eager", action="store_true", help="no CUDA graphs")
-    parser.add_argument("--repeats", type=int, default=1, help="steps for each simulated batch")
     parser.add_argument("--workers", type=int, default=0)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path)
@@ -329,7 +317,7 @@ def main():
         about = {"psf_hash": None, "pairs": "simulated across cameras", "recipe": described(arguments), "step": step}
         save_network(out, kept, "wiener-bank", options, **about)
 
-    learn(network, loss, average, repeated(loaded, arguments.repeats), arguments, save)
+    learn(network, loss, average, loaded, arguments, save)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """The gradient of a batch. On a GPU forward and backward pass are recorded once as a CUDA graph and replayed."""
 
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 
 import torch
 from torch import Tensor, nn
@@ -35,7 +35,8 @@ class Gradient:
         self.network, self.task, self.distance, self.device = network, task, distance, device
         self.bfloat16 = schedule.bfloat16 and has_bfloat16(device)
         self.norms = batch_norms(network) if schedule.fixed_norms else []
-        self.is_recorded = device.type == "cuda" and distributed.world_size() == 1 and not schedule.checkpointing
+        is_alone = device.type == "cuda" and distributed.world_size() == 1 and not schedule.checkpointing
+        self.is_recorded = is_alone and isinstance(task, SupervisedTask) and task.cache is None
         self.graphs: dict[Hashable, tuple[CudaGraph, list[Tensor | None]]] = {}
         self.names: tuple[str, ...] = ()
 
@@ -52,23 +53,20 @@ class Gradient:
         self.network.train()
         for norm in self.norms:
             norm.eval()
-        if self.is_recorded and isinstance(self.task, SupervisedTask) and self.task.cache is None:
-            values = self._graph(self.task, numbers)
+        if self.is_recorded:
+            values = self._graph(numbers)
         else:
-            self.network.zero_grad(set_to_none=True)
-            with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
-                loss, parts = self.task.loss(self.network, self.distance, numbers)
-            values = self._backward(loss, parts, weight)
+            values = self._run(lambda: self.task.loss(self.network, self.distance, numbers), weight)
         return dict(zip(self.names, values, strict=True))
 
-    def _graph(self, task: SupervisedTask, numbers: range) -> Tensor:
-        """The same from a graph, which is recorded for the first batch of its shapes."""
+    def _graph(self, numbers: range) -> Tensor:
+        """Loss and parts from a graph, which is recorded for the first batch of its shapes."""
+        task = self.task
+        assert isinstance(task, SupervisedTask)
         batch = task.batch(numbers)
 
         def calculate(*parts: Tensor) -> Tensor:
-            self.network.zero_grad(set_to_none=True)  # when recorded: a replay writes each gradient to the same memory
-            with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16, cache_enabled=False):
-                return self._backward(*task.batch_loss(self.network, self.distance, Batch(*parts)), 1.0)
+            return self._run(lambda: task.batch_loss(self.network, self.distance, Batch(*parts)))
 
         key = (*(part.shape for part in batch), *self.distance.weights.items())
         if key not in self.graphs:
@@ -85,7 +83,13 @@ class Gradient:
                 parameter.grad = gradient  # each graph has memory of its own
         return values
 
-    def _backward(self, loss: Tensor, parts: dict[str, Tensor], weight: float) -> Tensor:
+    def _run(self, compute: Callable[[], tuple[Tensor, dict[str, Tensor]]], weight: float = 1.0) -> Tensor:
+        """Loss and parts, with the gradient in new memory, which each replay of a graph writes again."""
+        self.network.zero_grad(set_to_none=True)
+        # A graph must cast the weights itself: a replay does not fill autocast's cache.
+        cached = not self.is_recorded
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16, cache_enabled=cached):
+            loss, parts = compute()
         torch.autograd.backward(weight * loss)
         self.names = "loss", *parts
         return torch.stack([loss.detach(), *parts.values()])
