@@ -8,10 +8,11 @@ share of the mean measurement: even 20 %, a slope of 0 to 50 %, Gaussian spots o
 (wide) and 0.15 (narrow) of the frame's width. PSNR over the whole frame, clipped, means. Prints the table and writes
 the numbers of each picture.
 
-`ambient` subtracts a noisy frame of the room's light alone. Two rows say what no method can recover. `exact` subtracts
-the light itself, so that only its photon noise remains. `dark room` has no such light, but the exposure of the capture
-that has: a bright spot saturates earlier, so the scene gets less light. `--spots` reconstructs nothing: it says which
-narrow spots are found, and with which error (root mean square over the mean measurement).
+`ambient` subtracts a frame of the room's light alone, without its noise, as `mwdn.Calibration` does. Two rows say
+what no method can recover. `exact` subtracts the light itself, so that only its photon noise remains. `dark room` has
+no such light, but the exposure of the capture that has: a bright spot saturates earlier, so the scene gets less light.
+`--spots` reconstructs nothing: it says which narrow spots are found, and with which error (root mean square over the
+mean measurement).
 """
 
 import argparse
@@ -25,6 +26,7 @@ from torch.nn import functional as F
 
 import mwdn
 from mwdn import Camera, Reconstructor, psnr
+from mwdn.calibration.ambient_frame import denoise_ambient
 from mwdn.data.photographs import Photographs
 from mwdn.optics.room_light import even_light, sloping_light, spot_light
 from mwdn.optics.sensor import Sensor
@@ -69,7 +71,8 @@ def scores(reconstructors, calibration, picture, *, fills):
         capture = sensor.expose((clean + room) * gain, generator=generator) / gain
         frame = sensor.expose((clean * 0 + room) * gain, generator=generator) / gain
         dark = sensor.expose(clean * gain, generator=generator) / gain
-        measurements = dict(zip(HANDLINGS, (capture, capture, capture - frame, capture - room, dark), strict=True))
+        known = capture - denoise_ambient(frame)
+        measurements = dict(zip(HANDLINGS, (capture, capture, known, capture - room, dark), strict=True))
         values[name] = {
             handling: round(float(psnr(one(measurements[handling]).clamp(0, 1), truth)), 3)
             for handling, one in reconstructors.items()

@@ -190,7 +190,8 @@ def test_background_is_the_5th_percentile_of_each_channel(generator):
 def test_ambient_light_is_subtracted_from_captures_alone(tmp_path, caustic):
     """The frame of the room's light holds the dark level, too."""
     rng = np.random.default_rng(2)
-    dark, room = (rng.integers(500, 4000, (*SIZE, 1)).astype(np.uint16) for _ in "ab")
+    dark = rng.integers(500, 4000, (*SIZE, 1)).astype(np.uint16)
+    room = np.linspace(500, 4000, SIZE[1]).round().astype(np.uint16)[:, None] * np.ones((*SIZE, 1), np.uint16)
     light = (caustic * 40000).astype(np.uint16)[..., None]
     calibration = Calibration.from_file(
         store(tmp_path / "psf.tif", light + dark),

@@ -71,6 +71,9 @@ KEYS: dict[str, tuple[str, Any]] = {
 }
 """Meaning and an example of each key, in the order of the file."""
 
+LONGEST_LENGTH = 1e9
+"""Largest `pitch_um` and `distance_mm`: 1 km and 1,000 km, beyond any lensless camera."""
+
 _FILES = ("psf", "dark", "ambient", "flat_field", "hot_pixels")
 _LISTS = ("distance_psfs", "field_psfs")
 _POSITIVE = ("pitch_um", "distance_mm", "distances_mm", "electrons_per_count", "full_well_electrons")
@@ -120,6 +123,12 @@ def _check_range(key: str, value: Any) -> None:  # noqa: ANN401
             raise ParameterError(f"`{key}` ({number}) must not be negative.")
         if key == "black_level" and not 0 <= number < 1:
             raise ParameterError(f"`{key}` ({number}) must be in [0, 1), a fraction of the full scale.")
+
+
+def check_length(name: str, length: float | None) -> None:
+    """Raise a `ParameterError` unless `pitch_um` or `distance_mm` is positive, and no longer than `LONGEST_LENGTH`."""
+    if length is not None and not 0 < length <= LONGEST_LENGTH:
+        raise ParameterError(f"`{name}` ({shown(length)}) must be above 0 and at most {LONGEST_LENGTH:g}.")
 
 
 def _as_tuple(value: Any) -> Any:  # noqa: ANN401

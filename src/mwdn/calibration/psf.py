@@ -8,7 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mwdn.calibration.camera_file import check_psf_file, pop_places, pop_sensor, read_camera
+from mwdn.calibration.ambient_frame import denoise_ambient
+from mwdn.calibration.camera_file import check_length, check_psf_file, pop_places, pop_sensor, read_camera
 from mwdn.calibration.corrections import Corrections
 from mwdn.calibration.float_scale import check_float_scale
 from mwdn.calibration.frame_format import FrameFormat
@@ -23,9 +24,6 @@ from mwdn.io.formats import as_frame
 from mwdn.optics.psf import checked_psf, psf_hash
 from mwdn.optics.sensor import Sensor
 from mwdn.types import ArrayPicture, Frame, Image, Measurement, Psf, Size
-
-LONGEST_LENGTH = 1e9
-"""Largest `pitch_um` and `distance_mm`: 1 km and 1,000 km, beyond any lensless camera."""
 
 
 @checked
@@ -230,9 +228,7 @@ class Calibration:
                 check_batch(getattr(self, name), name)
         check_white_balance(self.white_balance, self.light)
         for name in ("pitch_um", "distance_mm"):
-            length = getattr(self, name)
-            if length is not None and not 0 < length <= LONGEST_LENGTH:
-                raise ParameterError(f"`{name}` ({shown(length)}) must be above 0 and at most {LONGEST_LENGTH:g}.")
+            check_length(name, getattr(self, name))
 
     def __repr__(self) -> str:
         colours = "RGB" if self.psf.shape[1] == 3 else "grey"
@@ -242,6 +238,11 @@ class Calibration:
     def psf_hash(self) -> str:
         """First 16 hexadecimal digits of the SHA-256 of the PSF's shape and float32 numbers."""
         return psf_hash(self.psf)
+
+    @cached_property
+    def offset(self) -> Tensor | None:
+        """What is subtracted from raw captures: the dark frame, or the ambient frame without its noise."""
+        return self.dark if self.ambient is None else denoise_ambient(self.ambient, self.dark, self.frames.cell)
 
     @property
     def size(self) -> Size:
@@ -279,11 +280,9 @@ class Calibration:
 
     def to_measurement(self, frame: ArrayPicture) -> Measurement:
         """Turn a raw frame into a measurement of the frame's own size: `correct` without `check_fit`."""
-        # The ambient frame has the dark level, too: (capture - dark) - (ambient - dark) = capture - ambient.
-        offset = self.dark if self.ambient is None else self.ambient
         frame = as_frame(frame, finite=False)
         check_float_scale(frame, self.frames.bit_depth)
-        return self.refinement.measurement(self.frames.to_measurement(frame, offset, self.corrections.of_capture))
+        return self.refinement.measurement(self.frames.to_measurement(frame, self.offset, self.corrections.of_capture))
 
     def check_fit(self, measurement: Measurement) -> None:
         """Raise a `ShapeError` unless the measurement (1, C, H, W) has the PSF's size, and colours if the PSF has."""

@@ -185,7 +185,7 @@ def _images(calibration: Calibration) -> dict[str, Tensor]:
     )
     images = {
         "psf": calibration.psf,
-        "offset": calibration.dark if calibration.ambient is None else calibration.ambient,
+        "offset": calibration.offset,
         "flat": calibration.corrections.flat,
         "stray": stray,
         "field": None if field is None else field.clamp(min=DIMMEST),
