@@ -154,6 +154,8 @@ def test_calibrate_with_pairs(psf, generator, run, tmp_path, monkeypatch):
     report = json.loads((tmp_path / "camera-refinement.json").read_text())
     assert report["tried"][0]["term"] == ""
     assert len(report["tried"][0]["unexplained"]) == 3
+    assert report["scene_gamma"][0]["gamma"] == 1
+    assert "--scene-gamma" not in out
     assert (tmp_path / "camera-refinement.png").exists()
     calibration = Calibration.load("camera.toml")
     assert bool(calibration.refinement) == bool(report["kept"])

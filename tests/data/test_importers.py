@@ -185,6 +185,18 @@ def test_deeper_pictures_become_16_bits(tmp_path):
         import_pairs("folders", tmp_path, tmp_path / "no.h5", frames=FrameFormat(bit_depth=10))
 
 
+@pytest.mark.parametrize("gamma", ["srgb", 1.4])
+def test_encoded_scenes_are_decoded_and_captures_stay(tmp_path, gamma):
+    write(tmp_path / "captures" / "a.png", flag(1))
+    write(tmp_path / "scenes" / "a.png", stored := flag(2))
+    _, plain, _ = next(read_pairs("folders", tmp_path))
+    _, capture, scene = next(read_pairs("folders", tmp_path, layout=Layout(scene_gamma=gamma)))
+    assert np.array_equal(capture, 257 * plain.astype(np.uint16))  # 16 bits, as the decoded scenes
+    v = stored / 255
+    expected = v**1.4 if gamma == 1.4 else np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
+    assert np.abs(scene / 65535 - expected).max() < 1e-5
+
+
 def test_unpaired_files_are_named_before_anything_is_read(tmp_path):
     folders(tmp_path)
     (tmp_path / "scenes" / "2.png").unlink()

@@ -10,6 +10,7 @@ from mwdn.calibration import Calibration
 from mwdn.calibration.camera_file import read_camera, write_camera
 from mwdn.calibration.pair_model import Terms
 from mwdn.calibration.refinement import TERMS
+from mwdn.calibration.scene_encoding import scene_gamma, unexplained_by_gamma
 from mwdn.calibration.term_selection import LEAST_PAIRS, Selection, Step, left_out, select_terms
 from mwdn.cli.progress import show_progress
 from mwdn.cli.terminal import counted, say
@@ -72,6 +73,8 @@ def refine(camera: Path, pairs: Path, report: Path) -> None:
     calibration = Calibration.load(camera, **NO_TERMS, white_balance=None)
     with PairFile(pairs) as file:
         check_pairs(file, calibration.psf)
+        encoding = unexplained_by_gamma(calibration.psf, lambda: _all(file))
+        say(*_encoding_lines(encoding))
         selection = select_terms(calibration.psf, lambda: _all(file), report=lambda step: say(_sentence(step)))
         pictures = _pictures(calibration, selection, file)
     best = max(pictures, key=lambda each: fmean(each.psnr))
@@ -80,13 +83,26 @@ def refine(camera: Path, pairs: Path, report: Path) -> None:
     values |= {name: getattr(refinement, name) or None for name in TERMS}
     values.pop("psf_sha256", None)
     write_camera(camera, values)
-    write_json(report, _content(selection, pictures, best, {name: values[name] for name in TERMS}))
+    content = _content(selection, pictures, best, {name: values[name] for name in TERMS})
+    write_json(report, content | {"scene_gamma": [{"gamma": g, "unexplained": part} for g, part in encoding.items()]})
     write_refinement_page(report.with_suffix(".png"), calibration.psf, refinement, _lines(pictures, best))
     say(
         *_lines(pictures, best),
         *_new_hash(calibration, calibration.refined(refinement)),
         f"Look at {report.with_suffix('.png')}; all numbers are in {report}",
     )
+
+
+def _encoding_lines(unexplained: dict[float, tuple[float, ...]]) -> list[str]:
+    """A sentence if the scenes seem to be encoded."""
+    gamma = scene_gamma(unexplained)
+    if gamma is None:
+        return []
+    decoded, linear = fmean(unexplained[gamma]), fmean(unexplained[1.0])
+    return [
+        f"The scenes are not linear in light: decoded with a gamma of {gamma:g} they leave {decoded:.1%} of the "
+        f"measurements unexplained, as they are {linear:.1%}. Import them with --scene-gamma {gamma:g}"
+    ]
 
 
 def _new_hash(before: Calibration, after: Calibration) -> list[str]:

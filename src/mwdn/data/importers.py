@@ -122,7 +122,7 @@ def read_pairs(
 ) -> Iterator[Pair]:
     """Read the pairs of a data set one by one, in its order.
 
-    Measurement and scene are as stored, turned to RGB and upright; no gamma is decoded.
+    Measurement and scene are as stored, turned to RGB and upright; a gamma is decoded only if it is given.
 
     Args:
         kind: of `KINDS`.
@@ -192,6 +192,7 @@ def _convert(source: Source, kind: Kind, layout: Layout, changes: FrameFormat) -
     frames = _override(usual, changes)
     full_size = frames.full_size(capture)
     capture = _orient(_correct_levels(capture, frames, source.name), frames)
+    scene = _correct_levels(scene, FrameFormat(gamma=layout.scene_gamma), source.name)
     if kind.raw_frames is not None and scene.shape[2] == 1:
         scene = scene.repeat(3, axis=2)  # a few of ImageNet's photographs are grey
     if layout.scene_size is not None:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mwdn.calibration import FrameFormat
+from mwdn.calibration.frame_format import Gamma, check_gamma
 from mwdn.data.scene_place import Place, centre, paper_display
 from mwdn.data.sources import Listing, list_folders, list_hdf5, list_pair_file, list_parquet, list_phlatcam
 from mwdn.errors import ParameterError
@@ -21,15 +22,18 @@ class Layout:
         scene_size: height and width to which scenes are resized, if they are not all of one size.
         scene_place: first row and column of the scenes in the captures' frame, which is dark around them, in pixels of
             the cropped frame before binning; for scenes that show a part of the frame.
+        scene_gamma: encoding of the scenes' files, decoded to linear light: "srgb", or a power such as 2.2; without it
+            they are taken as linear.
 
     Raises:
-        ParameterError: a size is not positive, or a place is negative.
+        ParameterError: a size is not positive, a place is negative, or ``scene_gamma`` is not 1 to 4.
     """
 
     captures: str | None = None
     scenes: str | None = None
     scene_size: Size | None = None
     scene_place: Size | None = None
+    scene_gamma: Gamma | None = None
 
     def __post_init__(self) -> None:
         if self.scene_size is not None and min(self.scene_size) < 1:
@@ -38,6 +42,7 @@ class Layout:
         if self.scene_place is not None and min(self.scene_place) < 0:
             top, left = self.scene_place
             raise ParameterError(f"`scene_place` ({top}, {left}) must not be negative: `--scene-place 94 94`.")
+        check_gamma("scene_gamma", self.scene_gamma)
 
 
 @dataclass(frozen=True)
