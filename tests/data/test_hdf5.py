@@ -5,6 +5,7 @@ import os
 import h5py
 import numpy as np
 import pytest
+import torch
 
 from mwdn.capture.recording import Replay, record
 from mwdn.capture.source import Frame
@@ -114,3 +115,12 @@ def test_an_attribute_of_numbers_of_any_length_is_left_out(tmp_path):
     assert attributes["name"] == "a text"
     assert not {"numbers", b"\x80"} & attributes.keys()
     assert len(PairFile(tmp_path / "a.h5")) == 1
+
+
+def test_a_file_that_is_open_with_a_lock_is_read(tmp_path):
+    """In a notebook, say, where `h5py.File` looks at the pairs before `PairFile` reads them."""
+    with PairFile.create(tmp_path / "pairs.h5", measurement_shape=SHAPE[1:], scene_shape=SHAPE[1:]) as file:
+        file.append(torch.zeros(3, 3, 3), torch.ones(3, 3, 3))
+    with h5py.File(tmp_path / "pairs.h5") as looked_at:
+        assert PairFile(tmp_path / "pairs.h5")[0][1].min() == 1
+        assert looked_at["scene"].shape[0] == 1

@@ -96,8 +96,13 @@ def open_hdf5(path: Path, advice: str) -> Any:  # noqa: ANN401
 
     open_regular(path).close()
     with as_damage(f"`{path}` is not a complete HDF5 file", advice):
-        # No lock: finished files never change, and many shared file systems of clusters do not support locks.
-        return h5py.File(path, "r", locking=False)
+        try:
+            # No lock: finished files never change, and many shared file systems of clusters do not support locks.
+            return h5py.File(path, "r", locking=False)
+        except OSError as error:
+            if "locking flag" not in str(error):
+                raise
+            return h5py.File(path, "r")  # this process has it open with a lock, as in a notebook
 
 
 class _CheckedHeaps(io.FileIO):
