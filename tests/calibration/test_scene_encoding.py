@@ -1,4 +1,4 @@
-"""Scenes that a lens camera has encoded or clipped are told from scenes that are linear in light."""
+"""Scenes that a lens camera has encoded are told from scenes that are linear in light."""
 
 import pytest
 import torch
@@ -19,7 +19,7 @@ def psf(generator):
 def recorded(psf, encode, generator, *, field=1.0, count=4):
     """Measurements of random scenes, and the scenes as a lens camera stores them."""
     for _ in range(count):
-        scene = torch.nn.functional.interpolate(torch.rand(1, 3, 5, 6, generator=generator), SIZE)
+        scene = torch.nn.functional.interpolate(torch.rand(1, 3, 5, 6, generator=generator), SIZE, mode="bilinear")
         light = convolve(scene, psf) * field
         yield light + 0.002 * torch.randn(light.shape, generator=generator), encode(scene)
 
@@ -41,6 +41,18 @@ def test_an_uneven_sensor_is_no_gamma(psf, generator):
     field = 1 - 0.3 * polynomials(2, SIZE)[3] - 0.2 * polynomials(2, SIZE)[2]
     made = list(recorded(psf, lambda scene: scene, generator, field=field.float()))
     assert scene_gamma(unexplained_by_gamma(psf, lambda: made)) is None
+
+
+def test_clipping_is_no_gamma(psf, generator):
+    """It bends the scenes as a gamma does: pairs with much of it are left out."""
+    made = list(recorded(psf, lambda scene: scene.clamp(max=0.5), generator))
+    unexplained = unexplained_by_gamma(psf, lambda: made)
+    assert unexplained[1.0] == ()
+    assert scene_gamma(unexplained) is None
+    mixed = made[:1] + list(recorded(psf, lambda scene: scene ** (1 / 1.8), generator))
+    unexplained = unexplained_by_gamma(psf, lambda: mixed)
+    assert len(unexplained[1.0]) == len(mixed) - 1
+    assert scene_gamma(unexplained) == 1.8
 
 
 def test_a_single_pair_does_not_decide():

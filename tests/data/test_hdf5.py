@@ -117,10 +117,11 @@ def test_an_attribute_of_numbers_of_any_length_is_left_out(tmp_path):
     assert len(PairFile(tmp_path / "a.h5")) == 1
 
 
-def test_a_file_that_is_open_with_a_lock_is_read(tmp_path):
+@pytest.mark.parametrize("locking", [None, True, False])
+def test_a_file_that_is_open_with_a_lock_is_read(tmp_path, locking):
     """In a notebook, say, where `h5py.File` looks at the pairs before `PairFile` reads them."""
     with PairFile.create(tmp_path / "pairs.h5", measurement_shape=SHAPE[1:], scene_shape=SHAPE[1:]) as file:
         file.append(torch.zeros(3, 3, 3), torch.ones(3, 3, 3))
-    with h5py.File(tmp_path / "pairs.h5") as looked_at:
+    with h5py.File(tmp_path / "pairs.h5", locking=locking) as looked_at:
         assert PairFile(tmp_path / "pairs.h5")[0][1].min() == 1
         assert looked_at["scene"].shape[0] == 1

@@ -1,4 +1,4 @@
-"""Whether the scenes of pairs are linear in light: a lens camera may encode them for viewing, or clip bright parts."""
+"""Whether the scenes of pairs are linear in light: the camera that recorded them may have encoded them for viewing."""
 
 from collections.abc import Callable, Iterable
 from itertools import islice
@@ -7,14 +7,17 @@ from statistics import fmean
 from mwdn.calibration.pair_model import PairModel, Terms
 from mwdn.types import Measurement, Psf, Scene
 
-GAMMAS = (1.0, 1.2, 1.4, 1.6, 1.8, 2.0, 2.2)
+GAMMAS = (1.0, 1.4, 1.8, 2.2)
 """Powers that are tried; 1 is linear, 2.2 about sRGB."""
 
 MOST_PAIRS = 10
-"""Pairs that are examined; each takes a second at 270 x 480."""
+"""Pairs that are examined: the first ones; each takes a second at 270 x 480."""
 
-LEAST = 0.05
+LEAST = 0.1
 """Relative decrease of the unexplained part that speaks for a gamma."""
+
+CLIPPED = 0.02
+"""Part of a scene's pixels at its maximum from which it counts as clipped. Clipping bends a scene as a gamma does."""
 
 
 def unexplained_by_gamma(
@@ -27,18 +30,31 @@ def unexplained_by_gamma(
 
     Args:
         psf: (1, C, H, W), of the calibration.
-        pairs: reads the pairs, (1, C, H, W) each; called once for each gamma.
+        pairs: reads the pairs, (1, C, H, W) each; called once for each gamma. Pairs with clipped scenes are left out.
     """
-    models = (
-        PairModel(psf, ((b, v.clamp(min=0) ** gamma) for b, v in islice(pairs(), MOST_PAIRS))) for gamma in GAMMAS
-    )
-    parts = (tuple(model.unexplained(model.start(Terms()), pair) for pair in range(len(model))) for model in models)
-    return dict(zip(GAMMAS, parts, strict=True))
+    chosen = [number for number, (_, v) in enumerate(islice(pairs(), MOST_PAIRS)) if not _is_clipped(v)]
+    if not chosen:
+        return dict.fromkeys(GAMMAS, ())
+    return {gamma: _unexplained(psf, pairs(), chosen, gamma) for gamma in GAMMAS}
 
 
 def scene_gamma(unexplained: dict[float, tuple[float, ...]]) -> float | None:
     """The gamma that explains the pairs best; ``None`` if they are linear as far as can be told."""
     linear = unexplained[1.0]
+    if not linear:
+        return None
     best = min(unexplained, key=lambda gamma: fmean(unexplained[gamma]))
     wins = sum(decoded < plain for decoded, plain in zip(unexplained[best], linear, strict=True))
     return best if fmean(unexplained[best]) < (1 - LEAST) * fmean(linear) and wins > len(linear) / 2 else None
+
+
+def _is_clipped(scene: Scene) -> bool:
+    return float((scene >= 0.995 * scene.amax((-2, -1), keepdim=True)).float().mean()) > CLIPPED
+
+
+def _unexplained(
+    psf: Psf, pairs: Iterable[tuple[Measurement, Scene]], chosen: list[int], gamma: float
+) -> tuple[float, ...]:
+    decoded = ((b, v.clamp(min=0) ** gamma) for number, (b, v) in enumerate(pairs) if number in chosen)
+    model = PairModel(psf, islice(decoded, len(chosen)))
+    return tuple(model.unexplained(model.start(Terms()), pair) for pair in range(len(model)))

@@ -98,10 +98,10 @@ def _encoding_lines(unexplained: dict[float, tuple[float, ...]]) -> list[str]:
     gamma = scene_gamma(unexplained)
     if gamma is None:
         return []
-    decoded, linear = fmean(unexplained[gamma]), fmean(unexplained[1.0])
+    linear, decoded = fmean(unexplained[1.0]), fmean(unexplained[gamma])
     return [
-        f"The scenes are not linear in light: decoded with a gamma of {gamma:g} they leave {decoded:.1%} of the "
-        f"measurements unexplained, as they are {linear:.1%}. Import them with --scene-gamma {gamma:g}"
+        f"The scenes seem to be encoded: {linear:.1%} of the measurements are unexplained, {decoded:.1%} if the scenes "
+        f"are decoded with a gamma of {gamma:g}. To decode them: mwdn import --scene-gamma {gamma:g}"
     ]
 
 

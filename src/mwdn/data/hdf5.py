@@ -96,13 +96,15 @@ def open_hdf5(path: Path, advice: str) -> Any:  # noqa: ANN401
 
     open_regular(path).close()
     with as_damage(f"`{path}` is not a complete HDF5 file", advice):
-        try:
-            # No lock: finished files never change, and many shared file systems of clusters do not support locks.
-            return h5py.File(path, "r", locking=False)
-        except OSError as error:
-            if "locking flag" not in str(error):
-                raise
-            return h5py.File(path, "r")  # this process has it open with a lock, as in a notebook
+        # No lock: finished files never change, and many shared file systems of clusters do not support locks. A file
+        # that this process has open with a lock, as in a notebook, can only be opened in the same way.
+        for locking in (False, None):
+            try:
+                return h5py.File(path, "r", locking=locking)
+            except OSError as error:
+                if "flag values don't match" not in str(error):
+                    raise
+        return h5py.File(path, "r", locking=True)
 
 
 class _CheckedHeaps(io.FileIO):

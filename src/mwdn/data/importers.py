@@ -216,12 +216,12 @@ def _place(kind: Kind, layout: Layout, scene: Size, frame: Size) -> Size | None:
     return kind.place(scene, frame) if scene[0] <= frame[0] and scene[1] <= frame[1] else None
 
 
-def _correct_levels(capture: Frame, frames: FrameFormat, name: str) -> Frame:
+def _correct_levels(frame: Frame, frames: FrameFormat, name: str) -> Frame:
     """Apply every step of the format but channel order and orientation; without any, the numbers stay as stored."""
-    if frames.bit_depth is not None and frames.bit_depth > 8 * capture.dtype.itemsize:
-        raise ImageError(f"The capture of `{name}` has {capture.dtype}, fewer than {frames.bit_depth} bits.")
+    if frames.bit_depth is not None and frames.bit_depth > 8 * frame.dtype.itemsize:
+        raise ImageError(f"A frame of `{name}` has {frame.dtype}, fewer than {frames.bit_depth} bits.")
     steps = replace(frames, bgr=False, upside_down=False)
-    return capture if steps == FrameFormat() else steps.to_measurement(capture)[0].movedim(0, -1).numpy()
+    return frame if steps == FrameFormat() else steps.to_measurement(frame)[0].movedim(0, -1).numpy()
 
 
 def _orient(frame: Frame, frames: FrameFormat) -> Frame:
