@@ -55,7 +55,7 @@ def origin(settings: str, capture: Path) -> str:
 def _camera(calibration: Calibration) -> dict[str, object]:
     """Everything a measurement depends on; what was added later counts only where it is set."""
     frames = calibration.frames
-    later = {"gamma": frames.gamma, "ambient": calibration.ambient}
+    later = {"gamma": frames.gamma, "ambient": None if calibration.ambient is None else calibration.offset}
     refinement = {"refinement": repr(calibration.refinement)} if calibration.refinement else {}
     later |= {"flat": calibration.corrections.flat, "hot_pixels": calibration.corrections.defects}
     return {
