@@ -25,7 +25,7 @@ MEMORY = 2**30
 PROCESSOR_S = 20
 """Processor time after which a case counts as hanging; four times what a user is promised, for slow machines."""
 
-DURATION_S = float(os.environ.get("MWDN_FUZZ_SECONDS", "3600")) / 4
+DURATION_S = float(os.environ.get("MWDN_FUZZ_SECONDS", "600")) / 4
 """Duration of each of the four long runs of `make acceptance`: pictures, pairs, checkpoints and recipes."""
 
 
