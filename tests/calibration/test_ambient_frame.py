@@ -134,6 +134,13 @@ def test_a_frame_without_light_stays(level):
     assert torch.equal(denoise_ambient(frame), frame)
 
 
+def test_light_beside_the_whole_parts_stays():
+    """150 rows are nine parts of 16 pixels, and six rows that belong to none."""
+    frame = torch.zeros(1, 1, 150, 160)
+    frame[..., 144:, :] = 0.1
+    assert torch.equal(denoise_ambient(frame), frame)
+
+
 def test_one_pixel_that_is_not_a_number_stays_one(generator):
     frame = exposed(LIGHTS["slope"], generator)
     frame[0, 0, 3, 4] = torch.nan
