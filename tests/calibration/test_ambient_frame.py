@@ -31,6 +31,15 @@ LIGHTS = {
 }
 
 
+@pytest.fixture
+def mosaic():
+    """Light of a slope behind a colour filter array."""
+    light = LIGHTS["slope"][:, :1].clone()
+    light[..., ::2, 1::2] *= 0.4
+    light[..., 1::2, ::2] *= 0.7
+    return light
+
+
 @pytest.mark.parametrize("name", LIGHTS)
 def test_smooth_light_loses_five_sixths_of_its_noise(name, generator):
     frame = exposed(LIGHTS[name], generator)
@@ -42,13 +51,10 @@ def test_light_without_noise_stays_as_it_is():
         torch.testing.assert_close(denoise_ambient(light), light, atol=2e-4, rtol=0)
 
 
-def test_colours_of_a_mosaic_stay(generator):
+def test_colours_of_a_mosaic_stay(mosaic, generator):
     """Each kind of pixel sees the room through its own filter."""
-    light = LIGHTS["slope"][:, :1].clone()
-    light[..., ::2, 1::2] *= 0.4
-    light[..., 1::2, ::2] *= 0.7
-    frame = exposed(light, generator)
-    assert error(denoise_ambient(frame, cell=2), light) < error(frame, light) / 4
+    frame = exposed(mosaic, generator)
+    assert error(denoise_ambient(frame, cell=2), mosaic) < error(frame, mosaic) / 4
 
 
 def test_a_window_seen_through_the_mask_stays(generator):
@@ -105,12 +111,9 @@ def test_light_on_a_small_part_of_the_frame_stays(drift, generator):
     assert error(denoise_ambient(frame), light) < error(frame, light)
 
 
-def test_a_mosaic_that_was_not_named_stays(generator):
-    light = LIGHTS["slope"][:, :1].clone()
-    light[..., ::2, 1::2] *= 0.4
-    light[..., 1::2, ::2] *= 0.7
-    frame = exposed(light, generator)
-    assert error(denoise_ambient(frame), light) < 0.6 * error(frame, light)
+def test_a_mosaic_that_was_not_named_stays(mosaic, generator):
+    frame = exposed(mosaic, generator)
+    assert error(denoise_ambient(frame), mosaic) < 0.6 * error(frame, mosaic)
 
 
 @pytest.mark.parametrize("count", [1, 16])

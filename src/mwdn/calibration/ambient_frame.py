@@ -61,11 +61,12 @@ def denoise_ambient(ambient: Tensor, dark: Tensor | None = None, cell: int = 1) 
 
 def _smooth(plane: Image) -> Image:
     """A plane (1, 1, H, W) without its noise, or as it is if more than noise was removed."""
-    light = _parts(plane).mean((-2, -1)).flatten()
+    parts = _parts(plane)
+    light = parts.mean((-2, -1)).flatten()
     if not light.mean() > 0:
         return plane
     bright = light >= 0.99 * light.mean()  # never none of them, also by rounding
-    smooth = _wiener(plane, plane.mean() * _noise_per_light(_parts(plane)[bright], light[bright]))
+    smooth = _wiener(plane, plane.mean() * _noise_per_light(parts[bright], light[bright]))
     removed = _parts(smooth - plane).square().mean((-2, -1)).flatten()[bright] / light[bright]
     return plane if removed.quantile(0.95) > UNEVEN * removed.mean() else smooth
 

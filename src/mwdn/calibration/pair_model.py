@@ -106,6 +106,7 @@ class PairModel:
         pairs: read once.
         shift: of the envelope, applied to the PSF.
         kernels: (m, k) for which to convolve, besides (0, 0) and those of the envelope's displacement.
+        moves: whether to convolve for the envelope's displacement, without which `Terms.envelope` cannot be fitted.
     """
 
     def __init__(
@@ -115,6 +116,7 @@ class PairModel:
         *,
         kernels: Sequence[tuple[int, int]] = (),
         shift: tuple[float, float] | None = None,
+        moves: bool = True,
     ) -> None:
         size = psf.shape[-2], psf.shape[-1]
         self.block = max(1, min(size) // BLOCKS)
@@ -122,7 +124,8 @@ class PairModel:
         moved = psf if shift is None else _displaced(psf, shift)
         over_frame = polynomials(3, size)[:, None].float()
         bases = [((0, 0), moved), *(((m, k), moved * over_frame[m]) for m, k in kernels)]
-        for name, (down, right) in {(-1, 0): (DELTA, 0.0), (-2, 0): (0.0, DELTA)}.items():
+        steps = {(-1, 0): (DELTA, 0.0), (-2, 0): (0.0, DELTA)} if moves else {}
+        for name, (down, right) in steps.items():
             ends = (_displaced(moved, (sign * down, sign * right)) for sign in (1, -1))
             bases.append((name, next(ends) / (2 * DELTA) - next(ends) / (2 * DELTA)))
         self.kernels = [name for name, _ in bases]

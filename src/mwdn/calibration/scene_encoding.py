@@ -11,7 +11,7 @@ GAMMAS = (1.0, 1.4, 1.8, 2.2)
 """Powers that are tried; 1 is linear, 2.2 about sRGB."""
 
 MOST_PAIRS = 10
-"""Pairs that are examined: the first ones; each takes a second at 270 x 480."""
+"""Pairs that are examined, the first ones."""
 
 LEAST = 0.1
 """Relative decrease of the unexplained part that speaks for a gamma."""
@@ -56,5 +56,5 @@ def _unexplained(
     psf: Psf, pairs: Iterable[tuple[Measurement, Scene]], chosen: list[int], gamma: float
 ) -> tuple[float, ...]:
     decoded = ((b, v.clamp(min=0) ** gamma) for number, (b, v) in enumerate(pairs) if number in chosen)
-    model = PairModel(psf, islice(decoded, len(chosen)))
+    model = PairModel(psf, islice(decoded, len(chosen)), moves=False)
     return tuple(model.unexplained(model.start(Terms()), pair) for pair in range(len(model)))

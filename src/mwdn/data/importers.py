@@ -219,7 +219,7 @@ def _place(kind: Kind, layout: Layout, scene: Size, frame: Size) -> Size | None:
 def _correct_levels(frame: Frame, frames: FrameFormat, name: str) -> Frame:
     """Apply every step of the format but channel order and orientation; without any, the numbers stay as stored."""
     if frames.bit_depth is not None and frames.bit_depth > 8 * frame.dtype.itemsize:
-        raise ImageError(f"A frame of `{name}` has {frame.dtype}, fewer than {frames.bit_depth} bits.")
+        raise ImageError(f"The capture of `{name}` has {frame.dtype}, fewer than {frames.bit_depth} bits.")
     steps = replace(frames, bgr=False, upside_down=False)
     return frame if steps == FrameFormat() else steps.to_measurement(frame)[0].movedim(0, -1).numpy()
 
