@@ -6,9 +6,11 @@ from torch.nn import functional as F
 
 from cameras import contour_psf
 from mwdn import Calibration, Camera
+from mwdn.calibration import PsfFormat
 from mwdn.calibration.frame_operations import bin_pixels, crop_centre
 from mwdn.diagnosis.sizes import fitting_size
 from mwdn.errors import ShapeError
+from mwdn.optics.orientation import turn
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +52,16 @@ def test_bin_of_the_capture(fine, capture):
     small = bin_pixels(fine, 2)
     verdict = fitting_size(capture(fine), Calibration(small / small.sum()))
     assert (verdict.value, verdict.options) == ("1/2", "--bin 2 --psf-bin 1")
+
+
+@pytest.mark.parametrize("stored", [None, "flip-top-bottom"])
+def test_capture_of_a_camera_held_upright(fine, capture, stored):
+    """The sides are exchanged. The advice is for the PSF's file, which the calibration may have turned already."""
+    psf = crop_centre(fine, (288, 216))
+    turned = psf if stored is None else turn(psf, stored)
+    calibration = Calibration(turned / turned.sum(), psf_format=PsfFormat(psf_orientation=stored))
+    verdict = fitting_size(capture(turn(psf, "rotate-90")), calibration)
+    assert (verdict.state, verdict.options) == ("doubt", "--psf-orientation rotate-90")
 
 
 def test_noise_cannot_tell(fine):

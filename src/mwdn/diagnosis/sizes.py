@@ -1,7 +1,8 @@
-"""How a PSF fits captures of another size: the bins that are possible, and the one that explains a capture.
+"""How a PSF fits captures of another size: the bin, or the quarter turn, that explains a capture.
 
-PSF or capture is binned, and both are cropped to what they have in common. At the right bin one orientation of the PSF
-explains the capture better than all others (`mwdn.solvers.spectral_misfit`):
+If height and width are exchanged, the quarter turns are tried first. Then PSF or capture is binned, and both are cropped
+to what they have in common. At the right bin one orientation of the PSF explains the capture better than all others
+(`mwdn.solvers.spectral_misfit`):
 
     lead(bin) = second smallest log misfit - smallest log misfit, over the PSF's orientations
 
@@ -10,15 +11,16 @@ are comparable, though the misfit itself is smaller for every smaller, more comp
 """
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 from torch.nn import functional as F
 
 from mwdn.calibration import Calibration, FrameFormat
 from mwdn.calibration.frame_operations import bin_pixels, crop_centre
-from mwdn.diagnosis.orientation import CLEAR, HALF_TURNS, QUARTER_TURNS, fit_turns
+from mwdn.diagnosis.orientation import CLEAR, HALF_TURNS, QUARTER_TURNS, OrientationFit, fit_turns
 from mwdn.diagnosis.verdict import Verdict
 from mwdn.errors import ShapeError
+from mwdn.optics.orientation import Orientation, compose
 from mwdn.types import Measurement, Psf, Size
 
 BINS = range(1, 9)
@@ -61,10 +63,15 @@ def fit_sizes(measurement: Measurement, psf: Psf) -> list[Fit]:
 
 
 def _lead(capture: Measurement, psf: Psf) -> float:
+    turns = HALF_TURNS + (QUARTER_TURNS if psf.shape[-2] == psf.shape[-1] else ())
+    return math.log(_fit(capture, psf, turns).lead)
+
+
+def _fit(capture: Measurement, psf: Psf, turns: tuple[str, ...]) -> OrientationFit:
+    """`fit_turns` of grey pictures of at most `LARGEST` pixels."""
     while capture[0, 0].numel() > LARGEST:
         capture, psf = F.avg_pool2d(capture, 2), F.avg_pool2d(psf, 2)
-    turns = HALF_TURNS + (QUARTER_TURNS if psf.shape[-2] == psf.shape[-1] else ())
-    return math.log(fit_turns(capture, psf / psf.sum(), turns).lead)
+    return fit_turns(capture, psf / psf.sum(), turns)
 
 
 def fitting_size(measurement: Measurement, calibration: Calibration) -> Verdict:
@@ -75,8 +82,16 @@ def fitting_size(measurement: Measurement, calibration: Calibration) -> Verdict:
         calibration: the camera's; its bin is a factor of the bins in the options.
 
     Returns:
-        A verdict on the PSF. Its value is the bin of the PSF, or ``"1/n"`` if the capture must be binned by n.
+        A verdict on the PSF. Its value is the bin of the PSF, or ``"1/n"`` if the capture must be binned by n, or the
+        orientation of the PSF if it must be turned by a quarter.
     """
+    if measurement.shape[-2:] == calibration.psf.mT.shape[-2:]:
+        grey = measurement.mean(1, keepdim=True), calibration.psf.mean(1, keepdim=True)
+        turns = _fit(*grey, QUARTER_TURNS)
+        if turns.lead >= CLEAR:
+            right = compose(calibration.psf_format.psf_orientation, cast(Orientation, turns.best)) or "none"
+            text = "The capture is turned by a quarter against the PSF."
+            return Verdict("psf", "size", "doubt", text, right, f"--psf-orientation {right}")
     fits = fit_sizes(measurement, calibration.psf)
     if not fits or fits[0].lead < math.log(CLEAR) or any(fits[0].lead < 1.5 * fit.lead for fit in fits[1:]):
         text = f"No bin of 1 to {BINS[-1]} explains this capture clearly better than others."
