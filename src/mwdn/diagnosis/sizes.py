@@ -1,8 +1,8 @@
 """How a PSF fits captures of another size: the bin, or the quarter turn, that explains a capture.
 
-If height and width are exchanged, the quarter turns are tried first. Then PSF or capture is binned, and both are cropped
-to what they have in common. At the right bin one orientation of the PSF explains the capture better than all others
-(`mwdn.solvers.spectral_misfit`):
+If height and width are exchanged, the quarter turns are tried first. Then PSF or capture is binned, and both are
+cropped to what they have in common. At the right bin one orientation of the PSF explains the capture better than all
+others (`mwdn.solvers.spectral_misfit`):
 
     lead(bin) = second smallest log misfit - smallest log misfit, over the PSF's orientations
 
