@@ -171,6 +171,7 @@ def test_unknown_split():
         ({"channels": 1}, psf(), "`psf` (3 channels) must be grey, or have the channels of the measurements of"),
         ({"scene": (8, 12, 3)}, psf(), "The scenes of"),
         ({"scene": (8, 12, 3)}, psf(), "(8 x 12) must have the size of its measurements (4 x 6)"),
+        ({"channels": 1, "scene": (4, 6, 3)}, psf(channels=1), "(3 channels) must have the channels of its measurements"),
     ],
 )
 def test_pairs_that_do_not_fit_the_psf(pairs, file, own, said):

@@ -1,4 +1,4 @@
-"""Data sets of a benchmark: what is simulated, what was recorded, and which of it is for what."""
+"""Data sets of a benchmark: simulated or recorded pairs, divided into training, validation and test."""
 
 import json
 from collections.abc import Callable, Iterable
@@ -12,10 +12,11 @@ from mwdn.calibration import Calibration, FrameFormat
 from mwdn.data.importers import import_pairs
 from mwdn.data.kinds import KINDS, Layout
 from mwdn.data.mismatch import EXACT, Mismatch
+from mwdn.data.pair_checks import check_pairs
 from mwdn.data.pair_writer import Attribute
 from mwdn.data.pairs import PairFile, Part
 from mwdn.data.photographs import Photographs
-from mwdn.data.recorded import HELD_OUT, Division, RecordedPairs, check_pairs, record
+from mwdn.data.recorded import HELD_OUT, Division, RecordedPairs, record
 from mwdn.data.simulated import Placement, Samples, SimulatedPairs
 from mwdn.data.splits import split
 from mwdn.errors import ParameterError
@@ -123,7 +124,7 @@ PRESETS: dict[str, DatasetRecipe] = {
         deviation=replace(_REAL, turn_degrees=0.3),
         sensor=Sensor(5000.0, 7.0),
     ),
-    # Scenes of 384 x 384 in the middle of 384 x 640: where they stood is not published.
+    # Scenes of 384 x 384 in the middle of 384 x 640: their position is not published.
     "phlatcam-sim": replace(
         _PHLATCAM, placement=Placement((1.0, 1.0), 1.0, 0.0, 0.0), deviation=_REAL, protocol="0:384,128:512"
     ),
@@ -134,7 +135,7 @@ PRESETS: dict[str, DatasetRecipe] = {
     "diffusercam-paper": replace(_DIFFUSERCAM, kind="diffusercam", split="paper", validation=2500, test=0),
     "phlatcam": replace(_PHLATCAM, kind="phlatcam", split="phlatcam", test=0),
 }
-"""What is known of the data sets of the paper; a recipe names the files, and overrides what it likes."""
+"""Presets of the paper's data sets; a recipe names the files, and may replace any value."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,13 +181,13 @@ def open_dataset(name: str, recipe: DatasetRecipe, folder: Path, device: torch.d
     recipe.binned_protocol().crop(calibration.psf)  # refuses a part that does not fit before anything is trained
     simulates = not recipe.pairs
     not_in_pairs = {"camera", "psf", "captures", "protocol"}
-    not_in_pairs |= {"mismatch"} if recipe.mismatch == EXACT else set()  # which earlier files do not have
+    not_in_pairs |= {"mismatch"} if recipe.mismatch == EXACT else set()  # earlier files lack it
     identity = {key: value for key, value in asdict(recipe).items() if key not in not_in_pairs}
     if recipe.camera:
         identity["frames"] = repr(calibration.frames)
     identity = json.loads(json.dumps({**identity, "psf_hash": calibration.psf_hash}))
     note = folder / f"{name}.json"
-    own = simulates or recipe.kind  # else the user's file, of which nothing is made
+    own = simulates or recipe.kind  # else the user's file, which is only read
     path = folder / f"{name}.h5" if own else Path(recipe.pairs)
     made = read_json(note) if own and note.is_file() and path.is_file() else None
     if made not in (None, identity):

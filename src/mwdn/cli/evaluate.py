@@ -15,8 +15,9 @@ from mwdn.cli.method_options import MethodOptions, read_options
 from mwdn.cli.progress import show_progress
 from mwdn.cli.terminal import Json, results, say, warn
 from mwdn.cli.weights import ask_for_lpips
+from mwdn.data.pair_checks import check_pairs, other_camera
 from mwdn.data.pairs import PairFile, Part
-from mwdn.data.recorded import Division, check_pairs, other_camera
+from mwdn.data.recorded import Division
 from mwdn.errors import ParameterError
 from mwdn.evaluation import Perceptual, Variant
 from mwdn.evaluation.alexnet import SMALLEST

@@ -46,8 +46,8 @@ class Pictures:
 
 def check_pair_file(pairs: Path) -> None:
     """Raise an `MwdnError` unless this is a file of enough pairs."""
+    from mwdn.data.pair_checks import refuse_raw
     from mwdn.data.pairs import PairFile
-    from mwdn.data.recorded import refuse_raw
 
     with PairFile(pairs) as file:
         refuse_raw(file)
@@ -67,8 +67,8 @@ def refine(camera: Path, pairs: Path, report: Path) -> None:
         MwdnError: the pairs do not fit the camera, or a file cannot be written. The camera file stays as it was.
     """
     from mwdn.calibration.refinement_page import write_refinement_page
+    from mwdn.data.pair_checks import check_pairs
     from mwdn.data.pairs import PairFile
-    from mwdn.data.recorded import check_pairs
 
     calibration = Calibration.load(camera, **NO_TERMS, white_balance=None)
     with PairFile(pairs) as file:

@@ -1,4 +1,4 @@
-"""From a public data set, in its own layout, to a file of pairs."""
+"""Convert a public data set, in its own layout, to a file of pairs."""
 
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -122,7 +122,8 @@ def read_pairs(
 ) -> Iterator[Pair]:
     """Read the pairs of a data set one by one, in its order.
 
-    Measurement and scene are as stored, turned to RGB and upright; a gamma is decoded only if it is given.
+    Measurement and scene are as stored, turned to RGB and upright; a gamma is decoded only if it is given. The scene
+    gets the channels of the measurement: the mean of its colours for a grey camera, equal colours if it is grey.
 
     Args:
         kind: of `KINDS`.
@@ -185,16 +186,18 @@ def _override(usual: T, changes: T) -> T:
 
 
 def _convert(source: Source, kind: Kind, layout: Layout, changes: FrameFormat) -> tuple[Frame, Frame]:
-    """Load a pair as RGB, row 0 at the top, both in the smallest type that is exact for both."""
+    """Load a pair as RGB, row 0 at the top, both with the capture's channels, in the smallest type exact for both."""
     stored = source.load()
     capture, scene = stored
     usual = kind.raw_frames if kind.raw_frames is not None and capture.shape[2] == 1 else kind.frames
     frames = _override(usual, changes)
     full_size = frames.full_size(capture)
     capture = _orient(_correct_levels(capture, frames, source.name), frames)
-    scene = _correct_levels(scene, FrameFormat(gamma=layout.scene_gamma), source.name)
-    if kind.raw_frames is not None and scene.shape[2] == 1:
-        scene = scene.repeat(3, axis=2)  # a few of ImageNet's photographs are grey
+    # The scene gets the channels of the capture: the mean of its colours, or equal colours.
+    grey = capture.shape[2] == 1 < scene.shape[2]
+    scene = _correct_levels(scene, FrameFormat(gamma=layout.scene_gamma, grey=grey), source.name)
+    if scene.shape[2] == 1 < capture.shape[2]:  # a few of ImageNet's photographs are grey
+        scene = scene.repeat(3, axis=2)
     if layout.scene_size is not None:
         scene = _resize(scene, layout.scene_size)
     scene = _orient(scene, frames)
@@ -208,7 +211,7 @@ def _convert(source: Source, kind: Kind, layout: Layout, changes: FrameFormat) -
 
 
 def _place(kind: Kind, layout: Layout, scene: Size, frame: Size) -> Size | None:
-    """Where a scene is in the frame; ``None`` if it is as large as it is."""
+    """Where a scene is in the frame; ``None`` if it has the size of the frame."""
     if layout.scene_place is not None or kind.place is None:
         return layout.scene_place
     if scene == frame:
