@@ -166,7 +166,7 @@ def _dataset_recipe(name: str, table: dict[str, Any], folder: Path) -> DatasetRe
 
 
 def _of_camera(path: str) -> dict[str, Any]:
-    """The keys of a data set that a camera file says; its other keys are read with the PSF."""
+    """The keys of a data set that are in a camera file; its other keys are read with the PSF."""
     camera = read_camera(path)
     background = camera.get("background", "estimate")
     keys = {"psf": str(camera["psf"]), "psf_bin": 0, "background": -1.0 if background == "estimate" else background}

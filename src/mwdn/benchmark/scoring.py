@@ -52,7 +52,7 @@ class MethodResult:
 
 @dataclass(frozen=True, eq=False)
 class MeanPicture:
-    """The same picture for every capture: what a method must beat to have seen anything.
+    """The same picture for every capture: a baseline that a useful method must exceed.
 
     Args:
         scene: (1, C, H, W), mean of all training scenes.

@@ -1,4 +1,4 @@
-"""The ambient frame without its noise, which would otherwise be added to each capture."""
+"""Remove the noise of the ambient frame, which would otherwise be added to each capture."""
 
 import torch
 from torch import Tensor
@@ -14,18 +14,19 @@ PART = 16
 """Side in pixels of the parts of a frame in which noise and light are compared."""
 
 QUIET = 0.3
-"""Quantile of the bright parts' noise variance over light that counts: that of parts without sharp lines of the mask,
+"""The noise is this quantile of the bright parts' variance over light: that of parts without sharp lines of the mask,
 which look like noise."""
 
 NEIGHBOURS = 7
 """Side of the square of frequencies over which power is averaged; noise alone then scatters by sqrt(2) / 7 = 20 %."""
 
 EXCESS = 1.5
-"""How many times the noise's power counts, so that what scatters above its mean is removed, too."""
+"""Factor on the noise's power in the Wiener filter, so that noise that scatters above its mean is removed, too."""
 
 UNEVEN = 1.3
-"""95 % quantile of the bright parts' removed power over light, divided by its mean, from which more than noise was
-removed. Noise has 1.13 to 1.2: its power scatters by sqrt(2 / 256) = 9 % from part to part."""
+"""The filter is not used if the 95 % quantile of the bright parts' removed power over light exceeds its mean by this
+factor: then more than noise was removed. Noise has 1.13 to 1.2: its power scatters by sqrt(2 / 256) = 9 % from part to
+part."""
 
 
 def denoise_ambient(ambient: Tensor, dark: Tensor | None = None, cell: int = 1) -> Tensor:
@@ -65,7 +66,7 @@ def _smooth(plane: Image) -> Image:
     light = parts.mean((-2, -1)).flatten()
     if not light.mean() > 0:
         return plane
-    bright = light >= 0.99 * light.mean()  # never none of them, also by rounding
+    bright = light >= 0.99 * light.mean()  # at least one, also after rounding
     smooth = _wiener(plane, plane.mean() * _noise_per_light(parts[bright], light[bright]))
     removed = _parts(smooth - plane).square().mean((-2, -1)).flatten()[bright] / light[bright]
     return plane if removed.quantile(0.95) > UNEVEN * removed.mean() else smooth
@@ -74,7 +75,7 @@ def _smooth(plane: Image) -> Image:
 def _noise_per_light(parts: Image, light: Tensor) -> Tensor:
     """Variance of the noise over the light, which is the same everywhere for photons.
 
-    Pixels two apart are compared, too: the colours of a mosaic that was not named are no noise.
+    Pixels two apart are compared, too, because the colours of an unknown mosaic are not noise.
     """
     apart = noise_level(F.pixel_unshuffle(parts, 2), parts=1).square().mean(1, keepdim=True)
     variance = torch.minimum(noise_level(parts, parts=1).square(), apart).flatten()
@@ -87,7 +88,7 @@ def _parts(plane: Image) -> Tensor:
 
 
 def _wiener(plane: Image, noise_power: Tensor) -> Image:
-    """Filter a plane (1, 1, H, W) in the cosine transform: the Fourier transform of it beside its mirror images."""
+    """Filter a plane (1, 1, H, W) in the cosine transform: the Fourier transform of the plane and its mirror images."""
     height, width = plane.shape[-2:]
     grid = 2 * height, 2 * width
     mirrored = torch.cat([plane, plane.flip(-1)], -1)

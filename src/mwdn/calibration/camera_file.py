@@ -1,4 +1,4 @@
-"""A camera file: all that is known about a camera, in one TOML file that people can read and edit."""
+"""Camera files: the calibration of a camera in one TOML file that people can read and edit."""
 
 import json
 import os
@@ -114,7 +114,7 @@ def read_camera(path: str | Path) -> dict[str, Any]:
 
 
 def _check_range(key: str, value: Any) -> None:  # noqa: ANN401
-    """Raise a `ParameterError` if the number of a key, or one of its numbers, is out of any range."""
+    """Raise a `ParameterError` if the number of a key, or one of its numbers, is outside its possible range."""
     check_numbers(value, key)
     for number in value if isinstance(value, list | tuple) else [value]:
         if key in _POSITIVE and not number > 0:
@@ -136,7 +136,7 @@ def _as_tuple(value: Any) -> Any:  # noqa: ANN401
 
 
 def pop_sensor(camera: dict[str, Any]) -> Sensor | None:
-    """Take the keys of the sensor out of a camera file's; ``None`` unless its noise is there.
+    """Remove the keys of the sensor from those of a camera file; ``None`` unless they have its noise.
 
     Raises:
         ParameterError: a number is out of its range.
@@ -151,7 +151,7 @@ def pop_sensor(camera: dict[str, Any]) -> Sensor | None:
 
 
 def pop_places(camera: dict[str, Any]) -> PlaceFiles:
-    """Take the keys of PSFs at other places out of a camera file's.
+    """Remove the keys of PSFs at other places from those of a camera file.
 
     Raises:
         ParameterError: there are more files than places, or fewer.
@@ -202,8 +202,8 @@ def check_camera_path(path: Path) -> None:
 
 def check_psf_file(path: str | Path, sha256: str, psf: Path) -> None:
     """Raise a `PsfError` if the PSF of the camera file ``path`` has changed since that was written."""
-    # A larger file is refused where it is read; to hash it would take long.
-    with suppress(OSError):  # a name that no file can have; it is named where the file is read
+    # A larger file is refused when it is read; hashing it would take long.
+    with suppress(OSError):  # an impossible file name; reading the file reports it
         if not sha256 or not psf.is_file() or psf.stat().st_size > MAX_BYTES or file_sha256(psf) == sha256:
             return
         raise PsfError(

@@ -28,7 +28,7 @@ def write_camera_with_parts(
     """Write a camera file and its pictures.
 
     A picture's name ends in a hash of its numbers: ``camera-psf-1a2b3c4d.tif``. So the pictures of an existing camera
-    file stay until the new file has taken its place, at once; then those that it no longer names are removed.
+    file stay until the new file has replaced it atomically; then those that the new file does not name are removed.
 
     Args:
         path: the camera file.
@@ -62,8 +62,8 @@ def write_camera_with_parts(
 def draft_of(path: Path) -> Iterator[Path]:
     """A camera file that is made in several steps, in a hidden folder beside ``path``.
 
-    At the end it takes the place of ``path``, at once, with the pictures that this module has written for it. Until
-    then, and if anything fails, ``path`` stays as it is.
+    At the end it replaces ``path`` atomically, with the pictures that this module has written for it. Until then, and
+    if anything fails, ``path`` stays as it is.
 
     Raises:
         ParameterError: the folder cannot be written.

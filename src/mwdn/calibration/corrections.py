@@ -1,4 +1,4 @@
-"""What is corrected in the raw pixels of every frame: the flat field, and hot pixels."""
+"""Corrections of the raw pixels of every frame: the flat field, and hot pixels."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,7 +22,7 @@ class Corrections:
     Args:
         flat: (1, C or 1, H, W), response of each pixel relative to the mean, by which frames are divided.
         defects: (1, 1, H, W), bool, pixels that are replaced by the mean of their neighbours of the same colour.
-        psf_done: the PSF's file needs neither these nor the dark frame, as `mwdn calibrate FRAMES` writes it.
+        psf_done: the PSF's file is corrected already, also by the dark frame, as `mwdn calibrate FRAMES` writes it.
     """
 
     flat: Image | None = None
@@ -78,7 +78,7 @@ class Corrections:
 
     @cached_property
     def _repairs(self) -> dict[int, PixelRepair]:
-        """By the cell of the frames; made once, for a stream corrects many frames."""
+        """Repairs by the cell of the frames; made once, because a stream corrects many frames."""
         return {}
 
     @property

@@ -12,13 +12,13 @@ from mwdn.errors import ParameterError
 from mwdn.types import Image
 
 MOST = 8
-"""Most exposures."""
+"""Largest number of exposures."""
 
 CEILING = 0.92
 """Level above which a pixel of an exposure is not used: near saturation sensors are no longer linear."""
 
 WORST_RATIO = 1.5
-"""Factor between the exposures given and the light measured from which on they cannot belong together."""
+"""Largest factor between the given ratio of exposures and the measured one; beyond it they do not match."""
 
 
 class Merged(NamedTuple):
@@ -42,8 +42,8 @@ def merge_exposures(averages: Sequence[FrameAverage], exposures: Sequence[float]
 
     Light r gives the signal ``r t`` at the exposure t, whose mean over n frames has the variance
     ``v = (slope r t + floor) / n``. The best estimate of r weights each ``signal / t`` by ``w = t^2 / v`` and leaves
-    saturated pixels out. The weights follow from the merged light itself, not from one exposure's noisy signal: where
-    that is too low by chance it would get too high a weight, and the mean would be too low.
+    saturated pixels out. The weights are computed from the merged light, not from the noisy signal of one exposure: a
+    signal that is too low by chance would get too high a weight, and the mean would be too low.
 
     Cameras round exposure times. Their ratios are measured in the pixels that neighbouring exposures share.
 
@@ -52,8 +52,8 @@ def merge_exposures(averages: Sequence[FrameAverage], exposures: Sequence[float]
         exposures: their times in any unit.
 
     Raises:
-        ParameterError: other numbers of exposures and averages, an exposure twice or not positive, or frames that do
-            not have the light of their exposure.
+        ParameterError: the numbers of exposures and averages differ, an exposure is repeated or not positive, or frames
+            do not have the light of their exposure.
     """
     if len(averages) != len(exposures) or not 1 <= len(exposures) <= MOST:
         raise ParameterError(f"`exposures` ({len(exposures)}) must be 1 to {MOST}, one for each of {len(averages)}.")
@@ -96,7 +96,7 @@ def _measured(
     for number in range(1, len(averages)):
         shorter, longer = averages[number - 1], averages[number]
         given = nominal[number] / nominal[number - 1]
-        # Pixels well above the noise of the shorter exposure, chosen by the longer one, so that the choice is fair.
+        # Pixels well above the noise of the shorter exposure, selected in the longer one to avoid a selection bias.
         clear = longer.image > given * 3 * (models[number - 1].floor / shorter.count) ** 0.5
         shared = usable[number] & usable[number - 1] & clear
         least, most = float(shorter.image[shared].sum()), float(longer.image[shared].sum())

@@ -19,7 +19,7 @@ WELL_EXPOSED = (0.5, 0.95)
 """Peaks, as fractions of saturation, for which no other exposure is advised."""
 
 LARGEST_STEP = 16.0
-"""Largest factor by which one frame advises to change the exposure: a guess from a black or white frame is coarse."""
+"""Largest advised change of the exposure, as a factor: an estimate from a black or white frame is coarse."""
 
 
 class Exposure(NamedTuple):
@@ -66,7 +66,7 @@ def measure_exposure(frame: Frame, frames: FrameFormat = FrameFormat(), *, black
     frame = as_frame(frame, finite=False)
     saturated, maximum = frames.saturated(frame)
     full = float(maximum) if saturated else frames.full_scale(frame)
-    # Of a gamma-coded file the exposure scales the decoded light.
+    # In a gamma-coded file, the exposure scales the decoded light.
     brightest = np.sort(frames.normalise(frame).amax((0, 1)).flatten().numpy())[::-1]
     levels = brightest * np.float32(frames.full_scale(frame) / full)
     place = min(math.ceil(BRIGHTEST * levels.size), levels.size - 1)

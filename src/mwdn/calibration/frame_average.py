@@ -19,17 +19,17 @@ Kind = Literal["PSF", "dark", "flat"]
 """What the frames show: a point source, no light, or even light."""
 
 MAX_BYTES = 2**32
-"""Most bytes of frames averaged at once, as stored: 4 GiB, 170 frames of 12 megapixels."""
+"""Limit of the stored bytes of frames that are averaged at once: 4 GiB, 170 frames of 12 megapixels."""
 
 LIGHT_TOLERANCE = 0.05
-"""Relative difference of a frame's light from the median of all, from which on it has been taken with another light.
-Smaller differences, of a lamp that flickers, are divided out."""
+"""Relative difference of a frame's light from the median of all, above which the frame is left out. Smaller
+differences, as of a lamp that flickers, are divided out."""
 
 MOVED_PX = 0.5
-"""Displacement from which on a frame is left out: it would widen the lines of the PSF."""
+"""Displacement above which a frame is left out, because it would widen the lines of the PSF."""
 
 CLIP = 5.0
-"""Standard deviations from which on a pixel of one frame is an outlier: 6e-7 of the good ones."""
+"""Standard deviations above which a pixel of one frame is an outlier; 6e-7 of the good pixels are, too."""
 
 _ROWS = 2**22  # numbers of one frame processed at once: some tens of MB for the frames of a band
 _SIDE = 1024  # pixels of the longer side of the frames whose displacement is measured
@@ -68,8 +68,8 @@ def average_frames(
 
     A frame is left out if its light differs from the others' by more than `LIGHT_TOLERANCE`, or if its pattern is
     displaced by `MOVED_PX`. A pixel of a frame is left out if it differs from the median of all frames by more than
-    `CLIP` standard deviations of the noise, which is measured from the frames themselves; of two frames, the higher of
-    two such numbers, for a cosmic hit only adds light.
+    `CLIP` standard deviations of the noise, which is measured from the frames themselves. With two frames, the higher
+    of two such values is left out, because a cosmic hit only adds light.
 
     Args:
         frames: (H, W, C), as stored, all of one shape and type.
@@ -140,7 +140,7 @@ def _small(frame: Frame, format: FrameFormat, dark: Image | None) -> Image:
 
 
 def _light(image: Image) -> float:
-    """Mean above the darkest 5 %: the level of stray light and of the black level says nothing about the source."""
+    """Mean above the darkest 5 %: stray light and the black level do not depend on the source."""
     floor = image.flatten().kthvalue(max(1, image.numel() // 20)).values
     return float((image - floor).mean())
 
@@ -205,7 +205,7 @@ def _noise(
 
 
 def _saturated(frames: Sequence[Frame], format: FrameFormat) -> Tensor:
-    """(1, 1, H, W), pixels that are saturated in more than half of the frames: in one of them it is a cosmic hit."""
+    """(1, 1, H, W), pixels that are saturated in more than half of the frames; in a single frame it is a cosmic hit."""
     counts = np.zeros(frames[0].shape[:2], np.int32)
     for frame in frames:
         count, maximum = format.saturated(frame)

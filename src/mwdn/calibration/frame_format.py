@@ -152,7 +152,7 @@ class FrameFormat:
         return srgb_decode(image) if self.gamma == "srgb" else image.clamp(min=0) ** self.gamma
 
     def denormalise(self, image: Image) -> Frame:
-        """The frame of floats (H, W, C) in the order of the camera's files that `read` and `normalise` make this of."""
+        """Inverse of `read` and `normalise`: a frame of floats (H, W, C) in the order of the camera's files."""
         frame = image if self.gamma is None else image.clamp(min=0)
         if self.gamma is not None:
             frame = srgb_encode(frame) if self.gamma == "srgb" else frame ** (1 / self.gamma)
@@ -196,7 +196,10 @@ class FrameFormat:
         return int((frame.max(axis=-1) >= maximum).sum()), maximum
 
     def possible_bit_depth(self, frame: Frame) -> int | None:
-        """Least of 10, 12 and 14 bits that hold a frame of 16, unless a bit depth is given; or it is only dark."""
+        """Least of 10, 12 and 14 bits that hold a 16-bit frame; ``None`` if a bit depth is given.
+
+        A frame may also fit because it is dark.
+        """
         is_open = self.bit_depth is None and frame.dtype == np.uint16
         return next((bits for bits in (10, 12, 14) if is_open and frame.max() < 2**bits), None)
 

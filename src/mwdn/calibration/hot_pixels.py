@@ -15,10 +15,10 @@ DEAD = 0.5
 
 
 def find_hot_pixels(dark: FrameAverage, *, cell: int = 1) -> Tensor:
-    """Find pixels of a dark frame that stand out of their surroundings.
+    """Find pixels of a dark frame that are brighter than their surroundings.
 
-    The local level is the median of 5 x 5 pixels, of one colour of a mosaic. What is left is noise, whose standard
-    deviation is estimated without the outliers, but hot pixels.
+    The local level is the median of 5 x 5 pixels, of one colour of a mosaic. The difference is noise, whose standard
+    deviation is estimated without outliers, and hot pixels.
 
     Args:
         dark: the average of dark frames.

@@ -26,13 +26,13 @@ class NoiseModel(NamedTuple):
 
 
 TYPICAL = NoiseModel(1 / 15_000, (3.0 / 15_000) ** 2)
-"""The default of `mwdn.optics.Sensor`, for a single frame, of which nothing is known."""
+"""The default of `mwdn.optics.Sensor`, for a single frame, whose noise cannot be measured."""
 
 
 def clipped_variance(values: Tensor) -> float:
     """Variance of numbers around 0 without their outliers, by three rounds of clipping at five standard deviations.
 
-    Integers of a few counts make the median of their absolute values jump; this variance does not.
+    For integers of a few counts, the median of their absolute values would change in steps; this variance does not.
     """
     square = values.flatten().double().square()
     variance = float(square.mean())

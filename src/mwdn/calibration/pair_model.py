@@ -44,7 +44,7 @@ class Terms:
     Args:
         psf_gain: g over the PSF, for each colour.
         sensor_field: S, common to all colours.
-        stray_light: B for each colour, without the part that is even over the sensor, which o has.
+        stray_light: B for each colour, without the part that is even over the sensor, which is in o.
         field_dependence: g that changes linearly over the scene: 1 for its sum, 2 also over the PSF.
         envelope: 1 for a displaced aperture, 2 for one that moves on from the displacement of the model's PSF.
     """
@@ -158,7 +158,7 @@ class PairModel:
         return b, torch.stack(images, 1)
 
     def start(self, terms: Terms) -> Fit:
-        """No change at all."""
+        """The start of a fit: no change of the calibration."""
         colours, zeros = self.b.shape[1], torch.zeros
         field, stray = (coefficient_count(order) - 1 for order in (terms.sensor_field, terms.stray_light))
         kernels = zeros(colours, len(self._columns(terms)), dtype=torch.float64)
@@ -213,7 +213,7 @@ class PairModel:
         return J / self.scale[i], residual / self.scale[i]
 
     def _forward(self, fit: Fit, i: int, c: int) -> tuple[Tensor, Tensor, Tensor]:
-        """S, the images of an even scene and of the pair's (2, pixels), and B."""
+        """S, the images (2, pixels) of an even scene and of the pair's scene, and B."""
         columns, P = self._columns(fit.terms), self.over_sensor
         both = torch.stack([self.even[c], self.parts[i, c]])
         images = both[:, 0] + torch.einsum("k,nkp->np", fit.gain[c], both[:, columns])

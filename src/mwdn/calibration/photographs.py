@@ -73,7 +73,7 @@ def grouped(paths: Sequence[Path], count: int) -> list[list[Path]]:
 
 @dataclass(frozen=True, eq=False)
 class Photographed:
-    """What the photographs give: the content of a camera file, its pictures, and sentences for the user."""
+    """Result of `develop`: the content of a camera file, its pictures, and sentences for the user."""
 
     content: dict[str, Any]
     parts: dict[str, Frame | list[Frame]]
@@ -93,7 +93,7 @@ def develop(photographs: Photographs, frames: FrameFormat, known: Corrections = 
     Raises:
         MwdnError: a file cannot be read, frames disagree, or are saturated.
     """
-    _, frames = frames.read_stored(photographs.groups[0][0])  # a raw file says its own mosaic
+    _, frames = frames.read_stored(photographs.groups[0][0])  # a raw file states its own mosaic
     sensor = measure_sensor(photographs.sensor, frames, known)
     exposures, distances = photographs.exposures, photographs.distances_mm
     groups, count = photographs.groups, max(1, len(exposures))

@@ -17,12 +17,12 @@ SAME_LIGHT = 0.05
 """Relative difference of the light of two flat frames up to which they count as a pair."""
 
 COLLAPSE = 0.7
-"""Variance over that of the line from which on the pixels are full: electrons that spill over are not noisy."""
+"""Variance over that of the line, below which the pixels are full: electrons that spill over add no noise."""
 
 
 @dataclass(frozen=True)
 class PhotonTransfer:
-    """What photon transfer says of a sensor.
+    """Result of photon transfer for a sensor.
 
     Args:
         electrons_per_count: gain of the converter.
@@ -106,7 +106,8 @@ def _fit(signals: list[float], variances: list[float], black: float, full: float
     x = torch.tensor(signals, dtype=torch.float64)[torch.from_numpy(order)]
     y = torch.tensor(variances, dtype=torch.float64)[torch.from_numpy(order)]
     used = len(x)
-    # Full pixels are at the top: leave the brightest out while it lies far below the line through the others.
+    # The brightest pairs may have full pixels: leave the brightest out while it is far below the line through the
+    # others.
     while used > 3 and _collapsed(x[:used], y[:used]):
         used -= 1
     slope, _ = fit_line(x[:used], y[:used], 1 / y[:used].square())

@@ -29,9 +29,9 @@ def at_distance(calibration: Calibration, distance_mm: float) -> tuple[Calibrati
     """The calibration for points at a distance, and a sentence about where its PSF is from.
 
     The shadow of a mask at the distance d from the sensor, in the light of a point at z, is magnified by 1 + d / z.
-    Between two measured distances the nearer PSF (in 1 / z) is therefore magnified: by the part of their relative
-    magnification, which is measured, that 1 / z lies between them. Diffraction, which does not scale like a shadow, is
-    that of the PSF used. Beyond the measured distances the nearest PSF is used as it is.
+    So between two measured distances, the PSF that is nearer in 1 / z is magnified: by their measured relative
+    magnification, interpolated linearly in 1 / z. Diffraction does not scale like a shadow; it stays that of the PSF
+    used. Beyond the measured distances the nearest PSF is used as it is.
 
     Args:
         calibration: with PSFs at other distances.
@@ -113,7 +113,7 @@ def field_camera(calibration: Calibration) -> FieldCamera:
     """A camera whose PSF changes over the field as measured; it darkens off the axis as the point source did.
 
     On a grid of `GRID` x `GRID` points the PSFs are means of the measured ones and of the one on the axis, weighted by
-    the inverse square of the distance (Shepard); at a measured point that PSF alone counts.
+    the inverse square of the distance (Shepard); at a measured point only its own PSF has a weight.
 
     Args:
         calibration: with PSFs at other positions, which were taken with the exposure of the one on the axis.

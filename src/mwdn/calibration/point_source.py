@@ -75,7 +75,7 @@ def photograph_point(
     dark_noise = float(merged.noise.median())
     peak = max(float(image.amax()), 1e-12)
     decades = float(torch.log10(torch.tensor(peak / max(dark_noise, 1e-12)))) if averages[0].noise else 0.0
-    image = image / max(peak, 1.0)  # `FrameFormat.full_scale` allows no more
+    image = image / max(peak, 1.0)  # `FrameFormat.full_scale` allows at most 1
     return PointSource(image, merged.exposures, sum(a.count for a in averages), max(decades, 0.0), tuple(notes))
 
 
@@ -127,6 +127,6 @@ def centring_shift(image: Image, cell: int = 1) -> tuple[int, int]:
 
 
 def centred(source: Image, cell: int = 1) -> tuple[Image, tuple[int, int]]:
-    """A PSF with its centroid at the centre of the frame, and the shift; darkness enters at the border."""
+    """A PSF with its centroid at the centre of the frame, and the shift; zeros enter at the border."""
     shift = centring_shift(source, cell)
     return shifted(source, *shift), shift

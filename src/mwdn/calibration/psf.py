@@ -49,7 +49,7 @@ class Calibration:
         unrefined_hash: `psf_hash` before the refinement; empty without one.
 
     Raises:
-        PsfError: the PSF has other axes, or is negative, not finite, or dark.
+        PsfError: the PSF has wrong axes, or is negative, not finite, or dark.
         ParameterError: an argument is of another type or outside its range.
     """
 
@@ -88,7 +88,7 @@ class Calibration:
         terms = Refinement(**{name: camera.pop(name) for name in TERMS if name in camera})
         if camera["psf"] == own_psf:
             check_psf_file(path, sha256, own_psf)
-        else:  # of another file nothing is known
+        else:  # nothing is known about another PSF file
             camera["psf_corrected"] = False
             terms = replace(terms, psf_gain=(), envelope_shift=None)
         extra = {name: camera.pop(name, None) for name in ("white_balance", "pitch_um", "distance_mm")}
@@ -98,7 +98,7 @@ class Calibration:
         return replace(cls.from_file(camera.pop("psf"), corrections=corrections, **camera), **extra).refined(terms)
 
     def refined(self, refinement: Refinement) -> "Calibration":
-        """The calibration with a refinement, of which it has none yet: in its PSF and in all measurements."""
+        """Apply a refinement to a calibration that has none yet: to its PSF and to all measurements."""
         terms: dict[str, Any] = {"psf": refinement.psf(self.psf), "refinement": refinement}
         return replace(self, **terms, unrefined_hash=self.psf_hash) if refinement else self
 

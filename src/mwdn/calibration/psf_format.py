@@ -50,7 +50,7 @@ class PsfFormat:
             check_orientation(self.psf_orientation)
 
     def own_frames(self, captures: FrameFormat) -> FrameFormat:
-        """Format of the PSF's own file, as it is before `turn`."""
+        """Format of the PSF's own file, before `turn`."""
         frames = captures if self.psf_bin is None else captures.with_bin(self.psf_bin)
         crop = frames.crop[::-1] if frames.crop and swaps_axes(self.psf_orientation) else frames.crop
         return replace(frames, gamma=self.psf_gamma, crop=crop, upside_down=False)

@@ -1,4 +1,4 @@
-"""What known pictures tell of a camera beyond its PSF: smooth gains, a displaced envelope, a sensor field, stray light.
+"""Terms of a camera beyond its PSF, measured with known pictures: gains, displaced envelope, sensor field, stray light.
 
 With place r over the PSF, x over the sensor and p over the scene, all from -1 to 1 over the frame, a camera measures
 
@@ -20,7 +20,7 @@ from mwdn.optics.polynomials import frame_places, polynomial, polynomial_order
 from mwdn.types import Image, Measurement, Psf, Size
 
 Coefficients = tuple[tuple[float, ...], ...]
-"""Of polynomials, a row for each colour or one for all."""
+"""Coefficients of polynomials: a row for each colour, or one for all."""
 
 TERMS = ("psf_gain", "envelope_shift", "sensor_field", "stray_light")
 """Fields of `Refinement`, which are keys of a camera file, too."""

@@ -14,7 +14,7 @@ MOST_PAIRS = 10
 """Pairs that are examined, the first ones."""
 
 LEAST = 0.1
-"""Relative decrease of the unexplained part that speaks for a gamma."""
+"""Relative decrease of the unexplained part from which a gamma is accepted."""
 
 CLIPPED = 0.02
 """Part of a scene's pixels at its maximum from which it counts as clipped. Clipping bends a scene as a gamma does."""
@@ -39,7 +39,7 @@ def unexplained_by_gamma(
 
 
 def scene_gamma(unexplained: dict[float, tuple[float, ...]]) -> float | None:
-    """The gamma that explains the pairs best; ``None`` if they are linear as far as can be told."""
+    """The gamma that explains the pairs best; ``None`` if there is no evidence that they are not linear."""
     linear = unexplained[1.0]
     if not linear:
         return None

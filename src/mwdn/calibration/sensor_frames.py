@@ -1,4 +1,4 @@
-"""What dark and flat frames say of a sensor: dark level, hot pixels, flat field, noise, colour of the light."""
+"""Measure a sensor with dark and flat frames: dark level, hot pixels, flat field, noise, colour of the light."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ class SensorFiles:
         dark_exposures: one for each equal part of them, in order; empty if all have the same.
         flat: of even light at about half of the full scale, in pairs of the same exposure.
         flat_dark: without light and with the exposure of the flat frames; ``dark`` unless given.
-        flat_field: whether the flat frames' light is even; otherwise they say the noise alone.
+        flat_field: whether the flat frames' light is even; otherwise only the noise is measured from them.
         capture_exposure: that of the captures, one of ``dark_exposures``; the longest unless given.
     """
 
@@ -183,7 +183,7 @@ def _mean_flat(
         if float(average.saturated.float().mean()) > 1e-3:
             notes.append(f"`{names[start]}` is saturated, and left out of the flat field.")
             continue
-        # Frames of more light have less noise, relative to their level, with the square root of the electrons.
+        # Relative to the level, noise falls with the square root of the electrons.
         part = average.count * levels[start]
         total = part * average.image / levels[start] + (0.0 if total is None else total)
         weight += part

@@ -5,7 +5,7 @@ from mwdn.types import Size
 
 
 def advise_size(capture: Size, psf: Size, frames: FrameFormat) -> str:
-    """The options with which a capture and a PSF of other sizes fit."""
+    """The options with which a capture and a PSF of different sizes fit."""
     for larger, smaller, name, options in (
         (psf, capture, "PSF", "psf_bin={product}"),
         (capture, psf, "capture", "bin={product}, psf_bin={bin}"),

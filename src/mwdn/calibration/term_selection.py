@@ -4,7 +4,8 @@ In each round, each term is tried at each order beyond the one it has, on top of
 measured on pairs that it was not fitted to: each part of them (`left_out`) in turn is left out, and only the gain and
 offset of its pairs are fitted.
 The best term is taken if it lowers the mean unexplained part by `LEAST` and that of more than half of the pairs. The
-field dependence, which no solver uses, comes last: fitted together, it would take what the other terms can explain.
+field dependence, which no solver uses, comes last: fitted together with the other terms, it would absorb what they can
+explain.
 """
 
 from collections.abc import Callable, Iterable
@@ -135,7 +136,7 @@ def select_terms(
 
 
 def _displaced(model: PairModel, terms: Terms, psf: Psf, pairs: Callable[[], Pairs]) -> PairModel:
-    """Gauss-Newton on the displacement, which is linear in a model: the displaced PSF is what other terms change."""
+    """Gauss-Newton on the displacement, which a model linearises: the other terms then apply to the displaced PSF."""
     down, right = 0.0, 0.0
     for step in range(1, MOVES + 1):
         moved = model.fit(replace(terms, envelope=min(step, 2)), range(len(model))).displacement

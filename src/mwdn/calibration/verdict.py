@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 from mwdn.calibration.report import Levels, PsfReport
 
 Weight = Literal["bad", "mind", "good"]
-"""``bad`` costs most of the quality, ``mind`` some of it, ``good`` is as it should be."""
+"""``bad`` costs most of the quality, ``mind`` some of it, ``good`` none."""
 
 
 class Finding(NamedTuple):

@@ -1,4 +1,4 @@
-"""Guide the exposure while one turns the knobs: measure each new frame of a folder or of a camera."""
+"""Guide the exposure while the user adjusts it: measure each new frame of a folder or of a camera."""
 
 import contextlib
 from collections.abc import Callable, Iterable, Iterator
@@ -11,7 +11,7 @@ from mwdn.io.listing import list_folder
 from mwdn.types import Frame
 
 TRIES = 5
-"""Looks at a file that cannot be read, until it counts as damaged and not as still being written."""
+"""Attempts to read a file before it counts as damaged instead of still being written."""
 
 
 def watch_folder(folder: Path, frames: FrameFormat, wait: Callable[[], bool]) -> Iterator[tuple[str, Frame]]:

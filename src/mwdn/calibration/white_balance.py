@@ -54,7 +54,7 @@ def apply_white_balance(scene: Scene, balance: WhiteBalance, light: tuple[float,
 
     References:
         Grey world: G. Buchsbaum, "A spatial processor model for object colour perception", Journal of the Franklin
-        Institute 310, 1-26 (1980). Negative pixels, which only noise gives, count as 0.
+        Institute 310, 1-26 (1980). Negative pixels, which only noise causes, count as 0.
     """
     if scene.shape[1] != 3:
         return scene
@@ -68,6 +68,6 @@ def apply_white_balance(scene: Scene, balance: WhiteBalance, light: tuple[float,
 
 
 def _inverse(colour: Tensor) -> Tensor:
-    """Gains (B, 3) that make the colour grey; 1 where there is no light to tell."""
+    """Gains (B, 3) that make the colour grey; 1 where there is no light."""
     gains = colour[:, 1:2] / colour
     return torch.where(gains.isfinite() & (gains > 0), gains, torch.ones_like(gains))

@@ -120,7 +120,7 @@ class AravisCamera(CameraSource):
             try:
                 if buffer.get_status() == library.BufferStatus.SUCCESS:
                     return self._frame(buffer)
-                failed += 1  # packets were lost on the way
+                failed += 1  # network packets were lost
             finally:
                 self._stream.push_buffer(buffer)
         if self._lost:
@@ -152,7 +152,7 @@ class AravisCamera(CameraSource):
     def close(self) -> None:
         """Stop and release the camera."""
         if self._camera is not None:
-            with suppress(Exception):  # it may be gone
+            with suppress(Exception):  # it may be disconnected
                 self._camera.stop_acquisition()
         self._stream = self._camera = None
 
@@ -166,7 +166,7 @@ class AravisCamera(CameraSource):
         except CameraError:
             self.close()
             raise
-        except Exception as error:  # GLib.Error, of a module that is not always there
+        except Exception as error:  # GLib.Error; its module is not always installed
             if self._stream is None:
                 self.close()
             raise CameraError(f"{self.name} {what}: {reason(error)}. {advice}") from error

@@ -1,4 +1,4 @@
-"""The file of captured pairs: raw frames, the pictures as displayed, and all that alignment needs later.
+"""Files of captured pairs: raw frames, the pictures as displayed, and all data for the later alignment.
 
 `mwdn.data.PairFile` reads it at any time, also while it grows. docs/capture.md lists its content.
 """
@@ -21,7 +21,7 @@ from mwdn.errors import ImageError, ParameterError
 from mwdn.io.files import as_image_error
 
 NAME_BYTES = 255
-"""Most bytes of a photograph's name: that of a file."""
+"""Limit of the bytes of a photograph's name, as for a file name."""
 
 _ADVICE = "Start a new file: another name for `out`."
 
@@ -44,12 +44,12 @@ class CapturedPairs:
 
     @property
     def path(self) -> Path:
-        """Of the file."""
+        """Path of the file."""
         return self._growing.path
 
     @property
     def attributes(self) -> dict[str, Any]:
-        """Of the file: display, camera, format of the frames."""
+        """Attributes of the file: display, camera, format of the frames."""
         return dict(self._file.attrs)
 
     @property
@@ -93,7 +93,7 @@ class CapturedPairs:
             self._growing.commit()
 
     def append(self, frame: Frame, light: Light, name: str) -> None:
-        """Add a pair. When this returns it is on the disk, and has been read back.
+        """Add a pair. When this returns, the pair is on the disk and has been verified by reading it.
 
         Raises:
             ImageError: the disk is full, or what was read back differs. The pairs before are kept.
@@ -179,7 +179,7 @@ class CapturedPairs:
             self._growing.commit()
 
     def references(self, name: str) -> tuple[list[int], list[float]]:
-        """Pairs before which the reference frames were taken, and the mean of each frame."""
+        """Numbers of the pairs before which the reference frames were taken, and the mean of each frame."""
         group = self._file.get(f"references/{name}")
         if group is None:
             return [], []
@@ -221,7 +221,7 @@ def create_captured(
 
 @contextmanager
 def open_captured(path: Path) -> Iterator[CapturedPairs]:
-    """Open a file to go on.
+    """Open a file to add pairs.
 
     Raises:
         ImageError: damaged, of another command, or another process writes it.

@@ -1,4 +1,4 @@
-"""What every display is to this package: a picture is shown, confirmed, and only then captured."""
+"""Interface of a display: it shows a picture, and confirms it before the capture."""
 
 import time
 from abc import ABC, abstractmethod

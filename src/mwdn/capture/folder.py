@@ -1,4 +1,4 @@
-"""A folder that another program writes frames to, as a camera: tethered cameras, vendors' viewers, scripts."""
+"""A folder as a camera, into which another program writes frames: tethered cameras, vendors' viewers, scripts."""
 
 import os
 import time
@@ -14,16 +14,16 @@ from mwdn.io.listing import FRAMES
 from mwdn.io.raw import Mosaic
 
 POLL_S = 0.05
-"""Seconds between two looks at the folder."""
+"""Seconds between two scans of the folder."""
 
 PATIENCE = 20
-"""Looks at a file that stays the same and cannot be read before it counts as damaged: 1 s."""
+"""Scans of an unchanged file that cannot be read before it counts as damaged: 1 s."""
 
 
 class WatchedFolder(CameraSource):
     """Frames from files, the oldest first; each file once.
 
-    A file counts when two looks find the same size and time, and it can be decoded: half-written files are waited for.
+    A file is complete when two scans find the same size and time, and it can be decoded.
 
     Args:
         folder: not searched for subfolders; hidden files are skipped, so a program can write to ``.name`` and rename.
@@ -97,7 +97,7 @@ class WatchedFolder(CameraSource):
                     if not entry.name.startswith(".") and Path(entry.name).suffix.lower() in FRAMES:
                         status = entry.stat()
                         states[entry.name, status.st_mtime_ns] = status.st_size
-        except OSError as error:  # a network disk that is away, or a file that was removed meanwhile
+        except OSError as error:  # an unavailable network disk, or a file that was removed meanwhile
             if not self.folder.is_dir():
                 raise CameraError(f"`{self.folder}` cannot be read any more: {error.strerror}. Restore it.") from error
         return states

@@ -26,8 +26,8 @@ class Gamma(NamedTuple):
 def fit_gamma(levels: Sequence[int], light: Sequence[float]) -> Gamma:
     """Fit a gamma to grey steps.
 
-    Of ``log y = gamma log v`` the least squares, each step weighted with y^2: noise of y is even, so that of its
-    logarithm falls as 1 / y.
+    Least squares of ``log y = gamma log v``, each step weighted with y^2: the noise of y is constant, so the noise of
+    its logarithm falls as 1 / y.
 
     Args:
         levels: coded numbers, the first 0 and the last 255.

@@ -154,6 +154,6 @@ class HarvestersCamera(CameraSource):
     def close(self) -> None:
         """Stop, and release the camera and its producers."""
         for part, end in ((self._acquirer, "stop"), (self._acquirer, "destroy"), (self._harvester, "reset")):
-            with suppress(Exception):  # the camera may be gone
+            with suppress(Exception):  # the camera may be disconnected
                 getattr(part, end)()
         self._acquirer = self._harvester = None

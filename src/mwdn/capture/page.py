@@ -83,7 +83,7 @@ class PageDisplay(Display):
             raise DisplayError("The display page could not be served. Choose another `port`.")
 
     def wait(self, seconds: float | None = None) -> Screen:
-        """Wait for a page on which a person has pressed start; without end unless ``seconds`` are given.
+        """Wait until a page is open and a person has pressed start; forever unless ``seconds`` are given.
 
         Raises:
             DisplayError: none was opened and started in time.

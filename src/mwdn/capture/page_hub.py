@@ -34,7 +34,7 @@ REPLACED = 4000
 
 
 class Hub:
-    """Passes pictures from the session's thread to the page, and its answers back."""
+    """Passes pictures from the session's thread to the page, and the page's answers back."""
 
     def __init__(self, token: str, cm: dict[str, float], *, any_host: bool) -> None:
         self.token, self.cm, self.any_host = token, cm, any_host
@@ -114,7 +114,7 @@ class Hub:
                 await self._take(json.loads(await page.receive_text()))
         except (WebSocketDisconnect, RuntimeError):
             pass
-        except (ValueError, KeyError, TypeError, RecursionError):  # not from our page
+        except (ValueError, KeyError, TypeError, RecursionError):  # not sent by our page
             await page.close(1003)
         finally:
             if self._page is page:

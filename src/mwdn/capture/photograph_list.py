@@ -1,4 +1,4 @@
-"""The photographs of a session: their order, and each as the display is sent it."""
+"""The photographs of a session: their order, and their conversion for the display."""
 
 import random
 from pathlib import Path

@@ -1,7 +1,7 @@
 """Raspberry Pi cameras by picamera2, raw.
 
-Two traps are refused or avoided here. The Pi's usual raw formats are packed (``SRGGB10_CSI2P``) or compressed
-(``PISP_COMP1``): read as numbers they are noise. And the order of the colours depends on how the sensor is turned or
+This module avoids two errors. The Pi's usual raw formats are packed (``SRGGB10_CSI2P``) or compressed (``PISP_COMP1``):
+read as numbers they are noise, so they are refused. And the order of the colours depends on how the sensor is turned or
 flipped, so it is that of the configured stream, not of the sensor's data sheet.
 """
 
@@ -126,6 +126,6 @@ class PiCamera(CameraSource):
 
     def close(self) -> None:
         """Stop and release the camera."""
-        with suppress(Exception):  # it may be gone
+        with suppress(Exception):  # it may be disconnected
             self._camera.close()
         self._camera = None

@@ -1,4 +1,4 @@
-"""What the display of the simulated rig plays: a folder of pictures, or a video."""
+"""Pictures played on the display of the simulated rig: a folder of pictures, or a video."""
 
 import time
 from abc import ABC, abstractmethod
@@ -36,7 +36,7 @@ class PlaylistOptions:
 
 
 class Playlist(ABC):
-    """Pictures that are shown one after the other, again and again, from when the first is asked for.
+    """Pictures that are shown one after the other in a loop, which starts with the first call of `entry`.
 
     Args:
         size: height and width of the display.
@@ -53,7 +53,7 @@ class Playlist(ABC):
 
     @property
     def entry(self) -> int:
-        """Number of the picture whose turn it is."""
+        """Number of the picture that is shown now."""
         if self._start is None:
             self._start = self._clock()
         return int((self._clock() - self._start) / self.seconds) % self.count
@@ -103,12 +103,12 @@ class Video(Playlist):
 
     def read(self, entry: int) -> Picture:
         """One frame, its largest central part with the display's proportions."""
-        if entry < self._position:  # from the start again
+        if entry < self._position:  # restart the video
             self._video, self._position = self._open(), 0
         while self._position < entry and self._video.grab():
             self._position += 1
         done, frame = self._video.read()
-        if not done and self._position:  # fewer frames than its header says
+        if not done and self._position:  # fewer frames than the header states
             self.count, self._position, self._video = self._position, 0, self._open()
             done, frame = self._video.read()
         self._position += 1

@@ -1,4 +1,4 @@
-"""Frames for `mwdn calibrate` at the start of a session: a point on the display, darkness, and the white display.
+"""Frames for `mwdn calibrate` at the start of a session: of a point on the display, a black and a white display.
 
 They are stored in the session's file, each group (K, H, W, C) of `GROUPS` with its exposure:
 
@@ -46,7 +46,7 @@ _TRIES = 12
 
 
 class Shooting(NamedTuple):
-    """How a session shows and grabs.
+    """Functions of a session to show pictures and grab frames.
 
     Args:
         camera: of the session; its exposure is changed, and set back in the end.
@@ -117,7 +117,7 @@ def _series(shooting: Shooting, first: Frame, count: int) -> list[Frame]:
 
 
 def _add(pairs: CapturedPairs, name: str, frames: list[Frame], exposure_s: float) -> None:
-    """Store frames that were to have this exposure.
+    """Store frames, after a check that they have this exposure.
 
     Raises:
         CameraError: they have another one: the camera was opened again meanwhile, or does not take this exposure.
@@ -144,7 +144,7 @@ def _exposures(shooting: Shooting, table: PointTable, exposure_s: float) -> list
 
 
 def _check_contrast(pairs: CapturedPairs, dark: Frame, table: PointTable) -> None:
-    """Refuse a point that is faint beside what a dark display adds.
+    """Raise an error for a point that is faint compared with the light of a dark display.
 
     Raises:
         CameraError: it is.

@@ -6,14 +6,14 @@ from typing import Any
 import numpy.typing as npt
 
 KEPT_BYTES = 2**27
-"""Of all prepared frames, 218 of 320 x 320 x 3 at 16 bits; beyond them, frames are exposed anew."""
+"""Limit of the bytes of all prepared frames, 218 of 320 x 320 x 3 at 16 bits; further frames are not stored."""
 
 Key = tuple[int, float, float]
 """Entry of the playlist, exposure and gain."""
 
 
 class PreparedFrames:
-    """Frames by what they show.
+    """Frames by the picture, exposure and gain.
 
     Args:
         count: frames of each picture; 0 keeps none.
@@ -25,7 +25,7 @@ class PreparedFrames:
         self._turn, self._bytes = 0, 0
 
     def clear(self) -> None:
-        """Forget all frames: the display shows another picture."""
+        """Drop all frames, because the display shows another picture."""
         self._kept, self._turn, self._bytes = {}, 0, 0
 
     def next(self, key: Key, expose: Callable[[], npt.NDArray[Any]]) -> npt.NDArray[Any]:

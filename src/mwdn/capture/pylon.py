@@ -131,7 +131,7 @@ class PylonCamera(CameraSource):
 
     def close(self) -> None:
         """Stop and release the camera."""
-        with suppress(Exception):  # it may be gone
+        with suppress(Exception):  # it may be disconnected
             self._camera.Close()
         self._camera = None
 

@@ -91,9 +91,9 @@ class Rig(CameraSource):
         self._before, self._stale = self._shown, 0
 
     def show(self, picture: Picture, *, lamp: float = 0.0) -> None:
-        """Show a picture (H, W, 3) of the display's size, with the light of before in the next `latency` frames.
+        """Show a picture (H, W, 3) of the display's size; the next `latency` frames have some light of the last one.
 
-        A lamp in its middle, 0.1 cm wide, has ``lamp`` times the light of as much of a white display.
+        A lamp in its middle, 0.1 cm wide, has ``lamp`` times the light of the same area of a white display.
 
         Raises:
             ShapeError: it has another size.

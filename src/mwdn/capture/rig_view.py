@@ -1,4 +1,4 @@
-"""What a camera sees of a flat display: its light, projected to the camera's pixels."""
+"""Projection of a flat display's light to a camera's pixels."""
 
 import math
 
@@ -25,7 +25,8 @@ def view(light: FloatFrame, homography: Projection, size: Size) -> Scene:
     """
     import cv2
 
-    # Display pixels per sample, at the display's middle: shrunk first, so that none is skipped.
+    # Display pixels per sample, at the display's middle: if there are several, the display is downsampled first, so
+    # that none is skipped.
     shrink = max(int(1 / (_magnification(homography, light.shape[:2]) * SAMPLES)), 1)
     if shrink > 1:
         height, width = (length // shrink * shrink for length in light.shape[:2])

@@ -1,4 +1,4 @@
-"""A capture session: show a picture, let it settle, grab a frame, append the pair; for days, and on after any stop."""
+"""A capture session: show a picture, let it settle, grab a frame, append the pair. It can be stopped and continued."""
 
 import json
 import math
@@ -23,13 +23,13 @@ from mwdn.data.pair_writer import check_path
 from mwdn.errors import CameraError, ImageError, ParameterError
 
 SATURATED = 1e-3
-"""Fraction of a white frame's pixels that may be saturated: hot ones."""
+"""Fraction of a white frame's pixels that may be saturated (hot pixels)."""
 
 CONTRAST = 0.005
-"""Least difference of white and dark frames' means, over the full scale."""
+"""Smallest difference of the means of white and dark frames, over the full scale."""
 
 GAMMA_ERROR = 0.03
-"""Largest difference of a grey step from the fit that is not worth a warning."""
+"""Largest difference of a grey step from the fit without a warning."""
 
 ROOM = 1.02
 """Bytes of a file over those of its pictures."""
@@ -176,7 +176,7 @@ class Session:
             if last:
                 raise
 
-    # What is known about camera and display
+    # Calibration of camera and display
 
     def _calibrate(self, pairs: CapturedPairs) -> None:
         """Capture the point source, grey steps and patterns, unless an earlier run has."""

@@ -1,4 +1,4 @@
-"""What every camera is to this package: opened, configured, read frame by frame, closed."""
+"""Interface of a camera: opened, configured, read frame by frame, closed."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
@@ -90,7 +90,7 @@ class CameraSource(ABC):
 
     @abstractmethod
     def read(self) -> Frame:
-        """Wait for the next frame. A camera that is faster than its reader drops the older frames, not the newer.
+        """Wait for the next frame. If the camera is faster than its reader, the oldest frames are dropped.
 
         Raises:
             CameraError: the camera is not open, was disconnected, or delivers no frame in time.

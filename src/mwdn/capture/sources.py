@@ -1,4 +1,4 @@
-"""Every kind of camera by its name, and the one string that opens one: ``aravis:Basler-2134,pixel_format=Mono12``."""
+"""Kinds of cameras by name, and the string that opens a camera: ``aravis:Basler-2134,pixel_format=Mono12``."""
 
 import re
 import warnings
@@ -52,7 +52,7 @@ SOURCES: Registry[Kind] = Registry(
     accepts=lambda entry: isinstance(entry, Kind) and callable(entry.place),
     must_be="a `mwdn.capture.Kind` of a class or function that returns a `mwdn.capture.CameraSource`",
 )
-"""Kinds of cameras by name, those of plugins included. Another one of this package is one line above and one file."""
+"""Kinds of cameras by name, those of plugins included. A new one in this package needs one line above and one file."""
 
 
 def open_source(text: str, **options: Any) -> CameraSource:  # noqa: ANN401

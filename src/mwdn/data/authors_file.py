@@ -7,11 +7,11 @@ from mwdn.data.pair_writer import PairWriter, Shape
 from mwdn.types import Frame
 
 AUTHORS_NAMES = {"measurement": "blur", "scene": "gt"}
-"""Their names of a file's data sets."""
+"""Names of the data sets in the authors' files."""
 
 
 class AuthorsWriter(PairWriter):
-    """The authors' file that is being written: ``blur`` and ``gt``, (N, 3, H, W), uint8, blue first.
+    """Writer of the authors' file: ``blur`` and ``gt``, (N, 3, H, W), uint8, blue first.
 
     Their training divides it by position: the first tenth is the test, the second the validation.
 

@@ -4,8 +4,7 @@ The data sets of LenslessPiCam on the Hugging Face hub have the columns ``lensle
 ``mask_label``, a number, where the pattern changes from pair to pair; the patterns in ``masks/mask_NUMBER.npy``, or one
 in ``mask_pattern.npy``; and, where captures were taken in the light of a room, a picture of that light alone.
 
-A camera has one PSF, and so has a file of pairs: each pattern gets its own file, with the PSF that `mwdn.optics`
-computes for it.
+A file of pairs has one PSF, so each pattern gets its own file, with the PSF that `mwdn.optics` computes for it.
 
 References:
     E. Bezzam et al., "Towards Robust and Generalizable Lensless Imaging with Modular Learned Reconstruction" (2025).
@@ -189,7 +188,7 @@ def list_digicam(path: Path, captures: str, scenes: str, *, background: str) -> 
         folder = file.parent if path.is_file() else folder
         rows = range(shard.count)
         sources += [Source(f"{file.name} row {n}", partial(_read_row, shard, n), _label(labels[n])) for n in rows]
-    if not path.exists():  # downloaded: the patterns lie beside the folder of the shards
+    if not path.exists():  # downloaded: the patterns are beside the folder of the shards
         folder = next((p for p in file.parents if (p / "masks").is_dir() or (p / PATTERN).is_file()), file.parent)
     return Listing(sources, refused), folder
 

@@ -1,4 +1,4 @@
-"""HDF5 files: a full disk is noticed at the pair that no longer fits; nothing outside the file is ever read."""
+"""HDF5 files: a full disk is reported at the pair that no longer fits; nothing outside the file is ever read."""
 
 import io
 import math
@@ -12,17 +12,18 @@ from mwdn.errors import ImageError, MwdnError, reason
 from mwdn.io.reading import open_regular
 
 PICTURE_BYTES = 2**29
-"""Most bytes of one picture, and of one chunk, which is decompressed as a whole: 512 MiB, 44 million RGB floats."""
+"""Limit of the bytes of one picture, and of one chunk, which is decompressed as a whole: 512 MiB, 44 million RGB
+floats."""
 
 Numbers = str | int | float
 """Value of an attribute."""
 
 
 class CheckedFile(io.FileIO):
-    """The file that HDF5 writes to; an error of the disk is kept for `check`, and HDF5 never sees it.
+    """The file that HDF5 writes to; errors of the disk are hidden from HDF5 and kept for `check`.
 
     After a write that failed, HDF5 either calls the file complete, with zeros for the data that were lost, or cannot
-    close it and ends the process with a segmentation fault. So it is told that every write succeeded, and nothing is
+    close it and ends the process with a segmentation fault. So every write reports success to HDF5, and nothing is
     written after the first error.
     """
 
@@ -34,7 +35,7 @@ class CheckedFile(io.FileIO):
         size = rest.nbytes
         try:
             while rest.nbytes and self.error is None:
-                rest = rest[super().write(rest) :]  # a disk that is almost full takes a part
+                rest = rest[super().write(rest) :]  # a disk that is almost full writes only a part
         except BaseException as error:
             self.error = error
         return size
@@ -78,7 +79,7 @@ def as_damage(what: str, advice: str) -> Iterator[None]:
         yield
     except MwdnError:
         raise
-    except Exception as error:  # h5py's and pyarrow's for damaged files are of a dozen kinds
+    except Exception as error:  # h5py and pyarrow raise a dozen kinds of errors for damaged files
         raise ImageError(f"{what}: {reason(error)}. {advice}") from error
 
 
@@ -108,7 +109,7 @@ def open_hdf5(path: Path, advice: str) -> Any:  # noqa: ANN401
 
 
 class _CheckedHeaps(io.FileIO):
-    """The file that HDF5 reads a header from: a damaged heap of texts, in which it would search forever, is refused."""
+    """The file that HDF5 reads a header from; refuses a damaged heap of texts, in which HDF5 would search forever."""
 
     def readinto(self, buffer: Any, /) -> int:  # noqa: ANN401
         count = super().readinto(buffer)
@@ -237,7 +238,8 @@ def read_attributes(path: Path, file: Any, advice: str) -> dict[str, Numbers]:  
     with as_damage(f"The attributes of `{path}` cannot be read", advice):
         for name in (each for each in file.attrs if isinstance(each, str)):  # not UTF-8: bytes
             stored = file.attrs.get_id(name)
-            # HDF5 crashes on a sequence of numbers whose length is damaged: a type that damage makes of a text's.
+            # HDF5 crashes on a sequence of numbers whose length is damaged; damage can turn the type of a text into
+            # this one.
             if stored.shape == () and (stored.dtype.kind in "biufSU" or h5py.check_string_dtype(stored.dtype)):
                 value = file.attrs[name]
                 value = value.item() if hasattr(value, "item") else value

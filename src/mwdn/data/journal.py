@@ -1,15 +1,15 @@
-"""HDF5 files that grow for days: whatever ends the process or the power, the last committed state is on the disk.
+"""HDF5 files that grow for days: after a crash or a power failure, the last committed state is on the disk.
 
-HDF5 changes a file in several places for each new row: killed between two of them, it leaves a file that cannot be
-opened. Here HDF5 writes to a `JournalledFile`. New bytes go to the end of the file at once, where nothing refers to
-them yet. Changes of earlier bytes are held back until `Growing.commit`, which
+HDF5 changes a file in several places for each new row. A process that is killed between two of these changes leaves a
+file that cannot be opened. Here HDF5 writes to a `JournalledFile`. New bytes go to the end of the file at once, where
+nothing refers to them yet. Changes of earlier bytes are held back until `Growing.commit`, which
 
 1. flushes the file: the new bytes are on the disk;
 2. writes all changes to a journal beside the file, with a checksum, and flushes it;
 3. applies them to the file.
 
 A process that is killed before step 2 is complete leaves the state before; after it, the next `open_growing` finds the
-journal and repeats step 3, which does no harm a second time.
+journal and repeats step 3, which is idempotent.
 
 References:
     J. Gray and A. Reuter, Transaction Processing (1993), chapter 10: write-ahead logging.
@@ -34,7 +34,8 @@ from mwdn.io.files import check_regular
 from mwdn.io.reading import open_regular, read_bytes
 
 IDENTITY = "session"
-"""Attribute with a random text: ties the journal to its file, and tells a file that has grown from another one."""
+"""Attribute with a random text: links the journal to its file, and distinguishes a file that has grown from another
+one."""
 
 _HEAD = 2**16  # bytes at the start of a file, where HDF5 keeps the first attribute of the root group
 _MOST = 2**30  # bytes of a journal: far more than HDF5's tables of a million rows
@@ -70,7 +71,7 @@ class JournalledFile(io.FileIO):
         rest = given[len(held) :]
         try:
             while rest.nbytes and self.error is None:
-                rest = rest[super().write(rest) :]  # a disk that is almost full takes a part
+                rest = rest[super().write(rest) :]  # a disk that is almost full writes only a part
         except BaseException as error:
             self.error = error
         return given.nbytes
@@ -102,7 +103,7 @@ class JournalledFile(io.FileIO):
             raise self.error
 
     def apply(self) -> None:
-        """Write the changes that were held back; what has been appended is now committed, too."""
+        """Write the changes that were held back; the appended bytes are then committed, too."""
         for place, data in self.changes:
             self.seek(place)
             rest = memoryview(data)
@@ -232,7 +233,7 @@ def _finished(growing: Growing) -> Iterator[Growing]:
         yield growing
     finally:
         committed = disk.committed
-        disk.committed = sys.maxsize  # HDF5 writes what was not committed to nowhere
+        disk.committed = sys.maxsize  # HDF5's uncommitted changes are not written
         growing.file.close()
         os.ftruncate(disk.fileno(), committed)
         os.fsync(disk.fileno())
@@ -274,7 +275,7 @@ def _read_journal(journal: Path) -> tuple[bytes, int, Changes] | None:
 
 
 def _flush_folder(folder: Path) -> None:
-    """A new name is on the disk once its folder is."""
+    """Flush a folder, so that a new name in it is on the disk."""
     with suppress(OSError):  # Windows cannot
         number = os.open(folder, os.O_RDONLY)
         try:

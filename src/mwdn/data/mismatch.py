@@ -118,7 +118,8 @@ class Mismatch:
 
 
 REAL = tuple(part.name for part in fields(Mismatch) if part.kw_only)
-"""The options that real captures need, off by default. Only append: a place in this list numbers a random stream."""
+"""Options for real captures, off by default. Only append: the position in this list is the number of a random
+stream."""
 
 EXACT = Mismatch(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """A camera that equals its calibration."""

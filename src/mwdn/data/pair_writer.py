@@ -51,7 +51,7 @@ def check_path(path: Path) -> None:
 
 
 class PairWriter:
-    """A file of pairs that is being written, from `PairFile.create`.
+    """Writer of a file of pairs, from `PairFile.create`.
 
     It has a hidden name in the folder of ``path`` until the ``with`` statement ends without an exception.
     """
@@ -148,7 +148,7 @@ class PairWriter:
     def _write(self, pair: dict[str, Frame]) -> None:
         for name, pixels in pair.items():
             self._data[name].resize(self._length + 1, axis=0)
-            # Past HDF5's cache of chunks, which would write the pair some pairs later; three times as fast.
+            # Bypass HDF5's cache of chunks, which would write the pair later; also three times as fast.
             self._data[name].id.write_direct_chunk((self._length, 0, 0, 0), np.ascontiguousarray(self._stored(pixels)))
         if self._disk is not None:
             self._disk.check()

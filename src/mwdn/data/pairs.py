@@ -89,7 +89,7 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
         Raises:
             ParameterError: wrong suffix, shape, type or attribute.
             ImageError: the path is a folder.
-            ShapeError: the PSF has other axes.
+            ShapeError: the PSF has wrong axes.
         """
         return PairWriter(Path(path), (measurement_shape, scene_shape), dtype, dict(attributes or {}), psf)
 

@@ -1,4 +1,4 @@
-"""What real captures have beyond a changed PSF: the options of [mismatch] that are off by default, drawn for a batch.
+"""Real cameras beyond a changed PSF: the options of [mismatch] that are off by default, drawn for a batch.
 
 Each option of each sample has a random generator of its own: switching one on changes no other draw.
 """
@@ -25,7 +25,7 @@ STREAM = 16
 """Number of the first option's random stream; `mwdn.data.cameras` has 7."""
 
 POINTS = ((0, 0), (1, 0), (0, 1), (1, 1), (1, -1))
-"""Points (down, right) at which PSFs off the axis are computed: of a grid of 3 x 3, opposite ones have equal PSFs."""
+"""Points (down, right) of a 3 x 3 grid at which PSFs off the axis are computed; opposite points have equal PSFs."""
 
 ORDER = 4
 """Gain over the aperture, and the outline between two depths: cosines of up to one and a half periods a side."""
@@ -100,13 +100,13 @@ class RealCamera:
         return light + ((which < part) * current).to(light)
 
     def sensors(self, sensor: Sensor) -> list[Sensor]:
-        """The sensor of each sample: some are read out with 8 bits; files of 8 bits are another option."""
+        """The sensor of each sample: some are read out with 8 bits (8-bit files are another option)."""
         coarse = replace(sensor, bit_depth=min(8, sensor.bit_depth))
         chosen = zip(self._chosen("eight_bit"), self._chosen("gamma_coded"), strict=True)
         return [coarse if eight and not coded else sensor for eight, coded in chosen]
 
     def decoded(self, captures: Image) -> Image:
-        """Some captures as files of gamma 2.2 that are decoded with a slightly wrong gamma."""
+        """Store some captures with a gamma of 2.2 and decode them with a slightly wrong gamma."""
         if not self.mismatch.gamma_coded:
             return captures
         error = self.mismatch.signed(self._generators("gamma_error"), self.mismatch.gamma_error).flatten().tolist()

@@ -22,7 +22,7 @@ def paper_display(scene: Size, frame: Size) -> Size | None:
 
 
 def centre(scene: Size, frame: Size) -> Size:
-    """The middle of the frame, for PhlatCam, whose place is not published."""
+    """The middle of the frame, for PhlatCam, whose authors do not publish the place."""
     return (frame[0] - scene[0]) // 2, (frame[1] - scene[1]) // 2
 
 

@@ -71,7 +71,7 @@ class Shard:
             groups = [self._file.metadata.row_group(i) for i in range(self._file.metadata.num_row_groups)]
             rows = [group.num_rows for group in groups]
             self.count, self._ends = sum(rows), np.cumsum(rows, dtype=np.int64)
-            # Not by columns: pyarrow ends the process with an abort for the statistics of a damaged one.
+            # Not by columns: pyarrow aborts the process on the statistics of a damaged column.
             largest = max((group.total_byte_size for group in groups), default=0)
         if not set(self.columns) <= set(names):
             advice = "Name two of them: `--captures lensless --scenes lensed`."

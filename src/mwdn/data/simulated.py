@@ -1,4 +1,4 @@
-"""Pairs simulated during training: photographs placed in scenes, seen by a camera slightly unlike its calibration.
+"""Pairs simulated during training: photographs in scenes, captured by a camera that differs from its calibration.
 
 Every sample has its own random generator, seeded by (seed, number of the sample): a run makes the same pairs for any
 number of processes and any batch size.
@@ -76,7 +76,7 @@ class Placement:
 
 
 class Batch(NamedTuple):
-    """Samples for a network: its two inputs and the output it should give.
+    """Samples for a network: its two inputs and its target.
 
     Args:
         measurement: (B, C, H, W).

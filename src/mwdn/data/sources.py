@@ -125,7 +125,7 @@ def list_pair_file(path: Path, captures: str, scenes: str) -> Listing:
     Raises:
         ImageError: no such file, or not one of pairs.
     """
-    count = len(PairFile(path))  # refuses what is no file of pairs
+    count = len(PairFile(path))  # raises if it is not a file of pairs
     file = open_hdf5(path, COPY_AGAIN)
 
     def load(row: int) -> tuple[Frame, Frame]:

@@ -1,4 +1,4 @@
-"""A camera's own captures to learn from, without their scenes."""
+"""Captures of a camera without their scenes, for self-supervised training."""
 
 import hashlib
 from dataclasses import dataclass, field
@@ -153,5 +153,5 @@ class UnpairedCaptures:
         return torch.stack(noise).to(self.measurements)
 
     def _generator(self, number: int, purpose: int = 3) -> torch.Generator:
-        """A generator of its own for each sample and purpose."""
+        """A separate generator for each sample and purpose."""
         return seeded(4 * (self.seed * 1_000_003 + number) + purpose)

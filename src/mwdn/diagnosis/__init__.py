@@ -1,4 +1,4 @@
-"""What may be wrong with a PSF, a capture or a picture, and what to do about it."""
+"""Checks of PSFs, captures and pictures: what may be wrong, and what to do about it."""
 
 from mwdn.diagnosis.resolution import coarsest_bin
 from mwdn.diagnosis.verdict import Verdict

@@ -1,4 +1,4 @@
-"""What may be wrong with a capture: all checks of one raw frame."""
+"""All checks of one raw frame."""
 
 import torch
 from torch.nn import functional as F
@@ -15,7 +15,7 @@ DIM = 0.03
 """Fraction of the full scale that the brightest thousandth of a capture must reach."""
 
 FAINT = 0.05
-"""Fraction of the light that may be ambient without a word."""
+"""Fraction of the light that may be ambient without a remark."""
 
 
 def examine_capture(frame: Frame, calibration: Calibration, *, for_viewing: bool = False) -> tuple[Verdict, ...]:
@@ -30,7 +30,7 @@ def examine_capture(frame: Frame, calibration: Calibration, *, for_viewing: bool
     """
     raw = mosaic(frame, calibration)
     verdicts = *(check(frame, calibration) for check in (saturation, darkness, noise, ambient_light)), raw
-    if raw.state == "doubt":  # between pixels of other colours the noise of a level cannot be seen: first the mosaic
+    if raw.state == "doubt":  # the noise test needs a known mosaic
         return verdicts
     return *verdicts, gamma(frame, calibration, for_viewing=for_viewing)
 

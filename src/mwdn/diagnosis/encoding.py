@@ -5,10 +5,10 @@ into ``y = x^(1/g)`` and its variance into ``(dy/dx)^2 x = y^(2 - g) / g^2``: fo
 slope of log(variance) against log(level) is 1 for linear captures and -0.2 for coded ones; read noise makes it 0.6 and
 -0.8. Detail of the picture adds a variance that grows with the level, and rounding to 8 bits or JPEG hides the noise.
 
-**Misfit.** Light adds up, so a scene explains a linear capture through the PSF, and not its power. With decoded and
-stored numbers in turn, a non-negative scene is fitted at a quarter of the size; the part of the capture's detail that
-is left is compared. An even background does not count as detail. The PSF's file may be coded, too, so the PSF is tried
-as stored and decoded, and the better one counts.
+**Misfit.** Light adds up linearly, so a scene explains a linear capture through the PSF, but not a power of the
+capture. With decoded and stored numbers in turn, a non-negative scene is fitted at a quarter of the size; the part of
+the capture's detail that is left is compared. An even background does not count as detail. The PSF's file may be coded,
+too, so the PSF is tried as stored and decoded, and the better one counts.
 
 **File.** Cameras and programs write gamma-coded JPEGs, practically always.
 
@@ -50,7 +50,7 @@ SMALLEST = 64
 
 SURE = 1.3
 """Smallest logarithm of the likelihood ratio that decides: 1.1 gave 4 wrong answers of 200 with seed 28, 1.3 gives 3,
-and none of 200 with seed 29, which chose nothing."""
+and none of 200 with seed 29, which was not used to choose it."""
 
 FOR_VIEWING = -0.8
 """Logarithm of the likelihood ratio of a file type for viewing. Of 90 simulated and 60 real JPEGs, coded ones have
@@ -85,7 +85,7 @@ class NoiseSlope(NamedTuple):
 
 
 class Misfits(NamedTuple):
-    """What the best scenes leave of a capture's detail.
+    """Part of a capture's detail that the best scenes leave unexplained.
 
     Args:
         linear_psf: part of the detail of the numbers as stored, and of them decoded from sRGB, if the PSF is linear.
@@ -154,7 +154,7 @@ def gamma(frame: Frame, calibration: Calibration, *, for_viewing: bool = False) 
 
 
 def noise_slope(frame: Frame, calibration: Calibration) -> NoiseSlope:
-    """Measure it in the green pixels, in the middle of the frame."""
+    """Measure the slope in the green pixels, in the middle of the frame."""
     y, step = _green(frame, calibration.frames.mosaic)
     d = y[1:, 1:] - y[:-1, 1:] - y[1:, :-1] + y[:-1, :-1]  # four times the variance of white noise
     variance, level = _blocks(d * d / 4).mean((1, 3)).ravel(), _blocks(y[:-1, :-1]).mean((1, 3)).ravel()
@@ -185,7 +185,7 @@ def misfits(frame: Frame, calibration: Calibration) -> Misfits:
     energy = detail.square().sum(1)
     if energy.amin() <= 0:
         return Misfits((1.0, 1.0), (1.0, 1.0), 0.0)
-    # Binned, not halved: what the filter of `halve` blurs is the scene.
+    # Binned, not halved: the blur by `halve` in the capture counts as a blur of the scene, not of the PSF.
     psfs = [bin_pixels(_middle(psf), 4 * factor) for psf in as_linear_and_coded(calibration)]
     left = (fine_detail(solve(both, psf, _LEVELS).residual).flatten(1).square().sum(1) for psf in psfs)
     linear_psf, coded_psf = ((energies / energy).clamp(min=1e-6).tolist() for energies in left)

@@ -4,7 +4,7 @@ from mwdn.diagnosis.verdict import Verdict
 from mwdn.io.exif import TURNS
 
 _BACK = TURNS | {6: TURNS[8], 8: TURNS[6]}
-"""What undoes a turn of `TURNS`: all but the two quarter turns undo themselves."""
+"""Inverse of each turn of `TURNS`; all but the two quarter turns are their own inverse."""
 
 
 def exif_turn(capture: int, psf: int) -> Verdict:
@@ -12,7 +12,7 @@ def exif_turn(capture: int, psf: int) -> Verdict:
 
     The tag moves no pixels, and frames are read as the sensor stored them, so different tags alone do no harm: the
     camera was held in another way. But many programs that save a picture turn its pixels and reset the tag to 1. Then
-    one of the two frames no longer is what the sensor saw.
+    one of the two frames is not as the sensor stored it.
 
     Args:
         capture: EXIF orientation of its file, from `mwdn.io.exif.orientation`; 1 is upright.

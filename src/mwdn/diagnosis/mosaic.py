@@ -78,7 +78,7 @@ class Peaks(NamedTuple):
 def mosaic(frame: Frame, calibration: Calibration) -> Verdict:
     """Whether a frame is the raw data of a colour sensor, and whether ``--mosaic`` says so.
 
-    The value is one of "rggb|bggr" and "grbg|gbrg": which of the two, the frame cannot tell.
+    The value is "rggb|bggr" or "grbg|gbrg": the frame does not show which order of such a pair is right.
 
     Args:
         frame: (H, W, C), numbers as stored.

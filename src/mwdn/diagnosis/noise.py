@@ -30,8 +30,9 @@ def noise_bounds(measurement: Measurement) -> NoiseBounds:
 
     White noise is estimated from the finest detail, twice: of single pixels, and of means of 2 x 2, which have half of
     it. Noise that is correlated, by an interpolated mosaic, is smaller in single pixels only, and a sharp capture has
-    detail of its own in the means. So the two are bounds. JPEG removes fine noise and leaves its coarse part: no upper
-    bound. Nor have frames of few levels, dark or saturated ones, whose rounding is no white noise.
+    detail of its own in the means. So the two are bounds. There is no upper bound for JPEG, which removes fine noise
+    and leaves its coarse part, and for frames of few levels (dark or saturated ones), whose rounding is not white
+    noise.
 
     Args:
         measurement: (1, C, H, W).

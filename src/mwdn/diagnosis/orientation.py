@@ -91,8 +91,8 @@ def fit_orientations(
 ) -> OrientationFit:
     """Fit the best scene through a PSF in each orientation.
 
-    Quarter turns are tried if no half turn or mirror image leads clearly; then the PSF without its pose, for the pose
-    of a PSF in a wrong orientation is none.
+    If no half turn or mirror image leads clearly, quarter turns are tried, and then the PSF without its pose, because a
+    pose estimated in a wrong orientation is meaningless.
 
     Args:
         measurement: (1, C, H, W).

@@ -1,18 +1,18 @@
 """Whether the PSF's file is gamma-coded, from what it explains of a capture with the stored and with decoded numbers.
 
-Light adds up, so only a linear PSF explains a linear capture. But decoding makes any PSF sharper, and a sharper PSF
-explains more fine detail of any capture, even mirrored, when it belongs to no camera. So what counts is how much the
-best of its half turns and mirror images leads the second best, as in `mwdn.diagnosis.sizes`; with m the misfits of
-`mwdn.solvers.spectral_misfit`,
+Light adds up linearly, so only a linear PSF explains a linear capture. But decoding makes any PSF sharper, and a
+sharper PSF explains more fine detail of any capture, even a mirrored PSF, which belongs to no camera. So what counts is
+how much the best of its half turns and mirror images leads the second best, as in `mwdn.diagnosis.sizes`; with m the
+misfits of `mwdn.solvers.spectral_misfit`,
 
     lead = log(second smallest m / smallest m)
     score = lead(decoded) - lead(stored) - log(smallest m(decoded) / smallest m(stored)) / 10
 
-Decoding also removes haze, which the PSF's file may have too much of. Then coarse detail is explained worse, so for a
+Decoding also removes haze, of which the PSF's file may have too much. Then coarse detail is explained worse, so for a
 coded PSF the misfits at a quarter of the size (`mwdn.diagnosis.encoding`) must agree: with q the logarithm of the
 linear PSF's over the coded one's, the score is sqrt(score q) at most, and 0 if q is negative.
 
-A coded PSF above a bright background, or in a noisy capture, hardly differs from a linear one: it cannot be told.
+A coded PSF above a bright background, or in a noisy capture, hardly differs from a linear one and is not detected.
 """
 
 import math

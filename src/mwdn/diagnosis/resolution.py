@@ -1,4 +1,4 @@
-"""Which resolution a camera's captures are worth reconstructing at."""
+"""The resolution at which a camera's captures should be reconstructed."""
 
 from mwdn.calibration import Calibration
 from mwdn.diagnosis.verdict import Verdict

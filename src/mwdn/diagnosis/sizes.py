@@ -6,8 +6,8 @@ others (`mwdn.solvers.spectral_misfit`):
 
     lead(bin) = second smallest log misfit - smallest log misfit, over the PSF's orientations
 
-At a wrong bin the PSF is no better than its mirror images, which belong to no camera, and the lead is about 0. So bins
-are comparable, though the misfit itself is smaller for every smaller, more compact PSF.
+At a wrong bin the PSF is no better than its mirror images, which belong to no camera, and the lead is about 0. So leads
+can be compared between bins, although the misfit itself falls with the size of the PSF.
 """
 
 import math

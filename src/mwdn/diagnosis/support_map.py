@@ -1,14 +1,14 @@
-"""Where to trust a picture: which of its parts the capture supports.
+"""Map of the parts of a picture that the capture supports.
 
 With the residual r = d - H x of the capture's detail d, each part x_B of the picture x (its gain g fitted) is left out:
 
     Delta_B = |r + H x_B|^2 - |r|^2 = 2 <H^T r, x_B> + <x_B, H^T H x_B>
     support_B = Delta_B / (Delta_B + E_B),    E_B = n_B s^2
 
-Delta_B is how much more of the detail would be unexplained. E_B is what noise and errors of the PSF, the residual,
-could be fitted by: s^2 is its mean square after the matched filter H^T, relative to that of white noise of variance 1,
-and n_B the number of degrees of freedom that the PSF resolves in a part. Support is 1 where the capture demands what
-the picture shows, and 0 where it does not: an invented blob, or darkness.
+Delta_B is how much more of the detail would be unexplained. E_B is how much of the residual (noise and errors of the
+PSF) a part could fit: s^2 is the residual's mean square after the matched filter H^T, relative to that of white noise
+of variance 1, and n_B the number of degrees of freedom that the PSF resolves in a part. Support is 1 where the capture
+requires the content of the picture, and 0 where it does not: an invented blob, or darkness.
 
 All parts together cost one correlation and one small transform for each: within a part, H^T H is the PSF's
 autocorrelation up to its size. Parts are Hann windows that overlap by half.

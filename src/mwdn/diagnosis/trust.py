@@ -22,7 +22,7 @@ LEAST_POSSIBLE = 0.03
 
 @dataclass(frozen=True)
 class Trust:
-    """What PSF, capture and picture say about each other.
+    """Consistency of PSF, capture and picture.
 
     Args:
         consistency: how much of the capture the picture reproduces.
@@ -49,7 +49,7 @@ class Trust:
         """A one-line summary, which says so if the picture or the PSF cannot be judged."""
         psf, picture = self.verdicts
         text = self.consistency.sentence
-        if picture.state == "unknown":  # neither do the numbers of noise mean anything, nor does the pose that fits it
+        if picture.state == "unknown":  # numbers and pose are then fits to noise
             text = picture.text[0].lower() + picture.text[1:].rstrip(".")
         return text + "; this capture cannot judge the PSF" * (psf.state == "unknown")
 

@@ -10,7 +10,7 @@ State = Literal["good", "doubt", "unknown"]
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a check found.
+    """Result of a check.
 
     Args:
         subject: what it is about.

@@ -20,7 +20,7 @@ from mwdn.weights.checkpoint import first_difference
 from mwdn.weights.torch_file import read_plain
 
 SMALLEST = 31
-"""Least pixels along each axis: 31 -> 7 (stride 4) -> 3 -> 1 (pooled); with fewer, relu3 to relu5 are empty."""
+"""Fewest pixels along each axis: 31 -> 7 (stride 4) -> 3 -> 1 (pooled); with fewer, relu3 to relu5 are empty."""
 
 CHANNELS = 64, 192, 384, 256, 256
 """Channels of relu1 to relu5."""
@@ -221,7 +221,7 @@ def locate(public: PublicWeights, path: str | Path | None, *, download: bool) ->
 
 
 def _download(public: PublicWeights, path: Path) -> None:
-    # A warning, which reaches the error stream even without logging set up: 233 MiB take a while.
+    # A warning is printed even if logging is not set up: 233 MiB take a while.
     logging.getLogger(__name__).warning(
         "Downloading %s (%d MiB, once) from %s", public.what, public.mebibytes, public.address
     )

@@ -70,11 +70,12 @@ class Consistency:
 def consistency(measurement: Measurement, psf: Psf, scene: Scene, *, pose: Pose | None = None) -> Consistency:
     """Compare a measurement with the forward model of its reconstruction.
 
-    The scene passes the PSF in its best pose (`mwdn.solvers.alignment`) and the PSF as it is;
-    the better one counts. The gain and an even background are free in each channel. Saturated pixels
-    (`mwdn.optics.saturation`) contradict only a scene that leaves them darker.
+    The scene is convolved with the PSF in its best pose (`mwdn.solvers.alignment`) and with the PSF as it is; the
+    better result counts. The gain and an even background are free in each channel. Saturated pixels
+    (`mwdn.optics.saturation`) count only where the prediction is darker.
 
-    A merely displaced PSF goes unnoticed: it displaces the reconstruction and explains the measurement as well.
+    A PSF that is only displaced is not detected: it displaces the reconstruction and explains the measurement equally
+    well.
 
     Args:
         measurement: (1, C, H, W).

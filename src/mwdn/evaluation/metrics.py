@@ -201,7 +201,7 @@ def measure(
 
     Raises:
         ShapeError: the shapes differ, the part exceeds the picture, or is too small for a metric.
-        ParameterError: unknown variant, or no tensors of floats.
+        ParameterError: unknown variant, or not tensors of floats.
     """
     variant = variant or protocol.variant
     if variant not in VARIANTS:
@@ -262,6 +262,6 @@ def bootstrap(
     samples = (torch.randint(len(numbers), (len(numbers),), generator=generator) for _ in range(resamples))
     means = torch.stack([numbers[sample].mean() for sample in samples])
     tail = torch.tensor([(1 - confidence) / 2, (1 + confidence) / 2], dtype=torch.float64)
-    # The nearest mean: infinite values (the PSNR of identical pictures) cannot be interpolated.
+    # No interpolation between means: they may be infinite (the PSNR of identical pictures).
     low, high = torch.quantile(means, tail, interpolation="nearest").tolist()
     return numbers.mean().item(), low, high

@@ -8,7 +8,7 @@ from mwdn.evaluation.alexnet import PublicWeights, check_picture, load_weights, 
 from mwdn.types import Image
 
 SMALLEST = 8
-"""Least pixels along each axis: relu4_3 is at 1/8."""
+"""Fewest pixels along each axis: relu4_3 is at 1/8."""
 
 VGG16 = PublicWeights(
     "VGG-16",

@@ -144,7 +144,7 @@ def export(
                 quantise(file, simulate_captures(calibration, ("cat", "coffee"), channels))
         reached = agreement(run_file(file, measurement), expected)
         required = MIN_AGREEMENT[precision] if least is None else least
-        if not reached >= required:  # NaN is too little
+        if not reached >= required:  # also refuses NaN
             raise ExportError(
                 f"`{out}` must agree with `{name}` to {required:.1f} dB, but does to {reached:.1f} dB; it is not "
                 f"written. {'Report this' if precision == 'float32' else 'Use `--precision float32`'}, or lower "
@@ -214,7 +214,7 @@ def _about(name: str, calibration: Calibration, channels: int, precision: str) -
         about["bit_depth"] = str(calibration.frames.bit_depth)
     if calibration.frames.crop is not None:
         height, width = (length // calibration.frames.cell for length in calibration.frames.crop)
-        about["crop"] = f"{height} x {width}"  # of the colours, after the mosaic
+        about["crop"] = f"{height} x {width}"  # in pixels of the colours, after demosaicing
     if calibration.frames.upside_down:
         about["rows"] = "raw frames have their first row at the bottom"
     if calibration.frames.bgr:
@@ -240,6 +240,6 @@ def _program(module: FixedPsf, measurement: Measurement) -> ExportedProgram:
     """The method as a graph of operations, for batches of any size."""
     try:
         return torch.export.export(module, (measurement,), dynamic_shapes=({0: Dim("batch", min=1)},))
-    except (RuntimeError, ValueError, TypeError) as error:  # torch raises many kinds
+    except (RuntimeError, ValueError, TypeError) as error:  # torch raises many kinds of errors
         reason = str(error).strip().splitlines()[0]
         raise ExportError(f"`{type(module.method).__name__}` cannot be exported: {reason}") from error

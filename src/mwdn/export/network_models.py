@@ -1,4 +1,4 @@
-"""A network as two ONNX models: one prepares a PSF, the other reconstructs with what was prepared.
+"""A network as two ONNX models: one prepares a PSF, the other reconstructs with the prepared tensors.
 
 Together they serve every camera of one picture size: the PSF is an input, as in `mwdn.networks.network.Network`.
 """
@@ -113,7 +113,7 @@ def _model(module: nn.Module, arguments: tuple[Tensor, ...], outputs: list[str])
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # torch warns about constants that it copies
             program = torch.export.export(module.eval(), arguments)
-    except (RuntimeError, ValueError, TypeError) as error:  # torch raises many kinds
+    except (RuntimeError, ValueError, TypeError) as error:  # torch raises many kinds of errors
         raise ExportError(f"The network cannot be exported: {str(error).strip().splitlines()[0]}") from error
     model = to_onnx(program, outputs)
     onnx.checker.check_model(model)

@@ -42,7 +42,7 @@ FILES = (
     *(name for kind, library in LIBRARIES.items() for name in (library, f"runtime-{kind}.js")),
     "LICENSES.txt",
 )
-"""Of a site; the first has a mark, by which a later export knows that it may replace them."""
+"""Files of a site; the first has a mark that lets a later export replace them."""
 
 _MARK = b"<!-- mwdn export -->"
 
@@ -89,7 +89,7 @@ def export_site(
     scenes = exact.as_recorded(exact.on_device(captures.float() / 65535))
     reached = _compare(models, calibration, captures, scenes, channels)
     required = MIN_AGREEMENT["float32"] if least is None else least
-    if not reached >= required:  # NaN is too little
+    if not reached >= required:  # also refuses NaN
         raise ExportError(
             f"The page must agree with `{_title(method)}` to {required:.1f} dB, but does to {reached:.1f} dB; it is "
             "not written. Report this, or lower `--least`."
@@ -126,7 +126,7 @@ def _network(method: Method | str | Path) -> Network[Any]:
 
 
 def _title(method: Method | str | Path) -> str:
-    """Name of a bundled network, or of a checkpoint without its folders, which are nobody's business on a page."""
+    """Name of a bundled network, or of a checkpoint without its folders, which a public page should not show."""
     return Path(method).name if isinstance(method, str | Path) else type(method).__name__
 
 
@@ -145,7 +145,7 @@ def _compare(models: NetworkModels, calibration: Calibration, captures: Tensor, 
 
 
 def _camera(calibration: Calibration, about: Mapping[str, str], channels: int, scenes: Scene) -> dict[str, Any]:
-    """What the page knows of the camera besides its images."""
+    """Data of the camera for the page, besides its images."""
     values = scenes[0].flatten()
     step = max(1, len(values) // CHECKED) | 1  # odd: not the same columns of each row
     frames = calibration.frames

@@ -85,7 +85,7 @@ def _archive() -> Path:
     other = f"or get the package elsewhere (`npm install {PACKAGE}@{VERSION}`) and name its folder: `--runtime FOLDER`"
     if npm is None:
         raise ExportError(f"{PACKAGE} comes from npm, which is not installed. Install Node.js, {other}.")
-    # A warning, which reaches the error stream even without logging set up: 33 MB take a while.
+    # A warning is printed even if logging is not set up: 33 MB take a while.
     logging.getLogger(__name__).warning("Fetching %s %s by npm (33 MB, once)", PACKAGE, VERSION)
     with tempfile.TemporaryDirectory(prefix="mwdn-") as folder:
         command = [npm, "pack", f"{PACKAGE}@{VERSION}", "--ignore-scripts", "--pack-destination", folder]

@@ -10,12 +10,12 @@ from mwdn.types import Image, Measurement, Psf, Scene, Size, Spectrum
 
 
 def _operator(psf: Tensor, scene: Size, sensor: Size, *, circular: bool) -> tuple[Spectrum, Size]:
-    """Transfer function from a scene at (0, 0) to a sensor at (0, 0), their centres aligned; and its grid.
+    """Transfer function and its grid, for a scene and a sensor stored at (0, 0) whose centres are aligned.
 
-    No wrapped end of the full convolution may land on the sensor. Counted from the centres, for lengths s, o and p of
-    scene, sensor and PSF, the sensor is [-(o//2), o-o//2-1] and the full convolution
-    [-(s//2+p//2), (s-s//2-1)+(p-p//2-1)]. So the grid needs 1 + the larger of the two overhangs: 1.5 n for equal
-    sizes n, where 2 n is the usual choice.
+    The wrap-around of the full convolution must not reach the sensor. With the lengths s, o and p of scene, sensor and
+    PSF, counted from the centres, the sensor is [-(o//2), o-o//2-1] and the full convolution
+    [-(s//2+p//2), (s-s//2-1)+(p-p//2-1)]. So the grid needs 1 + the larger of the two overhangs: 1.5 n for equal sizes
+    n, where 2 n is the usual choice.
     """
     grid, origin = [], []
     for s, o, p in zip(scene, sensor, psf.shape[-2:], strict=True):
@@ -44,7 +44,7 @@ def check_fit(image: Tensor, psf: Tensor, name: str) -> None:
 
 @checked
 def convolve(scene: Scene, psf: Psf, *, size: Size | None = None, circular: bool = False) -> Image:
-    """Convolution of a scene with a PSF, as seen by a sensor of ``size`` whose centre faces the scene's centre.
+    """Convolution of a scene with a PSF, on a sensor of ``size`` whose centre is aligned with the scene's.
 
     Args:
         scene: (B, C, H, W).
@@ -102,7 +102,7 @@ class Convolution(NamedTuple):
 
     @classmethod
     def from_transfer(cls, transfer: Spectrum, scene: Size, sensor: Size) -> "Convolution":
-        """The same from the transfer function of another `Convolution` between these sizes."""
+        """Reuse the transfer function of another `Convolution` between the same sizes."""
         return cls(transfer, (transfer.shape[-2], 2 * (transfer.shape[-1] - 1)), scene, sensor)  # its grid is even
 
     def forward(self, scene: Scene) -> Image:

@@ -16,7 +16,7 @@ from mwdn.types import Size, Spectrum
 
 
 class FastFilter(torch.autograd.Function):
-    """``y = C F^-1(T F(P x))``; for its gradient the image is kept, not the larger spectrum.
+    """``y = C F^-1(T F(P x))``; the backward pass stores the image, not the larger spectrum.
 
     x is the image, P pads it to the grid of N pixels, F is the Fourier transform, T the transfer function, C crops.
     With the gradient g = dL/dy of a loss L and G = F(C^T g), where C^T pads with zeros:
@@ -24,8 +24,8 @@ class FastFilter(torch.autograd.Function):
     1. ``dL/dx = P^T F^-1(conj(T) G)``: the filter's kernel is real, so its adjoint has the transfer function conj(T).
     2. ``dL/dT = conj(F(P x)) G / N``: y is linear in T, and F^-1 divides by N.
 
-    A half spectrum stores T(k) but not T(-k) = conj T(k), which depends on it too: (2) doubles, except in the first
-    column and, of an even width, the last, which hold both.
+    A half spectrum stores T(k) and implies T(-k) = conj T(k). So (2) doubles, except in the first column and, for an
+    even width, the last column, which store both.
     """
 
     @staticmethod
@@ -66,9 +66,9 @@ class FastFilter(torch.autograd.Function):
 
 
 def filter_planes(image: Tensor, transfer: Tensor, grid: Size, boundary: Boundary) -> Tensor:
-    """Filter a few channels at a time, whose spectra stay in the CPU's cache: 109 ms.
+    """Filter a few channels at a time, so that their spectra stay in the CPU's cache: 109 ms.
 
-    The reference spends most of its time on fresh memory for whole spectra.
+    The reference spends most of its time on allocating memory for whole spectra.
     """
     planes, size = contiguous_planes(image), (image.shape[-2], image.shape[-1])
     result = torch.empty_like(planes)

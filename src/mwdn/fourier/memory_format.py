@@ -13,7 +13,7 @@ from torch.nn import functional as F
 from mwdn.types import Size
 
 LARGEST = 2**26
-"""Numbers of an image whose layout is changed at once, by default."""
+"""Largest number of values of an image that `chunked` processes at once, by default."""
 
 
 def chunks(planes: Tensor, grid: Size) -> Iterator[tuple[slice, slice]]:

@@ -1,7 +1,7 @@
 """Fourier transforms of real images: grids, spectra, transfer functions.
 
 The only file that calls ``torch.fft``. Everything is computed in float32, also under autocast: half-precision
-transforms do not exist on CPUs and lose the small values of a spectrum everywhere.
+transforms do not exist on CPUs, and on any device they lose the small values of a spectrum.
 
 A PSF is centred at ``(height // 2, width // 2)``; `transfer_function` moves its centre to the origin.
 """

@@ -39,7 +39,7 @@ SHOWN = 12
 """Number of captures on the summary: the first ones."""
 
 JUDGES = 3
-"""Number of captures, at most, by which the gamma of the PSF's file is judged."""
+"""Largest number of captures from which the gamma of the PSF's file is detected."""
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ class Batch:
         return replace(job, pose=align(measurement, self.reconstruct.psf), verdicts=verdicts)
 
     def _examine_psf(self, frame: Frame, verdicts: tuple[Verdict, ...]) -> tuple[Verdict, ...]:
-        """Whether the PSF's file is gamma-coded, which takes a second: from the first captures, until one can tell."""
+        """Whether the PSF's file is gamma-coded: tests the first captures, a second each, until one gives a result."""
         known = self._psf_verdicts
         gamma = [verdict.value for verdict in verdicts if verdict.topic == "gamma"]
         if gamma and len(known) < JUDGES and all(verdict.state == "unknown" for verdict in known):
@@ -237,7 +237,7 @@ class Batch:
             scene = enlarge(scene, calibration.frames.bin, job.full_size)
             pitch = pitch and pitch / calibration.frames.bin
         with as_image_error(sidecar):
-            sidecar.unlink(missing_ok=True)  # an old sidecar must not stand beside the new picture
+            sidecar.unlink(missing_ok=True)  # the new picture must not have an old sidecar
         write_output(job.output, scene, self.format, pitch)
         if trust and self.map:
             write_picture(support_name(job.output), support_picture(scene, trust.support.map))

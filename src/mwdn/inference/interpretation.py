@@ -1,4 +1,4 @@
-"""What a network did to reconstruct a capture: its PSFs, filters and estimates, scale by scale."""
+"""Intermediate results of a network for one capture: its PSFs, filters and estimates, scale by scale."""
 
 import copy
 from dataclasses import dataclass, field
@@ -22,7 +22,7 @@ from mwdn.solvers.alignment import align
 from mwdn.types import Measurement, Psf, Scene
 
 Kind = Literal["light", "psf", "features", "change"]
-"""How a picture is to be seen: linear light, a PSF, features of any sign, or a change of the picture around 0."""
+"""How a picture is displayed: linear light, a PSF, features of any sign, or a change of the picture around 0."""
 
 EXPLAINED = "mwdn, mwdn-cpsf, wiener, wiener-unet and wiener-bank (universal, universal-small)"
 
@@ -113,8 +113,8 @@ def interpret(network: object, measurement: Measurement, psf: Psf) -> Interpreta
 def _scale_rows(network: Mwdn | MwdnCpsf, measurement: Measurement, psf: Psf, result: Scene) -> list[Row]:
     """A row for each filter of MWDN and MWDN-CPSF, finest first.
 
-    What a filter contributes is the change of the picture if its features are replaced by their means over the frame:
-    they then say nothing about where anything is, and keep the level that the decoder expects.
+    The contribution of a filter is the change of the picture if its features are replaced by their means over the
+    frame: these have no spatial information, but the level that the decoder expects.
     """
     size = (measurement.shape[-2], measurement.shape[-1])
     given = normalise_psf(psf, size, network.channels, stored=network.stored_psf)
@@ -125,7 +125,7 @@ def _scale_rows(network: Mwdn | MwdnCpsf, measurement: Measurement, psf: Psf, re
     means = [x.mean((-2, -1), keepdim=True).expand_as(x) for x in filtered]
 
     def decoded(*kept: int) -> Scene:
-        """The picture if only the filters of these scales say where anything is."""
+        """The picture if only the filters of these scales have spatial information."""
         return network.decoder([*(filtered[i] if i in kept else means[i] for i in range(len(filtered))), bottom])
 
     every = range(len(filtered))
@@ -212,7 +212,7 @@ def _unexplained(network: WienerBank, measurement: Measurement, psf: Psf, scene:
 def _filter_numbers(wiener: WienerFilter, psf: Tensor) -> dict[str, float | None]:
     """w, lambda, and what they mean for this PSF (1, 1 or C, H, W).
 
-    ``inverted``: part of all frequencies at which |w H|^2 exceeds lambda, so that more than half of the PSF is undone.
+    ``inverted``: part of all frequencies at which |w H|^2 exceeds lambda: more than half of the blur is inverted there.
     ``largest_gain``: of the filter, over all frequencies; 1 / (2 sqrt(lambda)) at most.
     """
     weight = None if wiener.weight is None else wiener.weight.item()

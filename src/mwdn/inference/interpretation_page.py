@@ -32,7 +32,7 @@ def write_interpretation(folder: Path, interpretation: Interpretation, **about: 
     paths = [folder / SHEET, folder / JSON]
     pictures = folder / "pictures"
     pictures.mkdir(parents=True, exist_ok=True)
-    write_json(paths[1], {**about, **interpretation.content()})  # first: it tells whose the folder is
+    write_json(paths[1], {**about, **interpretation.content()})  # first: it marks the folder as one of this command
     for number, row in enumerate(interpretation.rows):
         for panel in row.panels:
             name = re.sub(r"[^a-z0-9.]+", "-", f"{row.name} {panel.name}".lower().replace("1/", ""))
@@ -45,8 +45,8 @@ def write_interpretation(folder: Path, interpretation: Interpretation, **about: 
 def display(panel: Panel) -> Tensor:
     """A panel as sRGB values in [0, 1], (1, 3, H, W).
 
-    Light is scaled to its brightest pixels, and PSFs besides are raised to the power 0.5, so that faint parts show.
-    Features are scaled to their 0.3 to 99.7 % values. A change is grey where it is 0, brighter where it adds.
+    Light and PSFs are scaled to their brightest pixels; PSFs are also raised to the power 0.5, so that faint parts are
+    visible. Features are scaled to their 0.3 to 99.7 % values. A change is grey where it is 0, brighter where it adds.
     """
     picture = panel.picture.float().cpu()
     if panel.kind in ("light", "psf"):

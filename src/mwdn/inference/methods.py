@@ -59,7 +59,7 @@ def as_method(method: Method | str | Path, **options: Any) -> Method:  # noqa: A
     """A method as it is, or `find_method` with options.
 
     Raises:
-        ParameterError: an object is given options, or as for `find_method`.
+        ParameterError: options are given for an object, or as for `find_method`.
         MwdnError: as for `find_method`.
     """
     if isinstance(method, str | Path):
@@ -73,8 +73,8 @@ def psf_for(method: object, calibration: Calibration) -> Psf:
     """The PSF that a method takes, (1, C, H, W).
 
     Most take the calibration's, whose channels have unit sum. A network with ``stored_psf`` takes that of the file: the
-    numbers in [0, 1] with the brightness of each colour, and the background if none was subtracted. A calibration that
-    does not know the brightness (``light``) gives a peak of 1.
+    numbers in [0, 1] with the brightness of each colour, and the background if none was subtracted. A calibration
+    without the brightness (``light``) gives a peak of 1.
     """
     psf = calibration.psf
     if not (isinstance(method, Network) and method.stored_psf):

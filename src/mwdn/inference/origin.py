@@ -1,7 +1,7 @@
 """Hash of everything that a picture depends on, so that an interrupted batch resumes without repeating work.
 
-The hash of a picture stays the same from version to version of the code, so it is made of the names below, not of
-whatever attributes an object has today.
+The hash must not change between versions of the code, so it uses the names below instead of all attributes of an
+object.
 """
 
 import hashlib
@@ -25,7 +25,7 @@ _OPTIONS = {
     **dict.fromkeys(("Mmcn", "Ifin"), ("channels",)),
     **dict.fromkeys(("WienerNetwork", "UNet", "WienerUNet", "Mwdn", "MwdnCpsf", "LeAdmmU"), ()),
 }
-"""What counts of a network besides its weights; all public attributes of any other module."""
+"""Attributes of each network that are hashed besides its weights; of other modules, all public attributes are."""
 
 
 def settings_hash(reconstruct: Reconstructor, format: str, *, full_size: bool = False) -> str:
@@ -53,7 +53,7 @@ def origin(settings: str, capture: Path) -> str:
 
 
 def _camera(calibration: Calibration) -> dict[str, object]:
-    """Everything a measurement depends on; what was added later counts only where it is set."""
+    """Everything a measurement depends on; fields that were added later are hashed only if they are set."""
     frames = calibration.frames
     later = {"gamma": frames.gamma, "ambient": None if calibration.ambient is None else calibration.offset}
     refinement = {"refinement": repr(calibration.refinement)} if calibration.refinement else {}
@@ -77,7 +77,7 @@ def _camera(calibration: Calibration) -> dict[str, object]:
 
 
 def _method(reconstruct: Reconstructor) -> tuple[object, ...]:
-    """What counts of the method; alignment has always been an option of some networks, now of every method."""
+    """The hashed attributes of the method. Alignment, first an option of some networks, is now one of every method."""
     method, aligned = reconstruct.method, ("aligned",) if reconstruct.align else ()
     lit = ("room light",) if reconstruct.room_light else ()
     if not isinstance(method, nn.Module):

@@ -175,7 +175,7 @@ class Reconstructor:
             yield measurement, to_host(self.finish(scene))
 
     def without_room_light(self, measurement: Measurement) -> tuple[Measurement, Tensor | None]:
-        """The measurement less the light of the room, and its share (B,); as it is and `None` if it is not sought."""
+        """The measurement less the light of the room, and its share (B,); unchanged and `None` if the option is off."""
         if not self.room_light:
             return measurement, None
         found = solvers.find_room_light(measurement, self.psf)

@@ -1,4 +1,4 @@
-"""What C libraries print while they decode a picture: libjpeg tells of damaged pixels nowhere else."""
+"""Messages that C libraries print while they decode a picture: libjpeg reports damaged pixels in no other way."""
 
 import ctypes
 import os
@@ -51,7 +51,7 @@ _first = threading.Lock()
 
 
 def _forget() -> None:
-    """In a forked child: the thread that decoded is not there to restore ``stderr`` and to unlock."""
+    """In a forked child: restore ``stderr`` and unlock, because the thread that decoded does not exist there."""
     global _messages, _first
     if _messages is not None and _messages.stderr is not None:
         _messages.stderr.value = _messages.real

@@ -17,13 +17,14 @@ TURNS = {
     7: "transverse",
     8: "rotate-90",
 }
-"""What shows a picture of each orientation upright, as in ``PIL.Image.Transpose``: rotations are anticlockwise."""
+"""Transposition that makes a picture of each orientation upright, as in ``PIL.Image.Transpose``: rotations are
+anticlockwise."""
 
 _ORIENTATION = 274
 """Number of the tag."""
 
 _STEPS = 100_000
-"""Most parts of a file that are searched: a PNG of 800 MB has as many."""
+"""Largest number of parts of a file that are searched: a PNG of 800 MB has as many."""
 
 
 def orientation(path: str | Path) -> int:
@@ -35,7 +36,7 @@ def orientation(path: str | Path) -> int:
     try:
         with open_regular(path) as file:
             return orientation_in(file)
-    except (OSError, ImageError):  # whoever reads the pixels says what is wrong
+    except (OSError, ImageError):  # reading the pixels reports the error
         return 1
 
 
@@ -116,7 +117,7 @@ def _read_tag(file: BinaryIO, start: int) -> int:
     """The orientation in the first directory of a TIFF."""
     order = "<" if _at(file, start, 2) == b"II" else ">"
     version, offset = struct.unpack(order + "HI", file.read(6))
-    if version == 43:  # BigTIFF, which no camera writes
+    if version == 43:  # BigTIFF; no camera writes it
         return 1
     (count,) = struct.unpack(order + "H", _at(file, start + offset, 2))
     for _ in range(count):

@@ -41,7 +41,7 @@ def atomic(path: Path) -> Iterator[Path]:
 
     Raises:
         OSError: the folder cannot be written to, the disk is full, or ``path`` is something else than a regular file:
-            a folder, a device, or a symbolic link, which may lead to a file that nobody meant to replace.
+            a folder, a device, or a symbolic link, whose target is not replaced.
     """
     path = path.absolute()
     check_regular(path)
@@ -76,7 +76,7 @@ def _as_os_error() -> Iterator[None]:
 def _computer() -> str:
     """Identifies the computer since its start, and the container: process numbers are unique within it.
 
-    Empty where the system does not tell; nobody then knows which files are left over, and they stay.
+    Empty if the system does not provide it; leftover files are then unknown, and stay.
     """
     try:
         start = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii")
@@ -89,7 +89,7 @@ def _computer() -> str:
 def _remove_leftovers(folder: Path) -> None:
     """Remove the hidden files of processes that were killed, once for each folder.
 
-    Another computer that shares the folder may still be writing its own: only those of this one are judged.
+    Only files of this computer are removed, because another computer that shares the folder may still be writing.
     """
     hidden = re.compile(rf"\.mwdn-{_computer()}-(\d+)-[0-9a-f]{{8}}(\..*)?")
     with suppress(OSError), os.scandir(folder) as entries:
@@ -204,11 +204,11 @@ def refuse_foreign(folder: Path, files: Sequence[str], mark: bytes) -> None:
 
     Args:
         folder: the output folder.
-        files: names of the files that will be replaced. The first tells whose they are, and is written first.
+        files: names of the files that will be replaced. The first identifies their owner, and is written first.
         mark: bytes in the first MiB of the first file if this package wrote it.
 
     Raises:
-        ParameterError: one of the files exists and is somebody else's, or is no regular file.
+        ParameterError: one of the files exists and is not of this package, or is not a regular file.
     """
     for name in files:
         refuse_overwrite(folder / name)

@@ -42,7 +42,7 @@ logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 @contextmanager
 def at_most_pixels(count: int) -> Iterator[None]:
-    """Refuse frames of more pixels, from their headers; for this thread, where strangers send the files."""
+    """Refuse frames with more pixels by their headers, in this thread; for files from untrusted senders."""
     token = _most_pixels.set(min(count, MAX_PIXELS))
     try:
         yield
@@ -107,7 +107,7 @@ def kind_of(start: bytes) -> str | None:
 
 def is_for_viewing(path: str | Path) -> bool:
     """Whether a file is a JPEG or WebP, which cameras and programs write gamma-coded."""
-    with suppress(OSError, ImageError), open_regular(path) as file:  # whoever reads the pixels says what is wrong
+    with suppress(OSError, ImageError), open_regular(path) as file:  # reading the pixels reports the error
         return kind_of(file.read(12)) in ("JPEG", "WebP")
     return False
 
@@ -195,7 +195,7 @@ def as_frame(picture: ArrayPicture, *, finite: bool = True) -> Frame:
     """
     if isinstance(picture, str | Path):
         raise FrameTypeError(f"`{picture}` is a path, not a frame: `mwdn.read_frame('{picture}')`.")
-    if hasattr(picture, "is_floating_point"):  # axes and scale of a tensor are others
+    if hasattr(picture, "is_floating_point"):  # a tensor has another order of axes and another scale
         raise FrameTypeError(
             f"A frame ({shown(picture)}) must be an array (H, W, C), not a tensor: `tensor.movedim(0, -1).numpy()` for "
             "one (C, H, W). A tensor (B, C, H, W) of floats is a measurement already."

@@ -30,7 +30,7 @@ _PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 4, 6: 4}  # grey, RGB, palette, grey with 
 
 
 class Claim(NamedTuple):
-    """What the header of a picture claims.
+    """Size of a picture as stated in its header.
 
     Args:
         height: of the picture.

@@ -90,7 +90,7 @@ def write_picture(path: str | Path, image: Tensor | FloatFrame, *, bits: int = 8
     Args:
         path: ends in ``.png``; missing folders are created.
         image: tensor (1, C, H, W) or (C, H, W), or numpy array (H, W) or (H, W, C), with 1 or 3 channels, RGB, row 0 at
-            the top. Floats in linear light, 1 is white; integers are refused, for they may be encoded already.
+            the top. Floats in linear light, 1 is white; integers are refused, because they may be encoded already.
         bits: 8, or 16 for a picture that will be edited.
 
     Raises:

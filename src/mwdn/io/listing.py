@@ -1,4 +1,4 @@
-"""Which files of a folder are frames, and which are not: named, never skipped silently."""
+"""List the frames of a folder; files that are left out are reported, never skipped silently."""
 
 import os
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ def list_folder(folder: Path) -> tuple[list[str], list[str]]:
         The frames, in alphabetical order; and one sentence for each kind of entry that is left out.
     """
     with os.scandir(folder) as entries:
-        # A pipe or a link to itself is listed as a frame: reading it names the fault.
+        # A pipe or a link to itself is listed as a frame; reading it reports the error.
         names = sorted(entry.name + "/" * _is_folder(entry) for entry in entries if not entry.name.startswith("."))
     start = str(folder / "x").removesuffix("x")
     frames = [start + name for name in names if not name.endswith("/") and Path(name).suffix.lower() in FRAMES]

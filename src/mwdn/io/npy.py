@@ -1,4 +1,4 @@
-"""Read NPY files: the header is judged before the numbers, which are read into memory and never mapped."""
+"""Read NPY files: the header is checked before the numbers, which are read into memory and never mapped."""
 
 import math
 import os
@@ -21,7 +21,7 @@ def read_array(path: str | Path, check: Callable[[tuple[int, ...], Any], object]
     Args:
         path: of the file.
         check: called with shape and dtype before the numbers are read; raises `ImageError`, without the file's name,
-            for what it does not want.
+            for an array that it does not accept.
 
     Raises:
         ImageError: not a complete NPY file of numbers, or over `MAX_NPY_BYTES`.

@@ -14,7 +14,7 @@ from mwdn.runtime.requirement import require
 from mwdn.types import Frame
 
 RAW = frozenset({".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef"})
-"""Suffixes, in lower case, of raw files. Most of them are TIFFs inside, so the content does not tell."""
+"""Suffixes, in lower case, of raw files. Most of them are TIFFs inside, so the content does not identify them."""
 
 WHITE = 65535
 """The number at which the sensor saturates, after scaling. 14 bits become 16: a step of the sensor is 4 numbers."""

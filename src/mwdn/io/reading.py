@@ -1,4 +1,4 @@
-"""One guarded way to read files of others: regular files only, no more bytes than expected, never mapped."""
+"""Read untrusted files: regular files only, no more bytes than expected, never mapped."""
 
 import errno
 import json
@@ -36,7 +36,7 @@ def open_regular(path: str | Path, error: type[MwdnError] = ImageError) -> Binar
             permission.
     """
     try:
-        _check_regular(Path(path).stat().st_mode)  # before it is opened, which a device may notice
+        _check_regular(Path(path).stat().st_mode)  # before opening, because that may affect a device
         flags = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
         file = open(path, "rb", opener=lambda name, _: os.open(name, flags))  # noqa: SIM115
         try:

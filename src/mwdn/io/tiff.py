@@ -1,4 +1,4 @@
-"""Read TIFF files: tifffile parses the tags, every strip and tile is decompressed here and is whole or an error."""
+"""Read TIFF files: tifffile parses the tags; strips and tiles are decompressed here, each complete or an error."""
 
 import itertools
 import re
@@ -58,7 +58,8 @@ def read_tiff(file: BinaryIO, check: Any) -> TiffPicture:  # noqa: ANN401
 
     Args:
         file: opened for reading.
-        check: called with shape and dtype before anything is decoded; raises `ImageError` for what it does not want.
+        check: called with shape and dtype before anything is decoded; raises `ImageError` for a picture that it does
+            not accept.
 
     Raises:
         ImageError: damaged in any strip or tile, a stack, of another compression, or its picture is in another file;

@@ -1,4 +1,4 @@
-"""Decompress the strips and tiles of TIFF files: each is whole, or an error. Decoders in libtiff leave damage black."""
+"""Decompress the strips and tiles of TIFF files; damage is an error. Decoders in libtiff leave damaged parts black."""
 
 import zlib
 from collections.abc import Callable, Iterator
@@ -74,7 +74,7 @@ def _tables(data: bytes, most: int) -> Iterator[tuple[Numbers, Numbers]]:
     while size < most and end == _CLEAR:
         codes, end = _codes(padded, bit, 8 * len(data))
         bit += int(_STARTS[len(codes)] + _WIDTHS[len(codes)])
-        if end == _CLEAR and not len(codes):  # a row of them would take long
+        if end == _CLEAR and not len(codes):  # a long run of them would take long
             raise ImageError("is damaged: LZW data has an empty table.")
         lengths = _lengths(codes)
         size += int(lengths.sum())

@@ -41,7 +41,7 @@ def find_recipe(recipe: str | Path) -> Path:
         UnknownNameError: no recipe has this name.
     """
     path = Path(recipe)
-    if path.is_file() or (path.suffix == ".toml" and path.exists()):  # a pipe is refused where it is read
+    if path.is_file() or (path.suffix == ".toml" and path.exists()):  # a pipe is refused when it is read
         return path
     if path.name != str(path) or path.suffix:
         hint = f" The recipe of the package is `{path.stem}`." if path.stem in packaged_recipes() else ""

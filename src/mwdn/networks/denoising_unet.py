@@ -8,7 +8,7 @@ from mwdn.networks.blocks import check_channels, convolutions
 from mwdn.types import Image
 
 WIDTHS = (24, 64, 128, 256, 512)
-"""Feature channels at scales 1 to 1/16; the bottleneck, at 1/32, has 512 too."""
+"""Feature channels at scales 1 to 1/16; the bottleneck, at 1/32, also has 512."""
 
 MINIMUM_SIDE = 64
 """Minimum height and width of a picture: BatchNorm needs more than one value at scale 1/32."""

@@ -1,4 +1,4 @@
-"""Build a network without memory for its weights, to judge options of a file or a recipe."""
+"""Build a network without memory for its weights, to check the options of a file or a recipe."""
 
 import warnings
 from typing import Any
@@ -14,7 +14,7 @@ MOST_PARAMETERS = 2**28
 """Largest number of parameters: 1 GiB in float32, twelve times the largest network of the paper."""
 
 MOST_TENSORS = 8_000
-"""Tensors that may be made while a network is built, a second's work; the networks of the package make up to 540."""
+"""Limit of the tensors made while a network is built, about a second; the networks of the package make up to 540."""
 
 
 class _Counted(TorchFunctionMode):
@@ -42,7 +42,7 @@ def build_empty(name: str, **options: Any) -> nn.Module:  # noqa: ANN401
         ParameterError: an option is out of range, a layer has no channels, or there are too many layers or parameters.
     """
     try:
-        with _Counted(), torch.device("meta"), warnings.catch_warnings(action="ignore"):  # torch's, of empty layers
+        with _Counted(), torch.device("meta"), warnings.catch_warnings(action="ignore"):  # about empty layers
             network = build(name, **options)
     except MwdnError:
         raise

@@ -1,4 +1,4 @@
-"""Evidence against the PSF, for `mwdn.networks.wiener_bank`: what the iterations could not explain of a measurement."""
+"""Evidence against the PSF, for `mwdn.networks.wiener_bank`: the residual that the iterations leave."""
 
 import torch
 from torch import Tensor
@@ -18,13 +18,13 @@ LARGEST_DOUBT = 20.0
 """Ten real captures of two cameras have 3 to 21 at a side of 16."""
 
 BENIGN_DOUBT = 2.0, 5.0
-"""The denoiser is told no doubt up to the first, and all of it from the second on. Where the PSF is exact,
-`mwdn.solvers.align` finds up to 2.5 % of haze, which causes doubts of 2 to 3. Told of them, the denoiser makes the
-scene too bright and loses 0.2 to 0.3 dB."""
+"""The denoiser's input is 0 up to the first doubt, and the full value from the second on. Where the PSF is exact,
+`mwdn.solvers.align` finds up to 2.5 % of haze, which causes doubts of 2 to 3. With these as its input, the denoiser
+makes the scene too bright and loses 0.2 to 0.3 dB."""
 
 
 def doubt_of_psf(estimate: Estimate) -> Tensor:
-    """How much the denoiser is to doubt the PSF, (B, 1, 1, 1): 0 if it is right, 3 at most.
+    """Doubt of the PSF, as an input of the denoiser, (B, 1, 1, 1): 0 for a right PSF, 3 at most.
 
     ``t log(d)``: d is the `Estimate.doubt` in the largest of `DOUBT_BLOCKS`; t rises from 0 to 1 between the two of
     `BENIGN_DOUBT`.
@@ -35,7 +35,7 @@ def doubt_of_psf(estimate: Estimate) -> Tensor:
 
 
 def against_psf(estimate: Estimate, detail: Scene, block: int) -> Tensor:
-    """What speaks for and against the PSF: (B, C + 4, H, W).
+    """Maps of evidence for and against the PSF: (B, C + 4, H, W).
 
     1. The back-projected residual, averaged over blocks: light that the estimate lacks, or has too much of.
     2. The squared distance from the middle, 1 in the corners: real cameras lose light there.

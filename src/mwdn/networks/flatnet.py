@@ -41,7 +41,7 @@ class FlatNet(Network[Tensor]):
 
     References:
         S. S. Khan et al., FlatNet: towards photorealistic scene reconstruction from lensless measurements, IEEE Trans.
-        Pattern Anal. Mach. Intell. 44, 1934 (2020); github.com/siddiquesalman/flatnet.
+        Pattern Anal. Mach. Intell. 44, 1934 (2022); github.com/siddiquesalman/flatnet.
     """
 
     def __init__(

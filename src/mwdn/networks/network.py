@@ -66,14 +66,14 @@ class Network(nn.Module, Generic[Prepared]):
         raise NotImplementedError
 
     def as_recorded(self, scene: Scene) -> Scene:
-        """The result of `reconstruct` as the camera shows it that recorded the scenes of the training pairs.
+        """Convert a result of `reconstruct` to the geometry and light of the camera that recorded the training scenes.
 
-        Unchanged unless their geometry or light was measured before the training. `mwdn.Reconstructor` applies this.
+        Unchanged unless these were measured before the training. `mwdn.Reconstructor` applies this.
         """
         return scene
 
     def as_reconstructed(self, scene: Scene) -> Scene:
-        """The inverse: a recorded scene as `reconstruct` shows it."""
+        """Inverse of `as_recorded`, for a recorded scene."""
         return scene
 
     def forward(self, measurement: Measurement, psf: Psf) -> Scene:
@@ -86,7 +86,7 @@ class Network(nn.Module, Generic[Prepared]):
 
         Raises:
             ShapeError: batch, channels or size do not fit.
-            ParameterError: no tensors of floats.
+            ParameterError: not tensors of floats.
             PsfError: the PSF is negative, not finite, or dark; not checked in training.
         """
         check_batch(measurement, "measurement")

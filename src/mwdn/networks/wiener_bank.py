@@ -27,11 +27,11 @@ BOUNDARY: Boundary = "taper"
 """Boundary handling where the bank filters the measurement itself."""
 
 MeanLight = Literal["kept", "free", "gated"]
-"""What the U-Net may do to the mean light of a block:
+"""How far the U-Net may change the mean light of a block:
 
-- ``kept``: nothing. The iterations' shading is right if the PSF is.
-- ``free``: anything.
-- ``gated``: as much as its gate, which it learns to open where the measurement contradicts the PSF.
+- ``kept``: not at all. The iterations' shading is right if the PSF is.
+- ``free``: without limit.
+- ``gated``: times a gate, which the U-Net learns to open where the measurement contradicts the PSF.
 """
 
 CLOSED = 2.0
@@ -163,19 +163,19 @@ class WienerBank(Network[BankTransfers]):
         return self.correct(estimates, self.unit(estimates))
 
     def as_recorded(self, scene: Scene) -> Scene:
-        """The result of `reconstruct` in the geometry and the light of the scenes that the network was trained on."""
+        """Convert a result of `reconstruct` to the geometry and light of the scenes that the network was trained on."""
         scene = scene if self.distortion is None else undistort(scene, self.distortion)
         return scene if self.shading is None else shade(scene, self.shading)
 
     def as_reconstructed(self, scene: Scene) -> Scene:
-        """The inverse: a recorded scene as `reconstruct` shows it."""
+        """Inverse of `as_recorded`, for a recorded scene."""
         scene = scene if self.shading is None else shade(scene.float(), -self.shading)
         return scene if self.distortion is None else distort(scene.float(), self.distortion)
 
     def estimates(self, measurement: Measurement, psf: Psf) -> Tensor:
         """Estimates of the scene, smoothest first, the measurement, and the evidence if any: (B, channels, H, W).
 
-        Of a grey camera's measurement with equal colours.
+        A grey measurement is expanded to equal colours.
         """
         if measurement.shape[1] == 1:
             measurement = measurement.expand(-1, self.channels, -1, -1)
@@ -207,7 +207,7 @@ class WienerBank(Network[BankTransfers]):
         return torch.cat([*scenes, estimate.measurement, *evidence], dim=1)
 
     def denoise(self, estimate: Estimate) -> Denoiser:
-        """The denoiser of plug and play. With evidence it is told sigma times the doubt beside its level sigma."""
+        """The denoiser of plug and play. With evidence, its inputs are the level sigma and sigma times the doubt."""
         if not self.has_evidence:
             return self.denoiser
         told = doubt_of_psf(estimate)
@@ -235,10 +235,11 @@ class WienerBank(Network[BankTransfers]):
         return self._correct(estimates, unit)
 
     def _border(self, estimates: Tensor) -> int:
-        """Pixels by which a frame's estimates are mirrored beyond it, so that the U-Net does not meet its own zeros.
+        """Pixels of mirror padding around a frame's estimates, in place of the U-Net's zero padding.
 
-        Those drew a frame around the picture. A block leaves the grid of blocks as it is. Without plug and play, in a
-        network for live pictures, no frame can be seen; the crops of a training have no border of a frame.
+        Zeros left a visible border around the picture. A whole block keeps the grid of blocks in place. Networks
+        without plug and play, for live pictures, show no such border; training uses crops, which have no border of a
+        frame.
         """
         return 0 if self.training or not self.rounds else min(self.block, *(n - 1 for n in estimates.shape[-2:]))
 
@@ -259,7 +260,7 @@ class WienerBank(Network[BankTransfers]):
         return first + unit * pixel_shuffle(correction, self.fold)[..., :height, :width]
 
     def _lit(self, output: Tensor) -> Tensor:
-        """The U-Net's correction, with as much of its mean light as it may change."""
+        """The U-Net's correction, whose mean light is limited by `MeanLight`."""
         correction = output[:, : self.channels * self.fold**2]
         if self.mean_light == "free" or not self.levels:
             return correction

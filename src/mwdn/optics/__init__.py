@@ -36,8 +36,8 @@ MASKS: Registry[type[MaskDesign]] = Registry(
     accepts=_is_mask,
     must_be="a dataclass with a default for each field and a method `build(setup)` that returns a `mwdn.optics.Mask`",
 )
-"""Every kind of mask that parameters describe, by its name in `mwdn design`, those of plugins included; `ArrayMask` is
-read from a file."""
+"""Kinds of masks that have parameters, by their names in `mwdn design`, including those of plugins. `ArrayMask` is read
+from a file instead."""
 
 __all__ = [
     "Aberration",

@@ -15,24 +15,25 @@ ENVELOPE_BLUR = 0.04
 the distance of the lines of the paper's PSF."""
 
 DIMMEST = 0.1
-"""Part of the envelope's maximum below which the pattern is not known well enough to be lit up."""
+"""Fraction of the envelope's maximum below which the PSF is not brightened: the pattern is too uncertain there."""
 
 
 def displaced_envelope(psf: Psf, shift: Tensor, *, blur: float = ENVELOPE_BLUR) -> Psf:
     """Displace the aperture's shadow against the mask's pattern.
 
-    A PSF is pattern x envelope, h = p E. The mask casts the pattern from a distance d_m in front of the sensor, the
-    aperture's edge its shadow from d_a. Light from the angle t displaces them by d_m tan t and d_a tan t, so against
-    the pattern the envelope moves by (d_a - d_m) tan t. E is unknown; a wide Gaussian blur of h estimates it. The new
-    PSF is h E(r - shift) / E(r), regularised like a Wiener filter: where E is dark the PSF stays as it is.
+    A PSF is pattern x envelope, h = p E. The mask is at the distance d_m in front of the sensor, the aperture's edge at
+    d_a. Light from the angle t displaces the pattern by d_m tan t and the shadow of the edge by d_a tan t, so the
+    envelope moves by (d_a - d_m) tan t relative to the pattern. E is unknown; a wide Gaussian blur of h estimates it.
+    The new PSF is h E(r - shift) / E(r), regularised like a Wiener filter: where E is dark the PSF stays as it is.
 
     Args:
         psf: (B, C, h, w).
         shift: (B, 2), of the envelope, down and right, in pixels.
-        blur: see `ENVELOPE_BLUR`. A narrow one takes the pattern's lines for the envelope, a wide one loses its edge.
+        blur: see `ENVELOPE_BLUR`. A narrow blur leaves the pattern's lines in the envelope, a wide one blurs the
+            envelope's edge.
 
     Returns:
-        (B, C, h, w); the light that the displaced aperture lets through, so the sum changes.
+        (B, C, h, w). The sum changes: it is the light that passes the displaced aperture.
     """
     envelope = gaussian_blur(psf, blur * min(psf.shape[-2:])).clamp(min=0)
     moved = [
@@ -62,7 +63,7 @@ def scattered(psf: Psf, part: Tensor, radius: Tensor) -> Psf:
         J. E. Harvey, Appl. Opt. 51, 3 (2012): scattering by polished surfaces falls as a power of the angle.
     """
     size = psf.shape[-2], psf.shape[-1]
-    grid = fast_length(2 * size[0]), fast_length(2 * size[1])  # light that leaves at one side does not enter opposite
+    grid = fast_length(2 * size[0]), fast_length(2 * size[1])  # no circular wrap-around
     rows, columns = frequency_grid(grid, device=psf.device)
     transfer = torch.exp(-2 * math.pi * radius * (rows.square() + columns.square()).sqrt())
     return (1 - part) * psf + part * inverse_spectrum(spectrum(psf, grid) * transfer, grid, size).clamp(min=0)
@@ -72,8 +73,8 @@ def low_order_field(coefficients: Tensor, size: Size) -> Tensor:
     """Smooth field of largest magnitude 1: a sum of products of cosines, the lowest terms of a DCT.
 
     Args:
-        coefficients: (..., n, n); that of row j and column k weights ``cos(pi j y) cos(pi k x)``, y and x from 0 to 1.
-            The first, of the constant, is left out.
+        coefficients: (..., n, n); row j and column k is the weight of ``cos(pi j y) cos(pi k x)``, y and x from 0 to 1.
+            The constant term (0, 0) is ignored.
         size: height and width of the field.
 
     Returns:

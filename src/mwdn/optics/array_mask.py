@@ -23,7 +23,7 @@ Numbers = npt.NDArray[Any]
 Quantity = Literal["height", "phase", "amplitude", "transmission"]
 
 MAX_RELIEF_UM = 1000.0
-"""Largest height of a mask over its lowest place: beyond it no mask is thin, and the numbers are rather in nm."""
+"""Largest height of a mask above its lowest point. A larger one is not a thin mask; its numbers are probably in nm."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class ArrayMask:
 
 
 def _check_slope(mask: Mask, setup: Setup, subdivide: int) -> None:
-    """Check that the samples of a surface are as near as the light behind it needs; say what to change."""
+    """Check that a surface is sampled finely enough for the light behind it; the error says what to change."""
     needed, deflection = needed_pitch(mask, setup)
     if mask.pitch_um <= needed:
         return
@@ -118,7 +118,7 @@ def _check_slope(mask: Mask, setup: Setup, subdivide: int) -> None:
 
 
 def _floor(pitch_um: float) -> float:
-    """Two digits of a pitch, rounded down."""
+    """Round a pitch down to two significant digits."""
     step = 10 ** (math.floor(math.log10(pitch_um)) - 1)
     return math.floor(pitch_um / step) * step
 
@@ -147,7 +147,7 @@ def make_mask(
     Raises:
         ParameterError: an argument is out of its range, NaN or infinity, an amplitude or transmission outside [0, 1],
             or a surface higher than `MAX_RELIEF_UM`.
-        UnknownNameError: ``values`` is none of its kinds.
+        UnknownNameError: ``values`` is an unknown kind.
     """
     if values not in get_args(Quantity):
         raise UnknownNameError("quantity of a mask", values, get_args(Quantity))
@@ -223,7 +223,7 @@ def _amplitude(numbers: Plane, values: Quantity) -> Plane:
 
 
 def _relief(height_um: Plane) -> Plane:
-    """Heights from 0 upwards: a constant height delays all light alike, so negative ones are raised."""
+    """Shift negative heights up to 0; a constant offset delays all light alike and has no effect."""
     low, high = height_um.min().item(), height_um.max().item()
     if high - low > MAX_RELIEF_UM:
         raise ParameterError(
@@ -234,10 +234,10 @@ def _relief(height_um: Plane) -> Plane:
 
 
 def _subdivided(plane: Plane, count: int) -> Plane:
-    """Squares of the same number."""
+    """Repeat each number in a square of ``count`` x ``count`` samples."""
     return plane.repeat_interleave(count, 0).repeat_interleave(count, 1)
 
 
 def _interpolated(plane: Plane, count: int) -> Plane:
-    """Bicubic interpolation: straight lines would leave an edge at every sample, which bends light."""
+    """Bicubic interpolation; a linear one would have an edge at every sample, which deflects light."""
     return F.interpolate(plane[None, None], scale_factor=count, mode="bicubic")[0, 0] if count > 1 else plane

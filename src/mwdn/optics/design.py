@@ -123,14 +123,14 @@ def design_camera(name: str, design: MaskDesign, setup: Setup) -> Designed:
     """Compute a mask and its PSF.
 
     Raises:
-        ParameterError: a parameter that no such mask or camera can have.
+        ParameterError: a parameter is invalid for this mask or camera.
     """
     mask = design.build(setup)
     return Designed(name, design, setup, mask, mask_psf(mask, setup))
 
 
 def check_replaced(out: Path, *, gds: bool = False, stl: bool = False) -> None:
-    """Refuse a folder where a design would replace files of anything but another design, such as a measured PSF.
+    """Refuse a folder in which a design would replace files that no design wrote, such as a measured PSF.
 
     Args:
         out: the folder.

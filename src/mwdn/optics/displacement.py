@@ -31,16 +31,16 @@ class Displacement(NamedTuple):
 def displacement(image: Psf, reference: Psf) -> Displacement:
     """Find the displacement of an image from a reference of the same size by the peak of their cross-correlation.
 
-    The peak is that of the band-limited correlation between the pixels, from its spectrum: the lines of a PSF are one
-    or two pixels wide, and half a pixel beside the peak their correlation has lost 5 % or more.
+    The peak is searched between the pixels, where the band-limited correlation is computed from its spectrum. The lines
+    of a PSF are one or two pixels wide, so half a pixel beside the peak the correlation is already 5 % lower or more.
 
     Args:
         image: (1, C, H, W).
         reference: (1, C, H, W).
 
     Raises:
-        ShapeError: other axes.
-        ParameterError: no tensors of floats.
+        ShapeError: the axes or sizes do not fit.
+        ParameterError: not tensors of floats.
 
     References:
         M. Guizar-Sicairos et al., Opt. Lett. 33, 156 (2008), for the refinement.
@@ -66,8 +66,8 @@ def displacement(image: Psf, reference: Psf) -> Displacement:
 def _between_pixels(product: Spectrum, grid: Size, rows: Tensor, columns: Tensor) -> Tensor:
     """Values (rows, columns) at fractional places of the image (1, 1, *grid) with this spectrum.
 
-    The inverse transform at these places alone, as two products of matrices. Columns other than the first and the last
-    stand for their mirror images, too.
+    The inverse transform is computed at these places only, as two matrix products. Each column of the half spectrum,
+    except the first and the last, also stands for its mirror image.
     """
     vertical, horizontal = (each.double() for each in frequency_grid(grid, device=product.device))
     twice = torch.full_like(horizontal, 2.0)
@@ -82,7 +82,7 @@ def _signed(place: float, length: int) -> float:
 
 
 def shifted(image: Tensor, down: int, right: int) -> Tensor:
-    """Shift (..., H, W) by whole pixels; darkness enters at the border."""
+    """Shift (..., H, W) by whole pixels; zeros enter at the border."""
     height, width = image.shape[-2:]
     moved = torch.zeros_like(image)
     if abs(down) >= height or abs(right) >= width:

@@ -1,7 +1,7 @@
 """Distortion of pictures: where a scene's light lies in the reconstruction, as polynomials over the frame.
 
-The scene at p is seen at ``p + d(p)``. In each direction d is a polynomial of the place, which goes from -1 to 1 over
-the frame, in halves of the frame's height or width: it fits pictures of any size.
+The scene at p is seen at ``p + d(p)``. Each component of d is a polynomial of the position, which goes from -1 to 1
+over the frame. Its unit is half of the frame's height or width, so that it applies to pictures of any size.
 """
 
 import torch
@@ -16,7 +16,7 @@ _INVERSIONS = 3
 
 
 def undistort(picture: Image, coefficients: Tensor) -> Scene:
-    """The scene at its own places: ``T(p) = I(p + d(p))``, bicubic; what lies outside repeats the border.
+    """Remove the distortion: ``T(p) = I(p + d(p))``, bicubic; beyond the frame the border is repeated.
 
     Args:
         picture: I, (B, C, H, W).

@@ -16,8 +16,8 @@ def contour_lines(field: Tensor, line: float, flattest: float = 1e-3) -> Tensor:
     Args:
         field: the smooth field.
         line: full width of a line at half its maximum, in pixels.
-        flattest: smallest slope per pixel; flatter places, where the field only touches zero, are drawn as if they
-            had it, so that they do not become wide blots.
+        flattest: lower limit of the slope per pixel. Without it, flat places where the field only touches zero would
+            become wide blots.
     """
     slope = torch.stack(torch.gradient(field, dim=(-2, -1))).square().sum(0).sqrt()
     # To first order the distance from the zero contour in pixels is field / |slope|. A line is a Gaussian of it;

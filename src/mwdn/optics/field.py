@@ -21,7 +21,7 @@ FieldPsfs = Float[Tensor, "rows columns psf_channel psf_height psf_width"]
 
 @dataclass(frozen=True)
 class Aberration:
-    """How a PSF changes from the axis to the corner of the field; in between, with the square of the distance.
+    """Change of a PSF at the corner of the field; it grows with the square of the distance from the axis.
 
     Args:
         scale: relative magnification of the PSF at the corner.
@@ -49,7 +49,7 @@ class Aberration:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) must be above -0.9: a relative change.")
 
     def __mul__(self, factor: float) -> "Aberration":
-        """All four changes times a factor."""
+        """Multiply all four changes by a factor."""
         return Aberration(**{part.name: getattr(self, part.name) * factor for part in fields(self)})
 
     def at(self, psf: Psf, y: float, x: float) -> Psf:
@@ -72,7 +72,7 @@ class Aberration:
         changed = warp(psf, matrix) if self.scale or self.stretch else psf
         if self.blur_px:
             changed = gaussian_blur(changed, self.blur_px * math.sqrt(square)).clamp(min=0)
-        # `warp` keeps the brightness; divided by the determinant, the same light falls on more pixels.
+        # `warp` keeps the brightness; division by the determinant keeps the total light.
         return changed * (1 - self.vignetting * square) / float(matrix.det())
 
 
@@ -121,7 +121,7 @@ class FieldCamera:
 
         The PSFs as rows of a matrix are ``U S V^T``: the kernels are rows of V^T, the weights columns of U S. Of all
         cameras with K kernels this one has the least squared error over the grid: the sum of the squared singular
-        values left out.
+        values that are left out.
 
         Args:
             psfs: (rows, columns, C, h, w); the first is at the scene's upper left corner.
@@ -189,7 +189,7 @@ class FieldCamera:
 
 
 def two_depths(near: FieldCamera, far: FieldCamera, is_near: Tensor) -> FieldCamera:
-    """One camera for a scene in which each point is at one of two distances, and so seen through one of two cameras.
+    """Combine two cameras into one, for a scene whose points are at one of two distances.
 
     At a distance z the PSF is magnified by 1 + d / z, with d from the mask to the sensor.
 
@@ -203,7 +203,7 @@ def two_depths(near: FieldCamera, far: FieldCamera, is_near: Tensor) -> FieldCam
 
 
 def gaussian_blur(image: Image, sigma: float) -> Image:
-    """Blur pictures by a Gaussian of standard deviation ``sigma`` in pixels; beyond their border is darkness."""
+    """Blur pictures by a Gaussian of standard deviation ``sigma`` in pixels; zeros beyond their border."""
     size = image.shape[-2], image.shape[-1]
     # Padding by four standard deviations: 6e-5 of the light at a border wraps around to the opposite one.
     margin = math.ceil(4 * sigma)

@@ -41,7 +41,7 @@ class Lcd:
             raise ParameterError(f"`opening_um` {self.opening_um} must be at most `pitch_um` {self.pitch_um}.")
 
     def amplitude(self, transmission: Plane, channel: int | None = None) -> Mask:
-        """The mask that one colour sees.
+        """The mask for one colour.
 
         Args:
             transmission: (rows, columns) of the cells' power, in [0, 1].

@@ -137,7 +137,7 @@ def write_gds(path: str | Path, mask: Mask) -> None:
             cell.add(gdstk.rectangle(corner, other, layer=layer))
     with atomic_write(path) as temporary:
         library.write_gds(temporary)
-        # gdstk does not notice a full disk. Its record of the end is missing then, or else some of the rectangles.
+        # gdstk does not report a full disk: the file then lacks its end record or some of the rectangles.
         if temporary.read_bytes()[-4:] != _GDS_END or gdstk.gds_info(temporary)["num_polygons"] != len(cell.polygons):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 

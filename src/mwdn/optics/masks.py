@@ -158,7 +158,7 @@ def mask_psf(mask: Mask, setup: Setup, *, angle_degrees: tuple[float, float] = (
 
 
 def _in_aperture(mask: Mask, setup: Setup) -> Mask:
-    """The samples of which a part lies within the aperture."""
+    """Crop a mask to the samples that lie at least partly within the aperture."""
     rows, columns = (2 * math.ceil(side * UM_PER_MM / mask.pitch_um / 2) + 1 for side in setup.aperture_mm)
     return mask.middle((rows, columns))
 

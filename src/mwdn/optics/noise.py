@@ -26,8 +26,8 @@ def noise_level(image: Image, *, parts: int = 16) -> Tensor:
             sharp lines can fill a part.
 
     Raises:
-        ShapeError: other axes.
-        ParameterError: no tensor of floats.
+        ShapeError: the axes are not (B, C, H, W).
+        ParameterError: not a tensor of floats.
 
     References:
         D. L. Donoho and I. M. Johnstone, Biometrika 81, 425 (1994), for the median of the finest detail.

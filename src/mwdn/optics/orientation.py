@@ -9,8 +9,8 @@ from mwdn.errors import UnknownNameError
 Orientation = Literal[
     "flip-left-right", "flip-top-bottom", "rotate-90", "rotate-180", "rotate-270", "transpose", "transverse"
 ]
-"""The turns of a square besides the identity, with the names of `PIL.Image.Transpose`; rotations are counter-clockwise,
-``transpose`` swaps rows and columns, ``transverse`` also rotates by 180 degrees."""
+"""Rotations and mirror images of a square, except the identity, with the names of `PIL.Image.Transpose`. Rotations are
+counter-clockwise, ``transpose`` swaps rows and columns, ``transverse`` also rotates by 180 degrees."""
 
 _STEPS: dict[str, tuple[bool, bool, bool]] = {
     "flip-left-right": (False, False, True),
@@ -29,8 +29,8 @@ _NAMES = {steps: cast(Orientation, name) for name, steps in _STEPS.items()}
 def turn(psf: Tensor, orientation: Orientation) -> Tensor:
     """Turn a PSF (..., H, W); its centre ``(H // 2, W // 2)`` stays the centre.
 
-    A capture is turned without this condition: it has no centre to keep, and one of its border lines would move to the
-    opposite border.
+    Not for captures: they have no centre to keep, and for even lengths this moves one border line to the opposite
+    border.
 
     Raises:
         UnknownNameError: no such orientation.
@@ -45,18 +45,18 @@ def turn(psf: Tensor, orientation: Orientation) -> Tensor:
 
 
 def compose(first: Orientation | None, second: Orientation | None) -> Orientation | None:
-    """One turn for two, one after the other; None for no turn."""
+    """Single turn that equals ``first`` followed by ``second``; None for no turn."""
     if first is None or second is None:
         return first or second
     (swap, *reversed_axes), (swap_next, *reversed_next) = _STEPS[first], _STEPS[second]
     if swap_next:
-        reversed_axes.reverse()  # what reversed rows reverses columns, once they are swapped
+        reversed_axes.reverse()  # after the swap, reversed rows are reversed columns
     rows, columns = (before != after for before, after in zip(reversed_axes, reversed_next, strict=True))
     return _NAMES.get((swap != swap_next, rows, columns))
 
 
 def swaps_axes(orientation: Orientation | None) -> bool:
-    """Whether a turn makes rows of columns, so that the PSF's height becomes its width."""
+    """Whether a turn swaps rows and columns, so that the PSF's height becomes its width."""
     return orientation is not None and _STEPS[orientation][0]
 
 

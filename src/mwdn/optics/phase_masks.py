@@ -77,7 +77,7 @@ class Contour:
         return Mask("phase", level * step_um, self.pitch_um, self.index, step_um)
 
     def _check(self, setup: Setup) -> None:
-        """Check everything that the mask or the light of a camera limits."""
+        """Check the parameters against the limits of the mask and of the camera's light."""
         check_levels(self.levels)
         check_index(self.index)
         check_positive(step_nm=self.step_nm, line_um=self.line_um, spacing_um=self.spacing_um)

@@ -32,12 +32,12 @@ def checked_psf(psf: Tensor, *, values: bool = True, scale: bool = True) -> Psf:
 
     Args:
         psf: (1 or B, C, h, w), light; of any scale.
-        values: refuse numbers that are no light. This waits for a GPU; training leaves it out.
+        values: also check the numbers. The check waits for a GPU, so training leaves it out.
         scale: scale it; otherwise it is returned as it is.
 
     Raises:
-        ShapeError: other axes.
-        ParameterError: no tensor of floats.
+        ShapeError: the axes are not those above.
+        ParameterError: not a tensor of floats.
         PsfError: NaN, infinity, a negative number, or a channel without light.
     """
     check_batch(psf, "psf")

@@ -14,10 +14,10 @@ from mwdn.optics.psf_spectrum import ring_means
 from mwdn.types import Psf, Size
 
 LOSSLESS_WIDTH = 6.0
-"""Full width of the autocorrelation, in pixels, of a PSF that is binned as far as that loses little."""
+"""Full width of the autocorrelation, in binned pixels, down to which binning loses little; see `coarsest_bin`."""
 
 SMALLEST_SIDE = 100
-"""Pixels of the shorter side of a frame that is binned without being asked."""
+"""Fewest pixels of the shorter side of a frame that is binned automatically."""
 
 
 def effective_rank(psf: Psf) -> float:
@@ -79,10 +79,10 @@ def coarsest_bin(psf: Psf) -> int:
 
     Gaussian lines whose autocorrelation has a full width of w pixels have the transfer function
     ``exp(-1.8 (w f)^2)``. Binned by w / 6, the highest frequency is f = 3 / w, where it is 1e-7: no linear method
-    resolves anything there. Solvers and networks draw edges on finer pixels than that, but what these gain is less
-    than what the errors of a calibrated PSF and the noise of finer pixels cost. Of 30 simulated captures with such
-    errors through five PSFs, `pyramid` gains 0.3 dB on average and is 29 times as fast, `universal-small` loses 0.2 dB;
-    with 3 % noise they gain 0.8 and 0.2 dB. Binned by w / 4, they lose up to 2 dB.
+    resolves anything there. Solvers and networks restore edges on finer pixels, but this gains less than the errors of
+    a calibrated PSF and the noise of finer pixels cost. Of 30 simulated captures with such errors through five PSFs,
+    `pyramid` gains 0.3 dB on average and is 29 times as fast, `universal-small` loses 0.2 dB; with 3 % noise they gain
+    0.8 and 0.2 dB. Binned by w / 4, they lose up to 2 dB.
 
     The shorter side of the binned frame keeps `SMALLEST_SIDE` pixels at least.
 
@@ -99,10 +99,11 @@ def _detail(plane: Tensor, grid: Size) -> Tensor:
 
 
 def _noise_power(plane: Tensor, power: Tensor, grid: Size) -> Tensor:
-    """White part of a PSF's power spectrum that is noise, for both lines and noise have power at high frequencies.
+    """Power of the white noise in a PSF's spectrum: the least of three upper bounds.
 
-    Lines of two pixels and more have little at the highest ones; spots of one pixel leave the dark between them without
-    noise; and a pattern that is white altogether is the PSF.
+    Both lines and noise have power at high frequencies. The bounds are the power at the highest frequencies, where
+    lines of two pixels and more have little; the noise of the dark areas between spots of one pixel; and half of the
+    mean power, because a pattern that is white altogether is the PSF.
     """
     rows, columns = frequency_grid(grid, device=plane.device)
     highest = power[(rows.abs() > 0.4) & (columns.abs() > 0.4)].mean()

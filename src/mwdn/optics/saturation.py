@@ -7,18 +7,18 @@ from torch.nn import functional as F
 from mwdn.types import Measurement
 
 PLATEAU = 0.98, 0.995
-"""Parts of a colour's maximum. In a saturated capture more pixels are above the second than between the two; in others
-many times fewer, for the brightest light is rare."""
+"""Fractions of a colour's maximum. A saturated capture has more pixels above the second than between the two; other
+captures have many times fewer, because the brightest light is rare."""
 
 LEAST_SATURATED = 5e-4
-"""Smallest fraction of saturated pixels: fewer are peaks of the light, or hot pixels."""
+"""Smallest fraction of saturated pixels: fewer are bright peaks or hot pixels."""
 
 
 def saturated_pixels(measurement: Measurement) -> Tensor:
     """Where a measurement (B, C, H, W) is saturated, bool, found by the plateau at the maximum of each colour.
 
-    So neither the scale of the measurement matters nor the black level that was subtracted. A capture without a
-    plateau, or with fewer than 50 levels of grey, has none.
+    The result does not depend on the scale of the measurement, nor on a black level that was subtracted. A capture
+    without a plateau, or with fewer than 50 grey levels, has no saturated pixels.
     """
     most = measurement.amax((-2, -1), keepdim=True)
     sample = measurement[..., ::2]
@@ -29,16 +29,16 @@ def saturated_pixels(measurement: Measurement) -> Tensor:
 
 
 def subtract_light(measurement: Measurement, light: Tensor) -> Measurement:
-    """A measurement less some light (B, C, H, W), whose saturated pixels stay a plateau (`keep_plateau`)."""
+    """Subtract light (B, C, H, W) from a measurement; its saturated pixels stay a plateau (`keep_plateau`)."""
     return keep_plateau(measurement, measurement - light)
 
 
 def keep_plateau(saturating: Measurement, corrected: Measurement) -> Measurement:
-    """A corrected measurement (B, C, H, W) whose saturated pixels are a plateau again: a lower bound of their light.
+    """Make the saturated pixels of a corrected measurement a plateau again: a lower bound of their light.
 
-    A flat field or a frame that is subtracted gives saturated pixels different values. The bound is the least of them,
-    each taken as the largest of 3 x 3 pixels. Hot pixels are no bound: a pixel counts only with a saturated one
-    beside it. Pixels that lose more than half do not count: what was subtracted may have saturated them by itself.
+    A flat field or a subtracted frame gives saturated pixels different values. The bound is the least of their maxima
+    over 3 x 3 pixels. Two kinds of pixels do not count: those without a saturated neighbour, which may be hot pixels,
+    and those that lose more than half, which the subtracted frame alone may have saturated.
 
     Args:
         saturating: (B, C, H, W), the measurement before the correction.

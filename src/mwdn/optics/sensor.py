@@ -73,13 +73,13 @@ def gamma_coded(capture: Image, gamma: float, decoded: float, *, bit_depth: int 
     """Store a capture as a gamma-coded file and read it again.
 
     A pixel of light v in [0, 1] is stored as v^(1 / gamma), rounded to a step of the file, and read as its power of
-    ``decoded``. With the right gamma only the rounding is left: of half a step s, ``s gamma v^(1 - 1 / gamma) / 2``.
-    With a wrong one light v becomes ``v^(decoded / gamma)``.
+    ``decoded``. With the right gamma only the rounding error remains: for half a step s,
+    ``s gamma v^(1 - 1 / gamma) / 2``. With a wrong gamma, light v becomes ``v^(decoded / gamma)``.
 
     Args:
         capture: (B, C, H, W); below 0 and above 1 it is clipped.
         gamma: of the file.
-        decoded: the gamma that the reader believes.
+        decoded: the gamma that the reader assumes.
         bit_depth: of the file.
     """
     steps = 2**bit_depth - 1

@@ -22,7 +22,7 @@ _ADVICE = "Capture it again: `mwdn capture`."
 
 _PATTERNS = ("charuco", "dots")
 _FRAMES = 16
-"""Most frames of a pattern, and of the dark display, that are averaged."""
+"""Largest number of averaged frames of a pattern, and of the dark display."""
 
 SRGB = "srgb"
 

@@ -24,7 +24,8 @@ from mwdn.types import FloatFrame, Size
 Array = npt.NDArray[np.float64]
 
 MARGIN = 0.08
-"""Dark rim around the displayed picture that is compared, too, as a fraction of its size: its border is an edge."""
+"""Dark rim around the displayed picture, as a fraction of its size, that is compared, too, because the border is an
+edge."""
 
 _OWN_BLURS = (0.0, 0.7, 1.4, 2.1, 3.0)
 """Standard deviations of a reconstruction's own blur in pixels: the one that gives the best correlation is taken."""
@@ -101,7 +102,7 @@ def correlate(projection: Projection, views: Views, blur: float, *, robust: bool
         projection: from pictures to reconstructions.
         views: pictures and reconstructions.
         blur: standard deviation in pixels of the camera.
-        robust: with Tukey's weights, as `refine`; they hide what tells a picture from its mirror image if it is small.
+        robust: with Tukey's weights, as `refine`; they hide a small difference between a picture and its mirror image.
     """
     smooth = smooth_images(views.reconstructions, blur)
     samples = matched_samples(projection, views, smooth, blur)
@@ -269,7 +270,7 @@ def _placed(projection: Projection, samples: Samples, free: int) -> tuple[Points
 
 
 def _moved(projection: Projection, step: Array) -> Projection | None:
-    """The projection after a step, if the picture is then still a sound quadrilateral."""
+    """The projection after a step, if the picture is then still a valid quadrilateral (`_is_sound`)."""
     with suppress(AlignmentError, ParameterError):
         moved = projection.moved(step)
         return moved if _is_sound(moved) else None

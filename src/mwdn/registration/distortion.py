@@ -1,4 +1,4 @@
-"""Measure the distortion of recorded pairs: scenes that another camera saw, with its own lens, from its own place.
+"""Measure the distortion of recorded pairs: another camera recorded the scenes, with its own lens and position.
 
 With the reconstruction I_n of a pair, its scene T_n, and polynomials P_k over the frame, minimise over c, and over a
 gain a_n of each picture,
@@ -25,14 +25,14 @@ BLURS = 2.0, 1.0
 the first is found."""
 
 LOCAL = 1 / 16
-"""Side of the square of a local mean, of the frame's shorter side. What is coarser is mostly shading."""
+"""Side of the square of a local mean, over the frame's shorter side. Coarser structure is mostly shading."""
 
 MARGIN = 1 / 20
-"""Rim of the frame that is not compared, of its shorter side: light from outside is not in the scene."""
+"""Rim of the frame that is not compared, over its shorter side: light from outside is not in the scene."""
 
 STEPS = 8
 RIDGE = 1e-4
-"""Of the normal equations, over the mean of their diagonal."""
+"""Ridge of the normal equations, over the mean of their diagonal."""
 
 
 class _Detail(NamedTuple):

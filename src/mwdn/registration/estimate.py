@@ -22,7 +22,7 @@ SURE = 0.8
 pictures reach 0.75, because their dark surround is right."""
 
 WORST = 0.6
-"""Least correlation that is accepted."""
+"""Smallest correlation that is accepted."""
 
 WORST_PX = 1.5
 """Largest residual that is accepted; for large pictures 2 % of their side."""
@@ -34,12 +34,12 @@ _CLOSE = 0.04
 """Starts whose correlation is this close to the best after coarse refinement are compared again in detail."""
 
 _AMBIGUOUS = 0.05
-"""Part by which the best start must leave less unexplained than the next, ``1 - correlation``."""
+"""Part by which the unexplained ``1 - correlation`` of the best start must be lower than that of the next."""
 
 _FEW = 4
 _FEWEST_PARTS = 4
 _ENOUGH_PARTS = 12
-"""Parts that tell shading from a displacement of the whole: 24 numbers for the 8 of a homography."""
+"""Fewest parts that separate shading from a displacement of the whole: 24 numbers for the 8 of a homography."""
 
 _ROUNDS = 2
 
@@ -51,7 +51,7 @@ class Estimate(NamedTuple):
         projection: from the displayed pictures to the reconstructions.
         correlation: of the square roots of both, 0 to 1.
         residuals: displacements of parts of the picture from where the projection puts them.
-        start: what found it: "markers", "features", "search" or "points".
+        start: method that found it: "markers", "features", "search" or "points".
     """
 
     projection: Projection
@@ -145,7 +145,7 @@ def _single(tried: list[tuple[Refined, str]], few: Views) -> tuple[Refined, str]
 
 
 def _through_parts(projection: Projection, views: Views) -> tuple[Projection, Residuals]:
-    """The projection through the parts of the picture where the reconstructions show them, and what is left."""
+    """Fit the projection to the positions of the picture's parts in the reconstructions; also returns the residuals."""
     residuals = measure_residuals(projection, views)
     for _ in range(_ROUNDS):
         if len(residuals.points) < _ENOUGH_PARTS:

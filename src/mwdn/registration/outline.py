@@ -5,8 +5,8 @@ brightness along profiles across it. Most profiles must agree: dark parts of the
 beside it and ringing of the reconstruction disturb a few.
 
 A prior that removes haze (positive light, sparse gradients, a network) also removes dark parts of the picture at its
-border: of the paper's camera's picture of a display, a strip of a tenth of its height. A Wiener estimate is linear: it
-keeps their edge, under haze that has none.
+border: in a picture of a display by the paper's camera, a strip of a tenth of its height. A Wiener estimate is linear:
+it keeps the edge of these parts, under haze without an edge.
 """
 
 from typing import Any
@@ -64,7 +64,7 @@ def find_outline(reconstruction: FloatFrame, linear: FloatFrame | None = None) -
 
 
 def _straightest(image: FloatFrame, starts: list[Points | None]) -> tuple[Points | None, float]:
-    """The corners whose sides most profiles agree with, and the share that agrees with the worst side."""
+    """The corners whose sides fit the profiles best, and the share of profiles that agree with the worst side."""
     fits = [_sharpen(image, start) for start in starts if start is not None]
     return max(fits, key=lambda fit: fit[1], default=(None, 0.0))
 

@@ -17,11 +17,11 @@ _MOST = 0.3
 """Largest radial term: `Projection.to_picture` converges below 1/3."""
 
 _LEAST_PX = 0.03
-"""Error of a part that no standard error tells of."""
+"""Error of a part that its standard error does not include."""
 
 _PREDICTS = 0.8
-"""Part of the error at points that were left out that a radial term must leave. Errors of neighbours are alike in
-reconstructions, and the criterion takes them for independent."""
+"""A radial term must reduce the error at points that were left out to this part. Errors of neighbours are alike in
+reconstructions, but the criterion assumes that they are independent."""
 
 
 class PointFit(NamedTuple):

@@ -70,7 +70,7 @@ class Projection:
 
     @property
     def radial(self) -> float:
-        """K of equation (2): relative displacement at the corners of the camera's frame."""
+        """The k of equation (2): relative displacement at the corners of the camera's frame."""
         return self.parameters[8]
 
     @property

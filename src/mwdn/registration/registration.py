@@ -1,4 +1,4 @@
-"""A registration: a projection with its quality as a file, and in words."""
+"""A registration, a projection with its quality: as a file, and in words."""
 
 import json
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ _SUFFIXES = (".h5", ".hdf5")
 
 @dataclass(frozen=True)
 class Place:
-    """Where a displayed picture is in the camera's frame, in words that people use.
+    """Where a displayed picture is in the camera's frame, in everyday terms.
 
     Args:
         left: of the picture's corner that is the top left one as seen, in pixels.

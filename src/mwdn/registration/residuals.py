@@ -1,4 +1,4 @@
-"""How far a projection is off, in pixels: the displacement of each part of the picture that would fit better."""
+"""Residuals of a projection, in pixels: the displacement of each part of the picture that fits best."""
 
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ _CORRELATED = 20.0
 """Pixels of a reconstruction that count as one independent sample."""
 
 _UNCERTAIN_PX = 0.5
-"""Standard error above which a part, such as a clear sky, says nothing about its displacement."""
+"""Standard error above which a part, such as a clear sky, gives no displacement."""
 
 
 class Residuals(NamedTuple):

@@ -1,4 +1,4 @@
-"""Find a displayed picture in a reconstruction from nothing: correlation at every place, size, turn and mirroring."""
+"""Find a displayed picture in a reconstruction by correlation at every place, size, turn and mirroring."""
 
 import numpy as np
 import numpy.typing as npt

@@ -23,8 +23,8 @@ BLOCK = 8
 
 STEPS = 8
 RIDGE = 0.03
-"""Of the normal equations, over the mean of their diagonal: it draws c to 0, and so tells S from a_n. With 0.001 eight
-real pairs come out within 0.01 dB."""
+"""Ridge of the normal equations, over the mean of their diagonal: it draws c to 0, and so separates S from a_n. With
+0.001 eight real pairs come out within 0.01 dB."""
 
 
 def measure_shading(pictures: Sequence[Tensor], scenes: Sequence[Tensor], order: int) -> Tensor:

@@ -9,7 +9,7 @@ from types import FrameType
 
 @contextmanager
 def deferred_interrupt() -> Iterator[Callable[[], bool]]:
-    """Let the first Ctrl-C (SIGINT) only be noted, so that the work in progress is not torn; the second interrupts.
+    """Only record the first Ctrl-C (SIGINT), so that the work in progress is completed; the second one interrupts.
 
     Outside the main thread, which alone receives signals, nothing is changed.
 

@@ -1,4 +1,4 @@
-"""Iterations that can be watched from outside: how much of a solver's work is done."""
+"""Iterations that report their progress: the fraction of a solver's work that is done."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -27,7 +27,7 @@ def iterations(count: int, *, start: float = 0.0, end: float = 1.0) -> Iterator[
         start: fraction of the work that is done before.
         end: fraction of the work that is done after.
     """
-    report = None if torch.compiler.is_compiling() else _report.get()  # an export has nobody to report to
+    report = None if torch.compiler.is_compiling() else _report.get()  # an export reports no progress
     for number in range(count):
         yield number
         if report is not None:

@@ -14,9 +14,9 @@ Entry = TypeVar("Entry")
 class Registry(Mapping[str, Entry]):
     """Entries by name: those of this package, then those of installed plugins.
 
-    Plugins are looked up only where a name is not one of this package, or where all names are listed: to read the
-    entry points of all installed packages takes some hundredths of a second, and a plugin's import as long as it likes.
-    A list leaves out plugins that cannot be loaded, each with one warning.
+    Plugins are looked up only where a name is not one of this package, or where all names are listed: reading the entry
+    points of all installed packages takes some hundredths of a second, and the import of a plugin any time. A list
+    leaves out plugins that cannot be loaded, each with one warning.
 
     Args:
         own: of this package. A plugin cannot replace them.
@@ -32,7 +32,7 @@ class Registry(Mapping[str, Entry]):
 
     @cached_property
     def _points(self) -> dict[str, EntryPoint]:
-        """Entry points of plugins by name. Of two of one name the package that comes first in the alphabet has it."""
+        """Entry points of plugins by name. Of two with the same name, the alphabetically first package's is used."""
         points: dict[str, EntryPoint] = {}
         for point in sorted(entry_points(group=self.group), key=lambda point: (point.name, _package(point))):
             owner = "mwdn" if point.name in self.own else _package(points.get(point.name))
@@ -90,7 +90,7 @@ class Registry(Mapping[str, Entry]):
         end = f"Update it, or remove it: `pip uninstall {package}`."
         try:
             entry = point.load()
-        except (Exception, SystemExit) as error:  # whatever the import of another package raises
+        except (Exception, SystemExit) as error:  # the import of another package can raise anything
             raise ParameterError(f"{start} {type(error).__name__}: {reason(error)}. {end}") from error
         if not self._accepts(entry):
             raise ParameterError(f"{start} `{point.value}` must be {self._must_be}. {end}")

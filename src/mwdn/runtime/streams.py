@@ -100,8 +100,8 @@ def latest_results(
 ) -> Generator[B, None, None]:
     """Process the newest frames of a source, several at the same time, and yield the newest result each time.
 
-    A result that a later frame's has overtaken is dropped. Close the generator before the source of the frames, as that
-    of `latest`.
+    A result is dropped if that of a later frame is already there. Close the generator before the source of the frames,
+    as for `latest`.
 
     Args:
         begin: called with a frame, in the order of the frames, one at a time; the function that it returns is called at

@@ -1,4 +1,4 @@
-"""The number of threads on which torch computes what one thread asks for."""
+"""The number of torch's threads for the operations of one calling thread."""
 
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -7,7 +7,7 @@ from threading import Lock
 import torch
 
 _LOCK = Lock()
-"""Two threads at once would take each other's number for that of new threads."""
+"""Two threads at once would read each other's number as that of new threads."""
 
 
 def usable_processors() -> int:
@@ -18,15 +18,15 @@ def usable_processors() -> int:
 
 
 def use_threads(count: int) -> None:
-    """Let torch compute on ``count`` threads what the calling thread asks for; other threads keep their number.
+    """Let torch use ``count`` threads for operations of the calling thread; other threads keep their number.
 
-    `torch.set_num_threads` changes the calling thread, and the number with which new threads start. A thread of its own
-    reads the second before, and another sets it back.
+    `torch.set_num_threads` changes the number of the calling thread, and the default of new threads. A temporary thread
+    reads this default before, and another one restores it.
     """
     with _LOCK:
         with ThreadPoolExecutor(1) as fresh:
             before = fresh.submit(torch.get_num_threads).result()
-        torch.get_num_threads()  # or else torch takes up the number of new threads at this thread's first operation
+        torch.get_num_threads()  # else this thread's first operation would take the default of new threads
         torch.set_num_threads(count)
         with ThreadPoolExecutor(1) as fresh:
             fresh.submit(torch.set_num_threads, before).result()

@@ -1,4 +1,4 @@
-"""Who may talk to a page of this package: this computer, and whoever knows its token."""
+"""Access control of the pages of this package: this computer, and requests with the page's token."""
 
 import hmac
 import socket
@@ -24,8 +24,8 @@ def check_token(host: str, token: str) -> None:
 def is_allowed(headers: Mapping[str, str], given: str, token: str, *, any_host: bool) -> bool:
     """Whether a request may be answered.
 
-    The token must be right. The request must not come from a page of another site (Origin), also not from one whose
-    name was made to lead to this computer (Host).
+    The token must be right. The request must not come from a page of another site (Origin), nor from one whose name
+    resolves to this computer (Host; DNS rebinding).
 
     Args:
         headers: of the request, by lower-case names.
@@ -56,7 +56,7 @@ def listen(host: str, port: int) -> socket.socket:
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((host, port))
-        listener.listen()  # before the server does: a page that comes early waits
+        listener.listen()  # before the server starts, so that early requests wait
     except (OSError, OverflowError) as error:
         listener.close()
         raise ParameterError(f"`host` and `port` ({host}:{port}) cannot be used: {reason(error)}.") from error

@@ -42,7 +42,7 @@ _NETWORKS = frozenset(
     {"drunet", "flatnet", "ifin", "le-admm", "le-admm-u", "mmcn", "mwdn", "mwdn-cpsf", "svdeconv", "unet", "updn"}
     | {"wiener-bank", "wiener-unet"}
 )
-"""Names of networks, known here only for the message of `build`: `mwdn.networks` is above this folder."""
+"""Names of networks, only for the error message of `build`: this folder cannot import `mwdn.networks`."""
 
 
 def build(name: str, **options: Any) -> Callable[[Measurement, Psf], Scene]:  # noqa: ANN401

@@ -18,12 +18,12 @@ Gauss-Newton steps minimise E with a Gaussian prior of standard deviations S on 
 5. ``(A^T A + s^2 S^-2) step = -(A^T r + s^2 S^-2 theta)``, where s^2 is the noise variance of the residual
 
 With the pose known, one such step finds the displacement d of the envelope (`mwdn.optics.aperture.displaced_envelope`),
-with theta = d. The envelope of near objects has a scale of its own: found together with the pose, d would change the
-pattern's scale and blur their picture; found after it, d draws faint ghosts. So d is zero for them. Where the PSF is
-exact, a small wrong d lowers E a little, so d counts only if it lowers E clearly (`MIN_ENVELOPE_GAIN`).
+with theta = d. For near objects, pattern and envelope have different scales. A d estimated with the pose would change
+the pattern's scale and blur the picture; a d estimated after it causes faint ghosts. So d is zero for them. Where the
+PSF is exact, a small wrong d lowers E a little, so d is used only if it lowers E clearly (`MIN_ENVELOPE_GAIN`).
 
 Haze is estimated after that. A faint veil over the scene compensates a haze that is missing from the PSF, but nothing
-compensates too much haze, for light is not negative: E at low frequencies is flat up to the true haze, then rises
+compensates too much haze, because light is not negative: E at low frequencies is flat up to the true haze, then rises
 steeply. The estimate is the largest haze of the flat part. Blur cannot be estimated: a sharper PSF always fits better.
 """
 
@@ -96,33 +96,33 @@ SMOOTH_LEVELS = (
     Level(1, 8, Penalties(0.1, 1.5, 1.5), 0.02, min_smoothing=0.2),
 )
 _HIGH_PASS = 0.03  # cycles per pixel: below, most of the residual is ambient light and unconverged iterations
-_MOST_FALL_OFF = 0.5  # of any polynomial: of x^2 + y^2, which is 2 in the corners, all of the light lost there
+_MOST_FALL_OFF = 0.5  # coefficient of any polynomial: that of x^2 + y^2 then loses all light in the corners
 _REACH = 16  # pixels, three standard deviations of the Gaussian of `_HIGH_PASS`
 _PRIOR = (0.5, 0.01)  # standard deviations S of a calibration's errors: degrees and relative magnification
 _DELTA = (0.1, 0.002)  # finite differences
 _ENVELOPE_BLUR = 0.06  # see `displaced_envelope`: wider than in [mismatch], which most real captures fit better
 _ENVELOPE_PRIOR = (0.015, 0.015)  # of the envelope: down and right, over the shorter side
 _ENVELOPE_DELTA = (0.004, 0.004)
-_ENVELOPE_PARTS = (1.5, 1.0, 0.5, 0.25)  # of its step, which is often too long in real captures
+_ENVELOPE_PARTS = (1.5, 1.0, 0.5, 0.25)  # of its step, tried in turn: it is often too long in real captures
 _LEAST_SIDE = 200  # pixels: at half of 160, the paper's PSF is so coarse that exact captures seem displaced: -1 dB each
 _MOST_SCALE = 0.02  # relative magnification of an object that is about as far away as the calibration's source
 _CORRELATED = 20.0  # pixels of the residual that count as one independent sample
 MIN_GAIN = 1e-3
-"""Part of the residual's energy that a pose must explain, or the PSF stays as it was calibrated. With an exact PSF a
+"""Part of the residual's energy that a pose must explain; otherwise the calibrated PSF is kept. With an exact PSF a
 smaller gain is noise."""
 
 MIN_ENVELOPE_GAIN = 0.02
 """The same for the displacement of the envelope, up to a noise of `_GOOD_LIGHT`; beyond it falls as 1 / noise, because
-noise raises E and hides what a displacement explains. 160 captures through four measured PSFs that are not displaced,
-on dark or filling the frame, exact or mismatched, are below: at 0.019 at most in good light, 0.005 in low light. Of 20
+noise raises E and hides what a displacement explains. 160 captures through four measured PSFs without displacement, on
+dark or filling the frame, exact or mismatched, are below: at most 0.019 in good light, 0.005 in low light. Of 20
 real-like ones 17 are above in good light, 12 in low light. A third of the saturated part is added: clipped lines do not
 contradict a wrong displacement. With 5 % saturated one gained 0.02 and cost 3 dB, with 41 % one gained 0.13."""
 
 _GOOD_LIGHT = 0.02  # noise over the measurement's root mean square: at 15,000 electrons 0.009 to 0.018
 
-# At a quarter of the size: haze has low frequencies only, the slowest to converge. With 20 iterations each, a frame
-# that is filled hid its haze and lost 1 to 3 dB. Strong smoothing keeps noise and detail out of what the haze explains.
-# Not `LEVELS`: with over-relaxation the haze of exact cameras came out 1 to 2 % larger.
+# At a quarter of the size: haze has only low frequencies, which converge slowest. With 20 iterations each, the haze of
+# frames that are filled was not found, which cost 1 to 3 dB. Strong smoothing keeps noise and detail from being
+# explained as haze. Not `LEVELS`: their over-relaxation makes the haze of exact cameras 1 to 2 % larger.
 _HAZES = (0.0, 0.02, 0.04, 0.07, 0.1, 0.14)
 _HAZE_LEVELS = (
     Level(2, 80, Penalties(0.015, 0.4, 0.06), 0.04),
@@ -130,7 +130,7 @@ _HAZE_LEVELS = (
 )
 _LEAST_HAZE = 0.001  # less is none: E rises by 5 % shortly after its minimum at no haze
 _HAZE_RISE = 1.05
-"""E over its minimum that ends the flat part. At this value, of 1.03 to 1.15, 40 captures through three measured PSFs,
+"""E over its minimum at which the flat part ends: the best from 1.03 to 1.15. 40 captures through three measured PSFs,
 exact and under 10 % of haze, come within 0.05 dB of their best haze, and 24 that fill the frame within 0.25 dB."""
 
 
@@ -147,7 +147,7 @@ def align(measurement: Measurement, psf: Psf, *, steps: int = 2, min_gain: float
 
     Raises:
         ShapeError: batch or channels do not fit.
-        ParameterError: no tensors of floats.
+        ParameterError: not tensors of floats.
         PsfError: the PSF is negative, not finite, or dark.
 
     References:
@@ -235,7 +235,7 @@ def _estimate_haze(measurement: Measurement, psf: Psf) -> Tensor:
     residual = inverse_spectrum(estimate.residual_spectrum * low, grid, grid)
     energy = residual.square().sum((1, 2, 3)).reshape(-1, len(hazes))
     limit = _HAZE_RISE * energy.amin(1, keepdim=True)
-    last = (energy < limit).long().cumsum(1).argmax(1, keepdim=True)  # the first of the largest sums: the last True
+    last = (energy < limit).long().cumsum(1).argmax(1, keepdim=True)  # the last True: argmax takes the first maximum
     after = (last + 1).clamp(max=len(hazes) - 1)
     below, above = energy.gather(1, last), energy.gather(1, after)
     part = (limit - below) / (above - below).clamp(min=torch.finfo(energy.dtype).tiny)
@@ -265,13 +265,13 @@ def _residual(measurement: Tensor, psfs: Psf) -> Tensor:
 
 
 def _without_fall_off(whole: Tensor, prediction: Tensor, size: Size, count: int) -> Tensor:
-    """The part of a residual r that no fall-off explains, on the sensor: ``r - sum_k a_k q_k p``, a by least squares.
+    """Remove the sensor's fall-off from a residual r: ``r - sum_k a_k q_k p``, a by least squares.
 
     The residual and the high-passed prediction are given on a grid (N, C, rows, columns) that begins with the sensor.
     The polynomials q are smooth, so that the high-passed product with a prediction is q times the high-passed
-    prediction p. A fall-off of more than `_MOST_FALL_OFF` is not a sensor's: if one of a capture's ``count`` poses has
-    it, its residuals stay as they are, with what the high pass spreads beyond the sensor. All poses or none, because
-    differences between residuals must come from the poses.
+    prediction p. A fall-off of more than `_MOST_FALL_OFF` cannot be the sensor's: if one of a capture's ``count`` poses
+    has it, all residuals of this capture stay unchanged, including what the high pass spreads beyond the sensor. All
+    poses are treated alike, so that differences between residuals come from the poses only.
     """
     height, width = size
     r, p = whole[..., :height, :width], prediction[..., :height, :width]
@@ -290,7 +290,7 @@ def _without_fall_off(whole: Tensor, prediction: Tensor, size: Size, count: int)
 
 
 def halve_psf(psf: Psf) -> Tensor:
-    """The PSF in pixels twice as long. Its centre may move by one of them, and shift the scene: E does not change."""
+    """Bin a PSF by 2. Its centre may move by one of the new pixels, which shifts the scene and does not change E."""
     return F.avg_pool2d(F.pad(psf, (0, psf.shape[-1] % 2, 0, psf.shape[-2] % 2)), 2)
 
 

@@ -58,8 +58,8 @@ COARSE_LEVELS = (
 )
 """Levels of a network whose bank restores the detail (`mwdn.networks.wiener_bank`). Total variation at the coarsest
 decides how the light is shared between the scene in the frame and around it, which takes many iterations where
-photographs fill the frame: 22 from even light reach what 40 from black do. The other levels do without total variation,
-which takes less time. At half the size over-relaxation loses 0.2 to 0.7 dB."""
+photographs fill the frame: 22 from even light are as good as 40 from black. The other levels have no total variation,
+which saves time. At half the size over-relaxation loses 0.2 to 0.7 dB."""
 
 REFERENCE_NOISE = 0.009
 """Noise over the root mean square of the measurement for which the tau of `LEVELS` are stated. They grow with the noise

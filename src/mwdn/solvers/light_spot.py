@@ -1,4 +1,4 @@
-"""Find a Gaussian spot of light in what no scene explains of a capture.
+"""Find a Gaussian spot of light in the part of a capture that no scene explains.
 
 With ``r(a) = b - B a - C H v(a)`` as in `mwdn.solvers.room_light`, for cosines B up to `ORDER`, and ``J = dr / da``, a
 spot of shape B s and amplitude A changes r by ``A J s``. For each s of a grid of centres and widths, the best amplitude
@@ -6,9 +6,9 @@ of a colour is ``A = -(s^T q) / (s^T G s)`` with ``q = J^T r``, ``G = J^T J``. I
 the energy ``|r|^2``. The spot that explains most in all colours together is taken. Only G and q are needed for all
 shapes: thousands of them cost less than one iteration of the solver. (The code keeps J transposed, one row a cosine.)
 
-A scene imitates the smoothest part of a spot, which is therefore not in r. It follows from the rest through the shape:
-a spot has five numbers, not one for each cosine. The narrower it is, the better it is known; a spot as wide as the PSF
-is not seen.
+A scene can imitate the smoothest part of a spot, so this part is not in r. It follows from the rest through the shape,
+because a spot has five numbers, not one for each cosine. Narrow spots are estimated best; a spot as wide as the PSF is
+not found.
 """
 
 import math
@@ -34,21 +34,22 @@ SIGMAS = 0.1, 0.12, 0.15, 0.18, 0.22, 0.27, 0.33, 0.4
 _STEP = (1 + 2 * OUTSIDE) / (CENTRES - 1), (1 + 2 * OUTSIDE) / (CENTRES - 1), 0.03  # of the grid
 
 STEPS = 5
-"""In each the solver sees less of the spot, so that J is more exact. A photograph that fills the frame needs all."""
+"""Steps of the search. In each, less of the spot is left in the capture, so J is more exact. Photographs that fill the
+frame need all of them."""
 
 EVIDENCE = 2.5
-"""A spot is believed if the unexplained energy falls by this factor: by more than 10 for spots of 0.1 to 0.2 of the
-frame's width through the paper's PSF, by at most 1.6 in 19 real captures and without light, but by 2.9 once where a
-bright scene went on beyond the frame on all sides."""
+"""A spot is accepted if the unexplained energy falls by this factor. It is more than 10 for spots of 0.1 to 0.2 of the
+frame's width through the paper's PSF, and at most 1.6 in 19 real captures and without light; once it was 2.9, where a
+bright scene continued beyond the frame on all sides."""
 
 PROMISING = 1.5
 """The search ends after a step if the energy has fallen by less than this factor."""
 
 SLIGHT = 0.028
-"""The fainter a spot, the larger this factor must be: the energy that the spot explains, times the factor, must exceed
-the square of this part of the mean measurement. Where the PSF is wrong, what is unexplained looks like a faint spot in
-the middle of the scene: in 96 captures of real-like cameras the root of the product is at most 0.024 without a spot,
-but for one with 0.037, and 0.033 to 0.22 where one is found."""
+"""A fainter spot needs a larger factor than `EVIDENCE`: the energy that the spot explains, times the factor, must
+exceed the square of this part of the mean measurement. With a wrong PSF the residual looks like a faint spot in the
+middle of the scene: in 96 captures of real-like cameras the root of the product is at most 0.024 without a spot, but
+for one with 0.037, and 0.033 to 0.22 where one is found."""
 
 
 class Cosines(NamedTuple):
@@ -62,7 +63,7 @@ class Cosines(NamedTuple):
         return self.light.shape[-2], self.light.shape[-1]
 
     def coefficients(self, light: Tensor) -> Tensor:
-        """Of some light (..., h, w): (..., T)."""
+        """Coefficients (..., T) of light (..., h, w)."""
         return light.flatten(-2) @ self.light.flatten(1).T / self.light[0].numel()
 
 
@@ -92,7 +93,7 @@ class Spot(NamedTuple):
         return self.amplitude[..., None, None] * gaussians(size, self.shape)[:, None]
 
     def where(self, condition: Tensor, other: "Spot") -> "Spot":
-        """Itself where a condition (B,) holds, another spot elsewhere."""
+        """Select this spot where a condition (B,) holds, another spot elsewhere."""
         return Spot(*(torch.where(condition[:, None], *both) for both in zip(self, other, strict=True)))
 
 
@@ -108,18 +109,18 @@ def find_spot(b: Measurement, psf: Psf, saturated: Tensor) -> Spot:
 
 
 def refine_spot(b: Measurement, psf: Psf, saturated: Tensor, spot: Spot) -> Spot:
-    """A spot that was found in the same captures at half of this size, fitted again.
+    """Fit a spot again that was found in the same captures at half of this size.
 
-    Spots of 30 % over photographs that fill the frame are then wrong by 0.5 to 0.8 % of the mean measurement in place
-    of 4.2 to 6.9, over objects on dark by 0.2 to 0.5 % in place of 0.8 to 0.9 (``benchmarks/ambient.py --spots``).
-    Where there is no spot, none is looked for.
+    The error of spots of 30 % is then 0.5 to 0.8 % of the mean measurement instead of 4.2 to 6.9 % over photographs
+    that fill the frame, and 0.2 to 0.5 % instead of 0.8 to 0.9 % over objects on dark
+    (``benchmarks/ambient.py --spots``). Captures without a spot are not searched again.
     """
     refined, _, _ = _fit(b, psf, saturated, spot, promising=1.0)
     return refined.where((spot.amplitude > 0).any(1), spot)
 
 
 def _fit(b: Measurement, psf: Psf, saturated: Tensor, spot: Spot, *, promising: float) -> tuple[Spot, Tensor, Tensor]:
-    """The spot with the least unexplained energy, of `STEPS` from one; that energy (B,) before and after."""
+    """Improve a spot in up to `STEPS` steps; returns the best one, and the unexplained energy (B,) before and after."""
     basis = cosines((b.shape[-2], b.shape[-1]), b.device)
     best, r = spot, unexplained(b - spot.light(basis.size), psf, saturated)
     start = least = energy(r)
@@ -149,7 +150,7 @@ def gaussians(size: Size, shapes: Tensor) -> Tensor:
 
 
 def best_spot(r: Tensor, J: Tensor, basis: Cosines) -> Spot:
-    """The best spot, from what is unexplained without it r (B, C, P), and J (B, T, P): the grid's, then refined."""
+    """The best spot for the residual r (B, C, P) without a spot, and J (B, T, P): the best of the grid, refined."""
     G, q, steps = J @ J.mT, -r @ J.mT, r.new_tensor(_STEP)
     shape, amplitude = _best_of(grid(r.device).expand(len(r), -1, -1), G, q, basis)
     offsets = torch.cartesian_prod(*r.new_tensor([-1.0, 0.0, 1.0]).expand(3, -1))

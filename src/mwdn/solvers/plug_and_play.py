@@ -3,7 +3,7 @@
 Minimises ``1/2 |C H v - b|^2 + R(z) + rho/2 |v - z|^2`` over scenes v and z alternately. H convolves with the PSF, C
 crops to the sensor, b is the measurement, each pixel weighted by W (`certainty`), and R is defined by its denoiser:
 
-1. v fits b near z. C keeps this from being one division in the Fourier domain; one iteration of ADMM (penalty 1,
+1. v fits b near z. Because of C this is not a single division in the Fourier domain; one iteration of ADMM (penalty 1,
    as in `mwdn.solvers.splitting`, p the target on the sensor) approximates it:
 
    ``p = C H v + W / (1 + W) (b - (2 C H v - p))``, the difference at least 0 where b is saturated
@@ -11,7 +11,7 @@ crops to the sensor, b is the measurement, each pixel weighted by W (`certainty`
 
 2. ``z = denoise(max(v, 0), sigma)``, its noise level sigma lower in each round.
 
-As in DPIR, ``rho = weight (noise / sigma)^2``: the prior counts more the noisier the measurement and the cleaner z.
+As in DPIR, ``rho = weight (noise / sigma)^2``: the prior has more weight for a noisier measurement and a cleaner z.
 """
 
 from collections.abc import Callable

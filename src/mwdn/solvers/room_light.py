@@ -8,8 +8,8 @@ been subtracted (`mwdn.solvers.light_spot`):
 2. ``r(c) = b - B c - C H v(c)``, where v(c) is the best scene for this background (`mwdn.solvers.unexplained`).
    ``E(c) = |r(c)|^2 / pixels``, in units of the mean measurement.
 
-Scenes can imitate smooth light, by a veil and by light from outside the frame, so E is flat where c has too little of
-it. Too much of it cannot be compensated, because light is not negative: beyond the true background E rises steeply.
+Scenes can imitate smooth light, by a veil and by light from outside the frame, so E is flat as long as c is too small.
+Too large a c cannot be compensated, because light is not negative: beyond the true background E rises steeply.
 (`mwdn.solvers.alignment` finds haze in the same way.) So c is searched from above, from the largest plane of light
 under the capture, by Gauss-Newton steps that eliminate the scene (variable projection), until E has hardly risen:
 
@@ -18,12 +18,12 @@ under the capture, by Gauss-Newton steps that eliminate the scene (variable proj
 4. ``c <- c + B^T r(c) / pixels``, three times, gives back the light that equation (3) tolerates. Here v(c) is the scene
    of the coarsest of `mwdn.solvers.levels.LEVELS`; r is negative where too much has been subtracted.
 
-A wider choice of backgrounds, with bumps, would take the light of an object in the middle of the frame: with the six
-cosines up to a whole period in place of these three planes, photographs that fill the frame lose half of their light,
-and E is as small as at the truth. Where the frame is filled, even three planes take the scene's own light. Smooth light
-can be told from a scene only where the scene is dark: a plane counts only if it leaves a part of the frame dark
-(`DARK_PART`). Everything but this test happens in coarse pixels, for each colour by itself; a spot has one shape in
-all, and is fitted again in pixels of half the side.
+A richer model of the background would absorb the light of an object in the middle of the frame: with the six cosines up
+to a whole period in place of these three planes, photographs that fill the frame lose half of their light, and E is as
+small as at the truth. Where the frame is filled, even three planes absorb the scene's own light. Smooth light can be
+separated from a scene only where the scene is dark: a plane is subtracted only if it leaves a part of the frame dark
+(`DARK_PART`). All steps but this test use coarse pixels, and each colour separately; a spot has the same shape in all
+colours, and is fitted again in pixels of half the side.
 """
 
 import math
@@ -56,8 +56,8 @@ TOLERANCE = 0.02
 lose a tenth more."""
 
 FAINT = 0.08
-"""Smaller shares of even and sloping light stay in the measurement: as much is found without a room's light in
-photographs that fill the frame."""
+"""Smaller shares of even and sloping light are not subtracted: as much is found in photographs that fill the frame
+without room light."""
 
 DARK_PART = 0.3
 """Least part of the frame that a scene must leave dark, below a quarter of its mean, for even and sloping light to be
@@ -66,10 +66,10 @@ without any light of a room. Through three measured PSFs most of them leave less
 least 0.32."""
 
 GIVE_BACKS = 3
-"""Times that light is given back from the plane to the scene. Objects on dark gain 0.2 to 0.8 dB."""
+"""Repetitions of step 4, which gives light back from the plane to the scene. Objects on dark gain 0.2 to 0.8 dB."""
 
 ABOVE = 0.002
-"""Weight of light above the largest plane below a capture; that below it has a weight of 1."""
+"""Weight of pixels above the fitted plane; pixels below it have a weight of 1."""
 
 _SPREAD = 1.0, 0.15, 0.15  # S: changes of the even light are taken first
 
@@ -125,7 +125,7 @@ def find_room_light(measurement: Measurement, psf: Psf) -> RoomLight:
         plane = _give_back(b, light, plane, coarsest) if counts.any() else plane
     background = torch.where(counts[:, None, None, None], plane, 0.0) + light
     share = background.mean((1, 2, 3)) / whole
-    share = torch.where(finite & (share > 0) & (share < 1), share, 0.0)  # NaN is none
+    share = torch.where(finite & (share > 0) & (share < 1), share, 0.0)  # NaN counts as none
     return RoomLight(torch.where(share[:, None, None, None] > 0, background, 0.0).to(measurement.dtype), share)
 
 
@@ -201,7 +201,7 @@ def _gauss_newton_step(J: Tensor, r: Tensor, limit: Tensor) -> Tensor:
 def _largest_plane(b: Measurement, B: Tensor) -> Tensor:
     """Coefficients (n, 3) of the largest plane of light below captures (n, 1, h, w), whose noise is smoothed.
 
-    Asymmetric least squares: what is above the plane hardly counts.
+    Asymmetric least squares: pixels above the plane have a small weight.
     """
     y = F.avg_pool2d(F.pad(b, (1, 1, 1, 1), mode="replicate"), 3, 1).flatten(1)
     X = B.flatten(1)

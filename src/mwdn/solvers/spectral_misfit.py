@@ -1,4 +1,4 @@
-"""How well the best scene explains a measurement through a PSF, in octaves and thirds of an octave of detail.
+"""How well the best scene explains a measurement through a PSF, averaged over bands of frequencies.
 
 With a smooth scene v fitted as in `mwdn.solvers.alignment`, residual ``r = b - h * v``, both under a
 window w that fades at the frame's border, and bands k of radial frequencies:
@@ -6,9 +6,9 @@ window w that fades at the frame's border, and bands k of radial frequencies:
     r_k = sum over band k of |F(w r)|^2,    b_k = sum over band k of |F(w b)|^2,    n_k = the noise in it
     log misfit = sum_k q_k log((r_k + n_k) / b_k) / sum_k q_k,    q_k = max(0, 1 - n_k / b_k)^2
 
-The energy of a capture's detail is at its coarsest frequencies, where some scene fits through almost any PSF: a
-difference of energies tells a wrong PSF from the right one by little, and by chance. The logarithm counts each band
-alike, whatever its energy. Without the window, the step at the border would fill the fine bands.
+Most of the energy of a capture's detail is at low frequencies, where some scene fits through almost any PSF: energies
+of residuals hardly distinguish a wrong PSF from the right one. The logarithm gives each band the same weight, whatever
+its energy. Without the window, the step at the border would fill the fine bands.
 """
 
 from itertools import pairwise

@@ -13,7 +13,7 @@ over penalty):
 The code keeps neither copies nor multipliers but the targets of (4), ``p1 = x - xi``, ``p2 = u - eta``,
 ``p3 = w - rho``. With (5) the multiplier is ``v - p`` for the last target p (H v and Psi v in place of v for p1 and
 p2), so the argument of the proximal map in (1) to (3) is ``z = v + (v - p) = 2 v - p`` and the next target is
-``prox(z) - (v - p) = v - (z - prox(z))``: the value less what the map takes away.
+``prox(z) - (v - p) = v - (z - prox(z))``: the value minus what the map removes.
 
 Over-relaxation goes further in the same direction: ``p + alpha (v - (z - prox(z)) - p)``. An alpha of 1.5 to 1.8 saves
 a third of the iterations or more (S. Boyd et al., Distributed optimization and statistical learning via the alternating

@@ -1,4 +1,4 @@
-"""What no scene explains of a capture, at the size at which `mwdn.solvers.room_light` looks for a background."""
+"""The part of a capture that no scene explains, at the coarse size of the search in `mwdn.solvers.room_light`."""
 
 import torch
 from torch import Tensor
@@ -7,11 +7,11 @@ from mwdn.solvers.splitting import Penalties, Problem, initial_state, make_filte
 from mwdn.types import Measurement, Psf
 
 ITERATIONS = 40
-"""Of ADMM for each scene. With 20 the best scenes are not reached; with 60 photographs that fill the frame lose twice
-as much of their own light."""
+"""ADMM iterations for each scene. With 20 the best scenes are not reached; with 60 photographs that fill the frame lose
+twice as much of their own light."""
 
 DELTA = 0.05
-"""Light by which backgrounds differ in finite differences, as a part of the mean measurement."""
+"""Step of the finite differences of the background, as a part of the mean measurement."""
 
 _PENALTIES = Penalties(0.15, 0.0, 0.6)
 
@@ -41,7 +41,7 @@ def energy(r: Tensor) -> Tensor:
 
 
 def differences(b: Measurement, psf: Psf, saturated: Tensor, lights: Tensor) -> Tensor:
-    """Finite differences (B, T, pixels) of `unexplained`, of the mean colour, for more of each light (T, h, w)."""
+    """Derivatives (B, T, pixels) of `unexplained` of the mean colour by each light (T, h, w), as finite differences."""
     trials = b.mean(1, keepdim=True) - DELTA * torch.cat([torch.zeros_like(lights[:1]), lights])
     psf, saturated = psf.mean(1, keepdim=True), saturated.any(1, keepdim=True)
     r = unexplained(trials, *(each.expand(-1, trials.shape[1], -1, -1) for each in (psf, saturated)))

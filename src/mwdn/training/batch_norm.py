@@ -10,7 +10,7 @@ from torch.nn import functional as F
 from mwdn.runtime import distributed
 
 PSF_ENCODER = "psf_encoder"
-"""Name of the submodule that processes the PSF only, of which every process has the whole batch."""
+"""Name of the submodule that processes only the PSF; every process has its whole batch."""
 
 
 def freeze_cancelled(network: nn.Module) -> None:

@@ -37,7 +37,7 @@ FILE_START = 2 * 10**12
 
 
 class TrainingData(NamedTuple):
-    """What to learn, and how much of it there is.
+    """Tasks of training and validation, and their numbers of samples.
 
     Args:
         task: to train on.

@@ -68,7 +68,7 @@ def stored_psf(recipe: Recipe, calibration: Calibration) -> Psf | None:
 
 @torch.no_grad()
 def measure_scenes(cache: SampleCache | None, network: nn.Module, average: nn.Module) -> None:
-    """Measure what the network corrects of `MEASURED_BUFFERS`, from the cached scenes; the mean over all processes.
+    """Measure the network's `MEASURED_BUFFERS` from the cached scenes; the mean over all processes.
 
     Args:
         cache: of the training's samples.

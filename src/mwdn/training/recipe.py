@@ -144,7 +144,7 @@ class Recipe:
         cameras: learn from random cameras instead of the calibrated one, see `mwdn.data.cameras.Cameras`.
         denoising: learn to denoise scenes, see `mwdn.data.noisy.Denoising`; only for `mwdn.networks.DENOISERS`.
         placement: see `mwdn.data.simulated.Placement`.
-        mismatch: see `mwdn.data.simulated.Mismatch`.
+        mismatch: see `mwdn.data.mismatch.Mismatch`.
         sensor: see `mwdn.optics.sensor.Sensor`.
     """
 

@@ -22,14 +22,15 @@ from mwdn.weights.tensors import read_header
 MAKE_ROOM = "Make room and give the same command again: it resumes from the last saved state."
 WEIGHTS = ("last", "best")
 STATE_BYTES = 2**33
-"""Most bytes of a state: 8 GiB, twice weights, average and two moments of the largest network that is built."""
+"""Limit of the bytes of a state: 8 GiB, twice what the largest network that is built needs (weights, average, two
+moments)."""
 
 
 def run_identity(recipe: Recipe, psf_hash: str, samples: str) -> dict[str, Any]:
-    """What must be the same for a run to be resumed; it is also stored in the checkpoints.
+    """Settings that must be the same when a run resumes; they are also stored in the checkpoints.
 
     Args:
-        recipe: the experiment. What does not change the weights is left out.
+        recipe: the experiment. Settings that do not change the weights are left out.
         psf_hash: of the calibration.
         samples: name of the task's samples.
     """
@@ -73,7 +74,7 @@ class RunFolder:
         return sum(file.stat().st_size for file in self.path.glob("samples/*/*"))
 
     def remove_samples(self) -> None:
-        """Remove the cached samples: the run needs them no more. Each process may have a disk of its own."""
+        """Remove the cached samples after the last step. Each process may have its own disk."""
         self.samples("").remove()
 
     def read(self) -> tuple[dict[str, Tensor], Header] | None:
@@ -97,7 +98,7 @@ class RunFolder:
             return b""
         open_regular(self.state, CheckpointError).close()
         try:
-            read_header(self.state)  # before the rest: a file that is no state may be of any size
+            read_header(self.state)  # check the header first: another file may have any size
         except CheckpointError as error:
             raise damaged(self.state, "its header does not fit it") from error
         return read_bytes(self.state, most=STATE_BYTES, error=CheckpointError)
@@ -163,7 +164,7 @@ class RunFolder:
             write_text(self.path / "recipe.json", json.dumps(self.identity, indent=2))
             # One line per step; those after the saved step will be written again.
             content = read_bytes(log, most=LOG_BYTES, error=ParameterError) if log.exists() else b""
-            # Of a line that was damaged on the disk, the bytes that are no UTF-8 are replaced.
+            # Bytes of a damaged line that are not UTF-8 are replaced.
             write_text(log, b"".join(content.splitlines(keepends=True)[:step]).decode(errors="replace"))
 
     def log(self, line: dict[str, Any]) -> None:

@@ -71,7 +71,7 @@ class SampleCache:
 
         Raises:
             KeyboardInterrupt: Ctrl-C; its message says how many samples are done.
-            ParameterError: the disk is full all the same.
+            ParameterError: the disk became full.
         """
         rows = dict.fromkeys(self._row(*divmod(number, self.size)) for number in numbers)
         device = next(network.parameters()).device
@@ -101,7 +101,7 @@ class SampleCache:
 
     @torch.no_grad()
     def measured(self, measure: Measure, network: Any, order: int) -> Tensor:  # noqa: ANN401
-        """What the scenes of the samples computed so far tell, at most `MEASURED`, beside their reconstructions."""
+        """Apply a measure to the reconstructions and scenes of the samples computed so far, `MEASURED` at most."""
         rows = sorted(self.samples)[:: -(-len(self.samples) // MEASURED)]
         pictures = [self.reconstruct_whole(network, [row])[0] for row in rows]
         return measure(pictures, [self.samples[row].scene for row in rows], order)

@@ -82,7 +82,7 @@ class SampleFiles:
             save_file({name: value.cpu() for name, value in sample._asdict().items()}, temporary)
 
     def fits(self, size: int) -> bool:
-        """Whether so many bytes are a sensible part of the disk's free space."""
+        """Whether so many bytes are at most `FREE_PART` of the disk's free space."""
         disk = next(folder for folder in (self.run, *self.run.resolve().parents) if folder.exists())
         return size <= FREE_PART * shutil.disk_usage(disk).free
 
@@ -96,7 +96,7 @@ class SampleFiles:
         """Remove all samples."""
         for folder in self._folders():
             _remove(folder)
-        with suppress(OSError):  # it is missing, or holds files of somebody else
+        with suppress(OSError):  # it is missing, or holds other files
             self.path.parent.rmdir()
 
     def _folders(self) -> list[Path]:

@@ -44,7 +44,7 @@ class FixedSchedule:
         return self
 
     def state(self) -> dict[str, Any]:
-        """What a saved run must remember: nothing, everything follows from the step."""
+        """State to save: nothing, because everything follows from the step."""
         return {}
 
 
@@ -99,7 +99,7 @@ class ReduceLROnPlateau:
         return ReduceLROnPlateau(self.recipe, self.current * self.recipe.plateau.factor, self.best)
 
     def state(self) -> dict[str, Any]:
-        """What a saved run must remember; `make_lr_schedule` takes it back."""
+        """State to save, for `make_lr_schedule`."""
         return {"current": self.current, "best": self.best, "bad": self.bad}
 
 

@@ -2,9 +2,10 @@
 
 Many scenes explain a measurement y: the sensor crops the pattern, and the PSF suppresses some frequencies. The loss has
 two parts. Consistency: the reconstruction x = f(y), convolved with the PSF, must explain y. Equivariance: x is moved
-(shifted, mirrored, transposed) to T x and captured again in simulation; the network must reconstruct T x from it. What
-the network invents or omits where the camera sees nothing does not survive this. T x is held fixed in the comparison
-(the papers propagate gradients through it): the network learns to find scenes, not to make scenes easy to find.
+(shifted, mirrored, transposed) to T x and captured again in simulation; the network must reconstruct T x from it. This
+penalises what the network invents or omits where the camera measures nothing. T x has no gradient in the comparison
+(the papers propagate gradients through it): the network learns to find scenes, not to make scenes that are easy to
+find.
 
 Alignment: each capture has its aligned PSF (`UnpairedCaptures.batch`), used to explain it and to capture again. In
 training and validation alike the network gets this PSF if it is used with an aligned one (``network.align``), otherwise
@@ -70,7 +71,7 @@ def selfsupervised_loss(
 
 
 def unexplained(explained: Image, measurement: Measurement) -> Tensor:
-    """Unexplained fraction of a measurement's variance, (B,): 0 is best, 1 that of a black reconstruction.
+    """Unexplained fraction of a measurement's variance, (B,): 0 is best, a black reconstruction has 1.
 
     A constant offset per colour does not count: stray light reaches a sensor without a lens from everywhere.
 

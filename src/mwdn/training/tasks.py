@@ -1,4 +1,4 @@
-"""What a network learns: a loss of numbered samples. Here from pairs; `selfsupervised` has the task without scenes."""
+"""Training tasks: a loss of numbered samples. Here from pairs; `selfsupervised` has the task without scenes."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple, Protocol, runtime_checkable

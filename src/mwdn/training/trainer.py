@@ -139,7 +139,7 @@ class Trainer:
     def _fill_cache(self, progress: Progress) -> None:
         """Compute this process's cached samples that the rest of the run needs."""
         cache, batch = self.task.cache, self.schedule.batch
-        # Two times the cache hold a whole epoch.
+        # Twice the size of the cache contains a whole epoch.
         steps = range(self.step, self.schedule.steps)[: 2 * cache.size // batch if cache else 0]
         if cache is None or not steps:
             return
@@ -195,7 +195,7 @@ class Trainer:
         self.optimiser.step()
         self._pull_to_start()
         self.step += 1
-        # The decay grows from 0 to the schedule's, or else a young average would remember the initial weights.
+        # The decay grows from 0 to the schedule's, so that the average does not keep the initial weights.
         decay = min(self.schedule.ema, self.step / (self.step + 10))
         update_average(self.average, self.network, decay=decay, start=self.start, share=self.schedule.start_share)
         return total, dict(zip(list(values)[1:], totals, strict=True))

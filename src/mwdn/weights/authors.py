@@ -32,7 +32,7 @@ def load_authors(state: dict[str, Tensor]) -> nn.Module:
     """Build MWDN or MWDN-CPSF as in the authors' code, with their weights.
 
     These networks take the PSF as stored (`mwdn.networks.Network.stored_psf`), in [0, 1] with its background:
-    calibrate with ``background=0``. Their w may be negative, to which training with their own settings leads.
+    calibrate with ``background=0``. Their w may be negative, as training with their own settings makes it.
 
     Args:
         state: tensors under the authors' names.
@@ -64,7 +64,7 @@ def load_authors(state: dict[str, Tensor]) -> nn.Module:
 
 
 def _is_dense(tensor: Tensor) -> bool:
-    """Whether a tensor of real numbers has the memory of all its elements; a stride of 0 claims any number of them."""
+    """Whether a real tensor stores all of its elements; with a stride of 0 it could claim any number of them."""
     real = tensor.layout == torch.strided and not tensor.is_quantized and not tensor.is_complex()
     return real and tensor.numel() * tensor.itemsize <= tensor.untyped_storage().nbytes()
 

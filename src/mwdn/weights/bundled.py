@@ -71,7 +71,8 @@ def bundle(checkpoint: Path, out: Path, denoiser: Path | None = None) -> None:
     Args:
         checkpoint: of a network.
         out: the file to write.
-        denoiser: checkpoint of a denoiser to replace the network's own; it may be told less (the noise level alone).
+        denoiser: checkpoint of a denoiser to replace the network's own; it may have fewer inputs (the noise level
+            only).
 
     Raises:
         CheckpointError: a checkpoint cannot be used, or a weight exceeds the range of float16.

@@ -76,8 +76,8 @@ def _metadata(path: Path, header: Header) -> dict[str, Any]:
 def load_checkpoint(path: str | Path) -> nn.Module:
     """Load a network from a checkpoint, on the CPU, in evaluation mode.
 
-    The network is first built without memory and compared with the shapes in the file: a file that asks for more
-    memory than it holds is refused before any is used.
+    The network is first built without memory and compared with the shapes in the file: a file whose options need more
+    memory than its tensors is refused before any is allocated.
 
     Args:
         path: a checkpoint of this package (``.safetensors``), or of the MWDN authors (``.tar`` and the like, read

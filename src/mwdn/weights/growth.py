@@ -1,14 +1,14 @@
-"""Weights of a network in one that has more inputs or outputs."""
+"""Load the weights of a network into one with more inputs or outputs."""
 
 import torch
 from torch import Tensor, nn
 
 
 def grown(weights: dict[str, Tensor], network: nn.Module) -> dict[str, Tensor]:
-    """Weights for a network with more inputs or outputs behind those there are; the new ones are zero.
+    """Weights for a network that has more inputs or outputs after the existing ones; the new ones are zero.
 
-    Weights of a network that is wider inside, so in several axes at once, stay as they are. Missing buffers are those
-    of the network.
+    If a tensor differs in several axes, as in a wider network, the weights stay unchanged. Missing buffers are those of
+    the network.
     """
     result = dict(network.named_buffers()) | weights
     for name, wanted in network.state_dict().items():

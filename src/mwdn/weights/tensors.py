@@ -1,7 +1,7 @@
-"""Read safetensors files of others. The header is judged before any tensor is read; nothing is mapped into memory.
+"""Read untrusted safetensors files. The header is checked before any tensor is read; nothing is mapped into memory.
 
 The format: 8 bytes with the length of the header (little-endian), the header (JSON), and the tensors' bytes. A file
-that shrinks while it is mapped ends the process by a signal; while it is read, it is only shorter.
+that shrinks while it is mapped would end the process by a signal; read in the usual way, it is only too short.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Read files of `torch.save` of others, without running code from them."""
+"""Read untrusted files of `torch.save`, without running code from them."""
 
 import pickletools
 import re
@@ -24,7 +24,7 @@ _GLOBALS = re.compile(
     r"collections OrderedDict|torch\._utils _rebuild_(tensor|tensor_v2|parameter)|torch\.storage UntypedStorage"
     r"|torch (\w+Storage|Size|device|b?float\d*|u?int\d+|double|half|long|bool)"
 )
-"""What plain weights are made of. torch allows more, for example ``bytearray``, which a file can ask to have 4 GB."""
+"""Names in the pickle of plain weights. torch allows more, for example ``bytearray``, which could allocate 4 GB."""
 
 
 def read_plain(path: Path) -> Any:  # noqa: ANN401
