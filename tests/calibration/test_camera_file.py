@@ -15,7 +15,7 @@ import torch
 from cameras import contour_psf
 from mwdn import Calibration
 from mwdn.calibration import FrameFormat, PsfFormat
-from mwdn.calibration.camera_file import KEYS, read_camera, write_camera
+from mwdn.calibration.camera_file import KEYS, named_files, read_camera, write_camera
 from mwdn.calibration.camera_parts import draft_of, write_camera_with_parts
 from mwdn.errors import ImageError, MwdnError, ParameterError, PsfError, UnknownNameError
 from mwdn.io.images import read_frame
@@ -119,6 +119,25 @@ def test_calibration_of_a_camera_file(folder):
     assert (other.size, other.frames.bin, other.ambient is None) == ((6, 8), 4, False)
     with pytest.raises(ParameterError, match="`bin=4`"):
         Calibration.from_file(path, FrameFormat(bin=4))
+
+
+def test_pitch_follows_the_bin(folder):
+    """It is that of the pixels after binning."""
+    path = folder / "camera.toml"
+    write_camera(path, {"psf": folder / "lab/psf.png", "bin": 2, "pitch_um": 4.0})
+    pitches = [Calibration.load(path, **options).pitch_um for options in ({}, {"bin": 4}, {"bin": 4, "pitch_um": 5.0})]
+    assert pitches == [4.0, 8.0, 5.0]
+
+
+def test_a_picture_is_no_camera_file(folder):
+    with pytest.raises(ParameterError, match=r"psf\.png` is a picture.*`--psf`"):
+        Calibration.load(folder / "lab/psf.png")
+
+
+def test_named_files_are_all_that_belong_to_the_camera(folder):
+    lab = {name: folder / "lab" / f"{name}.png" for name in ("psf", "dark", "ambient")}
+    write_camera(folder / "camera.toml", {**lab, "distance_psfs": (lab["psf"],), "distances_mm": (100.0,)})
+    assert named_files(folder / "camera.toml") == {**lab, "distance_psfs 1": lab["psf"]}
 
 
 def test_changed_psf_is_refused_unless_it_is_given(folder):

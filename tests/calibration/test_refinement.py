@@ -15,8 +15,8 @@ from mwdn.calibration.pair_model import PairModel, Terms
 from mwdn.calibration.psf_identity import psf_identity
 from mwdn.calibration.refinement import Refinement, smooth_field
 from mwdn.calibration.term_selection import PARTS, left_out, select_terms
-from mwdn.data.pairs import PairFile
 from mwdn.data.pair_checks import other_camera
+from mwdn.data.pairs import PairFile
 from mwdn.errors import ParameterError
 from mwdn.inference.methods import psf_warning
 from mwdn.io.images import write_frame

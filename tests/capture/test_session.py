@@ -21,6 +21,7 @@ from mwdn.capture.session import Session
 from mwdn.capture.set_up import open_camera
 from mwdn.cli.refine import check_pair_file
 from mwdn.data import PairFile
+from mwdn.data.importers import import_pairs
 from mwdn.data.recorded import Division, recorded_pairs
 from mwdn.errors import CameraError, DisplayError, ImageError, ParameterError, UnknownNameError
 
@@ -114,7 +115,12 @@ def test_a_session_records_each_picture_once_with_its_own_frame(tmp_path, recipe
         assert pairs.scene_shape == (80, 80, 3)
         assert pairs[0][1].max() > 0.9
         assert 0.1 < pairs[0][0].max() <= 1  # the full scale of 12 bits is 1, and not 1/16
-    for refused in (lambda: recorded_pairs(out, torch.ones(1, 3, 32, 32), Division()), lambda: check_pair_file(out)):
+    imported = tmp_path / "imported.h5"
+    for refused in (
+        lambda: recorded_pairs(out, torch.ones(1, 3, 32, 32), Division()),
+        lambda: check_pair_file(out),
+        lambda: import_pairs("pairs", out, imported),
+    ):
         with pytest.raises(ParameterError, match=r"raw frames of 12 bits.*`mwdn align"):
             refused()
 

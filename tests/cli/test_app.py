@@ -329,6 +329,7 @@ def test_resume_leaves_out_what_is_there(run, camera):
         ("admm --iterations 5 --variation isotropic", mwdn.solvers.Admm(iterations=5, variation="isotropic")),
         ("admm --penalties.data 0.01", mwdn.solvers.Admm(penalties=mwdn.solvers.Penalties(data=0.01))),
         ("wiener --regularisation 1e-3 --boundary zero", mwdn.solvers.Wiener(regularisation=1e-3, boundary="zero")),
+        ("wiener --regularisation none", mwdn.solvers.Wiener()),
     ],
 )
 def test_options_of_a_method(run, camera, line, method):
@@ -385,6 +386,11 @@ def test_folder_of_the_captures_is_none_for_the_pictures(run, camera, out):
     assert names(camera / "raw") == ["a.npy"]
     for _ in range(2):  # a file of it may have its picture beside it
         assert reconstruct(run, "raw/a.npy", out=out)[0] == 0
+    np.save("raw/b.npy", read_frame("captures/b.png"))
+    (camera / "raw" / "b.png").write_bytes(before := (camera / "captures" / "b.png").read_bytes())
+    code, _, err = reconstruct(run, "raw/b.npy", out=out)
+    assert (code, "b.png` was not written by mwdn and would be lost" in err) == (2, True)
+    assert (camera / "raw" / "b.png").read_bytes() == before
 
 
 def test_folder_that_cannot_be_written_to_is_found_first(run, camera, monkeypatch):

@@ -115,6 +115,10 @@ def test_the_bits_of_a_camera_file_stay_if_it_is_changed(run, folder):
     second = {path.name for path in folder.glob("camera-*")}
     assert first - second == {before["psf"].name}
     assert run("calibrate psf_1 --camera camera.toml --psf-bin 2")[0] == 2
+    # The PSF's file is corrected already: it is no frame of the point source, which would be corrected twice.
+    code, _, err = run("calibrate --camera camera.toml --dark dark")
+    assert (code, "corrected already" in err) == (2, True)
+    assert {path.name for path in folder.glob("camera-*")} == second
 
 
 def test_a_camera_file_appears_with_all_its_pictures_or_not_at_all(folder, monkeypatch):

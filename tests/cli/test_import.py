@@ -38,6 +38,12 @@ def test_camera_file_says_how_captures_are_stored(folders, tmp_path):
     assert PairFile(tmp_path / "pairs.h5").measurement_shape == (2, 3, 3)
 
 
+def test_background_of_the_psf_is_not_the_room_light_of_digicam(folders, tmp_path):
+    """Each camera file that was made with dark frames has one."""
+    (tmp_path / "camera.toml").write_text('psf = "psf.png"\nbackground = 0.0\n')
+    assert run("folders", folders, "-o", tmp_path / "pairs.h5", "--camera", tmp_path / "camera.toml") == 0
+
+
 def test_what_is_skipped_is_named(folders, capsys):
     (folders / "scenes" / "[1].png").write_bytes(b"no picture")
     (folders / "captures" / "[2].png").unlink()

@@ -65,6 +65,17 @@ def test_no_input_is_overwritten(run, tmp_path, monkeypatch, dark):
     assert (tmp_path / "my psf.png").read_bytes() == before
 
 
+@pytest.mark.parametrize("suffix", [".png", ".json"])
+def test_files_of_the_user_beside_the_psf_stay(run, tmp_path, suffix):
+    (tmp_path / "my psf.png").rename(tmp_path / "psf.tif")
+    (tmp_path / f"psf{suffix}").write_text("mine")
+    code, _, problem = run("psf.tif", "-o", tmp_path)
+    assert (code, f"psf{suffix}` was not written by this command" in problem) == (2, True)
+    assert (tmp_path / f"psf{suffix}").read_text() == "mine"
+    for _ in range(2):  # its own files are replaced
+        assert run("psf.tif", "-o", "out")[0] == 0
+
+
 def test_folder_that_cannot_be_written_to_is_found_first(run, tmp_path, monkeypatch):
     monkeypatch.setattr("mwdn.cli.inspect.inspect_psf", pytest.fail)
     (tmp_path / "file").write_text("no folder")

@@ -162,6 +162,27 @@ def test_train_on_recorded_pairs(run, camera):
     assert run(line.replace("psf.npy", "large.npy --psf-bin 2").replace("runs/x", "runs/y"))[0] == 0
 
 
+def test_grey_camera_learns_from_photographs(run, camera):
+    """Scenes are averaged over their colours for a network of one channel. `simulate --grey` does the same."""
+    np.save("grey.npy", np.load("psf.npy").mean(2, keepdims=True))
+    np.save("capture.npy", np.full((32, 40, 1), 0.3, np.float32))
+    line = TRAIN.replace("psf.npy", "grey.npy") + " --network.name unet --network.width 2 --network.channels 1"
+    code, _, err = run(line)
+    assert code == 0, err
+    assert run(f"{RECONSTRUCT} grey.npy --no-trust")[0] == 0
+    assert run("simulate photos --psf grey.npy --grey -o pairs.h5 --count 2 --recipe r.toml")[0] == 0
+    assert PairFile("pairs.h5").scene_shape == PairFile("pairs.h5").measurement_shape == (32, 40, 1)
+
+
+def test_pairs_of_another_camera_and_a_finished_run_are_named(run, camera):
+    assert run("simulate photos --psf psf.npy -o pairs.h5 --count 20 --recipe r.toml")[0] == 0
+    line = TRAIN.replace("--photos photos", "--pairs pairs.h5").replace("psf.npy", "other.npy")
+    code, _, err = run(line)
+    assert (code, "holds pairs of the camera of PSF" in flat(err)) == (0, True)
+    code, _, err = run(line)
+    assert (code, "was finished before" in flat(err)) == (0, True)
+
+
 def test_the_file_of_pairs_and_the_table_have_one_name(run, camera):
     """`--pairs` is a file and `--pairs.split` a key of the recipe, in either order."""
     assert run("simulate photos --psf psf.npy -o pairs.h5 --count 20 --recipe r.toml")[0] == 0
@@ -257,7 +278,7 @@ def test_simulate_then_evaluate(run, camera):
     calibration = Calibration.from_file("psf.npy")
     with PairFile("pairs.h5") as file:
         assert len(file) == 5
-        assert file.attributes == {"psf_hash": calibration.psf_hash, "seed": 3}
+        assert file.attributes == {"psf_hash": calibration.psf_hash, "seed": 3, "refined": "simulate"}
         assert torch.equal(file.psf, calibration.psf)
         measurement, scene = file[4]
         assert measurement.shape == scene.shape == (3, 32, 40)

@@ -8,6 +8,8 @@ import pytest
 import torch
 
 from cameras import capture_of_rectangles
+from mwdn.calibration.refinement import Refinement
+from mwdn.data.pair_checks import REFINED
 from mwdn.data.pairs import PairFile
 from mwdn.data.recorded import Division, PrefetchedPairs, RecordedPairs, recorded_pairs
 from mwdn.data.simulated import Samples
@@ -171,12 +173,31 @@ def test_unknown_split():
         ({"channels": 1}, psf(), "`psf` (3 channels) must be grey, or have the channels of the measurements of"),
         ({"scene": (8, 12, 3)}, psf(), "The scenes of"),
         ({"scene": (8, 12, 3)}, psf(), "(8 x 12) must have the size of its measurements (4 x 6)"),
-        ({"channels": 1, "scene": (4, 6, 3)}, psf(channels=1), "(3 channels) must have the channels of its measurements"),
+        (
+            {"channels": 1, "scene": (4, 6, 3)},
+            psf(channels=1),
+            "(3 channels) must have the channels of its measurements",
+        ),
     ],
 )
 def test_pairs_that_do_not_fit_the_psf(pairs, file, own, said):
     with pytest.raises(ShapeError, match=re.escape(said)):
         recorded_pairs(pairs(**file), own, Division())
+
+
+@pytest.mark.parametrize("refined", [False, True])
+def test_a_refinement_is_applied_once(tmp_path, refined):
+    """`mwdn align` has divided the measurements by the sensor's field already, if its camera had one."""
+    attributes = {REFINED: "align"} if refined else {}
+    path, field = tmp_path / "a.h5", Refinement(sensor_field=((1.0, 0.5, 0.0),))
+    with PairFile.create(
+        path, measurement_shape=(4, 6, 3), scene_shape=(4, 6, 3), dtype="float32", attributes=attributes
+    ) as file:
+        for _ in range(10):
+            file.append(torch.full((3, 4, 6), 0.5), torch.ones(3, 4, 6))
+    train, _ = recorded_pairs(path, psf(), Division(), refinement=field)
+    expected = torch.full((1, 3, 4, 6), 0.5)
+    torch.testing.assert_close(train.batch([0]).measurement, expected if refined else field.measurement(expected))
 
 
 def test_grey_psf_serves_pairs_in_colour(pairs):

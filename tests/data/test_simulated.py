@@ -85,6 +85,19 @@ def test_same_number_same_pair_in_any_batch(photographs, psf):
     torch.testing.assert_close(backwards.scene[1], together.scene[0], rtol=0, atol=1e-5)
 
 
+def test_a_grey_camera_sees_the_mean_of_the_colours(photographs, psf):
+    """Scenes are those of a colour camera, averaged; the measurement is the forward model of that."""
+    grey, colour = (
+        SimulatedPairs(photographs, psf[:, :1], mismatch=EXACT, sensor=CLEAN, grey=g) for g in (True, False)
+    )
+    batch, scene = grey.batch(range(3)), colour.batch(range(3)).scene
+    torch.testing.assert_close(batch.scene, scene.mean(1, keepdim=True))
+    light = Camera(psf[:, :1]).forward(batch.scene)
+    ratio = (batch.measurement - light).abs().amax() / light.amax()
+    assert (batch.measurement.shape, batch.scene.shape) == ((3, 1, *SIZE),) * 2
+    assert ratio < 0.06  # up to 5 % of even light, and the rounding of the sensor
+
+
 def test_samples_are_float32_under_autocast(photographs, psf):
     simulated = SimulatedPairs(photographs, psf, mismatch=Mismatch(full=True))
     captures = UnpairedCaptures(simulated.batch(range(2)).measurement, psf[:, :1])

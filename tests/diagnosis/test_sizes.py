@@ -54,6 +54,15 @@ def test_bin_of_the_capture(fine, capture):
     assert (verdict.value, verdict.options) == ("1/2", "--bin 2 --psf-bin 1")
 
 
+def test_bins_that_were_given_are_factors_of_the_advice(fine, capture):
+    """The PSF was read with --psf-bin 2 (from twice the size): half of its size would be --psf-bin 4."""
+    small, psf_format = bin_pixels(fine, 2), PsfFormat(psf_bin=2)
+    verdict = fitting_size(capture(small), Calibration(fine, psf_format=psf_format))
+    assert verdict.options == "--psf-bin 4"
+    verdict = fitting_size(capture(fine), Calibration(small / small.sum(), psf_format=psf_format))
+    assert verdict.options == "--bin 2 --psf-bin 2"
+
+
 @pytest.mark.parametrize("stored", [None, "flip-top-bottom"])
 def test_capture_of_a_camera_held_upright(fine, capture, stored):
     """The sides are exchanged. The advice is for the PSF's file, which the calibration may have turned already."""

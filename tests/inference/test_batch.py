@@ -422,6 +422,14 @@ def test_old_sidecar_never_stands_beside_a_new_picture(tmp_path, psf, captures, 
     assert [path.name for path in out.iterdir()] == ["0.png"]
 
 
+def test_old_map_never_stands_beside_a_new_picture(tmp_path, psf, captures):
+    out = tmp_path / "out"
+    list(make_batch(psf, out, map=True).run(captures[:1]))
+    assert (out / "0.support.png").exists()
+    list(make_batch(psf, out, Wiener(regularisation=1.0)).run(captures[:1]))
+    assert not (out / "0.support.png").exists()
+
+
 # --- Several processes --------------------------------------------------------------------------------
 
 COUNT = 16

@@ -89,6 +89,13 @@ def test_other_mosaics_are_refused(tmp_path: Path) -> None:
         read_raw(put(tmp_path / "a.dng", dng(mosaic, "rgbrgbrgb" * 4)))
 
 
+def test_a_raw_file_under_the_name_of_a_tiff_is_refused(tmp_path: Path, mosaic: np.ndarray) -> None:
+    """Its numbers are without black level and mosaic there. An upload to `mwdn preview` has no suffix at all."""
+    for name in ("a.tif", "capture"):
+        with pytest.raises(ImageError, match=r"raw file \(DNG\).*\.dng"):
+            read_frame(put(tmp_path / name, dng(mosaic)))
+
+
 def test_saturation_is_known(tmp_path: Path, mosaic: np.ndarray) -> None:
     mosaic[:] = 500
     mosaic[:2, :4] = WHITE

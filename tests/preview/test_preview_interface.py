@@ -66,6 +66,20 @@ def test_exposure_and_white_balance(client, capture):
     assert red > blue
 
 
+def test_white_balance_of_the_camera_unless_another_is_asked_for(serve, psf, capture):
+    calibration = Calibration(psf, white_balance=(1.0, 1.0, 4.0))
+    server = serve(Cameras(LIMITS, None, {"camera": calibration}))
+
+    with httpx.Client(base_url=server.url, timeout=120) as client:
+
+        def scene(**look):
+            return np.load(io.BytesIO(order(client, capture, format="npy", **look).content))
+
+        own, none = scene(), scene(white_balance="none")
+        np.testing.assert_allclose(own, none * np.float32([1, 1, 4]), rtol=1e-5)
+        np.testing.assert_array_equal(scene(white_balance="camera"), own)
+
+
 def test_verdicts(client, capture):
     report = json.loads(order(client, capture, trust="true").headers["mwdn-report"])
     assert {verdict["subject"] for verdict in report["verdicts"]} >= {"capture", "picture"}

@@ -15,6 +15,7 @@ from mwdn.calibration.white_balance import WhiteBalance
 from mwdn.errors import ParameterError, PsfError, UnknownNameError, fits_type, one_line, shown
 from mwdn.io.files import as_parameter_error, atomic, file_sha256
 from mwdn.io.headers import MAX_BYTES
+from mwdn.io.listing import FRAMES
 from mwdn.io.toml import check_numbers, read_toml
 from mwdn.optics.sensor import Sensor
 
@@ -96,6 +97,8 @@ def read_camera(path: str | Path) -> dict[str, Any]:
         UnknownNameError: a key is none of `KEYS`.
     """
     path = Path(path)
+    if path.suffix.lower() in FRAMES:
+        raise ParameterError(f"`{path}` is a picture, but a camera file ends in .toml. Give it as the PSF: `--psf`.")
     table = read_toml(path, "camera file")
     for key, value in table.items():
         if key not in KEYS:
@@ -113,6 +116,13 @@ def read_camera(path: str | Path) -> dict[str, Any]:
     return {**{key: _as_tuple(value) for key, value in table.items()}, **files, **lists}
 
 
+def named_files(path: str | Path) -> dict[str, Path]:
+    """The files that a camera file names, by their keys; those of a list have a number, too."""
+    camera = read_camera(path)
+    lists = {f"{key} {n}": file for key in _LISTS for n, file in enumerate(camera.get(key, ()), 1)}
+    return {**{key: camera[key] for key in _FILES if key in camera}, **lists}
+
+
 def _check_range(key: str, value: Any) -> None:  # noqa: ANN401
     """Raise a `ParameterError` if the number of a key, or one of its numbers, is outside its possible range."""
     check_numbers(value, key)
@@ -123,6 +133,14 @@ def _check_range(key: str, value: Any) -> None:  # noqa: ANN401
             raise ParameterError(f"`{key}` ({number}) must not be negative.")
         if key == "black_level" and not 0 <= number < 1:
             raise ParameterError(f"`{key}` ({number}) must be in [0, 1), a fraction of the full scale.")
+
+
+def with_changes(camera: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """The keys of a camera file with some of them replaced; `pitch_um`, a distance after binning, follows `bin`."""
+    changed = {**camera, **changes}
+    if "pitch_um" in camera and "pitch_um" not in changes:
+        changed["pitch_um"] = camera["pitch_um"] * changed.get("bin", 1) / camera.get("bin", 1)
+    return changed
 
 
 def check_length(name: str, length: float | None) -> None:

@@ -13,12 +13,12 @@ def subtract_dark(image: Image, dark: Tensor) -> Image:
     """Subtract a dark or ambient frame (1, C or 1, H, W).
 
     Raises:
-        ShapeError: it has another size.
+        ShapeError: it has another size or other colours.
     """
     if dark.shape[-2:] != image.shape[-2:] or dark.shape[1] not in (1, image.shape[1]):
         raise ShapeError(
             f"The frame to subtract, `dark` or `ambient` {tuple(dark.shape[1:])}, must have the size of the frame "
-            f"{tuple(image.shape[1:])}. Take it with the same camera settings."
+            f"{tuple(image.shape[1:])}, and its colours unless it is grey. Take it with the same camera settings."
         )
     return image - dark
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mwdn.calibration.ambient_frame import denoise_ambient
-from mwdn.calibration.camera_file import check_length, check_psf_file, pop_places, pop_sensor, read_camera
+from mwdn.calibration.camera_file import check_length, check_psf_file, pop_places, pop_sensor, read_camera, with_changes
 from mwdn.calibration.corrections import Corrections
 from mwdn.calibration.float_scale import check_float_scale
 from mwdn.calibration.frame_format import FrameFormat
@@ -84,7 +84,7 @@ class Calibration:
         """
         camera = read_camera(path)
         sha256, own_psf = camera.pop("psf_sha256", ""), camera["psf"]
-        camera |= options
+        camera = with_changes(camera, options)
         terms = Refinement(**{name: camera.pop(name) for name in TERMS if name in camera})
         if camera["psf"] == own_psf:
             check_psf_file(path, sha256, own_psf)
@@ -290,7 +290,7 @@ class Calibration:
         if size != self.size:
             raise ShapeError(
                 f"`psf` ({self.size[0]} x {self.size[1]}) and the capture ({size[0]} x {size[1]}) must have the same "
-                f"height and width. {advise_size(size, self.size, self.frames)}"
+                f"height and width. {advise_size(size, self.size, self.frames, self.psf_format)}"
             )
         if measurement.shape[1] == 1 and self.psf.shape[1] == 3:
             raise ShapeError(

@@ -73,9 +73,8 @@ class SensorFrames:
             return self.darks[None].image
         if exposure is None or exposure not in self.darks:
             known = ", ".join(f"{time:g}" for time in self.darks if time is not None)
-            raise ParameterError(
-                f"`dark_exposures` ({known}) must have one for each of `exposures`, also {exposure:g}."
-            )
+            missing = "Give `exposures`" if exposure is None else f"There is none for {exposure:g}"
+            raise ParameterError(f"`dark_exposures` ({known}) must have one for each of `exposures`. {missing}.")
         return self.darks[exposure].image
 
     @property

@@ -1,18 +1,20 @@
 """What to do about a capture that has another size than the PSF."""
 
 from mwdn.calibration.frame_format import FrameFormat
+from mwdn.calibration.psf_format import PsfFormat
 from mwdn.types import Size
 
 
-def advise_size(capture: Size, psf: Size, frames: FrameFormat) -> str:
+def advise_size(capture: Size, psf: Size, frames: FrameFormat, psf_format: PsfFormat) -> str:
     """The options with which a capture and a PSF of different sizes fit."""
+    own = psf_format.psf_bin or frames.bin
     for larger, smaller, name, options in (
-        (psf, capture, "PSF", "psf_bin={product}"),
-        (capture, psf, "capture", "bin={product}, psf_bin={bin}"),
+        (psf, capture, "PSF", "psf_bin={psf}"),
+        (capture, psf, "capture", "bin={capture}, psf_bin={own}"),
     ):
         factor = larger[0] // smaller[0]
         if factor > 1 and larger == (smaller[0] * factor, smaller[1] * factor):
-            options = options.format(product=frames.bin * factor, bin=frames.bin)
+            options = options.format(psf=own * factor, capture=frames.bin * factor, own=own)
             return f"The {name} is {factor} times as large: bin it by {factor}, `{options}`."
     if psf[0] <= capture[0] and psf[1] <= capture[1]:
         raw = frames.bin * frames.cell

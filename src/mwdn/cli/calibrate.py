@@ -102,6 +102,11 @@ def calibrate(  # noqa: PLR0913
             _written(out, pairs, partial(_of_one_picture, replace(options, dark=dark), kept, own))
             return
         _refuse_psf_format(psf_format)
+        if kept.get("psf_corrected") and [Path(picture) for picture in pictures] == [kept["psf"]]:
+            raise ParameterError(
+                f"The PSF of `{camera}` is corrected already. To correct it by other frames, name the photographs of "
+                "the point source again, with all that belong to them: `mwdn calibrate POINT --dark DARK ...`."
+            )
         known = Corrections.read(kept.get("flat_field"), kept.get("hot_pixels"))
         for file in (*expanded(pictures), *expanded(photographs.dark_files), *expanded(photographs.flat)):
             refuse_overwrite(out, file)

@@ -7,6 +7,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from mwdn.calibration import Calibration, FrameFormat, PsfFormat
+from mwdn.calibration.camera_file import named_files
 from mwdn.calibration.corrections import Corrections
 from mwdn.calibration.places import at_distance
 from mwdn.cli.terminal import detail, note
@@ -42,6 +43,8 @@ class CameraOptions:
     def roles(self) -> dict[str, Path]:
         """Files that describe the camera, by what they are."""
         files = {"PSF": self.psf, "dark frame": self.dark, "ambient frame": self.ambient, "camera file": self.camera}
+        if self.camera is not None:
+            files |= {f"{name} of the camera file": path for name, path in named_files(self.camera).items()}
         return {role: path for role, path in files.items() if path is not None}
 
     @property

@@ -28,6 +28,8 @@ def from_camera_file(app: App, commands: tuple[str, ...], arguments: Any) -> Non
 
     path = given.tokens[0].value
     options = {key.replace("_", "-"): value for key, value in read_camera(path).items()}
+    if commands[-1:] == ("import",):
+        options.pop("background", None)  # of the PSF; the option of `import` is the room's light of a data set
     # Not every command has all of them, and some take unknown options for those of a method or a recipe.
     values = {name: _plain(value) for name, value in options.items() if f"--{name}" in by_name}
     Dict(values, source=path, use_commands_as_keys=False)(app, commands, arguments)

@@ -15,7 +15,7 @@ from mwdn.cli.method_options import MethodOptions, read_options
 from mwdn.cli.progress import show_progress
 from mwdn.cli.terminal import Json, results, say, warn
 from mwdn.cli.weights import ask_for_lpips
-from mwdn.data.pair_checks import check_pairs, other_camera
+from mwdn.data.pair_checks import check_pairs, missing_refinement, other_camera
 from mwdn.data.pairs import PairFile, Part
 from mwdn.data.recorded import Division
 from mwdn.errors import ParameterError
@@ -94,7 +94,8 @@ def evaluate(  # noqa: PLR0913
     check_pairs(file, calibration.psf)
     pairs: Any = file if split is None else _part(file, split, part)
     pairs = pairs if first is None else evaluation.First(pairs, first)
-    pairs = Refined(pairs, calibration.refinement) if calibration.refinement else pairs
+    refinement = missing_refinement(file, calibration.refinement)
+    pairs = Refined(pairs, refinement) if refinement else pairs
     reconstructors = {
         method: Reconstructor(method, calibration, device=device, **own) for method, own in method_options.items()
     }

@@ -13,7 +13,7 @@ from mwdn.calibration.verdict import headline, verdict
 from mwdn.cli.camera import CameraOptions
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.terminal import Json, print_json, results, say
-from mwdn.io.files import check_folder, refuse_overwrite, write_json
+from mwdn.io.files import check_folder, refuse_foreign, refuse_overwrite, write_json
 
 _STYLES = {"bad": "bold red", "mind": "yellow", "good": "green"}
 
@@ -42,6 +42,7 @@ def inspect(
     json_file = page.with_suffix(".json")
     for output in (page, json_file):
         refuse_overwrite(output, *camera.files)
+    refuse_foreign(out, (json_file.name, page.name), b'"headline"')
     calibration = at_psf_resolution(camera).load()
     check_folder(out)
     depth, off_axis = psfs_elsewhere(calibration)
@@ -53,8 +54,8 @@ def inspect(
         "verdict": [finding._asdict() for finding in findings],
         **report.content(),
     }
+    write_json(json_file, content)  # first: it marks both files as of this command
     write_page(page, report, calibration.psf, psf.name)
-    write_json(json_file, content)
     if json:
         print_json(content)
         return

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from itertools import chain
+from types import NoneType
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 from cyclopts import App, Parameter
@@ -74,6 +75,8 @@ def _convert(option: Option, given: Any) -> Any:  # noqa: ANN401
     for kind in [option.type] if get_origin(option.type) is Literal else get_args(option.type) or [option.type]:
         if get_origin(kind) is Literal and text in get_args(kind):
             return text
+        if kind is NoneType and text == "none":
+            return None
         if kind in (int, float):
             with suppress(ValueError):
                 return kind(text)

@@ -13,8 +13,10 @@ from mwdn.cli.camera import CameraOptions
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.progress import Progressing, show_progress, track
 from mwdn.cli.recipe_keys import RecipeKeys, recipe_changes
-from mwdn.cli.terminal import counted, if_interrupted, note, notes, say
+from mwdn.cli.terminal import counted, if_interrupted, note, notes, say, warn
 from mwdn.data.captures import list_captures
+from mwdn.data.pair_checks import other_camera
+from mwdn.data.pairs import PairFile
 from mwdn.io.files import refuse_overwrite
 from mwdn.io.listing import unused_photographs
 from mwdn.optics.distortion import displacement_px
@@ -75,15 +77,20 @@ def train(  # noqa: PLR0913
         if is_first and photos is not None:
             note(*unused_photographs(photos))
         with notes.status("Reading photographs, pairs or captures"):
+            calibration = camera.load()
             trainer = experiment.prepare(
                 experiment_recipe,
-                camera.load(),
+                calibration,
                 out=out,
                 photos=photos,
                 pairs=pairs_file,
                 device=device,
                 exclude=camera.roles,
             )
+        if is_first and pairs_file is not None:
+            warn(other_camera(PairFile(pairs_file), calibration))
+        if is_first and trainer.step >= trainer.schedule.steps:
+            note(f"The run in `{out}` was finished before, perhaps with other data. To train anew: another `--out`.")
         board = (
             stack.enter_context(TensorBoard(out / "tensorboard", trainer.step)) if tensorboard and is_first else None
         )

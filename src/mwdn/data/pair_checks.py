@@ -2,9 +2,19 @@
 
 from mwdn.calibration.psf import Calibration
 from mwdn.calibration.psf_identity import other_psf
+from mwdn.calibration.refinement import Refinement
 from mwdn.data.pairs import PairFile
 from mwdn.errors import ParameterError, ShapeError
 from mwdn.types import Psf
+
+REFINED = "refined"
+"""Attribute of files whose measurements need no refinement of the camera: "align" has corrected them, "simulate" has
+made them without its sensor field and stray light."""
+
+
+def missing_refinement(file: PairFile, refinement: Refinement) -> Refinement:
+    """The refinement of the camera that a file's measurements still need: none if the file is `REFINED`."""
+    return Refinement() if REFINED in file.attributes else refinement
 
 
 def check_pairs(file: PairFile, psf: Psf) -> None:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 import torch
 
 from mwdn.calibration.refinement import Refinement
-from mwdn.data.pair_checks import check_pairs
+from mwdn.data.pair_checks import check_pairs, missing_refinement
 from mwdn.data.pair_writer import Attribute
 from mwdn.data.pairs import PairFile
 from mwdn.data.simulated import Batch, Samples
@@ -206,7 +206,7 @@ def recorded_pairs(
     file = PairFile(path)
     check_pairs(file, psf)
     train, validation = division.of(len(file))
-    psf = psf.to(device)
+    psf, refinement = psf.to(device), missing_refinement(file, refinement)
     training = RecordedPairs(file, train, psf, seed, aligned=division.aligned, refinement=refinement)
     return training, replace(training, rows=validation, shuffled=False, poses={})
 
@@ -217,6 +217,7 @@ def record(
     psf: Psf,
     *,
     batch: int = 4,
+    channels: int = 3,
     attributes: Mapping[str, Attribute] | None = None,
     track: Callable[[list[range]], Iterable[range]] = iter,
 ) -> None:
@@ -227,13 +228,14 @@ def record(
         parts: sources, each with the numbers of its samples.
         psf: of the calibration.
         batch: samples to make at once.
+        channels: of their measurements and scenes.
         attributes: see `PairFile.create`.
         track: wraps the batches of each part to show progress.
 
     Raises:
         MwdnError: a sample cannot be made, or the file cannot be written.
     """
-    shape = (psf.shape[-2], psf.shape[-1], 3)
+    shape = (psf.shape[-2], psf.shape[-1], channels)
     with PairFile.create(path, measurement_shape=shape, scene_shape=shape, attributes=attributes, psf=psf) as file:
         for samples, numbers in parts:
             for chunk in track([numbers[i : i + batch] for i in range(0, len(numbers), batch)]):

@@ -144,6 +144,7 @@ class SimulatedPairs(Samples):
         sensor: noise, black level and saturation.
         seed: of all random numbers.
         camera: a fixed true camera, in place of randomly perturbed PSFs.
+        grey: average the colours of the scenes, for a grey camera.
     """
 
     photographs: Photographs
@@ -153,6 +154,7 @@ class SimulatedPairs(Samples):
     sensor: Sensor = Sensor()
     seed: int = 0
     camera: FieldCamera | None = None
+    grey: bool = False
 
     @property
     def name(self) -> str:
@@ -170,7 +172,7 @@ class SimulatedPairs(Samples):
 
         Returns:
             measurement (B, 3, H, W), with the noise of its exposure, in units of the scene; scene (B, 3, H, W), linear
-            light in [0, 1]; PSF of the calibration (1, C, H, W).
+            light in [0, 1], both of 1 channel if ``grey``; PSF of the calibration (1, C, H, W).
         """
         generators = self.generators(numbers)
         scene = self.scenes(generators)
@@ -221,7 +223,7 @@ class SimulatedPairs(Samples):
         if p.backdrop[1]:
             background = 1 - _resample(torch.ones_like(pictures[:, :1]), theta, (height, width))
             scene = scene + background * uniform(generators, *p.backdrop, 3)[..., None, None].to(scene)
-        return scene
+        return scene.mean(1, keepdim=True) if self.grey else scene
 
 
 def _expose(light: Tensor, generator: torch.Generator, sensor: Sensor) -> Tensor:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from mwdn.data.hdf5 import as_damage, find_rows, names_in, open_hdf5
+from mwdn.data.pair_checks import refuse_raw
 from mwdn.data.pairs import PairFile
 from mwdn.data.shards import COPY_AGAIN, Shard, find_shards, natural_order
 from mwdn.errors import ImageError
@@ -124,8 +125,11 @@ def list_pair_file(path: Path, captures: str, scenes: str) -> Listing:
 
     Raises:
         ImageError: no such file, or not one of pairs.
+        ParameterError: it holds a session's raw frames.
     """
-    count = len(PairFile(path))  # raises if it is not a file of pairs
+    pairs = PairFile(path)  # raises if it is not a file of pairs
+    refuse_raw(pairs)
+    count = len(pairs)
     file = open_hdf5(path, COPY_AGAIN)
 
     def load(row: int) -> tuple[Frame, Frame]:

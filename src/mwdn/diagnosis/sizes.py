@@ -15,7 +15,7 @@ from typing import NamedTuple, cast
 
 from torch.nn import functional as F
 
-from mwdn.calibration import Calibration, FrameFormat
+from mwdn.calibration import Calibration
 from mwdn.calibration.frame_operations import bin_pixels, crop_centre
 from mwdn.diagnosis.orientation import CLEAR, HALF_TURNS, QUARTER_TURNS, OrientationFit, fit_turns
 from mwdn.diagnosis.verdict import Verdict
@@ -79,7 +79,7 @@ def fitting_size(measurement: Measurement, calibration: Calibration) -> Verdict:
 
     Args:
         measurement: (1, C, H, W), from `Calibration.to_measurement`.
-        calibration: the camera's; its bin is a factor of the bins in the options.
+        calibration: the camera's; its bins are factors of the bins in the options.
 
     Returns:
         A verdict on the PSF. Its value is the bin of the PSF, or ``"1/n"`` if the capture must be binned by n, or the
@@ -103,13 +103,14 @@ def fitting_size(measurement: Measurement, calibration: Calibration) -> Verdict:
     text = f"They fit with the {what} binned by {bin}, and at no other bin tried."
     sizes = (measurement.shape[-2:], best.bin), (calibration.psf.shape[-2:], best.psf_bin)
     cropped = any(best.size != tuple(length // by for length in size) for size, by in sizes)
-    return Verdict("psf", "size", "doubt", text, value, _options(best, calibration.frames, cropped=cropped))
+    return Verdict("psf", "size", "doubt", text, value, _options(best, calibration, cropped=cropped))
 
 
-def _options(fit: Fit, frames: FrameFormat, *, cropped: bool) -> str:
-    bin = frames.bin * fit.bin
+def _options(fit: Fit, calibration: Calibration, *, cropped: bool) -> str:
+    frames, given = calibration.frames, calibration.psf_format.psf_bin
+    bin, psf_bin = frames.bin * fit.bin, (given or frames.bin) * fit.psf_bin
     options = [f"--bin {bin}"] if bin > 1 else []
-    options += [f"--psf-bin {frames.bin * fit.psf_bin}"] if fit.psf_bin != fit.bin else []
+    options += [f"--psf-bin {psf_bin}"] if psf_bin != bin or given else []
     options += ["--crop {} {}".format(*(length * bin * frames.cell for length in fit.size))] if cropped else []
     return " ".join(options)
 

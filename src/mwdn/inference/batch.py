@@ -236,8 +236,9 @@ class Batch:
         if job.full_size:
             scene = enlarge(scene, calibration.frames.bin, job.full_size)
             pitch = pitch and pitch / calibration.frames.bin
-        with as_image_error(sidecar):
-            sidecar.unlink(missing_ok=True)  # the new picture must not have an old sidecar
+        with as_image_error(sidecar):  # the new picture must not have an old sidecar or map
+            sidecar.unlink(missing_ok=True)
+            support_name(job.output).unlink(missing_ok=True)
         write_output(job.output, scene, self.format, pitch)
         if trust and self.map:
             write_picture(support_name(job.output), support_picture(scene, trust.support.map))

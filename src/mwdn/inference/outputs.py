@@ -36,8 +36,9 @@ def check_outputs(
     """Check that every capture has its own file name in ``out`` and that nothing of the user's is overwritten.
 
     Raises:
-        ParameterError: two captures have the same output, an output would overwrite an input or a ``.json`` that is
-            not of this package, an output is a symbolic link, or ``out`` is a file.
+        ParameterError: two captures have the same output, an output would overwrite an input, a ``.json`` that is not
+            of this package, or a picture without one in a folder of captures; an output is a symbolic link, or ``out``
+            is a file.
     """
     if out.exists() and not out.is_dir():
         raise ParameterError(f"`{out}` must be a folder, but is a file. Choose another one: `--out`.")
@@ -51,7 +52,8 @@ def check_outputs(
             raise ParameterError(f"`{output}` is a link to `{links[output]}`. Choose another folder: `out`.")
 
     paths = list(out.iterdir()) if out.exists() else []
-    existing = {path.name for path in paths if path.suffix == ".json"}
+    existing = {path.name for path in paths}
+    holds_captures = real(str(out)) in {real(str(Path(capture).parent)) for capture in captures}
     links = {str(path): path.readlink() for path in paths if path.is_symlink()}
     check(str(out / SUMMARY))
     sources = {SUMMARY: "the summary picture"}
@@ -62,9 +64,11 @@ def check_outputs(
         check(start + name)
         check(start + sidecar)
         check(start + name.removesuffix(_SUFFIX[format]) + _SUPPORT)
-        if sidecar in existing and not read_sidecar(out / sidecar):
+        # Elsewhere a picture without its sidecar is of a run that was killed between the two.
+        foreign = next((each for each in (sidecar, name) if each in existing), None)
+        if foreign and (foreign == sidecar or holds_captures) and not read_sidecar(out / sidecar):
             raise ParameterError(
-                f"`{start}{sidecar}` was not written by mwdn and would be lost. Choose another folder: `--out`."
+                f"`{start}{foreign}` was not written by mwdn and would be lost. Choose another folder: `--out`."
             )
         if name in sources:
             raise ParameterError(

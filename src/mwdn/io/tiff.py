@@ -15,6 +15,9 @@ from mwdn.types import Frame
 MAX_PAGES = 64
 """Most pages of a file: the picture, and smaller copies of it."""
 
+_DNG_VERSION = 50706
+"""Tag of Adobe's raw format: its numbers mean little without the black level and mosaic that `mwdn.io.raw` reads."""
+
 MAX_PARTS = 2**17
 """Most strips and tiles: 131,072."""
 
@@ -71,6 +74,8 @@ def read_tiff(file: BinaryIO, check: Any) -> TiffPicture:  # noqa: ANN401
     file.seek(0)
     with tifffile.TiffFile(file, name="", is_ome=False) as tiff:
         every: list[Any] = [tiff.pages[number] for number in range(pages)]
+        if _DNG_VERSION in every[0].tags:
+            raise ImageError("is a camera's raw file (DNG). Give its name the suffix .dng, or export it as TIFF.")
         first = max(every, key=lambda page: page.imagelength * page.imagewidth)  # smaller ones are copies of it
         _check_page(first)
         planes = [page for page in every if page.shape == first.shape]

@@ -11,7 +11,6 @@ from typing import Any
 import torch
 
 from mwdn.calibration import Calibration
-from mwdn.calibration.white_balance import apply_white_balance
 from mwdn.capture.source import Frame
 from mwdn.errors import MwdnError, ParameterError
 from mwdn.inference.reconstructor import Reconstructor
@@ -47,9 +46,8 @@ class LivePicture:
 
     def encode(self) -> tuple[bytes, bytes]:
         """JPEGs of the measurement and the scene."""
-        scene, look = self.scene, self.settings.look
-        if look.white_balance is not None:
-            scene = apply_white_balance(scene, look.white_balance, self.calibration.light)
+        look = self.settings.look
+        scene = look.balance(self.scene, self.calibration.light, self.calibration.white_balance)
         measurement = encode_jpeg(self.measurement, brightest(self.measurement))
         return measurement, encode_jpeg(scene, brightest(scene) / 2**look.exposure)
 
@@ -69,7 +67,8 @@ class LivePicture:
             "bit_depth": frame.bit_depth,
             "mosaic": frame.mosaic,
         }
-        return Result(self.measurement, self.scene, self.calibration.light, report, frame=frame.array)
+        camera = self.calibration
+        return Result(self.measurement, self.scene, camera.light, camera.white_balance, report, frame=frame.array)
 
 
 def finite(value: float) -> float | None:

@@ -74,7 +74,8 @@ class LiveSettings:
             if "white_balance" in message
             else self.look.white_balance,
         )
-        check_white_balance(look.white_balance, light)
+        if look.white_balance != "camera":
+            check_white_balance(look.white_balance, light)
         return replace(changed, options=options, look=look)
 
     def prepare(self, calibration: Calibration, device: str | None) -> Reconstructor:

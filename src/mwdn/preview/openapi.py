@@ -124,7 +124,10 @@ def _order() -> dict[str, Any]:
         trust={"enum": ["true", "false"], "default": "true", "description": "Check the picture."},
         format={"enum": list(get_args(PictureFormat)), "default": "png"},
         exposure=_exposure(),
-        white_balance={"type": "string", "description": "none, grey-world, psf, or three gains: 1.8,1,1.5"},
+        white_balance={
+            "type": "string",
+            "description": "camera (default), none, grey-world, psf, or gains: 1.8,1,1.5",
+        },
     )
 
 

@@ -114,13 +114,13 @@ class Reconstructions:
         report = _report(order, reconstruct, time.perf_counter() - start)
         report["room_light"] = None if share is None else round(float(share), 4)
         shown = reconstruct.as_recorded(scene)
-        job.result = Result(measurement, shown, calibration.light, report)
+        job.result = Result(measurement, shown, calibration.light, calibration.white_balance, report)
         if order.trust:
             job.advance(0.9)
             job.state = "checking"
             with torch.inference_mode():
                 found = _check(frame, measurement, reconstruct, scene, for_viewing=for_viewing)
-            job.result = Result(measurement, shown, calibration.light, report | found)
+            job.result = replace(job.result, report=report | found)
 
 
 def _without_light(reconstruct: Reconstructor, measurement: Measurement) -> Reconstructor:

@@ -34,7 +34,7 @@ class Look:
     Args:
         format: see `MEDIA`.
         exposure: in stops, of pictures for viewing: 1 is twice as bright.
-        white_balance: see `mwdn.calibration.white_balance`.
+        white_balance: see `mwdn.calibration.white_balance`; "camera" for that of the calibration.
 
     Raises:
         ParameterError: a value is outside its range.
@@ -42,11 +42,23 @@ class Look:
 
     format: PictureFormat = "png"
     exposure: float = 0.0
-    white_balance: WhiteBalance | None = None
+    white_balance: WhiteBalance | Literal["camera"] | None = "camera"
 
     def __post_init__(self) -> None:
         if not -STOPS <= self.exposure <= STOPS:
             raise ParameterError(f"`exposure` ({self.exposure}) must be from -{STOPS:g} to {STOPS:g} stops.")
+
+    def balance(self, scene: Scene, light: tuple[float, ...], own: WhiteBalance | None) -> Scene:
+        """Apply the white balance to a scene, of a camera with this light of the point source and this own balance.
+
+        Raises:
+            ParameterError: the white balance is not possible for this camera.
+        """
+        chosen = own if self.white_balance == "camera" else self.white_balance
+        if chosen is None:
+            return scene
+        check_white_balance(chosen, light)
+        return apply_white_balance(scene, chosen, light)
 
 
 @dataclass(frozen=True)
@@ -57,6 +69,7 @@ class Result:
         measurement: (1, C, H, W).
         scene: (1, C, H, W), in the colours of the camera.
         light: of the point source, for the white balance.
+        white_balance: of the calibration.
         report: for JSON.
         frame: the raw frame of a live picture, as the camera delivered it.
     """
@@ -64,6 +77,7 @@ class Result:
     measurement: Measurement
     scene: Scene
     light: tuple[float, ...] = ()
+    white_balance: WhiteBalance | None = None
     report: dict[str, Any] = field(default_factory=dict)
     frame: npt.NDArray[Any] | None = None
 
@@ -78,11 +92,7 @@ class Result:
         Raises:
             ParameterError: the white balance is not possible for this camera.
         """
-        scene = self.scene
-        if look.white_balance is not None:
-            check_white_balance(look.white_balance, self.light)
-            scene = apply_white_balance(scene, look.white_balance, self.light)
-        return encode(scene, look)
+        return encode(look.balance(self.scene, self.light, self.white_balance), look)
 
 
 def encode(image: Tensor, look: Look) -> bytes:

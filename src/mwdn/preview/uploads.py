@@ -82,21 +82,25 @@ def parse_number(text: str | None, name: str, default: float) -> float:
 
 
 def parse_white_balance(text: str | None) -> Any:  # noqa: ANN401
-    """``grey-world``, ``psf`` or three gains with commas; ``None`` if empty.
+    """``grey-world``, ``psf`` or three gains with commas; ``camera`` if empty; ``None`` for ``none``.
 
     Raises:
         ParameterError: none of them.
     """
-    if not text or text == "none":
+    if text == "none":
         return None
-    if text in ("grey-world", "psf"):
+    if not text:
+        return "camera"
+    if text in ("camera", "grey-world", "psf"):
         return text
     try:
         gains = tuple(float(gain) for gain in text.split(","))
     except ValueError:
         gains = ()
     if len(gains) != 3:
-        raise ParameterError(f"`white_balance` ({text[:40]!r}) must be none, grey-world, psf or three gains: 1.8,1,1.5")
+        raise ParameterError(
+            f"`white_balance` ({text[:40]!r}) must be camera, none, grey-world, psf or gains: 1.8,1,1.5"
+        )
     return gains
 
 

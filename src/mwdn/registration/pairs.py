@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from mwdn.calibration.psf_identity import psf_identity
+from mwdn.data.pair_checks import REFINED
 from mwdn.data.pair_writer import Attribute
 from mwdn.data.pairs import PairFile
 from mwdn.errors import AlignmentError, ShapeError
@@ -108,6 +109,7 @@ def write_aligned(
         **psf_identity(pairs.calibration),
         "source": pairs.path.name,
         "display_white": brightest,
+        **({REFINED: "align"} if pairs.calibration.refinement else {}),
     }
     with PairFile.create(
         path, measurement_shape=shape, scene_shape=shape, attributes=attributes, psf=pairs.calibration.psf

@@ -14,6 +14,7 @@ from mwdn.data.cameras import CameraPairs
 from mwdn.data.captures import find_captures, read_captures
 from mwdn.data.mismatch import EXACT
 from mwdn.data.noisy import NoisyScenes
+from mwdn.data.pair_checks import REFINED
 from mwdn.data.pair_writer import Attribute, check_path
 from mwdn.data.photographs import Photographs
 from mwdn.data.recorded import HELD_OUT, RecordedPairs, record, recorded_pairs
@@ -138,7 +139,8 @@ def prepare(
 def simulated_captures(recipe: Recipe, photos: Path, psf: Psf) -> TrainingData:
     """Captures simulated from photographs, through one camera or random ones; or noisy scenes for a denoiser."""
     photographs, held_out = Photographs(photos).to(psf.device).split(HELD_OUT)
-    pairs, held_out_pairs = (_simulated_pairs(recipe, part, psf) for part in (photographs, held_out))
+    grey = getattr(build_empty(**recipe.network), "channels", 0) == 1
+    pairs, held_out_pairs = (_simulated_pairs(recipe, part, psf, grey=grey) for part in (photographs, held_out))
     training: Samples = pairs
     validation: Samples = held_out_pairs
     if recipe.denoising.levels[1]:
@@ -207,7 +209,7 @@ def _read_captures(recipe: Recipe, calibration: Calibration, exclude: Mapping[st
     return read_captures(files if recipe.selfsupervised.consistency else files[:SHOWN], calibration)
 
 
-def _simulated_pairs(recipe: Recipe, photographs: Photographs, psf: Psf) -> SimulatedPairs:
+def _simulated_pairs(recipe: Recipe, photographs: Photographs, psf: Psf, *, grey: bool) -> SimulatedPairs:
     return SimulatedPairs(
         photographs,
         psf,
@@ -215,6 +217,7 @@ def _simulated_pairs(recipe: Recipe, photographs: Photographs, psf: Psf) -> Simu
         mismatch=recipe.mismatch,
         sensor=recipe.sensor,
         seed=recipe.schedule.seed,
+        grey=grey,
     )
 
 
@@ -263,11 +266,13 @@ def simulate(
     check_path(out)
     if count < 1:
         raise ParameterError(f"`count` ({count}) must be at least 1.")
-    pairs = _simulated_pairs(_with_sensor(recipe, calibration), Photographs(photos), calibration.psf)
+    grey, photographs = calibration.frames.grey, Photographs(photos)
+    pairs = _simulated_pairs(_with_sensor(recipe, calibration), photographs, calibration.psf, grey=grey)
     if exact:
         pairs = replace(pairs, mismatch=EXACT)
     elif calibration.places.field_psfs:  # the measured field, instead of random changes of one PSF
         pairs = replace(pairs, camera=field_camera(calibration))
-    attributes: dict[str, Attribute] = {**psf_identity(calibration), "seed": pairs.seed}
+    attributes: dict[str, Attribute] = {**psf_identity(calibration), "seed": pairs.seed, REFINED: "simulate"}
     numbers = range(FILE_START, FILE_START + count)
-    record(out, [(pairs, numbers)], calibration.psf, batch=recipe.schedule.batch, attributes=attributes, track=track)
+    how = {"batch": recipe.schedule.batch, "channels": 1 if grey else 3}
+    record(out, [(pairs, numbers)], calibration.psf, **how, attributes=attributes, track=track)
