@@ -13,6 +13,7 @@ from cameras import contour_psf
 from mwdn import read_frame
 from mwdn.calibration import Calibration
 from mwdn.data.pairs import PairFile
+from mwdn.data.recorded import Division
 from mwdn.fourier.convolution import convolve
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.networks import build
@@ -199,6 +200,27 @@ def test_the_file_of_pairs_and_the_table_have_one_name(run, camera):
     assert json.loads(out)["pictures"] == 2  # the test's tenth of twenty
     code, _, err = run("evaluate wiener --data pairs.h5 --psf psf.npy --split folds")
     assert (code, "has no test part" in err) == (2, True)
+
+
+def test_a_checkpoint_is_evaluated_on_the_pairs_that_its_training_left_out(run, camera):
+    assert run("simulate photos --psf psf.npy -o pairs.h5 --count 20 --recipe r.toml")[0] == 0
+    line = TRAIN.replace("--photos photos --steps 4", "--pairs pairs.h5 --pairs.split folds --steps 1")
+    network = " --network.name unet --network.width 2"
+    assert run(f"{line} --pairs.fold 1{network}")[0] == 0
+    evaluate = "evaluate runs/x/best.safetensors --data pairs.h5 --psf psf.npy --device cpu --no-lpips --json"
+
+    def psnr(options=""):
+        code, out, err = run(evaluate + options)
+        assert code == 0, err
+        return json.loads(out)["methods"]["runs/x/best.safetensors"]["values"]["psnr"]
+
+    every, held_out = psnr(), Division("folds", fold=1).parts(20)["validation"]
+    assert psnr(" --split folds --part validation") == pytest.approx([every[n] for n in held_out], abs=1e-3)
+    assert run(line.replace("runs/x", "runs/y") + network)[0] == 0
+    code, _, err = run(
+        evaluate.replace("best.safetensors ", "best.safetensors runs/y/best.safetensors ") + " --split folds"
+    )
+    assert (code, "in different ways" in err) == (2, True)
 
 
 @pytest.mark.acceptance

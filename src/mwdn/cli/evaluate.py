@@ -1,5 +1,6 @@
 """`mwdn evaluate`: compare methods on pairs of measurements and scenes."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
@@ -23,6 +24,7 @@ from mwdn.evaluation import Perceptual, Variant
 from mwdn.evaluation.alexnet import SMALLEST
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import check_folder, refuse_foreign, refuse_overwrite
+from mwdn.weights.checkpoint import read_metadata
 
 
 @dataclass(frozen=True)
@@ -40,8 +42,26 @@ class Refined:
         return self.refinement.measurement(measurement[None])[0], scene
 
 
-def _part(file: PairFile, split: str, name: str) -> Part:
-    rows = Division(split).parts(len(file))[name]
+def _division(split: str, methods: Iterable[str]) -> Division:
+    """The division of the pairs that the checkpoints were trained with, if it is this split; else its defaults.
+
+    Raises:
+        ParameterError: they were trained with different ones, of which one trained on what another left out.
+    """
+    trained: set[Division] = set()
+    for method in methods:
+        if method.endswith(".safetensors") and Path(method).is_file():
+            table = read_metadata(method).get("recipe", {}).get("pairs", {})
+            if table.get("split") == split:
+                known = {name: table[name] for name in ("seed", "folds", "fold") if name in table}
+                trained.add(Division(split, tuple(table.get("fractions", Division.fractions)), **known))
+    if len(trained) > 1:
+        raise ParameterError(f"The checkpoints divided '{split}' in different ways. Evaluate each by itself.")
+    return trained.pop() if trained else Division(split)
+
+
+def _part(file: PairFile, division: Division, name: str) -> Part:
+    rows, split = division.parts(len(file))[name], division.split
     if not rows:
         raise ParameterError(f"The split '{split}' of {len(file):,} pairs has no {name} part. Choose another `--part`.")
     return Part(file, rows)
@@ -92,7 +112,7 @@ def evaluate(  # noqa: PLR0913
     region, file = evaluation.Protocol.parse(protocol), PairFile(data)
     calibration = replace(camera.load(), white_balance=None)  # scenes of pairs are in the camera's own colours
     check_pairs(file, calibration.psf)
-    pairs: Any = file if split is None else _part(file, split, part)
+    pairs: Any = file if split is None else _part(file, _division(split, methods), part)
     pairs = pairs if first is None else evaluation.First(pairs, first)
     refinement = missing_refinement(file, calibration.refinement)
     pairs = Refined(pairs, refinement) if refinement else pairs
