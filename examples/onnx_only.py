@@ -21,6 +21,8 @@ def load(model):
     about = session.get_modelmeta().custom_metadata_map
     if "psf_hash" not in about:
         sys.exit(f"{model} must be a file that `mwdn export` wrote.")
+    if missing := {"flat", "hot_pixels", "stray_light", "sensor_field"} & about.keys():
+        sys.exit(f"{model} needs corrections that this script does not make: {', '.join(sorted(missing))}.")
     return session, about
 
 

@@ -376,14 +376,27 @@ def test_widths_shrink_alike(tmp_path):
     assert options == {"quick": {"iterations": 3}, "wiener": {}, "mwdn": {"width": 16}, "own": {"width": 5}}
 
 
-@pytest.mark.parametrize("name", ["benchmark-small", "benchmark-ablation", "benchmark-paper"])
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("[shared.netwrok]\nwidth = 2", "netwrok"),
+        ('[data.mine]\npreset = "mwdn-smi"', "mwdn-smi"),
+    ],
+)
+def test_mistyped_tables_and_presets_are_named(tmp_path, line, said):
+    (tmp_path / "r.toml").write_text(f"networks = {{ wiener = {{}} }}\n{line}\n", encoding="utf-8")
+    with pytest.raises(UnknownNameError, match=said):
+        read_benchmark(tmp_path / "r.toml")
+
+
+@pytest.mark.parametrize("name", ["benchmark-small", "benchmark-ablation", "benchmark-quarter", "benchmark-paper"])
 def test_recipes_that_come_along(name, monkeypatch):
     monkeypatch.setenv("MWDN_DATA", "/data")
     monkeypatch.setenv("MWDN_PUBLIC", "/public")
     benchmark = read_benchmark(name)
     assert {"wiener", "unet", "wiener-unet", "mwdn", "mwdn-cpsf"} <= {method.label for method in benchmark.methods}
     assert benchmark.data["mwdn-sim"].psf == "/data/mwdn-camera/psf_320.png"
-    if name != "benchmark-ablation":  # one camera
+    if name not in ("benchmark-ablation", "benchmark-quarter"):  # one camera
         assert benchmark.data["diffusercam-real"].trained_on == "diffusercam-sim"
     for recipe in benchmark.data.values():
         assert (protocol := recipe.binned_protocol()).name == "full" or protocol.rows or protocol.centre

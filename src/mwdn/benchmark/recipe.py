@@ -116,6 +116,9 @@ def read_benchmark(path: str | Path) -> Benchmark:
         if key not in keys:
             raise UnknownNameError("key of a benchmark's recipe", key, keys)
     folder, shared = Path(path).parent, content.pop("shared", {})
+    for key in shared:
+        if key not in ("network", "data"):
+            raise UnknownNameError("table of [shared]", key, ["network", "data"])
     networks = read_methods("networks", content.pop("networks", {}), NETWORKS, shared.get("network", {}))
     methods = [*read_methods("solvers", content.pop("solvers", {}), UNTRAINED, {}), *networks]
     tables: dict[str, Any] = {
@@ -142,6 +145,8 @@ def read_benchmark(path: str | Path) -> Benchmark:
 
 def _dataset_recipe(name: str, table: dict[str, Any], folder: Path) -> DatasetRecipe:
     """A preset with the changes of a camera file and of a table; its nested tables change single fields, too."""
+    if table.get("preset", name) not in {*PRESETS, name}:
+        raise UnknownNameError(f"`preset` of [data] {name}", table["preset"], PRESETS)
     preset = PRESETS.get(table.pop("preset", name), DatasetRecipe())
     nested = {f.name: getattr(preset, f.name) for f in fields(DatasetRecipe) if is_dataclass(f.default)}
     changes: dict[str, Any] = {}

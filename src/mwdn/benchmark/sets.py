@@ -258,6 +258,10 @@ def _rows(recipe: DatasetRecipe, count: int, simulates: bool) -> dict[str, range
         return {"test": range(min(recipe.test or count, count))}
     train, validation = Division(recipe.split, seed=recipe.seed).of(count)
     test = split(count, recipe.split, seed=recipe.seed)["test"]
+    if not test:
+        raise ParameterError(
+            f"`split` ({recipe.split}) of {count:,} pairs must have a test part, to score the methods."
+        )
     return {"train": train, "validation": validation[: recipe.validation], "test": test[: recipe.test or len(test)]}
 
 

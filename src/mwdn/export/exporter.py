@@ -233,6 +233,10 @@ def _about(name: str, calibration: Calibration, channels: int, precision: str) -
         about["flat"] = "raw frames must be divided by the camera's flat field"
     if calibration.corrections.count:
         about["hot_pixels"] = f"{calibration.corrections.count} pixels of raw frames must be replaced by neighbours"
+    if calibration.refinement.stray_light:
+        about["stray_light"] = "the camera's stray light must be subtracted from measurements"
+    if calibration.refinement.sensor_field:
+        about["sensor_field"] = "measurements must be divided by the camera's sensor field"
     return about
 
 
