@@ -1,17 +1,17 @@
 """Pictures of docs/claims.md: learning curves, PSNR against mismatch, and real captures, of one folder of a benchmark.
 
-    mwdn benchmark benchmark-ablation --out runs/ablation-1 --seed 1
-    mwdn recipes benchmark-ablation |
+    mwdn benchmark benchmark-quarter --out runs/quarter --seed 3
+    mwdn recipes benchmark-quarter |
         sed 's/bin = 4/&, deviation = { turn_degrees = 0, background = 0, off_axis = 0 }/' > exact.toml
-    mwdn benchmark exact.toml --out runs/exact --seed 1
-    python docs/claims.py runs/ablation-1 [--exact runs/exact] [--captures ../shared/data/mwdn-camera/real-objects]
-                                          [--out docs]
+    mwdn benchmark exact.toml --out runs/exact --seed 3
+    python docs/claims.py runs/quarter [--exact runs/exact] [--captures ../shared/data/mwdn-camera/real-objects]
+                                       [--recipe benchmark-quarter] [--out docs]
 
 Mismatch is the deviation of the data set's true camera times 0, 1, 2 and 3: 0 is a camera that matches its
 calibration, 1 the camera of the training. Also measured, at 1: cameras and methods with the mirrored PSF. The scenes
 and the noise are the same for all. Networks of `--exact` were trained without mismatch; their labels end in ", exact".
-Writes ``claims-curves.png``, ``claims-captures.jpg``, and the numbers to `benchmarks/results/mismatch.json`, from which
-finished methods are not measured again.
+Writes ``claims-curves.png``, ``claims-captures.jpg``, and the numbers to `benchmarks/results/mismatch-quarter.json`, from
+which finished methods are not measured again.
 """
 
 import argparse
@@ -44,7 +44,7 @@ from mwdn.training.experiment import FILE_START
 from mwdn.types import Measurement, Scene
 
 matplotlib.use("agg")
-RECORD = Path(__file__).resolve().parent.parent / "benchmarks" / "results" / "mismatch.json"
+RECORD = Path(__file__).resolve().parent.parent / "benchmarks" / "results" / "mismatch-quarter.json"
 FACTORS = (0.0, 1.0, 2.0, 3.0)  # from 4 on, the corners of the field would get negative light
 COUNT = 16  # test pictures for each factor
 EXACT = ", exact"  # behind the name of a network that was trained without mismatch
@@ -164,9 +164,10 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--exact", type=Path)
     parser.add_argument("--captures", type=Path, default=Path("../shared/data/mwdn-camera/real-objects"))
+    parser.add_argument("--recipe", default="benchmark-quarter")
     parser.add_argument("--out", type=Path, default=Path("docs"))
     arguments = parser.parse_args()
-    benchmark = read_benchmark("benchmark-ablation")
+    benchmark = read_benchmark(arguments.recipe)
     name, recipe = next(iter(benchmark.data.items()))
     dataset = open_dataset(name, recipe, arguments.folder / "data", torch.device("cpu"), lambda title, rows: rows)
     runs = arguments.folder / "runs" / name
