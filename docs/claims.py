@@ -10,8 +10,8 @@
 Mismatch is the deviation of the data set's true camera times 0, 1, 2 and 3: 0 is a camera that matches its
 calibration, 1 the camera of the training. Also measured, at 1: cameras and methods with the mirrored PSF. The scenes
 and the noise are the same for all. Networks of `--exact` were trained without mismatch; their labels end in ", exact".
-Writes ``claims-curves.png``, ``claims-captures.jpg``, and the numbers to `benchmarks/results/mismatch-quarter.json`, from
-which finished methods are not measured again.
+Writes ``claims-curves.png``, ``claims-captures.jpg``, and the numbers to `benchmarks/results/mismatch-quarter.json`,
+from which finished methods are not measured again.
 """
 
 import argparse
