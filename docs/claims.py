@@ -5,13 +5,13 @@
         sed 's/bin = 4/&, deviation = { turn_degrees = 0, background = 0, off_axis = 0 }/' > exact.toml
     mwdn benchmark exact.toml --out runs/exact --seed 3
     python docs/claims.py runs/quarter [--exact runs/exact] [--captures ../shared/data/mwdn-camera/real-objects]
-                                       [--recipe benchmark-quarter] [--out docs]
+                                       [--recipe benchmark-quarter] [--record FILE] [--out docs]
 
 Mismatch is the deviation of the data set's true camera times 0, 1, 2 and 3: 0 is a camera that matches its
 calibration, 1 the camera of the training. Also measured, at 1: cameras and methods with the mirrored PSF. The scenes
 and the noise are the same for all. Networks of `--exact` were trained without mismatch; their labels end in ", exact".
-Writes ``claims-curves.png``, ``claims-captures.jpg``, and the numbers to `benchmarks/results/mismatch-quarter.json`,
-from which finished methods are not measured again.
+Writes ``claims-curves.png``, ``claims-captures.jpg``, and the numbers to the record, from which finished methods are
+not measured again.
 """
 
 import argparse
@@ -95,12 +95,16 @@ def score(method: Reconstructor, test: tuple[Measurement, Scene], dataset: Datas
 
 
 def mismatch(
-    benchmark: Benchmark, dataset: Dataset, weights: dict[str, Path], methods: dict[str, Reconstructor]
+    benchmark: Benchmark,
+    dataset: Dataset,
+    weights: dict[str, Path],
+    methods: dict[str, Reconstructor],
+    path: Path,
 ) -> dict[str, list[float]]:
     """PSNR of each method at each factor, and with the mirrored PSF; recorded results are kept."""
     hashes = {label: file_sha256(weights[label])[:16] if label in weights else "" for label in methods}
     settings = {"factors": list(FACTORS), "count": COUNT}
-    record = json.loads(RECORD.read_text()) if RECORD.exists() else {}
+    record = json.loads(path.read_text()) if path.exists() else {}
     if {key: record.get(key) for key in settings} != settings:
         record = settings
     record = {"psnr": {}, "mirrored": {}, "weights": {}} | record
@@ -115,7 +119,7 @@ def mismatch(
         record["mirrored"][label] = score(others[label], turned, dataset)
         record["weights"][label] = hashes[label]
         print(label, record["psnr"][label], record["mirrored"][label], flush=True)
-        write_text(RECORD, json.dumps(record, indent=1) + "\n")
+        write_text(path, json.dumps(record, indent=1) + "\n")
     return record["psnr"]
 
 
@@ -165,6 +169,7 @@ def main() -> None:
     parser.add_argument("--exact", type=Path)
     parser.add_argument("--captures", type=Path, default=Path("../shared/data/mwdn-camera/real-objects"))
     parser.add_argument("--recipe", default="benchmark-quarter")
+    parser.add_argument("--record", type=Path, default=RECORD)
     parser.add_argument("--out", type=Path, default=Path("docs"))
     arguments = parser.parse_args()
     benchmark = read_benchmark(arguments.recipe)
@@ -178,7 +183,7 @@ def main() -> None:
         others, exact = renamed(benchmark, exact, EXACT)
         benchmark, weights = replace(benchmark, methods=(*benchmark.methods, *others.methods)), weights | exact
     methods = reconstructors(benchmark, dataset, weights)
-    psnr = mismatch(benchmark, dataset, weights, methods)
+    psnr = mismatch(benchmark, dataset, weights, methods, arguments.record)
     colours = dict(zip(methods, [*matplotlib.colormaps["tab20"].colors] * 2, strict=False))
     figure = Figure(figsize=(13, 5), layout="constrained")
     left, right = figure.subplots(1, 2)
