@@ -171,11 +171,14 @@ def test_outlying_frames_are_named(run, folder, photographs):
         ("psf_1 --flat flat/frame_1.png flat/frame_3.png --dark dark --bit-depth 12", "must have the same light"),
         ("psf_1 --dark dark --white-balance flat", "needs flat frames"),
         ("psf_1 --dark dark --dark-exposures 1 2 --exposures 4", "must have one for each of `--exposures`"),
+        ("psf_1 --dark dark dark --dark-exposures 1 2 --bit-depth 12", "Give `--exposures`"),
+        ("psf_1 --flat small --bit-depth 12", "must have the size of `frame_"),
         ("empty --dark dark", "holds no frame"),
     ],
 )
 def test_photographs_that_do_not_fit(run, folder, line, message):
     (folder / "empty").mkdir()
+    save(folder / "small", [np.full((96, 128, 1), level, np.uint16) for level in (1500, 1502)])
     code, _, err = run(f"calibrate {line}")
     assert code == 2
     assert message in err
