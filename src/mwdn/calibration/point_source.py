@@ -88,8 +88,8 @@ def _check_exposure(
         (height, width), size = defects.shape[-2:], frame.shape[:2]
         if (height, width) != size:
             raise ShapeError(
-                f"Dark and flat frames ({height} x {width}) must have the size of `{file.name}` ({size[0]} x {size[1]}) "
-                "of the point source. Take them with the same settings of the sensor."
+                f"Dark and flat frames ({height} x {width}) must have the size of the point source's `{file.name}` "
+                f"({size[0]} x {size[1]}). Take them with the same settings of the sensor."
             )
         frame = np.where(defects[0, 0, :, :, None].numpy(), 0, frame).astype(frame.dtype)
     dark = sensor.dark(time)
