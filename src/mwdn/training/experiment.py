@@ -274,5 +274,6 @@ def simulate(
         pairs = replace(pairs, camera=field_camera(calibration))
     attributes: dict[str, Attribute] = {**psf_identity(calibration), "seed": pairs.seed, REFINED: "simulate"}
     numbers = range(FILE_START, FILE_START + count)
-    how = {"batch": recipe.schedule.batch, "channels": 1 if grey else 3}
-    record(out, [(pairs, numbers)], calibration.psf, **how, attributes=attributes, track=track)
+    batch, channels = recipe.schedule.batch, 1 if grey else 3
+    parts = [(pairs, numbers)]
+    record(out, parts, calibration.psf, batch=batch, channels=channels, attributes=attributes, track=track)
