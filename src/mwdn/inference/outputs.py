@@ -53,7 +53,8 @@ def check_outputs(
 
     paths = list(out.iterdir()) if out.exists() else []
     existing = {path.name for path in paths}
-    holds_captures = real(str(out)) in {real(str(Path(capture).parent)) for capture in captures}
+    folders = {str(Path(capture).parent) for capture in captures}
+    holds_captures = real(str(out)) in map(real, folders)
     links = {str(path): path.readlink() for path in paths if path.is_symlink()}
     check(str(out / SUMMARY))
     sources = {SUMMARY: "the summary picture"}
