@@ -107,3 +107,11 @@ def test_dark_frame_of_a_gamma_coded_camera_is_decoded_too(generator):
 def test_another_resolution_scales_the_crop():
     assert FrameFormat(bin=2, crop=(100, 60)).with_bin(4) == FrameFormat(bin=4, crop=(200, 120))
     assert FrameFormat(bin=2).with_bin(4) == FrameFormat(bin=4)
+
+
+def test_a_stated_mosaic_is_taken_or_must_be_the_same():
+    assert FrameFormat().with_mosaic("gbrg", of="the camera") == FrameFormat(mosaic="gbrg")
+    for stated in (None, "rggb"):
+        assert FrameFormat(mosaic="rggb").with_mosaic(stated, of="the camera") == FrameFormat(mosaic="rggb")
+    with pytest.raises(ParameterError, match=r"rggb.*the camera.*gbrg"):
+        FrameFormat(mosaic="rggb").with_mosaic("gbrg", of="the camera")

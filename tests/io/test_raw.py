@@ -51,9 +51,17 @@ def test_a_raw_file_needs_no_options(tmp_path: Path, colours: str) -> None:
     assert measurement.shape == (1, 3, 18, 24)
     expected = np.array([100, 200, 300]) / (WHITE - BLACK)
     np.testing.assert_allclose(measurement.mean((0, 2, 3)), expected, atol=1e-5)
-    # A given order is preferred to that of the file.
-    other = FrameFormat(mosaic="rggb" if colours != "rggb" else "bggr")
-    assert not np.allclose(other.to_measurement(other.read(path)).mean((0, 2, 3)), expected, atol=0.01)
+
+
+def test_another_mosaic_than_the_files_is_refused(tmp_path: Path, mosaic: np.ndarray) -> None:
+    """A flipped sensor exchanged red and blue without a word."""
+    psf, flipped = put(tmp_path / "psf.dng", dng(mosaic, "grbg")), put(tmp_path / "flipped.dng", dng(mosaic, "gbrg"))
+    camera = Calibration.from_file(psf)
+    assert camera.frames.mosaic == "grbg"
+    np.testing.assert_array_equal(camera.frames.read(psf), read_frame(psf))
+    for refused in (lambda: camera.frames.read(flipped), lambda: Calibration.from_file(flipped, mosaic="grbg")):
+        with pytest.raises(ParameterError, match=r"grbg.*flipped\.dng.*gbrg"):
+            refused()
 
 
 def test_crop_counts_the_pixels_of_the_sensor(tmp_path: Path, mosaic: np.ndarray) -> None:

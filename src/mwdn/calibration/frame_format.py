@@ -88,7 +88,8 @@ class FrameFormat:
 
         Raises:
             ImageError: the file cannot be read.
-            ParameterError: ``crop`` without ``mosaic``, and a raw file with one: its pixels are cells now.
+            ParameterError: a raw file has another mosaic than ``mosaic``; or ``crop`` without ``mosaic``, and a raw
+                file with one: its pixels are cells now.
         """
         frame, frames = self.read_stored(path)
         if frames.mosaic is None or frames.mosaic == self.mosaic:
@@ -106,11 +107,35 @@ class FrameFormat:
 
         Raises:
             ImageError: the file cannot be read.
+            ParameterError: a raw file has another mosaic than ``mosaic``.
         """
-        if is_raw(path) and self.mosaic is None:
+        if is_raw(path):
             raw = read_raw(path)
-            return raw.frame, replace(self, mosaic=raw.mosaic)
+            return raw.frame, self.with_mosaic(raw.mosaic, of=f"`{path}`")
         return read_frame(path, bgr=self.bgr), self
+
+    def with_mosaic(self, stated: Mosaic | None, *, of: str) -> "FrameFormat":
+        """The format with the mosaic that frames state themselves.
+
+        The order of a sensor changes if it is flipped, or if its window starts at an odd pixel. Then its frames are
+        mirrored or displaced, too: PSF and dark frame do not fit them, whichever order is taken.
+
+        Args:
+            stated: by a raw file, a session or a camera; ``None`` if it states none.
+            of: what states it, for the error message.
+
+        Raises:
+            ParameterError: ``mosaic`` is another one.
+        """
+        if stated is None or stated == self.mosaic:
+            return self
+        if self.mosaic is None:
+            return replace(self, mosaic=stated)
+        raise ParameterError(
+            f"`mosaic` ({self.mosaic}) must be that of {of}, which states {stated}. If it is the PSF's, the sensor has "
+            "been flipped or its window moved: take PSF and captures with the same settings. If you gave it: leave out "
+            "`mosaic`."
+        )
 
     def to_measurement(
         self, frame: Frame, dark: Tensor | None = None, corrections: Callable[[Image, int], Image] = Corrections()

@@ -108,8 +108,7 @@ def _extracted(path: Path, folder: Path, given: BenchFrames) -> BenchFrames:
     frames = given.frames
     if frames.bit_depth is None and "bit_depth" in attributes:
         frames = replace(frames, bit_depth=int(attributes["bit_depth"]))
-    if frames.mosaic is None and attributes.get("mosaic"):
-        frames = replace(frames, mosaic=attributes["mosaic"])  # type: ignore[arg-type]
+    frames = frames.with_mosaic(attributes.get("mosaic") or None, of=f"`{path}`")  # type: ignore[arg-type]
     return BenchFrames([file for name in points for file in groups[name]], photographs, frames)
 
 

@@ -51,8 +51,7 @@ class CapturedPairs:
         frames = calibration.frames
         if frames.bit_depth is None and "bit_depth" in attributes:
             frames = replace(frames, bit_depth=int(attributes["bit_depth"]))
-        if frames.mosaic is None and (mosaic := attributes.get("mosaic")):
-            frames = replace(frames, mosaic=_as_mosaic(mosaic))
+        frames = frames.with_mosaic(_as_mosaic(attributes.get("mosaic")), of=f"`{path}`")
         self.calibration = _with_ambient(path, replace(calibration, frames=frames))
         self.display_gamma = as_gamma(display_gamma)
         self._file: Any = None
@@ -144,5 +143,5 @@ def as_gamma(gamma: float | int | str) -> float | str:
     return power
 
 
-def _as_mosaic(text: object) -> Mosaic:
-    return str(text)  # type: ignore[return-value]
+def _as_mosaic(text: object) -> Mosaic | None:
+    return str(text) if text else None  # type: ignore[return-value]
