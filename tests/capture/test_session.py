@@ -231,10 +231,33 @@ def test_a_file_of_other_settings_is_not_mixed(tmp_path, recipe):
         replace(recipe, pictures=replace(recipe.pictures, size=(40, 40))),
         replace(recipe, rig=replace(recipe.rig, bit_depth=10)),
         replace(recipe, rig=replace(recipe.rig, height=recipe.rig.height // 2)),
+        replace(recipe, camera=replace(recipe.camera, exposure_s=0.011)),
+        replace(recipe, camera=replace(recipe.camera, gain=1.1)),
+        replace(recipe, display=replace(recipe.display, gamma=1.8)),
     ):
         with pytest.raises(ParameterError, match="was begun with"):
             session(changed, out).run()
     assert out.read_bytes() == content
+    rounded = replace(
+        recipe, camera=replace(recipe.camera, exposure_s=0.01, gain=1.0), display=replace(recipe.display, gamma=2.2)
+    )
+    assert session(rounded, out).run() == 7
+
+
+def test_frames_in_progress_have_the_old_exposure_and_are_skipped(tmp_path, recipe):
+    class Late(Rig):
+        """As a Raspberry Pi's camera: the exposure takes effect five frames after it is set."""
+
+        left = 5
+
+        def read(self):
+            self.left -= 1
+            frame = super().read()
+            return replace(frame, exposure_s=0.03) if self.left >= 0 else frame
+
+    recipe, out = replace(recipe, camera=replace(recipe.camera, exposure_s=0.01)), tmp_path / "pairs.h5"
+    for _ in range(2):
+        assert session(recipe, out, Late(recipe.rig, open_camera(recipe).screen)).run() == 7
 
 
 def test_wrong_exposures_are_refused_before_anything_is_recorded(tmp_path, recipe):

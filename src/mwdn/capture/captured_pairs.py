@@ -155,6 +155,12 @@ class CapturedPairs:
         """(K, H, W, C), the frames of a group."""
         return np.asarray(self._file[place]["measurement"][:])
 
+    def first_settings(self, place: str) -> dict[str, float]:
+        """``exposure_s`` and ``gain`` of the first frame of a group; NaN if the camera did not say."""
+        with as_damage(f"`{place}` of `{self.path}` cannot be read", _ADVICE):
+            data = self._file[place]["frame_data"]
+            return {name: float(data[name][0]) for name in ("exposure_s", "gain")}
+
     def has_group(self, place: str) -> bool:
         """Whether a group is there."""
         return place in self._file

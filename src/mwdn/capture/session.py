@@ -5,12 +5,13 @@ import math
 import shutil
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from mwdn.capture.captured_pairs import CapturedPairs, create_captured, displayed_light, open_captured
+from mwdn.capture.continuation import ROUNDING, check_continued, describe_place
 from mwdn.capture.display import Display
 from mwdn.capture.gamma import fit_gamma
 from mwdn.capture.patterns import grey, grey_levels, pattern
@@ -30,6 +31,9 @@ CONTRAST = 0.005
 
 GAMMA_ERROR = 0.03
 """Largest difference of a grey step from the fit without a warning."""
+
+IN_PROGRESS = 10
+"""Most frames with the old settings of a camera after it was set; a Raspberry Pi's has about five."""
 
 ROOM = 1.02
 """Bytes of a file over those of its pictures."""
@@ -80,11 +84,10 @@ class Session:
             ParameterError: the file was begun with other settings, or there is no room on the disk.
         """
         self._configure()
-        self._show(self._whole(0))
-        self._first = self._grab(time.time())
+        self._first = self._first_frame()
         if self.out.exists():
             with open_captured(self.out) as pairs:
-                self._check_same({**pairs.attributes, **pairs.kinds})
+                check_continued(pairs, self.recipe, self._first, self._screen, self._place)
                 return self._capture(pairs)
         self._check_room(len(self._names([])) or 1)
         with create_captured(self.out, self._first, self.recipe.pictures.size, self._attributes()) as pairs:
@@ -142,6 +145,17 @@ class Session:
     def _configure(self) -> None:
         table = self.recipe.camera
         self.camera.configure(table.exposure_s or None, table.gain if table.gain >= 0 else None)
+
+    def _first_frame(self) -> Frame:
+        """A frame of a dark display; frames that were in progress when the camera was set have its old settings."""
+        self._show(self._whole(0))
+        frame, table = self._grab(time.time()), self.recipe.camera
+        for _ in range(IN_PROGRESS):
+            wanted = ((frame.exposure_s, table.exposure_s), (frame.gain, table.gain))
+            if not any(value > 0 and abs(now / value - 1) > ROUNDING for now, value in wanted):
+                break
+            frame = self._grab(time.time())
+        return frame
 
     def _grab(self, shown: float) -> Frame:
         """The first frame whose exposure began after a moment; a camera that fails is opened again.
@@ -253,25 +267,9 @@ class Session:
         recipe["display"].pop("token")
         return {
             "camera": self.camera.name,
-            **asdict(self._screen),
-            **{f"place_{name}": value for name, value in asdict(self._place).items()},
+            **describe_place(self._screen, self._place),
             "recipe": json.dumps(recipe, default=str),
         }
-
-    def _check_same(self, stored: Mapping[str, Any]) -> None:
-        """Check that a file was begun with this display, place, pictures and kind of frames."""
-        frame = self._first
-        now = {**asdict(self._screen), **{f"place_{key}": value for key, value in asdict(self._place).items()}}
-        now["scene"] = (*self.recipe.pictures.size, 3, "uint16")
-        if frame is not None:
-            now["measurement"] = (*frame.array.shape, str(frame.array.dtype))
-            now |= {"bit_depth": frame.bit_depth, "mosaic": frame.mosaic or ""}
-        for name, value in now.items():
-            if stored.get(name) != value:
-                raise ParameterError(
-                    f"`{self.out}` was begun with `{name}` {stored.get(name)}, but now it is {value}. Set it as it "
-                    "was, or start a new file: `out`."
-                )
 
     def _check_room(self, count: int) -> None:
         if self._first is None or count <= 0:
