@@ -253,11 +253,11 @@ def test_frames_in_progress_have_the_old_exposure_and_are_skipped(tmp_path, reci
         def read(self):
             self.left -= 1
             frame = super().read()
-            return replace(frame, exposure_s=0.03) if self.left >= 0 else frame
+            return replace(frame, exposure_s=0.003) if self.left >= 0 else frame
 
     recipe, out = replace(recipe, camera=replace(recipe.camera, exposure_s=0.01)), tmp_path / "pairs.h5"
-    for _ in range(2):
-        assert session(recipe, out, Late(recipe.rig, open_camera(recipe).screen)).run() == 7
+    for camera in (None, Late(recipe.rig, open_camera(recipe).screen)):
+        assert session(recipe, out, camera).run() == 7
 
 
 def test_wrong_exposures_are_refused_before_anything_is_recorded(tmp_path, recipe):
@@ -348,6 +348,17 @@ def test_a_folder_is_relative_to_its_recipe_or_to_the_current_one_if_it_is_an_op
     path = write(tmp_path)
     assert read_capture_recipe(path).photographs == tmp_path / "photos"
     assert read_capture_recipe(path, pictures={"folder": "../photos"}).photographs.samefile(tmp_path / "photos")
+
+
+def test_a_board_needs_large_pictures_and_is_refused_before_anything_is_recorded(tmp_path, run):
+    path, out = write(tmp_path, count=1), tmp_path / "pairs.h5"
+    path.write_text(path.read_text().replace('["dots"]', '["dots", "charuco"]'))
+    code, _, err = run("capture", path, "-o", out)
+    assert code == 2
+    assert "(80 x 80)" in err
+    assert "84 x 84" in err
+    assert not out.exists()
+    assert run("capture", path, "-o", out, "--pictures.size", "[90, 90]")[0] == 0
 
 
 def test_wrong_recipes_are_named(tmp_path):

@@ -10,6 +10,9 @@ from mwdn.errors import ParameterError, UnknownNameError
 SQUARES = 7
 """Squares along each side of the ChArUco board, of the dictionary DICT_4X4_50; markers have 3/4 of a square."""
 
+LEAST_SIDE = 12 * SQUARES
+"""Least side of a picture for the board: 12 pixels a square give a marker 9 pixels, 1.5 for each of its 6 x 6 cells."""
+
 DOTS = 7
 """Dots along each side; the first two have twice the diameter of the others, so that turns and mirrors are noticed."""
 
@@ -78,8 +81,6 @@ def charuco(size: tuple[int, int]) -> Picture:
     from cv2 import aruco
 
     side = min(size) // SQUARES * SQUARES
-    if side < 12 * SQUARES:
-        raise ParameterError(f"`size` {size} must be at least {12 * SQUARES} pixels for a ChArUco board.")
     dictionary = aruco.getPredefinedDictionary(aruco.DICT_4X4_50)
     board = np.asarray(aruco.CharucoBoard((SQUARES, SQUARES), 1.0, 0.75, dictionary).generateImage((side, side)))
     picture = np.full(size, 255, np.uint8)
@@ -97,12 +98,23 @@ PATTERNS: Mapping[str, Callable[[tuple[int, int]], Picture]] = {
 """Patterns by name that fill a picture of any size."""
 
 
+def check_size(name: str, size: tuple[int, int]) -> None:
+    """Raise a `ParameterError` if a picture of this height and width is too small for a pattern."""
+    if name == "charuco" and min(size) < LEAST_SIDE:
+        raise ParameterError(
+            f"`size` ({size[0]} x {size[1]}) of [pictures] must be at least {LEAST_SIDE} x {LEAST_SIDE} pixels for a "
+            'ChArUco board. Enlarge it, or leave the board out: `patterns = ["dots"]` in [session].'
+        )
+
+
 def pattern(name: str, size: tuple[int, int]) -> Picture:
     """A pattern of `PATTERNS`, of this height and width.
 
     Raises:
         UnknownNameError: there is none of this name.
+        ParameterError: the picture is too small for it.
     """
     if name not in PATTERNS:
         raise UnknownNameError("pattern", name, PATTERNS)
+    check_size(name, size)
     return PATTERNS[name](size)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mwdn.capture.patterns import PATTERNS
+from mwdn.capture.patterns import PATTERNS, check_size
 from mwdn.capture.rig_options import RigOptions
 from mwdn.errors import ParameterError, UnknownNameError
 from mwdn.io.toml import find_recipe, read_toml, to_dataclass
@@ -175,6 +175,9 @@ class CaptureRecipe:
         point: see `PointTable`.
         rig: see `RigOptions`; for ``source = "rig"``.
         folder: to which paths are relative: that of the recipe.
+
+    Raises:
+        ParameterError: the pictures are too small for a pattern.
     """
 
     camera: CameraTable = CameraTable()
@@ -184,6 +187,10 @@ class CaptureRecipe:
     point: PointTable = PointTable()
     rig: RigOptions = RigOptions()
     folder: Path = Path()
+
+    def __post_init__(self) -> None:
+        for name in self.session.shown:
+            check_size(name, self.pictures.size)
 
     @property
     def photographs(self) -> Path:
