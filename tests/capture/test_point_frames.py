@@ -80,9 +80,14 @@ def test_a_session_with_a_lamp_becomes_a_camera_file(tmp_path, run, recipe):
     assert "flat_field" not in content  # the mask was in front of the sensor
     (tmp_path / "session").mkdir()
     (tmp_path / "captured.h5").rename(tmp_path / "session" / "captured.h5")
-    code, _, err = run("calibrate", tmp_path / "session", "--exposures", 1, "-o", tmp_path / "camera.toml")
-    assert code == 2
-    assert "Leave those options out" in err
+    for options, said in (
+        (("--exposures", 1), "Leave those options out"),
+        (("--capture-exposure", 1), "Leave those options out"),
+        (("--flat", "flat.png"), "`--flat-dark` must name"),  # the session's dark frames have several exposures
+    ):
+        code, _, err = run("calibrate", tmp_path / "session", *options, "-o", tmp_path / "camera.toml")
+        assert code == 2
+        assert said in err
 
 
 def test_it_is_recorded_once_and_not_at_all_unless_asked_for(tmp_path, run, recipe):

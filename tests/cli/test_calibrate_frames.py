@@ -170,6 +170,10 @@ def test_outlying_frames_are_named(run, folder, photographs):
         ("psf_8 psf_1 --exposures 1 8 --dark dark --bit-depth 12", "saturated"),
         ("psf_1 --flat flat/frame_1.png flat/frame_3.png --dark dark --bit-depth 12", "must have the same light"),
         ("psf_1 --dark dark --white-balance flat", "needs flat frames"),
+        ("psf_1 --dark-exposures 1 2 --exposures 1", r"`--dark-exposures` (1, 2) needs dark frames"),
+        ("psf_1 --dark dark --capture-exposure 5", "`--capture-exposure` (5) must be one of `--dark-exposures` (none)"),
+        ("psf_1/frame_1.png --capture-exposure 5", "`--capture-exposure` (5) must be one of `--dark-exposures` (none)"),
+        ("psf_1 --dark dark dark --dark-exposures 1 2 --exposures 1 --flat flat", "`--flat-dark` must name"),
         ("psf_1 --dark dark --dark-exposures 1 2 --exposures 4", "must have one for each of `--exposures`"),
         ("psf_1 --dark dark dark --dark-exposures 1 2 --bit-depth 12", "Give `--exposures`"),
         ("psf_1 --flat small --bit-depth 12", "must have the size of the point source's `frame_"),
@@ -183,6 +187,28 @@ def test_photographs_that_do_not_fit(run, folder, line, message):
     assert code == 2
     assert message in err
     assert not Path("camera.toml").exists()
+
+
+def test_flat_frames_of_another_size_are_named(run, folder, photographs):
+    """They ended in a traceback if they had dark frames of their own."""
+    bench, _ = photographs
+    save(folder / "small", [bench.flat(0.5)[:100, :120]] * 2)
+    save(folder / "small_dark", [bench.dark()[:100, :120]] * 2)
+    code, _, err = run("calibrate psf_1 --dark dark --flat small --flat-dark small_dark --bit-depth 12")
+    assert code == 2
+    assert "(100 x 120)" in err
+    assert "(128 x 160)" in err
+
+
+def test_each_folder_of_dark_frames_has_its_exposure(run, folder, photographs):
+    """Folders of unequal size were divided evenly, and frames of one exposure were averaged with the other's."""
+    bench, _ = photographs
+    save(folder / "dark_64", [bench.dark() + np.uint16(400)] * 2)
+    options = "--exposures 1 64 --dark dark dark_64 --dark-exposures 1 64 --bit-depth 12"
+    assert run(f"calibrate psf_1 psf_64 {options}")[0] == 0
+    lighter = float(Calibration.load("camera.toml").dark.mean())
+    assert run(f"calibrate psf_1 psf_64 {options} --capture-exposure 1")[0] == 0
+    assert lighter - float(Calibration.load("camera.toml").dark.mean()) == pytest.approx(400 / STEPS, rel=0.01)
 
 
 def test_watching_guides_the_exposure(folder, photographs):

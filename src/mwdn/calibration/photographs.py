@@ -9,6 +9,7 @@ import numpy as np
 
 from mwdn.calibration.camera_parts import picture_of
 from mwdn.calibration.corrections import Corrections
+from mwdn.calibration.frame_average import Kind
 from mwdn.calibration.frame_format import FrameFormat
 from mwdn.calibration.point_source import PointSource, centring_shift, photograph_point
 from mwdn.calibration.sensor_frames import SensorFiles, SensorFrames, equal_parts, measure_sensor
@@ -66,9 +67,10 @@ def expanded(paths: Sequence[Path]) -> list[Path]:
     return files
 
 
-def grouped(paths: Sequence[Path], count: int) -> list[list[Path]]:
+def grouped(paths: Sequence[Path], count: int, kind: Kind) -> tuple[tuple[Path, ...], ...]:
     """Files in groups: one for each path if there are as many, otherwise equal parts in order."""
-    return [expanded([path]) for path in paths] if len(paths) == count else equal_parts(expanded(paths), count, "PSF")
+    parts = [expanded([path]) for path in paths] if len(paths) == count else equal_parts(expanded(paths), count, kind)
+    return tuple(map(tuple, parts))
 
 
 @dataclass(frozen=True, eq=False)

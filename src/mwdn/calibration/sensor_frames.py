@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 
 import torch
@@ -13,7 +14,7 @@ from mwdn.calibration.frame_format import FrameFormat
 from mwdn.calibration.frame_operations import demosaic
 from mwdn.calibration.hot_pixels import find_dead_pixels, find_hot_pixels
 from mwdn.calibration.photon_transfer import SAME_LIGHT, PhotonTransfer, photon_transfer
-from mwdn.errors import ParameterError
+from mwdn.errors import ParameterError, ShapeError
 from mwdn.types import Frame, Image
 
 LEAST_RESPONSE = 0.1
@@ -25,20 +26,41 @@ class SensorFiles:
     """Frames that describe the sensor.
 
     Args:
-        dark: without light, several.
-        dark_exposures: one for each equal part of them, in order; empty if all have the same.
+        dark: without light, several for each of ``dark_exposures``.
+        dark_exposures: empty if all have the same.
         flat: of even light at about half of the full scale, in pairs of the same exposure.
-        flat_dark: without light and with the exposure of the flat frames; ``dark`` unless given.
+        flat_dark: without light and with the exposure of the flat frames; ``dark`` of a single exposure unless given.
         flat_field: whether the flat frames' light is even; otherwise only the noise is measured from them.
         capture_exposure: that of the captures, one of ``dark_exposures``; the longest unless given.
+
+    Raises:
+        ParameterError: the dark frames and ``dark_exposures`` are not as many, ``capture_exposure`` is none of them, or
+            it is not known which dark frames belong to the flat frames.
     """
 
-    dark: tuple[Path, ...] = ()
+    dark: tuple[tuple[Path, ...], ...] = ()
     dark_exposures: tuple[float, ...] = ()
     flat: tuple[Path, ...] = ()
     flat_dark: tuple[Path, ...] = ()
     flat_field: bool = True
     capture_exposure: float | None = None
+
+    def __post_init__(self) -> None:
+        known = ", ".join(f"{time:g}" for time in self.dark_exposures) or "none"
+        if (self.dark or self.dark_exposures) and len(self.dark) != max(1, len(self.dark_exposures)):
+            raise ParameterError(
+                f"`dark_exposures` ({known}) needs dark frames for each. Give those, a folder for each: `dark`."
+            )
+        if self.capture_exposure is not None and self.capture_exposure not in self.dark_exposures:
+            raise ParameterError(
+                f"`capture_exposure` ({self.capture_exposure:g}) must be one of `dark_exposures` ({known}): it chooses "
+                "the dark frame of the captures. Give the exposures of the dark frames, or leave it out."
+            )
+        if self.flat and len(self.dark) > 1 and not self.flat_dark:
+            raise ParameterError(
+                f"`flat_dark` must name dark frames with the exposure of the flat frames, because the other dark "
+                f"frames have several ({known})."
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,9 +135,8 @@ def measure_sensor(files: SensorFiles, frames: FrameFormat, known: Corrections =
     Raises:
         MwdnError: a file cannot be read, or frames of the same kind disagree.
     """
-    groups = equal_parts(files.dark, len(files.dark_exposures) or 1, "dark") if files.dark else []
-    times: Sequence[float | None] = files.dark_exposures or (None,)
-    darks = {time: average_files(group, frames, kind="dark") for time, group in zip(times, groups, strict=False)}
+    times: Sequence[float | None] = files.dark_exposures or (None,) * len(files.dark)
+    darks = {time: average_files(group, frames, kind="dark") for time, group in zip(times, files.dark, strict=True)}
     measured = SensorFrames(darks, replace(known, psf_done=False), capture_exposure=files.capture_exposure)
     notes = [sentence for average in darks.values() for sentence in average.rejected.values()]
     if (longest := measured.longest_dark) is not None and longest.count > 1:
@@ -142,7 +163,7 @@ def equal_parts(paths: Sequence[Path], count: int, kind: str) -> list[list[Path]
 
 
 def _with_flats(sensor: SensorFrames, files: SensorFiles, frames: FrameFormat) -> SensorFrames:
-    dark_paths = files.flat_dark or files.dark
+    dark_paths = files.flat_dark or tuple(chain(*files.dark))
     flats, darks = ([frames.read_stored(path)[0] for path in paths] for paths in (files.flat, dark_paths))
     names, defects, notes = [path.name for path in files.flat], sensor.corrections.defects, list(sensor.notes)
     dark = None
@@ -152,6 +173,12 @@ def _with_flats(sensor: SensorFrames, files: SensorFiles, frames: FrameFormat) -
         notes.append("Without dark frames the flat field holds the black level, too: `--dark`.")
     flat, left_out = _mean_flat(flats, names, frames, dark)
     notes += left_out
+    if defects is not None and defects.shape[-2:] != flat.shape[-2:]:
+        got, wanted = (" x ".join(map(str, image.shape[-2:])) for image in (flat, defects))
+        raise ShapeError(
+            f"Flat frames, as `{names[0]}` ({got}), must have the size of the other frames of the camera ({wanted}). "
+            "Take them with the same settings of the sensor."
+        )
     defects = (torch.zeros(1, 1, *flat.shape[-2:]) > 0) if defects is None else defects
     defects = defects | find_dead_pixels(flat.mean((0, 1)), cell=frames.cell)
     colour = demosaic(flat, frames.mosaic) if frames.mosaic else flat

@@ -24,9 +24,9 @@ class PhotographOptions:
             are merged to high dynamic range.
         dark: frames taken without light, or with the source switched off, several; subtracted from the PSF and the
             captures.
-        dark_exposures: exposure of each equal part of the dark frames, if they differ.
+        dark_exposures: exposure of each folder of dark frames, or of each equal part of the files, if they differ.
         flat: frames of even light, in pairs of the same exposure: flat field, gain and read noise.
-        flat_dark: dark frames with the exposure of the flat frames; --dark unless given.
+        flat_dark: dark frames with the exposure of the flat frames; --dark unless given, if it has one exposure.
         flat_through_mask: the flat frames were taken through the mask: no flat field, gain and read noise alone.
         capture_exposure: exposure of the captures, one of --dark-exposures, whose dark frame they have; the longest
             unless given.
@@ -55,8 +55,9 @@ class PhotographOptions:
 
     def are_one_picture(self, files: Sequence[Path]) -> bool:
         """Whether a camera file can name these pictures as they are."""
-        others = self.exposures or self.flat or self.distances or self.field or self.centre
-        return len(expanded(files)) <= 1 and len(expanded(self.dark_files)) <= 1 and not others
+        others = (self.exposures, self.dark_exposures, self.flat, self.distances, self.field, self.centre)
+        is_plain = not any(others) and self.capture_exposure is None
+        return is_plain and len(expanded(files)) <= 1 and len(expanded(self.dark_files)) <= 1
 
     def of(self, pictures: Sequence[Path]) -> Photographs:
         """The photographs, with these pictures of the point source.
@@ -64,10 +65,11 @@ class PhotographOptions:
         Raises:
             ParameterError: a folder is empty, or the pictures cannot be divided into exposures and distances.
         """
-        dark, flat, flat_dark = (tuple(expanded(each)) for each in (self.dark_files, self.flat, self.flat_dark))
+        dark = grouped(self.dark_files, max(1, len(self.dark_exposures)), "dark") if self.dark_files else ()
+        flat, flat_dark = (tuple(expanded(each)) for each in (self.flat, self.flat_dark))
         groups = max(1, len(self.exposures)) * max(1, len(self.distances))
         return Photographs(
-            tuple(map(tuple, grouped(pictures, groups))),
+            grouped(pictures, groups, "PSF"),
             exposures=self.exposures,
             sensor=SensorFiles(
                 dark, self.dark_exposures, flat, flat_dark, not self.flat_through_mask, self.capture_exposure

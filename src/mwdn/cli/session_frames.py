@@ -48,8 +48,12 @@ def bench_frames(given: BenchFrames) -> Iterator[BenchFrames]:
         yield given
         return
     options = given.photographs
-    if options.exposures or options.dark_files or options.dark_exposures or options.distances or options.field:
-        raise ParameterError(f"`{path}` has its own `exposures` and `dark` frames. Leave those options out.")
+    own = options.exposures or options.dark_files or options.dark_exposures or options.capture_exposure is not None
+    if own or options.distances or options.field:
+        raise ParameterError(
+            f"`{path}` has its own `exposures`, `dark` frames and `capture_exposure`, one distance and no `field`. "
+            "Leave those options out."
+        )
     with TemporaryDirectory(prefix="mwdn-frames-") as folder:
         yield _extracted(path, Path(folder), given)
 
