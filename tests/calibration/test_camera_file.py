@@ -66,6 +66,7 @@ def everything(folder):
         "field_positions": ((0.0, -40.0),),
         "electrons_per_count": 3.7,
         "read_noise_electrons": 3.0,
+        "dark_exposure": 64.0,
         "full_well_electrons": 15000.0,
         "black_level": 0.01,
         "psf_gain": ((1.0, 0.1, -0.1),),

@@ -78,6 +78,10 @@ def test_a_session_with_a_lamp_becomes_a_camera_file(tmp_path, run, recipe):
     content = read_camera(tmp_path / "camera.toml")
     assert content["bit_depth"] == 12
     assert "flat_field" not in content  # the mask was in front of the sensor
+    assert content["dark_exposure"] == pytest.approx(10)
+    # The dark frame of the camera file was taken for one of the options, and the session refused.
+    again = ("--camera", tmp_path / "camera.toml", "-o", tmp_path / "again.toml")
+    assert run("calibrate", tmp_path / "captured.h5", *again)[0] == 0
     (tmp_path / "session").mkdir()
     (tmp_path / "captured.h5").rename(tmp_path / "session" / "captured.h5")
     for options, said in (

@@ -207,7 +207,21 @@ def test_each_folder_of_dark_frames_has_its_exposure(run, folder, photographs):
     options = "--exposures 1 64 --dark dark dark_64 --dark-exposures 1 64 --bit-depth 12"
     assert run(f"calibrate psf_1 psf_64 {options}")[0] == 0
     lighter = float(Calibration.load("camera.toml").dark.mean())
+    assert read_camera("camera.toml")["dark_exposure"] == 64
+    # It was subtracted from new frames of the point source, whatever their exposure.
+    before = Path("camera.toml").read_bytes()
+    for new, given in (("psf_1", "not given"), ("psf_1 --exposures 1", "1"), ("psf_1/frame_1.png", "not given")):
+        code, _, err = run(f"calibrate {new} --camera camera.toml")
+        assert code == 2
+        assert f"`--exposures` of the PSF ({given}) must be that of the dark frame of `camera.toml` (64)" in err
+        assert Path("camera.toml").read_bytes() == before
+    assert run("calibrate --camera camera.toml --pitch-um 3")[0] == 0
+    assert run("calibrate psf_1 --exposures 64 --camera camera.toml")[0] == 0  # said to be of that exposure
+    assert read_camera("camera.toml")["dark_exposure"] == 64
+    assert run("calibrate psf_1 --dark dark --camera camera.toml")[0] == 0
+    assert "dark_exposure" not in read_camera("camera.toml")
     assert run(f"calibrate psf_1 psf_64 {options} --capture-exposure 1")[0] == 0
+    assert read_camera("camera.toml")["dark_exposure"] == 1
     assert lighter - float(Calibration.load("camera.toml").dark.mean()) == pytest.approx(400 / STEPS, rel=0.01)
 
 

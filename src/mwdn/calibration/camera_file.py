@@ -27,6 +27,7 @@ _TYPES: dict[str, Any] = {
     "white_balance": WhiteBalance,
     "pitch_um": float,
     "distance_mm": float,
+    "dark_exposure": float,
     **dict.fromkeys(("electrons_per_count", "read_noise_electrons", "full_well_electrons", "black_level"), float),
     **dict.fromkeys(("distance_psfs", "field_psfs"), tuple[str, ...]),
     "distances_mm": tuple[float, ...],
@@ -65,6 +66,7 @@ KEYS: dict[str, tuple[str, Any]] = {
     "read_noise_electrons": ("Noise of a pixel without light, a standard deviation.", 3.0),
     "full_well_electrons": ("Electrons at saturation.", 15000.0),
     "black_level": ("Mean of a dark frame, as a fraction of the full scale.", 0.01),
+    "dark_exposure": ("Exposure of the dark frame, in milliseconds, if frames of the PSF had others.", 64.0),
     "psf_gain": ("Gain over the PSF of each colour: 1, y, x, y^2, yx, x^2 ... from -1 to 1.", [[1.0, 0.1, -0.1]]),
     "envelope_shift": ("Displacement of the aperture's shadow, down and right, over the shorter side.", [0.02, 0.0]),
     "sensor_field": ("Light that the sensor keeps, in the same terms; captures are divided by it.", [[1.0, 0.1, -0.1]]),
@@ -77,7 +79,7 @@ LONGEST_LENGTH = 1e9
 
 _FILES = ("psf", "dark", "ambient", "flat_field", "hot_pixels")
 _LISTS = ("distance_psfs", "field_psfs")
-_POSITIVE = ("pitch_um", "distance_mm", "distances_mm", "electrons_per_count", "full_well_electrons")
+_POSITIVE = ("dark_exposure", "pitch_um", "distance_mm", "distances_mm", "electrons_per_count", "full_well_electrons")
 _HEAD = """\
 # A camera of mwdn: its PSF, and how its frames become measurements. Paths are relative to this file.
 # Use it in any command: mwdn reconstruct CAPTURES --camera {name}

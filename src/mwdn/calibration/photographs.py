@@ -151,7 +151,7 @@ def of_sensor(sensor: SensorFrames, frames: FrameFormat) -> tuple[dict[str, Any]
     content: dict[str, Any] = {}
     parts: dict[str, Frame | list[Frame]] = {}
     if (dark := sensor.capture_dark) is not None:
-        parts["dark"] = frames.denormalise(dark)
+        parts["dark"], content["dark_exposure"] = frames.denormalise(dark), sensor.dark_exposure
         content["black_level"] = round(float(dark.mean()), 6)
     if sensor.corrections.flat is not None:
         parts["flat_field"] = np.ascontiguousarray(sensor.corrections.flat[0].movedim(0, -1).numpy(), np.float32)

@@ -106,14 +106,21 @@ class SensorFrames:
         Raises:
             ParameterError: there is none of their exposure.
         """
-        if self.capture_exposure is None:
-            return None if self.longest_dark is None else self.longest_dark.image
-        return self.dark(self.capture_exposure)
+        return self.dark(self.dark_exposure)
+
+    @property
+    def dark_exposure(self) -> float | None:
+        """Exposure of the captures' dark frame; ``None`` if there is none, or if it is for any exposure."""
+        return self._longest if self.capture_exposure is None else self.capture_exposure
 
     @property
     def longest_dark(self) -> FrameAverage | None:
         """The dark frame of the longest exposure, which shows hot pixels best."""
-        return self.darks[max(self.darks, key=lambda time: time or 0.0)] if self.darks else None
+        return self.darks.get(self._longest)
+
+    @property
+    def _longest(self) -> float | None:
+        return max(self.darks, key=lambda time: time or 0.0, default=None)
 
 
 def average_files(

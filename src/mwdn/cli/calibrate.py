@@ -83,9 +83,14 @@ def calibrate(  # noqa: PLR0913
     if pairs is not None:
         check_pair_file(pairs)
         refuse_overwrite(out, pairs)
-    with bench_frames(BenchFrames(pictures, photographs, frames)) as bench:
+    kept = _kept(camera)
+    own_dark = kept.pop("dark", None)  # an option has it
+    with bench_frames(BenchFrames(pictures, photographs, frames), own_dark) as bench:
         pictures, photographs, frames = bench.pictures, bench.photographs, bench.frames
-        kept = _kept(camera)
+        if photographs.dark_files != (own_dark,):
+            kept.pop("dark_exposure", None)  # of another dark frame
+        elif pictures != [kept["psf"]] and psf_format.shares_pixels(frames):
+            photographs = _with_exposure(photographs, kept.get("dark_exposure"), camera)
         own = {
             "ambient": ambient,
             **_changes(psf_format),
@@ -135,11 +140,28 @@ def _written(out: Path, pairs: Path | None, write: Callable[[Path], tuple[str, C
 def _kept(camera: Path | None) -> dict[str, Any]:
     """The values of the camera file to change for which this command has no option."""
     values = {} if camera is None else read_camera(camera)
-    values.pop("dark", None)  # an option has it
     psf, sha256 = values.get("psf"), values.pop("psf_sha256", "")
     if psf is not None and sha256 and psf.is_file() and file_sha256(psf) != sha256:
         values.pop("psf_corrected", None)  # the PSF has been replaced by another picture
     return values
+
+
+def _with_exposure(photographs: PhotographOptions, exposure: float | None, camera: Path | None) -> PhotographOptions:
+    """The photographs of a new PSF, with the exposure of the camera's dark frame; ``None`` is for any exposure.
+
+    Raises:
+        ParameterError: the photographs have another exposure, or none is given.
+    """
+    if exposure is None or photographs.dark_exposures:
+        return photographs
+    if photographs.exposures != (exposure,):
+        given = ", ".join(f"{time:g}" for time in photographs.exposures) or "not given"
+        raise ParameterError(
+            f"The `exposures` of the PSF ({given}) must be that of the dark frame of `{camera}` ({exposure:g}), which "
+            "is subtracted. If they differ, give dark frames for the PSF and for the captures: `dark` and "
+            "`dark_exposures`."
+        )
+    return replace(photographs, dark_exposures=(exposure,))
 
 
 def _of_one_picture(

@@ -34,10 +34,14 @@ class BenchFrames:
 
 
 @contextmanager
-def bench_frames(given: BenchFrames) -> Iterator[BenchFrames]:
+def bench_frames(given: BenchFrames, known_dark: Path | None = None) -> Iterator[BenchFrames]:
     """The frames as they are, or those of a session: of its file, or of the only file of pairs in a folder.
 
     Those of a session are in a temporary folder until the end of the ``with`` statement.
+
+    Args:
+        given: by the options.
+        known_dark: dark frame of the camera file to change; a session's own replace it.
 
     Raises:
         ParameterError: the session has none, or options give what it has.
@@ -48,8 +52,9 @@ def bench_frames(given: BenchFrames) -> Iterator[BenchFrames]:
         yield given
         return
     options = given.photographs
-    own = options.exposures or options.dark_files or options.dark_exposures or options.capture_exposure is not None
-    if own or options.distances or options.field:
+    has_dark = options.dark_files not in ((), (known_dark,))
+    times = options.exposures or options.dark_exposures or options.capture_exposure is not None
+    if has_dark or times or options.distances or options.field:
         raise ParameterError(
             f"`{path}` has its own `exposures`, `dark` frames and `capture_exposure`, one distance and no `field`. "
             "Leave those options out."
