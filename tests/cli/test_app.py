@@ -197,6 +197,7 @@ def test_psf_of_another_size(run, camera):
         ("captures --psf psf.png --white-balance foo", "`--white-balance` (foo) must be grey-world, psf, three"),
         ("captures --psf psf.png --crop 3 x", "`--crop` (3 x) must be two whole numbers or none."),
         ("captures --psf psf.png --crop 3", "`--crop` must be followed by two whole numbers or none."),
+        ("captures --psf psf.png --map --no-trust", "`--map` needs the check that `--no-trust` skips"),
         ("captures --psf psf.png --psf psf.png", "`--psf` is given more than once."),
     ],
 )

@@ -79,7 +79,7 @@ def reconstruct(  # noqa: PLR0913
             there is no frame of it for --ambient; by default for universal. The .json and a line say its share.
         white_balance: of the pictures: grey-world, psf (the point source is white), or gains of red, green and blue.
         trust: check how well each picture explains its capture; takes a second or two for a small one.
-        map: also draw which parts of each picture its capture supports, as NAME.support.png.
+        map: also draw which parts of each picture its capture supports, as NAME.support.png; not with --no-trust.
         resume: skip each capture whose picture is there, made from the same file in the same way; the default for
             several processes.
         device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
@@ -87,6 +87,8 @@ def reconstruct(  # noqa: PLR0913
         auto_bin: whether --bin is not given.
         **options: options of the method.
     """
+    if map and not trust:
+        raise ParameterError("`map` needs the check that `--no-trust` skips. Leave out one of them.")
     method_options = read_options([method], options, reconstruct)[method]
     with distributed.process_group():
         is_first = distributed.rank() == 0
