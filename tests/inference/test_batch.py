@@ -79,6 +79,28 @@ def test_two_captures_of_one_name(tmp_path):
         check_outputs([one, two], tmp_path / "out", "png")
 
 
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_capture_called_like_the_map_of_another(tmp_path, order):
+    """The map replaced the picture, and without a map the picture was removed as an old one."""
+    captures = touch(tmp_path, "a.png", "a.support.tif")
+    message = rf"`{re.escape(str(captures[1]))}`.*map of `{re.escape(str(captures[0]))}`.*a\.support\.png`"
+    with pytest.raises(ParameterError, match=message):
+        check_outputs([captures[number] for number in order], tmp_path / "out", "png")
+    check_outputs(captures, tmp_path / "out", "tiff")
+    check_outputs(captures[1:], tmp_path / "out", "png")
+
+
+def test_maps_and_pictures_of_earlier_runs_stay(tmp_path, psf, captures):
+    out, other = tmp_path / "out", tmp_path / "in" / "0.support.png"
+    captures[1].rename(other)
+    for first, second, what in ((captures[0], other, "support map"), (other, captures[0], "picture")):
+        list(make_batch(psf, out, map=True).run([first]))
+        with pytest.raises(ParameterError, match=rf"0\.support\.png` is the {what} of another capture"):
+            check_outputs([second], out, "png")
+        check_outputs([first], out, "png")  # again
+        shutil.rmtree(out)
+
+
 def test_capture_called_summary(tmp_path):
     captures = touch(tmp_path, "summary.tif")
     with pytest.raises(ParameterError, match=r"summary\.tif` and the summary picture would both be written"):

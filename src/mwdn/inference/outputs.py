@@ -1,6 +1,6 @@
 """Files of a batch: their names, and the check that nothing of the user's is overwritten."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Literal
 
@@ -36,9 +36,9 @@ def check_outputs(
     """Check that every capture has its own file name in ``out`` and that nothing of the user's is overwritten.
 
     Raises:
-        ParameterError: two captures have the same output, an output would overwrite an input, a ``.json`` that is not
-            of this package, or a picture without one in a folder of captures; an output is a symbolic link, or ``out``
-            is a file.
+        ParameterError: two captures have the same output, or one the name of another's support map; an output would
+            overwrite an input, a ``.json`` that is not of this package, or a picture without one in a folder of
+            captures; an output is a symbolic link, or ``out`` is a file.
     """
     if out.exists() and not out.is_dir():
         raise ParameterError(f"`{out}` must be a folder, but is a file. Choose another one: `--out`.")
@@ -77,6 +77,30 @@ def check_outputs(
                 f"such as `*{Path(capture).suffix}`, or reconstruct them into two folders: `--out`."
             )
         sources[name] = f"`{capture}`"
+    _check_maps(sources, existing, start, format)
+
+
+def _check_maps(sources: Mapping[str, str], existing: Set[str], start: str, format: Format) -> None:
+    """Check that no picture has the name of another one's support map, in this run or an earlier one.
+
+    A new picture removes the map of an older one, so this holds for runs without maps, too.
+    """
+    for name, source in sources.items():
+        stem = name.removesuffix(_SUFFIX[format])
+        of = stem.removesuffix(".support")
+        if name == of + _SUPPORT and (other := sources.get(of + _SUFFIX[format])):
+            raise ParameterError(
+                f"The picture of {source} and the support map of {other} would both be written to `{start}{name}`. "
+                "Rename one of them, or reconstruct them into two folders: `--out`."
+            )
+        is_map = name == of + _SUPPORT and f"{of}.json" in existing
+        has_map = {stem + _SUPPORT, f"{stem}.support.json"} <= existing  # by its sidecar it is a picture
+        if has_map or (is_map and name in existing):
+            kind, lost = ("picture", stem + _SUPPORT) if has_map else ("support map", name)
+            raise ParameterError(
+                f"`{start}{lost}` is the {kind} of another capture, and {source} would replace or remove it. Choose "
+                "another folder: `--out`."
+            )
 
 
 def write_output(path: Path, scene: Scene, format: Format, pixel_um: float | None) -> None:
