@@ -1,6 +1,7 @@
 """Options of the camera, shared by most commands."""
 
 from dataclasses import KW_ONLY, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated
 
@@ -39,9 +40,9 @@ class CameraOptions:
     camera: Path | None = None
     distance: float | None = None
 
-    @property
+    @cached_property
     def roles(self) -> dict[str, Path]:
-        """Files that describe the camera, by what they are."""
+        """Files that describe the camera, by what they are; the camera file is read once."""
         files = {"PSF": self.psf, "dark frame": self.dark, "ambient frame": self.ambient, "camera file": self.camera}
         if self.camera is not None:
             files |= {f"{name} of the camera file": path for name, path in named_files(self.camera).items()}
