@@ -246,7 +246,7 @@ def test_a_file_of_other_settings_is_not_mixed(tmp_path, recipe):
 
 def test_frames_in_progress_have_the_old_exposure_and_are_skipped(tmp_path, recipe):
     class Late(Rig):
-        """As a Raspberry Pi's camera: the exposure takes effect five frames after it is set."""
+        """As a Raspberry Pi's camera: the exposure takes effect a few frames after it is set."""
 
         left = 5
 

@@ -33,7 +33,7 @@ GAMMA_ERROR = 0.03
 """Largest difference of a grey step from the fit without a warning."""
 
 IN_PROGRESS = 10
-"""Most frames with the old settings of a camera after it was set; a Raspberry Pi's has about five."""
+"""Largest number of frames that may have a camera's old settings after it was set; a Raspberry Pi's has a few."""
 
 ROOM = 1.02
 """Bytes of a file over those of its pictures."""
