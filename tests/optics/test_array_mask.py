@@ -65,6 +65,15 @@ def test_a_steep_surface_is_interpolated_as_the_message_says(tmp_path):
     assert replace(wrapped, levels=256).build(GREEN).step_um > 0
 
 
+def test_an_interpolated_surface_is_a_mask_file(tmp_path, generator):
+    """Interpolation between a peak and flat ground undershoots the ground, but no height of a mask is negative."""
+    bumps = 0.05 * (torch.rand(20, 20, generator=generator) > 0.9).float()
+    mask = make_mask(bumps, "height", pitch_um=10.0, subdivide=4)
+    assert mask.values.min() == 0
+    assert 0.05 < mask.values.max() < 0.1
+    write_mask(tmp_path / "mask.tif", mask)
+
+
 def test_a_surface_is_steep_only_where_light_passes(tmp_path):
     heights = torch.zeros(200, 200)
     heights[:, :20] = wave(2.0)[:200, :20]

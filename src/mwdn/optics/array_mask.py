@@ -165,7 +165,8 @@ def make_mask(
     um = phase_nm * UM_PER_NM / (2 * math.pi * (index - 1)) if values == "phase" else 1.0
     height, step = quantise(_relief(numbers.double() * um), levels)
     divide = _interpolated if levels is None else _subdivided
-    return Mask("phase", divide(height.float(), subdivide), pitch, index, step)
+    surface = _relief(divide(height.float(), subdivide))  # bicubic interpolation undershoots the lowest height
+    return Mask("phase", surface, pitch, index, step)
 
 
 def _read_design(path: Path) -> Mask | None:
