@@ -109,8 +109,9 @@ def test_the_mask_of_a_design_gives_the_same_psf(tmp_path):
     write_mask(tmp_path / "mask.tif", mask)
     again = ArrayMask(tmp_path / "mask.tif").build(setup)
     assert torch.equal(mask_psf(again, setup), mask_psf(mask, setup))
-    with pytest.raises(ParameterError, match="leave out `pitch_um`"):
-        ArrayMask(tmp_path / "mask.tif", pitch_um=2.0).build(setup)
+    for name, value in (("pitch_um", 2.0), ("index", 1.6), ("subdivide", 3), ("phase_nm", 532.0), ("levels", 8)):
+        with pytest.raises(ParameterError, match=f"leave out `{name}`"):
+            ArrayMask(tmp_path / "mask.tif", **{name: value}).build(setup)
 
 
 def test_files(tmp_path):

@@ -1,7 +1,7 @@
 """A mask from an array of numbers that another program computed or a microscope measured."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -66,10 +66,10 @@ class ArrayMask:
             ParameterError: an option is missing or out of its range, or the numbers cannot be what `values` says.
         """
         if designed := _read_design(self.mask):
-            given = [name for name in ("values", "pitch_um", "full_scale", "levels") if getattr(self, name) is not None]
+            given = [field.name for field in fields(self)[1:] if getattr(self, field.name) != field.default]
             if given:
                 raise ParameterError(
-                    f"`{self.mask}` is a design and says its own pitch and heights: leave out "
+                    f"`{self.mask}` is a design and says its own pitch, heights and index: leave out "
                     f"{', '.join(f'`{name}`' for name in given)}."
                 )
             needed, _ = needed_pitch(designed, setup)
