@@ -276,6 +276,8 @@ def test_impossible_masks(design, message):
         ({"aperture_mm": (3.0, 0.0)}, "`aperture_mm` (0) must be positive"),
         ({"pixels": (0, 10)}, "`pixels` (0) must be positive"),
         ({"bin": 2000}, "`bin` (2000) must be at most 1280"),
+        ({"bin": 200}, "6 x 6 pixels"),  # too few for the width of its autocorrelation
+        ({"pixels": (100_000, 100_000), "bin": 1}, "100,000 x 100,000 pixels"),  # 120 GB
         ({"band_nm": (760.0, 400.0)}, "`band_nm` (760.0, 400.0) must be the shortest and the longest"),
         ({"wavelengths": 0}, "`wavelengths` (0) must be positive"),
     ],
