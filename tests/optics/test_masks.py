@@ -171,6 +171,9 @@ def test_pinholes_have_their_number_and_area():
     mask = Pinholes(size_mm=(1.0, 1.5), count=12, diameter_um=40.0).build(SMALL)
     assert label(mask.values.numpy())[1] == 12
     assert mask.values.sum().item() * 4 == pytest.approx(12 * math.pi * 20**2, rel=0.03)
+    for seed in range(5):  # no part of a large hole is beyond the border
+        large = Pinholes(size_mm=(0.1, 0.1), count=1, diameter_um=90.0, seed=seed).build(SMALL)
+        assert large.values.sum().item() * 4 == pytest.approx(math.pi * 45**2, rel=0.03)
 
 
 # --- PSF ------------------------------------------------------------------------------------------------
@@ -257,6 +260,7 @@ IMPOSSIBLE = [
     (Pinholes(count=0), "`count` (0) must be positive"),
     (Pinholes(diameter_um=3.0), "`diameter_um` (3) must be at least 2 samples, 4 um"),
     (Pinholes(size_mm=(0.3, 0.3)), "`size_mm` (0.3, 0.3)"),
+    (Pinholes(size_mm=(0.1, 0.3), count=1, diameter_um=110.0), "`diameter_um` (110) must be"),
 ]
 
 
