@@ -72,3 +72,13 @@ def test_keyboard_alone_is_enough(serve, tmp_path):
         assert page.run("document.getElementById('stack').style.getPropertyValue('--split')") == "49%"
         page.tab_to("e.id === 'save-png'")
         assert not page.errors
+
+
+def test_hints_name_the_controls_of_the_page(serve, tmp_path):
+    with open_page(serve().url, tmp_path / "profile") as page:
+        page.wait("document.querySelectorAll('#samples button').length === 3")
+        for hint in ("--bin 2 --psf-bin 1", "bin=2, psf_bin=1"):
+            words = page.run(f"import('/static/hints.js').then(hints => hints.pageWords('Try `{hint}`.'))")
+            assert words == "Try “Bin”: 2, “Bin of the PSF”: 1."
+        for control in ("bin", "psf-bin"):
+            assert page.run(f"document.getElementById('{control}').labels[0].textContent").startswith("Bin")

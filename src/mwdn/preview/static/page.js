@@ -36,6 +36,7 @@ async function guarded(work) {
 function calibration() {
   const options = {};
   if (Number(byId("bin").value) > 1) options.bin = Number(byId("bin").value);
+  if (byId("psf-bin").value) options.psf_bin = Number(byId("psf-bin").value);
   if (byId("bit-depth").value) options.bit_depth = Number(byId("bit-depth").value);
   if (byId("mosaic").value) options.mosaic = byId("mosaic").value;
   if (byId("gamma").value) options.gamma = byId("gamma").value;
@@ -262,7 +263,7 @@ byId("room-light").onchange = () => {
   byId("ambient-zone").hidden = byId("room-light").value !== "frame";
   soon(reconstruct, 0);
 };
-for (const id of ["camera", "bin", "bit-depth", "mosaic", "gamma", "psf-gamma", "orientation", "align", "trust"]) byId(id).onchange = () => soon(reconstruct, 0);
+for (const id of ["camera", "bin", "psf-bin", "bit-depth", "mosaic", "gamma", "psf-gamma", "orientation", "align", "trust"]) byId(id).onchange = () => soon(reconstruct, 0);
 byId("exposure").oninput = () => {
   byId("exposure-value").textContent = Number(byId("exposure").value).toFixed(1);
   soon(() => showPictures());
