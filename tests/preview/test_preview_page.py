@@ -1,5 +1,7 @@
 """The page in a headless Chromium, used as a person uses it."""
 
+import threading
+
 import pytest
 
 from browser import CHROMIUM, open_page
@@ -72,6 +74,27 @@ def test_keyboard_alone_is_enough(serve, tmp_path):
         assert page.run("document.getElementById('stack').style.getPropertyValue('--split')") == "49%"
         page.tab_to("e.id === 'save-png'")
         assert not page.errors
+
+
+def test_verdicts_are_not_those_of_the_picture_before(serve, psf, capture, tmp_path, monkeypatch):
+    from mwdn.preview import reconstruction
+
+    (tmp_path / "capture.npy").write_bytes(capture)
+    check, may_check = reconstruction._check, threading.Event()
+    may_check.set()
+    monkeypatch.setattr(reconstruction, "_check", lambda *a, **b: may_check.wait(60) and check(*a, **b))
+    server = serve(Cameras(LIMITS, None, {"camera": Calibration(psf)}))
+    hidden = "document.getElementById('trust-section').hidden"
+    with open_page(server.url, tmp_path / "profile") as page:
+        page.wait("document.querySelectorAll('#samples button').length === 3")
+        page.drop("#capture", tmp_path / "capture.npy")
+        page.wait(f"!{hidden}")
+        may_check.clear()
+        page.run("document.getElementById('method').value = 'wiener', document.getElementById('method').onchange()")
+        page.wait("document.getElementById('state').textContent.startsWith('Checking')")
+        page.wait(hidden)
+        may_check.set()
+        page.wait(f"!{hidden}")
 
 
 def test_hints_name_the_controls_of_the_page(serve, tmp_path):

@@ -95,6 +95,7 @@ async function reconstruct() {
       if (now.report && !shown) {
         shown = true;
         chosen.job = now.id;
+        showVerdicts(now.report); // none yet: those of the picture before are not of this one
         await showPictures(true);
       }
     }, mine.signal);
