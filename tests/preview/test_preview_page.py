@@ -76,6 +76,21 @@ def test_keyboard_alone_is_enough(serve, tmp_path):
         assert not page.errors
 
 
+def test_a_capture_is_not_reconstructed_through_the_camera_of_the_samples(serve, psf_file, capture, tmp_path):
+    for name, data in (("psf.npy", psf_file), ("capture.npy", capture)):
+        (tmp_path / name).write_bytes(data)
+    server = serve(Cameras(LIMITS))
+    with open_page(server.url, tmp_path / "profile") as page:
+        page.wait("document.querySelectorAll('#samples button').length === 3")
+        assert page.run("document.getElementById('camera').value") == "sample"
+        page.run("document.getElementById('trust').checked = false")
+        page.drop("#capture", tmp_path / "capture.npy")
+        page.wait("document.getElementById('state').textContent.startsWith('Drop a PSF')")
+        page.drop("#psf", tmp_path / "psf.npy")
+        page.wait("document.getElementById('state').textContent.startsWith('universal-small: 48')")
+        assert not page.errors
+
+
 def test_verdicts_are_not_those_of_the_picture_before(serve, psf, capture, tmp_path, monkeypatch):
     from mwdn.preview import reconstruction
 

@@ -14,6 +14,7 @@ const UPLOAD = "";
 
 const chosen = { psf: null, capture: null, ambient: null, job: null };
 let methods = [];
+let sampleCamera = null;
 let running = null;
 let due = 0;
 let isTouched = false;
@@ -184,6 +185,8 @@ function take(what, file) {
 function setUpDrop(what) {
   setUpDropZone(byId(what), (files) => {
     if (files[0]) take(what, files[0]);
+    // The samples' camera is simulated: a visitor's capture is of another one.
+    if (what === "capture" && byId("camera").value === sampleCamera) byId("camera").value = UPLOAD;
     soon(reconstruct, 0);
   });
 }
@@ -232,6 +235,7 @@ function chooseMethod(values = {}) {
 async function start() {
   const [listed, samples] = await Promise.all([getJson("/methods"), getJson("/samples"), listCameras()]);
   methods = listed.methods;
+  sampleCamera = samples.camera;
   setUpLive(listed.live, {
     started: () => {
       running?.abort();
