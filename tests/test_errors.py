@@ -68,6 +68,7 @@ def test_an_option_of_another_type_is_named_with_its_value(create, options, want
         lambda: mwdn.correlate(PSF, PSF, size=(3.5, 4)),
         lambda: mwdn.wiener(PSF, PSF, "a"),
         lambda: mwdn.train("quick-cpu", PSF, out="runs/none"),
+        lambda: mwdn.simulate("quick-cpu", PSF, photos="photos", out="pairs.h5", count=2),
     ],
 )
 def test_every_border_refuses_other_types(create):

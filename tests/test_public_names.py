@@ -163,3 +163,12 @@ def test_a_network_is_trained_in_one_call_and_reconstructs(psf, capture, tmp_pat
     path = mwdn.train(recipe, calibration, photos=photos, out=tmp_path / "run", device="cpu", callback=steps.append)
     assert [report.step for report in steps] == [1, 2]
     assert Reconstructor(path, calibration, device="cpu")(capture).shape == (*SIZE, 3)
+
+
+def test_pairs_are_simulated_in_one_call_by_the_name_of_a_recipe(psf, capture, tmp_path):
+    (tmp_path / "photos").mkdir()
+    mwdn.write_picture(tmp_path / "photos" / "a.png", capture)
+    photos, out = str(tmp_path / "photos"), str(tmp_path / "pairs.h5")
+    mwdn.simulate("quick-cpu", Calibration.from_array(psf), photos=photos, out=out, count=2)
+    measurement, scene = mwdn.data.PairFile(out)[1]
+    assert measurement.shape == scene.shape == (3, *SIZE)

@@ -200,6 +200,8 @@ def test_the_file_of_pairs_and_the_table_have_one_name(run, camera):
     assert json.loads(out)["pictures"] == 2  # the test's tenth of twenty
     code, _, err = run("evaluate wiener --data pairs.h5 --psf psf.npy --split folds")
     assert (code, "has no test part" in err) == (2, True)
+    code, out, err = run("evaluate wiener --data pairs.h5 --psf psf.npy --part test")  # of which split?
+    assert (code, out, "--split" in err) == (2, "", True)
 
 
 def test_a_checkpoint_is_evaluated_on_the_pairs_that_its_training_left_out(run, camera):

@@ -1,6 +1,7 @@
 """Convolution, its adjoint and Wiener deconvolution against closed forms, scipy, numpy and scikit-image."""
 
 import itertools
+import re
 from typing import get_args
 
 import numpy as np
@@ -463,6 +464,22 @@ def test_psf_that_does_not_fit_is_refused(operation, psf, message):
 def test_image_without_batch_is_refused(operation):
     with pytest.raises(ShapeError, match=r"\(3, 8, 8\) .*\[None\]`"):
         operation(torch.ones(3, 8, 8), torch.ones(1, 1, 5, 5))
+
+
+@pytest.mark.parametrize("operation", [fourier.convolve, fourier.correlate])
+@pytest.mark.parametrize("size", [(0, 3), (3, -2)])
+def test_result_without_pixels_is_refused(operation, size):
+    with pytest.raises(ShapeError, match=re.escape(f"`size` {size}")):
+        operation(torch.ones(1, 1, 4, 4), torch.ones(1, 1, 4, 4), size=size)
+
+
+@pytest.mark.parametrize("operation", OPERATIONS.values(), ids=OPERATIONS)
+@pytest.mark.parametrize("empty", [(0, 1, 4, 4), (1, 1, 0, 4)])
+def test_what_is_empty_is_refused(operation, empty):
+    whole = torch.ones(1, 1, 4, 4)
+    for image, psf in ((torch.ones(empty), whole), (whole, torch.ones(empty))):
+        with pytest.raises(ShapeError, match=re.escape(str(empty))):
+            operation(image, psf)
 
 
 def test_psf_larger_than_the_grid_is_refused():

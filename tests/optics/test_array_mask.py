@@ -65,6 +65,15 @@ def test_a_steep_surface_is_interpolated_as_the_message_says(tmp_path):
     assert replace(wrapped, levels=256).build(GREEN).step_um > 0
 
 
+def test_an_interpolated_surface_is_a_mask_file(tmp_path, generator):
+    """Interpolation between a peak and flat ground undershoots the ground, but no height of a mask is negative."""
+    bumps = 0.05 * (torch.rand(20, 20, generator=generator) > 0.9).float()
+    mask = make_mask(bumps, "height", pitch_um=10.0, subdivide=4)
+    assert mask.values.min() == 0
+    assert 0.05 < mask.values.max() < 0.1
+    write_mask(tmp_path / "mask.tif", mask)
+
+
 def test_a_surface_is_steep_only_where_light_passes(tmp_path):
     heights = torch.zeros(200, 200)
     heights[:, :20] = wave(2.0)[:200, :20]
@@ -100,8 +109,9 @@ def test_the_mask_of_a_design_gives_the_same_psf(tmp_path):
     write_mask(tmp_path / "mask.tif", mask)
     again = ArrayMask(tmp_path / "mask.tif").build(setup)
     assert torch.equal(mask_psf(again, setup), mask_psf(mask, setup))
-    with pytest.raises(ParameterError, match="leave out `pitch_um`"):
-        ArrayMask(tmp_path / "mask.tif", pitch_um=2.0).build(setup)
+    for name, value in (("pitch_um", 2.0), ("index", 1.6), ("subdivide", 3), ("phase_nm", 532.0), ("levels", 8)):
+        with pytest.raises(ParameterError, match=f"leave out `{name}`"):
+            ArrayMask(tmp_path / "mask.tif", **{name: value}).build(setup)
 
 
 def test_files(tmp_path):

@@ -83,7 +83,8 @@ def test_another_design_is_replaced(run, tmp_path):
     (tmp_path / "cam").mkdir()
     (tmp_path / "cam" / "mask.stl").write_text("not asked for")
     for count in (3, 4):
-        assert run(*line, count)[0] == 0
+        code, _, err = run(*line, count)
+        assert (code, "Warning: `cam/mask.stl` is from before" in err, "mask.gds" in err) == (0, True, False)
         hashes.append(json.loads((tmp_path / "cam/camera.json").read_text())["made"]["psf_hash"])
     assert len(set(hashes)) == 2
     assert (tmp_path / "cam" / "mask.stl").read_text() == "not asked for"
@@ -131,13 +132,15 @@ def test_recipe_of_the_paper_is_the_default(run, monkeypatch):
         ("--mask none.npy", "`none.npy` does not exist"),
         ("--mask a.npy --levls 3", "Did you mean --levels?"),
         ("pinholes --stl --size-mm 0.4 0.4 --count 2", "no heights for an STL"),
+        ("diffuser --stl --size-mm 0.4 0.4 --stl-every 0", "`every` (0) at least 1"),
     ],
 )
-def test_wrong_call_is_one_message_and_exit_2(run, line, message):
+def test_wrong_call_is_one_message_and_exit_2(run, tmp_path, line, message):
     code, out, err = run(*line.split(), *SMALL)
     assert code == 2
     assert message in " ".join(err.split())
     assert "Traceback" not in out + err
+    assert not (tmp_path / "cam").exists()
 
 
 def test_a_mask_from_a_file(run, tmp_path):

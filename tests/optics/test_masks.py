@@ -171,6 +171,9 @@ def test_pinholes_have_their_number_and_area():
     mask = Pinholes(size_mm=(1.0, 1.5), count=12, diameter_um=40.0).build(SMALL)
     assert label(mask.values.numpy())[1] == 12
     assert mask.values.sum().item() * 4 == pytest.approx(12 * math.pi * 20**2, rel=0.03)
+    for seed in range(5):  # no part of a large hole is beyond the border
+        large = Pinholes(size_mm=(0.1, 0.1), count=1, diameter_um=90.0, seed=seed).build(SMALL)
+        assert large.values.sum().item() * 4 == pytest.approx(math.pi * 45**2, rel=0.03)
 
 
 # --- PSF ------------------------------------------------------------------------------------------------
@@ -257,6 +260,7 @@ IMPOSSIBLE = [
     (Pinholes(count=0), "`count` (0) must be positive"),
     (Pinholes(diameter_um=3.0), "`diameter_um` (3) must be at least 2 samples, 4 um"),
     (Pinholes(size_mm=(0.3, 0.3)), "`size_mm` (0.3, 0.3)"),
+    (Pinholes(size_mm=(0.1, 0.3), count=1, diameter_um=110.0), "`diameter_um` (110) must be"),
 ]
 
 
@@ -276,6 +280,8 @@ def test_impossible_masks(design, message):
         ({"aperture_mm": (3.0, 0.0)}, "`aperture_mm` (0) must be positive"),
         ({"pixels": (0, 10)}, "`pixels` (0) must be positive"),
         ({"bin": 2000}, "`bin` (2000) must be at most 1280"),
+        ({"bin": 200}, "6 x 6 pixels"),  # too few for the width of its autocorrelation
+        ({"pixels": (100_000, 100_000), "bin": 1}, "100,000 x 100,000 pixels"),  # 120 GB
         ({"band_nm": (760.0, 400.0)}, "`band_nm` (760.0, 400.0) must be the shortest and the longest"),
         ({"wavelengths": 0}, "`wavelengths` (0) must be positive"),
     ],

@@ -1,5 +1,7 @@
 """The page in a headless Chromium, used as a person uses it."""
 
+import threading
+
 import pytest
 
 from browser import CHROMIUM, open_page
@@ -72,3 +74,49 @@ def test_keyboard_alone_is_enough(serve, tmp_path):
         assert page.run("document.getElementById('stack').style.getPropertyValue('--split')") == "49%"
         page.tab_to("e.id === 'save-png'")
         assert not page.errors
+
+
+def test_a_capture_is_not_reconstructed_through_the_camera_of_the_samples(serve, psf_file, capture, tmp_path):
+    for name, data in (("psf.npy", psf_file), ("capture.npy", capture)):
+        (tmp_path / name).write_bytes(data)
+    server = serve(Cameras(LIMITS))
+    with open_page(server.url, tmp_path / "profile") as page:
+        page.wait("document.querySelectorAll('#samples button').length === 3")
+        assert page.run("document.getElementById('camera').value") == "sample"
+        page.run("document.getElementById('trust').checked = false")
+        page.drop("#capture", tmp_path / "capture.npy")
+        page.wait("document.getElementById('state').textContent.startsWith('Drop a PSF')")
+        page.drop("#psf", tmp_path / "psf.npy")
+        page.wait("document.getElementById('state').textContent.startsWith('universal-small: 48')")
+        assert not page.errors
+
+
+def test_verdicts_are_not_those_of_the_picture_before(serve, psf, capture, tmp_path, monkeypatch):
+    from mwdn.preview import reconstruction
+
+    (tmp_path / "capture.npy").write_bytes(capture)
+    check, may_check = reconstruction._check, threading.Event()
+    may_check.set()
+    monkeypatch.setattr(reconstruction, "_check", lambda *a, **b: may_check.wait(60) and check(*a, **b))
+    server = serve(Cameras(LIMITS, None, {"camera": Calibration(psf)}))
+    hidden = "document.getElementById('trust-section').hidden"
+    with open_page(server.url, tmp_path / "profile") as page:
+        page.wait("document.querySelectorAll('#samples button').length === 3")
+        page.drop("#capture", tmp_path / "capture.npy")
+        page.wait(f"!{hidden}")
+        may_check.clear()
+        page.run("document.getElementById('method').value = 'wiener', document.getElementById('method').onchange()")
+        page.wait("document.getElementById('state').textContent.startsWith('Checking')")
+        page.wait(hidden)
+        may_check.set()
+        page.wait(f"!{hidden}")
+
+
+def test_hints_name_the_controls_of_the_page(serve, tmp_path):
+    with open_page(serve().url, tmp_path / "profile") as page:
+        page.wait("document.querySelectorAll('#samples button').length === 3")
+        for hint in ("--bin 2 --psf-bin 1", "bin=2, psf_bin=1"):
+            words = page.run(f"import('/static/hints.js').then(hints => hints.pageWords('Try `{hint}`.'))")
+            assert words == "Try “Bin”: 2, “Bin of the PSF”: 1."
+        for control in ("bin", "psf-bin"):
+            assert page.run(f"document.getElementById('{control}').labels[0].textContent").startswith("Bin")

@@ -161,7 +161,7 @@ class Calibration:
         """Calibrate from a numpy array or PIL picture of a point source.
 
         Args:
-            picture: (H, W) or (H, W, 1 or 3), RGB, row 0 at the top, linear in light unless ``psf_gamma`` is given.
+            picture: (H, W) or (H, W, 1 or 3), RGB, rows as for `correct`; linear in light without ``psf_gamma``.
                 uint8 and uint16 saturate at their type's maximum unless ``bit_depth`` is given; floats have any scale.
             frames: as for `from_file`, as are the other arguments.
             psf_format: where the PSF's picture differs from it.
@@ -262,9 +262,10 @@ class Calibration:
         """Turn a raw frame into a measurement of the PSF's size.
 
         Args:
-            frame: (H, W) or (H, W, 1 or 3) raw pixel values, RGB, row 0 at the top: from `FrameFormat.read`, or another
-                numpy array or PIL picture. Integers, uint8 or uint16, saturate at their type's maximum and floats at 1,
-                unless `FrameFormat.bit_depth` is given. They are linear in light unless ``gamma`` is given.
+            frame: (H, W) or (H, W, 1 or 3) raw pixel values: from `FrameFormat.read`, or another numpy array or PIL
+                picture. Always RGB. Row 0 at the top; with `FrameFormat.upside_down` at the bottom, and turned here.
+                Integers, uint8 or uint16, saturate at their type's maximum and floats at 1, unless
+                `FrameFormat.bit_depth` is given. They are linear in light unless ``gamma`` is given.
 
         Returns:
             (1, C, *size), linear light; 1 is saturation.

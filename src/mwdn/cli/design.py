@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from cyclopts import App, Parameter
 from cyclopts.config import Toml
 
-from mwdn.cli.terminal import say
+from mwdn.cli.terminal import say, warn
 from mwdn.errors import UnknownNameError
 from mwdn.io.files import refuse_overwrite
 from mwdn.io.toml import find_recipe
@@ -54,15 +54,20 @@ class Output:
     def write(self, name: str, mask: MaskDesign, setup: Setup) -> None:
         """Compute the mask and its PSF, write the files, print a summary."""
         from mwdn.optics.design import check_replaced, design_camera
-        from mwdn.optics.mask_files import write_gds, write_stl
+        from mwdn.optics.mask_files import check_stl, write_gds, write_stl
 
         check_replaced(self.out, gds=self.gds, stl=self.stl)
         designed = design_camera(name, mask, setup)
+        if self.stl:
+            check_stl(designed.mask, every=self.stl_every)
         designed.write(self.out, sensitive=self.sensitivity)
         if self.gds:
             write_gds(self.out / "mask.gds", designed.mask)
         if self.stl:
             write_stl(self.out / "mask.stl", designed.mask, every=self.stl_every)
+        for option, written in (("gds", self.gds), ("stl", self.stl)):
+            if not written and (old := self.out / f"mask.{option}").exists():
+                warn(f"`{old}` is from before, and may be of another mask. Write it again: `--{option}`.")
         made = designed.report()["made"]
         light = ", ".join(f"{part:.1%}" for part in made["light_on_sensor"])
         field = " x ".join(f"{angle:.0f}" for angle in made["field_degrees"])

@@ -60,8 +60,8 @@ def _division(split: str, methods: Iterable[str]) -> Division:
     return trained.pop() if trained else Division(split)
 
 
-def _part(file: PairFile, division: Division, name: str) -> Part:
-    rows, split = division.parts(len(file))[name], division.split
+def _part(file: PairFile, split: str, name: str, methods: Iterable[str]) -> Part:
+    rows = _division(split, methods).parts(len(file))[name]
     if not rows:
         raise ParameterError(f"The split '{split}' of {len(file):,} pairs has no {name} part. Choose another `--part`.")
     return Part(file, rows)
@@ -75,7 +75,7 @@ def evaluate(  # noqa: PLR0913
     protocol: str = "full",
     variant: Variant | None = None,
     split: str | None = None,
-    part: Literal["test", "validation", "train"] = "test",
+    part: Literal["test", "validation", "train"] | None = None,
     first: int | None = None,
     lpips: bool | None = None,
     out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("results/evaluate"),
@@ -97,7 +97,7 @@ def evaluate(  # noqa: PLR0913
             centre-128 and clipped otherwise.
         split: use one part of the pairs only, as `mwdn train` divides them: paper (8:1:1), diffusercam, phlatcam,
             random or folds.
-        part: of --split: test, validation or train.
+        part: of --split: test (the default), validation or train.
         first: use only this many pairs.
         lpips: LPIPS and feature MSE: download their public weights (234 MiB, once) if they are missing, or leave both
             metrics out. By default they are used if they are there; a terminal asks before a download.
@@ -112,7 +112,9 @@ def evaluate(  # noqa: PLR0913
     region, file = evaluation.Protocol.parse(protocol), PairFile(data)
     calibration = replace(camera.load(), white_balance=None)  # scenes of pairs are in the camera's own colours
     check_pairs(file, calibration.psf)
-    pairs: Any = file if split is None else _part(file, _division(split, methods), part)
+    if part and not split:
+        raise ParameterError(f"`--part {part}` is a part of a split. Say which one: `--split paper`, as in training.")
+    pairs: Any = file if split is None else _part(file, split, part or "test", methods)
     pairs = pairs if first is None else evaluation.First(pairs, first)
     refinement = missing_refinement(file, calibration.refinement)
     pairs = Refined(pairs, refinement) if refinement else pairs

@@ -17,6 +17,8 @@ def _operator(psf: Tensor, scene: Size, sensor: Size, *, circular: bool) -> tupl
     [-(s//2+p//2), (s-s//2-1)+(p-p//2-1)]. So the grid needs 1 + the larger of the two overhangs: 1.5 n for equal sizes
     n, where 2 n is the usual choice.
     """
+    if min(*scene, *sensor) < 1:
+        raise ShapeError(f"`size` {min(scene, sensor, key=min)} must be positive: height and width in pixels.")
     grid, origin = [], []
     for s, o, p in zip(scene, sensor, psf.shape[-2:], strict=True):
         before = s // 2 + p // 2 + (o - o // 2 - 1)
@@ -28,9 +30,16 @@ def _operator(psf: Tensor, scene: Size, sensor: Size, *, circular: bool) -> tupl
 
 
 def check_fit(image: Tensor, psf: Tensor, name: str) -> None:
-    """Raise a `ShapeError` unless the PSF's batch and channels are 1 or those of the image called ``name``."""
+    """Raise a `ShapeError` unless the PSF's batch and channels are 1 or those of the image called ``name``.
+
+    Neither may be empty: FFTs of nothing fail in the libraries.
+    """
     check_batch(image, name)
     check_batch(psf, "psf")
+    if 0 in (*image.shape, *psf.shape):
+        raise ShapeError(
+            f"`{name}` {tuple(image.shape)} and `psf` {tuple(psf.shape)} must be non-empty batches (B, C, H, W)."
+        )
     for axis, dimension, way_out in (
         (0, "samples", "For one PSF: `psf[:1]`."),
         (1, "channels", "Average it: `psf.mean(1, keepdim=True)`."),
@@ -56,7 +65,7 @@ def convolve(scene: Scene, psf: Psf, *, size: Size | None = None, circular: bool
         (B, C, *size), float32.
 
     Raises:
-        ShapeError: batch, channels or (circular only) sizes do not fit.
+        ShapeError: batch, channels or (circular only) sizes do not fit, one is empty, or ``size`` is not positive.
 
     References:
         Eq. (1) of the MWDN paper, without the noise.
@@ -79,6 +88,9 @@ def correlate(measurement: Measurement, psf: Psf, *, size: Size | None = None, c
 
     Returns:
         (B, C, *size), float32.
+
+    Raises:
+        ShapeError: as for `convolve`.
     """
     check_fit(measurement, psf, "measurement")
     size = size or (measurement.shape[-2], measurement.shape[-1])

@@ -132,13 +132,16 @@ class Pinholes:
         """Compute the mask; it is the same for every camera.
 
         Raises:
-            ParameterError: a number is not positive, the holes are narrower than two samples, or there is no room.
+            ParameterError: a number is not positive, the holes are narrower than two samples or wider than the mask, or
+                there is no room.
         """
         size = sample_counts(self.size_mm, self.pitch_um)
         check_positive(count=self.count)
-        if self.diameter_um < 2 * self.pitch_um:
+        side_um = min(self.size_mm) * UM_PER_MM
+        if not 2 * self.pitch_um <= self.diameter_um <= side_um:
             raise ParameterError(
-                f"`diameter_um` ({self.diameter_um:g}) must be at least 2 samples, {2 * self.pitch_um:g} um."
+                f"`diameter_um` ({self.diameter_um:g}) must be at least 2 samples, {2 * self.pitch_um:g} um, and at "
+                f"most the mask's smaller side, {side_um:g} um."
             )
         return Mask("amplitude", _holes(self, size), self.pitch_um)
 
@@ -184,7 +187,7 @@ def _holes(design: Pinholes, size: Size) -> Tensor:
     """Open disks at random places, at least two diameters apart; rejection sampling."""
     generator = torch.Generator().manual_seed(design.seed)
     y, x = coordinates(size[0], design.pitch_um), coordinates(size[1], design.pitch_um)
-    room = torch.tensor(design.size_mm, dtype=torch.float64) * UM_PER_MM - 2 * design.diameter_um
+    room = (torch.tensor(design.size_mm, dtype=torch.float64) * UM_PER_MM - 2 * design.diameter_um).clamp(min=0)
     places: list[Tensor] = []
     for _ in range(200 * design.count):
         place = (torch.rand(2, generator=generator, dtype=torch.float64) - 0.5) * room

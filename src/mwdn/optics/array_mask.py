@@ -1,7 +1,7 @@
 """A mask from an array of numbers that another program computed or a microscope measured."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -66,10 +66,10 @@ class ArrayMask:
             ParameterError: an option is missing or out of its range, or the numbers cannot be what `values` says.
         """
         if designed := _read_design(self.mask):
-            given = [name for name in ("values", "pitch_um", "full_scale", "levels") if getattr(self, name) is not None]
+            given = [field.name for field in fields(self)[1:] if getattr(self, field.name) != field.default]
             if given:
                 raise ParameterError(
-                    f"`{self.mask}` is a design and says its own pitch and heights: leave out "
+                    f"`{self.mask}` is a design and says its own pitch, heights and index: leave out "
                     f"{', '.join(f'`{name}`' for name in given)}."
                 )
             needed, _ = needed_pitch(designed, setup)
@@ -165,7 +165,8 @@ def make_mask(
     um = phase_nm * UM_PER_NM / (2 * math.pi * (index - 1)) if values == "phase" else 1.0
     height, step = quantise(_relief(numbers.double() * um), levels)
     divide = _interpolated if levels is None else _subdivided
-    return Mask("phase", divide(height.float(), subdivide), pitch, index, step)
+    surface = _relief(divide(height.float(), subdivide))  # bicubic interpolation undershoots the lowest height
+    return Mask("phase", surface, pitch, index, step)
 
 
 def _read_design(path: Path) -> Mask | None:

@@ -142,6 +142,21 @@ def write_gds(path: str | Path, mask: Mask) -> None:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
+def check_stl(mask: Mask, *, base_um: float = 100.0, every: int = 1) -> None:
+    """Raise the `ParameterError` of `write_stl` for the same arguments, before anything is written."""
+    if mask.kind != "phase":
+        raise ParameterError("An amplitude mask has no heights for an STL. Use GDSII: `gds`.")
+    if not base_um > 0 or every < 1:
+        raise ParameterError(f"`base_um` ({base_um:g}) must be positive and `every` ({every}) at least 1.")
+    rows, columns = mask.values[::every, ::every].shape
+    if rows * columns > MAX_STL_SAMPLES or min(rows, columns) < 2:
+        needed = int(np.ceil(np.sqrt(mask.values.numel() / MAX_STL_SAMPLES)))
+        raise ParameterError(
+            f"An STL ({rows:,} x {columns:,} samples) must have at least 2 samples a side and at "
+            f"most {MAX_STL_SAMPLES:,} in all: `--stl-every {needed}`, in Python `every={needed}`; or use GDSII."
+        )
+
+
 def write_stl(path: str | Path, mask: Mask, *, base_um: float = 100.0, every: int = 1) -> None:
     """Write a phase mask as a closed body in binary STL, in um: the surface, four walls and a flat bottom.
 
@@ -155,17 +170,8 @@ def write_stl(path: str | Path, mask: Mask, *, base_um: float = 100.0, every: in
         ParameterError: an amplitude mask, a number that is not positive, or more than `MAX_STL_SAMPLES`.
         ImageError: the file cannot be written.
     """
-    if mask.kind != "phase":
-        raise ParameterError("An amplitude mask has no heights for an STL. Use GDSII: `gds`.")
-    if not base_um > 0 or every < 1:
-        raise ParameterError(f"`base_um` ({base_um:g}) must be positive and `every` ({every}) at least 1.")
+    check_stl(mask, base_um=base_um, every=every)
     heights = mask.values.numpy()[::every, ::every].astype(np.float64)
-    if heights.size > MAX_STL_SAMPLES or min(heights.shape) < 2:
-        needed = int(np.ceil(np.sqrt(mask.values.numel() / MAX_STL_SAMPLES)))
-        raise ParameterError(
-            f"An STL ({heights.shape[0]:,} x {heights.shape[1]:,} samples) must have at least 2 samples a side and at "
-            f"most {MAX_STL_SAMPLES:,} in all: `--stl-every {needed}`, in Python `every={needed}`; or use GDSII."
-        )
     triangles = np.concatenate(list(_body(heights, mask.pitch_um * every, base_um)))
     sides = triangles[:, 1:] - triangles[:, :1]
     normals = np.cross(sides[:, 0], sides[:, 1])

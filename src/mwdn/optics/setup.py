@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from mwdn.errors import ParameterError
+from mwdn.io.formats import MAX_PIXELS
 from mwdn.optics.propagation import check_positive
 from mwdn.types import Size
 
@@ -56,6 +57,12 @@ class Setup:
             raise ParameterError(f"`band_nm` {self.band_nm} must be the shortest and the longest wavelength, positive.")
         if self.bin > min(self.pixels):
             raise ParameterError(f"`bin` ({self.bin}) must be at most {min(self.pixels)}, the smaller side in pixels.")
+        rows, columns = self.size
+        if min(rows, columns) < 8 or rows * columns > MAX_PIXELS:
+            raise ParameterError(
+                f"`pixels` {self.pixels} over `bin` ({self.bin}) makes a PSF of {rows:,} x {columns:,} pixels, but it "
+                f"must have at least 8 x 8, and at most {MAX_PIXELS:,} in all."
+            )
 
     @property
     def size(self) -> Size:

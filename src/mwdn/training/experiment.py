@@ -239,12 +239,13 @@ def _in_steps(recipe: Recipe, data: TrainingData) -> Recipe:
     return replace(recipe, schedule=schedule)
 
 
+@checked
 def simulate(
-    recipe: Recipe,
+    recipe: Recipe | str | Path,
     calibration: Calibration,
     *,
-    photos: Path,
-    out: Path,
+    photos: str | Path,
+    out: str | Path,
     count: int,
     exact: bool = False,
     track: Callable[[list[range]], Iterable[range]] = iter,
@@ -252,7 +253,8 @@ def simulate(
     """Write simulated pairs to a file, which appears when it is complete.
 
     Args:
-        recipe: its placement, mismatch, sensor and seed are used.
+        recipe: its placement, mismatch, sensor and seed are used; or its TOML file, or the name of a recipe of the
+            package.
         calibration: of the camera.
         photos: folder of photographs.
         out: the file of pairs, ending in .h5 or .hdf5; an existing one is replaced on success.
@@ -263,10 +265,12 @@ def simulate(
     Raises:
         MwdnError: ``count`` is not positive, a photograph cannot be read, or the file cannot be written.
     """
+    recipe = recipe if isinstance(recipe, Recipe) else read_recipe(recipe)
+    out = Path(out)
     check_path(out)
     if count < 1:
         raise ParameterError(f"`count` ({count}) must be at least 1.")
-    grey, photographs = calibration.frames.grey, Photographs(photos)
+    grey, photographs = calibration.frames.grey, Photographs(Path(photos))
     pairs = _simulated_pairs(_with_sensor(recipe, calibration), photographs, calibration.psf, grey=grey)
     if exact:
         pairs = replace(pairs, mismatch=EXACT)

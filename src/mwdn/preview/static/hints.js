@@ -14,7 +14,7 @@ const NAMES = {
   iterations: "iterations",
   method: "Method",
   mosaic: "Colour filters of raw frames",
-  psf_bin: "Bin",
+  psf_bin: "Bin of the PSF",
   psf_gamma: "Encoding of the PSF",
   psf_orientation: "Turn the PSF",
   regularisation: "regularisation",
@@ -32,10 +32,19 @@ function control(name, value = "") {
   return shown ? `“${NAMES[key]}”: ${shown}` : `“${NAMES[key]}”`;
 }
 
+// Each option of a line, or null if the page has no words for one.
+function controls(line, between, equals) {
+  const words = line.split(between).map((option) => {
+    const [name, ...values] = option.split(equals);
+    return control(name, values.join(equals));
+  });
+  return words.includes(null) ? null : words.join(", ");
+}
+
 // "Try `--gamma srgb`." becomes "Try “Encoding of the capture”: sRGB."
 export function pageWords(text) {
   return text
-    .replace(/`--([a-z-]+)(?: ([^`]*))?`/g, (all, name, value) => control(name, value) ?? all)
-    .replace(/`([a-z_]+)=([^`]*)`/g, (all, name, value) => control(name, value) ?? all)
+    .replace(/`--([a-z][^`]*)`/g, (all, line) => controls(line, " --", " ") ?? all)
+    .replace(/`([a-z_]+=[^`]*)`/g, (all, line) => controls(line, /, (?=[a-z_]+=)/, "=") ?? all)
     .replace(/`\{"([a-z_]+)": ?([^`}]*)\}`/g, (all, name, value) => control(name, value) ?? all);
 }

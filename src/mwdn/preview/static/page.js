@@ -14,6 +14,7 @@ const UPLOAD = "";
 
 const chosen = { psf: null, capture: null, ambient: null, job: null };
 let methods = [];
+let sampleCamera = null;
 let running = null;
 let due = 0;
 let isTouched = false;
@@ -36,6 +37,7 @@ async function guarded(work) {
 function calibration() {
   const options = {};
   if (Number(byId("bin").value) > 1) options.bin = Number(byId("bin").value);
+  if (byId("psf-bin").value) options.psf_bin = Number(byId("psf-bin").value);
   if (byId("bit-depth").value) options.bit_depth = Number(byId("bit-depth").value);
   if (byId("mosaic").value) options.mosaic = byId("mosaic").value;
   if (byId("gamma").value) options.gamma = byId("gamma").value;
@@ -94,6 +96,7 @@ async function reconstruct() {
       if (now.report && !shown) {
         shown = true;
         chosen.job = now.id;
+        showVerdicts(now.report); // none yet: those of the picture before are not of this one
         await showPictures(true);
       }
     }, mine.signal);
@@ -182,6 +185,8 @@ function take(what, file) {
 function setUpDrop(what) {
   setUpDropZone(byId(what), (files) => {
     if (files[0]) take(what, files[0]);
+    // The samples' camera is simulated: a visitor's capture is of another one.
+    if (what === "capture" && byId("camera").value === sampleCamera) byId("camera").value = UPLOAD;
     soon(reconstruct, 0);
   });
 }
@@ -230,6 +235,7 @@ function chooseMethod(values = {}) {
 async function start() {
   const [listed, samples] = await Promise.all([getJson("/methods"), getJson("/samples"), listCameras()]);
   methods = listed.methods;
+  sampleCamera = samples.camera;
   setUpLive(listed.live, {
     started: () => {
       running?.abort();
@@ -262,7 +268,7 @@ byId("room-light").onchange = () => {
   byId("ambient-zone").hidden = byId("room-light").value !== "frame";
   soon(reconstruct, 0);
 };
-for (const id of ["camera", "bin", "bit-depth", "mosaic", "gamma", "psf-gamma", "orientation", "align", "trust"]) byId(id).onchange = () => soon(reconstruct, 0);
+for (const id of ["camera", "bin", "psf-bin", "bit-depth", "mosaic", "gamma", "psf-gamma", "orientation", "align", "trust"]) byId(id).onchange = () => soon(reconstruct, 0);
 byId("exposure").oninput = () => {
   byId("exposure-value").textContent = Number(byId("exposure").value).toFixed(1);
   soon(() => showPictures());
