@@ -238,6 +238,7 @@ OPERATIONS: dict[Any, Handler] = {
     _aten.linalg_vector_norm.default: _norm,
     _aten.log.default: _plain("Log"),
     **dict.fromkeys((_aten.lt.Tensor, _aten.lt.Scalar), _compare("Less")),
+    _aten.matmul.default: _plain("MatMul"),
     _aten.maximum.default: _plain("Max"),
     _aten.mean.dim: _reduce("ReduceMean"),
     _aten.median.dim: _median,
