@@ -7,6 +7,7 @@ import re
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
@@ -17,7 +18,7 @@ import torch
 
 from cameras import contour_psf
 from mwdn.benchmark import Watch, read_benchmark, run
-from mwdn.benchmark.sets import Dataset
+from mwdn.benchmark.sets import Dataset, DatasetRecipe, open_dataset
 from mwdn.benchmark.training import schedule_on
 from mwdn.calibration import Calibration
 from mwdn.calibration.camera_file import write_camera
@@ -25,6 +26,7 @@ from mwdn.cli.app import main
 from mwdn.data.pairs import PairFile
 from mwdn.errors import CheckpointError, ParameterError, UnknownNameError
 from mwdn.evaluation import alexnet, bootstrap
+from mwdn.optics import Sensor
 from mwdn.training.recipe import Schedule
 from mwdn.weights.checkpoint import read_metadata
 
@@ -354,6 +356,20 @@ def test_a_camera_file_says_what_a_data_set_does_not(tmp_path):
     (tmp_path / "camera.toml").write_text('psf = "psf.png"\nbins = 3\n', encoding="utf-8")
     with pytest.raises(UnknownNameError, match="Did you mean 'bin'"):
         read_benchmark(tmp_path / "r.toml")
+
+
+def test_captures_have_the_noise_that_the_camera_file_holds(folder):
+    """Binned by 2, a pixel has 4 times the electrons and twice the read noise of one of the sensor's."""
+    content = {"psf": folder / "psf.npy", "background": 0.0, "bin": 2}
+    content |= {"full_well_electrons": 400.0, "read_noise_electrons": 5.0}
+    write_camera(folder / "camera.toml", content)
+    recipe = DatasetRecipe(camera=str(folder / "camera.toml"), psf=str(folder / "psf.npy"), bin=2, psf_bin=0)
+    recipe = replace(recipe, photos=str(folder / "photos"), test_photos=str(folder / "test"), train=1, test=1)
+    for own, wanted in ((Sensor(), (1600.0, 10.0)), (Sensor(full_well=900.0), (900.0, Sensor().read_noise))):
+        name = f"noise-{own.full_well:g}"
+        dataset = open_dataset(name, replace(recipe, sensor=own), folder, torch.device("cpu"), lambda _, rows: rows)
+        assert (dataset.recipe.sensor.full_well, dataset.recipe.sensor.read_noise) == pytest.approx(wanted)
+        assert dataset.identity["sensor"]["full_well"] == pytest.approx(wanted[0])
 
 
 def test_a_loss_with_alexnet_downloads_nothing_unasked(folder, monkeypatch):

@@ -24,7 +24,7 @@ from mwdn.evaluation import Protocol
 from mwdn.io.files import write_text
 from mwdn.io.reading import read_json
 from mwdn.optics import Deviation, Sensor
-from mwdn.training.experiment import FILE_START
+from mwdn.training.experiment import FILE_START, simulated_sensor
 from mwdn.training.validation import START
 
 Track = Callable[[str, list[range]], Iterable[range]]
@@ -53,7 +53,7 @@ class DatasetRecipe:
         placement: how a photograph stands in the scene.
         deviation: how the true camera differs from its calibration, which is all that methods are told.
         mismatch: the same, drawn anew for each pair, in place of one true camera; see `mwdn.data.mismatch.Mismatch`.
-        sensor: its noise.
+        sensor: its noise; that of the camera file unless given.
         pairs: recorded ones in place of photographs: a file of ``mwdn import``, or a data set of this ``kind``.
         kind: how they are laid out, see `mwdn.data.kinds.KINDS`; empty for a file of pairs.
         split: which are for what, see `mwdn.data.splits.split`; empty if all are for the test.
@@ -180,6 +180,8 @@ def open_dataset(name: str, recipe: DatasetRecipe, folder: Path, device: torch.d
     calibration = recipe.calibration()
     recipe.binned_protocol().crop(calibration.psf)  # refuses a part that does not fit before anything is trained
     simulates = not recipe.pairs
+    if simulates:
+        recipe = replace(recipe, sensor=simulated_sensor(recipe.sensor, calibration))
     not_in_pairs = {"camera", "psf", "captures", "protocol"}
     not_in_pairs |= {"mismatch"} if recipe.mismatch == EXACT else set()  # earlier files lack it
     identity = {key: value for key, value in asdict(recipe).items() if key not in not_in_pairs}

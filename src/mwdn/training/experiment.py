@@ -221,11 +221,15 @@ def _simulated_pairs(recipe: Recipe, photographs: Photographs, psf: Psf, *, grey
     )
 
 
-def _with_sensor(recipe: Recipe, calibration: Calibration) -> Recipe:
-    """The recipe with the camera's measured noise, unless it has its own, or random cameras."""
+def simulated_sensor(sensor: Sensor, calibration: Calibration) -> Sensor:
+    """The sensor to simulate: that of a recipe, or the camera's measured one if the recipe has none of its own."""
     measured = calibration.binned_sensor
-    own = recipe.sensor != Sensor() or recipe.cameras.sizes
-    return recipe if measured is None or own else replace(recipe, sensor=measured)
+    return sensor if measured is None or sensor != Sensor() else measured
+
+
+def _with_sensor(recipe: Recipe, calibration: Calibration) -> Recipe:
+    """The recipe with its `simulated_sensor`, unless its cameras are random."""
+    return recipe if recipe.cameras.sizes else replace(recipe, sensor=simulated_sensor(recipe.sensor, calibration))
 
 
 def _in_steps(recipe: Recipe, data: TrainingData) -> Recipe:
