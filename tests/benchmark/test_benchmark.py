@@ -23,6 +23,7 @@ from mwdn.benchmark.training import schedule_on
 from mwdn.calibration import Calibration
 from mwdn.calibration.camera_file import write_camera
 from mwdn.cli.app import main
+from mwdn.data.pair_checks import REFINED
 from mwdn.data.pairs import PairFile
 from mwdn.errors import CheckpointError, ParameterError, UnknownNameError
 from mwdn.evaluation import alexnet, bootstrap
@@ -370,6 +371,22 @@ def test_captures_have_the_noise_that_the_camera_file_holds(folder):
         dataset = open_dataset(name, replace(recipe, sensor=own), folder, torch.device("cpu"), lambda _, rows: rows)
         assert (dataset.recipe.sensor.full_well, dataset.recipe.sensor.read_noise) == pytest.approx(wanted)
         assert dataset.identity["sensor"]["full_well"] == pytest.approx(wanted[0])
+
+
+@pytest.mark.parametrize("simulated", [False, True])
+def test_pairs_have_the_refinement_that_they_lack(folder, simulated):
+    """Pairs of `mwdn simulate` were made without stray light; recorded ones lose the 5 % that the camera adds."""
+    content = {"psf": folder / "psf.npy", "background": 0.0, "stray_light": ((0.05,),), "sensor_field": ((0.5,),)}
+    write_camera(folder / "camera.toml", content)
+    shape, marked = (48, 64, 3), {REFINED: "simulate"} if simulated else {}
+    with PairFile.create(folder / "p.h5", measurement_shape=shape, scene_shape=shape, attributes=marked) as file:
+        file.append(torch.full((10, 3, 48, 64), 0.3), torch.ones(10, 3, 48, 64))
+    recipe = DatasetRecipe(camera=str(folder / "camera.toml"), psf=str(folder / "psf.npy"), psf_bin=0)
+    recipe = replace(recipe, pairs=str(folder / "p.h5"), split="random")
+    dataset = open_dataset("p", recipe, folder, torch.device("cpu"), lambda _, rows: rows)
+    wanted = 0.3 if simulated else (0.3 - 0.05) / 0.5
+    for measurement in (dataset.test[0][0], *(part.batch([0]).measurement for part in dataset.training)):
+        assert measurement.numpy() == pytest.approx(wanted, abs=1e-3)
 
 
 def test_a_loss_with_alexnet_downloads_nothing_unasked(folder, monkeypatch):

@@ -9,14 +9,16 @@ from typing import Any
 import torch
 
 from mwdn.calibration import Calibration, FrameFormat
+from mwdn.calibration.psf_identity import psf_identity
+from mwdn.calibration.refinement import Refinement
 from mwdn.data.importers import import_pairs
 from mwdn.data.kinds import KINDS, Layout
 from mwdn.data.mismatch import EXACT, Mismatch
-from mwdn.data.pair_checks import check_pairs
+from mwdn.data.pair_checks import REFINED, check_pairs, missing_refinement
 from mwdn.data.pair_writer import Attribute
 from mwdn.data.pairs import PairFile, Part
 from mwdn.data.photographs import Photographs
-from mwdn.data.recorded import HELD_OUT, Division, RecordedPairs, record
+from mwdn.data.recorded import HELD_OUT, Division, RecordedPairs, RefinedPairs, record
 from mwdn.data.simulated import Placement, Samples, SimulatedPairs
 from mwdn.data.splits import split
 from mwdn.errors import ParameterError
@@ -154,7 +156,7 @@ class Dataset:
     name: str
     recipe: DatasetRecipe
     calibration: Calibration
-    test: Part
+    test: RefinedPairs
     training: tuple[Samples, RecordedPairs] | None
     identity: dict[str, Any]
 
@@ -187,6 +189,8 @@ def open_dataset(name: str, recipe: DatasetRecipe, folder: Path, device: torch.d
     identity = {key: value for key, value in asdict(recipe).items() if key not in not_in_pairs}
     if recipe.camera:
         identity["frames"] = repr(calibration.frames)
+    if calibration.refinement and not simulates:
+        identity["refinement"] = repr(calibration.refinement)
     identity = json.loads(json.dumps({**identity, "psf_hash": calibration.psf_hash}))
     note = folder / f"{name}.json"
     own = simulates or recipe.kind  # else the user's file, which is only read
@@ -211,8 +215,10 @@ def open_dataset(name: str, recipe: DatasetRecipe, folder: Path, device: torch.d
     file = PairFile(path)
     check_pairs(file, calibration.psf)
     rows = _rows(recipe, len(file), simulates)
-    training = None if recipe.trained_on else _training(recipe, calibration, file, rows, device)
-    return Dataset(name, recipe, calibration, Part(file, rows["test"]), training, identity)
+    refinement = Refinement() if simulates else missing_refinement(file, calibration.refinement)
+    pairs = RecordedPairs(file, rows["test"], calibration.psf.to(device), recipe.seed, refinement=refinement)
+    training = None if recipe.trained_on else _training(recipe, calibration, pairs, rows, device)
+    return Dataset(name, recipe, calibration, RefinedPairs(Part(file, rows["test"]), refinement), training, identity)
 
 
 def simulated_pairs(
@@ -248,7 +254,7 @@ def _simulate(
             (Photographs(recipe.test_photos), FILE_START, recipe.test),
         )
     ]
-    attributes: dict[str, Attribute] = {"psf_hash": calibration.psf_hash, "seed": recipe.seed}
+    attributes: dict[str, Attribute] = {**psf_identity(calibration), "seed": recipe.seed, REFINED: "simulate"}
     record(path, parts, calibration.psf, attributes=attributes, track=track)
 
 
@@ -270,12 +276,11 @@ def _rows(recipe: DatasetRecipe, count: int, simulates: bool) -> dict[str, range
 def _training(
     recipe: DatasetRecipe,
     calibration: Calibration,
-    file: PairFile,
+    pairs: RecordedPairs,
     rows: dict[str, range | list[int]],
     device: torch.device,
 ) -> tuple[Samples, RecordedPairs]:
-    psf = calibration.psf.to(device)
-    validation = RecordedPairs(file, rows["validation"], psf, recipe.seed, shuffled=False)
+    validation = replace(pairs, rows=rows["validation"], shuffled=False, poses={})
     if not recipe.pairs and not recipe.train:
         return simulated_pairs(recipe, calibration, Photographs(recipe.photos).split(HELD_OUT)[0], device), validation
-    return RecordedPairs(file, rows["train"], psf, recipe.seed), validation
+    return replace(pairs, rows=rows["train"]), validation

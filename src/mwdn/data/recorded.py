@@ -5,10 +5,12 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import Tensor
 
 from mwdn.calibration.refinement import Refinement
 from mwdn.data.pair_checks import check_pairs, missing_refinement
@@ -146,6 +148,21 @@ class RecordedPairs(Samples):
     def prefetched(self, stride: int) -> "PrefetchedPairs":
         """The same pairs, the next batch read while the last one is used."""
         return PrefetchedPairs(self, stride)
+
+
+@dataclass(frozen=True)
+class RefinedPairs:
+    """Pairs by index, (C, H, W) each, whose measurements, imported without it, have the camera's refinement."""
+
+    pairs: Any
+    refinement: Refinement
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
+        measurement, scene = self.pairs[index]
+        return self.refinement.measurement(measurement[None])[0], scene
 
 
 class PrefetchedPairs(Samples):
