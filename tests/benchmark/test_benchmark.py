@@ -389,6 +389,46 @@ def test_pairs_have_the_refinement_that_they_lack(folder, simulated):
         assert measurement.numpy() == pytest.approx(wanted, abs=1e-3)
 
 
+def grey_camera(folder, **content):
+    """camera.toml of a grey camera, and a grey capture."""
+    np.save(folder / "grey.npy", np.load(folder / "psf.npy")[..., :1])
+    write_camera(folder / "camera.toml", {"psf": folder / "grey.npy", "background": 0.0, "grey": True, **content})
+    cv2.imwrite(str(folder / "capture.png"), np.random.default_rng(0).integers(20, 200, (48, 64), np.uint8))
+    changed = RECIPE.replace('psf = "psf.npy"', 'camera = "camera.toml", captures = ["capture.png"]')
+    changed = changed.replace("quick = {", "universal-small = {}, quick = {")
+    return changed.replace("steps = 6", "steps = 1").replace("train = 4", "train = 0")
+
+
+def test_a_grey_camera(folder):
+    """Its networks have one channel, and its captures are shown with the pairs' reconstructions."""
+    (folder / "r.toml").write_text(grey_camera(folder), encoding="utf-8")
+    results = run(read_benchmark(folder / "r.toml"), folder / "out", device="cpu", lpips=False)
+    assert PairFile(folder / "out" / "data" / "caustic.h5").measurement_shape == (48, 64, 1)
+    assert read_metadata(folder / "out" / "runs" / "caustic" / "mwdn" / "best.safetensors")["options"]["channels"] == 1
+    for result in results.methods["caustic"].values():
+        assert (len(result.pictures), len(result.captures)) == (2, 1)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "camera", "said"),
+    [
+        ("mwdn = {}", "mwdn = { channels = 3 }", {}, r"`channels`.*\(3\).*`caustic`.*`channels = 1`"),
+        ("x", "x", {"grey": False}, r"`channels`.*\(3\) must be 1.*captures of `caustic`.*`grey = true`"),
+        (
+            "[data]",
+            '[data]\ncolour = { psf = "psf.npy", train = 4, validation = 2, test = 3, trained_on = "caustic" }',
+            {},
+            r"`channels`.*\(1\) must be 3.*`colour`.*`caustic`",
+        ),
+    ],
+)
+def test_networks_of_other_colours_are_refused_before_training(folder, before, after, camera, said):
+    (folder / "r.toml").write_text(grey_camera(folder, **camera).replace(before, after, 1), encoding="utf-8")
+    with pytest.raises(ParameterError, match=said):
+        run(read_benchmark(folder / "r.toml"), folder / "out", device="cpu", lpips=False)
+    assert not (folder / "out" / "runs").exists()
+
+
 def test_a_loss_with_alexnet_downloads_nothing_unasked(folder, monkeypatch):
     monkeypatch.delenv("MWDN_ALEXNET", raising=False)
     monkeypatch.setattr(alexnet, "cache_folder", lambda: folder / "cache")

@@ -151,6 +151,7 @@ class Dataset:
         test: pairs to score on.
         training: training and validation pairs; ``None`` if the networks of another data set are tested.
         identity: the settings that its pairs depend on, in values that JSON can hold.
+        channels: of measurements and scenes, 1 for a grey camera.
     """
 
     name: str
@@ -159,6 +160,7 @@ class Dataset:
     test: RefinedPairs
     training: tuple[Samples, RecordedPairs] | None
     identity: dict[str, Any]
+    channels: int = 3
 
     @property
     def protocol(self) -> Protocol:
@@ -189,6 +191,8 @@ def open_dataset(name: str, recipe: DatasetRecipe, folder: Path, device: torch.d
     identity = {key: value for key, value in asdict(recipe).items() if key not in not_in_pairs}
     if recipe.camera:
         identity["frames"] = repr(calibration.frames)
+    if calibration.frames.grey and simulates:
+        identity["channels"] = 1  # earlier pairs of grey cameras have colours
     if calibration.refinement and not simulates:
         identity["refinement"] = repr(calibration.refinement)
     identity = json.loads(json.dumps({**identity, "psf_hash": calibration.psf_hash}))
@@ -218,7 +222,8 @@ def open_dataset(name: str, recipe: DatasetRecipe, folder: Path, device: torch.d
     refinement = Refinement() if simulates else missing_refinement(file, calibration.refinement)
     pairs = RecordedPairs(file, rows["test"], calibration.psf.to(device), recipe.seed, refinement=refinement)
     training = None if recipe.trained_on else _training(recipe, calibration, pairs, rows, device)
-    return Dataset(name, recipe, calibration, RefinedPairs(Part(file, rows["test"]), refinement), training, identity)
+    test = RefinedPairs(Part(file, rows["test"]), refinement)
+    return Dataset(name, recipe, calibration, test, training, identity, file.measurement_shape[2])
 
 
 def simulated_pairs(
@@ -234,6 +239,7 @@ def simulated_pairs(
         sensor=recipe.sensor,
         seed=recipe.seed,
         camera=recipe.deviation.camera(psf) if recipe.mismatch == EXACT else None,
+        grey=calibration.frames.grey,
     )
 
 
@@ -255,7 +261,8 @@ def _simulate(
         )
     ]
     attributes: dict[str, Attribute] = {**psf_identity(calibration), "seed": recipe.seed, REFINED: "simulate"}
-    record(path, parts, calibration.psf, attributes=attributes, track=track)
+    channels = 1 if calibration.frames.grey else 3
+    record(path, parts, calibration.psf, channels=channels, attributes=attributes, track=track)
 
 
 def _rows(recipe: DatasetRecipe, count: int, simulates: bool) -> dict[str, range | list[int]]:

@@ -17,14 +17,14 @@ from mwdn.data.noisy import NoisyScenes
 from mwdn.data.pair_checks import REFINED
 from mwdn.data.pair_writer import Attribute, check_path
 from mwdn.data.photographs import Photographs
-from mwdn.data.recorded import HELD_OUT, RecordedPairs, record, recorded_pairs
+from mwdn.data.recorded import HELD_OUT, record, recorded_pairs
 from mwdn.data.simulated import Samples, SimulatedPairs
 from mwdn.data.unpaired import UnpairedCaptures
 from mwdn.errors import ParameterError, checked
 from mwdn.networks.empty import build_empty
 from mwdn.optics.sensor import Sensor
 from mwdn.runtime import distributed
-from mwdn.training.network import stored_psf
+from mwdn.training.network import check_colours, stored_psf
 from mwdn.training.recipe import Recipe, read_recipe
 from mwdn.training.report import Report
 from mwdn.training.selfsupervised import SelfSupervisedTask
@@ -158,7 +158,7 @@ def recorded_pairs_of(recipe: Recipe, pairs: Path, psf: Psf, *, refinement: Refi
         raise ParameterError("[denoising] makes its own pairs from photographs: give `--photos`, not `--pairs`.")
     seed = recipe.schedule.seed
     training, validation = recorded_pairs(pairs, psf, recipe.pairs, seed=seed, device=psf.device, refinement=refinement)
-    _check_channels(recipe, training)
+    _check_colours(recipe, training.file.measurement_shape[2], f"`{pairs}`")
     best_gain = recipe.pairs.best_gain
     if recipe.schedule.pool and recipe.pairs.aligned:
         task, held_out = few_pairs_tasks(training, validation, recipe.schedule, best_gain=best_gain)
@@ -168,15 +168,8 @@ def recorded_pairs_of(recipe: Recipe, pairs: Path, psf: Psf, *, refinement: Refi
     return TrainingData(task, held_out, len(training), len(validation))
 
 
-def _check_channels(recipe: Recipe, pairs: RecordedPairs) -> None:
-    network, colours = build_empty(**recipe.network), pairs.file.measurement_shape[2]
-    channels = getattr(network, "channels", colours)
-    takes_grey = hasattr(network, "estimates")  # as equal colours
-    if channels not in (0, colours) and not (takes_grey and colours == 1):  # 0 is any number
-        raise ParameterError(
-            f"`channels` of [network] ({channels}) must be {colours}, as many as the measurements of "
-            f"`{pairs.file.path}` have."
-        )
+def _check_colours(recipe: Recipe, colours: int, of: str) -> None:
+    check_colours(recipe.network, colours, of=of, way_out=f"Train one of {colours}: `--network.channels {colours}`.")
 
 
 def captures_alone(recipe: Recipe, captures: Measurement, psf: Psf) -> TrainingData:
