@@ -273,6 +273,7 @@ def test_another_method_and_another_set_are_a_line_each(done):
         ("train = 4", "train = -4", ParameterError, "at least 0"),
         ('psf = "psf.npy", ', "", ParameterError, "must name a PSF"),
         ('psf = "psf.npy"', 'psf = "$MWDN_NOWHERE/psf.npy"', ParameterError, "`MWDN_NOWHERE`.*is not set"),
+        ('data = "caustic", ', "", ParameterError, r"\[robustness\] \(noise, shift_px\).*`data = \"caustic\"`"),
         ("noise = [2]", "noise = []", ParameterError, "must be a list of numbers"),
         ("noise = [2]", "nois = [2]", UnknownNameError, "Did you mean 'noise'?"),
         ('data = "caustic"', 'data = "castic"', UnknownNameError, "Did you mean 'caustic'?"),
@@ -300,6 +301,14 @@ def test_epochs_are_steps_of_each_data_set(tmp_path):
     endless = RECIPE.replace("steps = 6", plateau).replace("train = 4", "train = 0")
     (tmp_path / "r.toml").write_text(endless, encoding="utf-8")
     with pytest.raises(ParameterError, match=r"`epochs`.*`caustic`.*`steps`"):
+        read_benchmark(tmp_path / "r.toml")
+
+
+@pytest.mark.parametrize("changed", ["train = 0", 'train = 4, trained_on = "caustic"'])
+def test_the_mean_picture_needs_training_pairs(tmp_path, changed):
+    text = RECIPE.replace("shown = 2", "mean_picture = true").replace("train = 4", changed)
+    (tmp_path / "r.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(ParameterError, match=r"`mean_picture`.*`caustic`.*`train`"):
         read_benchmark(tmp_path / "r.toml")
 
 
