@@ -89,8 +89,8 @@ def train(  # noqa: PLR0913
             )
         if is_first and pairs_file is not None:
             warn(other_camera(PairFile(pairs_file), calibration))
-        if is_first and trainer.step >= trainer.schedule.steps:
-            note(f"The run in `{out}` was finished before, perhaps with other data. To train anew: another `--out`.")
+        if is_first and trainer.finished:
+            note(f"The run in `{out}` was finished before. To train anew: another `--out`.")
         board = (
             stack.enter_context(TensorBoard(out / "tensorboard", trainer.step)) if tensorboard and is_first else None
         )

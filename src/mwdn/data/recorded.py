@@ -1,5 +1,6 @@
 """Recorded pairs as numbered samples, like the simulated ones; and samples recorded in a file."""
 
+import hashlib
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -25,6 +26,9 @@ from mwdn.types import Measurement, Psf
 
 HELD_OUT = 20
 """One in this many photographs is held out for validation, or training pairs of a split without a validation part."""
+
+FINGERPRINTED = 16
+"""Pairs that identify a file."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +116,15 @@ class RecordedPairs(Samples):
         status = self.file.path.stat()
         return f"{status.st_size} {status.st_mtime_ns}"
 
+    @property
+    def fingerprint(self) -> str:
+        """Hash of up to 16 pairs, evenly spaced over the file: reading all of a large one would take minutes."""
+        digest, count = hashlib.sha256(), len(self.file)
+        for row in range(0, count, -(-count // FINGERPRINTED)):
+            for picture in self.file[row]:
+                digest.update(picture.numpy().tobytes())
+        return digest.hexdigest()
+
     def batch(self, numbers: range | list[int]) -> Batch:
         """Read the samples of these numbers.
 
@@ -183,6 +196,11 @@ class PrefetchedPairs(Samples):
     def name(self) -> str:
         """The name of the pairs."""
         return self.pairs.name
+
+    @property
+    def fingerprint(self) -> str:
+        """That of the pairs."""
+        return self.pairs.fingerprint
 
     def batch(self, numbers: range | list[int]) -> Batch:
         """The samples of these numbers, as `RecordedPairs.batch` gives them, with its errors."""

@@ -20,7 +20,7 @@ from mwdn.data.photographs import Photographs
 from mwdn.data.recorded import HELD_OUT, record, recorded_pairs
 from mwdn.data.simulated import Samples, SimulatedPairs
 from mwdn.data.unpaired import UnpairedCaptures
-from mwdn.errors import ParameterError, checked
+from mwdn.errors import CheckpointError, ParameterError, checked
 from mwdn.networks.empty import build_empty
 from mwdn.optics.sensor import Sensor
 from mwdn.runtime import distributed
@@ -133,7 +133,15 @@ def prepare(
     stored = None if stored is None else stored.to(place)
     task, validation = (with_stored_psf(part, stored) for part in (data.task, data.validation))
     validator = Validator(recipe, validation, psf if stored is None else stored, captures)
-    return Trainer(recipe, task, out=out, calibration=calibration, validator=validator, device=place)
+    trainer = Trainer(recipe, task, out=out, calibration=calibration, validator=validator, device=place)
+    # A run may go on with more photographs. Other pairs have their numbers, but not their content.
+    if not trainer.same_samples and (trainer.finished or pairs is not None):
+        kind = "pairs" if pairs else "photographs"
+        raise CheckpointError(
+            f"`{out}` holds a run of the same recipe on other {kind} than those of `{pairs or photos}`. "
+            "Choose another folder, `--out`, or remove it."
+        )
+    return trainer
 
 
 def simulated_captures(recipe: Recipe, photos: Path, psf: Psf) -> TrainingData:
