@@ -174,6 +174,10 @@ def test_grey_camera_learns_from_photographs(run, camera):
     code, _, err = run(line)
     assert code == 0, err
     assert run(f"{RECONSTRUCT} grey.npy --no-trust")[0] == 0
+    for colours in ("3", "1"):
+        code, _, err = run(f"{line} --grey".replace("channels 1", f"channels {colours}").replace("runs/x", colours))
+        assert (code, "`--network.channels 1`" in flat(err)) == ((2, True) if colours == "3" else (0, False))
+    assert not Path("3").exists()
     assert run("simulate photos --psf grey.npy --grey -o pairs.h5 --count 2 --recipe r.toml")[0] == 0
     assert PairFile("pairs.h5").scene_shape == PairFile("pairs.h5").measurement_shape == (32, 40, 1)
 

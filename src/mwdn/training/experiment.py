@@ -127,6 +127,9 @@ def prepare(
     elif pairs is not None:
         data = recorded_pairs_of(recipe, pairs, psf, refinement=calibration.refinement)
     elif photos is not None:
+        one_camera = not (recipe.cameras.sizes or recipe.denoising.levels[1])
+        if calibration.frames.grey and one_camera:
+            _check_colours(recipe, 1, "this camera (`grey`)")
         data = simulated_captures(recipe, photos, psf)
     recipe = _in_steps(recipe, data)
     stored = stored_psf(recipe, calibration)
@@ -177,7 +180,7 @@ def recorded_pairs_of(recipe: Recipe, pairs: Path, psf: Psf, *, refinement: Refi
 
 
 def _check_colours(recipe: Recipe, colours: int, of: str) -> None:
-    check_colours(recipe.network, colours, of=of, way_out=f"Train one of {colours}: `--network.channels {colours}`.")
+    check_colours(recipe.network, colours, of=of, way_out=f"Give `--network.channels {colours}`.")
 
 
 def captures_alone(recipe: Recipe, captures: Measurement, psf: Psf) -> TrainingData:
