@@ -182,6 +182,20 @@ def test_grey_camera_learns_from_photographs(run, camera):
     assert PairFile("pairs.h5").scene_shape == PairFile("pairs.h5").measurement_shape == (32, 40, 1)
 
 
+def test_only_a_grey_psf_leaves_open_whether_captures_are_grey(run, camera):
+    np.save("grey.npy", np.load("psf.npy").mean(2, keepdims=True))
+    train = TRAIN + " --network.name unet --network.width 2"
+    for line, options in (
+        ("simulate photos --psf psf.npy -o pairs.h5 --count 1", "`--grey`"),
+        (train, "`--grey --network.channels 1`"),
+    ):
+        for psf, is_open in (("psf.npy", False), ("grey.npy", True)):
+            code, _, err = run(line.replace("psf.npy", psf).replace("runs/x", psf[:3]))
+            assert (code, f"If those of the camera are grey: {options}" in flat(err)) == (0, is_open), err
+    assert "If those of the camera" not in run("simulate photos --psf grey.npy --grey -o pairs.h5 --count 1")[2]
+    assert "If those of the camera" not in run(TRAIN.replace("psf.npy", "grey.npy"))[2]  # takes both
+
+
 def test_pairs_of_another_camera_and_a_finished_run_are_named(run, camera):
     assert run("simulate photos --psf psf.npy -o pairs.h5 --count 20 --recipe r.toml")[0] == 0
     line = TRAIN.replace("--photos photos", "--pairs pairs.h5").replace("psf.npy", "other.npy")
