@@ -27,7 +27,7 @@ def load(model):
 
 
 def read(path, about):
-    """Read a frame as linear light, RGB, (H, W, C), rows as stored; 1 is saturation."""
+    """Read a frame as linear light, RGB, (H, W, C), rows as stored, 1 is saturation; and whether it is saturated."""
     try:
         frame = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
     except (OSError, cv2.error):
@@ -39,8 +39,11 @@ def read(path, about):
     if largest > 1 and not frame.max() <= full <= largest:
         sys.exit(f"{path} ({frame.dtype}, up to {frame.max()}) must hold numbers of {about['bit_depth']} bits.")
     frame = frame[..., :3][..., ::-1] if frame.ndim == 3 else frame[..., None]  # OpenCV gives BGR
+    # Sensors of 10, 12 or 14 bits may use the lower bits of 16.
+    fills_bits = full == 65535 and "bit_depth" not in about and frame.max() in (1023, 4095, 16383)
+    saturated = largest > 1 and (frame.max() > 0.98 * full or fills_bits)
     frame = (frame[..., ::-1] if "colours" in about else frame).astype(np.float32) / full
-    return decoded(frame, about["gamma"]) if "gamma" in about else frame
+    return decoded(frame, about["gamma"]) if "gamma" in about else frame, saturated
 
 
 def decoded(frame, gamma):
@@ -48,6 +51,22 @@ def decoded(frame, gamma):
     if gamma == "srgb":
         return np.where(frame <= 0.04045, frame / 12.92, ((frame + 0.055) / 1.055) ** np.float32(2.4))
     return frame.clip(min=0) ** np.float32(gamma)
+
+
+def with_plateau(frame, corrected):
+    """Saturated pixels, whose light is unknown, have one value in each colour again, the least of their maxima."""
+    corrected = corrected.copy()
+    for before, after in zip(np.moveaxis(frame, 2, 0), np.moveaxis(corrected, 2, 0), strict=True):
+        low, high = np.float32([0.98, 0.995]) * before.max()
+        above, at = ((before[:, ::2] >= least).mean() for least in (low, high))
+        if not (at > above - at > 0 and at >= 5e-4):  # no plateau at the brightest value
+            continue
+        saturated, border = before >= high, cv2.BORDER_CONSTANT
+        count = cv2.boxFilter(saturated.astype(np.float32), -1, (3, 3), normalize=False, borderType=border)
+        known = saturated & (count > 1.5) & (after != before) & (after > before / 2)
+        largest = cv2.dilate(np.where(known, after, -np.inf).astype(np.float32), np.ones((3, 3), np.uint8))
+        after[:] = np.minimum(after, largest[known].min(initial=np.inf))
+    return corrected
 
 
 def cropped(frame, height, width):
@@ -75,12 +94,12 @@ def demosaiced(frame, mosaic):
 
 def measured(capture, dark, about):
     """Input of the file: a capture minus its dark or ambient frame, cropped, binned, row 0 at the top, (1, C, H, W)."""
-    frame = read(capture, about)
+    frame, saturated = read(capture, about)
     if dark:
-        level = read(dark, about)
+        level, _ = read(dark, about)
         if level.shape[:2] != frame.shape[:2] or level.shape[2] not in (1, frame.shape[2]):
             sys.exit(f"{dark} {level.shape} must have the size of {capture} {frame.shape}.")
-        frame = frame - level
+        frame = with_plateau(frame, frame - level) if saturated else frame - level
     elif kind := {"dark", "ambient"} & about.keys():
         sys.exit(f"{capture} needs a {kind.pop()} frame, as this camera's calibration has one: name it last.")
     if "mosaic" in about:

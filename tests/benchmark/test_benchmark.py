@@ -7,6 +7,7 @@ import re
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
@@ -17,14 +18,16 @@ import torch
 
 from cameras import contour_psf
 from mwdn.benchmark import Watch, read_benchmark, run
-from mwdn.benchmark.sets import Dataset
+from mwdn.benchmark.sets import Dataset, DatasetRecipe, open_dataset
 from mwdn.benchmark.training import schedule_on
 from mwdn.calibration import Calibration
 from mwdn.calibration.camera_file import write_camera
 from mwdn.cli.app import main
+from mwdn.data.pair_checks import REFINED
 from mwdn.data.pairs import PairFile
 from mwdn.errors import CheckpointError, ParameterError, UnknownNameError
 from mwdn.evaluation import alexnet, bootstrap
+from mwdn.optics import Sensor
 from mwdn.training.recipe import Schedule
 from mwdn.weights.checkpoint import read_metadata
 
@@ -270,6 +273,7 @@ def test_another_method_and_another_set_are_a_line_each(done):
         ("train = 4", "train = -4", ParameterError, "at least 0"),
         ('psf = "psf.npy", ', "", ParameterError, "must name a PSF"),
         ('psf = "psf.npy"', 'psf = "$MWDN_NOWHERE/psf.npy"', ParameterError, "`MWDN_NOWHERE`.*is not set"),
+        ('data = "caustic", ', "", ParameterError, r"\[robustness\] \(noise, shift_px\).*`data = \"caustic\"`"),
         ("noise = [2]", "noise = []", ParameterError, "must be a list of numbers"),
         ("noise = [2]", "nois = [2]", UnknownNameError, "Did you mean 'noise'?"),
         ('data = "caustic"', 'data = "castic"', UnknownNameError, "Did you mean 'caustic'?"),
@@ -297,6 +301,14 @@ def test_epochs_are_steps_of_each_data_set(tmp_path):
     endless = RECIPE.replace("steps = 6", plateau).replace("train = 4", "train = 0")
     (tmp_path / "r.toml").write_text(endless, encoding="utf-8")
     with pytest.raises(ParameterError, match=r"`epochs`.*`caustic`.*`steps`"):
+        read_benchmark(tmp_path / "r.toml")
+
+
+@pytest.mark.parametrize("changed", ["train = 0", 'train = 4, trained_on = "caustic"'])
+def test_the_mean_picture_needs_training_pairs(tmp_path, changed):
+    text = RECIPE.replace("shown = 2", "mean_picture = true").replace("train = 4", changed)
+    (tmp_path / "r.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(ParameterError, match=r"`mean_picture`.*`caustic`.*`train`"):
         read_benchmark(tmp_path / "r.toml")
 
 
@@ -354,6 +366,76 @@ def test_a_camera_file_says_what_a_data_set_does_not(tmp_path):
     (tmp_path / "camera.toml").write_text('psf = "psf.png"\nbins = 3\n', encoding="utf-8")
     with pytest.raises(UnknownNameError, match="Did you mean 'bin'"):
         read_benchmark(tmp_path / "r.toml")
+
+
+def test_captures_have_the_noise_that_the_camera_file_holds(folder):
+    """Binned by 2, a pixel has 4 times the electrons and twice the read noise of one of the sensor's."""
+    content = {"psf": folder / "psf.npy", "background": 0.0, "bin": 2}
+    content |= {"full_well_electrons": 400.0, "read_noise_electrons": 5.0}
+    write_camera(folder / "camera.toml", content)
+    recipe = DatasetRecipe(camera=str(folder / "camera.toml"), psf=str(folder / "psf.npy"), bin=2, psf_bin=0)
+    recipe = replace(recipe, photos=str(folder / "photos"), test_photos=str(folder / "test"), train=1, test=1)
+    for own, wanted in ((Sensor(), (1600.0, 10.0)), (Sensor(full_well=900.0), (900.0, Sensor().read_noise))):
+        name = f"noise-{own.full_well:g}"
+        dataset = open_dataset(name, replace(recipe, sensor=own), folder, torch.device("cpu"), lambda _, rows: rows)
+        assert (dataset.recipe.sensor.full_well, dataset.recipe.sensor.read_noise) == pytest.approx(wanted)
+        assert dataset.identity["sensor"]["full_well"] == pytest.approx(wanted[0])
+
+
+@pytest.mark.parametrize("simulated", [False, True])
+def test_pairs_have_the_refinement_that_they_lack(folder, simulated):
+    """Pairs of `mwdn simulate` were made without stray light; recorded ones lose the 5 % that the camera adds."""
+    content = {"psf": folder / "psf.npy", "background": 0.0, "stray_light": ((0.05,),), "sensor_field": ((0.5,),)}
+    write_camera(folder / "camera.toml", content)
+    shape, marked = (48, 64, 3), {REFINED: "simulate"} if simulated else {}
+    with PairFile.create(folder / "p.h5", measurement_shape=shape, scene_shape=shape, attributes=marked) as file:
+        file.append(torch.full((10, 3, 48, 64), 0.3), torch.ones(10, 3, 48, 64))
+    recipe = DatasetRecipe(camera=str(folder / "camera.toml"), psf=str(folder / "psf.npy"), psf_bin=0)
+    recipe = replace(recipe, pairs=str(folder / "p.h5"), split="random")
+    dataset = open_dataset("p", recipe, folder, torch.device("cpu"), lambda _, rows: rows)
+    wanted = 0.3 if simulated else (0.3 - 0.05) / 0.5
+    for measurement in (dataset.test[0][0], *(part.batch([0]).measurement for part in dataset.training)):
+        assert measurement.numpy() == pytest.approx(wanted, abs=1e-3)
+
+
+def grey_camera(folder, **content):
+    """camera.toml of a grey camera, and a grey capture."""
+    np.save(folder / "grey.npy", np.load(folder / "psf.npy")[..., :1])
+    write_camera(folder / "camera.toml", {"psf": folder / "grey.npy", "background": 0.0, "grey": True, **content})
+    cv2.imwrite(str(folder / "capture.png"), np.random.default_rng(0).integers(20, 200, (48, 64), np.uint8))
+    changed = RECIPE.replace('psf = "psf.npy"', 'camera = "camera.toml", captures = ["capture.png"]')
+    changed = changed.replace("quick = {", "universal-small = {}, quick = {")
+    return changed.replace("steps = 6", "steps = 1").replace("train = 4", "train = 0")
+
+
+def test_a_grey_camera(folder):
+    """Its networks have one channel, and its captures are shown with the pairs' reconstructions."""
+    (folder / "r.toml").write_text(grey_camera(folder), encoding="utf-8")
+    results = run(read_benchmark(folder / "r.toml"), folder / "out", device="cpu", lpips=False)
+    assert PairFile(folder / "out" / "data" / "caustic.h5").measurement_shape == (48, 64, 1)
+    assert read_metadata(folder / "out" / "runs" / "caustic" / "mwdn" / "best.safetensors")["options"]["channels"] == 1
+    for result in results.methods["caustic"].values():
+        assert (len(result.pictures), len(result.captures)) == (2, 1)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "camera", "said"),
+    [
+        ("mwdn = {}", "mwdn = { channels = 3 }", {}, r"`channels`.*\(3\).*`caustic`.*`channels = 1`"),
+        ("x", "x", {"grey": False}, r"`channels`.*\(3\) must be 1.*captures of `caustic`.*`grey = true`"),
+        (
+            "[data]",
+            '[data]\ncolour = { psf = "psf.npy", train = 4, validation = 2, test = 3, trained_on = "caustic" }',
+            {},
+            r"`channels`.*\(1\) must be 3.*`colour`.*`caustic`",
+        ),
+    ],
+)
+def test_networks_of_other_colours_are_refused_before_training(folder, before, after, camera, said):
+    (folder / "r.toml").write_text(grey_camera(folder, **camera).replace(before, after, 1), encoding="utf-8")
+    with pytest.raises(ParameterError, match=said):
+        run(read_benchmark(folder / "r.toml"), folder / "out", device="cpu", lpips=False)
+    assert not (folder / "out" / "runs").exists()
 
 
 def test_a_loss_with_alexnet_downloads_nothing_unasked(folder, monkeypatch):

@@ -1,8 +1,11 @@
 """The commands `mwdn train` and `mwdn simulate`, and their files."""
 
 import json
+import os
 import re
+import shutil
 import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -171,8 +174,26 @@ def test_grey_camera_learns_from_photographs(run, camera):
     code, _, err = run(line)
     assert code == 0, err
     assert run(f"{RECONSTRUCT} grey.npy --no-trust")[0] == 0
+    for colours in ("3", "1"):
+        code, _, err = run(f"{line} --grey".replace("channels 1", f"channels {colours}").replace("runs/x", colours))
+        assert (code, "`--network.channels 1`" in flat(err)) == ((2, True) if colours == "3" else (0, False))
+    assert not Path("3").exists()
     assert run("simulate photos --psf grey.npy --grey -o pairs.h5 --count 2 --recipe r.toml")[0] == 0
     assert PairFile("pairs.h5").scene_shape == PairFile("pairs.h5").measurement_shape == (32, 40, 1)
+
+
+def test_only_a_grey_psf_leaves_open_whether_captures_are_grey(run, camera):
+    np.save("grey.npy", np.load("psf.npy").mean(2, keepdims=True))
+    train = TRAIN + " --network.name unet --network.width 2"
+    for line, options in (
+        ("simulate photos --psf psf.npy -o pairs.h5 --count 1", "`--grey`"),
+        (train, "`--grey --network.channels 1`"),
+    ):
+        for psf, is_open in (("psf.npy", False), ("grey.npy", True)):
+            code, _, err = run(line.replace("psf.npy", psf).replace("runs/x", psf[:3]))
+            assert (code, f"If those of the camera are grey: {options}" in flat(err)) == (0, is_open), err
+    assert "If those of the camera" not in run("simulate photos --psf grey.npy --grey -o pairs.h5 --count 1")[2]
+    assert "If those of the camera" not in run(TRAIN.replace("psf.npy", "grey.npy"))[2]  # takes both
 
 
 def test_pairs_of_another_camera_and_a_finished_run_are_named(run, camera):
@@ -182,6 +203,26 @@ def test_pairs_of_another_camera_and_a_finished_run_are_named(run, camera):
     assert (code, "holds pairs of the camera of PSF" in flat(err)) == (0, True)
     code, _, err = run(line)
     assert (code, "was finished before" in flat(err)) == (0, True)
+    assert "`schedule.steps` is 4 there, 5 here" in flat(run(line.replace("--steps 4", "--steps 5"))[2])
+
+
+def test_a_run_does_not_go_on_with_other_data(run, camera):
+    """Nor is a finished one taken for one on the data given now, unless they are a copy of its own."""
+    for seed in (0, 1):
+        assert run(f"simulate photos --psf psf.npy -o pairs{seed}.h5 --count 20 --recipe r.toml --seed {seed}")[0] == 0
+    shutil.copytree("photos", "more")
+    shutil.copy("more/0.png", "more/copy.png")
+    first, data = "--photos photos", (("--pairs pairs0.h5", "--pairs pairs1.h5"), ("--photos photos", "--photos more"))
+    for name, (given, other) in zip("ab", data, strict=True):
+        line = TRAIN.replace(first, given).replace("runs/x", name)
+        assert run(line)[0] == 0
+        before = {path.name: path.read_bytes() for path in Path(name).iterdir()}
+        code, _, err = run(line.replace(given, other))
+        assert (code, other.split()[1] in flat(err), f"`{name}` holds a run" in flat(err)) == (2, True, True)
+        assert before == {path.name: path.read_bytes() for path in Path(name).iterdir()}
+    shutil.copy("pairs0.h5", "copy.h5")
+    os.utime("copy.h5", (0, 0))
+    assert run(TRAIN.replace(first, "--pairs copy.h5").replace("runs/x", "a"))[0] == 0
 
 
 def test_the_file_of_pairs_and_the_table_have_one_name(run, camera):

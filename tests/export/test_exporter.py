@@ -208,7 +208,7 @@ def example(monkeypatch, *arguments):
 
 @pytest.fixture
 def raw(tmp_path):
-    """PSF, capture, dark frame and room's light of a colour camera, 83 x 101, neither symmetrical nor grey.
+    """PSF, captures, dark frames and room's light of a colour camera, 83 x 101, neither symmetrical nor grey.
 
     The room's light has no noise, which `mwdn reconstruct` would remove, and the example subtracts.
     """
@@ -216,6 +216,10 @@ def raw(tmp_path):
     write_frame(tmp_path / "psf.png", (numbers.random((83, 101, 3)) ** 40 * 60000).astype(np.uint16))
     write_frame(tmp_path / "capture.png", numbers.integers(2000, 60000, (83, 101, 3), np.uint16))
     write_frame(tmp_path / "dark.png", numbers.integers(0, 2000, (83, 101, 3), np.uint16))
+    write_frame(tmp_path / "warm.png", numbers.integers(0, 16000, (83, 101, 3), np.uint16))
+    saturated = (read_frame(tmp_path / "capture.png") * 1.09).astype(np.uint16)
+    saturated[20:60, 30:60] = 65535  # a seventh of the frame
+    write_frame(tmp_path / "saturated.png", saturated)
     write_frame(tmp_path / "room.png", np.linspace([0, 500, 900], 2000, 83 * 101).reshape(83, 101, 3).astype(np.uint16))
     return tmp_path
 
@@ -228,6 +232,7 @@ def raw(tmp_path):
         ("capture.tif", []),
         ("capture.png", ["--dark", "dark.png", "--crop", "78", "99", "--bin", "2", "--upside-down", "--bgr"]),
         ("capture.png", ["--ambient", "room.png", "--gamma", "2.2"]),
+        ("saturated.png", ["--dark", "warm.png"]),
     ],
 )
 def test_the_example_gives_the_picture_of_mwdn_reconstruct(capture, options, raw, monkeypatch):
@@ -236,8 +241,9 @@ def test_the_example_gives_the_picture_of_mwdn_reconstruct(capture, options, raw
     camera_options = ["--psf", "psf.png", "--background", "0", *options]
     command("export", "wiener", "--regularisation", "1e-3", "--out", "camera.onnx", *camera_options)
     command("reconstruct", capture, "--method", "wiener", "--regularisation", "1e-3", "--no-trust", *camera_options)
-    example(monkeypatch, "camera.onnx", capture, "scene.png", *{"dark.png", "room.png"}.intersection(options))
-    expected = read_frame("results/reconstruct/capture.png").astype(int)
+    frames = {"dark.png", "room.png", "warm.png"}.intersection(options)
+    example(monkeypatch, "camera.onnx", capture, "scene.png", *frames)
+    expected = read_frame(f"results/reconstruct/{Path(capture).stem}.png").astype(int)
     assert np.abs(read_frame("scene.png") - expected).max() <= 1
 
 

@@ -42,9 +42,9 @@ def psf_frame(seed, bits):
     return (psf / psf.max() * 0.9 * 2**bits + 0.02 * 2**bits).numpy().astype(np.uint8 if bits == 8 else np.uint16)
 
 
-def write_capture(path, calibration, picture, maximum=65535):
+def write_capture(path, calibration, picture, maximum=65535, peak=0.8):
     light = Camera(calibration.psf).simulate(dark_scene(picture, SIZE, 60), generator=seeded(1))
-    light = light * (0.8 / light.max())
+    light = light * (peak / light.max())
     write_frame(path, (light.clamp(0, 1) * maximum).round()[0].movedim(0, -1).numpy().astype(np.uint16))
 
 
@@ -58,9 +58,11 @@ def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("site")
     write_frame(folder / "psf.png", psf_frame(0, 12))
     write_frame(folder / "other.png", psf_frame(1, 8))
-    own = Calibration.from_file(folder / "psf.png", bit_depth=12)
+    write_frame(folder / "dark.png", np.random.default_rng(0).integers(0, 300, (*SIZE, 3), np.uint16))
+    own = Calibration.from_file(folder / "psf.png", bit_depth=12, dark=folder / "dark.png")
     other = Calibration.from_file(folder / "other.png", psf_orientation="rotate-180")
     write_capture(folder / "capture.png", own, "coffee", maximum=4095)
+    write_capture(folder / "bright.png", own, "coffee", maximum=4095, peak=2.0)
     write_capture(folder / "of-the-other.png", other, "cat")
     for name in ("other.png", "of-the-other.png"):  # of a sensor with pixels of half the size
         write_frame(folder / f"fine-{name}", read_frame(folder / name).repeat(2, 0).repeat(2, 1))
@@ -68,8 +70,9 @@ def files(tmp_path_factory):
     (folder / "photo.jpg").write_bytes(cv2.imencode(".jpg", np.zeros((96, 128, 3), np.uint8))[1].tobytes())
     write_frame(folder / "small.png", np.zeros((64, 64, 3), np.uint8))
     jaxtyping.config.update("jaxtyping_disable", True)  # torch traces with sizes that are no numbers
+    camera = [str(folder / "psf.png"), "--bit-depth", "12", "--dark", str(folder / "dark.png")]
     with pytest.raises(SystemExit) as ended:
-        main(["export", "--web", str(folder / "psf.png"), "--bit-depth", "12", "-o", str(folder / "site")])
+        main(["export", "--web", *camera, "-o", str(folder / "site")])
     jaxtyping.config.update("jaxtyping_disable", False)
     assert ended.value.code == 0
     return folder, own, other
@@ -134,9 +137,12 @@ def check_scene(page, calibration, capture):
 
 def check_files(page, folder, own, other):
     """Captures of this camera and of another one, and files that are none."""
+    for name in ("capture.png", "bright.png"):  # the second is saturated
+        page.drop("#capture", folder / name)
+        wait_for(page, name)
+        check_scene(page, own, folder / name)
     page.drop("#capture", folder / "capture.png")
     wait_for(page, "capture.png")
-    check_scene(page, own, folder / "capture.png")
 
     page.drop("#psf", folder / "other.png")
     page.wait(f"{STATE}.textContent.startsWith('capture.png: ') || {STATE}.classList.contains('wrong')")

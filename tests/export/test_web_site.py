@@ -4,6 +4,8 @@ import base64
 import gzip
 import json
 import re
+import shutil
+import subprocess
 from dataclasses import replace
 
 import jaxtyping
@@ -143,6 +145,41 @@ def test_modules_become_one_classic_script():
         )
     ]
     assert len(top) == len(set(top)) > 50
+
+
+MEASURE = """
+import { readFileSync, writeFileSync } from "node:fs";
+import { normalise, toMeasurement } from "./frames.js";
+import { decodeNpy } from "./npy.js";
+const read = (name) => decodeNpy(new Uint8Array(readFileSync(`${name}.npy`)));
+const plain = { bit_depth: null, gamma: null, bgr: false, bin: 1 };
+const [offset, flat] = ["dark", "flat"].map((name) => normalise(read(name), plain));
+const format = { ...plain, bit_depth: JSON.parse(process.argv[2]), offset, flat };
+writeFileSync("measurement.bin", toMeasurement(read("capture"), format).data);
+"""
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="needs Node.js")
+@pytest.mark.parametrize(("depth", "maximum"), [(12, 4095), (None, 65535), (None, 4095)])
+def test_the_page_keeps_the_plateau_of_saturated_pixels(tmp_path, depth, maximum):
+    """Dark frame and flat field gave 7 % saturated pixels different values, and the picture lost 3 dB."""
+    numbers = np.random.default_rng(3)
+    smooth = np.kron(numbers.random((8, 10, 3)), np.ones((8, 8, 1)))
+    light = smooth + 0.02 * numbers.random(smooth.shape)
+    frame = (light / np.quantile(light, 0.93) * maximum).clip(0, maximum).round().astype(np.uint16)
+    dark, flat = 0.1 * numbers.random(smooth.shape), 1 + 0.2 * numbers.random(smooth.shape)
+    for name, image in (("capture", frame), ("dark", dark.astype(np.float32)), ("flat", flat.astype(np.float32))):
+        np.save(tmp_path / f"{name}.npy", image)
+    for name in ("frames.js", "npy.js", "png.js"):
+        (tmp_path / name).write_text(read_static(name), encoding="utf-8")
+    (tmp_path / "package.json").write_text('{"type": "module"}', encoding="utf-8")
+    (tmp_path / "measure.js").write_text(MEASURE, encoding="utf-8")
+    subprocess.run(["node", "measure.js", json.dumps(depth)], cwd=tmp_path, check=True, timeout=60)
+    given = np.fromfile(tmp_path / "measurement.bin", "<f4").reshape(1, 3, *smooth.shape[:2])
+    dark, flat = (torch.from_numpy(image.astype(np.float32)).movedim(-1, 0)[None] for image in (dark, flat))
+    wanted = FrameFormat(bit_depth=depth).to_measurement(frame, dark, Corrections(flat=flat))
+    assert (wanted == wanted.amax((-2, -1), keepdim=True)).sum() > 300  # the plateau
+    np.testing.assert_allclose(given, wanted, atol=1e-6)
 
 
 def test_files_of_others_stay(runtime, tmp_path):

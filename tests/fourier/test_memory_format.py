@@ -20,7 +20,7 @@ def test_pixel_unshuffle_is_torchs(shape, block, dtype, generator):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 @pytest.mark.parametrize("block", [1, 2, 4])
-@pytest.mark.parametrize("shape", [(1, 16, 3, 2), (2, 48, 5, 7)])
+@pytest.mark.parametrize("shape", [(1, 16, 3, 2), (2, 48, 5, 7), (2, 16, 1, 1)])
 def test_pixel_shuffle_is_torchs(shape, block, dtype, generator):
     image = torch.rand(shape, generator=generator).to(dtype)
     for layout in (image, image.contiguous(memory_format=torch.channels_last), image.mT):

@@ -102,7 +102,7 @@ def test_alignment_is_reported(measurement, psf, generator):
 
 def test_methods_without_filters_are_refused(measurement, psf):
     for method in (Admm(), build("unet", width=2)):
-        with pytest.raises(ParameterError, match="has no Wiener filters to look into"):
+        with pytest.raises(ParameterError, match=r"has no learned Wiener filters.*universal-small, or the checkpoint"):
             interpret(method, measurement, psf)
 
 
@@ -120,4 +120,4 @@ def test_the_command_writes_a_sheet_pictures_and_numbers(run, psf, tmp_path, mon
     assert len(list((tmp_path / "out/pictures").glob("*.png"))) == 3 + 3
     assert run("interpret n.safetensors capture.npy --psf psf.npy -o out --device cpu")[0] == 0  # again
     code, _, err = run("interpret wiener capture.npy --psf psf.npy -o out")
-    assert (code, "no Wiener filters" in " ".join(err.split())) == (2, True), err
+    assert (code, "no learned Wiener filters" in " ".join(err.split())) == (2, True), err

@@ -138,3 +138,10 @@ def test_a_spot_is_fitted_again_in_finer_pixels():
     measurement, light = lit(scene, psf, 0.3 * spot_light(size, (0.4, 0.6), 0.15))
     found = find_room_light(measurement + light, psf)
     assert float((found.background - light).norm() / light.norm()) < 0.2
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1)])
+def test_a_single_row_or_column_has_none(size):
+    measurement = torch.rand(2, 3, *size, generator=torch.Generator().manual_seed(0))
+    background, share = find_room_light(measurement, torch.ones(1, 3, *size))
+    assert (background.shape, background.any(), share.tolist()) == (measurement.shape, False, [0.0, 0.0])

@@ -561,12 +561,12 @@ def test_another_recipe_or_psf_in_the_same_folder(trainer, photos, calibration, 
     trainer().run()
     before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
     other = Calibration(calibration.psf.flip(-1))
-    for again in (
-        lambda: trainer(few(learning_rate=1e-4)),
-        lambda: prepare(RECIPE, other, photos=photos, out=tmp_path / "run", device="cpu"),
+    for again, said in (
+        (lambda: trainer(few(learning_rate=1e-4)), "`schedule.learning_rate` is 0.002 there, 0.0001 here"),
+        (lambda: prepare(RECIPE, other, photos=photos, out=tmp_path / "run", device="cpu"), calibration.psf_hash),
     ):
         with pytest.raises(
-            CheckpointError, match=r"holds a run of another recipe or PSF, or on other pairs\. Choose another folder"
+            CheckpointError, match=f"holds a run of another recipe or PSF.*{said}.*Choose another folder"
         ):
             again()
     assert before == {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}

@@ -233,6 +233,12 @@ def _check(benchmark: Benchmark) -> None:
             f"`epochs` of [schedule] needs a number of training pairs, but those of `{endless[0]}` are without end "
             "(`train` is 0). Give `train` or `steps`."
         )
+    without = endless + [name for name, recipe in benchmark.data.items() if recipe.trained_on]
+    if benchmark.mean_picture and without:
+        raise ParameterError(
+            f"`mean_picture` needs a number of training pairs in each data set, but `{without[0]}` has none of "
+            "its own. Give it `train` in place of 0 or `trained_on`, or leave `mean_picture` out."
+        )
     if not 0 < benchmark.trial <= 1:
         raise ParameterError(f"`trial` ({benchmark.trial}) must be a part of the steps, such as 0.1.")
     if not benchmark.rate_factor > 0:
@@ -240,6 +246,11 @@ def _check(benchmark: Benchmark) -> None:
     for name, recipe in benchmark.data.items():
         _check_dataset(name, recipe, benchmark.data)
     simulated = [name for name, recipe in benchmark.data.items() if not recipe.pairs]
+    if benchmark.robustness.sizes and not benchmark.robustness.data:
+        raise ParameterError(
+            f"[robustness] ({', '.join(benchmark.robustness.sizes)}) must name the simulated data set to test: "
+            f'`data = "{(simulated or ["mwdn-sim"])[0]}"`.'
+        )
     if benchmark.robustness.data not in ("", *simulated):
         raise UnknownNameError("simulated data set of this recipe", benchmark.robustness.data, simulated)
 

@@ -43,7 +43,7 @@ def pairs_at(dataset: Dataset, photographs: Photographs, count: int, axis: str, 
         size: of the mismatch, added to what the camera had in training; for noise a factor.
 
     Returns:
-        measurements and scenes, (count, 3, H, W).
+        measurements and scenes, (count, C, H, W).
     """
     recipe = dataset.recipe
     if axis == "noise":

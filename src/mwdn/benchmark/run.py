@@ -19,7 +19,7 @@ from mwdn.benchmark.robustness import Sweep, pairs_at, sweep
 from mwdn.benchmark.scoring import MethodResult, identity, make_reconstructor, score
 from mwdn.benchmark.sections import sections
 from mwdn.benchmark.sets import Dataset, open_dataset
-from mwdn.benchmark.training import schedule_on, train
+from mwdn.benchmark.training import check_networks, schedule_on, train
 from mwdn.data.photographs import Photographs
 from mwdn.evaluation import Perceptual
 from mwdn.evaluation.alexnet import SMALLEST, load_alexnet
@@ -111,6 +111,7 @@ def run(
             name: open_dataset(name, recipe, out / "data", torch_device, watch.track)
             for name, recipe in benchmark.data.items()
         }
+    check_networks(benchmark, datasets)
     _train_all(benchmark, datasets, out, torch_device, watch)
     files = benchmark.alexnet or None, benchmark.heads or None
 

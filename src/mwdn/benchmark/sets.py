@@ -9,14 +9,16 @@ from typing import Any
 import torch
 
 from mwdn.calibration import Calibration, FrameFormat
+from mwdn.calibration.psf_identity import psf_identity
+from mwdn.calibration.refinement import Refinement
 from mwdn.data.importers import import_pairs
 from mwdn.data.kinds import KINDS, Layout
 from mwdn.data.mismatch import EXACT, Mismatch
-from mwdn.data.pair_checks import check_pairs
+from mwdn.data.pair_checks import REFINED, check_pairs, missing_refinement
 from mwdn.data.pair_writer import Attribute
 from mwdn.data.pairs import PairFile, Part
 from mwdn.data.photographs import Photographs
-from mwdn.data.recorded import HELD_OUT, Division, RecordedPairs, record
+from mwdn.data.recorded import HELD_OUT, Division, RecordedPairs, RefinedPairs, record
 from mwdn.data.simulated import Placement, Samples, SimulatedPairs
 from mwdn.data.splits import split
 from mwdn.errors import ParameterError
@@ -24,7 +26,7 @@ from mwdn.evaluation import Protocol
 from mwdn.io.files import write_text
 from mwdn.io.reading import read_json
 from mwdn.optics import Deviation, Sensor
-from mwdn.training.experiment import FILE_START
+from mwdn.training.experiment import FILE_START, simulated_sensor
 from mwdn.training.validation import START
 
 Track = Callable[[str, list[range]], Iterable[range]]
@@ -53,7 +55,7 @@ class DatasetRecipe:
         placement: how a photograph stands in the scene.
         deviation: how the true camera differs from its calibration, which is all that methods are told.
         mismatch: the same, drawn anew for each pair, in place of one true camera; see `mwdn.data.mismatch.Mismatch`.
-        sensor: its noise.
+        sensor: its noise; that of the camera file unless given.
         pairs: recorded ones in place of photographs: a file of ``mwdn import``, or a data set of this ``kind``.
         kind: how they are laid out, see `mwdn.data.kinds.KINDS`; empty for a file of pairs.
         split: which are for what, see `mwdn.data.splits.split`; empty if all are for the test.
@@ -149,14 +151,16 @@ class Dataset:
         test: pairs to score on.
         training: training and validation pairs; ``None`` if the networks of another data set are tested.
         identity: the settings that its pairs depend on, in values that JSON can hold.
+        channels: of measurements and scenes, 1 for a grey camera.
     """
 
     name: str
     recipe: DatasetRecipe
     calibration: Calibration
-    test: Part
+    test: RefinedPairs
     training: tuple[Samples, RecordedPairs] | None
     identity: dict[str, Any]
+    channels: int = 3
 
     @property
     def protocol(self) -> Protocol:
@@ -180,11 +184,17 @@ def open_dataset(name: str, recipe: DatasetRecipe, folder: Path, device: torch.d
     calibration = recipe.calibration()
     recipe.binned_protocol().crop(calibration.psf)  # refuses a part that does not fit before anything is trained
     simulates = not recipe.pairs
+    if simulates:
+        recipe = replace(recipe, sensor=simulated_sensor(recipe.sensor, calibration))
     not_in_pairs = {"camera", "psf", "captures", "protocol"}
     not_in_pairs |= {"mismatch"} if recipe.mismatch == EXACT else set()  # earlier files lack it
     identity = {key: value for key, value in asdict(recipe).items() if key not in not_in_pairs}
     if recipe.camera:
         identity["frames"] = repr(calibration.frames)
+    if calibration.frames.grey and simulates:
+        identity["channels"] = 1  # earlier pairs of grey cameras have colours
+    if calibration.refinement and not simulates:
+        identity["refinement"] = repr(calibration.refinement)
     identity = json.loads(json.dumps({**identity, "psf_hash": calibration.psf_hash}))
     note = folder / f"{name}.json"
     own = simulates or recipe.kind  # else the user's file, which is only read
@@ -209,8 +219,11 @@ def open_dataset(name: str, recipe: DatasetRecipe, folder: Path, device: torch.d
     file = PairFile(path)
     check_pairs(file, calibration.psf)
     rows = _rows(recipe, len(file), simulates)
-    training = None if recipe.trained_on else _training(recipe, calibration, file, rows, device)
-    return Dataset(name, recipe, calibration, Part(file, rows["test"]), training, identity)
+    refinement = Refinement() if simulates else missing_refinement(file, calibration.refinement)
+    pairs = RecordedPairs(file, rows["test"], calibration.psf.to(device), recipe.seed, refinement=refinement)
+    training = None if recipe.trained_on else _training(recipe, calibration, pairs, rows, device)
+    test = RefinedPairs(Part(file, rows["test"]), refinement)
+    return Dataset(name, recipe, calibration, test, training, identity, file.measurement_shape[2])
 
 
 def simulated_pairs(
@@ -226,6 +239,7 @@ def simulated_pairs(
         sensor=recipe.sensor,
         seed=recipe.seed,
         camera=recipe.deviation.camera(psf) if recipe.mismatch == EXACT else None,
+        grey=calibration.frames.grey,
     )
 
 
@@ -246,8 +260,9 @@ def _simulate(
             (Photographs(recipe.test_photos), FILE_START, recipe.test),
         )
     ]
-    attributes: dict[str, Attribute] = {"psf_hash": calibration.psf_hash, "seed": recipe.seed}
-    record(path, parts, calibration.psf, attributes=attributes, track=track)
+    attributes: dict[str, Attribute] = {**psf_identity(calibration), "seed": recipe.seed, REFINED: "simulate"}
+    channels = 1 if calibration.frames.grey else 3
+    record(path, parts, calibration.psf, channels=channels, attributes=attributes, track=track)
 
 
 def _rows(recipe: DatasetRecipe, count: int, simulates: bool) -> dict[str, range | list[int]]:
@@ -268,12 +283,11 @@ def _rows(recipe: DatasetRecipe, count: int, simulates: bool) -> dict[str, range
 def _training(
     recipe: DatasetRecipe,
     calibration: Calibration,
-    file: PairFile,
+    pairs: RecordedPairs,
     rows: dict[str, range | list[int]],
     device: torch.device,
 ) -> tuple[Samples, RecordedPairs]:
-    psf = calibration.psf.to(device)
-    validation = RecordedPairs(file, rows["validation"], psf, recipe.seed, shuffled=False)
+    validation = replace(pairs, rows=rows["validation"], shuffled=False, poses={})
     if not recipe.pairs and not recipe.train:
         return simulated_pairs(recipe, calibration, Photographs(recipe.photos).split(HELD_OUT)[0], device), validation
-    return RecordedPairs(file, rows["train"], psf, recipe.seed), validation
+    return replace(pairs, rows=rows["train"]), validation

@@ -3,7 +3,7 @@
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from inspect import signature
 from pathlib import Path
@@ -14,19 +14,19 @@ import torch
 from mwdn.benchmark.methods import Method
 from mwdn.benchmark.published import PUBLISHED
 from mwdn.benchmark.recipe import Benchmark
+from mwdn.benchmark.scoring import captured_measurements
 from mwdn.benchmark.sets import Dataset
 from mwdn.data.recorded import RecordedPairs
 from mwdn.errors import DivergenceError, ParameterError
 from mwdn.io.files import write_text
 from mwdn.io.reading import LOG_BYTES, parse_json, read_json, read_text, unexpected_content
 from mwdn.networks import NETWORKS
-from mwdn.training.network import stored_psf
+from mwdn.training.network import check_colours, stored_psf
 from mwdn.training.recipe import OPTIMISERS, Recipe, Schedule
 from mwdn.training.report import Report
 from mwdn.training.tasks import SupervisedTask, supervised_task, with_stored_psf
 from mwdn.training.trainer import Trainer
 from mwdn.training.validation import Validator
-from mwdn.types import Size
 
 CLOCK = "clock.json"
 """File with the training time in seconds, up to the last saved state."""
@@ -70,11 +70,36 @@ def schedule_on(method: Method, benchmark: Benchmark, dataset: Dataset) -> Sched
     return replace(schedule, steps=schedule.epochs * steps, validate_every=steps)
 
 
-def options(method: Method, size: Size) -> dict[str, Any]:
-    """Options to build a network with; includes the picture size for a network that learns a PSF of this size."""
-    if "size" in signature(NETWORKS[method.name]).parameters:
-        return {"size": list(size), **method.options}
-    return method.options
+def options(method: Method, dataset: Dataset) -> dict[str, Any]:
+    """Options to build a network with; includes what it must know of the data set: picture size, grey pairs."""
+    known: dict[str, Any] = {"size": list(dataset.calibration.size)}
+    if dataset.channels == 1:
+        known["channels"] = 1
+    parameters = signature(NETWORKS[method.name]).parameters
+    return {key: value for key, value in known.items() if key in parameters} | method.options
+
+
+def check_networks(benchmark: Benchmark, datasets: Mapping[str, Dataset]) -> None:
+    """Check that each network takes the channels of the pairs and captures that it is tested on.
+
+    Raises:
+        ParameterError: the recipe gives it another number, or it is trained on pairs of another number.
+        MwdnError: captures cannot be read, or do not fit the camera.
+    """
+    learned = [method for method in benchmark.methods if method.learned]
+    for name, dataset in datasets.items():
+        trained_on = dataset.recipe.trained_on
+        networks = [{"name": method.name, **options(method, datasets[trained_on or name])} for method in learned]
+        way_out = f"Set `channels = {dataset.channels}` of the network."
+        if trained_on:
+            way_out = f"It is trained on `{trained_on}`, whose pairs must be like these: all grey, or all in colour."
+        for network in networks:
+            check_colours(network, dataset.channels, of=f"`{name}`", way_out=way_out)
+        if dataset.recipe.captures and networks:
+            colours = captured_measurements(dataset).shape[1]
+            way_out = "For a grey camera set `grey = true` in its camera file; for a mosaic, `mosaic`."
+            for network in networks:
+                check_colours(network, colours, of=f"the captures of `{name}`", way_out=way_out)
 
 
 def train(
@@ -127,7 +152,7 @@ def _trainer(
 ) -> Trainer:
     assert dataset.training is not None
     training, validation = dataset.training
-    network = {"name": method.name, **options(method, dataset.calibration.size)}
+    network = {"name": method.name, **options(method, dataset)}
     recipe = Recipe(network, schedule, benchmark.loss, benchmark.plateau, benchmark.later_loss)
     stored = stored_psf(recipe, dataset.calibration)
     stored = None if stored is None else stored.to(device)

@@ -1,15 +1,13 @@
 """`mwdn evaluate`: compare methods on pairs of measurements and scenes."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
-from torch import Tensor
 
-from mwdn.calibration.refinement import Refinement
 from mwdn.cli.camera import CameraOptions
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.method_options import MethodOptions, read_options
@@ -18,28 +16,13 @@ from mwdn.cli.terminal import Json, results, say, warn
 from mwdn.cli.weights import ask_for_lpips
 from mwdn.data.pair_checks import check_pairs, missing_refinement, other_camera
 from mwdn.data.pairs import PairFile, Part
-from mwdn.data.recorded import Division
+from mwdn.data.recorded import Division, RefinedPairs
 from mwdn.errors import ParameterError
 from mwdn.evaluation import Perceptual, Variant
 from mwdn.evaluation.alexnet import SMALLEST
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import check_folder, refuse_foreign, refuse_overwrite
 from mwdn.weights.checkpoint import read_metadata
-
-
-@dataclass(frozen=True)
-class Refined:
-    """Pairs whose measurements, imported without it, have the camera's refinement."""
-
-    pairs: Any
-    refinement: Refinement
-
-    def __len__(self) -> int:
-        return len(self.pairs)
-
-    def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
-        measurement, scene = self.pairs[index]
-        return self.refinement.measurement(measurement[None])[0], scene
 
 
 def _division(split: str, methods: Iterable[str]) -> Division:
@@ -117,7 +100,7 @@ def evaluate(  # noqa: PLR0913
     pairs: Any = file if split is None else _part(file, split, part or "test", methods)
     pairs = pairs if first is None else evaluation.First(pairs, first)
     refinement = missing_refinement(file, calibration.refinement)
-    pairs = Refined(pairs, refinement) if refinement else pairs
+    pairs = RefinedPairs(pairs, refinement) if refinement else pairs
     reconstructors = {
         method: Reconstructor(method, calibration, device=device, **own) for method, own in method_options.items()
     }

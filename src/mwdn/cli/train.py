@@ -9,6 +9,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from mwdn.calibration import Calibration
 from mwdn.cli.camera import CameraOptions
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.progress import Progressing, show_progress, track
@@ -87,16 +88,26 @@ def train(  # noqa: PLR0913
                 device=device,
                 exclude=camera.roles,
             )
+        takes_colours = getattr(trainer.network, "channels", 0) == 3 and not hasattr(trainer.network, "estimates")
+        if is_first and photos is not None and takes_colours and not experiment_recipe.cameras.sizes:
+            _note_colours(calibration, "--grey --network.channels 1")
         if is_first and pairs_file is not None:
             warn(other_camera(PairFile(pairs_file), calibration))
-        if is_first and trainer.step >= trainer.schedule.steps:
-            note(f"The run in `{out}` was finished before, perhaps with other data. To train anew: another `--out`.")
+        if is_first and trainer.finished:
+            note(f"The run in `{out}` was finished before. To train anew: another `--out`.")
         board = (
             stack.enter_context(TensorBoard(out / "tensorboard", trainer.step)) if tensorboard and is_first else None
         )
         _train(trainer, stack.enter_context(show_progress(enabled=is_first, titles=True)), board)
     if is_first:
         say(f"Weights in {out / 'best.safetensors'}")
+
+
+def _note_colours(calibration: Calibration, options: str) -> None:
+    """Say that captures are simulated in colour if nothing but the PSF, which is grey, tells what the camera's are."""
+    frames = calibration.frames
+    if calibration.psf.shape[1] == 1 and not frames.grey and frames.mosaic is None:
+        note(f"The PSF is grey; captures are simulated in colour. If those of the camera are grey: `{options}`.")
 
 
 def _train(trainer: Trainer, progress: Progressing, board: TensorBoard | None) -> None:
@@ -181,6 +192,7 @@ def simulate(
     progress = partial(track, title="Simulating")
     note(*unused_photographs(photos))
     calibration = camera.load()
+    _note_colours(calibration, "--grey")
     with if_interrupted(lambda: f"Interrupted. Nothing is kept: {out} is written when all pairs are done."):
         experiment.simulate(simulation, calibration, photos=photos, out=out, count=count, exact=exact, track=progress)
     say(f"{counted(count, 'pair')} written to {out}")

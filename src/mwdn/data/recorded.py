@@ -1,14 +1,17 @@
 """Recorded pairs as numbered samples, like the simulated ones; and samples recorded in a file."""
 
+import hashlib
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import Tensor
 
 from mwdn.calibration.refinement import Refinement
 from mwdn.data.pair_checks import check_pairs, missing_refinement
@@ -23,6 +26,9 @@ from mwdn.types import Measurement, Psf
 
 HELD_OUT = 20
 """One in this many photographs is held out for validation, or training pairs of a split without a validation part."""
+
+FINGERPRINTED = 16
+"""Pairs that identify a file."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +116,15 @@ class RecordedPairs(Samples):
         status = self.file.path.stat()
         return f"{status.st_size} {status.st_mtime_ns}"
 
+    @property
+    def fingerprint(self) -> str:
+        """Hash of up to 16 pairs, evenly spaced over the file: reading all of a large one would take minutes."""
+        digest, count = hashlib.sha256(), len(self.file)
+        for row in range(0, count, -(-count // FINGERPRINTED)):
+            for picture in self.file[row]:
+                digest.update(picture.numpy().tobytes())
+        return digest.hexdigest()
+
     def batch(self, numbers: range | list[int]) -> Batch:
         """Read the samples of these numbers.
 
@@ -148,6 +163,21 @@ class RecordedPairs(Samples):
         return PrefetchedPairs(self, stride)
 
 
+@dataclass(frozen=True)
+class RefinedPairs:
+    """Pairs by index, (C, H, W) each, whose measurements, imported without it, have the camera's refinement."""
+
+    pairs: Any
+    refinement: Refinement
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
+        measurement, scene = self.pairs[index]
+        return self.refinement.measurement(measurement[None])[0], scene
+
+
 class PrefetchedPairs(Samples):
     """Recorded pairs whose next batch is read by another thread.
 
@@ -166,6 +196,11 @@ class PrefetchedPairs(Samples):
     def name(self) -> str:
         """The name of the pairs."""
         return self.pairs.name
+
+    @property
+    def fingerprint(self) -> str:
+        """That of the pairs."""
+        return self.pairs.fingerprint
 
     def batch(self, numbers: range | list[int]) -> Batch:
         """The samples of these numbers, as `RecordedPairs.batch` gives them, with its errors."""

@@ -102,6 +102,11 @@ class Samples(Protocol):
         """Hash of the files that the samples are made from; empty without files."""
         return ""
 
+    @property
+    def fingerprint(self) -> str:
+        """Hash of what the samples show, the same for a copy of the files."""
+        return self.content
+
     def batch(self, numbers: range | list[int]) -> Batch:
         """The samples of these numbers, on one device."""
 

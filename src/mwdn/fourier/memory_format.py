@@ -117,7 +117,8 @@ def pixel_shuffle(image: Tensor, block: int) -> Tensor:
 
     From channels-last, two adjacent pixels are copied as one number: 12 x 160 x 160 in 0.2 instead of 1.1 ms.
     """
-    channels_last = image.is_contiguous(memory_format=torch.channels_last)
+    # A single pixel is contiguous in both formats, with strides that are no pairs.
+    channels_last = image.is_contiguous(memory_format=torch.channels_last) and not image.is_contiguous()
     if block != 2 or not channels_last or image.requires_grad or torch.compiler.is_exporting():
         return F.pixel_shuffle(image, block).contiguous()
     pairs = _pairs(image.movedim(1, -1)).unflatten(-1, (-1, 2))  # type: ignore[no-untyped-call]

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mwdn.errors import ParameterError
@@ -24,7 +24,8 @@ from mwdn.types import Measurement, Psf, Scene
 Kind = Literal["light", "psf", "features", "change"]
 """How a picture is displayed: linear light, a PSF, features of any sign, or a change of the picture around 0."""
 
-EXPLAINED = "mwdn, mwdn-cpsf, wiener, wiener-unet and wiener-bank (universal, universal-small)"
+EXPLAINED = "mwdn, mwdn-cpsf, wiener, wiener-unet or wiener-bank"
+"""Names of these networks in [network] of a recipe; the solver `wiener` is something else."""
 
 
 class Panel(NamedTuple):
@@ -90,7 +91,11 @@ def interpret(network: object, measurement: Measurement, psf: Psf) -> Interpreta
         ShapeError: measurement and PSF do not fit.
     """
     if not isinstance(network, Mwdn | MwdnCpsf | WienerNetwork | WienerUNet | WienerBank):
-        raise ParameterError(f"`{type(network).__name__}` has no Wiener filters to look into. Use {EXPLAINED}.")
+        kind = "network" if isinstance(network, nn.Module) else "solver"
+        raise ParameterError(
+            f"The {kind} `{type(network).__name__}` has no learned Wiener filters to look into. Use universal, "
+            f"universal-small, or the checkpoint of a network that has some: {EXPLAINED}."
+        )
     network = copy.deepcopy(network).eval()
     psf, pose = checked_psf(psf, scale=not network.stored_psf), {}
     if network.align:

@@ -91,6 +91,8 @@ class RoomLight(NamedTuple):
 def find_room_light(measurement: Measurement, psf: Psf) -> RoomLight:
     """Find even light, a slope and a narrow spot of light in each capture, from the capture alone.
 
+    Captures of a single row or column have none.
+
     Args:
         measurement: (B, C, H, W), a tensor as `mwdn.Calibration.correct` returns it.
         psf: (1 or B, 1 or C, h, w), centred. Its scale does not matter.
@@ -108,6 +110,8 @@ def find_room_light(measurement: Measurement, psf: Psf) -> RoomLight:
     finite = b.isfinite().flatten(1).all(1)
     b = torch.where(finite[:, None, None, None], b, 1.0)
     size = b.shape[-2], b.shape[-1]
+    if min(size) < 2:  # a slope needs two pixels
+        return RoomLight(torch.zeros_like(measurement), b.new_zeros(len(b)))
     mean = b.mean((-2, -1), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
     y, h, saturated = _halved(b / mean, psf, PIXELS)
     spot = find_spot(y, h, saturated)

@@ -17,14 +17,14 @@ from mwdn.data.noisy import NoisyScenes
 from mwdn.data.pair_checks import REFINED
 from mwdn.data.pair_writer import Attribute, check_path
 from mwdn.data.photographs import Photographs
-from mwdn.data.recorded import HELD_OUT, RecordedPairs, record, recorded_pairs
+from mwdn.data.recorded import HELD_OUT, record, recorded_pairs
 from mwdn.data.simulated import Samples, SimulatedPairs
 from mwdn.data.unpaired import UnpairedCaptures
-from mwdn.errors import ParameterError, checked
+from mwdn.errors import CheckpointError, ParameterError, checked
 from mwdn.networks.empty import build_empty
 from mwdn.optics.sensor import Sensor
 from mwdn.runtime import distributed
-from mwdn.training.network import stored_psf
+from mwdn.training.network import check_colours, stored_psf
 from mwdn.training.recipe import Recipe, read_recipe
 from mwdn.training.report import Report
 from mwdn.training.selfsupervised import SelfSupervisedTask
@@ -127,13 +127,24 @@ def prepare(
     elif pairs is not None:
         data = recorded_pairs_of(recipe, pairs, psf, refinement=calibration.refinement)
     elif photos is not None:
+        one_camera = not (recipe.cameras.sizes or recipe.denoising.levels[1])
+        if calibration.frames.grey and one_camera:
+            _check_colours(recipe, 1, "this camera (`grey`)")
         data = simulated_captures(recipe, photos, psf)
     recipe = _in_steps(recipe, data)
     stored = stored_psf(recipe, calibration)
     stored = None if stored is None else stored.to(place)
     task, validation = (with_stored_psf(part, stored) for part in (data.task, data.validation))
     validator = Validator(recipe, validation, psf if stored is None else stored, captures)
-    return Trainer(recipe, task, out=out, calibration=calibration, validator=validator, device=place)
+    trainer = Trainer(recipe, task, out=out, calibration=calibration, validator=validator, device=place)
+    # A run may go on with more photographs. Other pairs have their numbers, but not their content.
+    if not trainer.same_samples and (trainer.finished or pairs is not None):
+        kind = "pairs" if pairs else "photographs"
+        raise CheckpointError(
+            f"`{out}` holds a run of the same recipe on other {kind} than those of `{pairs or photos}`. "
+            "Choose another folder, `--out`, or remove it."
+        )
+    return trainer
 
 
 def simulated_captures(recipe: Recipe, photos: Path, psf: Psf) -> TrainingData:
@@ -158,7 +169,7 @@ def recorded_pairs_of(recipe: Recipe, pairs: Path, psf: Psf, *, refinement: Refi
         raise ParameterError("[denoising] makes its own pairs from photographs: give `--photos`, not `--pairs`.")
     seed = recipe.schedule.seed
     training, validation = recorded_pairs(pairs, psf, recipe.pairs, seed=seed, device=psf.device, refinement=refinement)
-    _check_channels(recipe, training)
+    _check_colours(recipe, training.file.measurement_shape[2], f"`{pairs}`")
     best_gain = recipe.pairs.best_gain
     if recipe.schedule.pool and recipe.pairs.aligned:
         task, held_out = few_pairs_tasks(training, validation, recipe.schedule, best_gain=best_gain)
@@ -168,15 +179,8 @@ def recorded_pairs_of(recipe: Recipe, pairs: Path, psf: Psf, *, refinement: Refi
     return TrainingData(task, held_out, len(training), len(validation))
 
 
-def _check_channels(recipe: Recipe, pairs: RecordedPairs) -> None:
-    network, colours = build_empty(**recipe.network), pairs.file.measurement_shape[2]
-    channels = getattr(network, "channels", colours)
-    takes_grey = hasattr(network, "estimates")  # as equal colours
-    if channels not in (0, colours) and not (takes_grey and colours == 1):  # 0 is any number
-        raise ParameterError(
-            f"`channels` of [network] ({channels}) must be {colours}, as many as the measurements of "
-            f"`{pairs.file.path}` have."
-        )
+def _check_colours(recipe: Recipe, colours: int, of: str) -> None:
+    check_colours(recipe.network, colours, of=of, way_out=f"Give `--network.channels {colours}`.")
 
 
 def captures_alone(recipe: Recipe, captures: Measurement, psf: Psf) -> TrainingData:
@@ -221,11 +225,15 @@ def _simulated_pairs(recipe: Recipe, photographs: Photographs, psf: Psf, *, grey
     )
 
 
-def _with_sensor(recipe: Recipe, calibration: Calibration) -> Recipe:
-    """The recipe with the camera's measured noise, unless it has its own, or random cameras."""
+def simulated_sensor(sensor: Sensor, calibration: Calibration) -> Sensor:
+    """The sensor to simulate: that of a recipe, or the camera's measured one if the recipe has none of its own."""
     measured = calibration.binned_sensor
-    own = recipe.sensor != Sensor() or recipe.cameras.sizes
-    return recipe if measured is None or own else replace(recipe, sensor=measured)
+    return sensor if measured is None or sensor != Sensor() else measured
+
+
+def _with_sensor(recipe: Recipe, calibration: Calibration) -> Recipe:
+    """The recipe with its `simulated_sensor`, unless its cameras are random."""
+    return recipe if recipe.cameras.sizes else replace(recipe, sensor=simulated_sensor(recipe.sensor, calibration))
 
 
 def _in_steps(recipe: Recipe, data: TrainingData) -> Recipe:

@@ -49,6 +49,28 @@ def build_network(recipe: Recipe) -> nn.Module:
     return network
 
 
+def check_colours(network: Mapping[str, Any], colours: int, *, of: str, way_out: str) -> None:
+    """Check that a network takes measurements of so many channels.
+
+    Args:
+        network: its name and options, as in [network] of a recipe.
+        colours: channels of the measurements.
+        of: what has them, for the message.
+        way_out: its last sentence.
+
+    Raises:
+        ParameterError: it takes another number of channels.
+    """
+    built = build_empty(**network)
+    channels = getattr(built, "channels", colours)
+    takes_grey = hasattr(built, "estimates")  # as equal colours
+    if channels not in (0, colours) and not (takes_grey and colours == 1):  # 0 is any number
+        raise ParameterError(
+            f"`channels` of the network '{network['name']}' ({channels}) must be {colours}, as many as the "
+            f"measurements of {of} have. {way_out}"
+        )
+
+
 def stored_psf(recipe: Recipe, calibration: Calibration) -> Psf | None:
     """The PSF (1, C, H, W) for a network that takes it as stored; ``None`` for the others, which take the samples'.
 

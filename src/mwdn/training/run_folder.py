@@ -10,7 +10,7 @@ from typing import Any
 
 from torch import Tensor
 
-from mwdn.errors import CheckpointError, ParameterError
+from mwdn.errors import CheckpointError, ParameterError, shown
 from mwdn.io.files import as_parameter_error, check_folder, refuse_foreign, write_text
 from mwdn.io.reading import LOG_BYTES, TEXT_BYTES, open_regular, read_bytes
 from mwdn.runtime import distributed
@@ -112,12 +112,12 @@ class RunFolder:
 
     def _check(self, owner: str) -> None:
         try:
-            same = _with_current_names(json.loads(owner)) == json.loads(json.dumps(self.identity))
+            difference = _difference(_with_current_names(json.loads(owner)), json.loads(json.dumps(self.identity)))
         except (ValueError, RecursionError):
-            same = False
-        if not same:
+            difference = "its record is damaged"
+        if difference:
             raise CheckpointError(
-                f"`{self.path}` holds a run of another recipe or PSF, or on other pairs. "
+                f"`{self.path}` holds a run of another recipe or PSF, or on other pairs: {difference}. "
                 "Choose another folder, `--out`, or remove it."
             )
 
@@ -175,6 +175,17 @@ class RunFolder:
         """
         with as_parameter_error(self.path, MAKE_ROOM), (self.path / "log.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
+
+
+def _difference(there: Any, here: Any, name: str = "") -> str:  # noqa: ANN401
+    """The first setting in which two identities differ, and its values; empty if they are equal."""
+    if there == here:
+        return ""
+    if not (isinstance(there, dict) and isinstance(here, dict)):
+        return f"`{name.removeprefix('recipe.')}` is {shown(there)} there, {shown(here)} here"
+    # From the end: other pairs change the number of validations in the recipe, too.
+    keys = [key for key in reversed(here | there) if there.get(key) != here.get(key)]
+    return _difference(there.get(keys[0]), here.get(keys[0]), f"{name}.{keys[0]}".removeprefix("."))
 
 
 def _with_current_names(identity: Any) -> Any:  # noqa: ANN401

@@ -97,6 +97,7 @@ class SelfSupervisedTask:
 
     columns: ClassVar[tuple[str, str]] = "measurement", "through the camera"
     cache: ClassVar[None] = None
+    fingerprint: ClassVar[str] = ""
 
     @property
     def name(self) -> str:

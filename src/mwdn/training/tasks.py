@@ -46,6 +46,10 @@ class Task(Protocol):
     def name(self) -> str:
         """Identifies the source of the samples when a run resumes."""
 
+    @property
+    def fingerprint(self) -> str:
+        """Hash of what the samples show; empty if the name has it."""
+
     def check(self, network: nn.Module) -> None:
         """Raise an `MwdnError` if the network cannot learn the task."""
 
@@ -83,6 +87,11 @@ class SupervisedTask:
     def name(self) -> str:
         """The name of the pairs."""
         return self.pairs.name
+
+    @property
+    def fingerprint(self) -> str:
+        """That of the pairs."""
+        return self.pairs.fingerprint
 
     def check(self, network: nn.Module) -> None:
         """Check that the network can use the cache."""

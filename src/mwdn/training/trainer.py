@@ -87,6 +87,7 @@ class Trainer:
         self.start = {name: value.clone() for name, value in weights if name not in MEASURED_BUFFERS}
         self.gradient = Gradient(self.network, task, self.distance, self.schedule, self.device)
         self.step, self.best = 0, -math.inf
+        self.fingerprint, self.same_samples = task.fingerprint, True
 
         # 2. Resume a run that was stopped.
         self.identity = run_identity(recipe, calibration.psf_hash, task.name)
@@ -100,6 +101,11 @@ class Trainer:
         self.validator.reconstruct_captures(self.average)
         if distributed.rank() == 0:
             self.folder.claim(self.step)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the schedule has come to its end."""
+        return self.step >= self.schedule.steps or self.lr_schedule.finished
 
     def run(
         self, callback: Callable[[Report], None] = lambda report: None, *, samples: Progress = lambda done, total: None
@@ -151,7 +157,7 @@ class Trainer:
 
     def _train(self, callback: Callable[[Report], None]) -> None:
         with deferred_interrupt() as interrupted:
-            while self.step < self.schedule.steps and not self.lr_schedule.finished:
+            while not self.finished:
                 self._step(callback)
                 if distributed.all_reduce_sum(torch.tensor(int(interrupted()))):
                     self._save_state()
@@ -270,7 +276,7 @@ class Trainer:
         if distributed.rank() > 0:
             return
         header = {"identity": json.dumps(self.identity), "step": str(self.step), "best": repr(self.best)}
-        header["lr_schedule"] = json.dumps(self.lr_schedule.state())
+        header |= {"lr_schedule": json.dumps(self.lr_schedule.state()), "samples": self.fingerprint}
         with as_parameter_error(self.out, MAKE_ROOM):
             path = self.folder.state
             write_state(path, header, network=self.network, average=self.average, optimiser=self.optimiser)
@@ -285,5 +291,6 @@ class Trainer:
         except (KeyError, RuntimeError) as error:
             raise damaged(self.folder.state, "a part is missing") from error
         self.step, self.best = int(header["step"]), float(header["best"])
+        self.same_samples = header.get("samples", self.fingerprint) == self.fingerprint
         saved_schedule = header.get("lr_schedule") or header["course"]  # the second is its former name
         self.lr_schedule = make_lr_schedule(self.recipe, **json.loads(saved_schedule))

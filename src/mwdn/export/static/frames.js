@@ -49,6 +49,51 @@ function combine(image, other, what, operation) {
   return { ...image, data: image.data.map((value, index) => operation(value, other.data[index % other.data.length])) };
 }
 
+// As `FrameFormat.saturated`: sensors of 10, 12 or 14 bits may use the lower bits of 16.
+function isSaturated({ data, maximum }, depth) {
+  if (data instanceof Float32Array || data instanceof Float64Array) return false;
+  const largest = data.reduce((a, b) => Math.max(a, b), 0);
+  if (!depth && maximum === 65535 && [1023, 4095, 16383].includes(largest)) return true;
+  return largest > 0.98 * (depth ? 2 ** depth - 1 : maximum);
+}
+
+// Least saturated value of a plane if it has a plateau at its maximum, as `mwdn.optics.saturation.saturated_pixels`.
+function plateauOf(values, width) {
+  const most = values.reduce((a, b) => Math.max(a, b), -Infinity);
+  const [low, high] = [0.98, 0.995].map((part) => Math.fround(Math.fround(part) * most));
+  const sample = values.filter((_, place) => (place % width) % 2 === 0);
+  const above = sample.filter((value) => value >= low).length;
+  const at = sample.filter((value) => value >= high).length;
+  return at > above - at && above > at && at >= 5e-4 * sample.length ? high : Infinity;
+}
+
+// Saturated pixels of a corrected image become a plateau again, as `mwdn.optics.saturation.keep_plateau`.
+function keepPlateau(saturating, corrected) {
+  const { width, height, channels } = corrected;
+  const plane = width * height;
+  const data = corrected.data.slice();
+  const aroundOf = (place) => {
+    const [y, x] = [Math.floor(place / width), place % width];
+    const places = [];
+    for (let row = Math.max(y - 1, 0); row <= Math.min(y + 1, height - 1); row += 1) {
+      for (let column = Math.max(x - 1, 0); column <= Math.min(x + 1, width - 1); column += 1) places.push(row * width + column);
+    }
+    return places;
+  };
+  for (let channel = 0; channel < channels; channel += 1) {
+    const [before, after] = [saturating, corrected].map((image) => image.data.subarray(channel * plane, (channel + 1) * plane));
+    const least = plateauOf(before, width);
+    const known = before.map((value, place) => value >= least && after[place] !== value && after[place] > value / 2
+      && aroundOf(place).filter((near) => before[near] >= least).length > 1);
+    let bound = Infinity;
+    known.forEach((isKnown, place) => {
+      if (isKnown) bound = Math.min(bound, aroundOf(place).reduce((most, near) => (known[near] ? Math.max(most, after[near]) : most), -Infinity));
+    });
+    for (let place = 0; place < plane; place += 1) data[channel * plane + place] = Math.min(after[place], bound);
+  }
+  return { ...corrected, data };
+}
+
 // Hot pixels become the mean of good neighbours: pairs of a pixel and its neighbours.
 function repair(image, hotPixels) {
   const plane = image.width * image.height;
@@ -138,9 +183,10 @@ export function flip(image, { rows = false, columns = false }) {
 }
 
 export function toMeasurement(frame, format) {
-  let image = normalise(frame, format);
-  image = combine(image, format.offset, "the dark or ambient frame", (value, dark) => value - dark);
-  image = combine(image, format.flat, "the flat field", (value, flat) => value / flat);
+  const light = normalise(frame, format);
+  let image = combine(light, format.offset, "the dark or ambient frame", (value, dark) => value - dark);
+  if (isSaturated(frame, format.bit_depth)) image = keepPlateau(light, image);
+  image = keepPlateau(image, combine(image, format.flat, "the flat field", (value, flat) => value / flat));
   if (format.hot_pixels) image = repair(image, format.hot_pixels);
   if (format.crop) image = cropCentre(image, format.crop, format.mosaic ? 2 : 1);
   if (format.mosaic) image = demosaic(image, format.mosaic);
