@@ -53,7 +53,7 @@ with a third fewer iterations at full size."""
 
 COARSE_LEVELS = (
     Level(8, 18, Penalties(0.05, 2.0, 0.12), 0.005, relaxation=1.85, lit=True),
-    Level(4, 10, Penalties(0.3, 0.0, 0.6), relaxation=1.7),
+    Level(4, 11, Penalties(0.3, 0.0, 0.5), relaxation=1.75),
     Level(2, 8, Penalties(0.2, 0.0, 0.9)),
 )
 """Levels of a network whose bank restores the detail (`mwdn.networks.wiener_bank`). Total variation at the coarsest
