@@ -15,7 +15,7 @@ from mwdn.capture.patterns import point
 from mwdn.capture.recipe import read_capture_recipe
 from mwdn.capture.session import Session
 from mwdn.capture.set_up import open_camera, open_lamp
-from mwdn.errors import CameraError
+from mwdn.errors import CameraError, ParameterError
 from mwdn.optics.displacement import displacement
 
 TABLES = {
@@ -127,3 +127,10 @@ def test_a_faint_point_is_refused_with_its_reason(tmp_path, recipe, rig, point, 
     recipe = replace(recipe, rig=replace(recipe.rig, **rig), point=replace(recipe.point, **point))
     with pytest.raises(CameraError, match=said):
         session(recipe, tmp_path / "captured.h5")[1].run()
+
+
+def test_a_point_that_is_larger_than_the_display_is_refused_before_anything_is_recorded(tmp_path, recipe):
+    recipe = replace(recipe, point=replace(recipe.point, size_cm=100.0))
+    with pytest.raises(ParameterError, match="size_cm"):
+        session(recipe, tmp_path / "captured.h5")
+    assert not (tmp_path / "captured.h5").exists()

@@ -48,7 +48,10 @@ def point(screen: Screen, size_cm: float = 0.1, at_cm: tuple[float, float] = (0.
         side = max(round(size_cm * per_cm), 1)
         first = round(length / 2 + at * per_cm - side / 2)
         if not 0 <= first <= length - side:
-            raise ParameterError(f"`at_cm` {at_cm} must be on the display, {screen.width_cm} x {screen.height_cm} cm.")
+            raise ParameterError(
+                f"A point of `size_cm` {size_cm:g} at {at_cm} cm must be on the display, {screen.width_cm} x "
+                f"{screen.height_cm} cm. Make it smaller."
+            )
         edges.append(slice(first, first + side))
     canvas[edges[1], edges[0]] = 255
     return canvas

@@ -14,7 +14,7 @@ from mwdn.capture.captured_pairs import CapturedPairs, create_captured, displaye
 from mwdn.capture.continuation import ROUNDING, check_continued, describe_place
 from mwdn.capture.display import Display
 from mwdn.capture.gamma import fit_gamma
-from mwdn.capture.patterns import grey, grey_levels, pattern
+from mwdn.capture.patterns import grey, grey_levels, pattern, point
 from mwdn.capture.photograph_list import list_photographs, read_photograph
 from mwdn.capture.point_frames import Shooting, record_point
 from mwdn.capture.recipe import CaptureRecipe
@@ -73,6 +73,8 @@ class Session:
         self._screen: Screen = display.screen
         self._place: Place = place_picture(self._screen, recipe.pictures.size, recipe.pictures.fill)
         self._gamma = 1.0
+        if recipe.point.frames and not recipe.point.lamp:
+            point(self._screen, recipe.point.size_cm)  # refuses one that is too large before anything is recorded
 
     def run(self) -> int:
         """Capture what is left; returns how many pairs the file has.
@@ -276,8 +278,8 @@ class Session:
             return
         every = self.recipe.session.references_every
         height, width = self.recipe.pictures.size
-        point = self.recipe.point
-        references = (2 * math.ceil(count / every) if every else 0) + (2 * point.exposures + 3) * point.frames
+        table = self.recipe.point
+        references = (2 * math.ceil(count / every) if every else 0) + (2 * table.exposures + 3) * table.frames
         needed = ROOM * (
             count * (self._first.array.nbytes + height * width * 6) + references * self._first.array.nbytes
         )
