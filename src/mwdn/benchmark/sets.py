@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -220,7 +221,7 @@ def open_dataset(name: str, recipe: DatasetRecipe, folder: Path, device: torch.d
     check_pairs(file, calibration.psf)
     rows = _rows(recipe, len(file), simulates)
     refinement = Refinement() if simulates else missing_refinement(file, calibration.refinement)
-    pairs = RecordedPairs(file, rows["test"], calibration.psf.to(device), recipe.seed, refinement=refinement)
+    pairs = partial(RecordedPairs, file, psf=calibration.psf.to(device), seed=recipe.seed, refinement=refinement)
     training = None if recipe.trained_on else _training(recipe, calibration, pairs, rows, device)
     test = RefinedPairs(Part(file, rows["test"]), refinement)
     return Dataset(name, recipe, calibration, test, training, identity, file.measurement_shape[2])
@@ -283,11 +284,11 @@ def _rows(recipe: DatasetRecipe, count: int, simulates: bool) -> dict[str, range
 def _training(
     recipe: DatasetRecipe,
     calibration: Calibration,
-    pairs: RecordedPairs,
+    pairs: Callable[..., RecordedPairs],
     rows: dict[str, range | list[int]],
     device: torch.device,
 ) -> tuple[Samples, RecordedPairs]:
-    validation = replace(pairs, rows=rows["validation"], shuffled=False, poses={})
+    validation = pairs(rows["validation"], shuffled=False)
     if not recipe.pairs and not recipe.train:
         return simulated_pairs(recipe, calibration, Photographs(recipe.photos).split(HELD_OUT)[0], device), validation
-    return replace(pairs, rows=rows["train"]), validation
+    return pairs(rows["train"]), validation

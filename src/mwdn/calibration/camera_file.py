@@ -161,8 +161,8 @@ def pop_sensor(camera: dict[str, Any]) -> Sensor | None:
     Raises:
         ParameterError: a number is out of its range.
     """
-    names = ("electrons_per_count", "read_noise_electrons", "full_well_electrons", "black_level")
-    gain, read_noise, full_well, black = (camera.pop(name, None) for name in names)
+    names = ("electrons_per_count", "read_noise_electrons", "full_well_electrons", "black_level", "dark_exposure")
+    gain, read_noise, full_well, black, _ = (camera.pop(name, None) for name in names)
     if read_noise is None or full_well is None:
         return None
     steps = full_well / gain if gain else 2**12 - 1  # the numbers between black and saturation

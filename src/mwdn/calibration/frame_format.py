@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 import torch
@@ -113,6 +113,19 @@ class FrameFormat:
             raw = read_raw(path)
             return raw.frame, self.with_mosaic(raw.mosaic, of=f"`{path}`")
         return read_frame(path, bgr=self.bgr), self
+
+    def completed(
+        self, bit_depth: str | int | float | None, mosaic: str | int | float | None, *, of: str
+    ) -> "FrameFormat":
+        """The format with what frames state themselves: their bit depth, unless it is given, and their mosaic.
+
+        Args:
+            bit_depth: of the frames, as an attribute of a file or a camera states it; ``None`` if it does not.
+            mosaic: the same; empty for none.
+            of: as for `with_mosaic`, which raises.
+        """
+        frames = self.with_mosaic(cast("Mosaic | None", mosaic or None), of=of)
+        return frames if frames.bit_depth or not bit_depth else replace(frames, bit_depth=int(bit_depth))
 
     def with_mosaic(self, stated: Mosaic | None, *, of: str) -> "FrameFormat":
         """The format with the mosaic that frames state themselves.

@@ -83,7 +83,7 @@ class Calibration:
             MwdnError: as for `from_file`, and for a camera file with wrong keys or values.
         """
         camera = read_camera(path)
-        sha256, own_psf, _ = camera.pop("psf_sha256", ""), camera["psf"], camera.pop("dark_exposure", None)
+        sha256, own_psf = camera.pop("psf_sha256", ""), camera["psf"]
         camera = with_changes(camera, options)
         terms = Refinement(**{name: camera.pop(name) for name in TERMS if name in camera})
         if camera["psf"] == own_psf:

@@ -114,10 +114,7 @@ def _extracted(path: Path, folder: Path, given: BenchFrames) -> BenchFrames:
         capture_exposure=usual,
         **own,
     )
-    frames = given.frames
-    if frames.bit_depth is None and "bit_depth" in attributes:
-        frames = replace(frames, bit_depth=int(attributes["bit_depth"]))
-    frames = frames.with_mosaic(attributes.get("mosaic") or None, of=f"`{path}`")  # type: ignore[arg-type]
+    frames = given.frames.completed(attributes.get("bit_depth"), attributes.get("mosaic"), of=f"`{path}`")
     return BenchFrames([file for name in points for file in groups[name]], photographs, frames)
 
 

@@ -24,6 +24,7 @@ from mwdn.optics.distortion import displacement_px
 from mwdn.optics.shading import shading
 from mwdn.runtime import distributed
 from mwdn.training import experiment
+from mwdn.training.network import takes_channels
 from mwdn.training.recipe import read_recipe
 from mwdn.training.report import Report
 from mwdn.training.tables import Sheet
@@ -88,8 +89,8 @@ def train(  # noqa: PLR0913
                 device=device,
                 exclude=camera.roles,
             )
-        takes_colours = getattr(trainer.network, "channels", 0) == 3 and not hasattr(trainer.network, "estimates")
-        if is_first and photos is not None and takes_colours and not experiment_recipe.cameras.sizes:
+        one_camera = photos is not None and not experiment_recipe.cameras.sizes
+        if is_first and one_camera and not takes_channels(trainer.network, 1):
             _note_colours(calibration, "--grey --network.channels 1")
         if is_first and pairs_file is not None:
             warn(other_camera(PairFile(pairs_file), calibration))

@@ -174,8 +174,7 @@ class LivePictures:
 
     def _calibration(self, frame: Frame) -> Calibration:
         """The calibration, with what the camera says about its frames, and the room's light."""
-        frames = self._given.frames.with_mosaic(frame.mosaic, of="the camera")
-        frames = replace(frames, bit_depth=frames.bit_depth or frame.bit_depth)
+        frames = self._given.frames.completed(frame.bit_depth, frame.mosaic, of="the camera")
         ambient = self._given.ambient if self._ambient is None else frames.normalise(self._ambient.array)
         return replace(self._given, frames=frames, ambient=ambient)
 

@@ -15,7 +15,6 @@ from mwdn.data.pair_writer import NAMES
 from mwdn.data.pairs import PairFile
 from mwdn.errors import ImageError, ParameterError
 from mwdn.io.images import srgb_decode
-from mwdn.io.raw import Mosaic
 from mwdn.types import Frame, Image, Measurement
 
 _ADVICE = "Capture it again: `mwdn capture`."
@@ -48,10 +47,7 @@ class CapturedPairs:
             self.picture_size = file.scene_shape[0], file.scene_shape[1]
         if not self._count:
             raise ImageError(f"`{path}` holds no pair. {_ADVICE}")
-        frames = calibration.frames
-        if frames.bit_depth is None and "bit_depth" in attributes:
-            frames = replace(frames, bit_depth=int(attributes["bit_depth"]))
-        frames = frames.with_mosaic(_as_mosaic(attributes.get("mosaic")), of=f"`{path}`")
+        frames = calibration.frames.completed(attributes.get("bit_depth"), attributes.get("mosaic"), of=f"`{path}`")
         self.calibration = _with_ambient(path, replace(calibration, frames=frames))
         self.display_gamma = as_gamma(display_gamma)
         self._file: Any = None
@@ -141,7 +137,3 @@ def as_gamma(gamma: float | int | str) -> float | str:
     if not 0.5 <= power <= 4:
         raise ParameterError(f"`display_gamma` ({gamma}) must be srgb, or a power from 0.5 to 4.")
     return power
-
-
-def _as_mosaic(text: object) -> Mosaic | None:
-    return str(text) if text else None  # type: ignore[return-value]

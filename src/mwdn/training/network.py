@@ -49,6 +49,12 @@ def build_network(recipe: Recipe) -> nn.Module:
     return network
 
 
+def takes_channels(network: nn.Module, colours: int) -> bool:
+    """Whether a network takes measurements of so many channels; one with `estimates` takes grey as equal colours."""
+    channels = getattr(network, "channels", colours)
+    return channels in (0, colours) or (colours == 1 and hasattr(network, "estimates"))  # 0 is any number
+
+
 def check_colours(network: Mapping[str, Any], colours: int, *, of: str, way_out: str) -> None:
     """Check that a network takes measurements of so many channels.
 
@@ -62,11 +68,9 @@ def check_colours(network: Mapping[str, Any], colours: int, *, of: str, way_out:
         ParameterError: it takes another number of channels.
     """
     built = build_empty(**network)
-    channels = getattr(built, "channels", colours)
-    takes_grey = hasattr(built, "estimates")  # as equal colours
-    if channels not in (0, colours) and not (takes_grey and colours == 1):  # 0 is any number
+    if not takes_channels(built, colours):
         raise ParameterError(
-            f"`channels` of the network '{network['name']}' ({channels}) must be {colours}, as many as the "
+            f"`channels` of the network '{network['name']}' ({built.channels}) must be {colours}, as many as the "
             f"measurements of {of} have. {way_out}"
         )
 

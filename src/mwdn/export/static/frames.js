@@ -69,6 +69,7 @@ function plateauOf(values, width) {
 
 // Saturated pixels of a corrected image become a plateau again, as `mwdn.optics.saturation.keep_plateau`.
 function keepPlateau(saturating, corrected) {
+  if (corrected === saturating) return corrected; // nothing was corrected
   const { width, height, channels } = corrected;
   const plane = width * height;
   const data = corrected.data.slice();
