@@ -16,7 +16,6 @@ References:
 """
 
 import hashlib
-import io
 import os
 import struct
 import sys
@@ -28,7 +27,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from mwdn.data.hdf5 import as_damage, open_hdf5_header, read_attributes
+from mwdn.data.hdf5 import CheckedFile, as_damage, open_hdf5_header, read_attributes
 from mwdn.errors import ImageError
 from mwdn.io.files import check_regular
 from mwdn.io.reading import open_regular, read_bytes
@@ -47,17 +46,13 @@ _DIGEST = 16
 Changes = list[tuple[int, bytes]]
 
 
-class JournalledFile(io.FileIO):
-    """The file that HDF5 writes to: bytes before `committed` change only in `apply`.
-
-    An error of the disk is kept for `check`, as in `mwdn.data.hdf5.CheckedFile`, and nothing is written after it.
-    """
+class JournalledFile(CheckedFile):
+    """The file that HDF5 writes to: bytes before `committed` change only in `apply`."""
 
     def __init__(self, path: Path, mode: str) -> None:
         super().__init__(path, mode)
         self.committed = self.seek(0, os.SEEK_END)
         self.changes: Changes = []
-        self.error: BaseException | None = None
         self.seek(0)
 
     def write(self, data: Any, /) -> int:  # noqa: ANN401
@@ -68,13 +63,7 @@ class JournalledFile(io.FileIO):
         if held:
             self.changes.append((place, bytes(held)))
             self.seek(place + len(held))
-        rest = given[len(held) :]
-        try:
-            while rest.nbytes and self.error is None:
-                rest = rest[super().write(rest) :]  # a disk that is almost full writes only a part
-        except BaseException as error:
-            self.error = error
-        return given.nbytes
+        return len(held) + super().write(given[len(held) :])
 
     def readinto(self, buffer: Any, /) -> int:  # noqa: ANN401
         """Read bytes as they will be after the commit."""
@@ -90,25 +79,18 @@ class JournalledFile(io.FileIO):
     def truncate(self, size: int | None = None, /) -> int:
         """Cut or extend the part beyond `committed`."""
         wanted = self.tell() if size is None else size
-        try:
-            if self.error is None and wanted >= self.committed:
-                super().truncate(wanted)
-        except BaseException as error:
-            self.error = error
-        return wanted
-
-    def check(self) -> None:
-        """Raise the first error."""
-        if self.error is not None:
-            raise self.error
+        return super().truncate(wanted) if wanted >= self.committed else wanted
 
     def apply(self) -> None:
-        """Write the changes that were held back; the appended bytes are then committed, too."""
+        """Write the changes that were held back; the appended bytes are then committed, too.
+
+        Raises:
+            OSError: the disk has refused these bytes, or earlier ones.
+        """
         for place, data in self.changes:
             self.seek(place)
-            rest = memoryview(data)
-            while rest:
-                rest = rest[super().write(rest) :]
+            super().write(data)
+        self.check()
         self.changes = []
         self.committed = self.seek(0, os.SEEK_END)
 
