@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from mwdn.capture.recording import COLUMNS, FrameRows, add_rows, set_format, write_row
+from mwdn.capture.recording import COLUMNS, FrameRows, set_format
 from mwdn.capture.screen import Picture
 from mwdn.capture.source import Frame
-from mwdn.data.hdf5 import as_damage, find_rows, open_hdf5
+from mwdn.data.hdf5 import add_rows, as_damage, find_rows, open_hdf5, write_row
 from mwdn.data.journal import Growing, create_growing, open_growing
 from mwdn.data.pair_writer import VERSION, VERSION_KEY
 from mwdn.errors import ImageError, ParameterError

@@ -10,7 +10,15 @@ from typing import Any
 import numpy as np
 
 from mwdn.capture.source import TIMEOUT_S, CameraSource, Frame, check_like
-from mwdn.data.hdf5 import as_damage, find_rows, open_hdf5, open_hdf5_header, read_attributes
+from mwdn.data.hdf5 import (
+    add_rows,
+    as_damage,
+    find_rows,
+    open_hdf5,
+    open_hdf5_header,
+    read_attributes,
+    write_row,
+)
 from mwdn.data.journal import Growing, create_growing
 from mwdn.errors import CameraError, ImageError
 from mwdn.io.files import as_image_error
@@ -109,24 +117,6 @@ class FrameRows:
         write_row(self.data, frame.array)
         for key, column in self.columns.items():
             write_row(column, getattr(frame, key))
-
-
-def add_rows(file: Any, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Any:  # noqa: ANN401
-    """A data set that grows, one chunk for each array and 1,024 numbers for scalars; an existing one is returned."""
-    if name in file:
-        return file[name]
-    chunk = (1, *shape) if shape else (1024,)
-    return file.create_dataset(name, (0, *shape), dtype, maxshape=(None, *shape), chunks=chunk, track_times=False)
-
-
-def write_row(data: Any, value: Any) -> None:  # noqa: ANN401
-    """Append one row."""
-    number = len(data)
-    data.resize(number + 1, axis=0)
-    if data.ndim > 1:  # past HDF5's cache of chunks, three times as fast
-        data.id.write_direct_chunk((number, *[0] * (data.ndim - 1)), np.ascontiguousarray(value))
-    else:
-        data[number] = value
 
 
 def set_format(attributes: Any, frame: Frame) -> None:  # noqa: ANN401

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from mwdn.data.hdf5 import add_rows
 from mwdn.data.pair_writer import PairWriter, Shape
 from mwdn.types import Frame
 
@@ -26,7 +27,7 @@ class AuthorsWriter(PairWriter):
 
     def _set_up(self, file: Any) -> None:  # noqa: ANN401
         for name, (height, width, channels) in self._shapes.items():
-            self._data[name] = self._make_rows(file, AUTHORS_NAMES[name], (channels, height, width))
+            self._data[name] = add_rows(file, AUTHORS_NAMES[name], (channels, height, width), self.dtype)
 
     def _stored(self, pixels: Frame) -> Frame:
         return pixels[..., ::-1].transpose(2, 0, 1)

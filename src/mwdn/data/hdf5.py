@@ -8,6 +8,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mwdn.errors import ImageError, MwdnError, reason
 from mwdn.io.reading import open_regular
 
@@ -70,6 +72,24 @@ def create_hdf5(path: Path) -> Iterator[tuple[Any, CheckedFile]]:
         with h5py.File(disk, "w") as file:
             yield file, disk
         disk.check()
+
+
+def add_rows(file: Any, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Any:  # noqa: ANN401
+    """A data set that grows, one chunk for each array and 1,024 numbers for scalars; an existing one is returned."""
+    if name in file:
+        return file[name]
+    chunk = (1, *shape) if shape else (1024,)
+    return file.create_dataset(name, (0, *shape), dtype, maxshape=(None, *shape), chunks=chunk, track_times=False)
+
+
+def write_row(data: Any, value: Any) -> None:  # noqa: ANN401
+    """Append one row."""
+    number = len(data)
+    data.resize(number + 1, axis=0)
+    if data.ndim > 1:  # past HDF5's cache of chunks: on the disk at once, in a third of the time
+        data.id.write_direct_chunk((number, *[0] * (data.ndim - 1)), np.ascontiguousarray(value))
+    else:
+        data[number] = value
 
 
 @contextmanager

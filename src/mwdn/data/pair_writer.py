@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mwdn.data.hdf5 import PICTURE_BYTES, CheckedFile, create_hdf5
+from mwdn.data.hdf5 import PICTURE_BYTES, CheckedFile, add_rows, create_hdf5, write_row
 from mwdn.errors import ImageError, ParameterError, ShapeError
 from mwdn.io.files import as_image_error, atomic
 from mwdn.types import Frame
@@ -98,15 +98,9 @@ class PairWriter:
         """Make the data sets of an `h5py.File`, without rows."""
         file.attrs.update({VERSION_KEY: VERSION, **self._attributes})
         for name, shape in self._shapes.items():
-            self._data[name] = self._make_rows(file, name, shape)
+            self._data[name] = add_rows(file, name, shape, self.dtype)
         if self._psf is not None:
             file.create_dataset("psf", data=self._psf, track_times=False)
-
-    def _make_rows(self, file: Any, name: str, shape: tuple[int, ...]) -> Any:  # noqa: ANN401
-        """A data set (0, *shape) that can grow, one chunk a row."""
-        return file.create_dataset(
-            name, (0, *shape), self.dtype, maxshape=(None, *shape), chunks=(1, *shape), track_times=False
-        )
 
     def _stored(self, pixels: Frame) -> Frame:
         """A sample (H, W, C) in the axes and channels of the file."""
@@ -147,9 +141,7 @@ class PairWriter:
 
     def _write(self, pair: dict[str, Frame]) -> None:
         for name, pixels in pair.items():
-            self._data[name].resize(self._length + 1, axis=0)
-            # Bypass HDF5's cache of chunks, which would write the pair later; also three times as fast.
-            self._data[name].id.write_direct_chunk((self._length, 0, 0, 0), np.ascontiguousarray(self._stored(pixels)))
+            write_row(self._data[name], self._stored(pixels))
         if self._disk is not None:
             self._disk.check()
 
