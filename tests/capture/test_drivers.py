@@ -116,7 +116,7 @@ def test_harvesters_reads_a_gentl_producer(producer):
     with open_source("harvesters:0", cti=str(producer)) as camera:
         frame = check_stream(camera, is_black=True)[-1]  # this producer draws in RGBa8 alone
         assert (frame.array.shape, frame.array.dtype, frame.bit_depth) == ((400, 400, 1), np.uint8, 8)
-        with pytest.raises(CameraError, match="exposure_s"):
+        with pytest.raises(CameraError, match=r"`exposure_s` \(0\.1\)"):
             camera.configure(exposure_s=0.1)
     with pytest.raises(CameraError, match="names 3 of 3"), open_source("harvesters:Viky", cti=str(producer)):
         pass

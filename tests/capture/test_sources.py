@@ -52,6 +52,22 @@ def test_wrong_strings_are_named(tmp_path):
         pass
 
 
+@pytest.mark.parametrize("close", [True, False])
+def test_errors_of_a_drivers_library_are_camera_errors(close):
+    with open_source("rig,height=32,width=48") as camera:
+        with (
+            pytest.raises(CameraError, match=r"was disconnected: no reply\. Check its cable\.$"),
+            camera.as_camera_error("was disconnected", "Check its cable.", close=close),
+        ):
+            raise OSError("no reply")
+        if not close:
+            camera.read()
+            with pytest.raises(CameraError, match=r"^it is silent$"), camera.as_camera_error("", "", close=False):
+                raise CameraError("it is silent")
+        with pytest.raises(CameraError, match="open"):
+            camera.read()
+
+
 def test_the_rig_is_a_camera_like_any_other():
     with open_source("rig,height=32,width=48,seed=5,bit_depth=8") as camera:
         assert isinstance(camera, CameraSource)

@@ -2,8 +2,7 @@
 
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from functools import cache
 from importlib import util
 from importlib.machinery import PathFinder
@@ -12,7 +11,7 @@ from typing import Any
 from mwdn.capture.pixel_formats import PixelFormat, choose_format, unpack
 from mwdn.capture.source import TIMEOUT_S, CameraSource, Frame
 from mwdn.capture.sources import load_driver
-from mwdn.errors import CameraError, reason
+from mwdn.errors import CameraError
 
 BUFFERS = 5
 """Frames that Aravis can hold: more do not help, since only the newest is used."""
@@ -45,7 +44,7 @@ class AravisCamera(CameraSource):
         if self.address == "fake":
             library.enable_interface("Fake")
         name = {"first": None, "fake": "Fake_1"}.get(self.address, self.address)
-        with self._as_camera_error("cannot be opened", "Check its cable and address: `arv-tool-0.8`."):
+        with self.as_camera_error("cannot be opened", "Check its cable and address: `arv-tool-0.8`."):
             self._camera = library.Camera.new(name)
             self._camera.get_device().connect("control-lost", self._on_lost)
             self._start()
@@ -91,11 +90,11 @@ class AravisCamera(CameraSource):
             if value is None:
                 continue
             scale = 1e6 if label == "exposure_s" else 1.0
-            with self._as_camera_error(f"has no setting `{label}`", "Leave it out."):
+            with self.as_camera_error(f"has no setting `{label}`", "Leave it out.", close=False):
                 low, high = (bound / scale for bound in bounds())
             if not low <= value <= high:
                 raise CameraError(f"{self.name} takes `{label}` ({value:g}) from {low:g} to {high:g}.")
-            with self._as_camera_error(f"refuses `{label}` ({value:g})", "Choose another value."):
+            with self.as_camera_error(f"refuses `{label}` ({value:g})", "Choose another value.", close=False):
                 set_value(value * scale)
         self._settings()
 
@@ -158,18 +157,6 @@ class AravisCamera(CameraSource):
 
     def _on_lost(self, *_: object) -> None:
         self._lost = True
-
-    @contextmanager
-    def _as_camera_error(self, what: str, advice: str) -> Iterator[None]:
-        try:
-            yield
-        except CameraError:
-            self.close()
-            raise
-        except Exception as error:  # GLib.Error; its module is not always installed
-            if self._stream is None:
-                self.close()
-            raise CameraError(f"{self.name} {what}: {reason(error)}. {advice}") from error
 
 
 @cache

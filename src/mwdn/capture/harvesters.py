@@ -10,7 +10,7 @@ from typing import Any
 from mwdn.capture.pixel_formats import choose_format, unpack
 from mwdn.capture.source import TIMEOUT_S, CameraSource, Frame
 from mwdn.capture.sources import load_driver
-from mwdn.errors import CameraError, reason
+from mwdn.errors import CameraError
 
 PRODUCERS = "GENICAM_GENTL64_PATH"
 """Variable in which installers of producers put their folders (GenTL standard 1.5, section 3.1)."""
@@ -39,20 +39,12 @@ class HarvestersCamera(CameraSource):
         core = load_driver("harvesters", "harvesters.core")
         self.close()
         self._harvester = core.Harvester()
-        try:
+        with self.as_camera_error("cannot be opened", "Close other programs that use it; check its cable."):
             for file in self._producers():
                 self._harvester.add_file(str(file), check_existence=True, check_validity=True)
             self._harvester.update()
             self._acquirer = self._harvester.create(self._index())
             self._start()
-        except CameraError:
-            self.close()
-            raise
-        except Exception as error:  # of the producer, of any kind
-            self.close()
-            raise CameraError(
-                f"{self.name} cannot be opened: {reason(error)}. Close other programs that use it; check its cable."
-            ) from error
 
     def _producers(self) -> list[Path]:
         if self.cti is not None:
@@ -98,15 +90,10 @@ class HarvestersCamera(CameraSource):
         if self._acquirer is None:
             raise self.not_open()
         nodes = self._acquirer.remote_device.node_map
-        for label, node, value in (
-            ("exposure_s", "ExposureTime", None if exposure_s is None else exposure_s * 1e6),
-            ("gain", "Gain", gain),
-        ):
+        for label, node, value, unit in (("exposure_s", "ExposureTime", exposure_s, 1e6), ("gain", "Gain", gain, 1.0)):
             if value is not None:
-                try:
-                    getattr(nodes, node).value = value
-                except Exception as error:  # of the producer, of any kind
-                    raise CameraError(f"{self.name} refuses `{label}` ({value:g}): {reason(error)}.") from error
+                with self.as_camera_error(f"refuses `{label}` ({value:g})", "Choose another value.", close=False):
+                    getattr(nodes, node).value = value * unit
 
     def _setting(self, node: str) -> float:
         """A setting of the camera; NaN if it has none."""
@@ -146,10 +133,8 @@ class HarvestersCamera(CameraSource):
 
     def _fetch(self, wait_s: float) -> Any:  # noqa: ANN401
         """A filled buffer, or ``None`` after this time."""
-        try:
+        with self.as_camera_error("was disconnected", "Check its cable and power.", close=False):
             return self._acquirer.try_fetch(timeout=max(wait_s, 1e-3))
-        except Exception as error:  # of the producer, of any kind
-            raise CameraError(f"{self.name} was disconnected: {reason(error)}. Check its cable and power.") from error
 
     def close(self) -> None:
         """Stop, and release the camera and its producers."""

@@ -34,18 +34,10 @@ class PiCamera(CameraSource):
         """Connect, choose an unpacked raw format, and start."""
         library = load_driver("picamera2", "picamera2")
         self.close()
-        try:
+        advice = "Close other programs that use it; see `rpicam-hello --list-cameras`."
+        with self.as_camera_error("cannot be opened", advice):
             self._camera = library.Picamera2(self.number)
             self._start()
-        except CameraError:
-            self.close()
-            raise
-        except Exception as error:  # of libcamera, of several kinds
-            self.close()
-            raise CameraError(
-                f"{self.name} cannot be opened: {reason(error)}. Close other programs that use it; see "
-                "`rpicam-hello --list-cameras`."
-            ) from error
 
     def _start(self) -> None:
         wanted = self.pixel_format or self._best()

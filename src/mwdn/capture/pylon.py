@@ -2,14 +2,13 @@
 
 import math
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from typing import Any
 
 from mwdn.capture.pixel_formats import choose_format, unpack
 from mwdn.capture.source import TIMEOUT_S, CameraSource, Frame
 from mwdn.capture.sources import load_driver
-from mwdn.errors import CameraError, reason
+from mwdn.errors import CameraError
 
 _EXPOSURES = "ExposureTime", "ExposureTimeAbs"
 _GAINS = ("Gain",)
@@ -47,7 +46,7 @@ class PylonCamera(CameraSource):
                 f"{self.name} names {len(matches)} of {len(found)} cameras: {', '.join(names)[:150] or 'none found'}. "
                 "Check its cable; give its serial number."
             )
-        with self._as_camera_error("cannot be opened", "Close other programs that use it."):
+        with self.as_camera_error("cannot be opened", "Close other programs that use it."):
             self._camera = pylon.InstantCamera(factory.CreateDevice(found[matches[0]]))
             self._camera.Open()
             self._start()
@@ -106,7 +105,7 @@ class PylonCamera(CameraSource):
             raise self.not_open()
         exposure_s, gain = self._setting(_EXPOSURES) / 1e6, self._setting(_GAINS)
         wait_s = self.timeout_s + (exposure_s if exposure_s > 0 else 0)
-        with self._as_camera_error("was disconnected", "Check its cable and power."):
+        with self.as_camera_error("was disconnected", "Check its cable and power."):
             result = self._camera.RetrieveResult(int(1e3 * wait_s), self._pylon.TimeoutHandling_Return)
         if not result.IsValid():
             raise self.silent()
@@ -134,14 +133,3 @@ class PylonCamera(CameraSource):
         with suppress(Exception):  # it may be disconnected
             self._camera.Close()
         self._camera = None
-
-    @contextmanager
-    def _as_camera_error(self, what: str, advice: str) -> Iterator[None]:
-        try:
-            yield
-        except CameraError:
-            self.close()
-            raise
-        except Exception as error:  # of pypylon, of several kinds
-            self.close()
-            raise CameraError(f"{self.name} {what}: {reason(error)}. {advice}") from error

@@ -2,13 +2,14 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy.typing as npt
 
 from mwdn.calibration import FrameFormat
-from mwdn.errors import CameraError
+from mwdn.errors import CameraError, reason
 from mwdn.io.raw import Mosaic
 
 TIMEOUT_S = 5.0
@@ -122,6 +123,25 @@ class CameraSource(ABC):
             f"{self.name} has delivered no frame for {self.timeout_s:g} s. Check its cable, power and trigger, or wait "
             "longer: `timeout_s`."
         )
+
+    @contextmanager
+    def as_camera_error(self, what: str, advice: str, *, close: bool = True) -> Iterator[None]:
+        """Turn any error of a driver's library into a `CameraError`: ``{name} {what}: {reason}. {advice}``.
+
+        Args:
+            what: has gone wrong: ``cannot be opened``.
+            advice: the way out, a sentence.
+            close: whether to close the camera after the error. A `CameraError` from within always closes it.
+        """
+        try:
+            yield
+        except CameraError:
+            self.close()
+            raise
+        except Exception as error:  # each library has kinds of its own
+            if close:
+                self.close()
+            raise CameraError(f"{self.name} {what}: {reason(error)}. {advice}") from error
 
 
 def check_like(frame: Frame, first: Frame, name: str) -> None:
