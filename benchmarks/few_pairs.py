@@ -78,7 +78,7 @@ def tuned(recipe, calibration, parts, samples, path):
     recipe = replace(recipe, schedule=replace(recipe.schedule, validation=len(test)))
     tasks = few_pairs_tasks(train, test, recipe.schedule, best_gain=True)
     for task in tasks:
-        task.cache.samples = {number: samples[task.pairs.row(number)] for number in range(task.cache.size)}
+        task.cache.samples = {number: samples[task.samples.row(number)] for number in range(task.cache.size)}
     with tempfile.TemporaryDirectory() as folder:
         trainer = Trainer(recipe, tasks[0], out=Path(folder), calibration=calibration, validator=NoValidation())
         trainer.run()

@@ -100,7 +100,7 @@ def main():
         attempt(lambda: start("small", replace(recipe, schedule=replace(recipe.schedule, batch=1))))
         attempt(lambda: distributed.local_device("cuda:0"))
         trainer = start("not-finite")
-        trainer.gradient.task = SupervisedTask(NotFinite(**vars(trainer.task.pairs)))
+        trainer.gradient.task = SupervisedTask(NotFinite(**vars(trainer.task.samples)))
         attempt(trainer.run)
         # The second has another recipe and ends; the first loses its connection.
         odd = replace(recipe, schedule=replace(recipe.schedule, seed=int(number)))

@@ -73,7 +73,7 @@ def test_four_steps_are_theirs(tmp_path, name, options, alexnet, psf, pairs, gen
     trainer = prepare(
         recipe(name, tmp_path / "start.tar", **options), calibration, out=tmp_path, pairs=pairs, device="cpu"
     )
-    batches = [trainer.task.pairs.batch(range(i, i + BATCH))[:2] for i in range(0, STEPS * BATCH, BATCH)]
+    batches = [trainer.task.samples.batch(range(i, i + BATCH))[:2] for i in range(0, STEPS * BATCH, BATCH)]
     for _ in range(STEPS):
         trainer.advance()
     ours = dict(trainer.network.named_parameters())

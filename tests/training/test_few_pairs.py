@@ -74,8 +74,8 @@ def test_pairs_are_estimated_once_statistics_stay_and_weights_move(camera):
     run = trainer(camera, steps=2)
     run.run()
     assert len(run.task.cache.samples) == 4  # of a batch of 2; a quarter of five is held out
-    assert len(run.validator.task.pairs) == 1
-    assert run.task.pairs.aligned
+    assert len(run.validator.task.samples) == 1
+    assert run.task.samples.aligned
     moved = changes("run-2")
     assert not any(value for name, value in moved.items() if "running" in name or "num_batches" in name)
     assert moved["decoder.head.weight"] > 0
@@ -113,7 +113,7 @@ def test_validation_has_no_units(camera):
     held_out = run.validator.task
     first = held_out.score(run.average, run.distance, range(1)).psnr
     image = held_out.cache.reconstruct_whole(run.average, range(1))
-    scene = held_out.pairs.batch(range(1)).scene
+    scene = held_out.samples.batch(range(1)).scene
     for units in (scene, 2 * scene + 0.5):
         fitted = held_out._in_units(image, units)
         torch.testing.assert_close(fitted.mean((2, 3)), units.mean((2, 3)))

@@ -705,7 +705,7 @@ def test_any_seed(trainer, seed):
 
 def test_divergence_names_recorded_rows_and_the_way_out(pairs, calibration, tmp_path):
     run = prepare(few(seed=1), calibration, pairs=pairs, out=tmp_path / "run", device="cpu")
-    rows = [run.task.pairs.pairs.row(number) for number in range(2)]
+    rows = [run.task.samples.pairs.row(number) for number in range(2)]
     with torch.no_grad():
         next(run.network.parameters()).fill_(float("nan"))
     said = rf"samples 0 to 1, rows {re.escape(str(rows))} of the file\) is not finite\. .* another folder, `--out`\.$"
@@ -821,7 +821,7 @@ def test_samples_are_not_kept_on_a_disk_without_room(trainer, tmp_path, monkeypa
 def test_a_denoiser_is_trained_alone_and_then_frozen(trainer, tmp_path):
     """Trained on noisy scenes, then part of a network whose U-Net learns, with a cache or without."""
     learned = trainer(replace(few(steps=40, learning_rate=1e-3), network=DRUNET, denoising=Denoising((0.05, 0.1))), "a")
-    noisy, scene, level = learned.task.pairs.batch(range(10**6, 10**6 + 8))  # not trained on
+    noisy, scene, level = learned.task.samples.batch(range(10**6, 10**6 + 8))  # not trained on
 
     def error(denoiser):
         with torch.no_grad():

@@ -90,12 +90,12 @@ class Batch(NamedTuple):
 
 
 @runtime_checkable
-class Samples(Protocol):
-    """A source of pairs with unlimited numbers: the same number always gives the same pair."""
+class NumberedSamples(Protocol):
+    """Samples with unlimited numbers, and what tells a run that they are the same when it resumes."""
 
     @property
     def name(self) -> str:
-        """Identifies the source when a run resumes."""
+        """Identifies the source of the samples."""
 
     @property
     def content(self) -> str:
@@ -107,12 +107,17 @@ class Samples(Protocol):
         """Hash of what the samples show, the same for a copy of the files."""
         return self.content
 
-    def batch(self, numbers: range | list[int]) -> Batch:
-        """The samples of these numbers, on one device."""
-
     def describe(self, numbers: range) -> str:
         """Names the samples in an error message."""
         return f"samples {numbers.start} to {numbers.stop - 1}"
+
+
+@runtime_checkable
+class Samples(NumberedSamples, Protocol):
+    """A source of pairs: the same number always gives the same pair."""
+
+    def batch(self, numbers: range | list[int]) -> Batch:
+        """The samples of these numbers, on one device."""
 
     def prefetched(self, stride: int) -> "Samples":
         """The same samples, the next batch loaded in advance where loading is slow.

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.data.random import seeded
-from mwdn.data.simulated import full_precision
+from mwdn.data.simulated import NumberedSamples, full_precision
 from mwdn.errors import ParameterError
 from mwdn.fourier.convolution import convolve
 from mwdn.optics.noise import noise_level
@@ -60,7 +60,7 @@ class CaptureBatch(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class UnpairedCaptures:
+class UnpairedCaptures(NumberedSamples):
     """Captures as numbered samples: each once per epoch, in another order, its noise split in another way.
 
     Args:
@@ -82,7 +82,7 @@ class UnpairedCaptures:
 
     @property
     def name(self) -> str:
-        """Identifies the captures when a run resumes."""
+        """States the content of the captures."""
         content = self.measurements.cpu().contiguous().numpy().tobytes()
         return f"{len(self):,} captures {hashlib.sha256(content).hexdigest()[:16]}"
 

@@ -93,32 +93,22 @@ class SelfSupervisedTask:
     Validation reports the loss in dB below 1 in place of a PSNR, on the same captures.
     """
 
-    captures: UnpairedCaptures
+    samples: UnpairedCaptures
 
     columns: ClassVar[tuple[str, str]] = "measurement", "through the camera"
     cache: ClassVar[None] = None
-    fingerprint: ClassVar[str] = ""
-
-    @property
-    def name(self) -> str:
-        """The name of the captures."""
-        return self.captures.name
 
     @torch.no_grad()
     def check(self, network: nn.Module) -> None:
         """Reconstruct the first capture: one that does not fit the network is reported before training."""
-        network(self.captures.measurements[:1], self.captures.psf)
+        network(self.samples.measurements[:1], self.samples.psf)
 
     def loss(self, network: nn.Module, distance: Loss, numbers: range) -> tuple[Tensor, dict[str, Tensor]]:
         """The self-supervised loss of the captures of these numbers, and its parts."""
-        result = selfsupervised_loss(self.captures, network, distance, numbers)
+        result = selfsupervised_loss(self.samples, network, distance, numbers)
         return result.loss, result.parts
 
     def score(self, network: nn.Module, distance: Loss, numbers: range) -> Scores:
         """The same loss; its distance has the weights of the training's current phase."""
-        result = selfsupervised_loss(self.captures, network, distance, numbers)
+        result = selfsupervised_loss(self.samples, network, distance, numbers)
         return Scores(-10 * torch.log10(result.loss).expand(len(numbers)), float(result.loss), result.pictures)
-
-    def describe(self, numbers: range) -> str:
-        """Names the samples in an error message."""
-        return f"samples {numbers.start} to {numbers.stop - 1}"

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from mwdn.data.recorded import RecordedPairs
-from mwdn.data.simulated import Batch, Samples
+from mwdn.data.simulated import Batch, NumberedSamples, Samples
 from mwdn.evaluation.metrics import best_gain
 from mwdn.networks import Network
 from mwdn.solvers import align
@@ -43,12 +43,8 @@ class Task(Protocol):
         """Samples to compute before training, if they are cached."""
 
     @property
-    def name(self) -> str:
-        """Identifies the source of the samples when a run resumes."""
-
-    @property
-    def fingerprint(self) -> str:
-        """Hash of what the samples show; empty if the name has it."""
+    def samples(self) -> NumberedSamples:
+        """The samples to learn from."""
 
     def check(self, network: nn.Module) -> None:
         """Raise an `MwdnError` if the network cannot learn the task."""
@@ -59,9 +55,6 @@ class Task(Protocol):
     def score(self, network: nn.Module, distance: Loss, numbers: range) -> Scores:
         """Validate a network in evaluation mode on the samples of these numbers."""
 
-    def describe(self, numbers: range) -> str:
-        """Names the samples in an error message."""
-
 
 @dataclass(frozen=True, eq=False)
 class SupervisedTask:
@@ -70,28 +63,18 @@ class SupervisedTask:
     Training does not align the PSF, validation does if the network is used with an aligned one (``network.align``).
 
     Args:
-        pairs: measurement, scene and PSF of each sample.
+        samples: pairs of measurement and scene, and their PSFs.
         cache: of these pairs, to train or validate on it instead.
         best_gain: scenes have units of their own: compare after the gain and offset of each colour that fit best.
         stored_psf: (1, C, H, W), PSF for a network that takes it as stored, instead of that of the samples.
     """
 
-    pairs: Samples
+    samples: Samples
     cache: SampleCache | None = None
     best_gain: bool = False
     stored_psf: Psf | None = None
 
     columns: ClassVar[tuple[str, str]] = "measurement", "scene"
-
-    @property
-    def name(self) -> str:
-        """The name of the pairs."""
-        return self.pairs.name
-
-    @property
-    def fingerprint(self) -> str:
-        """That of the pairs."""
-        return self.pairs.fingerprint
 
     def check(self, network: nn.Module) -> None:
         """Check that the network can use the cache."""
@@ -125,13 +108,9 @@ class SupervisedTask:
         loss = sum(weight * parts[name].item() for name, weight in distance.initial_weights.items())
         return Scores(psnr, loss, (measurement, reconstruction, scene))
 
-    def describe(self, numbers: range) -> str:
-        """Names the samples in an error message."""
-        return self.pairs.describe(numbers)
-
     def batch(self, numbers: range) -> Batch:
         """Measurements, scenes and PSFs of these numbers."""
-        batch = self.pairs.batch(numbers)
+        batch = self.samples.batch(numbers)
         return batch if self.stored_psf is None else batch._replace(psf=self.stored_psf)
 
     def _in_units(self, reconstruction: Image, scene: Scene) -> Image:

@@ -87,10 +87,10 @@ class Trainer:
         self.start = {name: value.clone() for name, value in weights if name not in MEASURED_BUFFERS}
         self.gradient = Gradient(self.network, task, self.distance, self.schedule, self.device)
         self.step, self.best = 0, -math.inf
-        self.fingerprint, self.same_samples = task.fingerprint, True
+        self.fingerprint, self.same_samples = task.samples.fingerprint, True
 
         # 2. Resume a run that was stopped.
-        self.identity = run_identity(recipe, calibration.psf_hash, task.name)
+        self.identity = run_identity(recipe, calibration.psf_hash, task.samples.name)
         self.psf_identity = psf_identity(calibration) if self.identity["psf_hash"] else {}
         distributed.check_same(self.identity)
         distributed.shard(range(self.schedule.batch))  # raises if the batch is too small
@@ -194,7 +194,7 @@ class Trainer:
         terms = weight * torch.stack(list(values.values())).double()
         total, *totals = distributed.all_reduce_sum(terms).tolist()
         if not math.isfinite(total):
-            raise self._diverged(f"step {self.step} ({self.task.describe(batch)})")
+            raise self._diverged(f"step {self.step} ({self.task.samples.describe(batch)})")
         distributed.all_reduce_gradients(self.network)
         if self.schedule.clip > 0:
             torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.schedule.clip)
