@@ -14,7 +14,6 @@ from mwdn.calibration.frame_format import FrameFormat
 from mwdn.calibration.psf_levels import SATURATED_PART, estimate_background
 from mwdn.calibration.sensor_frames import SensorFrames, average_files
 from mwdn.errors import PsfError, ShapeError
-from mwdn.optics.displacement import shifted
 from mwdn.types import Image
 
 DIM = 0.3
@@ -130,9 +129,3 @@ def centring_shift(image: Image, cell: int = 1) -> tuple[int, int]:
         centroid = float((plane.sum(1 - axis) * torch.arange(length)).sum()) / total
         shift.append(round((length // 2 - centroid) / cell) * cell)
     return shift[0], shift[1]
-
-
-def centred(source: Image, cell: int = 1) -> tuple[Image, tuple[int, int]]:
-    """A PSF with its centroid at the centre of the frame, and the shift; zeros enter at the border."""
-    shift = centring_shift(source, cell)
-    return shifted(source, *shift), shift

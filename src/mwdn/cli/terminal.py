@@ -95,9 +95,9 @@ def complain(start: str, error: MwdnError) -> None:
     errors.print(f"{start} {escape(_spell(str(error)))}", highlight=False, soft_wrap=True)
 
 
-def counted(count: int, noun: str, nouns: str = "") -> str:
-    """A number of things in words: "1 pair", "2,000 pairs"; ``nouns`` is the plural unless it ends in s."""
-    return f"{count:,} {noun if count == 1 else nouns or noun + 's'}"
+def counted(count: int, noun: str) -> str:
+    """A number of things in words: "1 pair", "2,000 pairs"."""
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
 @contextmanager

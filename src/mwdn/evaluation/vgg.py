@@ -49,17 +49,16 @@ class Vgg16(nn.Module):
         return middle, self.features[9:](middle)
 
 
-def load_vgg16(path: str | Path | None = None, *, download: bool = True) -> Vgg16:
+def load_vgg16(path: str | Path | None = None) -> Vgg16:
     """Load VGG-16 with its ImageNet weights, frozen, in evaluation mode, on the CPU.
 
     Args:
         path: a state dict with torchvision's keys. Unless given, the file named by the environment variable
             ``MWDN_VGG16``, else ``~/.cache/mwdn/vgg16-397923af.pth``, which is downloaded once (528 MiB) and checked.
-        download: whether a missing file may be downloaded.
 
     Raises:
-        CheckpointError: the file is missing and cannot or may not be downloaded, or holds other weights.
+        CheckpointError: the file is missing and cannot be downloaded, or holds other weights.
     """
     network = Vgg16()
     wanted = tuple(f"{key.rpartition('.')[0]}." for key in network.state_dict())
-    return load_weights(network, locate(VGG16, path, download=download), wanted)
+    return load_weights(network, locate(VGG16, path, download=True), wanted)

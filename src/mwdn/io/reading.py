@@ -100,13 +100,13 @@ def read_text(path: str | Path, *, most: int = TEXT_BYTES, error: type[MwdnError
         raise error(f"`{path}` must be text in UTF-8, but byte {wrong.start:,} is not. Save it as UTF-8.") from wrong
 
 
-def read_json(path: str | Path, *, most: int = JSON_BYTES, error: type[MwdnError] = ParameterError) -> Any:  # noqa: ANN401
+def read_json(path: str | Path) -> Any:  # noqa: ANN401
     """Read a JSON file.
 
     Raises:
-        MwdnError: as for `read_text`, or the content is not JSON.
+        ParameterError: as for `read_text`, or the content is not JSON.
     """
-    return parse_json(read_text(path, most=most, error=error), path, error=error)
+    return parse_json(read_text(path, most=JSON_BYTES), path)
 
 
 def parse_json(text: str | bytes, path: str | Path, *, error: type[MwdnError] = ParameterError) -> Any:  # noqa: ANN401
@@ -127,11 +127,11 @@ def parse_json(text: str | bytes, path: str | Path, *, error: type[MwdnError] = 
 
 
 @contextmanager
-def unexpected_content(path: str | Path, error: type[MwdnError] = ParameterError) -> Iterator[None]:
+def unexpected_content(path: str | Path) -> Iterator[None]:
     """Turn errors about the content of a file of this package (`KeyError`, `TypeError` ...) into one line.
 
     Raises:
-        MwdnError: of the kind ``error``: the file is damaged, or of another version.
+        ParameterError: the file is damaged, or of another version.
     """
     try:
         yield
@@ -139,4 +139,4 @@ def unexpected_content(path: str | Path, error: type[MwdnError] = ParameterError
         raise
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as wrong:
         what = f"{type(wrong).__name__}: {reason(wrong)}"
-        raise error(f"`{path}` is damaged, or of another version ({what}). Remove it.") from wrong
+        raise ParameterError(f"`{path}` is damaged, or of another version ({what}). Remove it.") from wrong

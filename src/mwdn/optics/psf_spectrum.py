@@ -96,15 +96,15 @@ def radial_spectrum(psf: Psf, bins: int = 60) -> Tensor:
     return (means / means[0] * power[0, 0]).sqrt()
 
 
-def modulus_image(psf: Psf, decades: float = 3.0) -> Image:
-    """|H| as a picture on a logarithmic scale, frequency 0 in the middle: white is its maximum, black 10^-decades."""
+def modulus_image(psf: Psf) -> Image:
+    """|H| as a picture on a logarithmic scale, frequency 0 in the middle: white is its maximum, black 0.001 of it."""
     size = (psf.shape[-2], psf.shape[-1])
     half = spectrum(psf.mean(1, keepdim=True), size).abs()
     # |H| of a real PSF is symmetric, |H(-v, -u)| = |H(v, u)|: the missing half is this one, turned by 180 degrees.
     turned = half[..., 1 : size[1] - size[1] // 2].flip(-1)
     turned = torch.cat([turned[..., :1, :], turned[..., 1:, :].flip(-2)], dim=-2)
     modulus = torch.cat([half, turned], dim=-1).roll((size[0] // 2, (size[1] - 1) // 2), dims=(-2, -1))
-    return (1 + (modulus / modulus.amax()).clamp(min=10**-decades).log10() / decades) ** 2.2
+    return (1 + (modulus / modulus.amax()).clamp(min=1e-3).log10() / 3) ** 2.2
 
 
 def spectral_zeros(psf: Psf) -> tuple[float, tuple[float, ...]]:

@@ -30,6 +30,9 @@ edge."""
 _OWN_BLURS = (0.0, 0.7, 1.4, 2.1, 3.0)
 """Standard deviations of a reconstruction's own blur in pixels: the one that gives the best correlation is taken."""
 
+_FREE = 8
+"""Fitted parameters of a projection: all but the radial term."""
+
 _ITERATIONS = 25
 _SAMPLES = 150_000
 _TUKEY = 4.685 * 1.4826
@@ -72,16 +75,13 @@ class Refined(NamedTuple):
     correlation: float
 
 
-def refine(
-    projection: Projection, views: Views, *, blurs: tuple[float, ...] = (4.0, 2.0, 1.0), radial: bool = False
-) -> Refined:
-    """Maximise the correlation, from coarse to fine.
+def refine(projection: Projection, views: Views, *, blurs: tuple[float, ...]) -> Refined:
+    """Maximise the correlation, from coarse to fine; the radial term stays.
 
     Args:
         projection: start, within about 3 times the first blur of the truth.
         views: pictures and reconstructions.
         blurs: standard deviations in pixels of the camera of the Gaussians that smooth both, one after the other.
-        radial: whether the radial term is fitted, too; otherwise it stays.
 
     References:
         G. D. Evangelidis and E. Z. Psarakis, Parametric image alignment using enhanced correlation coefficient
@@ -91,7 +91,7 @@ def refine(
     for blur in blurs:
         smooth = smooth_images(views.reconstructions, blur)
         samples = matched_samples(result.projection, views, smooth, blur)
-        result = _maximise(result.projection, samples, smooth, radial=radial)
+        result = _maximise(result.projection, samples, smooth)
     return result
 
 
@@ -240,20 +240,20 @@ def _tukey(residual: Array, weights: Array) -> Array:
     return np.where(np.abs(z) < 1, (1 - z * z) ** 2, 0.0)
 
 
-def _maximise(projection: Projection, samples: Samples, smooth: Smooth, *, radial: bool) -> Refined:
+def _maximise(projection: Projection, samples: Samples, smooth: Smooth) -> Refined:
     """Levenberg-Marquardt on equation (1) at one blur."""
-    free, damping = 9 if radial else 8, 1e-4
-    best = linearise(*_placed(projection, samples, free), samples, smooth)
+    damping = 1e-4
+    best = linearise(*_placed(projection, samples), samples, smooth)
     for _ in range(_ITERATIONS):
         A = np.einsum("ngi,ng,ngj->ij", best.slope, best.weights, best.slope, optimize=True)
         g = np.einsum("ngi,ng,ng->i", best.slope, best.weights, best.residual, optimize=True)
         step = np.zeros(9)
-        step[:free] = -np.linalg.solve(A + damping * np.diag(A.diagonal()) + 1e-12 * np.eye(free), g)
+        step[:_FREE] = -np.linalg.solve(A + damping * np.diag(A.diagonal()) + 1e-12 * np.eye(_FREE), g)
         moved = _moved(projection, step)
         if moved is None:
             damping *= 10
             continue
-        trial = linearise(*_placed(moved, samples, free), samples, smooth)
+        trial = linearise(*_placed(moved, samples), samples, smooth)
         motion = np.abs(moved.corners() - projection.corners()).max()
         if trial.correlation >= best.correlation:
             projection, best, damping = moved, trial, damping / 10
@@ -264,9 +264,9 @@ def _maximise(projection: Projection, samples: Samples, smooth: Smooth, *, radia
     return Refined(projection, best.correlation)
 
 
-def _placed(projection: Projection, samples: Samples, free: int) -> tuple[Points, Array]:
+def _placed(projection: Projection, samples: Samples) -> tuple[Points, Array]:
     points, motion = projection.project(samples.points)
-    return points, motion[..., :free]
+    return points, motion[..., :_FREE]
 
 
 def _moved(projection: Projection, step: Array) -> Projection | None:
