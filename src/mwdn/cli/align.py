@@ -21,7 +21,7 @@ from mwdn.data.pair_writer import SUFFIXES, check_path
 from mwdn.errors import ParameterError
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.contact_sheets import contact_sheet
-from mwdn.io.files import check_folder, refuse_overwrite
+from mwdn.io.files import check_folder, refuse_overwrite, write_json
 from mwdn.io.images import read_frame, write_picture
 from mwdn.registration.captured import SRGB, CapturedPairs, as_gamma, as_light
 from mwdn.registration.estimate import estimate, through_corners
@@ -29,7 +29,7 @@ from mwdn.registration.outline import find_outline
 from mwdn.registration.overlay import draw_outline, overlay
 from mwdn.registration.pairs import chosen, fit_levels, reconstruct_views, write_aligned
 from mwdn.registration.projection import Points, Projection
-from mwdn.registration.registration import Place, read_projection, write_registration
+from mwdn.registration.registration import Place, read_projection
 from mwdn.registration.views import Views
 from mwdn.registration.warp import warp_pictures
 from mwdn.types import Image, Scene
@@ -158,7 +158,7 @@ def _align_session(task: _Task, capture: Path, out: Path, count: int, *, levels:
         )
         number = len(pairs)
     write_picture(page, sheet)
-    write_registration(sidecar, content)
+    write_json(sidecar, content)
     say(_quality(projection, content), f"{counted(number, 'pair')} written to {out}. Look at {page}")
     return content
 
@@ -177,7 +177,7 @@ def _align_frame(task: _Task, capture: Path, picture: Path | None, out: Path) ->
         shown = as_light(read_frame(picture, upright=True), task.gamma or SRGB)[None]
         projection, content, sheet = _known_picture(task, shown, scene)
     write_picture(page, sheet)
-    write_registration(sidecar, content)
+    write_json(sidecar, content)
     say(_quality(projection, content), f"Look at {page}")
     return content
 

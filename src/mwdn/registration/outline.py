@@ -35,8 +35,6 @@ _AGREEING = 0.5
 _CERTAIN = 0.9
 """Likewise in a linear estimate, whose haze and noise also have edges: those agreed to 0.83 at most in simulations."""
 
-Bytes = npt.NDArray[np.uint8]
-
 
 def find_outline(reconstruction: FloatFrame, linear: FloatFrame | None = None) -> Points:
     """Corners of the bright quadrilateral.

@@ -37,11 +37,6 @@ class PointFit(NamedTuple):
     residuals: Points
     inliers: npt.NDArray[np.bool_]
 
-    @property
-    def rms_px(self) -> float:
-        """Root mean square distance of the inliers in pixels."""
-        return float(np.sqrt((self.residuals[self.inliers] ** 2).sum(-1).mean()))
-
 
 class _Seen(NamedTuple):
     """Points of the picture, where the camera sees them, and the weights of their errors."""

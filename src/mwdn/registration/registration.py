@@ -9,15 +9,13 @@ from typing import Any
 import numpy as np
 
 from mwdn.data.hdf5 import open_hdf5_header, read_attributes
+from mwdn.data.pair_writer import SUFFIXES
 from mwdn.errors import ParameterError
-from mwdn.io.files import write_json
 from mwdn.io.reading import parse_json, read_json, unexpected_content
 from mwdn.registration.projection import Points, Projection
 
 KEY = "registration"
 """Attribute of a file of aligned pairs that holds the registration as JSON."""
-
-_SUFFIXES = (".h5", ".hdf5")
 
 
 @dataclass(frozen=True)
@@ -62,15 +60,6 @@ class Place:
         )
 
 
-def write_registration(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a registration as JSON.
-
-    Raises:
-        ImageError: the file cannot be written.
-    """
-    write_json(path, dict(content))
-
-
 def read_projection(path: str | Path) -> Projection:
     """Read the projection of a registration from its JSON file, or from a file of aligned pairs.
 
@@ -79,7 +68,7 @@ def read_projection(path: str | Path) -> Projection:
         ImageError: no such file.
     """
     path = Path(path)
-    if path.suffix.lower() in _SUFFIXES:
+    if path.suffix.lower() in SUFFIXES:
         with open_hdf5_header(path, "Align again: `mwdn align`.") as file:
             attributes = read_attributes(path, file, "Align again: `mwdn align`.")
         if KEY not in attributes:
