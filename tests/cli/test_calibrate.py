@@ -98,6 +98,16 @@ def test_camera_file_is_changed_by_calibrating_again(run):
     assert run(f"{RECONSTRUCT} a --camera camera.toml")[0] == 0
 
 
+def test_files_of_a_camera_file_are_known_by_any_path(run, folder):
+    """The corrected PSF by its absolute path was corrected again, by the dark frame and without its gain."""
+    cv2.imwrite("dark.png", np.full((*SIZE, 3), 2000, np.uint16))
+    about = {"psf": Path("lab/psf.png"), "dark": "dark.png", "psf_corrected": True, "dark_exposure": 8.0}
+    write_camera("camera.toml", {**about, "psf_gain": ((1.0, 0.1, -0.1),) * 3})
+    before = read_camera("camera.toml")
+    assert run(f"calibrate {folder}/lab/../lab/psf.png --dark {folder}/dark.png --camera camera.toml")[0] == 0
+    assert read_camera("camera.toml") == before
+
+
 @pytest.mark.usefixtures("folder")
 def test_a_bin_of_1_is_kept_because_it_refuses_automatic_binning(run):
     assert run("calibrate lab/psf.png --bin 1 -o refuses.toml")[0] == 0

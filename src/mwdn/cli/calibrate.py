@@ -1,9 +1,11 @@
 """`mwdn calibrate`: a PSF and everything else about a camera, as one file for the other commands."""
 
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -29,6 +31,9 @@ from mwdn.io.files import file_sha256, refuse_overwrite
 
 POLL_S = 0.3
 """Seconds between two looks at a watched folder."""
+
+_ELSEWHERE = (("distance_psfs", "distances_mm"), ("field_psfs", "field_positions"))
+"""Keys of the PSFs of points elsewhere, and of their places."""
 
 
 def calibrate(  # noqa: PLR0913
@@ -77,14 +82,14 @@ def calibrate(  # noqa: PLR0913
         _watch(watch, frames, photographs.exposures)
         return
     check_camera_path(out)
-    pictures = [*files] or ([psf] if psf is not None else [])
-    if not pictures:
-        raise ParameterError("Give the camera's PSF, `--psf psf.png`, or its camera file, `--camera camera.toml`.")
+    pictures = [*files] or [CameraOptions(psf).psf_file]
     if pairs is not None:
         check_pair_file(pairs)
         refuse_overwrite(out, pairs)
     kept = _kept(camera)
     own_dark = kept.pop("dark", None)  # an option has it
+    pictures = _by_kept_path(pictures, kept.get("psf"))
+    photographs = replace(photographs, dark=tuple(_by_kept_path(photographs.dark, own_dark)))
     with bench_frames(BenchFrames(pictures, photographs, frames), own_dark) as bench:
         pictures, photographs, frames = bench.pictures, bench.photographs, bench.frames
         if photographs.dark_files != (own_dark,):
@@ -107,7 +112,7 @@ def calibrate(  # noqa: PLR0913
             _written(out, pairs, partial(_of_one_picture, replace(options, dark=dark), kept, own))
             return
         _refuse_psf_format(psf_format)
-        if kept.get("psf_corrected") and [Path(picture) for picture in pictures] == [kept["psf"]]:
+        if kept.get("psf_corrected") and pictures == [kept["psf"]]:
             raise ParameterError(
                 f"The PSF of `{camera}` is corrected already. To correct it by other frames, name the photographs of "
                 "the point source again, with all that belong to them: `mwdn calibrate POINT --dark DARK ...`."
@@ -146,6 +151,13 @@ def _kept(camera: Path | None) -> dict[str, Any]:
     return values
 
 
+def _by_kept_path(files: Sequence[Path], kept: Path | None) -> list[Path]:
+    """These files; one that is the camera file's, by the path that is there, by which it is known again."""
+    if kept is not None and [os.path.realpath(file) for file in files] == [os.path.realpath(kept)]:
+        return [kept]
+    return [*files]
+
+
 def _with_exposure(photographs: PhotographOptions, exposure: float | None, camera: Path | None) -> PhotographOptions:
     """The photographs of a new PSF, with the exposure of the camera's dark frame; ``None`` is for any exposure.
 
@@ -169,11 +181,8 @@ def _of_one_picture(
 ) -> tuple[str, Calibration]:
     """Write a camera file that names the PSF's picture as it is. The PSF's verdict, and the calibration."""
     if options.psf != kept.get("psf"):
-        kept = {
-            key: value for key, value in kept.items() if key not in ("psf_corrected", "distance_psfs", "field_psfs")
-        }
-        of_the_psf = ("distances_mm", "field_positions", "psf_gain", "envelope_shift")
-        kept = {key: value for key, value in kept.items() if key not in of_the_psf}
+        of_a_psf = {"psf_corrected", "psf_gain", "envelope_shift", *chain.from_iterable(_ELSEWHERE)}
+        kept = {key: value for key, value in kept.items() if key not in of_a_psf}
     corrections = Corrections.read(
         kept.get("flat_field"), kept.get("hot_pixels"), psf_done=kept.get("psf_corrected", False)
     )
@@ -200,9 +209,9 @@ def _of_photographs(
     own_distance = {"distance_mm": content["distance_mm"]} if content.get("distance_mm") else {}
     content |= {"psf_gain": None, "envelope_shift": None}  # of an earlier PSF
     content = {**content, "background": background, **done.content, **own_distance, "psf_gamma": None}
-    for key in ("distance_psfs", "field_psfs"):  # those of an earlier PSF do not fit this one
-        if key not in done.parts:
-            content |= {key: None, {"distance_psfs": "distances_mm", "field_psfs": "field_positions"}[key]: None}
+    for psfs, places in _ELSEWHERE:  # those of an earlier PSF do not fit this one
+        if psfs not in done.parts:
+            content |= {psfs: None, places: None}
     written = write_camera_with_parts(out, content, done.parts)
     calibration = Calibration.load(out)
     check_white_balance(calibration.white_balance, calibration.light)
