@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mwdn.capture.patterns import point
 from mwdn.capture.playlist import Playlist, PlaylistOptions, open_playlist
 from mwdn.capture.prepared_frames import PreparedFrames
 from mwdn.capture.rig_options import RigOptions
@@ -87,7 +88,7 @@ class Rig(CameraSource):
         self._started, self._stale = 0.0, 0
         self._shown = self._before = self._dark()
         self._entry, self._lit, self._frames = -1, -1, PreparedFrames(options.prepared)
-        self.show(_point(screen) if picture is None else picture)
+        self.show(point(screen) if picture is None else picture)
         self._before, self._stale = self._shown, 0
 
     def show(self, picture: Picture, *, lamp: float = 0.0) -> None:
@@ -103,7 +104,7 @@ class Rig(CameraSource):
             raise ShapeError(f"`picture` {picture.shape} must have the display's size, {wanted}.")
         light = self._light(picture)
         if lamp:
-            light = light + lamp * (self._light(_point(self.screen)) - self._light(np.zeros_like(picture)))
+            light = light + lamp * (self._light(point(self.screen)) - self._light(np.zeros_like(picture)))
         self._before, self._shown, self._stale = self._shown, light, self.options.latency
         self._frames.clear()
 
@@ -223,12 +224,6 @@ def open_rig(**options: Any) -> Rig:  # noqa: ANN401
     display = part(Screen, "display")
     own["playlist"] = open_playlist(part(PlaylistOptions, "display"), (display.height_px, display.width_px))
     return Rig(to_dataclass(RigOptions, "rig", options), display, **own)
-
-
-def _point(screen: Screen) -> Picture:
-    from mwdn.capture.patterns import point
-
-    return point(screen)
 
 
 def _mosaic(light: Tensor, mosaic: str) -> Tensor:

@@ -130,12 +130,9 @@ class Session:
     def _whole(self, level: int) -> Picture:
         return grey(level, (self._screen.height_px, self._screen.width_px))
 
-    def _show(self, picture: Picture) -> float:
-        return self.display.show(picture)
-
     def _frame_of(self, picture: Picture) -> Frame:
         """Show a picture, let it settle, and grab a frame of it."""
-        shown = self._show(picture)
+        shown = self.display.show(picture)
         self._wait(self.recipe.session.settle_s)
         frame = self._grab(shown)
         if self._first is not None:
@@ -150,7 +147,7 @@ class Session:
 
     def _first_frame(self) -> Frame:
         """A frame of a dark display; frames that were in progress when the camera was set have its old settings."""
-        self._show(self._whole(0))
+        self.display.show(self._whole(0))
         frame, table = self._grab(time.time()), self.recipe.camera
         for _ in range(IN_PROGRESS):
             wanted = ((frame.exposure_s, table.exposure_s), (frame.gain, table.gain))

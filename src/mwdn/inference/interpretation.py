@@ -187,7 +187,7 @@ def _bank_rows(network: WienerBank, measurement: Measurement, psf: Psf, result: 
         start = plain.estimates(coloured, psf)[:, :channels]
     if network.levels:
         smooth = [Panel("iterations", parts[0] if start is None else start)]
-        numbers: dict[str, float | None] = {"residual": _unexplained(network, coloured, psf, parts[0])}
+        numbers: dict[str, float | None] = {"residual": _share(coloured - convolve(parts[0], psf), coloured)}
         if start is not None:
             smooth += [
                 Panel(f"after {network.rounds} rounds", parts[0]),
@@ -208,10 +208,6 @@ def _bank_rows(network: WienerBank, measurement: Measurement, psf: Psf, result: 
         )
     )
     return rows
-
-
-def _unexplained(network: WienerBank, measurement: Measurement, psf: Psf, scene: Scene) -> float:
-    return _share(measurement - convolve(scene, psf), measurement)
 
 
 def _filter_numbers(wiener: WienerFilter, psf: Tensor) -> dict[str, float | None]:

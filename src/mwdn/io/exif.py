@@ -85,10 +85,7 @@ def _in_jpeg(file: BinaryIO) -> int | None:
 def _in_png(file: BinaryIO) -> int | None:
     position = 8
     for _ in range(_STEPS):
-        head = _at(file, position, 8)
-        if len(head) < 8:
-            break
-        length, name = struct.unpack(">I4s", head)
+        length, name = struct.unpack(">I4s", _at(file, position, 8))
         if name == b"eXIf":
             return position + 8
         position += 12 + length  # a checksum follows the data
@@ -98,10 +95,7 @@ def _in_png(file: BinaryIO) -> int | None:
 def _in_webp(file: BinaryIO) -> int | None:
     position = 12
     for _ in range(_STEPS):
-        head = _at(file, position, 8)
-        if len(head) < 8:
-            break
-        name, length = struct.unpack("<4sI", head)
+        name, length = struct.unpack("<4sI", _at(file, position, 8))
         if name == b"EXIF":
             return position + (14 if file.read(6) == b"Exif\0\0" else 8)  # some programs write JPEG's header
         position += 8 + length + length % 2

@@ -180,11 +180,6 @@ def gather_json(value: Any) -> list[Any]:  # noqa: ANN401
     return [json.loads(broadcast(lambda: content, source=source)) for source in range(world_size())]
 
 
-def broadcast_floats(numbers: list[float]) -> list[float]:
-    """Send numbers of the first process to all, exactly."""
-    return json.loads(broadcast(lambda: json.dumps(numbers).encode()))
-
-
 def check_same(identity: dict[str, Any]) -> None:
     """Check that every process has the same recipe and PSF.
 

@@ -245,7 +245,7 @@ class Trainer:
         result = Validation(math.nan, math.nan)
         if distributed.rank() == 0:
             result = self.validator(self.average, self.distance, f"step {self.step}")
-        psnr, loss = distributed.broadcast_floats([result.psnr, result.loss])
+        psnr, loss = distributed.broadcast_json(lambda: (result.psnr, result.loss))
         if not math.isfinite(loss):
             raise self._diverged(f"the validation after step {self.step}")
         if result.sheet is not None:
