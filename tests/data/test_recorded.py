@@ -137,12 +137,13 @@ def test_the_file_is_opened_when_the_first_pair_is_read(pairs):
 
 
 def test_a_split_without_validation_holds_out_training_pairs():
-    train, validation = Division("diffusercam").of(1100)
+    parts = Division("diffusercam").parts(1100)
+    train, validation = parts["train"], parts["validation"]
     assert list(validation) == [1019, 1039, 1059, 1079, 1099]
     assert sorted([*train, *validation]) == list(range(1000, 1100))
-    train, validation = Division("random", fractions=(0.5, 0.25, 0.25), seed=3).of(40)
-    assert (len(train), len(validation)) == (20, 10)
-    assert not set(train) & set(validation)
+    parts = Division("random", fractions=(0.5, 0.25, 0.25), seed=3).parts(40)
+    assert (len(parts["train"]), len(parts["validation"])) == (20, 10)
+    assert not set(parts["train"]) & set(parts["validation"])
 
 
 @pytest.mark.parametrize(
@@ -155,12 +156,12 @@ def test_a_split_without_validation_holds_out_training_pairs():
 )
 def test_too_few_pairs(division, count, said):
     with pytest.raises(ParameterError, match=re.escape(said)):
-        division.of(count)
+        division.parts(count)
 
 
 def test_unknown_split():
     with pytest.raises(UnknownNameError, match="Did you mean 'paper'"):
-        Division("papr").of(100)
+        Division("papr").parts(100)
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,6 @@ from mwdn.data.pairs import PairFile, Part
 from mwdn.data.photographs import Photographs
 from mwdn.data.recorded import HELD_OUT, Division, RecordedPairs, RefinedPairs, record
 from mwdn.data.simulated import Placement, Samples, SimulatedPairs
-from mwdn.data.splits import split
 from mwdn.errors import ParameterError
 from mwdn.evaluation import Protocol
 from mwdn.io.files import write_text
@@ -272,13 +271,13 @@ def _rows(recipe: DatasetRecipe, count: int, simulates: bool) -> dict[str, range
         return {"train": range(first), "validation": range(first, second), "test": range(second, count)}
     if not recipe.split:
         return {"test": range(min(recipe.test or count, count))}
-    train, validation = Division(recipe.split, seed=recipe.seed).of(count)
-    test = split(count, recipe.split, seed=recipe.seed)["test"]
-    if not test:
+    parts = Division(recipe.split, seed=recipe.seed).parts(count)
+    if not parts["test"]:
         raise ParameterError(
             f"`split` ({recipe.split}) of {count:,} pairs must have a test part, to score the methods."
         )
-    return {"train": train, "validation": validation[: recipe.validation], "test": test[: recipe.test or len(test)]}
+    lengths = {"train": None, "validation": recipe.validation, "test": recipe.test or None}
+    return {name: parts[name][:length] for name, length in lengths.items()}
 
 
 def _training(

@@ -22,7 +22,7 @@ from mwdn.io.files import write_text
 from mwdn.io.reading import LOG_BYTES, parse_json, read_json, read_text, unexpected_content
 from mwdn.networks import NETWORKS
 from mwdn.training.network import check_colours, stored_psf
-from mwdn.training.recipe import OPTIMISERS, Recipe, Schedule
+from mwdn.training.recipe import Recipe, Schedule
 from mwdn.training.report import Report
 from mwdn.training.tasks import SupervisedTask, supervised_task, with_stored_psf
 from mwdn.training.trainer import Trainer
@@ -50,13 +50,10 @@ def settings(method: Method, benchmark: Benchmark) -> Settings:
     published = PUBLISHED.get(method.name) if benchmark.published else None
     if published is None:
         return Settings(replace(benchmark.schedule, **method.schedule), "the recipe's")
-    optimiser = str(published.optimiser).lower()
-    changes: dict[str, Any] = {"weight_decay": float(published.weight_decay)}
-    if optimiser in OPTIMISERS:
-        changes["optimiser"] = optimiser
+    changes: dict[str, Any] = {"optimiser": published.optimiser, "weight_decay": published.weight_decay}
     factor = ""
     if published.rate is not None:
-        changes["learning_rate"] = float(published.rate) * benchmark.rate_factor
+        changes["learning_rate"] = published.rate * benchmark.rate_factor
         factor = f"; its rate times {benchmark.rate_factor:g}" if benchmark.rate_factor != 1 else ""
     return Settings(replace(benchmark.schedule, **changes | method.schedule), f"{published.source}{factor}")
 

@@ -53,18 +53,13 @@ class Division:
     aligned: bool = False
     best_gain: bool = False
 
-    def of(self, count: int) -> tuple[range | list[int], range | list[int]]:
-        """Positions of the pairs for training and for validation, without the test part.
+    def parts(self, count: int) -> Split:
+        """Positions of the pairs for "train", "validation" and "test".
 
         Raises:
             UnknownNameError: no such split.
-            ParameterError: it does not fit the count, or leaves no pair for training.
+            ParameterError: it does not fit the count, or leaves no pair for training or validation.
         """
-        parts = self.parts(count)
-        return parts["train"], parts["validation"]
-
-    def parts(self, count: int) -> Split:
-        """Positions of the pairs for "train", "validation" and "test"; raises as `of`."""
         parts = split(count, self.split, fractions=self.fractions, seed=self.seed, folds=self.folds, fold=self.fold)
         train, validation = parts["train"], parts.get("validation", [])
         if not validation:
@@ -240,10 +235,10 @@ def recorded_pairs(
     """
     file = PairFile(path)
     check_pairs(file, psf)
-    train, validation = division.of(len(file))
+    parts = division.parts(len(file))
     psf, refinement = psf.to(device), missing_refinement(file, refinement)
-    training = RecordedPairs(file, train, psf, seed, aligned=division.aligned, refinement=refinement)
-    return training, replace(training, rows=validation, shuffled=False, poses={})
+    training = RecordedPairs(file, parts["train"], psf, seed, aligned=division.aligned, refinement=refinement)
+    return training, replace(training, rows=parts["validation"], shuffled=False, poses={})
 
 
 def record(
