@@ -90,20 +90,45 @@ def trainer(photos, calibration, tmp_path):
     return make
 
 
+def unbroken_run(recipe, folder):
+    """Folder of a run that nothing stopped."""
+    prepare(recipe, small_camera(), photos=smooth_photos(folder / "photos"), out=folder / "run", device="cpu").run()
+    return folder / "run"
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """Folder of a run of `RECIPE` that nothing stopped."""
-    folder = tmp_path_factory.mktemp("whole")
-    prepare(RECIPE, small_camera(), photos=smooth_photos(folder / "photos"), out=folder / "run", device="cpu").run()
-    return folder / "run"
+    return unbroken_run(RECIPE, tmp_path_factory.mktemp("whole"))
 
 
 @pytest.fixture(scope="module")
 def whole_paper(tmp_path_factory):
-    """Folder of a run of `PAPER` that nothing stopped."""
-    folder = tmp_path_factory.mktemp("paper")
-    prepare(PAPER, small_camera(), photos=smooth_photos(folder / "photos"), out=folder / "run", device="cpu").run()
-    return folder / "run"
+    return unbroken_run(PAPER, tmp_path_factory.mktemp("paper"))
+
+
+def stop(trainer, step):
+    """Run, and stop after a step as a crash would: its validation and state are saved, if they are due."""
+
+    def interrupt(report):
+        if report.step == step:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        trainer.run(interrupt)
+
+
+def advance(trainer):
+    """Three steps, then a validation and a saved state."""
+    for _ in range(3):
+        trainer.advance()
+    trainer.save(trainer.validate())
+
+
+def assert_same_end(folder, unbroken):
+    """Weights, state and log are those of the run that nothing stopped."""
+    for name in ("last", "best", "state"):
+        assert same(unbroken / f"{name}.safetensors", folder / f"{name}.safetensors")
+    assert log(folder) == log(unbroken)
 
 
 # --- Learning -----------------------------------------------------------------------------------------
@@ -130,10 +155,7 @@ def test_overfits_four_pairs(photos, calibration, tmp_path):
 def test_checkpointing_is_the_same_run(trainer, tmp_path):
     """It may be switched on in the middle of a run, if memory is too short."""
     trainer(few(bfloat16=False), "kept").run()
-    first = trainer(few(bfloat16=False), "changed")
-    for _ in range(3):
-        first.advance()
-    first.save(first.validate())
+    advance(trainer(few(bfloat16=False), "changed"))
     second = trainer(few(bfloat16=False, checkpointing=True), "changed")
     assert second.step == 3
     second.run()
@@ -198,15 +220,10 @@ def test_network_with_an_unused_parameter_is_resumed(trainer, tmp_path):
     network = {"name": "mwdn-cpsf", "width": 2, "authors_scalars": True}
     recipe = replace(few(steps=2, validate_every=1), network=network)
     trainer(recipe, "whole").run()
-
-    def stop(report):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        trainer(recipe, "halves").run(stop)
+    stop(trainer(recipe, "halves"), 1)
     assert trainer(recipe, "halves").step == 1
     trainer(recipe, "halves").run()
-    assert same(tmp_path / "whole" / "state.safetensors", tmp_path / "halves" / "state.safetensors")
+    assert_same_end(tmp_path / "halves", tmp_path / "whole")
 
 
 @pytest.mark.parametrize(("best_by", "step"), [("psnr", 2), ("loss", 1)])
@@ -225,9 +242,7 @@ def test_resumed_run_ends_bit_identical(trainer, tmp_path):
     recipe = few(bfloat16=False)
     trainer(recipe, "whole").run()
     first = trainer(recipe, "halves")
-    for _ in range(3):
-        first.advance()
-    first.save(first.validate())
+    advance(first)
     second = trainer(recipe, "halves")
     assert (second.step, second.best) == (3, first.best)
     second.run()
@@ -247,9 +262,7 @@ def test_ctrl_c_ends_after_the_step_and_saves_it(trainer, whole, tmp_path):
     second = trainer()
     assert second.step == 2
     second.run()
-    for name in ("last", "best", "state"):
-        assert same(whole / f"{name}.safetensors", tmp_path / "run" / f"{name}.safetensors")
-    assert log(tmp_path / "run") == log(whole)
+    assert_same_end(tmp_path / "run", whole)
 
 
 def test_second_ctrl_c_ends_at_once(trainer, tmp_path):
@@ -265,14 +278,7 @@ def test_second_ctrl_c_ends_at_once(trainer, tmp_path):
 
 def test_log_has_one_line_a_step_after_a_resume(trainer, tmp_path):
     """Interrupted after step 5, in the middle of a line; resumed from step 3."""
-    first = trainer()
-
-    def stop(report):
-        if report.step == 5:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        first.run(stop)
+    stop(trainer(), 5)
     path = tmp_path / "run" / "log.jsonl"
     before = log(tmp_path / "run")
     path.write_text(path.read_text() + '{"step": 6, "lo')
@@ -285,9 +291,7 @@ def test_log_has_one_line_a_step_after_a_resume(trainer, tmp_path):
 
 
 def test_log_of_a_run_without_a_state_starts_again(trainer, tmp_path):
-    run = trainer()
-    with pytest.raises(KeyboardInterrupt):
-        run.run(lambda report: (_ for _ in ()).throw(KeyboardInterrupt))
+    stop(trainer(), 1)
     trainer()
     assert log(tmp_path / "run") == []
 
@@ -308,16 +312,21 @@ schedule = { steps = 30, batch = 1, warmup = 2, ema = 0.9, validate_every = 7, v
 """
 
 
+def command(folder, calibration, photos):
+    """``mwdn train`` without ``--out``, to be called in a folder that gets the recipe and the PSF."""
+    (folder / "r.toml").write_text(TOML, encoding="utf-8")
+    np.save(folder / "psf.npy", calibration.psf[0].movedim(0, -1).numpy() / calibration.psf.max().item())
+    return ["train", "r.toml", "--psf", "psf.npy", "--photos", str(photos), "--device", "cpu"]
+
+
 @pytest.mark.acceptance
 def test_killed_runs_end_as_an_unbroken_one(photos, calibration, tmp_path):
     """SIGKILL after a random number of steps, then undisturbed."""
-    (tmp_path / "r.toml").write_text(TOML, encoding="utf-8")
-    np.save(tmp_path / "psf.npy", calibration.psf[0].movedim(0, -1).numpy() / calibration.psf.max().item())
-    line = [sys.executable, "-m", "mwdn", "train", "r.toml", "--psf", "psf.npy", "--photos", str(photos)]
+    line = [sys.executable, "-m", "mwdn", *command(tmp_path, calibration, photos)]
     options = {"cwd": tmp_path, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "env": os.environ}
 
     def start(folder):
-        return subprocess.Popen([*line, "--device", "cpu", "--out", folder], **options)
+        return subprocess.Popen([*line, "--out", folder], **options)
 
     def lines():
         path = tmp_path / "killed" / "log.jsonl"
@@ -334,18 +343,14 @@ def test_killed_runs_end_as_an_unbroken_one(photos, calibration, tmp_path):
     for process in (whole, start("killed")):
         _, err = process.communicate(timeout=300)
         assert process.returncode == 0, err
-    for name in ("best", "last", "state"):
-        assert same(tmp_path / "whole" / f"{name}.safetensors", tmp_path / "killed" / f"{name}.safetensors")
+    assert_same_end(tmp_path / "killed", tmp_path / "whole")
     assert [line["step"] for line in log(tmp_path / "killed")] == list(range(1, 31))
-    assert log(tmp_path / "killed") == log(tmp_path / "whole")
 
 
 def test_two_runs_do_not_share_a_folder(photos, calibration, tmp_path, monkeypatch, capsys):
     """While one process trains, a second run may neither start nor change the files."""
-    (tmp_path / "r.toml").write_text(TOML, encoding="utf-8")
-    np.save(tmp_path / "psf.npy", calibration.psf[0].movedim(0, -1).numpy() / calibration.psf.max().item())
     monkeypatch.chdir(tmp_path)
-    line = ["train", "r.toml", "--psf", "psf.npy", "--photos", str(photos), "--steps", "1000000", "--device", "cpu"]
+    line = [*command(tmp_path, calibration, photos), "--steps", "1000000"]
     folder, options = tmp_path / "run", {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     first = subprocess.Popen([sys.executable, "-m", "mwdn", *line, "--out", "run"], **options)
     try:
@@ -413,20 +418,12 @@ def test_plateau_switches_phase_and_stops_when_torchs_scheduler_does(whole_paper
 
 def test_plateau_resumes(trainer, whole_paper, tmp_path):
     """Stopped four times: in each phase, right after a validation and in between."""
-    for stop in (2, 8, 15, 20):
-
-        def interrupt(report, stop=stop):
-            if report.step == stop:
-                raise KeyboardInterrupt
-
-        with pytest.raises(KeyboardInterrupt):
-            trainer(PAPER, "parts").run(interrupt)
-        assert trainer(PAPER, "parts").step == stop - stop % 2
+    for step in (2, 8, 15, 20):
+        stop(trainer(PAPER, "parts"), step)
+        assert trainer(PAPER, "parts").step == step - step % 2
     last = trainer(PAPER, "parts")
     last.run()
-    assert log(whole_paper) == log(tmp_path / "parts")
-    for name in ("last", "best", "state"):
-        assert same(whole_paper / f"{name}.safetensors", tmp_path / "parts" / f"{name}.safetensors")
+    assert_same_end(tmp_path / "parts", whole_paper)
     again = trainer(PAPER, "parts")
     assert again.lr_schedule == last.lr_schedule
     assert again.lr_schedule.finished
@@ -448,20 +445,12 @@ def as_of_an_earlier_version(folder):
 @pytest.mark.parametrize(("recipe", "unbroken"), [(PAPER, "whole_paper"), (RECIPE, "whole")], ids=["plateau", "cosine"])
 def test_a_run_of_an_earlier_version_goes_on(trainer, tmp_path, request, recipe, unbroken):
     unbroken = request.getfixturevalue(unbroken)
-
-    def interrupt(report):
-        if report.step == 5:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        trainer(recipe, "halves").run(interrupt)
+    stop(trainer(recipe, "halves"), 5)
     as_of_an_earlier_version(tmp_path / "halves")
     second = trainer(recipe, "halves")
     assert second.step in (3, 4)
     second.run()
-    assert log(unbroken) == log(tmp_path / "halves")
-    for name in ("last", "best", "state"):
-        assert same(unbroken / f"{name}.safetensors", tmp_path / "halves" / f"{name}.safetensors")
+    assert_same_end(tmp_path / "halves", unbroken)
 
 
 def test_weights_of_an_earlier_version_belong_to_the_same_run(trainer, tmp_path):
@@ -520,17 +509,10 @@ def test_resumed_run_on_recorded_pairs_ends_bit_identical(pairs, calibration, tm
         return prepare(few(steps=14), calibration, pairs=pairs, out=tmp_path / folder, device="cpu")
 
     make("whole").run()
-
-    def interrupt(report):
-        if report.step == 10:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        make("halves").run(interrupt)
+    stop(make("halves"), 10)
     assert make("halves").step == 9
     make("halves").run()
-    assert same(tmp_path / "whole" / "state.safetensors", tmp_path / "halves" / "state.safetensors")
-    assert log(tmp_path / "whole") == log(tmp_path / "halves")
+    assert_same_end(tmp_path / "halves", tmp_path / "whole")
 
 
 def test_captures_on_the_sheet_change_nothing_else(whole, photos, calibration, tmp_path):
@@ -676,9 +658,7 @@ def test_full_disk_leaves_the_state(trainer, whole, tmp_path, monkeypatch, refus
 
 def test_divergence_leaves_the_state(trainer, tmp_path):
     run = trainer(few(steps=9))
-    for _ in range(3):
-        run.advance()
-    run.save(run.validate())
+    advance(run)
     before = (tmp_path / "run" / "state.safetensors").read_bytes()
     with torch.no_grad():
         next(run.network.parameters()).fill_(float("nan"))
@@ -752,10 +732,7 @@ def test_a_run_starts_from_given_weights(trainer, tmp_path):
 def test_a_resumed_run_with_a_cache_ends_as_an_unbroken_one(trainer, tmp_path):
     pooled = few(pool=4)
     trainer(pooled, "whole").run()
-    stopped = trainer(pooled, "stopped")
-    while stopped.step < 3:
-        stopped.advance()
-    stopped.save(stopped.validate())
+    advance(trainer(pooled, "stopped"))
     trainer(pooled, "stopped").run()
     assert same(tmp_path / "whole" / "last.safetensors", tmp_path / "stopped" / "last.safetensors")
 
