@@ -10,6 +10,8 @@ import torch
 
 from cameras import contour_psf
 from mwdn.calibration import Calibration
+from mwdn.calibration.place_files import PlaceFiles
+from mwdn.calibration.places import psfs_elsewhere
 from mwdn.calibration.report import inspect_psf
 from mwdn.calibration.verdict import headline, verdict
 from mwdn.errors import ImageError
@@ -53,6 +55,21 @@ def test_a_good_psf_has_nothing_to_mind(tmp_path, psf):
     assert report.levels.peak == pytest.approx(0.9, abs=1e-4)
     assert report.levels.saturated == 0
     assert report.size == SIZE
+
+
+@pytest.mark.parametrize("sides", ["ab", "ba"])
+def test_of_two_points_as_far_from_the_axis_the_less_alike_counts(tmp_path, psf, sides):
+    """Only the last one was compared."""
+    others = {"a": psf, "b": sample_camera(6, SIZE, family="contours", variety=CLEAN)}
+    for name, other in others.items():
+        np.save(tmp_path / f"{name}.npy", other[0].movedim(0, -1).numpy())
+    field = PlaceFiles(
+        field_positions=((0.0, -20.0), (0.0, 20.0)), field_psfs=tuple(tmp_path / f"{name}.npy" for name in sides)
+    )
+    _, beside = psfs_elsewhere(Calibration(psf, places=field))
+    worst = psf_measures.likeness(others["b"], psf)
+    assert inspect_psf(Calibration(psf), off_axis=beside).off_axis == {20.0: pytest.approx(worst, abs=0.02)}
+    assert worst < 0.9
 
 
 def test_background_is_reported(tmp_path, psf):

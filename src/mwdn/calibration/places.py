@@ -13,6 +13,7 @@ from mwdn.calibration.psf import Calibration
 from mwdn.errors import ParameterError
 from mwdn.optics.field import FieldCamera
 from mwdn.optics.psf_measures import likeness
+from mwdn.optics.sensor import Sensor
 from mwdn.optics.warp import warp
 from mwdn.types import Psf
 
@@ -97,8 +98,11 @@ def _read(calibration: Calibration, file: Path) -> Calibration:
     return Calibration.from_file(file, calibration.frames, psf_format=calibration.psf_format, corrections=done)
 
 
-def psfs_elsewhere(calibration: Calibration) -> tuple[dict[float, Psf], dict[float, Psf]]:
-    """All PSFs of a camera at other distances, by the distance in mm, and off the axis, by the displacement in raw px.
+def psfs_elsewhere(calibration: Calibration) -> tuple[dict[float, Psf], list[tuple[float, Psf]]]:
+    """All PSFs of a camera at other distances, and off the axis.
+
+    Returns:
+        Those at other distances by the distance in mm, and each PSF off the axis with its displacement in raw pixels.
 
     Raises:
         MwdnError: a PSF cannot be read.
@@ -106,7 +110,7 @@ def psfs_elsewhere(calibration: Calibration) -> tuple[dict[float, Psf], dict[flo
     places = calibration.places
     far = {z: _psf(calibration, file) for z, file in zip(places.distances_mm, places.distance_psfs, strict=True)}
     moved = [round(math.hypot(*position), 1) for position in places.field_positions]
-    return far, {d: _psf(calibration, file) for d, file in zip(moved, places.field_psfs, strict=True)}
+    return far, [(d, _psf(calibration, file)) for d, file in zip(moved, places.field_psfs, strict=True)]
 
 
 def field_camera(calibration: Calibration) -> FieldCamera:
@@ -135,7 +139,7 @@ def field_camera(calibration: Calibration) -> FieldCamera:
     psfs = torch.cat([calibration.psf, *(level * one.psf for level, one in zip(light, others, strict=True))])
     weights = _shepard(torch.tensor(points), calibration.size)
     maps = F.interpolate(weights, calibration.size, mode="bilinear", align_corners=True)
-    return FieldCamera(psfs, maps, sensor=calibration.binned_sensor or FieldCamera(psfs, maps).sensor)
+    return FieldCamera(psfs, maps, sensor=calibration.binned_sensor or Sensor())
 
 
 def _shepard(points: Tensor, size: tuple[int, int]) -> Tensor:

@@ -1,5 +1,7 @@
 """The report of a PSF: all its measures."""
 
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -75,7 +77,8 @@ class PsfReport:
         known_frequency: frequency up to which the PSF exceeds the noise of its file; 0.5 at most.
         depth: correlation with the PSF of the design distance, by the distance of the point; may be empty.
         angle: correlation with the PSF on the axis, by the angle; may be empty.
-        off_axis: correlation with the PSF on the axis, by the point's displacement in raw pixels; may be empty.
+        off_axis: correlation with the PSF on the axis, by the point's displacement in raw pixels, of the least alike
+            if several are displaced as far; may be empty.
         corrected: the PSF's file was made by `mwdn calibrate FRAMES`.
         defects: number of hot and dead pixels, if they were sought.
         sensor: full well and read noise in electrons of a raw pixel, if they were measured.
@@ -119,7 +122,7 @@ def inspect_psf(
     *,
     depth: dict[float, Psf] | None = None,
     angle: dict[float, Psf] | None = None,
-    off_axis: dict[float, Psf] | None = None,
+    off_axis: Sequence[tuple[float, Psf]] = (),
 ) -> PsfReport:
     """Measure a PSF.
 
@@ -128,7 +131,7 @@ def inspect_psf(
         frame: the PSF's raw frame, from `FrameFormat.read`; without it there are no levels in the report.
         depth: PSFs of points at other distances, by the distance.
         angle: PSFs of points off the axis, by the angle.
-        off_axis: PSFs of points off the axis, by their displacement in raw pixels.
+        off_axis: PSFs of points off the axis, each with its displacement in raw pixels.
     """
     psf = calibration.psf.float().cpu()
     colours = [psf[:, [c]] for c in range(psf.shape[1])]
@@ -152,8 +155,8 @@ def inspect_psf(
         detail_kept={value: min(psf_spectrum.detail_kept(psf, value)) for value in LAMBDAS},
         resolution_px={noise: _resolution(colours, noise) for noise in NOISES},
         known_frequency=_known_frequency(psf, levels.noise_floor if levels else 0.0),
-        depth=_likenesses(psf, depth),
-        angle=_likenesses(psf, angle),
+        depth=_likenesses(psf, (depth or {}).items()),
+        angle=_likenesses(psf, (angle or {}).items()),
         off_axis=_likenesses(psf, off_axis),
         corrected=calibration.corrections.psf_done,
         defects=None if calibration.corrections.defects is None else calibration.corrections.count,
@@ -161,8 +164,12 @@ def inspect_psf(
     )
 
 
-def _likenesses(psf: Psf, others: dict[float, Psf] | None) -> dict[float, float]:
-    return {place: psf_measures.likeness(other, psf) for place, other in (others or {}).items()}
+def _likenesses(psf: Psf, others: Iterable[tuple[float, Psf]]) -> dict[float, float]:
+    """Correlation with the PSFs of other points, by their place; the least of those at the same place."""
+    found: dict[float, float] = {}
+    for place, other in others:
+        found[place] = min(psf_measures.likeness(other, psf), found.get(place, math.inf))
+    return found
 
 
 def _resolution(colours: list[Psf], noise: float) -> float:
