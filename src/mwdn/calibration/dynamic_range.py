@@ -28,13 +28,11 @@ class Merged(NamedTuple):
         image: (1, C, H, W), light in units of the shortest exposure's full scale.
         exposures: relative to the shortest, as measured in the pixels that neighbouring exposures share.
         noise: (1, C, H, W), standard deviation at each pixel.
-        unknown: (1, 1, H, W), bool, pixels that are saturated in every exposure.
     """
 
     image: Image
     exposures: tuple[float, ...]
     noise: Image
-    unknown: Tensor
 
 
 def merge_exposures(averages: Sequence[FrameAverage], exposures: Sequence[float]) -> Merged:
@@ -68,9 +66,8 @@ def merge_exposures(averages: Sequence[FrameAverage], exposures: Sequence[float]
     light = averages[0].image
     for _ in range(3):  # the weights change by less than 1 % after the second round
         light, weight = _weighted(averages, usable, times, models, light)
-    unknown = ~torch.stack(usable).any(0).all(1, keepdim=True)
     single = (models[0].variance(light) / averages[0].count).sqrt()
-    return Merged(light, tuple(times), torch.where(weight > 0, weight.clamp(min=1e-30).rsqrt(), single), unknown)
+    return Merged(light, tuple(times), torch.where(weight > 0, weight.clamp(min=1e-30).rsqrt(), single))
 
 
 def _weighted(

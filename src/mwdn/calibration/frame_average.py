@@ -44,7 +44,6 @@ class FrameAverage:
         count: number of frames averaged.
         saturated: (1, 1, H, W), bool, pixels that are saturated in more than half of the frames.
         noise: of one frame; ``None`` for a single one.
-        left_out: number of outlying pixel values left out, such as cosmic hits.
         rejected: reason for each frame left out, by its name.
     """
 
@@ -52,7 +51,6 @@ class FrameAverage:
     count: int
     saturated: Tensor
     noise: NoiseModel | None = None
-    left_out: int = 0
     rejected: dict[str, str] = field(default_factory=dict)
 
 
@@ -97,17 +95,15 @@ def average_frames(
         )
     scales = _scales([frames[i] for i in kept], format, kind, dark)
     noise = _noise([frames[i] for i in kept], format, scales, dark)
-    parts, left_out = [], 0
+    parts = []
     rows = max(1, _ROWS // (frames[0].shape[1] * frames[0].shape[2] * max(1, len(kept) // 4)))
     for top in range(0, frames[0].shape[0], rows):
         band = slice(top, top + rows)
         stack = _linear([frames[i][band] for i in kept], format, scales, _band(dark, band))
-        part, outliers = _clipped_mean(stack, noise)
-        parts.append(part)
-        left_out += outliers
+        parts.append(_clipped_mean(stack, noise))
     saturated = _saturated([frames[i] for i in kept], format)
     image = torch.cat(parts, -2)
-    return FrameAverage(image, len(kept), saturated, noise, left_out, rejected)
+    return FrameAverage(image, len(kept), saturated, noise, rejected)
 
 
 def _check_alike(frames: Sequence[Frame], names: Sequence[str]) -> None:
@@ -214,17 +210,16 @@ def _saturated(frames: Sequence[Frame], format: FrameFormat) -> Tensor:
     return torch.from_numpy(2 * counts > len(frames))[None, None]
 
 
-def _clipped_mean(stack: Tensor, noise: NoiseModel | None) -> tuple[Image, int]:
-    """Mean (1, C, H, W) over the frames without outliers, and how many values were left out."""
+def _clipped_mean(stack: Tensor, noise: NoiseModel | None) -> Image:
+    """Mean (1, C, H, W) over the frames without outliers."""
     if noise is None:
-        return stack.mean(0, keepdim=True), 0
+        return stack.mean(0, keepdim=True)
     two = len(stack) == 2
     centre = stack.amin(0, keepdim=True) if two else stack.median(0, keepdim=True).values
     # The difference of two frames has twice the variance of one.
     limit = CLIP * (2 if two else 1) ** 0.5 * noise.variance(centre).sqrt()
     good = (stack - centre).abs() <= limit
-    mean = (stack * good).sum(0, keepdim=True) / good.sum(0, keepdim=True)
-    return mean, int((~good).sum())
+    return (stack * good).sum(0, keepdim=True) / good.sum(0, keepdim=True)
 
 
 def _listed(rejected: dict[str, str]) -> str:
