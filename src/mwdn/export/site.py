@@ -1,6 +1,5 @@
 """A folder for static hosts: one page that reconstructs a camera's captures in the visitor's browser."""
 
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from mwdn.export.web_runtime import BINARIES, LIBRARIES, PACKAGE, VERSION, read_
 from mwdn.inference.methods import Method, as_method
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import as_parameter_error, atomic, check_folder, refuse_foreign
-from mwdn.io.images import write_frame
+from mwdn.io.images import encode_png
 from mwdn.networks.network import Network
 from mwdn.types import Measurement, Scene
 from mwdn.version import __version__
@@ -97,7 +96,8 @@ def export_site(
     about = {"method": _title(method), "version": __version__, "runtime": f"{PACKAGE} {VERSION}"}
     camera = _camera(calibration, about | {"name": name}, channels, scenes)
     images = {key: _bytes(image) for key, image in _images(calibration).items()}
-    samples = {f"{key}.png": _png(capture) for key, capture in zip(SAMPLES, captures, strict=True)}
+    frames = captures.movedim(1, -1).numpy().astype("uint16")
+    samples = {f"{key}.png": encode_png(frame, f"{key}.png") for key, frame in zip(SAMPLES, frames, strict=True)}
     texts = [name for name in FILES if not name.endswith(".js")]
     contents = {name: read_static(name) for name in texts}
     contents |= {
@@ -206,13 +206,6 @@ def _hot_pixels(calibration: Calibration) -> list[tuple[int, list[int]]]:
 
 def _bytes(image: Tensor) -> bytes:
     return image.to(torch.float32).contiguous().numpy().astype("<f4").tobytes()
-
-
-def _png(capture: Tensor) -> bytes:
-    with tempfile.TemporaryDirectory(prefix="mwdn-") as folder:
-        path = Path(folder) / "capture.png"
-        write_frame(path, capture.movedim(0, -1).numpy().astype("uint16"))
-        return path.read_bytes()
 
 
 def _runtime_scripts(binaries: Mapping[str, bytes]) -> dict[str, str]:

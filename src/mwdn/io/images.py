@@ -168,7 +168,7 @@ def write_frame(path: str | Path, frame: Frame) -> None:
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    data = _encode_png(path, frame) if suffix == ".png" else b""  # before there is a temporary file
+    data = encode_png(frame, path) if suffix == ".png" else b""  # before there is a temporary file
     with atomic_write(path) as temporary:
         if suffix == ".png":
             temporary.write_bytes(data)
@@ -179,6 +179,29 @@ def write_frame(path: str | Path, frame: Frame) -> None:
             import tifffile
 
             tifffile.imwrite(temporary, frame, photometric="rgb" if frame.shape[-1] == 3 else "minisblack")
+
+
+def encode_png(frame: Frame, name: str | Path) -> bytes:
+    """A frame as a PNG of 8 or 16 bits: the content of the file that `write_frame` writes.
+
+    Args:
+        frame: (H, W, 1) or (H, W, 3), RGB, uint8 or uint16.
+        name: of the picture, for the error.
+
+    Raises:
+        ImageError: it has over a million rows or columns.
+    """
+    import cv2
+
+    try:
+        encoded, data = cv2.imencode(".png", np.ascontiguousarray(frame[..., ::-1]))
+    except cv2.error as error:
+        raise ImageError(f"`{name}` cannot be written: OpenCV: {error.err}.") from error
+    if not encoded:
+        raise ImageError(
+            f"`{name}` cannot be written: OpenCV cannot encode {frame.shape[0]:,} x {frame.shape[1]:,} pixels as PNG."
+        )
+    return data.tobytes()
 
 
 def srgb_encode(linear: Tensor) -> Tensor:
@@ -196,20 +219,6 @@ def srgb_encode(linear: Tensor) -> Tensor:
 def srgb_decode(encoded: Tensor) -> Tensor:
     """Decode sRGB numbers in [0, 1], of any shape, to linear light; the inverse of `srgb_encode`."""
     return torch.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-
-
-def _encode_png(path: Path, frame: Frame) -> bytes:
-    import cv2
-
-    try:
-        encoded, data = cv2.imencode(".png", np.ascontiguousarray(frame[..., ::-1]))
-    except cv2.error as error:
-        raise ImageError(f"`{path}` cannot be written: OpenCV: {error.err}.") from error
-    if not encoded:
-        raise ImageError(
-            f"`{path}` cannot be written: OpenCV cannot encode {frame.shape[0]:,} x {frame.shape[1]:,} pixels as PNG."
-        )
-    return data.tobytes()
 
 
 def _float_frame(path: Path, image: Tensor | FloatFrame, *suffixes: str) -> FloatFrame:

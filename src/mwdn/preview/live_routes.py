@@ -9,12 +9,12 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket
 
+from mwdn.io.images import encode_png
 from mwdn.preview.cameras import Cameras
 from mwdn.preview.jobs import Jobs
 from mwdn.preview.limits import Limits, RefusedError
 from mwdn.preview.live import Live
 from mwdn.preview.live_viewer import serve_viewer
-from mwdn.preview.result import encode_frame
 
 CAMERA = "live"
 """Name of the live camera's calibration, once there is a snapshot."""
@@ -63,4 +63,4 @@ class LiveRoutes:
         frame = self.jobs.result(request.path_params["id"]).frame
         if frame is None:
             raise RefusedError(404, "This job is no snapshot of the live camera: its client has the capture.")
-        return Response(await to_thread.run_sync(partial(encode_frame, frame)), media_type="image/png")
+        return Response(await to_thread.run_sync(partial(encode_png, frame, "capture.png")), media_type="image/png")

@@ -11,7 +11,7 @@ from torch import Tensor
 from mwdn.calibration.white_balance import WhiteBalance, apply_white_balance, check_white_balance
 from mwdn.errors import ParameterError
 from mwdn.io.contact_sheets import to_display
-from mwdn.io.images import write_frame, write_linear, write_picture
+from mwdn.io.images import write_linear, write_picture
 from mwdn.types import Measurement, Scene
 
 PictureFormat = Literal["png", "png16", "tiff", "npy"]
@@ -104,12 +104,4 @@ def encode(image: Tensor, look: Look) -> bytes:
         else:
             shown = (to_display(image) * 2**look.exposure).clamp(0, 1)
             write_picture(path, shown, bits=16 if look.format == "png16" else 8)
-        return path.read_bytes()
-
-
-def encode_frame(frame: npt.NDArray[Any]) -> bytes:
-    """A raw frame as a PNG of 8 or 16 bits: the numbers of the sensor."""
-    with tempfile.TemporaryDirectory(prefix="mwdn-") as folder:
-        path = Path(folder) / "capture.png"
-        write_frame(path, frame)
         return path.read_bytes()

@@ -1,14 +1,12 @@
 """A camera to try: a simulated one, and captures of three photographs."""
 
-import tempfile
 from functools import cache
-from pathlib import Path
 
 import torch
 
 from mwdn.calibration import Calibration
 from mwdn.data.random import seeded
-from mwdn.io.images import write_frame
+from mwdn.io.images import encode_png
 from mwdn.io.pictures import dark_scene
 from mwdn.optics import Camera, Sensor, Variety, sample_camera
 from mwdn.types import Frame
@@ -42,7 +40,4 @@ def sample_capture(name: str) -> Frame:
 @cache
 def sample_png(name: str) -> bytes:
     """A sample capture as a PNG of 16 bits."""
-    with tempfile.TemporaryDirectory(prefix="mwdn-") as folder:
-        path = Path(folder) / "capture.png"
-        write_frame(path, sample_capture(name))
-        return path.read_bytes()
+    return encode_png(sample_capture(name), f"{name}.png")
