@@ -6,7 +6,6 @@ answers with a checksum of the pixels it has drawn.
 
 import threading
 import time
-from urllib.parse import quote
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from mwdn.capture.page_hub import MESSAGE_BYTES, Hub
 from mwdn.capture.screen import Picture, Screen
 from mwdn.errors import DisplayError
 from mwdn.runtime.requirement import require
-from mwdn.runtime.web_access import LOOPBACK, check_token, listen
+from mwdn.runtime.web_access import LOOPBACK, check_token, listen, page_url
 
 LIBRARIES = ("starlette", "websockets", "uvicorn")
 
@@ -58,10 +57,7 @@ class PageDisplay(Display):
         Screen(width_px=1, height_px=1, **self._cm)
         self.show_s = show_s
         self._socket = listen(host, port)
-        address = f"[{host}]" if ":" in host else host
-        self.url = f"http://{address}:{self._socket.getsockname()[1]}/"
-        if token:
-            self.url += f"?token={quote(token)}"
+        self.url = page_url(host, self._socket, token)
         self._hub = Hub(token, self._cm, any_host=host not in LOOPBACK)
         self._start()
 

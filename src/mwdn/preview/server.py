@@ -5,11 +5,10 @@ import socket
 import sys
 import threading
 from typing import Any
-from urllib.parse import quote
 
 from mwdn.preview.limits import Limits
 from mwdn.runtime.requirement import require
-from mwdn.runtime.web_access import LOOPBACK, check_token, listen
+from mwdn.runtime.web_access import LOOPBACK, check_token, listen, page_url
 
 CONNECTIONS = 512
 """Connections at the same time; others get the status 503 at once."""
@@ -37,8 +36,7 @@ class PreviewServer:
         import uvicorn
 
         self.socket: socket.socket = listen(host, port)
-        address = f"[{host}]" if ":" in host else host
-        self.url = f"http://{address}:{self.socket.getsockname()[1]}/{f'?token={quote(token)}' if token else ''}"
+        self.url = page_url(host, self.socket, token)
         config = uvicorn.Config(
             preview.app(token=token, any_host=host not in LOOPBACK),
             ws="websockets-sansio",

@@ -3,7 +3,7 @@
 import hmac
 import socket
 from collections.abc import Mapping
-from urllib.parse import urlsplit
+from urllib.parse import quote, urlsplit
 
 from mwdn.errors import ParameterError, reason
 
@@ -61,3 +61,16 @@ def listen(host: str, port: int) -> socket.socket:
         listener.close()
         raise ParameterError(f"`host` and `port` ({host}:{port}) cannot be used: {reason(error)}.") from error
     return listener
+
+
+def page_url(host: str, listener: socket.socket, token: str) -> str:
+    """The address of a page, with its token if it needs one.
+
+    Args:
+        host: address of this computer, as for `listen`.
+        listener: its listening socket: it knows the port.
+        token: empty if none is needed.
+    """
+    address = f"[{host}]" if ":" in host else host
+    query = f"?token={quote(token)}" if token else ""
+    return f"http://{address}:{listener.getsockname()[1]}/{query}"
