@@ -75,16 +75,12 @@ def _session(pictures: Sequence[Path]) -> Path | None:
 
 
 def _extracted(path: Path, folder: Path, given: BenchFrames) -> BenchFrames:
+    numbered = (f"{kind}-{number}" for number in range(1, 5) for kind in ("point", "dark"))
     with open_hdf5(path, _ADVICE) as file:
         attributes = read_attributes(path, file, _ADVICE)
         groups: dict[str, list[Path]] = {}
         exposures_ms: dict[str, float] = {}
-        for name in (
-            "dark",
-            "white",
-            "half",
-            *(f"{kind}-{number}" for number in range(1, 5) for kind in ("point", "dark")),
-        ):
+        for name in ("dark", "white", "half", *numbered):
             rows = find_rows(path, file, f"calibration/{name}/measurement", _ADVICE)
             if rows is not None:
                 groups[name] = _written(path, rows, folder / name)
@@ -96,24 +92,18 @@ def _extracted(path: Path, folder: Path, given: BenchFrames) -> BenchFrames:
             "starts (`mwdn capture RECIPE --point.frames 8`), or photograph one: `mwdn calibrate --help`."
         )
     points, darks = ([f"{kind}-{number}" for number in range(1, count + 1)] for kind in ("point", "dark"))
-    times = [exposures_ms[name] for name in points]
-    usual = exposures_ms["dark"]
-    own: dict[str, Any] = {"flat": given.photographs.flat, "flat_dark": given.photographs.flat_dark}
-    if not given.photographs.flat:  # the mask is in front of the sensor: no flat field
-        darkest = min(("dark", *darks), key=lambda name: exposures_ms[name])  # least of the room's light and its noise
-        own = {
-            "flat": (*groups["white"], *groups["half"]),
-            "flat_dark": tuple(groups[darkest]),
-            "flat_through_mask": True,
-        }
+    times, usual = tuple(exposures_ms[name] for name in points), exposures_ms["dark"]
     photographs = replace(
         given.photographs,
-        exposures=tuple(times),
+        exposures=times,
         dark=tuple(file for name in (*darks, "dark") for file in groups[name]),
         dark_exposures=(*times, usual),
         capture_exposure=usual,
-        **own,
     )
+    if not photographs.flat:  # the mask is in front of the sensor: no flat field
+        darkest = min(("dark", *darks), key=lambda name: exposures_ms[name])  # least of the room's light and its noise
+        flat, flat_dark = (*groups["white"], *groups["half"]), tuple(groups[darkest])
+        photographs = replace(photographs, flat=flat, flat_dark=flat_dark, flat_through_mask=True)
     frames = given.frames.completed(attributes.get("bit_depth"), attributes.get("mosaic"), of=f"`{path}`")
     return BenchFrames([file for name in points for file in groups[name]], photographs, frames)
 
