@@ -65,7 +65,16 @@ class Scores:
 
     def content(self) -> dict[str, Any]:
         """All numbers, with means and intervals, as plain values for JSON."""
-        return _finite(_plain(self))
+        content = {
+            "learnable": self.learnable,
+            "device": self.device,
+            "peak_bytes": self.peak_bytes,
+            "median_seconds": self.median_seconds,
+            "mean_low_high": {metric: self.summary(metric) for metric in self.values},
+            "values": self.values,
+            "seconds": self.seconds,
+        }
+        return _finite(content)
 
     @classmethod
     def read(cls, content: Mapping[str, Any]) -> "Scores":
@@ -182,19 +191,6 @@ def _cell(metric: str, summary: tuple[float, float, float], best: bool) -> str:
 def _costs(scores: Scores) -> tuple[str, str, str]:
     memory = "?" if scores.peak_bytes is None else f"{scores.peak_bytes / 2**20:,.0f} MiB {scores.device}"
     return f"{1000 * scores.median_seconds:.1f}", memory, f"{scores.learnable:,}"
-
-
-def _plain(scores: Scores) -> dict[str, Any]:
-    summaries = {metric: scores.summary(metric) for metric in scores.values}
-    return {
-        "learnable": scores.learnable,
-        "device": scores.device,
-        "peak_bytes": scores.peak_bytes,
-        "median_seconds": scores.median_seconds,
-        "mean_low_high": summaries,
-        "values": scores.values,
-        "seconds": scores.seconds,
-    }
 
 
 def _finite(content: Any) -> Any:  # noqa: ANN401
