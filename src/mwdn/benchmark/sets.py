@@ -186,16 +186,7 @@ def open_dataset(name: str, recipe: DatasetRecipe, folder: Path, device: torch.d
     simulates = not recipe.pairs
     if simulates:
         recipe = replace(recipe, sensor=simulated_sensor(recipe.sensor, calibration))
-    not_in_pairs = {"camera", "psf", "captures", "protocol"}
-    not_in_pairs |= {"mismatch"} if recipe.mismatch == EXACT else set()  # earlier files lack it
-    identity = {key: value for key, value in asdict(recipe).items() if key not in not_in_pairs}
-    if recipe.camera:
-        identity["frames"] = repr(calibration.frames)
-    if calibration.frames.grey and simulates:
-        identity["channels"] = 1  # earlier pairs of grey cameras have colours
-    if calibration.refinement and not simulates:
-        identity["refinement"] = repr(calibration.refinement)
-    identity = json.loads(json.dumps({**identity, "psf_hash": calibration.psf_hash}))
+    identity = _identity(recipe, calibration)
     note = folder / f"{name}.json"
     own = simulates or recipe.kind  # else the user's file, which is only read
     path = folder / f"{name}.h5" if own else Path(recipe.pairs)
@@ -209,11 +200,8 @@ def open_dataset(name: str, recipe: DatasetRecipe, folder: Path, device: torch.d
             _simulate(recipe, calibration, path, device, lambda rows: track(f"{name}: simulating", rows))
         else:
             resized = (recipe.camera or recipe.bin > 1) and KINDS[recipe.kind].place is None
-            size = calibration.size if resized else None
-            layout, frames = (
-                Layout(scene_size=size),
-                calibration.frames if recipe.camera else FrameFormat(bin=recipe.bin),
-            )
+            layout = Layout(scene_size=calibration.size if resized else None)
+            frames = calibration.frames if recipe.camera else FrameFormat(bin=recipe.bin)
             import_pairs(recipe.kind, recipe.pairs, path, layout=layout, frames=frames)
         write_text(note, json.dumps(identity, indent=2))
     file = PairFile(path)
@@ -224,6 +212,20 @@ def open_dataset(name: str, recipe: DatasetRecipe, folder: Path, device: torch.d
     training = None if recipe.trained_on else _training(recipe, calibration, pairs, rows, device)
     test = RefinedPairs(Part(file, rows["test"]), refinement)
     return Dataset(name, recipe, calibration, test, training, identity, file.measurement_shape[2])
+
+
+def _identity(recipe: DatasetRecipe, calibration: Calibration) -> dict[str, Any]:
+    """The settings that the pairs of a data set depend on, in values that JSON can hold."""
+    not_in_pairs = {"camera", "psf", "captures", "protocol"}
+    not_in_pairs |= {"mismatch"} if recipe.mismatch == EXACT else set()  # earlier files lack it
+    identity = {key: value for key, value in asdict(recipe).items() if key not in not_in_pairs}
+    if recipe.camera:
+        identity["frames"] = repr(calibration.frames)
+    if calibration.frames.grey and not recipe.pairs:
+        identity["channels"] = 1  # earlier pairs of grey cameras have colours
+    if calibration.refinement and recipe.pairs:
+        identity["refinement"] = repr(calibration.refinement)
+    return json.loads(json.dumps({**identity, "psf_hash": calibration.psf_hash}))
 
 
 def simulated_pairs(

@@ -208,36 +208,34 @@ def _about(name: str, calibration: Calibration, channels: int, precision: str) -
         "scene": "float32, linear light, not clipped to [0, 1]",
         "binning": str(calibration.frames.bin),
     }
-    if calibration.white_balance is not None:
-        about["white_balance"] = f"not applied to the scene: {calibration.white_balance}"
-    if calibration.frames.bit_depth is not None:
-        about["bit_depth"] = str(calibration.frames.bit_depth)
-    if calibration.frames.crop is not None:
-        height, width = (length // calibration.frames.cell for length in calibration.frames.crop)
-        about["crop"] = f"{height} x {width}"  # in pixels of the colours, after demosaicing
-    if calibration.frames.upside_down:
-        about["rows"] = "raw frames have their first row at the bottom"
-    if calibration.frames.bgr:
-        about["colours"] = "raw frames have their channels in the order blue, green, red"
-    if calibration.frames.mosaic:
-        about["mosaic"] = calibration.frames.mosaic
-    if calibration.frames.grey:
-        about["grey"] = "the colours of raw frames must be averaged"
-    if calibration.frames.gamma is not None:
-        about["gamma"] = str(calibration.frames.gamma)
-    if calibration.ambient is not None:
-        about["ambient"] = "a frame taken with the room's light alone must be subtracted from raw frames"
-    elif calibration.dark is not None:
-        about["dark"] = "a frame taken without light must be subtracted from raw frames"
-    if calibration.corrections.flat is not None:
-        about["flat"] = "raw frames must be divided by the camera's flat field"
-    if calibration.corrections.count:
-        about["hot_pixels"] = f"{calibration.corrections.count} pixels of raw frames must be replaced by neighbours"
-    if calibration.refinement.stray_light:
-        about["stray_light"] = "the camera's stray light must be subtracted from measurements"
-    if calibration.refinement.sensor_field:
-        about["sensor_field"] = "measurements must be divided by the camera's sensor field"
-    return about
+    frames, corrections, refinement = calibration.frames, calibration.corrections, calibration.refinement
+    crop = (str(length // frames.cell) for length in frames.crop or ())  # in pixels of the colours, after demosaicing
+    more = {
+        "white_balance": (calibration.white_balance, f"not applied to the scene: {calibration.white_balance}"),
+        "bit_depth": (frames.bit_depth, str(frames.bit_depth)),
+        "crop": (frames.crop, " x ".join(crop)),
+        "rows": (frames.upside_down, "raw frames have their first row at the bottom"),
+        "colours": (frames.bgr, "raw frames have their channels in the order blue, green, red"),
+        "mosaic": (frames.mosaic, str(frames.mosaic)),
+        "grey": (frames.grey, "the colours of raw frames must be averaged"),
+        "gamma": (frames.gamma, str(frames.gamma)),
+        "ambient": (
+            calibration.ambient is not None,
+            "a frame taken with the room's light alone must be subtracted from raw frames",
+        ),
+        "dark": (
+            calibration.dark is not None and calibration.ambient is None,
+            "a frame taken without light must be subtracted from raw frames",
+        ),
+        "flat": (corrections.flat is not None, "raw frames must be divided by the camera's flat field"),
+        "hot_pixels": (
+            corrections.count,
+            f"{corrections.count} pixels of raw frames must be replaced by neighbours",
+        ),
+        "stray_light": (refinement.stray_light, "the camera's stray light must be subtracted from measurements"),
+        "sensor_field": (refinement.sensor_field, "measurements must be divided by the camera's sensor field"),
+    }
+    return about | {key: text for key, (applies, text) in more.items() if applies}
 
 
 def _program(module: FixedPsf, measurement: Measurement) -> ExportedProgram:
