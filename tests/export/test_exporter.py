@@ -368,10 +368,8 @@ def test_lower_precisions(precision, share, tmp_path):
     assert read_about(done.path)["precision"] == precision
 
 
-@pytest.mark.parametrize(
-    "name", ["flatnet", *(pytest.param(name, marks=pytest.mark.acceptance) for name in ("ifin", "svdeconv"))]
-)
 @pytest.mark.acceptance
+@pytest.mark.parametrize("name", ["flatnet", "ifin", "svdeconv"])
 def test_float16_of_group_norm_and_mixed_precisions(name, tmp_path):
     """From 16 features on convolutions are float16; what stands between them stays float32."""
     options = {"size": SIZE} if name == "svdeconv" else {}
