@@ -130,6 +130,12 @@ def test_no_option_of_a_camera_names_a_file(client, capture, psf_file, option):
 
 # Starlette before 1.10 leaves a file of a refused upload to the garbage collector.
 @pytest.mark.filterwarnings("ignore:.*SpooledTemporaryFile:pytest.PytestUnraisableExceptionWarning")
+def test_a_psf_too_small_to_judge_by_is_refused(client, capture, psf_file):
+    cropped = '{"crop": [14, 14]}'
+    error = order(client, capture, 422, camera=None, files={"psf": psf_file}, calibration=cropped).json()["error"]
+    assert "(14 x 14) must have at least 15 pixels" in error
+
+
 def test_upload_limit(client, capture):
     error = order(client, b"\0" * (LIMITS.upload_bytes + 1), 413).json()["error"]
     assert f"{LIMITS.upload_bytes:,}" in error

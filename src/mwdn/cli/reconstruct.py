@@ -11,7 +11,6 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.markup import escape
 
-from mwdn.calibration import Calibration
 from mwdn.calibration.white_balance import WhiteBalance
 from mwdn.cli.automatic_bin import binned
 from mwdn.cli.camera import CameraOptions
@@ -21,17 +20,14 @@ from mwdn.cli.method_options import MethodOptions, read_options
 from mwdn.cli.progress import show_progress
 from mwdn.cli.terminal import Json, complain, counted, detail, if_interrupted, note, print_json, say, warn
 from mwdn.data.captures import list_captures
-from mwdn.errors import ParameterError, PsfError, one_line
+from mwdn.diagnosis.trust import check_size
+from mwdn.errors import ParameterError, one_line
 from mwdn.inference.batch import SHOWN, Batch, Job
 from mwdn.inference.outputs import Format, check_outputs, output_name, read_sidecar
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.exif import orientation
 from mwdn.io.files import check_folder
 from mwdn.runtime import distributed
-
-SMALLEST = 15
-"""Minimum height and width of a PSF in pixels. The check accepts the right PSF of 12 pixels for 1 or 2 captures in 10,
-of 15 pixels for 7 or 8."""
 
 
 @no_empty_folder
@@ -93,7 +89,7 @@ def reconstruct(  # noqa: PLR0913
     with distributed.process_group():
         is_first = distributed.rank() == 0
         calibration, is_binned = camera.load(), ""
-        _check_size(calibration)
+        check_size(calibration.psf)
         # Listed by the first process: files may be added to a folder meanwhile.
         files: list[str] = distributed.broadcast_json(lambda: _list_files(captures, camera, out, format))
         if auto_bin:
@@ -142,16 +138,6 @@ def reconstruct(  # noqa: PLR0913
     status = 1 if failed else 0
     distributed.set_exit_status(status)
     return status
-
-
-def _check_size(calibration: Calibration) -> None:
-    """Raise a `PsfError` if the PSF is too small for a reliable result."""
-    height, width = calibration.size
-    if min(height, width) < SMALLEST:
-        raise PsfError(
-            f"The PSF ({height} x {width}) must have at least {SMALLEST} pixels along each side. Take the whole frame "
-            "of the sensor, or crop and bin it less: `--crop`, `--bin`, `--psf-bin`."
-        )
 
 
 def _name_turn(files: Iterable[str | Path]) -> None:

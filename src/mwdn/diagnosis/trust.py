@@ -8,10 +8,15 @@ import torch
 from mwdn.diagnosis.orientation import OrientationFit, fit_orientations
 from mwdn.diagnosis.support_map import Support, support_map
 from mwdn.diagnosis.verdict import Verdict
+from mwdn.errors import PsfError
 from mwdn.evaluation.consistency import Consistency, consistency
 from mwdn.optics.orientation import Orientation
 from mwdn.solvers.alignment import Pose, align
 from mwdn.types import Measurement, Psf, Scene
+
+SMALLEST = 15
+"""Minimum height and width of a PSF in pixels. The check accepts the right PSF of 12 pixels for 1 or 2 captures in 10,
+of 15 pixels for 7 or 8."""
 
 LEAST_EXPLAINED = 0.25
 """Smallest trusted ``explained / possible``. On real captures the right PSF reaches 0.32 and more."""
@@ -79,6 +84,16 @@ class Trust:
         if explained < LEAST_EXPLAINED * possible:
             return Verdict("picture", "little-explained", "doubt", f"The picture reproduces only {share}.")
         return Verdict("picture", "little-explained", "good", f"The picture reproduces {share}.")
+
+
+def check_size(psf: Psf) -> None:
+    """Raise a `PsfError` if a PSF is too small for a reliable result."""
+    height, width = psf.shape[-2:]
+    if min(height, width) < SMALLEST:
+        raise PsfError(
+            f"The PSF ({height} x {width}) must have at least {SMALLEST} pixels along each side. Take the whole frame "
+            "of the sensor, or crop and bin it less: `crop`, `bin`, `psf_bin`."
+        )
 
 
 @torch.inference_mode()

@@ -14,8 +14,8 @@ import torch
 from mwdn.calibration import Calibration
 from mwdn.diagnosis.captures import examine_capture
 from mwdn.diagnosis.sizes import mismatch
-from mwdn.diagnosis.trust import examine_picture
-from mwdn.errors import ImageError, PsfError, ShapeError
+from mwdn.diagnosis.trust import check_size, examine_picture
+from mwdn.errors import ImageError, ShapeError
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.formats import is_for_viewing
 from mwdn.preview.cameras import check_pixels, read_upload
@@ -28,9 +28,6 @@ from mwdn.types import Frame, Measurement
 
 KEPT = 4
 """Prepared methods that are kept for the next capture; one of 1 Mpixel takes about 100 MB."""
-
-SMALLEST = 15
-"""Pixels of a PSF along each side, at least, for a reliable result."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,8 +74,7 @@ class Reconstructions:
         Raises:
             MwdnError: no such method or option, or it does not fit the camera.
         """
-        if min(calibration.size) < SMALLEST:
-            raise PsfError(f"`psf` {calibration.size} must have at least {SMALLEST} pixels along each side.")
+        check_size(calibration.psf)
         ambient = hashlib.sha256(order.ambient).digest()
         options = tuple(sorted(order.options.items()))
         key = (id(calibration), order.method, options, order.align, order.room_light, ambient)
