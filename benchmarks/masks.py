@@ -17,7 +17,7 @@ from statistics import fmean
 import torch
 
 from mwdn import Calibration, Reconstructor
-from mwdn.benchmark.sets import PRESETS
+from mwdn.benchmark.dataset_recipe import PRESETS
 from mwdn.data.mismatch import EXACT
 from mwdn.data.photographs import Photographs
 from mwdn.data.simulated import SimulatedPairs

@@ -18,16 +18,22 @@ import torch
 
 from cameras import contour_psf
 from mwdn.benchmark import Watch, read_benchmark, run
-from mwdn.benchmark.sets import Dataset, DatasetRecipe, open_dataset
+from mwdn.benchmark.dataset_recipe import DatasetRecipe
+from mwdn.benchmark.recipe import Robustness
+from mwdn.benchmark.robustness import check_axes
+from mwdn.benchmark.sets import Dataset, open_dataset
 from mwdn.benchmark.training import schedule_on
 from mwdn.calibration import Calibration
 from mwdn.calibration.camera_file import write_camera
+from mwdn.calibration.places import field_camera
 from mwdn.cli.app import main
 from mwdn.data.pair_checks import REFINED
 from mwdn.data.pairs import PairFile
+from mwdn.data.simulated import Placement
 from mwdn.errors import CheckpointError, ParameterError, UnknownNameError
 from mwdn.evaluation import alexnet, bootstrap
-from mwdn.optics import Sensor
+from mwdn.fourier import convolve
+from mwdn.optics import Deviation, Sensor
 from mwdn.training.recipe import Schedule
 from mwdn.weights.checkpoint import read_metadata
 
@@ -396,6 +402,58 @@ def test_pairs_have_the_refinement_that_they_lack(folder, simulated):
     wanted = 0.3 if simulated else (0.3 - 0.05) / 0.5
     for measurement in (dataset.test[0][0], *(part.batch([0]).measurement for part in dataset.training)):
         assert measurement.numpy() == pytest.approx(wanted, abs=1e-3)
+
+
+def opened(folder, camera, **changes):
+    """A data set of a camera file, and what its pairs depend on."""
+    write_camera(folder / "camera.toml", {"psf": folder / "psf.npy", "background": 0.0, **camera})
+    recipe = DatasetRecipe(camera=str(folder / "camera.toml"), psf=str(folder / "psf.npy"), psf_bin=0, background=0.0)
+    recipe = replace(recipe, **changes)
+    name = f"set-{len(list(folder.glob('set-*')))}"
+    return open_dataset(name, recipe, folder, torch.device("cpu"), lambda _, rows: rows)
+
+
+def test_imported_captures_lose_the_dark_frame_of_the_camera(folder):
+    """Without a word they were scored, and trained on, with the light that the sensor shows without any."""
+    capture = np.random.default_rng(0).integers(90, 200, (48, 64, 3), np.uint8)
+    for place in ("captures", "scenes"):
+        (folder / "pairs" / place).mkdir(parents=True)
+        for number in range(10):
+            cv2.imwrite(str(folder / "pairs" / place / f"{number}.png"), capture)
+    cv2.imwrite(str(folder / "dark.png"), np.full((48, 64, 3), 51, np.uint8))
+    np.save(folder / "flat.npy", np.full((48, 64, 1), 1.25, np.float32))
+    changes = {"kind": "folders", "pairs": str(folder / "pairs"), "split": "random"}
+    files = {"dark": folder / "dark.png", "flat_field": folder / "flat.npy"}
+    dataset = opened(folder, files | {"psf_corrected": True}, **changes)
+    wanted = (capture[..., ::-1] / 255 - 0.2) / 1.25
+    assert dataset.test[0][0].movedim(0, -1).numpy() == pytest.approx(wanted, abs=1e-4)
+    assert dataset.test[0][1].movedim(0, -1).numpy() == pytest.approx(capture[..., ::-1] / 255, abs=1e-4)
+    other = opened(folder, {"psf_corrected": True}, **changes)
+    assert other.identity != dataset.identity
+
+
+def field_of(folder):
+    """Files of a camera that shows the PSF at half the light at its right border."""
+    psf = np.load(folder / "psf.npy")
+    np.save(folder / "right.npy", np.roll(psf[::-1], 3, 0) / 2)
+    return {"field_psfs": [folder / "right.npy"], "field_positions": [(0.0, 31.0)]}
+
+
+def test_simulated_captures_have_the_field_of_the_camera(folder):
+    changes = {"photos": str(folder / "photos"), "test_photos": str(folder / "test"), "train": 1, "test": 1}
+    changes |= {"validation": 1, "sensor": Sensor(full_well=1e9, read_noise=0.0)}
+    changes |= {"placement": Placement(ambient=(0.0, 0.0))}
+    dataset = opened(folder, field_of(folder), **changes)
+    measurement, scene = dataset.test[0]
+    field = measurement - field_camera(dataset.calibration).forward(scene[None])
+    one_psf = measurement - convolve(scene[None], dataset.calibration.psf)
+    assert field.norm() < 0.05 * one_psf.norm()
+    assert dataset.identity != opened(folder, {}, **changes).identity
+    with pytest.raises(ParameterError, match=r"`field_psfs`.*`deviation`"):
+        opened(folder, field_of(folder), **changes, deviation=Deviation(shift_px=1.0))
+    with pytest.raises(ParameterError, match=r"`noise` for `.*`, not `shift_px`"):
+        check_axes(Robustness(sizes={"noise": (2.0,), "shift_px": (1.0,)}), dataset)
+    check_axes(Robustness(sizes={"noise": (2.0,)}), dataset)
 
 
 def grey_camera(folder, **content):

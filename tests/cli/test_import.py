@@ -21,6 +21,7 @@ def folders(tmp_path, generator):
     for i in range(3):
         for folder in ("captures", "scenes"):
             write_picture(tmp_path / folder / f"[{i}].png", torch.rand(1, 3, 6, 7, generator=generator))
+    write_picture(tmp_path / "psf.png", torch.rand(1, 3, 6, 7, generator=generator) * 0.9)
     return tmp_path
 
 
@@ -36,6 +37,19 @@ def test_camera_file_says_how_captures_are_stored(folders, tmp_path):
     (tmp_path / "camera.toml").write_text('psf = "psf.png"\ncrop = [4, 6]\nbin = 2\nwhite_balance = "psf"\n')
     assert run("folders", folders, "-o", tmp_path / "pairs.h5", "--camera", tmp_path / "camera.toml") == 0
     assert PairFile(tmp_path / "pairs.h5").measurement_shape == (2, 3, 3)
+
+
+def test_camera_file_corrects_captures(folders, tmp_path, capsys):
+    """It said that the dark frame is not subtracted; the flat field and the hot pixels were ignored without a word."""
+    np.save(tmp_path / "flat.npy", np.full((6, 7, 1), 0.8, np.float32))
+    (tmp_path / "camera.toml").write_text('psf = "psf.png"\nflat_field = "flat.npy"\n')
+    assert run("folders", folders, "-o", tmp_path / "pairs.h5") == 0
+    assert run("folders", folders, "-o", tmp_path / "flat.h5", "--camera", tmp_path / "camera.toml") == 0
+    plain, corrected = (PairFile(tmp_path / name)[1][0] for name in ("pairs.h5", "flat.h5"))
+    assert corrected.max() > 1.1  # not clipped
+    assert np.allclose(corrected, plain / 0.8, atol=1e-4)
+    assert run("pairs", tmp_path / "pairs.h5", "-o", tmp_path / "new.h5", "--camera", tmp_path / "camera.toml") == 2
+    assert "corrected already" in " ".join(capsys.readouterr().err.split())
 
 
 def test_background_of_the_psf_is_not_the_room_light_of_digicam(folders, tmp_path):

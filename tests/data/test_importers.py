@@ -9,7 +9,8 @@ import pytest
 import torch
 from PIL import Image as Pillow
 
-from mwdn.calibration import FrameFormat
+from mwdn.calibration import Calibration, FrameFormat
+from mwdn.calibration.corrections import Corrections
 from mwdn.data import PairFile, import_pairs, read_pairs
 from mwdn.data.kinds import Layout
 from mwdn.errors import ImageError, MissingPackageError, ParameterError, UnknownNameError
@@ -379,3 +380,49 @@ def test_parquet_needs_its_package(tmp_path, monkeypatch):
 def test_wrong_numbers_of_a_layout(wrong, said):
     with pytest.raises(ParameterError, match=said):
         Layout(**wrong)
+
+
+# Corrections of a camera
+
+
+def camera_of(format, generator):
+    """A calibration with a dark frame, a flat field and a map of hot pixels, all different in each channel."""
+    dark = generator.integers(5, 40, (6, 8, 3), np.uint8)
+    flat = torch.from_numpy(generator.uniform(0.8, 1.2, (1, 3, 6, 8)).astype(np.float32))
+    hot = torch.zeros(1, 1, 6, 8, dtype=torch.bool)
+    hot[..., 2, 3] = True
+    psf = torch.rand(1, 3, 6, 8)
+    return Calibration(psf, format, format.normalise(dark), corrections=Corrections(flat, hot))
+
+
+@pytest.mark.parametrize("bgr", [False, True])
+def test_captures_are_corrected_as_the_camera_does(tmp_path, bgr):
+    generator = np.random.default_rng(0)
+    frames = FrameFormat(bgr=bgr, upside_down=True, bin=2)
+    camera = camera_of(frames, generator)
+    capture = generator.integers(0, 60, (6, 8, 3), np.uint8)
+    stored = capture[..., ::-1] if bgr else capture
+    write(tmp_path / "captures" / "0.npy", np.ascontiguousarray(stored))
+    write(tmp_path / "scenes" / "0.npy", np.ascontiguousarray(stored))
+    _, measurement, _ = next(read_pairs("folders", tmp_path, frames=frames, camera=camera))
+    wanted = camera.to_measurement(capture)[0].movedim(0, -1).numpy()
+    assert measurement.min() < 0  # not clipped
+    assert measurement == pytest.approx(wanted, abs=1e-6)
+
+
+def test_a_dark_frame_on_another_scale_is_refused(tmp_path):
+    write(tmp_path / "captures" / "0.npy", np.full((6, 8, 3), 100, np.uint16))
+    write(tmp_path / "scenes" / "0.npy", np.full((6, 8, 3), 100, np.uint16))
+    camera = camera_of(FrameFormat(), np.random.default_rng(0))
+    with pytest.raises(ImageError, match=r"`bit_depth` of the camera \(None\).*\(12\)"):
+        list(read_pairs("folders", tmp_path, frames=FrameFormat(bit_depth=12), camera=camera))
+
+
+def test_colours_of_a_mosaic_stay_in_order(tmp_path):
+    """`bgr` is of the scenes' files: the captures have one channel. It exchanged red and blue of the mosaic."""
+    capture = np.tile(np.array([[200, 100], [100, 50]], np.uint8), (3, 4))[..., None]
+    write(tmp_path / "captures" / "0.npy", capture)
+    write(tmp_path / "scenes" / "0.npy", np.full((3, 4, 3), (50, 100, 200), np.uint8))
+    _, measurement, scene = next(read_pairs("folders", tmp_path, frames=FrameFormat(bgr=True, mosaic="rggb")))
+    for picture in (measurement, scene):
+        assert picture[0, 0] / np.float64(picture.max()) == pytest.approx([1, 0.5, 0.25], abs=1e-3)

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from mwdn.benchmark.dataset_recipe import PRESETS, DatasetRecipe
 from mwdn.benchmark.methods import MEAN, Method, check_name, read_methods, scale_width
-from mwdn.benchmark.sets import PRESETS, DatasetRecipe
 from mwdn.calibration.camera_file import read_camera
 from mwdn.errors import ParameterError, UnknownNameError, shown
 from mwdn.io.toml import find_recipe, read_toml, to_dataclass

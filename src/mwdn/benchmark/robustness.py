@@ -13,6 +13,7 @@ from mwdn.benchmark.recipe import AXES, Robustness
 from mwdn.benchmark.scoring import read_record
 from mwdn.benchmark.sets import Dataset, simulated_pairs
 from mwdn.data.photographs import Photographs
+from mwdn.errors import ParameterError
 from mwdn.evaluation import measure
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import write_text
@@ -30,6 +31,16 @@ def noisier(sensor: Sensor, factor: float) -> Sensor:
     The variance of shot noise is signal / full well; read noise is a standard deviation in electrons.
     """
     return replace(sensor, full_well=sensor.full_well / factor**2, read_noise=sensor.read_noise / factor)
+
+
+def check_axes(robustness: Robustness, dataset: Dataset) -> None:
+    """Raise a `ParameterError` if more than the noise is to change of a camera with measured PSFs over its field."""
+    axes = [axis for axis in robustness.sizes if axis != "noise"]
+    if axes and dataset.calibration.places.field_psfs:
+        raise ParameterError(
+            f"[robustness] can only have `noise` for `{dataset.name}`, not `{axes[0]}`: its camera's `field_psfs` are "
+            "measured, and no other PSFs are simulated."
+        )
 
 
 def pairs_at(dataset: Dataset, photographs: Photographs, count: int, axis: str, size: float) -> tuple[Tensor, Tensor]:

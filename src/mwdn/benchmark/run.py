@@ -15,7 +15,7 @@ from mwdn.benchmark.methods import Method
 from mwdn.benchmark.pages import MARK, write_html, write_markdown
 from mwdn.benchmark.recipe import Benchmark
 from mwdn.benchmark.results import Results
-from mwdn.benchmark.robustness import Sweep, pairs_at, sweep
+from mwdn.benchmark.robustness import Sweep, check_axes, pairs_at, sweep
 from mwdn.benchmark.scoring import MethodResult, identity, make_reconstructor, score
 from mwdn.benchmark.sections import sections
 from mwdn.benchmark.sets import Dataset, open_dataset
@@ -112,6 +112,8 @@ def run(
             for name, recipe in benchmark.data.items()
         }
     check_networks(benchmark, datasets)
+    if benchmark.robustness.data:
+        check_axes(benchmark.robustness, datasets[benchmark.robustness.data])
     _train_all(benchmark, datasets, out, torch_device, watch)
     files = benchmark.alexnet or None, benchmark.heads or None
 

@@ -9,135 +9,31 @@ from typing import Any
 
 import torch
 
+from mwdn.benchmark.dataset_recipe import DatasetRecipe
 from mwdn.calibration import Calibration, FrameFormat
+from mwdn.calibration.places import field_camera
 from mwdn.calibration.psf_identity import psf_identity
 from mwdn.calibration.refinement import Refinement
 from mwdn.data.importers import import_pairs
 from mwdn.data.kinds import KINDS, Layout
-from mwdn.data.mismatch import EXACT, Mismatch
+from mwdn.data.mismatch import EXACT
 from mwdn.data.pair_checks import REFINED, check_pairs, missing_refinement
 from mwdn.data.pair_writer import Attribute
 from mwdn.data.pairs import PairFile, Part
 from mwdn.data.photographs import Photographs
 from mwdn.data.recorded import HELD_OUT, Division, RecordedPairs, RefinedPairs, record
-from mwdn.data.simulated import Placement, Samples, SimulatedPairs
+from mwdn.data.simulated import Samples, SimulatedPairs
 from mwdn.errors import ParameterError
 from mwdn.evaluation import Protocol
 from mwdn.io.files import write_text
 from mwdn.io.reading import read_json
-from mwdn.optics import Deviation, Sensor
+from mwdn.optics import Deviation, FieldCamera
+from mwdn.optics.psf import psf_hash
 from mwdn.training.experiment import FILE_START, simulated_sensor
 from mwdn.training.validation import START
 
 Track = Callable[[str, list[range]], Iterable[range]]
 """Shows the progress of an iteration under a title."""
-
-
-@dataclass(frozen=True)
-class DatasetRecipe:
-    """Pairs of one camera: simulated from photographs, or recorded.
-
-    Args:
-        camera: camera file of `mwdn calibrate`, for the settings of the camera that are not given here.
-        psf: of the calibration, a file.
-        bin: average blocks of so many pixels of the PSF and of captures; the protocol shrinks with them.
-        psf_bin: of the PSF besides, where it was taken at so many times the resolution of the captures; 0 for that of
-            the camera file.
-        background: even light under the PSF, as a part of the full scale; estimated if negative.
-        upside_down: files have their first row at the bottom.
-        bgr: files have their channels in the order blue, green, red.
-        photos: folder to simulate training from; every 20th photograph is for validation.
-        test_photos: folder to simulate the test from.
-        train: pairs to train on that are made once; 0 makes every sample a new one.
-        validation: pairs to choose the best weights by.
-        test: pairs to be scored on; of recorded ones at most so many, 0 for all.
-        seed: of all that is simulated.
-        placement: how a photograph stands in the scene.
-        deviation: how the true camera differs from its calibration, which is all that methods are told.
-        mismatch: the same, drawn anew for each pair, in place of one true camera; see `mwdn.data.mismatch.Mismatch`.
-        sensor: its noise; that of the camera file unless given.
-        pairs: recorded ones in place of photographs: a file of ``mwdn import``, or a data set of this ``kind``.
-        kind: how they are laid out, see `mwdn.data.kinds.KINDS`; empty for a file of pairs.
-        split: which are for what, see `mwdn.data.splits.split`; empty if all are for the test.
-        trained_on: another data set, of the same camera, whose networks are tested here; nothing is trained.
-        captures: real ones without a scene, files and folders, to be shown.
-        protocol: the part of each picture that counts, in pixels before ``bin``.
-    """
-
-    camera: str = ""
-    psf: str = ""
-    bin: int = 1
-    psf_bin: int = 1
-    background: float = -1.0
-    upside_down: bool = False
-    bgr: bool = False
-    photos: str = ""
-    test_photos: str = ""
-    train: int = 1000
-    validation: int = 16
-    test: int = 24
-    seed: int = 0
-    placement: Placement = Placement()
-    deviation: Deviation = Deviation()
-    mismatch: Mismatch = EXACT
-    sensor: Sensor = Sensor()
-    pairs: str = ""
-    kind: str = ""
-    split: str = ""
-    trained_on: str = ""
-    captures: tuple[str, ...] = ()
-    protocol: str = "full"
-
-    def binned_protocol(self) -> Protocol:
-        """The protocol at the size of the binned pictures: "centre-128" binned by 2 is "centre-64"."""
-        whole = Protocol.parse(self.protocol)
-        if whole.centre:
-            return Protocol.parse(f"centre-{whole.centre // self.bin}")
-        if whole.rows and whole.columns:
-            (top, bottom), (left, right) = whole.rows, whole.columns
-            top, bottom, left, right = (number // self.bin for number in (top, bottom, left, right))
-            return Protocol.parse(f"{top}:{bottom},{left}:{right}")
-        return whole
-
-    def calibration(self) -> Calibration:
-        """Read the PSF."""
-        options: dict[str, Any] = {"bin": self.bin, "bgr": self.bgr, "upside_down": self.upside_down}
-        options["background"] = self.background if self.background >= 0 else "estimate"
-        if self.psf_bin:
-            options["psf_bin"] = self.bin * self.psf_bin
-        if not self.camera:
-            return Calibration.from_file(self.psf, **options)
-        # Reconstructions are compared with scenes in the camera's colours.
-        return replace(Calibration.load(self.camera, psf=Path(self.psf), **options), white_balance=None)
-
-
-_PAPER = DatasetRecipe(protocol="centre-128")
-_DIFFUSERCAM = DatasetRecipe(background=0.0, upside_down=True, bgr=True, protocol="60:270,60:440")
-_PHLATCAM = DatasetRecipe(background=0.0)
-_REAL = Deviation(turn_degrees=0.5, background=0.1, off_axis=1.0)
-
-PRESETS: dict[str, DatasetRecipe] = {
-    # The display took 137 of 320 pixels, 2.5 of the 91.5 beside it off the centre.
-    "mwdn-sim": replace(_PAPER, placement=Placement((0.428, 0.428), 1.0, 0.0, 0.027), deviation=_REAL),
-    # Scenes of many sizes about the 210 x 380 that its display filled; the noise explains its captures.
-    "diffusercam-sim": replace(
-        _DIFFUSERCAM,
-        placement=Placement((0.7, 1.5), 1.6, 5.0, 0.8),
-        deviation=replace(_REAL, turn_degrees=0.3),
-        sensor=Sensor(5000.0, 7.0),
-    ),
-    # Scenes of 384 x 384 in the middle of 384 x 640: their position is not published.
-    "phlatcam-sim": replace(
-        _PHLATCAM, placement=Placement((1.0, 1.0), 1.0, 0.0, 0.0), deviation=_REAL, protocol="0:384,128:512"
-    ),
-    "diffusercam-real": replace(_DIFFUSERCAM, kind="diffusercam", trained_on="diffusercam-sim", test=0),
-    # The public sets in their own layouts, and their own splits.
-    "mwdn": replace(_PAPER, kind="mwdn", split="paper", test=0),
-    "diffusercam": replace(_DIFFUSERCAM, kind="diffusercam", split="diffusercam", validation=2500, test=0),
-    "diffusercam-paper": replace(_DIFFUSERCAM, kind="diffusercam", split="paper", validation=2500, test=0),
-    "phlatcam": replace(_PHLATCAM, kind="phlatcam", split="phlatcam", test=0),
-}
-"""Presets of the paper's data sets; a recipe names the files, and may replace any value."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,8 +97,9 @@ def open_dataset(name: str, recipe: DatasetRecipe, folder: Path, device: torch.d
         else:
             resized = (recipe.camera or recipe.bin > 1) and KINDS[recipe.kind].place is None
             layout = Layout(scene_size=calibration.size if resized else None)
-            frames = calibration.frames if recipe.camera else FrameFormat(bin=recipe.bin)
-            import_pairs(recipe.kind, recipe.pairs, path, layout=layout, frames=frames)
+            camera = calibration if recipe.camera else None
+            frames = camera.frames if camera else FrameFormat(bin=recipe.bin)
+            import_pairs(recipe.kind, recipe.pairs, path, layout=layout, frames=frames, camera=camera)
         write_text(note, json.dumps(identity, indent=2))
     file = PairFile(path)
     check_pairs(file, calibration.psf)
@@ -225,7 +122,34 @@ def _identity(recipe: DatasetRecipe, calibration: Calibration) -> dict[str, Any]
         identity["channels"] = 1  # earlier pairs of grey cameras have colours
     if calibration.refinement and recipe.pairs:
         identity["refinement"] = repr(calibration.refinement)
+    identity |= _parts_of_camera(recipe, calibration)
     return json.loads(json.dumps({**identity, "psf_hash": calibration.psf_hash}))
+
+
+def _parts_of_camera(recipe: DatasetRecipe, calibration: Calibration) -> dict[str, str]:
+    """Hashes of the files of a camera, beside its PSF, that its pairs depend on; earlier pairs did not."""
+    if recipe.kind and recipe.camera:
+        corrections = calibration.corrections
+        parts = {"subtracted": calibration.offset, "flat": corrections.flat, "hot_pixels": corrections.defects}
+        return {key: "none" if part is None else psf_hash(part) for key, part in parts.items()}
+    if calibration.places.field_psfs and not recipe.pairs:
+        return {"field": psf_hash(_field(recipe, calibration).kernels)}
+    return {}
+
+
+def _field(recipe: DatasetRecipe, calibration: Calibration) -> FieldCamera:
+    """The camera whose PSF changes over the field as measured.
+
+    Raises:
+        ParameterError: the recipe makes it differ in another way, too.
+    """
+    if recipe.deviation != Deviation() or recipe.mismatch != EXACT:
+        raise ParameterError(
+            "A camera with `field_psfs` differs from its calibration as measured, not by `deviation` or `mismatch`. "
+            "Leave these out, set the deviation of a preset to 0, or remove `field_psfs` and `field_positions` from "
+            "the camera file."
+        )
+    return field_camera(calibration)
 
 
 def simulated_pairs(
@@ -233,6 +157,9 @@ def simulated_pairs(
 ) -> SimulatedPairs:
     """The source of a data set's simulated pairs."""
     psf = calibration.psf.to(device)
+    camera = recipe.deviation.camera(psf) if recipe.mismatch == EXACT else None
+    if calibration.places.field_psfs:
+        camera = _field(recipe, calibration).to(device)
     return SimulatedPairs(
         photographs.to(device),
         psf,
@@ -240,7 +167,7 @@ def simulated_pairs(
         mismatch=recipe.mismatch,
         sensor=recipe.sensor,
         seed=recipe.seed,
-        camera=recipe.deviation.camera(psf) if recipe.mismatch == EXACT else None,
+        camera=camera,
         grey=calibration.frames.grey,
     )
 

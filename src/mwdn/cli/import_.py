@@ -7,12 +7,12 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.markup import escape
 
-from mwdn.calibration import FrameFormat
+from mwdn.calibration import Calibration, FrameFormat
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.progress import track
 from mwdn.cli.terminal import counted, if_interrupted, notes, say
 from mwdn.data.digicam import DigiCam, import_digicam
-from mwdn.data.importers import import_pairs
+from mwdn.data.importers import import_pairs, refuse_corrections
 from mwdn.data.kinds import Layout
 from mwdn.errors import ParameterError
 
@@ -28,7 +28,7 @@ def import_(  # noqa: PLR0913
     layout: Annotated[Layout, Parameter(name="*")] = Layout(),
     frames: Annotated[FrameFormat, Parameter(name="*")] = FrameFormat(),
     digicam: Annotated[DigiCam, Parameter(name="*")] = DigiCam(),
-    camera: Path | None = None,  # its values are in `frames`, see `from_camera_file`
+    camera: Path | None = None,  # its format is in `frames`, see `from_camera_file`
 ) -> None:
     """Convert a public data set, or two folders of pictures, to one file of pairs.
 
@@ -43,7 +43,8 @@ def import_(  # noqa: PLR0913
         layout: where this copy of the data set differs from the usual layout.
         frames: format of the captures, where it differs from the usual one.
         digicam: optics of a camera of the kind digicam.
-        camera: camera file with this format; its dark and ambient frames are not subtracted.
+        camera: camera file with this format; its dark or ambient frame, flat field and hot pixels correct the
+            captures.
     """
     progress = partial(track, title="Importing")
     if kind != "digicam" and digicam != DigiCam():
@@ -51,7 +52,9 @@ def import_(  # noqa: PLR0913
         raise ParameterError(f"Only the kind digicam has {options}. Leave them out.")
     if kind == "digicam" and authors:
         raise ParameterError("`authors` is for one camera, but digicam has one for each mask. Leave it out.")
+    calibration = None if camera is None else Calibration.load(camera, **vars(frames))
     if kind == "digicam":
+        refuse_corrections(kind, calibration)
         with if_interrupted(lambda: f"Interrupted. Files that are complete are kept: {out.parent}."):
             done = import_digicam(
                 path, out, digicam, layout=layout, frames=frames, skip_damaged=skip_damaged, track=progress
@@ -63,7 +66,15 @@ def import_(  # noqa: PLR0913
         return
     with if_interrupted(lambda: f"Interrupted. Nothing is kept: {out} is written when all pairs are done."):
         result = import_pairs(
-            kind, path, out, layout=layout, frames=frames, skip_damaged=skip_damaged, authors=authors, track=progress
+            kind,
+            path,
+            out,
+            layout=layout,
+            frames=frames,
+            camera=calibration,
+            skip_damaged=skip_damaged,
+            authors=authors,
+            track=progress,
         )
     _name_skipped(result.skipped)
     names = f": {', '.join(result.skipped)}" if result.skipped else ""

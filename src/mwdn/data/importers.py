@@ -9,13 +9,13 @@ from typing import TypeVar, cast
 
 import numpy as np
 
-from mwdn.calibration import FrameFormat
+from mwdn.calibration import Calibration, FrameFormat
 from mwdn.data.authors_file import AuthorsWriter
 from mwdn.data.kinds import KINDS, Kind, Layout
 from mwdn.data.pair_writer import Attribute, PairWriter, PixelType, Shape, check_path, quantise
 from mwdn.data.scene_place import bin_scene, place_scene
 from mwdn.data.sources import Listing, Source
-from mwdn.errors import ImageError, MwdnError, UnknownNameError
+from mwdn.errors import ImageError, MwdnError, ParameterError, UnknownNameError
 from mwdn.io.files import refuse_overwrite
 from mwdn.types import Frame, Psf, Size
 
@@ -40,13 +40,15 @@ def import_pairs(  # noqa: PLR0913
     *,
     layout: Layout = Layout(),
     frames: FrameFormat = FrameFormat(),
+    camera: Calibration | None = None,
     skip_damaged: bool = False,
     authors: bool = False,
     track: Callable[[list[Source]], Iterable[Source]] = iter,
 ) -> Imported:
     """Convert a data set to a file of pairs, which appears when all of it is written.
 
-    Pictures of 8 bits are stored as such, deeper or binned ones as 16 bits, floats as floats.
+    Pictures of 8 bits are stored as such, deeper or binned ones as 16 bits, floats as floats. If the camera has a frame
+    to subtract or to divide by, all are floats, because numbers go below 0 or above 1.
 
     Args:
         kind: of `KINDS`.
@@ -54,20 +56,21 @@ def import_pairs(  # noqa: PLR0913
         output: the new file, ending in .h5 or .hdf5; an existing one is replaced.
         layout: what differs from the usual layout of the kind.
         frames: what differs from the usual format of the captures.
+        camera: corrects the captures, see `read_pairs`.
         skip_damaged: leave out pairs that are damaged or incomplete, and name them in the result.
         authors: write the file of the MWDN authors' code: 8 bits, `mwdn.data.authors_file`.
         track: wraps the list of pairs to read, for a progress bar.
 
     Raises:
         UnknownNameError: no such kind.
-        ParameterError: ``output`` has another suffix, or is the data set itself.
+        ParameterError: ``output`` has another suffix, or is the data set itself; or as for `read_pairs`.
         ImageError: nothing to import; a pair is damaged and not to be skipped; ``output`` cannot be written.
     """
     check_path(Path(output))
     refuse_overwrite(Path(output), Path(path))
     result = Imported()
     skipped = result.skipped if skip_damaged else None
-    pairs = read_pairs(kind, path, layout=layout, frames=frames, skipped=skipped, track=track)
+    pairs = read_pairs(kind, path, layout=layout, frames=frames, camera=camera, skipped=skipped, track=track)
     first = next(pairs, None)
     if first is None:
         reason = f" {len(skipped):,} were skipped; {next(iter(skipped.values()))}" if skipped else ""
@@ -117,6 +120,7 @@ def read_pairs(
     *,
     layout: Layout = Layout(),
     frames: FrameFormat = FrameFormat(),
+    camera: Calibration | None = None,
     skipped: dict[str, str] | None = None,
     track: Callable[[list[Source]], Iterable[Source]] = iter,
 ) -> Iterator[Pair]:
@@ -132,20 +136,37 @@ def read_pairs(
         layout: what differs from the usual layout of the kind.
         frames: what differs from the usual format of the captures; its channel order and orientation are also those
             of the scenes.
+        camera: corrects the captures as `mwdn.Calibration.correct` does, except the refinement: by its dark or ambient
+            frame, flat field and hot pixels. Its own ``frames`` are those of these files, not of the captures.
         skipped: receives the name of each damaged or incomplete pair and the reason; without it, the first one raises.
         track: wraps the list of pairs to read, for a progress bar.
 
     Raises:
         UnknownNameError: no such kind.
+        ParameterError: ``camera`` corrects, but the pairs are corrected already, see `refuse_corrections`.
         ImageError: nothing there; or, without ``skipped``, a pair is damaged, incomplete, or unlike the first.
     """
     if kind not in KINDS:
         raise UnknownNameError("kind of data set", kind, KINDS)
+    if kind == "pairs":
+        refuse_corrections(kind, camera)
+        camera = None
     of_folder = KINDS[kind].of_folder
     chosen = of_folder if of_folder and Path(path).is_dir() else KINDS[kind]
     layout = _override(chosen.layout, layout)
     listing = chosen.list_pairs(Path(path), layout.captures or "", layout.scenes or "")
-    return read_listing(listing, chosen, layout, frames, skipped=skipped, track=track)
+    return read_listing(listing, chosen, layout, frames, camera=camera, skipped=skipped, track=track)
+
+
+def refuse_corrections(kind: str, camera: Calibration | None) -> None:
+    """Raise a `ParameterError` if the camera has frames to correct captures by, for a kind whose captures are done."""
+    if camera is not None and any(
+        part is not None for part in (camera.offset, camera.corrections.flat, camera.corrections.defects)
+    ):
+        raise ParameterError(
+            f"Captures of the kind {kind} are corrected already, but the camera has a dark frame, an ambient frame, a "
+            "flat field or a map of hot pixels. Use a camera file without them."
+        )
 
 
 def read_listing(
@@ -154,6 +175,7 @@ def read_listing(
     layout: Layout,
     frames: FrameFormat,
     *,
+    camera: Calibration | None = None,
     skipped: dict[str, str] | None = None,
     track: Callable[[list[Source]], Iterable[Source]] = iter,
 ) -> Iterator[Pair]:
@@ -167,7 +189,7 @@ def read_listing(
     first: tuple[Frame, Frame] | None = None
     for source in track(listing.sources):
         try:
-            pair = _convert(source, kind, layout, frames)
+            pair = _convert(source, kind, layout, frames, camera)
             first = first or pair
             _check_like_first(first, pair, source.name)
         except MwdnError as error:
@@ -185,14 +207,18 @@ def _override(usual: T, changes: T) -> T:
     return replace(usual, **{name: value for name, (value, default) in values.items() if value != default})
 
 
-def _convert(source: Source, kind: Kind, layout: Layout, changes: FrameFormat) -> tuple[Frame, Frame]:
+def _convert(
+    source: Source, kind: Kind, layout: Layout, changes: FrameFormat, camera: Calibration | None
+) -> tuple[Frame, Frame]:
     """Load a pair as RGB, row 0 at the top, both with the capture's channels, in the smallest type exact for both."""
     stored = source.load()
     capture, scene = stored
     usual = kind.raw_frames if kind.raw_frames is not None and capture.shape[2] == 1 else kind.frames
     frames = _override(usual, changes)
     full_size = frames.full_size(capture)
-    capture = _orient(_correct_levels(capture, frames, source.name), frames)
+    if frames.bgr:
+        capture, scene = (np.ascontiguousarray(frame[..., ::-1]) for frame in stored)
+    capture = _upright(_correct_levels(capture, frames, source.name, camera), frames)
     # The scene gets the channels of the capture: the mean of its colours, or equal colours.
     grey = capture.shape[2] == 1 < scene.shape[2]
     scene = _correct_levels(scene, FrameFormat(gamma=layout.scene_gamma, grey=grey), source.name)
@@ -200,12 +226,13 @@ def _convert(source: Source, kind: Kind, layout: Layout, changes: FrameFormat) -
         scene = scene.repeat(3, axis=2)
     if layout.scene_size is not None:
         scene = _resize(scene, layout.scene_size)
-    scene = _orient(scene, frames)
+    scene = _upright(scene, frames)
     place = _place(kind, layout, (scene.shape[0], scene.shape[1]), full_size)
     if place is not None:
         scene = bin_scene(place_scene(scene, full_size, place, source.name), frames.bin)
 
-    floats = any(frame.dtype.kind == "f" for frame in stored)
+    shifted = camera is not None and (camera.offset is not None or camera.corrections.flat is not None)
+    floats = shifted or any(frame.dtype.kind == "f" for frame in stored)
     dtype = np.dtype("float32" if floats else "uint8" if capture.dtype == scene.dtype == np.uint8 else "uint16")
     return quantise(capture, dtype, f"capture of {source.name}"), quantise(scene, dtype, f"scene of {source.name}")
 
@@ -219,17 +246,33 @@ def _place(kind: Kind, layout: Layout, scene: Size, frame: Size) -> Size | None:
     return kind.place(scene, frame) if scene[0] <= frame[0] and scene[1] <= frame[1] else None
 
 
-def _correct_levels(frame: Frame, frames: FrameFormat, name: str) -> Frame:
+def _correct_levels(frame: Frame, frames: FrameFormat, name: str, camera: Calibration | None = None) -> Frame:
     """Apply every step of the format but channel order and orientation; without any, the numbers stay as stored."""
     if frames.bit_depth is not None and frames.bit_depth > 8 * frame.dtype.itemsize:
         raise ImageError(f"The capture of `{name}` has {frame.dtype}, fewer than {frames.bit_depth} bits.")
     steps = replace(frames, bgr=False, upside_down=False)
-    return frame if steps == FrameFormat() else steps.to_measurement(frame)[0].movedim(0, -1).numpy()
+    if camera is None:
+        return frame if steps == FrameFormat() else steps.to_measurement(frame)[0].movedim(0, -1).numpy()
+    if camera.offset is not None:
+        _check_scale(camera.frames, frames)
+    measurement = steps.to_measurement(frame, camera.offset, camera.corrections.of_capture)
+    return measurement[0].movedim(0, -1).numpy()
 
 
-def _orient(frame: Frame, frames: FrameFormat) -> Frame:
-    """Reorder to RGB, row 0 at the top."""
-    return frame[:: -1 if frames.upside_down else 1, :, :: -1 if frames.bgr else 1]
+def _check_scale(own: FrameFormat, frames: FrameFormat) -> None:
+    """Raise a `ParameterError` if the camera's dark frame was read on another scale than captures of this format."""
+    for key in ("bit_depth", "gamma", "mosaic"):
+        wanted, got = getattr(frames, key), getattr(own, key)
+        if wanted != got:
+            raise ParameterError(
+                f"`{key}` of the camera ({got}), in which its dark or ambient frame was read, must be that of the "
+                f"captures ({wanted}). State it in the camera file."
+            )
+
+
+def _upright(frame: Frame, frames: FrameFormat) -> Frame:
+    """Row 0 at the top."""
+    return frame[::-1] if frames.upside_down else frame
 
 
 def _resize(scene: Frame, size: Size) -> Frame:

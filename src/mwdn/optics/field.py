@@ -1,7 +1,7 @@
 """A camera whose PSF changes over its field of view: the forward model without shift invariance."""
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import torch
 from jaxtyping import Float
@@ -183,6 +183,10 @@ class FieldCamera:
     def simulate(self, scene: Scene, *, generator: torch.Generator | None = None) -> Image:
         """A capture: `forward`, then the sensor. See `mwdn.Camera.simulate`."""
         return self.sensor.expose(self.forward(scene), generator=generator)
+
+    def to(self, device: torch.device | str) -> "FieldCamera":
+        """The same camera on a device."""
+        return replace(self, kernels=self.kernels.to(device), weights=self.weights.to(device))
 
     def _terms(self) -> list[tuple[Tensor, Tensor]]:
         return list(zip(self.kernels, self.weights, strict=True))
