@@ -18,7 +18,7 @@ from mwdn.calibration import FrameFormat, PsfFormat
 from mwdn.calibration.camera_file import KEYS, named_files, read_camera, write_camera
 from mwdn.calibration.camera_parts import draft_of, write_camera_with_parts
 from mwdn.errors import ImageError, MwdnError, ParameterError, PsfError, UnknownNameError
-from mwdn.io.images import read_frame
+from mwdn.io.images import read_frame, write_frame
 from mwdn.io.toml import read_toml
 from mwdn.optics.orientation import Orientation
 
@@ -269,3 +269,25 @@ def test_a_draft_takes_the_place_of_a_camera_file_with_its_pictures_at_the_end(t
     assert (read_frame(camera["dark"]) == old).all()
     assert {file.name for file in tmp_path.iterdir()} == {path.name, camera["psf"].name, camera["dark"].name}
     assert camera["bit_depth"] == 12
+
+
+@pytest.mark.parametrize("other", ["other.toml", "folder/camera.toml", "new-psf-of-camera.toml"])
+def test_a_camera_file_does_not_name_the_pictures_of_another_one(tmp_path, other):
+    """The other one removes them when it is calibrated again: the new file could not be read any more."""
+    path, new = tmp_path / "camera.toml", tmp_path / other
+    new.parent.mkdir(exist_ok=True)
+    pictures = np.arange(4 * 16, dtype=np.uint16).reshape(4, 4, 4, 1)
+    write_camera_with_parts(path, {}, {"psf": pictures[0], "dark": pictures[1], "field_psfs": list(pictures[2:])})
+    write_frame(tmp_path / "ambient.png", pictures[0])
+    camera = {key: value for key, value in read_camera(path).items() if key != "psf_sha256"}
+    write_camera_with_parts(new, {**camera, "ambient": tmp_path / "ambient.png"}, {})
+    with draft_of(tmp_path / "drafted.toml") as draft:
+        write_camera_with_parts(draft, camera, {})
+    write_camera_with_parts(path, {}, {"psf": pictures[3]})
+    assert len(list(tmp_path.glob("camera-*"))) == 1
+    for file in (new, tmp_path / "drafted.toml"):
+        kept = read_camera(file)
+        assert (read_frame(kept["psf"]) == pictures[0]).all()
+        assert (read_frame(kept["dark"]) == pictures[1]).all()
+        assert [read_frame(each)[0, 0, 0] for each in kept["field_psfs"]] == [32, 48]
+    assert read_camera(new)["ambient"].samefile(tmp_path / "ambient.png")

@@ -2,6 +2,7 @@
 
 import hashlib
 import re
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -13,13 +14,16 @@ import torch
 
 from mwdn.calibration.camera_file import read_camera, write_camera
 from mwdn.errors import ParameterError
-from mwdn.io.files import as_parameter_error
+from mwdn.io.files import as_parameter_error, atomic_write
 from mwdn.io.images import write_frame
 from mwdn.io.toml import read_toml
 from mwdn.types import Frame
 
 PARTS = ("psf", "dark", "flat_field", "hot_pixels", "distance_psfs", "field_psfs")
 """Keys of a camera file whose files this module writes."""
+
+_NAME = rf"-(?:{'|'.join(key.removesuffix('s').replace('_', '-') for key in PARTS)})-[0-9a-f]{{8}}\.(?:tif|png)"
+"""What follows the camera file's stem in the name of a picture."""
 
 
 def write_camera_with_parts(
@@ -29,6 +33,7 @@ def write_camera_with_parts(
 
     A picture's name ends in a hash of its numbers: ``camera-psf-1a2b3c4d.tif``. So the pictures of an existing camera
     file stay until the new file has replaced it atomically; then those that the new file does not name are removed.
+    Of pictures that were written for another camera file, which removes them in the same way, the new one gets copies.
 
     Args:
         path: the camera file.
@@ -44,6 +49,8 @@ def write_camera_with_parts(
     before = _own_parts(path)
     written: list[Path] = []
     try:
+        others = {key: content[key] for key in PARTS if content.get(key) and key not in parts}
+        content = {**content, **{key: _copied(path, value, written) for key, value in others.items()}}
         for key, frames in parts.items():
             if isinstance(frames, np.ndarray):
                 content = {**content, key: _write(path, key, frames, written)}
@@ -106,6 +113,21 @@ def _write(path: Path, key: str, frame: Frame, written: list[Path]) -> Path:
     return file
 
 
+def _copied(path: Path, value: Any, written: list[Path]) -> Any:  # noqa: ANN401
+    """A path, or several, of a camera file; of the pictures of another camera file those of their copies."""
+    if not isinstance(value, str | Path):
+        return tuple(_copied(path, each, written) for each in value)
+    name = re.fullmatch(rf".+?({_NAME})", Path(value).name)
+    copy = path.with_name(path.stem + name[1]) if name else Path(value)
+    if copy.resolve() == Path(value).resolve() or not Path(value).is_file():
+        return value
+    if not copy.exists():
+        written.append(copy)
+    with atomic_write(copy) as temporary:
+        shutil.copyfile(value, temporary)
+    return copy
+
+
 def _own_parts(path: Path) -> set[Path]:
     """Files that a camera file names, and that this module has written for it."""
     try:
@@ -116,7 +138,7 @@ def _own_parts(path: Path) -> set[Path]:
     for key in PARTS:
         value = table.get(key, ())
         names += [value] if isinstance(value, str) else value
-    pattern = re.compile(rf"{re.escape(path.stem)}-[a-z-]+-[0-9a-f]{{8}}\.(tif|png)")
+    pattern = re.compile(re.escape(path.stem) + _NAME)
     return {path.with_name(name) for name in names if isinstance(name, str) and pattern.fullmatch(name)}
 
 

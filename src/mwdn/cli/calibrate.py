@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from mwdn.calibration import Calibration, FrameFormat, PsfFormat
-from mwdn.calibration.camera_file import check_camera_path, read_camera, write_camera
+from mwdn.calibration.camera_file import check_camera_path, read_camera
 from mwdn.calibration.camera_parts import draft_of, write_camera_with_parts
 from mwdn.calibration.corrections import Corrections
 from mwdn.calibration.photographs import Photographed, develop, expanded
@@ -193,7 +193,7 @@ def _of_one_picture(
     check_white_balance(balance, calibration.light)
     own_resolution = at_psf_resolution(options).load(corrections)
     report = inspect_psf(own_resolution, own_resolution.frames.read(options.psf_file))
-    write_camera(out, {**kept, "psf": options.psf_file, "dark": options.dark, **own})
+    write_camera_with_parts(out, {**kept, "psf": options.psf_file, "dark": options.dark, **own}, {})
     return headline(report), calibration
 
 
