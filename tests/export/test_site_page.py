@@ -63,6 +63,9 @@ def files(tmp_path_factory):
     other = Calibration.from_file(folder / "other.png", psf_orientation="rotate-180")
     write_capture(folder / "capture.png", own, "coffee", maximum=4095)
     write_capture(folder / "bright.png", own, "coffee", maximum=4095, peak=2.0)
+    hot = read_frame(folder / "capture.png")
+    hot[[10, 50, 51, 80], [20, 60, 60, 127], 1] += 1500
+    write_frame(folder / "hot.png", hot)
     write_capture(folder / "of-the-other.png", other, "cat")
     for name in ("other.png", "of-the-other.png"):  # of a sensor with pixels of half the size
         write_frame(folder / f"fine-{name}", read_frame(folder / name).repeat(2, 0).repeat(2, 1))
@@ -137,7 +140,7 @@ def check_scene(page, calibration, capture):
 
 def check_files(page, folder, own, other):
     """Captures of this camera and of another one, and files that are none."""
-    for name in ("capture.png", "bright.png"):  # the second is saturated
+    for name in ("capture.png", "bright.png", "hot.png"):  # the second is saturated, the third has hot pixels
         page.drop("#capture", folder / name)
         wait_for(page, name)
         check_scene(page, own, folder / name)

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 from dataclasses import replace
 
+import cv2
 import jaxtyping
 import numpy as np
 import pytest
@@ -154,9 +155,21 @@ import { decodeNpy } from "./npy.js";
 const read = (name) => decodeNpy(new Uint8Array(readFileSync(`${name}.npy`)));
 const plain = { bit_depth: null, gamma: null, bgr: false, bin: 1 };
 const [offset, flat] = ["dark", "flat"].map((name) => normalise(read(name), plain));
-const format = { ...plain, bit_depth: JSON.parse(process.argv[2]), offset, flat };
+const format = { ...plain, offset, flat, ...JSON.parse(process.argv[2]) };
 writeFileSync("measurement.bin", toMeasurement(read("capture"), format).data);
 """
+
+
+def measured_by_the_page(folder, format, **images):
+    """The measurement that the page makes of a capture, a dark frame and a flat field, all (H, W, C)."""
+    for name, image in images.items():
+        np.save(folder / f"{name}.npy", image)
+    for name in ("frames.js", "hot_pixels.js", "npy.js", "png.js"):
+        (folder / name).write_text(read_static(name), encoding="utf-8")
+    (folder / "package.json").write_text('{"type": "module"}', encoding="utf-8")
+    (folder / "measure.js").write_text(MEASURE, encoding="utf-8")
+    subprocess.run(["node", "measure.js", json.dumps(format)], cwd=folder, check=True, timeout=60)
+    return np.fromfile(folder / "measurement.bin", "<f4")
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs Node.js")
@@ -168,18 +181,36 @@ def test_the_page_keeps_the_plateau_of_saturated_pixels(tmp_path, depth, maximum
     light = smooth + 0.02 * numbers.random(smooth.shape)
     frame = (light / np.quantile(light, 0.93) * maximum).clip(0, maximum).round().astype(np.uint16)
     dark, flat = 0.1 * numbers.random(smooth.shape), 1 + 0.2 * numbers.random(smooth.shape)
-    for name, image in (("capture", frame), ("dark", dark.astype(np.float32)), ("flat", flat.astype(np.float32))):
-        np.save(tmp_path / f"{name}.npy", image)
-    for name in ("frames.js", "npy.js", "png.js"):
-        (tmp_path / name).write_text(read_static(name), encoding="utf-8")
-    (tmp_path / "package.json").write_text('{"type": "module"}', encoding="utf-8")
-    (tmp_path / "measure.js").write_text(MEASURE, encoding="utf-8")
-    subprocess.run(["node", "measure.js", json.dumps(depth)], cwd=tmp_path, check=True, timeout=60)
-    given = np.fromfile(tmp_path / "measurement.bin", "<f4").reshape(1, 3, *smooth.shape[:2])
-    dark, flat = (torch.from_numpy(image.astype(np.float32)).movedim(-1, 0)[None] for image in (dark, flat))
+    dark, flat = dark.astype(np.float32), flat.astype(np.float32)
+    given = measured_by_the_page(tmp_path, {"bit_depth": depth}, capture=frame, dark=dark, flat=flat)
+    dark, flat = (torch.from_numpy(image).movedim(-1, 0)[None] for image in (dark, flat))
     wanted = FrameFormat(bit_depth=depth).to_measurement(frame, dark, Corrections(flat=flat))
     assert (wanted == wanted.amax((-2, -1), keepdim=True)).sum() > 300  # the plateau
-    np.testing.assert_allclose(given, wanted, atol=1e-6)
+    np.testing.assert_allclose(given, wanted.flatten(), atol=1e-6)
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="needs Node.js")
+@pytest.mark.parametrize(
+    ("mosaic", "excess", "is_found"),
+    [(None, 0.4, True), ("rggb", 0.4, True), (None, 0.05, False), (None, 0.0, False)],
+    ids=["colour", "mosaic", "faint", "none"],
+)
+def test_the_page_finds_the_hot_pixels_that_the_package_finds(tmp_path, mosaic, excess, is_found):
+    numbers = np.random.default_rng(4)
+    channels = 1 if mosaic else 3
+    light = cv2.resize(numbers.random((5, 6, 3), np.float32), (120, 98)).reshape(98, 120, 3)[..., :channels]
+    light = 0.1 + 0.4 * light + numbers.normal(0, 0.01, light.shape)
+    for y, x in ((30, 40), (31, 40), (30, 41), (0, 60), (97, 5), (60, 119)):  # three together, three at the border
+        light[y, x, -1] += excess
+    frame = (light.clip(0, 1) * 4095).round().astype(np.uint16)
+    dark, flat = np.full((98, 120, 1), 0.05, np.float32), np.ones((98, 120, 1), np.float32)
+    format = {"bit_depth": 12, "mosaic": mosaic, "hot_pixels": None}
+    given = measured_by_the_page(tmp_path, format, capture=frame, dark=dark, flat=flat)
+    frames, corrections = FrameFormat(bit_depth=12, mosaic=mosaic), Corrections(flat=torch.ones(1, 1, 98, 120))
+    offset = torch.from_numpy(dark).movedim(-1, 0)[None]
+    wanted = frames.to_measurement(frame, offset, corrections.of_capture)
+    assert bool((wanted != frames.to_measurement(frame, offset, corrections)).any()) == is_found
+    np.testing.assert_allclose(given, wanted.flatten(), atol=1e-6)
 
 
 def test_files_of_others_stay(runtime, tmp_path):

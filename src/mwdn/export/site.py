@@ -193,10 +193,10 @@ def _images(calibration: Calibration) -> dict[str, Tensor]:
     return {name: image for name, image in images.items() if image is not None}
 
 
-def _hot_pixels(calibration: Calibration) -> list[tuple[int, list[int]]]:
-    """Each hot pixel with its good neighbours, whose mean replaces it."""
+def _hot_pixels(calibration: Calibration) -> list[tuple[int, list[int]]] | None:
+    """Each hot pixel with its good neighbours, whose mean replaces it; ``None`` if the page must find them itself."""
     if calibration.corrections.defects is None:
-        return []
+        return None
     repair = PixelRepair(calibration.corrections.defects[0, 0], calibration.frames.cell)
     return [
         (pixel, neighbours[weights > 0].tolist())

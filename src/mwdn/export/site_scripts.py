@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from importlib.resources import files
 from typing import Any
 
-MODULES = ("png", "npy", "frames", "psf", "display", "network", "divider", "dropping", "site")
+MODULES = ("png", "npy", "hot_pixels", "frames", "psf", "display", "network", "divider", "dropping", "site")
 """Each after those that it imports; those in `_SHARED` are of `mwdn preview`. Their top-level names differ."""
 
 _SHARED = {"divider.js", "dropping.js", "page.css", "icon.svg", "welcome.svg"}

@@ -1,5 +1,6 @@
 // From the numbers of a raw frame to a measurement, as `mwdn.calibration.FrameFormat.to_measurement`.
 // Images are planes: {width, height, channels, data: Float32Array (channels, height, width)}.
+import { findHotPixels } from "./hot_pixels.js";
 import { decodeNpy, isNpy } from "./npy.js";
 import { decodePng, FileError, isPng } from "./png.js";
 
@@ -188,7 +189,9 @@ export function toMeasurement(frame, format) {
   let image = combine(light, format.offset, "the dark or ambient frame", (value, dark) => value - dark);
   if (isSaturated(frame, format.bit_depth)) image = keepPlateau(light, image);
   image = keepPlateau(image, combine(image, format.flat, "the flat field", (value, flat) => value / flat));
-  if (format.hot_pixels) image = repair(image, format.hot_pixels);
+  // Without a map, which is null, they are sought; a sample, which has no such key, is a measurement already.
+  const hot = format.hot_pixels === null ? findHotPixels(image, format.mosaic ? 2 : 1) : format.hot_pixels ?? [];
+  if (hot.length) image = repair(image, hot);
   if (format.crop) image = cropCentre(image, format.crop, format.mosaic ? 2 : 1);
   if (format.mosaic) image = demosaic(image, format.mosaic);
   if (format.grey && image.channels > 1) image = averageColours(image);

@@ -63,7 +63,7 @@ function gammaOf(id) {
 function chosenFormat() {
   const bit_depth = Number(byId("depth").value) || null;
   const bin = Math.max(1, Math.round(Number(byId("bin").value) || 1));
-  return { ...RAW, bit_depth, bin, gamma: gammaOf("gamma"), crop: byId("crop").checked ? [HEIGHT * bin, WIDTH * bin] : null };
+  return { ...RAW, hot_pixels: null, bit_depth, bin, gamma: gammaOf("gamma"), crop: byId("crop").checked ? [HEIGHT * bin, WIDTH * bin] : null };
 }
 
 function captureFormat(capture) {
