@@ -176,7 +176,7 @@ def test_outlying_frames_are_named(run, folder, photographs):
         ("psf_1 --dark dark dark --dark-exposures 1 2 --exposures 1 --flat flat", "`--flat-dark` must name"),
         ("psf_1 --dark dark --dark-exposures 1 2 --exposures 4", "must have one for each of `--exposures`"),
         ("psf_1 --dark dark dark --dark-exposures 1 2 --bit-depth 12", "Give `--exposures`"),
-        ("psf_1 --flat small --bit-depth 12", "must have the size of the point source's `frame_"),
+        ("psf_1 --flat small --bit-depth 12", "Frames of the point source, as `frame_"),
         ("empty --dark dark", "holds no frame"),
     ],
 )

@@ -13,7 +13,7 @@ from mwdn.calibration.frame_average import FrameAverage
 from mwdn.calibration.frame_format import FrameFormat
 from mwdn.calibration.psf_levels import SATURATED_PART, estimate_background
 from mwdn.calibration.sensor_frames import SensorFrames, average_files
-from mwdn.errors import PsfError, ShapeError
+from mwdn.errors import PsfError
 from mwdn.types import Image
 
 DIM = 0.3
@@ -83,13 +83,8 @@ def _check_exposure(
 ) -> list[str]:
     """Refuse a saturated exposure, the shortest one, and say if it is too short."""
     frame = frames.read_stored(file)[0]
+    sensor.check_size(f"Frames of the point source, as `{file.name}`", (frame.shape[0], frame.shape[1]))
     if (defects := sensor.corrections.defects) is not None:
-        (height, width), size = defects.shape[-2:], frame.shape[:2]
-        if (height, width) != size:
-            raise ShapeError(
-                f"Dark and flat frames ({height} x {width}) must have the size of the point source's `{file.name}` "
-                f"({size[0]} x {size[1]}). Take them with the same settings of the sensor."
-            )
         frame = np.where(defects[0, 0, :, :, None].numpy(), 0, frame).astype(frame.dtype)
     dark = sensor.dark(time)
     format = FrameFormat(bit_depth=frames.bit_depth, gamma=frames.gamma)

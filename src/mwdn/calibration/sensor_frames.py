@@ -15,7 +15,7 @@ from mwdn.calibration.frame_operations import demosaic
 from mwdn.calibration.hot_pixels import find_dead_pixels, find_hot_pixels
 from mwdn.calibration.photon_transfer import SAME_LIGHT, PhotonTransfer, photon_transfer
 from mwdn.errors import ParameterError, ShapeError
-from mwdn.types import Frame, Image
+from mwdn.types import Frame, Image, Size
 
 LEAST_RESPONSE = 0.1
 """Smallest value of a flat field: a pixel with less light is replaced, not amplified."""
@@ -99,6 +99,16 @@ class SensorFrames:
             raise ParameterError(f"`dark_exposures` ({known}) must have one for each of `exposures`. {missing}.")
         return self.darks[exposure].image
 
+    def check_size(self, what: str, size: Size) -> None:
+        """Raise a `ShapeError` if frames, ``what`` in the plural, have another size than the map of hot pixels."""
+        defects = self.corrections.defects
+        if defects is not None and tuple(defects.shape[-2:]) != tuple(size):
+            got, wanted = (" x ".join(map(str, each)) for each in (size, defects.shape[-2:]))
+            raise ShapeError(
+                f"{what} ({got}) must have the size of the camera's dark and flat frames ({wanted}). Take them with "
+                "the same settings of the sensor."
+            )
+
     @property
     def capture_dark(self) -> Image | None:
         """The dark frame of the captures.
@@ -180,12 +190,7 @@ def _with_flats(sensor: SensorFrames, files: SensorFiles, frames: FrameFormat) -
         notes.append("Without dark frames the flat field holds the black level, too: `--dark`.")
     flat, left_out = _mean_flat(flats, names, frames, dark)
     notes += left_out
-    if defects is not None and defects.shape[-2:] != flat.shape[-2:]:
-        got, wanted = (" x ".join(map(str, image.shape[-2:])) for image in (flat, defects))
-        raise ShapeError(
-            f"Flat frames, as `{names[0]}` ({got}), must have the size of the other frames of the camera ({wanted}). "
-            "Take them with the same settings of the sensor."
-        )
+    sensor.check_size(f"Flat frames, as `{names[0]}`", (flat.shape[-2], flat.shape[-1]))
     defects = (torch.zeros(1, 1, *flat.shape[-2:]) > 0) if defects is None else defects
     defects = defects | find_dead_pixels(flat.mean((0, 1)), cell=frames.cell)
     colour = demosaic(flat, frames.mosaic) if frames.mosaic else flat
