@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from mwdn.calibration import FrameFormat, PsfFormat
+from mwdn.calibration import Calibration, FrameFormat, PsfFormat
+from mwdn.calibration.camera_file import write_camera
 from mwdn.cli.app import main
 from mwdn.cli.camera import CameraOptions
-from mwdn.cli.inspect import at_psf_resolution
+from mwdn.cli.inspect import load_at_psf_resolution
 from mwdn.optics import sample_camera
 
 
@@ -92,14 +93,22 @@ def test_json_alone_with_the_options_of_the_camera(run):
     assert content["size"] == [16, 18]
 
 
-def test_psf_at_its_own_resolution():
-    """Captures of 32 x 36 raw pixels; the PSF was taken at twice the resolution."""
-    captures = CameraOptions(
-        Path("psf.png"), FrameFormat(crop=(32, 36)), psf_format=PsfFormat(psf_bin=2), dark=Path("dark.png")
+@pytest.mark.parametrize("named", [False, True])
+def test_psf_at_its_own_resolution(run, named):
+    """Captures of 32 x 36 raw pixels, whose frames do not fit a PSF that was taken at twice the resolution."""
+    cv2.imwrite("dark.png", np.full((32, 36, 3), 9, np.uint16))
+    np.save("flat.npy", np.full((32, 36, 1), 1, np.float32))
+    files = {"dark": Path("dark.png"), "flat_field": Path("flat.npy")}
+    write_camera(
+        "camera.toml", {"psf": Path("my psf.png"), "psf_bin": 2, **files} if named else {"psf": Path("my psf.png")}
     )
-    assert at_psf_resolution(captures) == CameraOptions(Path("psf.png"), FrameFormat(crop=(64, 72), bin=2))
-    same = CameraOptions(Path("psf.png"), FrameFormat(bin=2), psf_format=PsfFormat(psf_bin=2))
-    assert at_psf_resolution(same) is same
+    frames, psf_format = FrameFormat(crop=(32, 36)), PsfFormat(psf_bin=2)
+    camera = Path("camera.toml") if named else None
+    options = CameraOptions(Path("my psf.png"), frames, psf_format=psf_format, dark=Path("dark.png"), camera=camera)
+    calibration = load_at_psf_resolution(options)
+    assert calibration.psf_hash == Calibration.from_file("my psf.png", bin=2).psf_hash
+    if named:  # the size of the whole frame is that of the options
+        assert run("--camera", "camera.toml", "--json")[0] == 0
 
 
 def test_saturated_psf_is_refused(run):

@@ -89,7 +89,7 @@ class Calibration:
         if camera["psf"] == own_psf:
             check_psf_file(path, sha256, own_psf)
         else:  # nothing is known about another PSF file
-            camera["psf_corrected"] = False
+            camera["psf_corrected"] = options.get("psf_corrected", False)
             terms = replace(terms, psf_gain=(), envelope_shift=None)
         extra = {name: camera.pop(name, None) for name in ("white_balance", "pitch_um", "distance_mm")}
         extra |= {"sensor": pop_sensor(camera), "places": pop_places(camera)}

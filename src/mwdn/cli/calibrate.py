@@ -21,7 +21,7 @@ from mwdn.calibration.verdict import headline
 from mwdn.calibration.watching import guide_exposure, watch_folder
 from mwdn.calibration.white_balance import WhiteBalance, check_white_balance
 from mwdn.cli.camera import CameraOptions
-from mwdn.cli.inspect import at_psf_resolution
+from mwdn.cli.inspect import load_at_psf_resolution
 from mwdn.cli.photographs import PhotographOptions
 from mwdn.cli.refine import check_pair_file, refine
 from mwdn.cli.session_frames import BenchFrames, bench_frames
@@ -191,7 +191,7 @@ def _of_one_picture(
     if balance == "flat":
         raise ParameterError("`white_balance` 'flat' needs flat frames: `--flat`. Use 'grey-world', or gains.")
     check_white_balance(balance, calibration.light)
-    own_resolution = at_psf_resolution(options).load(corrections)
+    own_resolution = load_at_psf_resolution(options, corrections)
     report = inspect_psf(own_resolution, own_resolution.frames.read(options.psf_file))
     write_camera_with_parts(out, {**kept, "psf": options.psf_file, "dark": options.dark, **own}, {})
     return headline(report), calibration

@@ -1,6 +1,6 @@
 """Options of the camera, shared by most commands."""
 
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated
@@ -64,18 +64,21 @@ class CameraOptions:
             raise ParameterError("Give the camera's PSF, `--psf psf.png`, or its camera file, `--camera camera.toml`.")
         return self.psf
 
-    def load(self, corrections: Corrections = Corrections()) -> Calibration:
+    def load(self, corrections: Corrections = Corrections(), *, psf_done: bool = False) -> Calibration:
         """Read the calibration.
 
         Args:
             corrections: flat field and hot pixels, for a camera without a camera file.
+            psf_done: no flat field and hot pixels for the PSF's file, whatever the camera file says.
         """
         formats = {**vars(self.frames), **vars(self.psf_format)}
         detail(f"{self.psf_file}: {', '.join(f'{name} {value}' for name, value in formats.items())}")
         options = {"dark": self.dark, "ambient": self.ambient, **formats}
         if self.camera is None:
+            corrections = replace(corrections, psf_done=psf_done or corrections.psf_done)
             calibration = Calibration.from_file(self.psf_file, corrections=corrections, **options)
         else:
+            options |= {"psf_corrected": True} if psf_done else {}
             calibration = Calibration.load(self.camera, psf=self.psf_file, **options)
         if self.distance is None:
             return calibration

@@ -7,6 +7,8 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.markup import escape
 
+from mwdn.calibration import Calibration
+from mwdn.calibration.corrections import Corrections
 from mwdn.calibration.places import psfs_elsewhere
 from mwdn.calibration.report import inspect_psf
 from mwdn.calibration.verdict import headline, verdict
@@ -43,7 +45,7 @@ def inspect(
     for output in (page, json_file):
         refuse_overwrite(output, *camera.files)
     refuse_foreign(out, (json_file.name, page.name), b'"headline"')
-    calibration = at_psf_resolution(camera).load()
+    calibration = load_at_psf_resolution(camera)
     check_folder(out)
     depth, off_axis = psfs_elsewhere(calibration)
     report = inspect_psf(calibration, calibration.frames.read(psf), depth=depth, off_axis=off_axis)
@@ -65,10 +67,11 @@ def inspect(
     say(f"Look at {page}")
 
 
-def at_psf_resolution(camera: CameraOptions) -> CameraOptions:
-    """The options for frames at the PSF's resolution, if the captures have another; their dark frame is left out."""
+def load_at_psf_resolution(camera: CameraOptions, corrections: Corrections = Corrections()) -> Calibration:
+    """The calibration for frames at the PSF's resolution; frames of captures of another one do not correct it."""
     psf_bin = camera.psf_format.psf_bin
     if psf_bin is None or psf_bin == camera.frames.bin:
-        return camera
+        return camera.load(corrections)
     psf_format = replace(camera.psf_format, psf_bin=None)
-    return replace(camera, frames=camera.frames.with_bin(psf_bin), psf_format=psf_format, dark=None)
+    changed = replace(camera, frames=camera.frames.with_bin(psf_bin), psf_format=psf_format, dark=None)
+    return changed.load(corrections, psf_done=True)
