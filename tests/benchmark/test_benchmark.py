@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 
 from cameras import contour_psf
 from mwdn.benchmark import Watch, read_benchmark, run
@@ -22,7 +23,7 @@ from mwdn.benchmark.dataset_recipe import DatasetRecipe
 from mwdn.benchmark.recipe import Robustness
 from mwdn.benchmark.robustness import check_axes
 from mwdn.benchmark.sets import Dataset, open_dataset
-from mwdn.benchmark.training import schedule_on
+from mwdn.benchmark.training import schedule_on, train
 from mwdn.calibration import Calibration
 from mwdn.calibration.camera_file import write_camera
 from mwdn.calibration.places import field_camera
@@ -35,6 +36,7 @@ from mwdn.evaluation import alexnet, bootstrap
 from mwdn.fourier import convolve
 from mwdn.optics import Deviation, Sensor
 from mwdn.training.recipe import Schedule
+from mwdn.training.tasks import SupervisedTask
 from mwdn.weights.checkpoint import read_metadata
 
 RECIPE = """
@@ -540,6 +542,18 @@ def test_recipes_that_come_along(name, monkeypatch):
         assert benchmark.data["diffusercam-real"].trained_on == "diffusercam-sim"
     for recipe in benchmark.data.values():
         assert (protocol := recipe.binned_protocol()).name == "full" or protocol.rows or protocol.centre
+
+
+def test_a_training_does_not_hash_its_pairs(folder, monkeypatch):
+    """It read 16 pairs of each data set for a hash that nothing compared."""
+    (folder / "r.toml").write_text(RECIPE.replace("steps = 6", "steps = 1"), encoding="utf-8")
+    benchmark = read_benchmark(folder / "r.toml")
+    recipe = benchmark.data["caustic"]
+    dataset = open_dataset("caustic", recipe, folder, torch.device("cpu"), lambda _, rows: rows)
+    monkeypatch.setattr(SupervisedTask, "fingerprint", "hash")  # beartype looks at it, so it cannot raise
+    train(benchmark.methods[-1], dataset, benchmark, folder / "run", device=torch.device("cpu"), show=lambda _: None)
+    with safe_open(folder / "run" / "state.safetensors", "pt") as state:
+        assert state.metadata()["samples"] == ""
 
 
 def test_samples_are_a_stage_before_the_steps():

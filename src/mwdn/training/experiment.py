@@ -138,7 +138,7 @@ def prepare(
     validator = Validator(recipe, validation, psf if stored is None else stored, captures)
     trainer = Trainer(recipe, task, out=out, calibration=calibration, validator=validator, device=place)
     # A run may go on with more photographs. Other pairs have their numbers, but not their content.
-    if not trainer.same_samples and (trainer.finished or pairs is not None):
+    if not trainer.compare_samples() and (trainer.finished or pairs is not None):
         kind = "pairs" if pairs else "photographs"
         raise CheckpointError(
             f"`{out}` holds a run of the same recipe on other {kind} than those of `{pairs or photos}`. "

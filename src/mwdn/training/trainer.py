@@ -86,8 +86,7 @@ class Trainer:
         weights = self.network.state_dict().items() if held else ()
         self.start = {name: value.clone() for name, value in weights if name not in MEASURED_BUFFERS}
         self.gradient = Gradient(self.network, task, self.distance, self.schedule, self.device)
-        self.step, self.best = 0, -math.inf
-        self.fingerprint, self.same_samples = task.samples.fingerprint, True
+        self.step, self.best, self.fingerprint = 0, -math.inf, ""
 
         # 2. Resume a run that was stopped.
         self.identity = run_identity(recipe, calibration.psf_hash, task.samples.name)
@@ -101,6 +100,11 @@ class Trainer:
         self.validator.reconstruct_captures(self.average)
         if distributed.rank() == 0:
             self.folder.claim(self.step)
+
+    def compare_samples(self) -> bool:
+        """Whether a resumed run had the same samples. Hashes them, which takes time, for this and for saved states."""
+        saved, self.fingerprint = self.fingerprint, self.task.samples.fingerprint
+        return saved in ("", self.fingerprint)
 
     @property
     def finished(self) -> bool:
@@ -291,6 +295,6 @@ class Trainer:
         except (KeyError, RuntimeError) as error:
             raise damaged(self.folder.state, "a part is missing") from error
         self.step, self.best = int(header["step"]), float(header["best"])
-        self.same_samples = header.get("samples", self.fingerprint) == self.fingerprint
+        self.fingerprint = header.get("samples", "")
         saved_schedule = header.get("lr_schedule") or header["course"]  # the second is its former name
         self.lr_schedule = make_lr_schedule(self.recipe, **json.loads(saved_schedule))
