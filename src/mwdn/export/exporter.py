@@ -6,6 +6,7 @@ agree with those of `Reconstructor`.
 
 import copy
 import tempfile
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -17,6 +18,7 @@ from torch.utils._pytree import tree_flatten, tree_unflatten
 
 from mwdn.calibration import Calibration
 from mwdn.errors import ExportError, ParameterError
+from mwdn.export.loops import as_loops
 from mwdn.export.model_file import as_export_error, publish, run_file, write_file
 from mwdn.inference.fusion import fuse
 from mwdn.inference.methods import Method, as_method, psf_for
@@ -136,7 +138,11 @@ def export(
     with torch.no_grad(), tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / out.name
         module = FixedPsf(method, psf_for(method, calibration), dtype=torch.float16 if precision == "float16" else None)
-        write_file(file, _program(module.eval(), measurement), about)
+        # torch's own file holds one iteration after the other.
+        loops = as_loops() if file.suffix == ".onnx" and not isinstance(method, Network) else nullcontext()
+        with loops:
+            program = _program(module.eval(), measurement)
+        write_file(file, program, about)
         if precision == "int8":
             from mwdn.export.quantise import quantise
 

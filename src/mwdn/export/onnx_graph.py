@@ -1,6 +1,7 @@
 """Builder of ONNX graphs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -28,6 +29,8 @@ class OnnxGraph:
         self.nodes: list[onnx.NodeProto] = []
         self.constants: dict[tuple[str, tuple[int, ...], bytes], onnx.TensorProto] = {}
         self.count = 0
+        self.around: list[onnx.NodeProto] = []
+        self.loop: tuple[list[str], list[str], int] = [], [], 0
 
     def __call__(self, operation: str, *inputs: Any, **attributes: Any) -> str:  # noqa: ANN401
         """Add an operation with one result and return its name; ``None`` stands for a missing input."""
@@ -61,6 +64,43 @@ class OnnxGraph:
         if key not in self.constants:
             self.constants[key] = numpy_helper.from_array(array, f"constant_{len(self.constants)}")
         return self.constants[key].name
+
+    def begin_loop(self, state: Sequence[Any], count: int) -> list[str]:
+        """Begin the body of a loop of ``count`` iterations; returns the names of the state in it, all float32.
+
+        Operations that do not depend on the state can be added outside of the body, see `outside`.
+        """
+        self.count += 1
+        names = [f"state_{self.count}_{index}" for index in range(len(state))]
+        self.loop = [self.name(value) for value in state], names, count
+        self.around, self.nodes = self.nodes, []
+        return names
+
+    def end_loop(self, state: Sequence[Any]) -> list[str]:
+        """End the body; returns the names of the state after the loop."""
+        from onnx import TensorProto, helper
+
+        start, names, count = self.loop
+        results = [self("Identity", value) for value in state]
+        given = helper.make_node("Identity", ["go_on"], ["goes_on"])
+        number = helper.make_tensor_value_info("number", TensorProto.INT64, [])
+        inputs, outputs = (
+            [
+                helper.make_tensor_value_info(flag, TensorProto.BOOL, []),
+                *(helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in floats),
+            ]
+            for flag, floats in (("go_on", names), ("goes_on", results))
+        )
+        body = helper.make_graph([*self.nodes, given], f"body_{self.count}", [number, *inputs], outputs)
+        self.nodes = self.around
+        return self.several("Loop", len(state), self.integers([count]), None, *start, body=body)
+
+    @contextmanager
+    def outside(self) -> Iterator[None]:
+        """Add operations outside of the body that has begun, before the loop."""
+        self.nodes, self.around = self.around, self.nodes
+        yield
+        self.nodes, self.around = self.around, self.nodes
 
     def model(
         self, inputs: Mapping[str, Sequence[int | str]], outputs: Mapping[str, tuple[Any, Sequence[int | str]]]

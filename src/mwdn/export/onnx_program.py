@@ -15,6 +15,7 @@ from torch.export import ExportedProgram
 
 from mwdn.errors import ExportError
 from mwdn.export import dft
+from mwdn.export.loops import BEGIN, END
 from mwdn.export.onnx_graph import OnnxGraph, Pair
 from mwdn.export.onnx_layers import LAYERS
 from mwdn.export.onnx_operations import OPERATIONS, Handler, filled, source, value
@@ -49,13 +50,25 @@ def to_onnx(program: ExportedProgram, outputs: Sequence[str] = ("scene",)) -> "o
     values, steps = _fold_constants(module)
     g = OnnxGraph()
     inputs = {}
+    in_loop: set[fx.Node] = set()  # that depend on the state of the loop that has begun
     for step in steps:
         if step.op == "placeholder":
             values[step] = step.name
             inputs[step.name] = _axes(value(step))
         elif step.op == "call_function":
             arguments, options = fx.map_arg((step.args, step.kwargs), values.get)
-            values[step] = _convert(g, step, arguments, options)
+            if step.target is BEGIN:
+                values[step] = _begin_loop(g, arguments)
+                in_loop = {step}
+            elif step.target is END:
+                values[step] = _end_loop(g, arguments)
+                in_loop = set()
+            elif in_loop and in_loop.isdisjoint(step.all_input_nodes):
+                with g.outside():
+                    values[step] = _convert(g, step, arguments, options)
+            else:
+                values[step] = _convert(g, step, arguments, options)
+                in_loop |= {step} if in_loop else set()
         elif step.op == "output":
             results: Any = step.args[0]
             named = zip(outputs, results if isinstance(results, tuple | list) else [results], strict=True)
@@ -70,13 +83,39 @@ def _fold_constants(module: fx.GraphModule) -> tuple[dict[fx.Node, Any], list[fx
     for node in module.graph.nodes:
         if node.op == "get_attr":
             values[node] = operator.attrgetter(str(node.target))(module)
-        elif node.op == "call_function" and all(source in values for source in node.all_input_nodes):
+        elif _is_constant(node) and all(source in values for source in node.all_input_nodes):
             arguments, options = fx.map_arg((node.args, node.kwargs), values.__getitem__)
             values[node] = node.target(*arguments, **options)
         elif node.op != "call_module" and node.target is not _aten._assert_tensor_metadata.default:  # only checks
             steps.append(node)
     pairs = {node: Pair(v.real, v.imag) for node, v in values.items() if isinstance(v, Tensor) and v.is_complex()}
     return values | pairs, steps
+
+
+def _is_constant(node: fx.Node) -> bool:
+    """Whether the result of an operation is constant if its arguments are."""
+    return node.op == "call_function" and node.target not in (BEGIN, END)
+
+
+def _begin_loop(g: OnnxGraph, arguments: Any) -> list[Any]:  # noqa: ANN401
+    state, count = arguments
+    return _like(state, g.begin_loop(_parts(state), count))
+
+
+def _end_loop(g: OnnxGraph, arguments: Any) -> list[Any]:  # noqa: ANN401
+    (state,) = arguments
+    return _like(state, g.end_loop(_parts(state)))
+
+
+def _parts(state: list[Any]) -> list[Any]:
+    """The numbers of a state, complex ones in two parts."""
+    return [part for each in state for part in (each if isinstance(each, Pair) else (each,))]
+
+
+def _like(state: list[Any], parts: Sequence[str]) -> list[Any]:
+    """The inverse of `_parts`."""
+    names = iter(parts)
+    return [Pair(next(names), next(names)) if isinstance(each, Pair) else next(names) for each in state]
 
 
 def _axes(image: Tensor) -> list[int | str]:

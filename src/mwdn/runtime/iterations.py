@@ -3,9 +3,13 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import Any, TypeVar
 
 import torch
 
+S = TypeVar("S")
+
+_recorder: ContextVar[Callable[..., Any] | None] = ContextVar("recorder", default=None)
 _report: ContextVar[Callable[[float], None] | None] = ContextVar("report", default=None)
 
 
@@ -32,3 +36,31 @@ def iterations(count: int, *, start: float = 0.0, end: float = 1.0) -> Iterator[
         yield number
         if report is not None:
             report(start + (end - start) * (number + 1) / count)
+
+
+def repeat(step: Callable[[S], S], state: S, count: int, *, start: float = 0.0, end: float = 1.0) -> S:
+    """Apply ``step`` to a state, a tuple of tensors, ``count`` times.
+
+    Args:
+        step: an iteration; the state that it returns has the shapes and types of the one that it gets.
+        state: at the beginning.
+        count: number of iterations.
+        start: as for `iterations`.
+        end: as for `iterations`.
+    """
+    recorder = _recorder.get()
+    if recorder is not None and count > 1:
+        return recorder(step, state, count)
+    for _ in iterations(count, start=start, end=end):
+        state = step(state)
+    return state
+
+
+@contextmanager
+def record_loops(recorder: Callable[..., Any]) -> Iterator[None]:
+    """Call ``recorder(step, state, count)`` in place of each `repeat` in this thread: an export records one step."""
+    token = _recorder.set(recorder)
+    try:
+        yield
+    finally:
+        _recorder.reset(token)

@@ -9,7 +9,7 @@ from torch import Tensor
 from mwdn.errors import ParameterError, checked
 from mwdn.fourier.convolution import check_fit
 from mwdn.optics.psf import checked_psf
-from mwdn.runtime.iterations import iterations
+from mwdn.runtime.iterations import repeat
 from mwdn.solvers.proximal import Variation
 from mwdn.solvers.splitting import (
     Penalties,
@@ -96,9 +96,12 @@ class Admm:
         else:
             problem, state = start.problem._replace(measurement=b.float()), start.state
         filters = make_filters(problem, self.penalties)
-        for _ in iterations(self.iterations):
+
+        def step(state: State) -> State:
             state = update_copies(state, problem, self.penalties, self.regularisation, self.variation)
-            state = update_scene(state, problem, filters)
+            return update_scene(state, problem, filters)
+
+        state = repeat(step, state, self.iterations)
         height, width = problem.sensor
         scene = state.v[..., :height, :width].clamp(min=0) * (b_norm / h_norm)
         return scene, Iterate(problem, state)

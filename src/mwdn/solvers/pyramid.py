@@ -14,7 +14,7 @@ from mwdn.fourier.convolution import check_fit
 from mwdn.fourier.transforms import fast_length, inverse_spectrum, spectrum, transfer_function
 from mwdn.optics.psf import checked_psf
 from mwdn.optics.saturation import saturated_pixels
-from mwdn.runtime.iterations import iterations
+from mwdn.runtime.iterations import repeat
 from mwdn.solvers.levels import (
     LEVELS,
     REFERENCE_NOISE,
@@ -24,7 +24,7 @@ from mwdn.solvers.levels import (
     relative_noise,
     smoothing_scale,
 )
-from mwdn.solvers.splitting import Problem, initial_state, make_filters, update_copies, update_scene
+from mwdn.solvers.splitting import Problem, State, initial_state, make_filters, update_copies, update_scene
 from mwdn.types import Measurement, Psf, Scene, Size, Spectrum
 
 MIXED = 0.1
@@ -271,7 +271,8 @@ def _solve(
     smooth = level.regularisation > 0
     filters = make_filters(problem, mu, smooth=smooth)
     state = initial_state(problem, start.expand(*problem.measurement.shape[:2], *band.grid), smooth=smooth)
-    for _ in iterations(level.iterations, start=done[0], end=done[1]):
-        state = update_copies(state, problem, mu, tau, "colour", level.relaxation)
-        state = update_scene(state, problem, filters)
-    return state.v / band.norm
+
+    def step(state: State) -> State:
+        return update_scene(update_copies(state, problem, mu, tau, "colour", level.relaxation), problem, filters)
+
+    return repeat(step, state, level.iterations, start=done[0], end=done[1]).v / band.norm
