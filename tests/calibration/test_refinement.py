@@ -12,6 +12,7 @@ from cameras import contour_psf
 from mwdn import Calibration, convolve
 from mwdn.calibration.camera_file import write_camera
 from mwdn.calibration.pair_model import PairModel, Terms
+from mwdn.calibration.places import at_distance
 from mwdn.calibration.psf_identity import psf_identity
 from mwdn.calibration.refinement import Refinement, smooth_field
 from mwdn.calibration.term_selection import PARTS, left_out, select_terms
@@ -199,3 +200,18 @@ def test_camera_file_holds_the_terms(psf, generator, tmp_path, monkeypatch):
     assert Calibration.load("camera.toml", psf="other.npy").refinement == replace(
         terms, psf_gain=(), envelope_shift=None
     )
+
+
+def test_terms_of_the_psf_are_those_of_its_distance(psf, tmp_path):
+    """PSFs at other distances were used without them and without a word."""
+    for name in ("own", "far"):
+        write_frame(tmp_path / f"{name}.tif", (psf / psf.max())[0].movedim(0, -1).numpy())
+    content = {"psf": tmp_path / "own.tif", "distance_mm": 100.0, "background": 0.0, "psf_gain": GAIN}
+    content |= {"distance_psfs": (tmp_path / "far.tif",), "distances_mm": (300.0,)}
+    write_camera(tmp_path / "camera.toml", content)
+    calibration = Calibration.load(tmp_path / "camera.toml")
+    (near, said_near), (far, said_far) = (at_distance(calibration, distance) for distance in (100.0, 300.0))
+    assert torch.equal(near.psf, calibration.psf)
+    assert torch.allclose(far.psf, psf / psf.sum((-2, -1), keepdim=True), atol=1e-6)
+    assert "psf_gain" not in said_near
+    assert said_far.endswith("Without `psf_gain`, found for the PSF of 100 mm.")

@@ -54,18 +54,21 @@ def at_distance(calibration: Calibration, distance_mm: float) -> tuple[Calibrati
     ordered = sorted(files, key=lambda z: abs(1 / z - 1 / distance_mm))
     nearest = ordered[0]
     psf = _psf(calibration, files[nearest])
+    refined = [name for name in ("psf_gain", "envelope_shift") if getattr(calibration.refinement, name)]
+    without = f" Without `{'` and `'.join(refined)}`, found for the PSF of {own:g} mm."
+    without = without if refined and files[nearest] else ""
     chosen = replace(calibration, psf=psf, distance_mm=distance_mm, unrefined_hash="")
     other = next((z for z in ordered if (z - distance_mm) * (nearest - distance_mm) < 0), None)
     if abs(nearest / distance_mm - 1) < 1e-3 or other is None:
         beyond = "" if min(files) <= distance_mm * 1.001 and distance_mm <= max(files) * 1.001 else ", the nearest one"
-        return chosen, f"PSF of {nearest:g} mm for a scene at {distance_mm:g} mm{beyond}."
+        return chosen, f"PSF of {nearest:g} mm for a scene at {distance_mm:g} mm{beyond}.{without}"
     magnification, alike = relative_magnification(_psf(calibration, files[other]), psf)
     part = (1 / distance_mm - 1 / nearest) / (1 / other - 1 / nearest)
     scale = 1 + part * (magnification - 1)
     moved = warp(psf, scale * torch.eye(2))
     sentence = (
         f"PSF for {distance_mm:g} mm: that of {nearest:g} mm, magnified by {scale:.4f}; that of {other:g} mm has "
-        f"{magnification:.4f} times its size (correlation {alike:.2f})."
+        f"{magnification:.4f} times its size (correlation {alike:.2f}).{without}"
     )
     return replace(chosen, psf=moved / moved.sum((-2, -1), keepdim=True)), sentence
 
