@@ -48,7 +48,8 @@ class PixelRepair:
         if tuple(image.shape[-2:]) != self.size:
             raise ShapeError(
                 f"The map of hot pixels ({self.size[0]} x {self.size[1]}) must have the size of the frame "
-                f"({image.shape[-2]} x {image.shape[-1]}). Use raw frames of the camera, or `--hot-pixels none`."
+                f"({image.shape[-2]} x {image.shape[-1]}). Use raw frames of the camera, or remove "
+                "`hot_pixels` from the camera file."
             )
         if not len(self.index):
             return image
