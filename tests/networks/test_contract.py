@@ -145,6 +145,14 @@ def test_psf_matters_but_not_its_scale(name, ready, generator):
     assert torch.equal(moved, scene) == (name == "unet")
 
 
+def test_both_steps_together_are_a_call(name, generator):
+    """Also for a PSF that is as bright as its colours were exposed: docs/methods.md calls the steps one by one."""
+    b, h, _ = pair(generator)
+    h = h * torch.tensor([1.0, 5.0, 0.2])[:, None, None]
+    network = trained(small(name), generator)
+    torch.testing.assert_close(network.reconstruct(b, network.prepare(h, b.shape[-2:])), network(b, h))
+
+
 def test_grey_psf_is_that_of_each_colour(name, ready, generator, request):
     """A monochrome calibration shot serves a colour camera, with weights trained on coloured ones too."""
     b, h, _ = pair(generator)

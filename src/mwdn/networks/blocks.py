@@ -15,6 +15,7 @@ from mwdn.fourier.memory_format import chunked
 from mwdn.fourier.padding import Boundary
 from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
 from mwdn.networks.activation_checkpointing import CheckpointedModule
+from mwdn.optics.psf import checked_psf
 from mwdn.types import Image, Psf, Size
 
 Pooling = Literal["max", "average"]
@@ -236,10 +237,10 @@ class WienerFilters(nn.ModuleList):
 
 
 def normalise_psf(psf: Psf, size: Size, channels: int | None = None, *, stored: bool = False) -> Tensor:
-    """Scale each PSF to a peak of 1, as the paper's PSFs have.
+    """Scale each channel to unit sum, then each PSF to a peak of 1, as the paper's PSFs have.
 
     Args:
-        psf: (1 or B, 1 or C, H, W).
+        psf: (1 or B, 1 or C, H, W), of any scale.
         size: height and width of the measurement.
         channels: number of channels to which a grey PSF is expanded; ``None`` keeps it grey.
         stored: leave the scale as it is, for a network with ``stored_psf``.
@@ -248,7 +249,9 @@ def normalise_psf(psf: Psf, size: Size, channels: int | None = None, *, stored: 
         ShapeError: the PSF does not have the height and width of the measurement.
     """
     check_size(psf, size)
-    psf = psf if stored else psf / psf.amax(dim=(1, 2, 3), keepdim=True)
+    if not stored:
+        psf = checked_psf(psf, values=False)
+        psf = psf / psf.amax(dim=(1, 2, 3), keepdim=True)
     return psf if channels is None or psf.shape[1] != 1 else psf.expand(-1, channels, -1, -1)
 
 

@@ -42,7 +42,7 @@ class Network(nn.Module, Generic[Prepared]):
         """Compute what depends on the PSF alone.
 
         Args:
-            psf: (1 or B, 1 or C, H, W), centred.
+            psf: (1 or B, 1 or C, H, W), centred; of any scale, as for `forward`, which also checks its numbers.
             size: height and width of the measurements.
 
         Raises:
