@@ -71,6 +71,25 @@ def test_nothing_exceeds_saturation(generator):
     assert (captured[light < 0.9] < 1).all()
 
 
+@pytest.mark.parametrize("light", [10.0, 1e30, math.inf])
+def test_light_far_beyond_saturation_saturates(light, generator):
+    assert (Sensor().expose(torch.full((1, 1, 8, 8), light), generator=generator) == 1).all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+def test_noise_is_that_of_float32_in_every_precision(dtype, generator):
+    """float16 ends at 65,504 electrons, and bfloat16 counts them in steps of 512."""
+    capture = Sensor(full_well=1e5).expose(torch.full((1, 1, 200, 200), 0.875, dtype=dtype), generator=generator)
+    assert capture.dtype == torch.float32
+    assert capture.mean().item() == pytest.approx(0.875, abs=1e-4)
+    assert capture.std().item() == pytest.approx((0.875 / 1e5) ** 0.5, rel=0.02)
+
+
+def test_light_that_is_no_number_is_refused():
+    with pytest.raises(ParameterError, match="`light` holds NaN"):
+        Sensor().expose(torch.full((1, 1, 8, 8), math.nan))
+
+
 def test_black_level_keeps_the_negative_half_of_the_noise(generator):
     """Dark pixels: half of the noise is below zero, down to -black / (1 - black), and the mean is zero."""
     dark = torch.zeros(1, 1, 300, 300)

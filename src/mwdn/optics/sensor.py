@@ -49,17 +49,28 @@ class Sensor:
         return replace(self, full_well=n * self.full_well, read_noise=n**0.5 * self.read_noise)
 
     def expose(self, light: Image, *, generator: torch.Generator | None = None) -> Image:
-        """One capture of the light on the sensor.
+        """One capture of the light on the sensor. Its gradient is zero: counts are whole numbers.
 
         Args:
             light: (B, C, H, W); 1 saturates a pixel.
             generator: source of the noise, on the device of the light.
 
         Returns:
-            Same shape. The black level is subtracted and saturation is 1; noise makes dark pixels negative.
+            Same shape, float32. The black level is subtracted and saturation is 1; noise makes dark pixels negative.
+
+        Raises:
+            ParameterError: the light holds NaN (not checked on a GPU), or is no tensor of floats.
+            ShapeError: other axes.
         """
         check_batch(light, "light")
-        electrons = torch.poisson(light.clamp(min=0) * self.full_well, generator=generator)
+        # Beyond 2^63 electrons, torch's Poisson numbers overflow to darkness; a light of 1e6 saturates as any other.
+        light = light.float().clamp(0, 1e6)
+        try:
+            electrons = torch.poisson(light * self.full_well, generator=generator)
+        except RuntimeError as error:
+            if not light.isnan().any():
+                raise
+            raise ParameterError("`light` holds NaN. Replace it: `torch.nan_to_num(light)`.") from error
         electrons += self.read_noise * torch.randn(
             light.shape, generator=generator, device=light.device, dtype=light.dtype
         )
