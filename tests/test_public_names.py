@@ -95,6 +95,7 @@ def test_a_pil_picture(psf, capture):
         (lambda x: np.stack([x, x]), "2 x 32 x 40 x 3"),
         (lambda x: np.where(x == x.max(), np.nan, x).astype(np.float32), "NaN"),
         (lambda x: x[..., :2], "32 x 40 x 2"),
+        (lambda x: np.ma.masked_greater(x, x.mean()), "masked"),
         (lambda x: "capture.png", r"`capture.png` is a path, .*`mwdn.read_frame\('capture.png'\)`"),
     ],
 )

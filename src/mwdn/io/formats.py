@@ -190,7 +190,7 @@ def as_frame(picture: ArrayPicture, *, finite: bool = True) -> Frame:
 
     Raises:
         FrameShapeError: other axes, for example a batch or alpha.
-        FrameTypeError: numbers of other types, for example int32; a path; a tensor; a PIL picture of another mode.
+        FrameTypeError: numbers of other types (int32), or masked; a path; a tensor; a PIL picture of another mode.
         ImageError: NaN or infinity.
     """
     if isinstance(picture, str | Path):
@@ -200,6 +200,8 @@ def as_frame(picture: ArrayPicture, *, finite: bool = True) -> Frame:
             f"A frame ({shown(picture)}) must be an array (H, W, C), not a tensor: `tensor.movedim(0, -1).numpy()` for "
             "one (C, H, W). A tensor (B, C, H, W) of floats is a measurement already."
         )
+    if np.ma.is_masked(picture):
+        raise FrameTypeError(f"A frame ({shown(picture)}) must have no masked pixels. Fill them: `array.filled(0)`.")
     mode = getattr(picture, "mode", "L")
     if mode not in _PIL_MODES:
         raise FrameTypeError(f"The picture (mode {mode}) must be grey or RGB. Convert it: `picture.convert('RGB')`.")
