@@ -163,8 +163,10 @@ def test_missing_networks_are_nan_and_have_a_reason(pair, tmp_path, data):
 def test_wrong_calls_are_refused(pair):
     with pytest.raises(ShapeError, match="must have the same shape"):
         measure(pair[0][..., :-1], pair[1], Protocol())
-    with pytest.raises(ParameterError, match="raw, clipped, best-gain"):
+    with pytest.raises(ParameterError, match="best-gain, clipped, raw"):
         measure(*pair, Protocol(), variant="best")
+    with pytest.raises(ParameterError, match=r"`protocol` \('full'\) of `measure` must be `Protocol`"):
+        measure(*pair, "full")
 
 
 def test_bootstrap_is_reproducible_and_holds_the_mean(generator):

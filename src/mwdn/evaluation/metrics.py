@@ -10,7 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from mwdn.errors import CheckpointError, ParameterError, ShapeError, check_batch
+from mwdn.errors import CheckpointError, ParameterError, ShapeError, check_batch, checked
 from mwdn.evaluation import distances
 from mwdn.evaluation.alexnet import AlexNet, Heads, load_alexnet, load_heads
 from mwdn.types import Image
@@ -23,8 +23,6 @@ Variant = Literal["raw", "clipped", "best-gain"]
 - ``best-gain``: one gain and one offset per picture, by least squares over all pixels and channels; not clipped. For
   methods and data whose absolute brightness has no meaning.
 """
-
-VARIANTS = ("raw", "clipped", "best-gain")
 
 METRICS = ("psnr", "ssim", "lpips", "feature_mse", "mse")
 """The metrics of `measure`, in the order of tables."""
@@ -174,6 +172,7 @@ def best_gain(image: Image, reference: Image, *, axes: tuple[int, ...] = (1, 2, 
     return deviation * torch.where(power > 0, product / power, 0) + target
 
 
+@checked
 @torch.no_grad()
 def measure(
     reconstruction: Image,
@@ -204,8 +203,6 @@ def measure(
         ParameterError: unknown variant, or not tensors of floats.
     """
     variant = variant or protocol.variant
-    if variant not in VARIANTS:
-        raise ParameterError(f"`variant` ('{variant}') must be one of {', '.join(VARIANTS)}.")
     check_batch(reconstruction, "reconstruction")
     check_batch(scene, "scene")
     if reconstruction.shape != scene.shape:
