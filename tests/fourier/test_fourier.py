@@ -497,6 +497,34 @@ def test_regularisation_must_be_positive(value):
 
 
 @pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("shape", [(3,), (7,), (2, 3), (2, 3, 1, 7), (5, 1, 1), (1, 1, 1, 1, 1, 2)])
+def test_regularisation_for_other_axes_is_refused(shape):
+    """A half spectrum of 12 columns has 7: one number a column would be another filter."""
+    b = torch.rand(2, 3, 8, 8)
+    with pytest.raises(ShapeError, match=re.escape(f"`regularisation` {shape} must broadcast")):
+        fourier.wiener(b, b[:1], torch.full(shape, 0.1))
+    for fits in ((), (1,), (3, 1, 1), (2, 1, 1, 1), (2, 3, 1, 1)):
+        torch.testing.assert_close(fourier.wiener(b, b[:1], torch.full(fits, 0.1)), fourier.wiener(b, b[:1], 0.1))
+
+
+def test_wiener_under_the_transforms_of_torch_func(generator):
+    """`vmap`, `jacrev` and `jvp`: Wiener is linear in the measurement."""
+    b, h = torch.rand(2, 4, 6, 7, generator=generator), torch.rand(1, 1, 6, 7, generator=generator)
+
+    def wiener(measurement):
+        return fourier.wiener(measurement[None], h, 0.1)[0]
+
+    expected = fourier.wiener(b, h, 0.1)
+    torch.testing.assert_close(torch.func.vmap(wiener)(b), expected)
+    slopes = torch.func.vmap(torch.func.grad(lambda x: wiener(x).square().sum()))(b)
+    x = b.clone().requires_grad_()
+    fourier.wiener(x, h, 0.1).square().sum().backward()
+    torch.testing.assert_close(slopes, x.grad)
+    jacobian = torch.func.jacrev(wiener)(b[0])
+    torch.testing.assert_close(torch.einsum("cijdkl,dkl->cij", jacobian, b[1]), expected[1], rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.usefixtures("unchecked")
 def test_unknown_boundary_is_refused():
     with pytest.raises(ParameterError, match="No boundary named 'mirror'"):
         fourier.wiener(torch.ones(1, 1, 8, 8), torch.ones(1, 1, 8, 8), 0.1, boundary="mirror")

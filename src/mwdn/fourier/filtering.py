@@ -23,7 +23,9 @@ def filter_image(image: Tensor, transfer: Tensor, grid: Size, boundary: Boundary
     Returns:
         Shape, precision and memory format of ``image``; computed in float32.
     """
-    if torch.compiler.is_compiling():  # `torch.compile` and export trace one transform more easily than a loop
+    # `torch.compile` and export trace one transform more easily than a loop. `torch.func` (vmap, jvp, jacrev) cannot
+    # follow the loop's writing in place.
+    if torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active():
         return reference_filter(image, transfer, grid, boundary)
     return FastFilter.apply(image, transfer, grid, boundary)  # type: ignore[no-untyped-call]
 

@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from mwdn.errors import ParameterError, checked
+from mwdn.errors import ParameterError, ShapeError, checked
 from mwdn.fourier.convolution import check_fit
 from mwdn.fourier.filtering import filter_image
 from mwdn.fourier.padding import Boundary
@@ -35,13 +35,21 @@ def wiener(
         (B, C, H, W), float32; its range is that of ``measurement`` over the sum of ``psf``.
 
     Raises:
-        ShapeError: batch or channels do not fit.
+        ShapeError: batch or channels do not fit, or ``regularisation`` has other axes.
         ParameterError: ``regularisation`` is a number that is not positive, or ``boundary`` is unknown.
 
     References:
         N. Wiener, Extrapolation, Interpolation, and Smoothing of Stationary Time Series (1949).
     """
     check_fit(measurement, psf, "measurement")
+    if isinstance(regularisation, Tensor):
+        samples, channels = measurement.shape[:2]
+        axes = (1,) * (4 - regularisation.ndim) + tuple(regularisation.shape)
+        if axes[0] not in (1, samples) or axes[1] not in (1, channels) or axes[2:] != (1, 1):
+            raise ShapeError(
+                f"`regularisation` {tuple(regularisation.shape)} must broadcast against (B, C, 1, 1) of `measurement` "
+                f"{tuple(measurement.shape)}. For one a channel: `regularisation.reshape(1, -1, 1, 1)`."
+            )
     grid = deconvolution_grid((measurement.shape[-2], measurement.shape[-1]), boundary)
     return filter_image(measurement.float(), wiener_transfer(psf, regularisation, grid), grid, boundary)
 
