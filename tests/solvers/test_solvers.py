@@ -15,6 +15,7 @@ from mwdn.optics import unit_sum
 from mwdn.solvers import TEXTBOOK, Admm, Penalties, build, proximal, splitting
 from mwdn.solvers.fista import Fista
 from mwdn.solvers.pyramid import Pyramid
+from mwdn.solvers.wiener import Wiener
 
 # (sensor, PSF)
 SIZES = [
@@ -304,6 +305,7 @@ SOLVERS = {
     "isotropic": Admm(regularisation=1e-3, penalties=BRISK, iterations=15, variation="isotropic"),
     "fista": Fista(iterations=15),
     "pyramid": Pyramid(),
+    "wiener": Wiener(regularisation=1e-2),
 }
 
 
@@ -331,6 +333,17 @@ def test_scene_scales_with_the_measurement_and_not_with_the_psf(solver, factor, 
     result = solver(b, h)
     torch.testing.assert_close(solver(factor * b, h) / factor, result, rtol=1e-3, atol=1e-4)
     torch.testing.assert_close(solver(b, factor * h), result, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float64])
+def test_scene_is_float32_in_every_precision(solver, dtype, generator):
+    """The sum of the measurement's squares, 7e5, is beyond float16."""
+    _, b, h = capture(generator)
+    b = (100 * b).half()
+    result = solver(b.to(dtype), h.to(dtype))
+    assert result.dtype == torch.float32
+    expected = solver(b.float(), h)
+    assert (result - expected).norm() < 1e-2 * expected.norm()
 
 
 @pytest.mark.parametrize("psf_batch", [1, 3])

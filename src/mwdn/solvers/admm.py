@@ -86,7 +86,7 @@ class Admm:
                 measurement gives the result of all iterations so far.
         """
         check_fit(measurement, psf, "measurement")
-        psf = checked_psf(psf)
+        measurement, psf = measurement.float(), checked_psf(psf).float()  # squares in half precision end at 65,504
         b_norm = _norm(measurement).clamp(min=torch.finfo(torch.float32).tiny)
         h_norm = _norm(psf)
         b = measurement / b_norm
@@ -94,7 +94,7 @@ class Admm:
             problem = Problem.from_psf(b, psf / h_norm)
             state = initial_state(problem)
         else:
-            problem, state = start.problem._replace(measurement=b.float()), start.state
+            problem, state = start.problem._replace(measurement=b), start.state
         filters = make_filters(problem, self.penalties)
 
         def step(state: State) -> State:

@@ -50,7 +50,7 @@ class Wiener:
     def __call__(self, measurement: Measurement, psf: Psf) -> Scene:
         """Reconstruct a batch."""
         check_fit(measurement, psf, "measurement")
-        psf = checked_psf(psf)
+        psf = checked_psf(psf).float()
         size = measurement.shape[-2], measurement.shape[-1]
         grid = deconvolution_grid(size, self.boundary)
         total = psf.sum((-2, -1), keepdim=True)
