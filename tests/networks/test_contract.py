@@ -20,6 +20,9 @@ FEW = ("wiener", "le-admm")
 SLOW = ("mmcn", "updn", "le-admm-u", "ifin", "svdeconv")
 """Networks that take 1 to 3 seconds to export."""
 
+ANY_SIDE = (*FEW, "wiener-bank", "le-admm-u", "mmcn", "flatnet", "svdeconv")
+"""Networks that pad small pictures, or never halve them."""
+
 LEARN_SLOWLY = (*SLOW, "wiener-bank", "flatnet", "wiener-unet")
 """Networks that take 3 to 10 seconds to learn four pairs."""
 
@@ -296,6 +299,38 @@ def test_picture_without_batch_is_refused(name):
     if name != "unet":  # it has no PSF
         with pytest.raises(ShapeError, match=r"`psf` \(3, 32, 32\) must be \(B, C, H, W\)"):
             network(picture[None], picture)
+
+
+def test_precision_of_the_measurement_does_not_matter(name, generator):
+    """numpy's floats are float64. Each result has the precision of the weights."""
+    b, h, _ = pair(generator, (16, 18))
+    network = small(name).eval()
+    expected = network(b.half().float(), h)
+    for dtype in (torch.float64, torch.float16):
+        result = network(b.half().to(dtype), h.to(dtype))
+        assert result.dtype == torch.float32
+        assert (result - expected).norm() < 1e-2 * expected.norm()
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.usefixtures("unchecked")
+def test_what_does_not_fit_is_refused(name):
+    network, b = small(name).eval(), torch.rand(2, 3, 24, 24)
+    for measurement, psf in ((b[:0], b[:1]), (b, b[:0]), (b[:, :1], b[:1]), (b, b[:1, :2]), (b[:1], b)):
+        with pytest.raises(ShapeError):
+            network(measurement, psf)
+
+
+@pytest.mark.parametrize("side", [1, 7, 15])
+def test_small_picture_is_reconstructed_or_refused(name, ready, side, generator):
+    """docs/methods.md promises sides from 16 pixels on: U-Nets halve four times."""
+    b, h, _ = pair(generator, (16, side))
+    network = ready(small(name))
+    if name in ANY_SIDE:
+        assert network(b, h).shape == b.shape
+    else:
+        with pytest.raises(ShapeError, match="at least 16 x 16 pixels"):
+            network(b, h)
 
 
 @pytest.mark.parametrize("option", ["pooling", "psf_pooling"])

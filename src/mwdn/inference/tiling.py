@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from mwdn.networks.blocks import Decoder, Encoder, check_channels
+from mwdn.networks.blocks import Decoder, Encoder, check_channels, check_sides
 from mwdn.types import Size
 
 Rows = Callable[[int, int], Tensor]
@@ -33,6 +33,7 @@ class StripEncoder(nn.Module):
     def forward(self, picture: Tensor) -> list[Tensor]:
         """Features, finest first."""
         check_channels(picture, self.channels)
+        check_sides(picture, len(self.scales) - 1)
         size = picture.shape[-2], picture.shape[-1]
         limit = self.max_strip_numbers
         features = [apply_in_strips(self.scales[0], size, lambda first, last: picture[..., first:last, :], limit)]

@@ -56,6 +56,15 @@ def check_channels(picture: Image, channels: int) -> None:
         )
 
 
+def check_sides(picture: Image, halvings: int) -> None:
+    """Raise a `ShapeError` unless a measurement or PSF can be pooled so many times."""
+    if min(picture.shape[-2:]) < 2**halvings:
+        raise ShapeError(
+            f"A picture or PSF {tuple(picture.shape)} must have at least {2**halvings} x {2**halvings} pixels for this "
+            "network. Bin or crop less, or use a solver: `mwdn.solvers.Admm()`."
+        )
+
+
 class Encoder(CheckpointedModule):
     """U-Net encoder: a double convolution at each of the scales 1, 1/2, 1/4, ..., with pooling between them.
 
@@ -81,9 +90,10 @@ class Encoder(CheckpointedModule):
         """Features of each scale, finest first.
 
         Raises:
-            ShapeError: the picture does not have ``channels`` channels.
+            ShapeError: the picture does not have ``channels`` channels, or is too small for all scales.
         """
         check_channels(picture, self.channels)
+        check_sides(picture, len(self.scales) - 1)
         features = [self.checkpointed(self.scales[0], picture)]
         for scale in self.scales[1:]:
             features.append(self.checkpointed(self._pool_and_convolve, scale, features[-1]))
@@ -276,24 +286,3 @@ def resize(image: Tensor, size: Size) -> Tensor:
     if tuple(image.shape[-2:]) == tuple(size):
         return image
     return F.interpolate(image, size=size, mode="bilinear", align_corners=False, antialias=True)
-
-
-def block_means(picture: Tensor, block: int) -> Tensor:
-    """Means of blocks, interpolated bilinearly to the picture's size, (B, C, H, W)."""
-    height, width = picture.shape[-2:]
-    below, right = -height % block, -width % block
-    padded = F.pad(picture, (0, right, 0, below), mode="replicate") if below or right else picture
-    means = F.avg_pool2d(padded, block)
-    rows, columns = (_tents(count, block, means) for count in means.shape[-2:])
-    return (rows @ means @ columns.mT)[..., :height, :width]
-
-
-def _tents(count: int, block: int, like: Tensor) -> Tensor:
-    """Linear interpolation of the means of ``count`` blocks, as a matrix (block count, count).
-
-    The matrix products take a fifth of the time of torch's kernel for bilinear interpolation.
-    """
-    blocks = torch.arange(count, device=like.device)
-    pixels = torch.arange(count * block, device=like.device)
-    position = ((pixels + 0.5) / block - 0.5).clamp(0, count - 1)
-    return (1 - (position[:, None] - blocks).abs()).clamp(min=0).to(like.dtype)

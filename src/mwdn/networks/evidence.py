@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from mwdn.networks.blocks import block_means
+from mwdn.networks.block_means import block_means
 from mwdn.solvers.levels import REFERENCE_NOISE
 from mwdn.solvers.pyramid import Estimate
 from mwdn.types import Scene

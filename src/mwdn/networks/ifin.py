@@ -15,6 +15,7 @@ from mwdn.networks.blocks import (
     Encoder,
     WienerFilter,
     check_channels,
+    check_sides,
     convolutions,
     normalise_psf,
     paper_widths,
@@ -122,6 +123,7 @@ class Ifin(Network[IfinPsfs]):
     def prepare(self, psf: Psf, size: Size) -> IfinPsfs:
         """PSF for the first Wiener filter, and kernels of each scale."""
         psf = normalise_psf(psf, size, self.channels)
+        check_sides(psf, len(self.scales))
         return IfinPsfs(psf / psf.sum((-2, -1), keepdim=True), self.kernels(psf))
 
     def reconstruct(self, measurement: Measurement, prepared: IfinPsfs) -> Scene:

@@ -9,6 +9,7 @@ from mwdn.networks.blocks import (
     Pooling,
     WienerFilter,
     WienerFilters,
+    check_sides,
     normalise_psf,
     paper_widths,
     pooling_layer,
@@ -70,6 +71,7 @@ class Mwdn(Network[list[Tensor]]):
 
     def prepare(self, psf: Psf, size: Size) -> list[Tensor]:
         """Transfer function of each scale's filter."""
+        check_sides(psf, len(self.filters))
         psfs = self.pyramid(normalise_psf(psf, size, self.channels, stored=self.stored_psf))
         return [wiener.prepare(h) for wiener, h in zip(self.filters, psfs, strict=True)]
 

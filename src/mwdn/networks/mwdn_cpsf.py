@@ -6,7 +6,16 @@ import torch
 from torch import Tensor, nn
 
 from mwdn.fourier.padding import Boundary
-from mwdn.networks.blocks import Decoder, Encoder, Pooling, WienerFilter, WienerFilters, normalise_psf, paper_widths
+from mwdn.networks.blocks import (
+    Decoder,
+    Encoder,
+    Pooling,
+    WienerFilter,
+    WienerFilters,
+    check_sides,
+    normalise_psf,
+    paper_widths,
+)
 from mwdn.networks.network import Network
 from mwdn.types import Measurement, Psf, Scene, Size
 
@@ -71,6 +80,7 @@ class MwdnCpsf(Network[list[Tensor]]):
 
     def prepare(self, psf: Psf, size: Size) -> list[Tensor]:
         """Transfer functions of each scale's filter, one per feature channel."""
+        check_sides(psf, len(self.filters))
         psfs = self.pyramid(normalise_psf(psf, size, self.channels, stored=self.stored_psf))
         return [wiener.prepare(psfs.pop(0)) for wiener in self.filters]
 

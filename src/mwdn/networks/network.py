@@ -2,9 +2,11 @@
 
 from typing import Any, Generic, TypeVar
 
+import torch
 from torch import Tensor, nn
 
-from mwdn.errors import check_batch, checked
+from mwdn.errors import checked
+from mwdn.fourier.convolution import check_fit
 from mwdn.optics.psf import checked_psf
 from mwdn.types import Measurement, Psf, Scene, Size
 
@@ -80,17 +82,19 @@ class Network(nn.Module, Generic[Prepared]):
         """Scene (B, C, H, W): `prepare`, then `reconstruct`.
 
         Args:
-            measurement: (B, C, H, W), linear light, 1 is saturation.
+            measurement: (B, C, H, W), linear light, 1 is saturation; converted to the precision of the weights.
             psf: (1 or B, 1 or C, H, W), centred. Its scale does not matter: each channel counts as of unit sum,
                 unless the network has ``stored_psf``.
 
         Raises:
-            ShapeError: batch, channels or size do not fit.
+            ShapeError: batch, channels or size do not fit, or one is empty.
             ParameterError: not tensors of floats.
             PsfError: the PSF is negative, not finite, or dark; not checked in training.
         """
-        check_batch(measurement, "measurement")
+        check_fit(measurement, psf, "measurement")
         psf = checked_psf(psf, values=not self.training, scale=not self.stored_psf)
+        weights = next(self.parameters(), psf)
+        measurement, psf = measurement.to(weights.dtype), psf.to(torch.promote_types(weights.dtype, torch.float32))
         return self.reconstruct(measurement, self.prepare(psf, (measurement.shape[-2], measurement.shape[-1])))
 
 

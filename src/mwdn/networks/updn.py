@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mwdn.fourier.convolution import Convolution
-from mwdn.networks.blocks import check_channels, normalise_psf, resize
+from mwdn.networks.blocks import check_channels, check_sides, normalise_psf, resize
 from mwdn.networks.network import Network
 from mwdn.types import Measurement, Psf, Scene, Size, Transfer
 
@@ -116,6 +116,7 @@ class Updn(Network[Tensor]):
 
     def psfs(self, psf: Psf, size: Size) -> Tensor:
         """Learned PSFs, (1 or B, C * width, H, W), of mean sum 1 before correction."""
+        check_sides(psf, len(self.unet.ups))
         psf = normalise_psf(psf, size, self.channels)[:, :, None]
         total = psf.sum((-2, -1), keepdim=True).mean(1, keepdim=True)
         if self.correction is not None:

@@ -11,7 +11,8 @@ from mwdn.fourier.memory_format import pixel_shuffle, pixel_unshuffle
 from mwdn.fourier.padding import Boundary, pad
 from mwdn.fourier.transforms import inverse_spectrum, spectrum
 from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
-from mwdn.networks.blocks import Decoder, Encoder, block_means, check_channels, normalise_psf, paper_widths
+from mwdn.networks.block_means import block_means
+from mwdn.networks.blocks import Decoder, Encoder, check_channels, normalise_psf, paper_widths
 from mwdn.networks.drunet import Drunet
 from mwdn.networks.evidence import MAPS, against_psf, doubt_of_psf
 from mwdn.networks.network import Network

@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from mwdn.networks.blocks import block_means
+from mwdn.networks.block_means import block_means
 
 
 @pytest.mark.parametrize(("size", "block"), [((48, 64), 16), ((37, 50), 8), ((5, 7), 16)])
