@@ -105,6 +105,37 @@ def test_what_is_no_frame_is_refused(change, named, psf, capture):
         Reconstructor("wiener", Calibration.from_array(psf), device="cpu")(change(capture))
 
 
+@pytest.fixture
+def double():
+    """What some scientists put at the top of every script."""
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(torch.float32)
+
+
+@pytest.mark.usefixtures("double")
+@pytest.mark.parametrize("method", ["wiener", "universal-small", "universal"])
+def test_methods_do_not_depend_on_torchs_default_type(method, psf, capture):
+    """Alignment of `universal` included."""
+    calibration = Calibration.from_array(psf)
+    assert calibration.psf.dtype == torch.float32
+    scene = Reconstructor(method, calibration, device="cpu", precision="exact")(calibration.correct(capture))
+    torch.set_default_dtype(torch.float32)
+    expected = Reconstructor(method, calibration, device="cpu", precision="exact")(calibration.correct(capture))
+    assert scene.dtype == torch.float32
+    assert (scene - expected).norm() < 1e-3 * expected.norm()
+
+
+@pytest.mark.usefixtures("double")
+@pytest.mark.parametrize("name", mwdn.networks.NETWORKS)
+def test_networks_do_not_depend_on_torchs_default_type(name):
+    options = {"size": (16, 18)} if name in ("updn", "flatnet", "svdeconv") else {}
+    network = mwdn.build(name, **options, **({} if name in ("wiener", "le-admm") else {"width": 4})).eval()
+    scene = network(torch.rand(1, 3, 16, 18), torch.rand(1, 3, 16, 18) ** 6)
+    assert scene.dtype == torch.float32
+    assert scene.isfinite().all()
+
+
 def test_the_psf_of_an_array_is_that_of_its_file(psf, tmp_path):
     np.save(tmp_path / "psf.npy", psf)
     file = Calibration.from_file(tmp_path / "psf.npy", bin=2, grey=True)

@@ -222,7 +222,7 @@ class Calibration:
             )
         if self.psf.ndim != 4 or self.psf.shape[0] != 1 or self.psf.shape[1] not in (1, 3) or 0 in self.psf.shape:
             raise PsfError(f"`psf` {tuple(self.psf.shape)} must be (1, 1 or 3, H, W): grey or RGB.")
-        object.__setattr__(self, "psf", checked_psf(self.psf))
+        object.__setattr__(self, "psf", checked_psf(self.psf).float())
         for name in ("dark", "ambient"):
             if getattr(self, name) is not None:
                 check_batch(getattr(self, name), name)

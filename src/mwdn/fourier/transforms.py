@@ -32,8 +32,8 @@ def fast_length(length: int) -> int:
 
 def frequency_grid(grid: Size, *, device: torch.device | str | None = None) -> tuple[Tensor, Tensor]:
     """Frequencies of the rows (H, 1) and the columns (1, W // 2 + 1) of a `spectrum`, in cycles per pixel."""
-    rows = torch.fft.fftfreq(grid[0], device=device)[:, None]
-    return rows, torch.fft.rfftfreq(grid[1], device=device)[None]
+    rows = torch.fft.fftfreq(grid[0], device=device, dtype=torch.float32)[:, None]
+    return rows, torch.fft.rfftfreq(grid[1], device=device, dtype=torch.float32)[None]
 
 
 def gaussian_transfer(grid: Size, sigma: float, *, device: torch.device | str | None = None) -> Tensor:

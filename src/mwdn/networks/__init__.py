@@ -71,7 +71,8 @@ def build(name: str, **options: Any) -> nn.Module:  # noqa: ANN401
     if options.get("width", 1) < 1:
         raise ParameterError(f"`width` ({options['width']}) must be at least 1.")
     # JSON and TOML have lists, not tuples.
-    return kind(**{key: tuple(v) if isinstance(v, list) else v for key, v in options.items()})
+    network = kind(**{key: tuple(v) if isinstance(v, list) else v for key, v in options.items()})
+    return network.float()  # also where `torch.set_default_dtype` says otherwise
 
 
 __all__ = [

@@ -51,6 +51,6 @@ def against_psf(estimate: Estimate, detail: Scene, block: int) -> Tensor:
     doubts = [estimate.doubt(side).clamp(max=LARGEST_DOUBT) for side in DOUBT_BLOCKS]
     numbers = [(value + 1e-3).log() for value in (noise / REFERENCE_NOISE, *doubts)]
     size = detail.shape[-2:]
-    y, x = (torch.linspace(-1, 1, length, device=detail.device).square() / 2 for length in size)
+    y, x = (torch.linspace(-1, 1, length, device=detail.device, dtype=detail.dtype).square() / 2 for length in size)
     maps = [(y[:, None] + x).expand(detail.shape[0], 1, -1, -1), *(number.expand(-1, -1, *size) for number in numbers)]
     return torch.cat([block_means(detail, block), *maps], dim=1)

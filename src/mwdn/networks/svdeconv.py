@@ -26,7 +26,7 @@ def field_weights(side: int, size: Size, device: torch.device) -> Tensor:
     horizontal = (columns - centres[:, None]).square()[None, :, None, :]
     # 1e-3 keeps the weights finite; at a tile's centre the tile's own weight is then nearly 1.
     weights = 1 / ((vertical + horizontal).sqrt() + 1e-3)
-    return (weights / weights.sum((0, 1))).flatten(0, 1)
+    return (weights / weights.sum((0, 1))).flatten(0, 1).float()
 
 
 class SvDeconv(Network[Tensor]):

@@ -22,8 +22,8 @@ def warp(psf: Psf, matrix: Tensor, shift: tuple[float, float] = (0.0, 0.0)) -> T
     """
     height, width = psf.shape[-2:]
     inverse = torch.linalg.inv(matrix.to(psf)).expand(max(len(psf), len(matrix.reshape(-1, 2, 2))), 2, 2)
-    y = torch.arange(height, device=psf.device)[:, None] - height // 2 - shift[0]
-    x = torch.arange(width, device=psf.device)[None] - width // 2 - shift[1]
+    y = torch.arange(height, device=psf.device, dtype=psf.dtype)[:, None] - height // 2 - shift[0]
+    x = torch.arange(width, device=psf.device, dtype=psf.dtype)[None] - width // 2 - shift[1]
     a, b, c, d = inverse.flatten(1).T[..., None, None]
     rows, columns = a * y + b * x + height // 2, c * y + d * x + width // 2
     grid = torch.stack([(2 * columns + 1) / width - 1, (2 * rows + 1) / height - 1], -1)

@@ -275,7 +275,7 @@ def _without_fall_off(whole: Tensor, prediction: Tensor, size: Size, count: int)
     """
     height, width = size
     r, p = whole[..., :height, :width], prediction[..., :height, :width]
-    y, x = (torch.linspace(-1, 1, length, device=r.device) for length in r.shape[-2:])
+    y, x = (torch.linspace(-1, 1, length, device=r.device, dtype=r.dtype) for length in r.shape[-2:])
     y, x = torch.meshgrid(y, x, indexing="ij")
     q = torch.stack([torch.ones_like(x), x, y, x * y, x.square() - y.square(), x.square() + y.square()])
     A = (q[:, None] * p[:, None]).flatten(2)
