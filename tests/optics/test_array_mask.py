@@ -161,6 +161,13 @@ def test_what_cannot_be_a_mask(tmp_path, array, options, error, message):
         ArrayMask(tmp_path / "mask.npy", **options).build(GREEN)
 
 
+@pytest.mark.parametrize("numbers", [np.ones((8, 8)), torch.ones(1, 8, 8)])
+@pytest.mark.usefixtures("unchecked")
+def test_only_a_tensor_of_two_axes_is_a_mask(numbers):
+    with pytest.raises(ParameterError, match=r"must be a tensor \(H, W\)"):
+        make_mask(numbers, "height", pitch_um=2.0)
+
+
 def test_bad_files_are_named(tmp_path):
     (tmp_path / "text.npy").write_text("no numbers")
     cv2.imwrite(str(tmp_path / "colour.png"), np.arange(48, dtype=np.uint8).reshape(4, 4, 3))

@@ -204,6 +204,19 @@ def test_impossible_aberrations_are_refused(wrong, name):
 
 
 @pytest.mark.usefixtures("unchecked")
+@pytest.mark.usefixtures("unchecked")
+def test_psfs_without_an_axis_of_colours_are_refused(generator):
+    psfs = torch.rand(3, 3, 5, 5, generator=generator)
+    with pytest.raises(ShapeError, match=r"`psfs` \(3, 3, 5, 5\) must be \(rows, columns, C, h, w\)"):
+        FieldCamera.from_psfs(psfs, (9, 9))
+
+
+def test_a_call_is_forward(generator):
+    camera = FieldCamera.from_psfs(torch.rand(2, 2, 1, 5, 5, generator=generator), (9, 9))
+    scene = torch.rand(1, 1, 9, 9, generator=generator)
+    assert torch.equal(camera(scene), camera.forward(scene))
+
+
 def test_wrong_calls():
     psfs = torch.ones(2, 2, 1, 3, 3)
     with pytest.raises(ParameterError, match="rank"):

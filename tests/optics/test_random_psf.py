@@ -3,6 +3,7 @@
 import math
 from functools import cache
 
+import numpy as np
 import pytest
 import torch
 
@@ -171,6 +172,18 @@ def test_contour_line_of_a_ramp_has_its_width():
 def test_impossible_varieties_are_refused(wrong):
     with pytest.raises(ParameterError, match=next(iter(wrong))):
         Variety(**wrong)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_numpys_numbers_are_seeds():
+    assert torch.equal(sample_camera(np.int64(3), (16, 24)), sample_camera(3, (16, 24)))
+
+
+@pytest.mark.parametrize(("seed", "size"), [(1.5, (16, 16)), (None, (16, 16)), (2**70, (16, 16)), (0, 16)])
+@pytest.mark.usefixtures("unchecked")
+def test_arguments_of_other_types_are_named(seed, size):
+    with pytest.raises(ParameterError, match="of `sample_camera` must be"):
+        sample_camera(seed, size)
 
 
 def test_wrong_calls():

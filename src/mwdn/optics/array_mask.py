@@ -10,7 +10,7 @@ import numpy.typing as npt
 import torch
 from torch.nn import functional as F
 
-from mwdn.errors import ImageError, ParameterError, ShapeError, UnknownNameError
+from mwdn.errors import ImageError, ParameterError, ShapeError, UnknownNameError, shown
 from mwdn.io.images import read_frame
 from mwdn.io.npy import read_array
 from mwdn.optics.mask_files import read_mask
@@ -145,13 +145,15 @@ def make_mask(
         subdivide: samples of the mask along each side of a number; see `ArrayMask`.
 
     Raises:
-        ParameterError: an argument is out of its range, NaN or infinity, an amplitude or transmission outside [0, 1],
-            or a surface higher than `MAX_RELIEF_UM`.
+        ParameterError: ``numbers`` is no tensor (H, W); an argument is out of its range, NaN or infinity, an amplitude
+            or transmission outside [0, 1], or a surface higher than `MAX_RELIEF_UM`.
         UnknownNameError: ``values`` is an unknown kind.
     """
     if values not in get_args(Quantity):
         raise UnknownNameError("quantity of a mask", values, get_args(Quantity))
     check_positive(pitch_um=pitch_um, phase_nm=phase_nm, subdivide=subdivide)
+    if not isinstance(numbers, torch.Tensor) or numbers.ndim != 2:
+        raise ParameterError(f"`numbers` ({shown(numbers)}) must be a tensor (H, W): `torch.from_numpy(array)`.")
     rows, columns = numbers.shape
     check_samples(rows * subdivide, columns * subdivide)
     if not numbers.isfinite().all():

@@ -131,7 +131,13 @@ class FieldCamera:
 
         Raises:
             ParameterError: `rank` is below 1.
+            ShapeError: ``psfs`` has other axes.
         """
+        if psfs.ndim != 5:
+            raise ShapeError(
+                f"`psfs` {tuple(psfs.shape)} must be (rows, columns, C, h, w), as `field_psfs` returns them. For grey "
+                "ones: `psfs[:, :, None]`."
+            )
         if rank is not None and rank < 1:
             raise ParameterError(f"`rank` ({rank}) must be at least 1.")
         rows, columns, *shape = psfs.shape
@@ -174,6 +180,10 @@ class FieldCamera:
             )
         parts = (convolve(scene * w, h[None], size=self.sensor_size) for h, w in self._terms())
         return torch.stack(list(parts)).sum(0)
+
+    def __call__(self, scene: Scene) -> Measurement:
+        """The same as `forward`."""
+        return self.forward(scene)
 
     def adjoint(self, measurement: Measurement) -> Scene:
         """Exact adjoint of `forward`."""

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from mwdn.errors import ParameterError, UnknownNameError
+from mwdn.errors import ParameterError, UnknownNameError, checked
 from mwdn.fourier.transforms import fast_length, gaussian_transfer, inverse_spectrum, spectrum
 from mwdn.optics.drawing import contour_lines, scatter_light, smooth_field
 from mwdn.optics.psf import unit_sum
@@ -202,6 +202,7 @@ FAMILIES: dict[str, Callable[[_Draw, _Aperture], Tensor]] = {
 """Families of masks for `sample_camera`."""
 
 
+@checked
 def sample_camera(
     generator: torch.Generator | int,
     size: Size,
@@ -226,7 +227,7 @@ def sample_camera(
 
     Raises:
         UnknownNameError: unknown family.
-        ParameterError: a size below 8.
+        ParameterError: a size below 8, or an argument of another type.
 
     References:
         V. Boominathan et al., IEEE TPAMI 42, 1618 (2020) for contours; N. Antipa et al., Optica 5, 1 (2018) for
@@ -237,8 +238,8 @@ def sample_camera(
         raise ParameterError(f"`size` {size} must be at least 8 x 8 pixels.")
     if family is not None and family not in FAMILIES:
         raise UnknownNameError("family", family, FAMILIES)
-    if isinstance(generator, int):
-        generator = torch.Generator().manual_seed(generator)
+    if not isinstance(generator, torch.Generator):
+        generator = torch.Generator().manual_seed(int(generator))  # numpy's numbers, too
     draw = _Draw(generator, variety or Variety(), size, torch.device(device or generator.device))
     name = family or list(FAMILIES)[int(draw.uniform(0.0, float(len(FAMILIES))))]
     aperture = _aperture(draw)
