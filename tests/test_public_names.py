@@ -152,6 +152,20 @@ def test_arrays_are_written_and_scaled_as_tensors_are(capture, tmp_path):
     assert (tmp_path / "array.png").read_bytes() == (tmp_path / "tensor.png").read_bytes()
 
 
+@pytest.mark.parametrize("write", [mwdn.write_picture, mwdn.write_linear])
+def test_flipped_and_read_only_arrays_are_written(write, tmp_path):
+    suffix = "png" if write is mwdn.write_picture else "tif"
+    array = np.linspace(0, 1, 8 * 9 * 3, dtype=np.float32).reshape(8, 9, 3)
+    flipped, fixed = array[::-1, ::-1], array.copy()
+    fixed.flags.writeable = False
+    for number, view in enumerate((flipped, flipped.copy(), fixed, array)):
+        write(tmp_path / f"{number}.{suffix}", view)
+    files = [(tmp_path / f"{number}.{suffix}").read_bytes() for number in range(4)]
+    assert files[0] == files[1]
+    assert files[2] == files[3]
+    assert files[0] != files[2]
+
+
 def test_networks_are_loaded_by_name_or_path(tmp_path):
     network = mwdn.load_network("universal-small")
     mwdn.weights.save_network(tmp_path / "net.safetensors", mwdn.build("unet", width=2), "unet", {"width": 2})

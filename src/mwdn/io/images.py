@@ -226,7 +226,7 @@ def _float_frame(path: Path, image: Tensor | FloatFrame, *suffixes: str) -> Floa
     if path.suffix.lower() not in suffixes:
         raise ImageError(f"`{path}` must end in {' or '.join(suffixes)}, not '{path.suffix}'. Rename it.")
     if not isinstance(image, Tensor):
-        image = torch.from_numpy(as_frame(image)).movedim(-1, 0)
+        image = torch.from_numpy(as_frame(image).copy()).movedim(-1, 0)  # flipped and read-only arrays, too
     picture = image[0] if image.ndim == 4 and len(image) == 1 else image
     fits = picture.ndim == 3 and len(picture) in (1, 3) and picture.numel() > 0
     if not (fits and picture.is_floating_point()):
