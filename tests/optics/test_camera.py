@@ -40,6 +40,13 @@ def test_adjoint(scene, psf, sensor, generator):
     assert difference.abs() <= 1e-5 * Av.norm() * y.norm()
 
 
+def test_adjoint_of_another_sensors_measurement_is_refused():
+    """It would be the adjoint of another camera's `forward`."""
+    camera = Camera(torch.ones(1, 1, 5, 5), size=(8, 9))
+    with pytest.raises(ShapeError, match=r"`measurement` \(1, 2, 5, 5\) must have the camera's sensor size \(8, 9\)"):
+        camera.adjoint(torch.ones(1, 2, 5, 5))
+
+
 def test_adjoint_returns_a_scene_of_the_sensors_size_unless_asked():
     camera = Camera(torch.ones(1, 1, 5, 5), size=(8, 9))
     assert camera.adjoint(torch.ones(1, 2, 8, 9)).shape == (1, 2, 8, 9)

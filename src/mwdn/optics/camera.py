@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import torch
 
-from mwdn.errors import checked
+from mwdn.errors import ShapeError, check_batch, checked
 from mwdn.fourier.convolution import convolve, correlate
 from mwdn.optics.psf import checked_psf, psf_hash
 from mwdn.optics.sensor import Sensor
@@ -55,7 +55,17 @@ class Camera:
         return self.forward(scene)
 
     def adjoint(self, measurement: Measurement, *, scene_size: Size | None = None) -> Scene:
-        """Exact adjoint of `forward` for scenes of ``scene_size`` (the sensor's unless given)."""
+        """Exact adjoint of `forward` for scenes of ``scene_size`` (the sensor's unless given).
+
+        Raises:
+            ShapeError: the measurement does not have `sensor_size`.
+        """
+        check_batch(measurement, "measurement")
+        if (measurement.shape[-2], measurement.shape[-1]) != tuple(self.sensor_size):
+            raise ShapeError(
+                f"`measurement` {tuple(measurement.shape)} must have the camera's sensor size {self.sensor_size}. For "
+                "another sensor: `Camera(psf, size=(height, width))`."
+            )
         return correlate(measurement, self.psf, size=scene_size)
 
     def simulate(self, scene: Scene, *, generator: torch.Generator | None = None) -> Image:
