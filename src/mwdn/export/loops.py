@@ -1,6 +1,6 @@
 """Iterations of a solver as one loop of an exported program, in place of a copy of the operations for each."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -38,7 +38,10 @@ def as_loops() -> Iterator[None]:
         yield
 
 
-def _record(step: Callable[[S], S], state: S, count: int) -> S:
+def _record(updates: Sequence[Callable[[S], S]], state: S, count: int) -> S:
     tensors, layout = tree_flatten(state)
-    tensors, layout = tree_flatten(step(tree_unflatten(begin_loop(tensors, count), layout)))
+    state = tree_unflatten(begin_loop(tensors, count), layout)
+    for update in updates:
+        state = update(state)
+    tensors, layout = tree_flatten(state)
     return tree_unflatten(end_loop(tensors), layout)

@@ -1,6 +1,6 @@
 """Iterations that report their progress: the fraction of a solver's work that is done."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any, TypeVar
@@ -38,11 +38,11 @@ def iterations(count: int, *, start: float = 0.0, end: float = 1.0) -> Iterator[
             report(start + (end - start) * (number + 1) / count)
 
 
-def repeat(step: Callable[[S], S], state: S, count: int, *, start: float = 0.0, end: float = 1.0) -> S:
-    """Apply ``step`` to a state, a tuple of tensors, ``count`` times.
+def repeat(updates: Sequence[Callable[[S], S]], state: S, count: int, *, start: float = 0.0, end: float = 1.0) -> S:
+    """Apply ``updates`` in turn to a state, a tuple of tensors, ``count`` times.
 
     Args:
-        step: an iteration; the state that it returns has the shapes and types of the one that it gets.
+        updates: of an iteration; together they keep the shapes and types of the state.
         state: at the beginning.
         count: number of iterations.
         start: as for `iterations`.
@@ -50,15 +50,16 @@ def repeat(step: Callable[[S], S], state: S, count: int, *, start: float = 0.0, 
     """
     recorder = _recorder.get()
     if recorder is not None and count > 1:
-        return recorder(step, state, count)
+        return recorder(updates, state, count)
     for _ in iterations(count, start=start, end=end):
-        state = step(state)
+        for update in updates:
+            state = update(state)
     return state
 
 
 @contextmanager
 def record_loops(recorder: Callable[..., Any]) -> Iterator[None]:
-    """Call ``recorder(step, state, count)`` in place of each `repeat` in this thread: an export records one step."""
+    """Call ``recorder(updates, state, count)`` for each `repeat` in this thread: an export traces the updates once."""
     token = _recorder.set(recorder)
     try:
         yield

@@ -1,6 +1,7 @@
 """ADMM with total variation and non-negativity, the classical reconstruction of a lensless camera."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -90,18 +91,14 @@ class Admm:
         b_norm = _norm(measurement).clamp(min=torch.finfo(torch.float32).tiny)
         h_norm = _norm(psf)
         b = measurement / b_norm
-        if start is None:
-            problem = Problem.from_psf(b, psf / h_norm)
-            state = initial_state(problem)
-        else:
-            problem, state = start.problem._replace(measurement=b), start.state
-        filters = make_filters(problem, self.penalties)
-
-        def step(state: State) -> State:
-            state = update_copies(state, problem, self.penalties, self.regularisation, self.variation)
-            return update_scene(state, problem, filters)
-
-        state = repeat(step, state, self.iterations)
+        problem = start.problem._replace(measurement=b) if start else Problem.from_psf(b, psf / h_norm)
+        updates = (
+            partial(
+                update_copies, problem=problem, mu=self.penalties, tau=self.regularisation, variation=self.variation
+            ),
+            partial(update_scene, problem=problem, filters=make_filters(problem, self.penalties)),
+        )
+        state = repeat(updates, start.state if start else initial_state(problem), self.iterations)
         height, width = problem.sensor
         scene = state.v[..., :height, :width].clamp(min=0) * (b_norm / h_norm)
         return scene, Iterate(problem, state)

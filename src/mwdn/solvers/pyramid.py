@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import torch
@@ -24,7 +24,7 @@ from mwdn.solvers.levels import (
     relative_noise,
     smoothing_scale,
 )
-from mwdn.solvers.splitting import Problem, State, initial_state, make_filters, update_copies, update_scene
+from mwdn.solvers.splitting import Problem, initial_state, make_filters, update_copies, update_scene
 from mwdn.types import Measurement, Psf, Scene, Size, Spectrum
 
 MIXED = 0.1
@@ -270,9 +270,11 @@ def _solve(
     tau = size_factor * tau
     smooth = level.regularisation > 0
     filters = make_filters(problem, mu, smooth=smooth)
-    state = initial_state(problem, start.expand(*problem.measurement.shape[:2], *band.grid), smooth=smooth)
-
-    def step(state: State) -> State:
-        return update_scene(update_copies(state, problem, mu, tau, "colour", level.relaxation), problem, filters)
-
-    return repeat(step, state, level.iterations, start=done[0], end=done[1]).v / band.norm
+    updates = (
+        partial(update_copies, problem=problem, mu=mu, tau=tau, variation="colour", relaxation=level.relaxation),
+        partial(update_scene, problem=problem, filters=filters),
+    )
+    start = start.expand(*problem.measurement.shape[:2], *band.grid)
+    # No variable holds the initial state: it is freed after the first iteration.
+    state = repeat(updates, initial_state(problem, start, smooth=smooth), level.iterations, start=done[0], end=done[1])
+    return state.v / band.norm
