@@ -260,9 +260,14 @@ def normalise_psf(psf: Psf, size: Size, channels: int | None = None, *, stored: 
     """
     check_size(psf, size)
     if not stored:
-        psf = checked_psf(psf, values=False)
+        psf = unit_psf(psf)
         psf = psf / psf.amax(dim=(1, 2, 3), keepdim=True)
     return psf if channels is None or psf.shape[1] != 1 else psf.expand(-1, channels, -1, -1)
+
+
+def unit_psf(psf: Psf) -> Tensor:
+    """Scale each channel to unit sum. An exported `prepare` takes such PSFs only, and has no operation for it."""
+    return psf if torch.compiler.is_exporting() else checked_psf(psf, values=False)
 
 
 def check_size(psf: Psf, size: Size) -> None:

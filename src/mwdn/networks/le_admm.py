@@ -7,9 +7,8 @@ from torch import Tensor, nn
 
 from mwdn.errors import ParameterError
 from mwdn.fourier.transforms import fast_length, transfer_function
-from mwdn.networks.blocks import check_size
+from mwdn.networks.blocks import check_size, unit_psf
 from mwdn.networks.network import Network
-from mwdn.optics.psf import checked_psf
 from mwdn.solvers.proximal import Variation
 from mwdn.solvers.splitting import Penalties, Problem, initial_state, make_filters, rescale, update_copies, update_scene
 from mwdn.types import Measurement, Psf, Scene, Size, Transfer
@@ -68,7 +67,7 @@ class LeAdmm(Network[Tensor]):
     def prepare(self, psf: Psf, size: Size) -> Transfer:
         """Transfer function (B, 1, ...) of the grey PSF at unit L2 norm, on a grid of twice the sensor."""
         check_size(psf, size)
-        grey = checked_psf(psf, values=False).float().sum(1, keepdim=True)
+        grey = unit_psf(psf).float().sum(1, keepdim=True)
         grey = grey / torch.linalg.vector_norm(grey, dim=(1, 2, 3), keepdim=True)
         return transfer_function(grey, (fast_length(2 * size[0]), fast_length(2 * size[1])))
 
