@@ -215,3 +215,10 @@ def test_terms_of_the_psf_are_those_of_its_distance(psf, tmp_path):
     assert torch.allclose(far.psf, psf / psf.sum((-2, -1), keepdim=True), atol=1e-6)
     assert "psf_gain" not in said_near
     assert said_far.endswith("Without `psf_gain`, found for the PSF of 100 mm.")
+
+
+def test_terms_of_the_sensor_leave_the_psf_as_it_is(psf, generator):
+    """It was normalised again, and rounding gave it another hash."""
+    calibration = Calibration(psf + torch.rand(psf.shape, generator=generator) / psf[0, 0].numel())
+    refined = calibration.refined(Refinement(stray_light=LIGHT, sensor_field=FIELD))
+    assert refined.psf_hash == refined.unrefined_hash == calibration.psf_hash

@@ -68,6 +68,8 @@ class Refinement:
         Raises:
             ParameterError: three rows for a grey PSF.
         """
+        if self.envelope_shift is None and not self.psf_gain:
+            return psf  # not normalised again: rounding would change its hash
         if self.envelope_shift is not None:
             shift = torch.tensor([self.envelope_shift], dtype=psf.dtype) * min(psf.shape[-2:])
             psf = displaced_envelope(psf, shift.expand(len(psf), -1))
