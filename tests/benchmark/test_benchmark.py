@@ -30,13 +30,13 @@ from mwdn.calibration.places import field_camera
 from mwdn.cli.app import main
 from mwdn.data.pair_checks import REFINED
 from mwdn.data.pairs import PairFile
+from mwdn.data.recorded import RecordedPairs
 from mwdn.data.simulated import Placement
 from mwdn.errors import CheckpointError, ParameterError, UnknownNameError
 from mwdn.evaluation import alexnet, bootstrap
 from mwdn.fourier import convolve
 from mwdn.optics import Deviation, Sensor
 from mwdn.training.recipe import Schedule
-from mwdn.training.tasks import SupervisedTask
 from mwdn.weights.checkpoint import read_metadata
 
 RECIPE = """
@@ -550,7 +550,7 @@ def test_a_training_does_not_hash_its_pairs(folder, monkeypatch):
     benchmark = read_benchmark(folder / "r.toml")
     recipe = benchmark.data["caustic"]
     dataset = open_dataset("caustic", recipe, folder, torch.device("cpu"), lambda _, rows: rows)
-    monkeypatch.setattr(SupervisedTask, "fingerprint", "hash")  # beartype looks at it, so it cannot raise
+    monkeypatch.setattr(RecordedPairs, "fingerprint", "hash")  # beartype looks at it, so it cannot raise
     train(benchmark.methods[-1], dataset, benchmark, folder / "run", device=torch.device("cpu"), show=lambda _: None)
     with safe_open(folder / "run" / "state.safetensors", "pt") as state:
         assert state.metadata()["samples"] == ""
