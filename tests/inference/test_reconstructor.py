@@ -362,3 +362,9 @@ def test_representations_are_one_short_line(psf):
         assert "tensor" not in repr(thing)
     assert repr(reconstruct) == f"Reconstructor('admm', 32 x 40, PSF {calibration.psf_hash}, cpu, aligned)"
     assert repr(calibration) == f"Calibration(32 x 40, RGB, PSF {calibration.psf_hash}, FrameFormat(bin=4))"
+
+
+def test_a_class_in_place_of_a_method_is_refused(psf):
+    """It failed only at the first capture, in the class's constructor."""
+    with pytest.raises(ParameterError, match=r"must be an object: `Admm\(\)`"):
+        Reconstructor(solvers.Admm, Calibration(psf))

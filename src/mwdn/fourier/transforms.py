@@ -88,10 +88,16 @@ def transfer_function(psf: Psf, grid: Size, origin: Size | None = None) -> Spect
         psf: (B, C, h, w), at most as large as ``grid``.
         grid: height and width of the transform.
         origin: the pixel of zero displacement; by default the centre ``(h // 2, w // 2)``.
+
+    Raises:
+        ShapeError: the PSF is larger than the grid.
     """
     height, width = psf.shape[-2:]
     if height > grid[0] or width > grid[1]:
-        raise ShapeError(f"`psf` ({height} x {width}) must not be larger than the grid ({grid[0]} x {grid[1]}).")
+        raise ShapeError(
+            f"`psf` ({height} x {width}) must not be larger than the grid ({grid[0]} x {grid[1]}). Crop it about its "
+            "centre to the size of the measurement."
+        )
     row, column = (height // 2, width // 2) if origin is None else origin
     padded = torch.nn.functional.pad(psf.float().contiguous(), (0, grid[1] - width, 0, grid[0] - height))
     return spectrum(padded.roll((-row, -column), dims=(-2, -1)), grid)

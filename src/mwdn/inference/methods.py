@@ -59,11 +59,13 @@ def as_method(method: Method | str | Path, **options: Any) -> Method:  # noqa: A
     """A method as it is, or `find_method` with options.
 
     Raises:
-        ParameterError: options are given for an object, or as for `find_method`.
+        ParameterError: options are given for an object, a class is given, or as for `find_method`.
         MwdnError: as for `find_method`.
     """
     if isinstance(method, str | Path):
         return find_method(method, **options)
+    if isinstance(method, type):
+        raise ParameterError(f"The method (the class `{method.__name__}`) must be an object: `{method.__name__}()`.")
     if options:
         raise ParameterError(f"Options ({', '.join(options)}) need a method given by its name, not an object.")
     return method
