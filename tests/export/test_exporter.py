@@ -359,8 +359,9 @@ def test_iterations_are_a_loop_in_the_file(tmp_path, generator):
     assert agreement(run_file(file, captures), wanted) > 100
 
 
-@pytest.mark.acceptance
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.acceptance] * (name in ("admm", "pyramid"))) for name in SOLVERS]
+)
 def test_every_solver(name, tmp_path):
     options = {"iterations": 5} if name == "fista" else {}  # the others are loops
     export(build_solver(name, **options), camera(), tmp_path / "camera.onnx", least=100)

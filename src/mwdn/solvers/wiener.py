@@ -78,7 +78,7 @@ class Wiener:
         allowed = (noise_level(measurement) / contrast).square() + self.tolerance**2
         # Parseval: sum |B|^2 = pixels x variance. In a half spectrum all columns count twice but the first and, of an
         # even width, the last. The mean is left out.
-        count = torch.ones_like(B.real[0, 0])
+        count = torch.ones(B.shape[-2:], device=B.device, dtype=torch.float32)
         count[:, 1 : (width + 1) // 2] = 2
         count[0, 0] = 0
         power, filtered = (B.abs() / contrast).square() * count, H.abs().square()
