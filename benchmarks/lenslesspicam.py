@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from statistics import fmean, median
 
@@ -23,7 +24,6 @@ import numpy as np
 import torch
 
 METRICS = ("psnr", "ssim", "lpips")
-DIFFUSERCAM = {"background": 0.0, "upside_down": True, "bgr": True}
 THEIRS = {
     "LenslessPiCam ADMM, 100 iterations": ("ADMM", 100, {}),
     "LenslessPiCam ADMM, 100 iterations, mu 1e-4, tau 2e-3": (
@@ -96,17 +96,19 @@ def main():
     if arguments.serve:
         return serve(arguments.serve)
 
-    from mwdn import Calibration, Reconstructor, keep_memory
+    from mwdn import Reconstructor, keep_memory
+    from mwdn.benchmark.dataset_recipe import PRESETS
     from mwdn.data.importers import read_pairs
-    from mwdn.evaluation import Perceptual, Protocol
+    from mwdn.evaluation import Perceptual
     from mwdn.evaluation.metrics import measure
     from mwdn.io.files import write_json
 
     keep_memory()
     folder = arguments.data / "diffusercam"
-    calibration = Calibration.from_file(folder / "psf_recovered_270x480.npy", **DIFFUSERCAM)
+    recipe = replace(PRESETS["diffusercam"], psf=str(folder / "psf_recovered_270x480.npy"))
+    calibration = recipe.calibration()
     ours = {name: Reconstructor(name, calibration) for name in arguments.methods}
-    protocol, perceptual = Protocol.parse("60:270,60:440"), Perceptual.load()
+    protocol, perceptual = recipe.binned_protocol(), Perceptual.load()
     rows = {label: {key: [] for key in (*METRICS, "seconds")} for label in (*THEIRS, *ours)}
     with tempfile.TemporaryDirectory() as scratch:
         theirs = Theirs(arguments.lensless, Path(scratch), calibration.psf)
