@@ -1,8 +1,6 @@
 """Several processes at one benchmark."""
 
-import signal
-import subprocess
-import sys
+import multiprocessing
 import time
 
 import pytest
@@ -10,41 +8,55 @@ import pytest
 from mwdn.benchmark.locks import claim_parts, lock
 from mwdn.errors import ParameterError
 
-AT_WORK = """
-import sys, time
-from pathlib import Path
-from mwdn.benchmark.locks import claim_parts
-
-folder = Path(sys.argv[1])
-for part in claim_parts(folder, ["a", "b", "c", "d"]):
-    done = folder / part
-    if not done.exists():
-        with done.open("x") as file:  # fails if another is at it
-            time.sleep(float(sys.argv[2]))
-    print(part, flush=True)
-"""
+pytestmark = pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # of other threads: none holds a lock
 
 
-def at_work(folder, seconds):
-    call = [sys.executable, "-c", AT_WORK, str(folder), str(seconds)]
-    return subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+def work(folder, seconds, said):
+    """Do four parts, each in so many seconds, and tell them."""
+    for part in claim_parts(folder, ["a", "b", "c", "d"]):
+        done = folder / part
+        if not done.exists():
+            with done.open("x"):  # fails if another is at it
+                time.sleep(seconds)
+        said.put(part)
 
 
-def test_each_part_is_done_once_and_all_wait_for_the_last(tmp_path):
-    workers = [at_work(tmp_path, 0.2) for _ in range(2)]
-    said = [worker.communicate(timeout=600) for worker in workers]
-    assert [error for _, error in said] == ["", ""]
-    assert all(sorted(out.split()) == ["a", "b", "c", "d"] for out, _ in said)
+@pytest.fixture
+def start(tmp_path):
+    """Start a process that does parts in so many seconds each; returns it and the queue of what it tells."""
+    if "fork" not in multiprocessing.get_all_start_methods():
+        pytest.skip("no fork: a new Python takes seconds to start")
+    context, processes = multiprocessing.get_context("fork"), []
+
+    def start(seconds):
+        said = context.SimpleQueue()
+        processes.append(context.Process(target=work, args=(tmp_path, seconds, said)))
+        processes[-1].start()
+        return processes[-1], said
+
+    yield start
+    for process in processes:
+        process.kill()
+        process.join()
 
 
-def test_a_part_of_a_killed_process_is_another_ones(tmp_path):
-    worker = at_work(tmp_path, 600)
+def test_each_part_is_done_once_and_all_wait_for_the_last(start):
+    workers = [start(0.1) for _ in range(2)]
+    for process, said in workers:
+        process.join(600)
+        assert process.exitcode == 0
+        assert sorted(said.get() for _ in range(4)) == ["a", "b", "c", "d"]
+        assert said.empty()
+
+
+def test_a_part_of_a_killed_process_is_another_ones(start, tmp_path):
+    worker, _ = start(600)
     while not (tmp_path / "a").exists():
         time.sleep(0.05)
     parts = claim_parts(tmp_path, ["a", "b"])
     assert next(parts) == "b"
-    worker.send_signal(signal.SIGKILL)
-    worker.communicate()
+    worker.kill()
+    worker.join()
     assert next(parts) == "a"
     assert list(parts) == []
 

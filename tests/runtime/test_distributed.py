@@ -86,7 +86,7 @@ def machines(folder, port, *line):
 
 
 def training(out):
-    line = "-m mwdn train r.toml --psf psf.npy --background 0 --photos photos --device cpu --out"
+    line = "train r.toml --psf psf.npy --background 0 --photos photos --device cpu --out"
     return [*line.split(), out]
 
 
@@ -129,16 +129,8 @@ def one(folder):
 
 
 @pytest.fixture(scope="module")
-def two(folder):
-    out, err = finish(torchrun(folder, *training("two")))
-    assert out.split() == ["Weights", "in", "two/best.safetensors"]  # printed once
-    assert err.count(f"step {STEPS}: validation") == 1
-    return folder / "two"
-
-
-@pytest.fixture(scope="module")
 def worked(folder):
-    """Folder with the results of `two_processes.py`."""
+    """Folder with the results of `two_processes.py`, which begins with `mwdn train` into `two`."""
     stop = InterruptedError
 
     def after_four(report):
@@ -147,8 +139,15 @@ def worked(folder):
 
     with pytest.raises(stop):
         alone(folder, "mixed").run(after_four)
-    finish(torchrun(folder, str(Path(__file__).with_name("two_processes.py"))))
+    out, err = finish(torchrun(folder, str(Path(__file__).with_name("two_processes.py")), *training("two")))
+    assert out.split() == ["Weights", "in", "two/best.safetensors"]  # printed once
+    assert err.count(f"step {STEPS}: validation") == 1
     return folder
+
+
+@pytest.fixture(scope="module")
+def two(worked):
+    return worked / "two"
 
 
 def assert_alike(found, expected):
@@ -254,7 +253,7 @@ def test_killed_run_goes_on_with_two_machines_and_ends_as_an_unbroken_one(folder
 
     The next one has a process on each of two machines, which share the folder.
     """
-    process, path = torchrun(folder, *training("killed")), folder / "killed" / "log.jsonl"
+    process, path = torchrun(folder, "-m", "mwdn", *training("killed")), folder / "killed" / "log.jsonl"
     goal = random.randint(2, STEPS // 2)  # the rest is the time in which this process must see it
     while process.poll() is None and not (path.exists() and path.read_bytes().count(b"\n") >= goal):
         with pytest.raises(subprocess.TimeoutExpired):
@@ -269,7 +268,7 @@ def test_killed_run_goes_on_with_two_machines_and_ends_as_an_unbroken_one(folder
         assert select.select([handle], [], [], 60)[0] == [handle]
         os.close(handle)
     assert len(log(folder / "killed")) < STEPS
-    said = [finish(machine) for machine in machines(folder, free_port, *training("killed"))]
+    said = [finish(machine) for machine in machines(folder, free_port, "-m", "mwdn", *training("killed"))]
     assert [out.split() for out, _ in said] == [["Weights", "in", "killed/best.safetensors"], []]
     for name in ("best", "last", "state"):
         assert same(folder / "killed" / f"{name}.safetensors", two / f"{name}.safetensors")

@@ -1,8 +1,12 @@
-"""Run by two processes, which `test_distributed.py` starts by torchrun; it checks the files they write."""
+"""Run by two processes, which `test_distributed.py` starts by torchrun; it checks the files they write.
+
+They begin with the `mwdn` command of their arguments.
+"""
 
 import json
 import os
-from contextlib import contextmanager
+import sys
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +14,7 @@ import torch
 from safetensors.torch import save_file
 from torch import nn
 
+from mwdn import cli
 from mwdn.calibration import Calibration
 from mwdn.data.simulated import SimulatedPairs
 from mwdn.errors import MwdnError
@@ -73,6 +78,9 @@ def double_precision():
 
 
 def main():
+    with suppress(SystemExit):
+        cli.main(sys.argv[1:])  # `mwdn train`, in a group of its own
+    os.environ["TORCHELASTIC_RESTART_COUNT"] = "again"  # the store still has the addresses of that group
     calibration = Calibration.from_file("psf.npy", background=0.0)
     precise, recipe = Calibration(calibration.psf.double()), read_recipe("r.toml")
     number = os.environ["RANK"]
