@@ -43,8 +43,10 @@ def store(path, image):
     assert cv2.imwrite(str(path), frame[..., ::-1])
 
 
-def reconstruct(run, *captures, psf="psf.png", out="out", method="wiener"):
-    return run("reconstruct", *captures, "--psf", psf, "--out", out, "--method", method)
+def reconstruct(run, *captures, psf="psf.png", out="out", method="wiener", trust=False):
+    """The command; the check of the pictures takes longer than the rest together."""
+    check = () if trust else ("--no-trust",)
+    return run("reconstruct", *captures, "--psf", psf, "--out", out, "--method", method, *check)
 
 
 def names(folder):
@@ -55,7 +57,7 @@ def names(folder):
 
 
 def test_one_file(run, camera):
-    code, out, err = reconstruct(run, "captures/a.png", method="admm")
+    code, out, err = reconstruct(run, "captures/a.png", method="admm", trust=True)
     assert (code, err) == (0, "")
     assert re.search(r"PSF [0-9a-f]{16}, background 0\.\d{4}, 0\.\d{4}, 0\.\d{4} of the full scale", out)
     assert "\n1 capture reconstructed into out\n" in out
@@ -101,7 +103,7 @@ def test_an_exif_turn_is_named_once_and_doubts_no_psf_that_fits(run, camera, tur
     exif[274] = 6
     picture = Image.fromarray((read_frame(camera / f"{turned}.png") >> 8).astype(np.uint8))
     picture.save(camera / f"{turned}.png", exif=exif)
-    code, _, err = reconstruct(run, "captures")
+    code, _, err = reconstruct(run, "captures/a.png", "captures/b.png", trust=True)
     assert code == 0
     assert err.count(f"{turned.removeprefix('captures/')}.png is to be shown turned (EXIF orientation 6)") == 1
     assert err.count("EXIF") == 1
@@ -111,16 +113,14 @@ def test_formats_and_checkpoint(run, camera):
     options = {"width": 2}
     mwdn.weights.checkpoint.save_network("net.safetensors", mwdn.build("mwdn", **options), "mwdn", options)
     line = ("reconstruct", "captures/a.png", "--psf", "psf.png", "--out", "out", "--method", "net.safetensors")
-    assert run(*line, "--format", "npy", "--device", "cpu")[0] == 0
+    assert run(*line, "--format", "npy", "--device", "cpu", "--no-trust")[0] == 0
     assert read_frame("out/a.npy").dtype == np.float32
     assert names(camera / "out") == ["a.json", "a.npy", "summary.png"]
 
 
 def test_options_of_the_camera(run, camera):
-    line = ("reconstruct", "captures/a.png", "--psf", "psf.png", "--method", "wiener", "--background", "0.01")
-    code, out, err = run(
-        *line, "--crop", "30", "32", "--bin", "2", "--bgr", "--upside-down", "--dark", "captures/c.png"
-    )
+    line = "reconstruct captures/a.png --psf psf.png --method wiener --background 0.01 --no-trust"
+    code, out, err = run(f"{line} --crop 30 32 --bin 2 --bgr --upside-down --dark captures/c.png")
     assert (code, err) == (0, "")
     assert "background 0.0100" in out
     assert read_frame("results/reconstruct/a.png").shape == (15, 16, 3)
@@ -157,14 +157,14 @@ def test_psf_of_another_size(run, camera):
     assert code == 1
     assert "`--psf` (64 x 80) and the capture (32 x 40) must have the same height and width" in err
     assert "The PSF is 2 times as large: bin it by 2, `--psf-bin 2`." in err
-    line = ("reconstruct", "captures/a.png", "--method", "wiener")
+    line = ("reconstruct", "captures/a.png", "--method", "wiener", "--no-trust")
     assert run(*line, "--psf", "large.png", "--psf-bin", "2")[0] == 0
     assert run(*line, "--psf", "psf.png", "--psf-bin", "2")[0] == 1
     (camera / "halves").mkdir()
     store("halves/a.png", torch.rand(1, 3, 2 * SIZE[0], 2 * SIZE[1]))
-    code, _, err = run("reconstruct", "halves", "--method", "wiener", "--psf", "psf.png")
-    assert "`--bin 2 --psf-bin 1`" in err
-    assert run("reconstruct", "halves", "--psf", "psf.png", "--bin", "2", "--psf-bin", "1")[0] == 0
+    line = ("reconstruct", "halves", "--method", "wiener", "--psf", "psf.png", "--no-trust")
+    assert "`--bin 2 --psf-bin 1`" in run(*line)[2]
+    assert run(*line, "--bin", "2", "--psf-bin", "1")[0] == 0
 
 
 @pytest.mark.parametrize(
@@ -246,8 +246,7 @@ def test_parser_speaks_as_the_commands_do(run, line, message):
 
 
 def test_quiet_prints_nothing_but_errors(run, camera):
-    (camera / "captures" / "none.png").write_bytes(b"")
-    code, out, err = run("reconstruct", "captures", "--psf", "psf.png", "--out", "out", "--method", "wiener", "-q")
+    code, out, err = run("reconstruct captures/a.png none.png --psf psf.png --out out --method wiener -q")
     assert (code, out, len(err.splitlines())) == (1, "", 1)
     assert "none.png" in err
     assert run("--quiet", "methods") == run("methods")
@@ -277,17 +276,17 @@ def test_an_option_is_named_as_typed(run, camera):
 
 
 def test_json_of_reconstruct(run, camera):
-    (camera / "captures" / "d.png").write_bytes(b"")
-    line = ("reconstruct", "captures", "--psf", "psf.png", "--out", "out", "--method", "wiener", "--json")
-    code, out, err = run(*line)
+    (camera / "d.png").write_bytes(b"")
+    line = "reconstruct captures/a.png d.png --psf psf.png --out out --method wiener --json"
+    code, out, err = run(line)
     assert code == 1
-    assert "3 of 4 captures" in err
-    first, *_, last = json.loads(out)
+    assert "1 of 2 captures" in err
+    first, last = json.loads(out)
     assert first == {"capture": "captures/a.png", "picture": "out/a.png", **json.loads(Path("out/a.json").read_text())}
-    assert last["capture"] == "captures/d.png"
+    assert last["capture"] == "d.png"
     assert last["picture"] is None
-    assert "`captures/d.png`" in last["error"]
-    assert json.loads(run(*line, "--resume", "--quiet")[1])[:3] == json.loads(out)[:3]
+    assert "`d.png`" in last["error"]
+    assert json.loads(run(f"{line} --resume --quiet")[1])[0] == first
 
 
 @pytest.mark.parametrize("place", [0, -1])
@@ -313,14 +312,13 @@ def test_existing_output_is_replaced(run, camera):
 
 def test_resume_leaves_out_what_is_there(run, camera):
     assert reconstruct(run, "captures/a.png")[0] == 0
-    line = ("reconstruct", "captures", "--psf", "psf.png", "--out", "out", "--method", "wiener", "--resume")
+    line = "reconstruct captures --psf psf.png --out out --method wiener --resume --no-trust"
     before = (camera / "out" / "a.png").stat().st_mtime_ns
-    code, out, _ = run(*line)
+    code, out, _ = run(line)
     assert code == 0
     assert "3 captures reconstructed into out, 1 of them before" in out
-    assert "a.png: the picture reproduces" not in out
     assert (camera / "out" / "a.png").stat().st_mtime_ns == before
-    assert "3 captures reconstructed into out\n" in run(*line, "--regularisation", "1e-3")[1]
+    assert "3 captures reconstructed into out\n" in run(f"{line} --regularisation 1e-3")[1]
 
 
 @pytest.mark.parametrize(
@@ -422,7 +420,7 @@ def test_overexposed_capture_is_named_before_its_psf_is_doubted(run, camera):
     part = (bright.max(-1) == top).mean()
     assert 0.15 < part < 0.25
     cv2.imwrite("captures/bright.png", bright[..., ::-1])
-    code, out, err = reconstruct(run, "captures/bright.png")
+    code, out, err = reconstruct(run, "captures/bright.png", trust=True)
     assert code == 0
     assert f"Warning: bright.png: {part:.1%} of the capture's pixels are saturated" in err
     assert "`mwdn explain saturation`" in err
@@ -430,7 +428,7 @@ def test_overexposed_capture_is_named_before_its_psf_is_doubted(run, camera):
     beside = json.loads((camera / "out" / "bright.json").read_text(encoding="utf-8"))
     (verdict,) = [verdict for verdict in beside["verdicts"] if verdict["topic"] == "saturation"]
     assert (verdict["subject"], verdict["state"]) == ("capture", "doubt")
-    assert "saturated" not in reconstruct(run, "captures/a.png")[2]
+    assert "saturated" not in reconstruct(run, "captures/a.png", trust=True)[2]
 
 
 def test_without_trust(run, camera):
