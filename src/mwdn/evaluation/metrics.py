@@ -255,9 +255,10 @@ def bootstrap(
             f"`values` ({len(numbers)} of them) must not be empty, `confidence` ({confidence}) must lie in (0, 1) "
             f"and `resamples` ({resamples}) must be positive."
         )
-    generator = torch.Generator().manual_seed(seed)
-    samples = (torch.randint(len(numbers), (len(numbers),), generator=generator) for _ in range(resamples))
-    means = torch.stack([numbers[sample].mean() for sample in samples])
+    generator, count = torch.Generator().manual_seed(seed), len(numbers)
+    at_once = max(1, 2**16 // count)  # resamples that fit into a processor's cache
+    parts = (min(at_once, resamples - first) for first in range(0, resamples, at_once))
+    means = torch.cat([numbers[torch.randint(count, (part, count), generator=generator)].mean(1) for part in parts])
     tail = torch.tensor([(1 - confidence) / 2, (1 + confidence) / 2], dtype=torch.float64)
     # No interpolation between means: they may be infinite (the PSNR of identical pictures).
     low, high = torch.quantile(means, tail, interpolation="nearest").tolist()
