@@ -130,7 +130,7 @@ HELP = "from mwdn.cli import main\nwith suppress(SystemExit): main({})"
         *((HELP.format(arguments), HEAVY | {"torch", "numpy"}) for arguments in ([], ["--help"], ["--version"])),
         (HELP.format(["doctor", "--help"]), HEAVY | {"torch", "numpy"}),
         (HELP.format(["recipes"]), {"torch"}),
-        ("for name in mwdn.__all__: getattr(mwdn, name)", HEAVY | {"cyclopts"}),
+        ("import mwdn.data\nfor name in mwdn.__all__: getattr(mwdn, name)", HEAVY | {"cyclopts"}),
     ],
 )
 def test_import_is_light(code, missing):

@@ -96,10 +96,10 @@ def test_the_displacement_of_the_envelope_is_found(psf, generator):
 
 
 def test_only_terms_that_explain_left_out_pairs_are_taken(psf, generator):
-    exact = select_terms(psf, lambda: pairs(psf, Refinement(), torch.Generator().manual_seed(1), noise=0.01))
+    exact = select_terms(psf, lambda: pairs(psf, Refinement(), torch.Generator().manual_seed(1), 3, noise=0.01))
     assert [step.term for step in exact.taken] == [""]
     uneven = select_terms(
-        psf, lambda: pairs(psf, Refinement(sensor_field=FIELD), torch.Generator().manual_seed(1), noise=0.003)
+        psf, lambda: pairs(psf, Refinement(sensor_field=FIELD), torch.Generator().manual_seed(1), 3, noise=0.003)
     )
     assert uneven.taken[1].term == "sensor_field"
     assert not uneven.fit(uneven.taken[0].terms).refinement()
@@ -107,7 +107,7 @@ def test_only_terms_that_explain_left_out_pairs_are_taken(psf, generator):
 
 def test_with_a_displaced_envelope_the_calibration_as_it_was_stays(psf):
     truth = Refinement(envelope_shift=(0.05, 0.0))
-    made = pairs(psf, truth, torch.Generator().manual_seed(1), noise=0.003)
+    made = pairs(psf, truth, torch.Generator().manual_seed(1), 3, noise=0.003)
     selection = select_terms(psf, lambda: made)
     assert not selection.fit(selection.taken[0].terms).refinement()
     with_it = next(step for step in selection.taken if step.term == "envelope")

@@ -17,7 +17,7 @@ SIZE = 96
 HOMOGRAPHY = np.array([[0.62, 0.03, 20.0], [-0.02, 0.6, 22.0], [1e-4, -2e-4, 1]])
 WHITE = 0.4
 GAMMA = 2.2
-METHOD = ("--method", "admm", "--iterations", "100")
+METHOD = ("--method", "admm", "--iterations", "50")
 
 
 def displayed(number):
@@ -55,7 +55,7 @@ def session(tmp_path):
         dtype="uint16",
         attributes={"bit_depth": 12},
     ) as file:
-        for number in range(3):
+        for number in range(2):
             picture = displayed(number)
             frame, scene = capture(picture, psf)
             scenes.append(scene)
@@ -70,9 +70,9 @@ def test_a_session_becomes_aligned_pairs_that_the_psf_explains(session, run):
     out = folder / "aligned.h5"
     status, said, _ = run("align", folder / "session.h5", "--psf", folder / "psf.npy", *METHOD, "-o", out)
     assert status == 0
-    assert "3 pairs written" in said
+    assert "2 pairs written" in said
     with PairFile(out) as file:
-        assert (len(file), file.scene_shape) == (3, (SIZE, SIZE, 3))
+        assert (len(file), file.scene_shape) == (2, (SIZE, SIZE, 3))
         assert file.attributes["display_white"] == pytest.approx(WHITE, rel=0.03)
         for number, scene in enumerate(scenes):
             measurement, aligned = file[number]
@@ -86,13 +86,11 @@ def test_a_session_becomes_aligned_pairs_that_the_psf_explains(session, run):
     assert read_frame(out.with_suffix(".png")).shape[2] == 3
 
     again = folder / "again.h5"
+    line = ("align", folder / "session.h5", "--psf", folder / "psf.npy", "--method", "wiener", "-o", again)
     for source in (out, out.with_suffix(".json")):
-        status, _, _ = run(
-            "align", folder / "session.h5", "--psf", folder / "psf.npy", *METHOD, "-o", again, "--homography", source
-        )
-        assert status == 0
+        assert run(*line, "--homography", source)[0] == 0
         with PairFile(out) as first, PairFile(again) as second:
-            torch.testing.assert_close(first[2][1], second[2][1], atol=1e-4, rtol=0)
+            torch.testing.assert_close(first[1][1], second[1][1], atol=1e-4, rtol=0)
 
 
 def test_one_capture_prints_place_and_writes_an_overlay(session, run):

@@ -1,7 +1,5 @@
 """Photographs, the sRGB curve, and written pictures."""
 
-import subprocess
-import sys
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
@@ -149,14 +147,6 @@ def test_what_cannot_be_written(
 def test_png_has_8_or_16_bits(tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match=r"`bits` \(12\)"):
         write_picture(tmp_path / "a.png", torch.rand(3, 4, 4), bits=12)
-
-
-# The package itself
-
-
-def test_importing_it_loads_no_image_library() -> None:
-    code = "import sys, mwdn.data; assert not {'cv2', 'tifffile'} & set(sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_readable_suffixes_are_in_lower_case() -> None:

@@ -79,13 +79,9 @@ def test_turned_psf_is_scipys(psf):
 
 
 def test_haze_is_estimated_beside_a_turn_and_removes_the_veil():
-    psf = contour_psf((288, 320), generator=torch.Generator().manual_seed(4))
-    scene = torch.zeros(1, 3, 288, 320)
-    scene[..., 100:180, 120:220] = (
-        torch.rand(3, 10, 10, generator=torch.Generator().manual_seed(5))
-        .repeat_interleave(8, 1)
-        .repeat_interleave(10, 2)
-    )
+    psf = contour_psf((192, 208), generator=torch.Generator().manual_seed(4))
+    blocks = torch.rand(1, 3, 7, 7, generator=torch.Generator().manual_seed(5))
+    scene = F.pad(blocks.repeat_interleave(8, 2).repeat_interleave(10, 3), (69, 69, 68, 68))
     clear = turned(psf, 0.5, 1.0)
     measurements = torch.cat([captured(true, scene) for true in (clear, hazed(clear, 0.1))])
     pose = align(measurements, psf)
@@ -97,9 +93,9 @@ def test_haze_is_estimated_beside_a_turn_and_removes_the_veil():
 
 def test_haze_is_found_where_the_scene_fills_the_frame():
     """Without dark parts only the crop at the edges tells haze from faint light; missed, it costs 1 dB here."""
-    psf = contour_psf((288, 320), generator=torch.Generator().manual_seed(4))
-    blocks = torch.rand(1, 3, 18, 20, generator=torch.Generator().manual_seed(6))
-    scene = blocks.repeat_interleave(16, 2).repeat_interleave(16, 3)
+    psf = contour_psf((144, 156), generator=torch.Generator().manual_seed(4))
+    blocks = torch.rand(1, 3, 12, 13, generator=torch.Generator().manual_seed(6))
+    scene = blocks.repeat_interleave(12, 2).repeat_interleave(12, 3)
     measurement = captured(hazed(psf, 0.1), scene)
     pose = align(measurement, psf)
     assert 0.05 <= pose.haze[0] <= 0.15
@@ -117,12 +113,17 @@ def through_aperture(down=0.0, right=0.0):
     return psf / psf.sum()
 
 
+def behind_aperture():
+    """A scene in the middle of the frame, of coloured blocks."""
+    blocks = torch.rand(1, 3, 7, 8, generator=torch.Generator().manual_seed(5))
+    return F.pad(blocks.repeat_interleave(12, 2).repeat_interleave(12, 3), (80, 80, 70, 70))
+
+
 @pytest.mark.parametrize("degrees", [0.0, 0.4])
 def test_displaced_aperture_is_found_and_removed(degrees):
     """Mask and aperture are not equally far from the sensor: light that comes at an angle parts their shadows."""
     psf, true = through_aperture(), turned(through_aperture(0.03, -0.02), degrees, 1.0)
-    blocks = torch.rand(1, 3, 7, 8, generator=torch.Generator().manual_seed(5))
-    scene = F.pad(blocks.repeat_interleave(12, 2).repeat_interleave(12, 3), (80, 80, 70, 70))
+    scene = behind_aperture()
     measurement = captured(true, scene)
     pose = align(measurement, psf)
     torch.testing.assert_close(pose.envelope, torch.tensor([[0.03, -0.02]]), rtol=0, atol=0.012)  # a third too short
@@ -131,15 +132,17 @@ def test_displaced_aperture_is_found_and_removed(degrees):
         (Pyramid()(measurement, p.move(psf)) - scene).square().mean() for p in (pose, pose._replace(envelope=None))
     ]
     assert errors[0] < 0.6 * errors[1]
-    assert not align(captured(psf, scene), psf).envelope.any()
+
+
+def test_an_aperture_in_its_place_is_not_displaced():
+    psf = through_aperture()
+    assert not align(captured(psf, behind_aperture()), psf).envelope.any()
 
 
 @pytest.mark.parametrize(("down", "saturated", "found"), [(0.0, 0.5, False), (0.03, 0.1, True)])
 def test_overexposure_is_not_taken_for_a_displaced_aperture(down, saturated, found):
     """Clipped lines do not contradict a displacement. Without a margin the first has one of 2 %."""
-    blocks = torch.rand(1, 3, 7, 8, generator=torch.Generator().manual_seed(5))
-    scene = F.pad(blocks.repeat_interleave(12, 2).repeat_interleave(12, 3), (80, 80, 70, 70))
-    measurement = captured(through_aperture(down, 0.0), scene)
+    measurement = captured(through_aperture(down, 0.0), behind_aperture())
     clipped = measurement.clamp(max=float(measurement.quantile(1 - saturated)))
     assert align(clipped, through_aperture()).envelope.any() == found
 

@@ -66,7 +66,7 @@ def test_a_scene_on_dark_keeps_its_light(psf, scene):
     assert (found.background == 0).all()
 
 
-@pytest.mark.parametrize("kept", [0.98, 0.9, 0.7])
+@pytest.mark.parametrize("kept", [0.98, 0.7])
 def test_light_that_is_cut_off_is_not_unexplained(psf, scene, kept):
     """The brightest pixels are saturated. The scene that explains the others is brighter there."""
     measurement = fourier.convolve(scene, psf)

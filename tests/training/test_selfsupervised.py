@@ -180,6 +180,12 @@ def run(scenes, calibration, tmp_path):
     return make
 
 
+@pytest.fixture
+def no_alignment(monkeypatch):
+    """Without the poses of the captures, which take longer than six steps; `test_the_loss_falls` has them."""
+    monkeypatch.setattr("mwdn.data.unpaired.align", lambda *_: NO_POSE)
+
+
 def test_the_loss_falls(run):
     trainer = run(replace(RECIPE, schedule=replace(RECIPE.schedule, steps=20, validate_every=20)))
     with torch.no_grad():
@@ -193,6 +199,7 @@ def test_the_loss_falls(run):
     assert (trainer.out / "validation.png").is_file()
 
 
+@pytest.mark.usefixtures("no_alignment")
 @pytest.mark.parametrize("fixed", [False, True])
 def test_fixed_norms_keep_their_statistics(fixed, run):
     trainer = run(replace(RECIPE, schedule=replace(RECIPE.schedule, fixed_norms=fixed)))
@@ -204,6 +211,7 @@ def test_fixed_norms_keep_their_statistics(fixed, run):
     assert any(not torch.equal(norm.weight, weight) for norm, (_, weight) in pairs)
 
 
+@pytest.mark.usefixtures("no_alignment")
 def test_a_resumed_run_ends_as_an_unbroken_one(run, calibration, tmp_path):
     run(folder="whole").run()
     stopped = run(folder="stopped")
@@ -234,6 +242,7 @@ def test_what_is_missing_or_does_not_fit(run, calibration, tmp_path):
         run()
 
 
+@pytest.mark.usefixtures("no_alignment")
 def test_a_run_begins_with_the_weights_of_the_package(run, tmp_path, monkeypatch):
     first = run()
     first.save(first.validate())
