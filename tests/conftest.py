@@ -1,5 +1,6 @@
 """Shape checking of every annotated function, fixtures and small objects that many tests share."""
 
+import gc
 import os
 import random
 import signal
@@ -19,6 +20,9 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# A million objects live from the imports to the end. The collector would look through all of them, again and again.
+gc.disable()
+
 # Before anything imports mwdn: from here on each call checks the shapes and types in its signature.
 jaxtyping.install_import_hook("mwdn", "beartype.beartype")
 
@@ -27,6 +31,12 @@ import torch  # noqa: E402
 torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else 2)
 
 ROOT = Path(__file__).resolve().parents[1]
+
+
+def pytest_collection_finish() -> None:
+    """From here on the garbage collector runs, but not over what is there already."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(autouse=True)

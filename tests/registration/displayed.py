@@ -1,5 +1,7 @@
 """Pictures on a display, and what a camera sees of them: without the code that is tested."""
 
+from functools import cache
+
 import cv2
 import numpy as np
 import torch
@@ -44,17 +46,20 @@ def mean_error(estimate, truth):
     return float(np.linalg.norm(estimate.to_camera(points) - truth.to_camera(points), axis=-1).mean())
 
 
-def natural_pictures(count, size):
-    """Photographs (h, w, 3) in linear light."""
+@cache
+def natural_picture(name, size):
+    """A photograph (size, size, 3) in linear light."""
     from skimage import data, transform
 
-    pictures = []
-    for name in ("astronaut", "coffee", "chelsea", "rocket")[:count]:
-        whole = getattr(data, name)()
-        side = min(whole.shape[:2])
-        square = transform.resize(whole[:side, :side], (size, size), anti_aliasing=True)
-        pictures.append((square**2.2).astype(np.float32))
-    return pictures
+    whole = getattr(data, name)()
+    side = min(whole.shape[:2])
+    square = transform.resize(whole[:side, :side], (size, size), anti_aliasing=True)
+    return (square**2.2).astype(np.float32)
+
+
+def natural_pictures(count, size):
+    """So many of four photographs."""
+    return [natural_picture(name, size) for name in ("astronaut", "coffee", "chelsea", "rocket")[:count]]
 
 
 def board(side=420):
