@@ -65,7 +65,7 @@ def ready(request):
     return lambda network: lambda b, h: Engine(network, h, precision=request.param)(b)
 
 
-@pytest.mark.parametrize("size", [(16, 16), (33, 47), (40, 17)])
+@pytest.mark.parametrize("size", [(16, 16), (33, 17)])
 def test_scene_has_the_size_of_the_measurement(name, size, generator):
     """In training, in evaluation and in the engine."""
     b, h, _ = pair(generator, size)
@@ -321,7 +321,7 @@ def test_what_does_not_fit_is_refused(name):
             network(measurement, psf)
 
 
-@pytest.mark.parametrize("side", [1, 7, 15])
+@pytest.mark.parametrize("side", [1, 15])
 def test_small_picture_is_reconstructed_or_refused(name, ready, side, generator):
     """docs/methods.md promises sides from 16 pixels on: U-Nets halve four times."""
     b, h, _ = pair(generator, (16, side))

@@ -26,7 +26,7 @@ from mwdn.weights.bundled import BUNDLED, load_network
 from mwdn.weights.checkpoint import load_checkpoint, save_network
 from mwdn.weights.growth import grown
 
-OPTIONS = {"width": 2, "regularisations": (1e-2, 1e-4), "mean_light": "free"}
+OPTIONS = {"width": 2, "regularisations": (1e-2, 1e-4), "mean_light": "free", "finest": 8}
 SCHEDULE = Schedule(
     steps=3, pool=200, batch=2, learning_rate=1e-2, warmup=0, validate_every=3, ema=0.0, weight_decay=0.0,
     anchor=1.0, fixed_norms=True, start="start.safetensors",
@@ -39,12 +39,16 @@ SHADING = torch.tensor(
 RECIPE = Recipe({"name": "wiener-bank", **OPTIONS}, SCHEDULE, pairs=Division("folds", aligned=True, best_gain=True))
 
 
-@pytest.fixture
-def camera(tmp_path, monkeypatch, generator):
-    """A calibration, five pairs whose scenes are in units of their own, and random start weights."""
+@pytest.fixture(autouse=True)
+def _aligned(tmp_path, monkeypatch):
+    """Without the alignment of the pairs, 0.5 s each; `test_recorded.py` has it."""
     monkeypatch.chdir(tmp_path)
-    # Tested in tests/data/test_recorded.py; 0.5 s a pair.
     monkeypatch.setattr("mwdn.data.recorded.align", lambda *_: Pose(torch.zeros(1), torch.zeros(1)))
+
+
+@pytest.fixture
+def camera(generator):
+    """A calibration, five pairs whose scenes are in units of their own, and random start weights."""
     psf = contour_psf((32, 32), cell=10, generator=generator).expand(1, 3, -1, -1).contiguous()
     with PairFile.create("pairs.h5", measurement_shape=(32, 32, 3), scene_shape=(32, 32, 3)) as file:
         for number in range(5):
@@ -156,16 +160,15 @@ def test_a_grey_camera_is_learned_from_as_equal_colours(camera):
 
 
 @pytest.fixture
-def distorted(tmp_path, monkeypatch, generator):
+def distorted(generator):
     """A calibration, and five pairs whose scenes another camera saw: displaced by up to 3 pixels."""
-    monkeypatch.chdir(tmp_path)
     psf = contour_psf(LARGE, cell=24, generator=generator).expand(1, 3, -1, -1).contiguous()
     with PairFile.create("pairs.h5", measurement_shape=(*LARGE, 3), scene_shape=(*LARGE, 3)) as file:
         for number in range(5):
             scene = F.avg_pool2d(torch.rand(1, 3, LARGE[0] + 4, LARGE[1] + 4, generator=generator), 5, 1)
             scene[..., 20 + 9 * number :, 30:60] *= 0.3
             file.append(0.8 * convolve(distort(scene, DISTORTION), psf)[0], scene[0])
-    options = OPTIONS | {"regularisations": (1e-3,)}
+    options = OPTIONS | {"regularisations": (1e-3,), "finest": 1}
     save_network("start.safetensors", build("wiener-bank", **options).eval(), "wiener-bank", options)
     recipe = replace(RECIPE, network={"name": "wiener-bank", **options, "distortion": 2})
     return recipe, Calibration(psf)

@@ -797,7 +797,8 @@ def test_samples_are_not_kept_on_a_disk_without_room(trainer, tmp_path, monkeypa
 
 def test_a_denoiser_is_trained_alone_and_then_frozen(trainer, tmp_path):
     """Trained on noisy scenes, then part of a network whose U-Net learns, with a cache or without."""
-    learned = trainer(replace(few(steps=40, learning_rate=1e-3), network=DRUNET, denoising=Denoising((0.05, 0.1))), "a")
+    alone = few(steps=20, learning_rate=3e-3, validate_every=20)
+    learned = trainer(replace(alone, network=DRUNET, denoising=Denoising((0.05, 0.1))), "a")
     noisy, scene, level = learned.task.samples.batch(range(10**6, 10**6 + 8))  # not trained on
 
     def error(denoiser):
