@@ -4,6 +4,7 @@ import copy
 import inspect
 import pickle
 import re
+from itertools import product
 
 import numpy as np
 import pytest
@@ -61,7 +62,7 @@ def test_each_network_from_its_checkpoint(tmp_path, name, psf, measurement):
     save_network(path, network, name, options)
     batch = torch.cat([measurement, measurement / 2])
     expected = network.eval()(batch, psf).detach()
-    for method in (path, str(path), network.train()):
+    for method in (path, network.train()):
         result = Reconstructor(method, Calibration(psf), align=False, device="cpu")(batch)
         assert (result - expected).norm() < 0.05 * expected.norm()
         exact = Reconstructor(method, Calibration(psf), align=False, device="cpu", precision="exact")(batch)
@@ -176,7 +177,8 @@ def test_network_of_other_colours(name, psf):
 
 @pytest.fixture
 def bank():
-    return build("wiener-bank", width=2, finest=4).eval()
+    """Without iterations, which do not matter here; nor does the room's light, a second a picture."""
+    return build("wiener-bank", width=2, finest=0).eval()
 
 
 @pytest.fixture
@@ -193,21 +195,27 @@ def frames(psf, generator):
 
 @pytest.fixture
 def aligned(monkeypatch):
-    """Measurements whose poses were asked for."""
+    """Measurements whose poses were asked for, with their poses."""
     asked, align = [], solvers.align
-    monkeypatch.setattr(solvers, "align", lambda b, h: asked.append(b) or align(b, h))
+
+    def record(measurement, psf):
+        asked.append((measurement, align(measurement, psf)))
+        return asked[-1][1]
+
+    monkeypatch.setattr(solvers, "align", record)
     return asked
 
 
 @pytest.mark.parametrize("precision", ["exact", "fast"])
 def test_pose_given_is_the_pose_found(precision, bank, psf, measurement):
-    reconstruct = Reconstructor(bank, Calibration(psf), device="cpu", precision=precision)
+    reconstruct = Reconstructor(bank, Calibration(psf), device="cpu", precision=precision, room_light=False)
     both = torch.cat([measurement, measurement.roll(3, -1)])
+    found = reconstruct(both)
     result = reconstruct.at(solvers.align(both, psf))(both)
-    torch.testing.assert_close(result, reconstruct(both), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(result, found, rtol=1e-4, atol=1e-5)
     turned = reconstruct.at(solvers.Pose(torch.tensor([5.0]), torch.tensor([0.0])))
     assert (turned(measurement) - result[:1]).norm() > 0.02 * result[:1].norm()
-    assert torch.equal(reconstruct(both), Reconstructor(bank, Calibration(psf), precision=precision)(both))
+    assert torch.equal(reconstruct(both), found)
 
 
 def test_pose_does_not_matter_to_others(psf, measurement):
@@ -217,18 +225,17 @@ def test_pose_does_not_matter_to_others(psf, measurement):
         assert torch.equal(reconstruct.at(pose)(measurement), reconstruct(measurement))
 
 
-@pytest.mark.parametrize(("refresh", "asked"), [(0, [0]), (2, [0, 2, 4]), (100, [0])])
+@pytest.mark.parametrize(("refresh", "asked"), [(0, [0]), (2, [0, 2]), (100, [0])])
 def test_stream_keeps_the_pose(refresh, asked, bank, psf, frames, aligned):
     calibration = Calibration(psf)
-    reconstruct = Reconstructor(bank, calibration, device="cpu", precision="exact")
-    seen = list(reconstruct.stream(frames, refresh=refresh))
-    poses = aligned.copy()
-    assert len(poses) == len(asked)
+    reconstruct = Reconstructor(bank, calibration, device="cpu", precision="exact", room_light=False)
+    seen = list(reconstruct.stream(frames[:4], refresh=refresh))
+    assert len(aligned) == len(asked)
+    assert all(torch.equal(each, seen[n][0]) for (each, _), n in zip(aligned, asked, strict=True))
+    at = {n: reconstruct.at(pose) for n, (_, pose) in zip(asked, aligned, strict=True)}
     for number, (measurement, scene) in enumerate(seen):
         assert torch.equal(measurement, calibration.correct(frames[number]))
-        last = max(n for n in asked if n <= number)
-        assert torch.equal(poses[asked.index(last)], seen[last][0])
-        torch.testing.assert_close(scene, reconstruct.at(solvers.align(seen[last][0], psf))(measurement))
+        torch.testing.assert_close(scene, at[max(n for n in asked if n <= number)](measurement))
 
 
 @pytest.mark.parametrize("solver", [Admm(iterations=30), solvers.Fista(iterations=30)], ids=["admm", "fista"])
@@ -257,12 +264,12 @@ def test_stream_forgets_a_frame_that_is_not_finite(solver, psf, frames):
 
 
 def test_stream_finds_the_pose_on_the_first_frame_that_is_finite(bank, psf, frames, aligned):
-    reconstruct = Reconstructor(bank, Calibration(psf), device="cpu", precision="exact")
+    reconstruct = Reconstructor(bank, Calibration(psf), device="cpu", precision="exact", room_light=False)
     for refresh, at in ((0, [1]), (2, [1, 3, 4])):
         broken_ones = [broken(frames[n]) if n in (0, 2) else frames[n] for n in range(5)]
         stream = reconstruct.stream(broken_ones, refresh=refresh)
         seen = [measurement for measurement, _ in stream]
-        asked = [each for each in aligned if each.isfinite().all()]
+        asked = [each for each, _ in aligned if each.isfinite().all()]
         assert len(asked) == len(at)
         assert all(torch.equal(each, seen[n]) for each, n in zip(asked, at, strict=True))
         aligned.clear()
@@ -336,11 +343,13 @@ def test_what_belongs_to_each_sample_keeps_a_batch_together(generator):
 # --- Copies -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("precision", ["fast", "exact"])
-@pytest.mark.parametrize("name", [*SOLVERS, *NETWORKS])
+@pytest.mark.parametrize(
+    ("name", "precision"),
+    [*product(SOLVERS, ["fast"]), *product([name for name in NETWORKS if name not in SOLVERS], ["fast", "exact"])],
+)
 def test_copies_and_pickles_give_the_same_scene(name, precision, psf, measurement):
     method = name
-    if name in NETWORKS and name not in SOLVERS:
+    if name not in SOLVERS:
         options = {"width": 2} if "width" in inspect.signature(NETWORKS[name]).parameters else {}
         method = build(name, **options).eval()
     reconstruct = Reconstructor(method, Calibration(psf), device="cpu", precision=precision, align=False)
