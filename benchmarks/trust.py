@@ -18,7 +18,7 @@ from mwdn import Calibration, Reconstructor
 from mwdn.diagnosis.trust import examine_picture
 from mwdn.io.files import atomic
 from mwdn.optics import sample_camera
-from mwdn.solvers.alignment import Pose
+from mwdn.solvers.pose import Pose
 
 
 def wrong(psf):

@@ -25,7 +25,8 @@ from mwdn.data.photographs import Photographs
 from mwdn.io.images import srgb_encode
 from mwdn.optics import Camera, Sensor, sample_camera
 from mwdn.optics.orientation import turn
-from mwdn.solvers.alignment import Pose, fine_detail
+from mwdn.solvers.alignment import fine_detail
+from mwdn.solvers.pose import Pose
 
 HALF_TURNS = ("", "flip-left-right", "flip-top-bottom", "rotate-180")
 TURNS = (*HALF_TURNS, "rotate-90", "rotate-270", "transpose", "transverse")

@@ -15,7 +15,7 @@ from mwdn.data.recorded import Division, PrefetchedPairs, RecordedPairs, recorde
 from mwdn.data.simulated import Samples
 from mwdn.errors import ImageError, ParameterError, ShapeError, UnknownNameError
 from mwdn.fourier.convolution import convolve
-from mwdn.solvers.alignment import Pose
+from mwdn.solvers.pose import Pose
 
 
 @pytest.fixture

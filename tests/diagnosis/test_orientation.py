@@ -7,7 +7,7 @@ from cameras import contour_psf
 from mwdn.diagnosis.orientation import OrientationFit, fit_orientations
 from mwdn.optics.camera import Camera
 from mwdn.optics.orientation import turn
-from mwdn.solvers.alignment import Pose
+from mwdn.solvers.pose import Pose
 
 SIDE = 112
 INVERSE = {"rotate-90": "rotate-270", "rotate-270": "rotate-90"}

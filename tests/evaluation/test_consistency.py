@@ -7,7 +7,8 @@ from cameras import capture_of_rectangles
 from mwdn.errors import ShapeError
 from mwdn.evaluation.consistency import Consistency, consistency
 from mwdn.optics.camera import Camera
-from mwdn.solvers.alignment import Pose, fine_detail
+from mwdn.solvers.alignment import fine_detail
+from mwdn.solvers.pose import Pose
 
 
 @pytest.fixture(scope="module")

@@ -7,13 +7,14 @@ from scipy.ndimage import affine_transform
 from torch.nn import functional as F
 
 from cameras import contour_psf
-from mwdn.errors import ShapeError
+from mwdn.errors import ParameterError, ShapeError
 from mwdn.optics.aperture import displaced_envelope
 from mwdn.optics.camera import Camera
 from mwdn.optics.drawing import contour_lines
 from mwdn.optics.warp import hazed
 from mwdn.solvers import alignment
-from mwdn.solvers.alignment import Pose, align
+from mwdn.solvers.alignment import align
+from mwdn.solvers.pose import ENVELOPE_BLUR, Pose
 from mwdn.solvers.pyramid import Pyramid
 
 SIZE = (144, 160)
@@ -34,6 +35,26 @@ def scenes():
             top, left = torch.randint(30, 100, (2,), generator=generator).tolist()
             scene[:, top : top + 12, left : left + 16] = torch.rand(3, 1, 1, generator=generator)
     return scenes
+
+
+def test_a_capture_with_nan_keeps_the_calibrated_psf(psf, scenes):
+    """Its haze was NaN, and so was each PSF moved by its pose. The other captures of the batch have their own."""
+    measurement = Camera(psf).forward(scenes)
+    alone = align(measurement[:1], psf)
+    measurement[1, 0, 70, 80] = torch.nan
+    pose = align(measurement, psf)
+    for name, value in alone.numbers().items():
+        assert Pose(*(None if part is None else part[:1] for part in pose)).numbers()[name] == pytest.approx(
+            value, rel=1e-3
+        )
+        assert Pose(*(None if part is None else part[1:] for part in pose)).numbers()[name] == 0
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_steps_that_cannot_be(psf):
+    for steps in (-1, 1.5):
+        with pytest.raises(ParameterError, match=rf"`steps` \({steps}\)"):
+            align(psf, psf, steps=steps)
 
 
 def turned(psf, degrees, scale):
@@ -150,7 +171,7 @@ def test_overexposure_is_not_taken_for_a_displaced_aperture(down, saturated, fou
 def test_envelope_moves_before_haze_and_keeps_the_sum(psf):
     shift = torch.tensor([[0.05, -0.02]])
     moved = Pose(torch.zeros(1), torch.zeros(1), 0.1, shift).move(psf)
-    expected = displaced_envelope(psf, shift * SIZE[0], blur=alignment._ENVELOPE_BLUR)
+    expected = displaced_envelope(psf, shift * SIZE[0], blur=ENVELOPE_BLUR)
     torch.testing.assert_close(moved, hazed(expected / expected.sum(), 0.1))
 
 

@@ -19,7 +19,7 @@ from mwdn.networks import build
 from mwdn.optics.distortion import distort, undistort
 from mwdn.optics.polynomials import polynomials
 from mwdn.optics.shading import shade, shading
-from mwdn.solvers.alignment import Pose
+from mwdn.solvers.pose import Pose
 from mwdn.training.experiment import prepare
 from mwdn.training.recipe import Recipe, Schedule, read_recipe
 from mwdn.weights.bundled import BUNDLED, load_network

@@ -16,7 +16,7 @@ from mwdn.fourier.convolution import convolve
 from mwdn.fourier.wiener import wiener
 from mwdn.networks.activation_checkpointing import batch_norms
 from mwdn.optics.noise import noise_level
-from mwdn.solvers.alignment import Pose
+from mwdn.solvers.pose import Pose
 from mwdn.training.experiment import prepare
 from mwdn.training.losses import Loss
 from mwdn.training.recipe import Recipe, Schedule

@@ -21,7 +21,8 @@ from mwdn.data.simulated import Batch, Samples
 from mwdn.data.splits import Split, split
 from mwdn.errors import ParameterError
 from mwdn.runtime.transfers import to_device
-from mwdn.solvers.alignment import Pose, align
+from mwdn.solvers.alignment import align
+from mwdn.solvers.pose import Pose
 from mwdn.types import Measurement, Psf
 
 HELD_OUT = 20

@@ -13,7 +13,8 @@ from mwdn.data.simulated import NumberedSamples, full_precision
 from mwdn.errors import ParameterError
 from mwdn.fourier.convolution import convolve
 from mwdn.optics.noise import noise_level
-from mwdn.solvers.alignment import Pose, align
+from mwdn.solvers.alignment import align
+from mwdn.solvers.pose import Pose
 from mwdn.types import Image, Measurement, Psf, Scene
 
 

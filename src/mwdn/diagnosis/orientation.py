@@ -13,7 +13,7 @@ import torch
 from mwdn.diagnosis.noise import noise_bounds
 from mwdn.diagnosis.verdict import Verdict
 from mwdn.optics.orientation import Orientation, compose, swaps_axes, turn
-from mwdn.solvers.alignment import Pose
+from mwdn.solvers.pose import Pose
 from mwdn.solvers.spectral_misfit import spectral_misfit
 from mwdn.types import Measurement, Psf
 

@@ -11,7 +11,8 @@ from mwdn.diagnosis.verdict import Verdict
 from mwdn.errors import PsfError
 from mwdn.evaluation.consistency import Consistency, consistency
 from mwdn.optics.orientation import Orientation
-from mwdn.solvers.alignment import Pose, align
+from mwdn.solvers.alignment import align
+from mwdn.solvers.pose import Pose
 from mwdn.types import Measurement, Psf, Scene
 
 SMALLEST = 15

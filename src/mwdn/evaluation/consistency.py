@@ -23,7 +23,8 @@ from mwdn.fourier.convolution import check_fit, convolve
 from mwdn.optics.noise import noise_level
 from mwdn.optics.psf import checked_psf
 from mwdn.optics.saturation import saturated_pixels
-from mwdn.solvers.alignment import Pose, align, fine_detail
+from mwdn.solvers.alignment import align, fine_detail
+from mwdn.solvers.pose import Pose
 from mwdn.types import Measurement, Psf, Scene
 
 

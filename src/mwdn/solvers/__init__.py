@@ -17,8 +17,9 @@ from mwdn.optics.noise import noise_level
 from mwdn.runtime.forks import survive_forks
 from mwdn.runtime.plugins import Registry
 from mwdn.solvers.admm import Admm
-from mwdn.solvers.alignment import Pose, align
+from mwdn.solvers.alignment import align
 from mwdn.solvers.fista import Fista
+from mwdn.solvers.pose import Pose
 from mwdn.solvers.pyramid import Pyramid
 from mwdn.solvers.room_light import RoomLight, find_room_light
 from mwdn.solvers.splitting import TEXTBOOK, Penalties

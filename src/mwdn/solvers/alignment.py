@@ -27,64 +27,22 @@ compensates too much haze, because light is not negative: E at low frequencies i
 steeply. The estimate is the largest haze of the flat part. Blur cannot be estimated: a sharper PSF always fits better.
 """
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from mwdn.errors import ParameterError, checked
 from mwdn.fourier.convolution import check_fit
 from mwdn.fourier.transforms import frequency_grid, inverse_spectrum, spectrum
 from mwdn.optics.aperture import displaced_envelope
 from mwdn.optics.psf import checked_psf
 from mwdn.optics.saturation import saturated_pixels
-from mwdn.optics.warp import hazed, warp
+from mwdn.optics.warp import hazed
 from mwdn.solvers.levels import Level, relative_noise
+from mwdn.solvers.pose import ENVELOPE_BLUR, Pose
 from mwdn.solvers.pyramid import halve, solve
 from mwdn.solvers.splitting import Penalties
 from mwdn.types import Image, Measurement, Psf, Size
-
-
-class Pose(NamedTuple):
-    """Difference of each capture's PSF from the calibrated one.
-
-    Args:
-        turn_degrees: (B,), clockwise.
-        scale: (B,), relative magnification, 0 for none.
-        haze: (B,), fraction of the light that is spread evenly under the PSF: scattered by the mask or the sensor's
-            glass, or subtracted from the PSF as if it were the sensor's black level.
-        envelope: (B, 2), displacement of the aperture's shadow against the mask's pattern, down and right, over the
-            PSF's shorter side; or `None` for none.
-    """
-
-    turn_degrees: Tensor
-    scale: Tensor
-    haze: Tensor | float = 0.0
-    envelope: Tensor | None = None
-
-    def __repr__(self) -> str:
-        if len(self.turn_degrees) != 1:
-            return f"Pose(of {len(self.turn_degrees)} captures)"
-        return f"Pose({', '.join(f'{name}={value:.3g}' for name, value in self.numbers().items())})"
-
-    def numbers(self) -> dict[str, float]:
-        """The pose of a single capture; `envelope` as ``envelope_down`` and ``envelope_right``."""
-        down, right = (0.0, 0.0) if self.envelope is None else self.envelope[0].tolist()
-        haze = torch.as_tensor(self.haze).mean()
-        values = {"turn_degrees": self.turn_degrees, "scale": self.scale, "haze": haze}
-        numbers = {name: float(value) for name, value in values.items()}
-        return numbers | {"envelope_down": down, "envelope_right": right}
-
-    def move(self, psf: Psf) -> Tensor:
-        """The PSF (1 or B, C, h, w) of each capture: (B, C, h, w), each colour of unit sum."""
-        angle, size = torch.deg2rad(self.turn_degrees), 1 + self.scale
-        c, s = size * angle.cos(), size * angle.sin()
-        moved = warp(psf, torch.stack([torch.stack([c, s], -1), torch.stack([-s, c], -1)], 1))
-        if self.envelope is not None and self.envelope.any():
-            moved = displaced_envelope(moved, self.envelope * min(psf.shape[-2:]), blur=_ENVELOPE_BLUR)
-        moved = moved / moved.sum((-2, -1), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
-        return hazed(moved, torch.as_tensor(self.haze, device=moved.device).reshape(-1, 1, 1, 1))
-
 
 _NO_VARIATION = Penalties(0.15, 0.0, 0.6)
 
@@ -100,7 +58,6 @@ _MOST_FALL_OFF = 0.5  # coefficient of any polynomial: that of x^2 + y^2 then lo
 _REACH = 16  # pixels, three standard deviations of the Gaussian of `_HIGH_PASS`
 _PRIOR = (0.5, 0.01)  # standard deviations S of a calibration's errors: degrees and relative magnification
 _DELTA = (0.1, 0.002)  # finite differences
-_ENVELOPE_BLUR = 0.06  # see `displaced_envelope`: wider than in [mismatch], which most real captures fit better
 _ENVELOPE_PRIOR = (0.015, 0.015)  # of the envelope: down and right, over the shorter side
 _ENVELOPE_DELTA = (0.004, 0.004)
 _ENVELOPE_PARTS = (1.5, 1.0, 0.5, 0.25)  # of its step, tried in turn: it is often too long in real captures
@@ -134,12 +91,14 @@ _HAZE_RISE = 1.05
 exact and under 10 % of haze, come within 0.05 dB of their best haze, and 24 that fill the frame within 0.25 dB."""
 
 
+@checked
 @torch.no_grad()
 def align(measurement: Measurement, psf: Psf, *, steps: int = 2, min_gain: float = MIN_GAIN) -> Pose:
     """Estimate rotation, scale, displaced envelope and haze of each capture's PSF from the capture alone.
 
     Args:
-        measurement: (B, C, H, W), a tensor as `mwdn.Calibration.correct` returns it for an array or picture.
+        measurement: (B, C, H, W), a tensor as `mwdn.Calibration.correct` returns it for an array or picture. For one
+            with NaN or infinity the calibrated pose is returned, all zeros.
         psf: (1 or B, 1 or C, h, w), centred: `mwdn.Calibration.psf`. Its scale does not matter.
         steps: of Gauss-Newton for rotation and scale; each solves three scenes of half the size. Two reach half a
             degree and 1 % to within a tenth of it. A step that increases the residual is not taken.
@@ -147,7 +106,7 @@ def align(measurement: Measurement, psf: Psf, *, steps: int = 2, min_gain: float
 
     Raises:
         ShapeError: batch or channels do not fit.
-        ParameterError: not tensors of floats.
+        ParameterError: not tensors of floats, or negative ``steps``.
         PsfError: the PSF is negative, not finite, or dark.
 
     References:
@@ -155,6 +114,8 @@ def align(measurement: Measurement, psf: Psf, *, steps: int = 2, min_gain: float
         applications, Inverse Problems 19, R1 (2003).
     """
     check_fit(measurement, psf, "measurement")
+    if steps < 0:
+        raise ParameterError(f"`steps` ({steps}) must not be negative; 0 keeps rotation and scale.")
     half = halve(measurement.float())
     half = half / half.abs().amax((1, 2, 3), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
     psf = checked_psf(psf).expand(len(half), -1, -1, -1)
@@ -200,7 +161,7 @@ def _estimate_envelope(half: Measurement, psf: Psf, least_gain: Tensor) -> Tenso
 
     def residual(shifts: Tensor) -> Tensor:
         psfs, pixels = psf.repeat_interleave(shifts.shape[1], 0), shifts.flatten(0, 1) * min(psf.shape[-2:])
-        return _residual(half, displaced_envelope(psfs, pixels, blur=_ENVELOPE_BLUR))
+        return _residual(half, displaced_envelope(psfs, pixels, blur=ENVELOPE_BLUR))
 
     none = delta.new_zeros(len(half), 2)
     r = residual(none[:, None] + torch.cat([none[:1], delta.diag()]))
@@ -239,7 +200,8 @@ def _estimate_haze(measurement: Measurement, psf: Psf) -> Tensor:
     after = (last + 1).clamp(max=len(hazes) - 1)
     below, above = energy.gather(1, last), energy.gather(1, after)
     part = (limit - below) / (above - below).clamp(min=torch.finfo(energy.dtype).tiny)
-    return F.threshold(torch.lerp(hazes[last], hazes[after], part.clamp(max=1))[:, 0], _LEAST_HAZE, 0.0)
+    haze = torch.lerp(hazes[last], hazes[after], part.clamp(max=1))[:, 0].nan_to_num()
+    return F.threshold(haze, _LEAST_HAZE, 0.0)
 
 
 def fine_detail(image: Image) -> Image:
