@@ -2,6 +2,8 @@ import multiprocessing
 import os
 import pickle
 import re
+import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import h5py
 import numpy as np
@@ -47,6 +49,12 @@ def test_what_goes_in_comes_out_exactly(pairs):
         for outside in (12, -13):
             with pytest.raises(IndexError, match="has 12 pairs"):
                 file[outside]
+
+
+def test_several_pairs_at_once_are_refused(pairs, unchecked):
+    for index in (slice(0, 2), 1.0, [0, 1], None):
+        with pytest.raises(ParameterError, match=r"`index` .*Subset"):
+            PairFile(pairs[0])[index]
 
 
 def test_noise_below_zero_survives_as_float_and_is_clipped_as_integer(tmp_path):
@@ -173,9 +181,9 @@ def test_workers_read_what_was_written(pairs, method, workers):
 
 
 def _child(file, queue):
-    inherited = file._file
+    ((inherited, _),) = file._opened.values()
     file[0]
-    queue.put((file._file is inherited, file._owner == os.getpid(), bool(inherited)))
+    queue.put((list(file._opened) == [os.getpid()], bool(inherited)))
 
 
 @pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
@@ -186,9 +194,22 @@ def test_a_forked_process_opens_the_file_anew(pairs):
     queue = context.Queue()
     process = context.Process(target=_child, args=(file, queue))
     process.start()
-    assert queue.get(timeout=600) == (False, True, False)
+    assert queue.get(timeout=600) == (True, False)
     process.join()
-    assert bool(file._file)
+    assert list(file._opened) == [os.getpid()]
+    assert torch.equal(file[0][0], pairs[1][0])
+
+
+def test_threads_may_open_it_together(pairs, monkeypatch):
+    """One that came while another one was opening the file read from data sets that were not there yet."""
+    together = threading.Barrier(4, timeout=60)
+    first = PairFile(pairs[0])
+    is_same = PairFile._is_same
+    monkeypatch.setattr(PairFile, "_is_same", lambda self, file: together.wait() >= 0 and is_same(self, file))
+    with ThreadPoolExecutor(4) as threads:
+        for number, (measurement, _) in enumerate(threads.map(first.__getitem__, range(4))):
+            assert torch.equal(measurement, pairs[1][number])
+    assert torch.equal(first[5][1], pairs[2][5])
 
 
 def test_it_can_be_pickled_and_closed_and_read_again(pairs):

@@ -131,9 +131,9 @@ def test_a_number_is_the_same_pair_in_any_batch_and_process(pairs):
 
 def test_the_file_is_opened_when_the_first_pair_is_read(pairs):
     train, _ = recorded_pairs(pairs(), psf(), Division())
-    assert train.file._file is None
+    assert not train.file._opened
     train.batch([0])
-    assert train.file._file is not None
+    assert train.file._opened
 
 
 def test_a_split_without_validation_holds_out_training_pairs():

@@ -15,7 +15,7 @@ from torch.utils.data import Dataset
 from mwdn.data.hdf5 import as_damage, find_rows, names_in, open_hdf5, open_hdf5_header, read_attributes
 from mwdn.data.journal import IDENTITY
 from mwdn.data.pair_writer import NAMES, VERSION, VERSION_KEY, Attribute, PairWriter, PixelType, Shape
-from mwdn.errors import ImageError
+from mwdn.errors import ImageError, ParameterError, shown
 from mwdn.types import Psf
 
 _MAKE_AGAIN = "Make it again, with `mwdn import`."
@@ -47,7 +47,7 @@ class _Header(NamedTuple):
 class PairFile(Dataset[tuple[Tensor, Tensor]]):
     """A file of pairs, as a data set for `torch.utils.data.DataLoader`.
 
-    Each process opens the file on its first read, so workers can be forked or spawned.
+    Each process opens the file on its first read, so workers can be forked or spawned. Threads may share it.
 
     Args:
         path: HDF5 with the data sets ``measurement`` and ``scene``, both (N, H, W, C) of uint8, uint16 or float32,
@@ -59,9 +59,8 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self._file: Any = None
-        self._rows: dict[str, Any] = {}  # a lookup by name takes as long as reading a pair
-        self._owner = 0
+        # The open file and its data sets, by process. A lookup by name takes as long as reading a pair.
+        self._opened: dict[int, tuple[Any, dict[str, Any]]] = {}
         with open_hdf5_header(self.path, _MAKE_AGAIN) as file:
             self._header = _read_header(self.path, file)
 
@@ -100,8 +99,19 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
         """Measurement and scene, each (C, H, W), linear light, float32, nominally in [0, 1].
 
         A file of `mwdn capture` has raw frames and displayed pictures, with the sensor's full scale and white as 1.
+
+        Raises:
+            IndexError: there is no such pair.
+            ParameterError: the index is no whole number, for example a slice.
+            ImageError: the pair cannot be read.
         """
-        number = operator.index(index)
+        try:
+            number = operator.index(index)
+        except TypeError as error:
+            raise ParameterError(
+                f"`index` ({shown(index)}) must be one whole number. For several pairs: "
+                "`torch.utils.data.Subset(pairs, range(0, 2))`."
+            ) from error
         if not -len(self) <= number < len(self):
             raise IndexError(f"`{self.path}` has {len(self):,} pairs; there is no pair {number}.")
         number %= len(self)
@@ -132,7 +142,7 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
     @property
     def psf(self) -> Psf | None:
         """(1, C, H, W), as stored, or ``None`` if the file has none."""
-        file = self._open()
+        file, _ = self._open()
         data = find_rows(self.path, file, "psf", _MAKE_AGAIN)
         if data is None:
             return None
@@ -143,9 +153,8 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
 
     def close(self) -> None:
         """Close the file in this process; the next read opens it again."""
-        if self._file is not None:
-            self._file.close()
-            self._file, self._rows = None, {}
+        while self._opened:
+            self._opened.popitem()[1][0].close()
 
     def __enter__(self) -> "PairFile":
         return self
@@ -154,29 +163,34 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
         self.close()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_file": None, "_rows": {}}
+        return {**self.__dict__, "_opened": {}}
 
-    def _open(self) -> Any:  # noqa: ANN401
-        if self._owner != os.getpid():
+    def _open(self) -> tuple[Any, dict[str, Any]]:
+        """The file and its data sets."""
+        process = os.getpid()
+        if process in self._opened:
+            return self._opened[process]
+        for parent in {*self._opened} - {process}:
             # After a fork the handle is the parent's. Closing this copy does not close the parent's.
-            self.close()
-        if self._file is None:
-            self._file, self._owner = open_hdf5(self.path, _MAKE_AGAIN), os.getpid()
-            if not self._is_same(_read_shapes(self.path, self._file)):
-                raise ImageError(f"`{self.path}` was replaced by another file meanwhile. Start again.")
-            self._rows = {name: self._file[name] for name in NAMES}
-        return self._file
+            self._opened.pop(parent)[0].close()
+        file = open_hdf5(self.path, _MAKE_AGAIN)
+        if not self._is_same(file):
+            raise ImageError(f"`{self.path}` was replaced by another file meanwhile. Start again.")
+        mine = file, {name: file[name] for name in NAMES}
+        first = self._opened.setdefault(process, mine)
+        if first is not mine:  # another thread was faster
+            file.close()
+        return first
 
-    def _is_same(self, shapes: tuple[int, Shape, Shape]) -> bool:
+    def _is_same(self, file: Any) -> bool:  # noqa: ANN401
         """Whether the open file is that of the header, or has grown since (`mwdn.data.journal`)."""
-        session = self._header.attributes.get(IDENTITY)
-        has_grown = session is not None and self._file.attrs.get(IDENTITY) == session and shapes[0] > len(self)
+        shapes, session = _read_shapes(self.path, file), self._header.attributes.get(IDENTITY)
+        has_grown = session is not None and file.attrs.get(IDENTITY) == session and shapes[0] > len(self)
         return shapes[1:] == self._header[1:3] and (has_grown or shapes[0] == len(self))
 
     def _read(self, name: str, number: int) -> Tensor:
         with as_damage(f"`{name}` {number} of `{self.path}` cannot be read", _MAKE_AGAIN):
-            self._open()
-            stored = self._rows[name][number]
+            stored = self._open()[1][name][number]
         pixels = stored.transpose(2, 0, 1).astype(np.float32, order="C")
         if stored.dtype.kind == "u":
             bits = self.raw_bits if name == NAMES[0] else None  # 12 bits are in the lower bits of 16
