@@ -1,5 +1,6 @@
 """The contract of all networks. It holds for a new one as soon as `NETWORKS` lists it."""
 
+import contextlib
 import inspect
 from dataclasses import replace
 
@@ -310,6 +311,24 @@ def test_precision_of_the_measurement_does_not_matter(name, generator):
         result = network(b.half().to(dtype), h.to(dtype))
         assert result.dtype == torch.float32
         assert (result - expected).norm() < 1e-2 * expected.norm()
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float64])
+def test_weights_of_another_precision_work_or_are_refused(name, dtype, generator):
+    """Most mix them with float32, which Fourier transforms give. An engine converts the weights back."""
+    b, h, _ = pair(generator, (16, 18))
+    network = small(name).eval()
+    expected = network(b, h)
+    network = network.to(dtype)
+    with contextlib.suppress(ParameterError):
+        assert (network(b, h) - expected).norm() < 1e-2 * expected.norm()
+    assert (Engine(network, h, precision="exact")(b) - expected).norm() < 1e-2 * expected.norm()
+
+
+def test_refused_precision_names_the_way_out(generator):
+    b, h, _ = pair(generator, (16, 18))
+    with pytest.raises(ParameterError, match=r"WienerBank \(torch.float16\).*`network.float\(\)`"):
+        small("wiener-bank").half()(b, h)
 
 
 @pytest.mark.parametrize("name", NETWORKS)

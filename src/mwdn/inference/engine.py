@@ -46,7 +46,7 @@ class Engine(Generic[Prepared]):
         if precision not in get_args(Precision):
             raise ParameterError(f"`precision` must be fast or exact, not {precision!r}.")
         self.precision, psf = precision, checked_psf(psf, scale=not network.stored_psf)
-        exact = copy.deepcopy(network).to(psf.device).eval().requires_grad_(False)
+        exact = copy.deepcopy(network).to(psf.device, torch.float32).eval().requires_grad_(False)
         half = half_precision(psf.device) if precision == "fast" else None
         self.network = cast(Network[Prepared], fuse(copy.deepcopy(exact), half))
         # Prepares the PSF, because spectra and regularisation need float32.
@@ -83,7 +83,7 @@ class Engine(Generic[Prepared]):
                 self.graphs.clear()
             self.graphs[measurement.shape] = None
             return self._reconstruct(measurement)
-        graph = self.graphs[measurement.shape]
+        graph = self.graphs.get(measurement.shape)  # another thread may have cleared them
         if graph is None:
             graph = self.graphs[measurement.shape] = CudaGraph(self._reconstruct, measurement)
         return graph(measurement)

@@ -5,7 +5,7 @@ from typing import Any, Generic, TypeVar
 import torch
 from torch import Tensor, nn
 
-from mwdn.errors import checked
+from mwdn.errors import ParameterError, checked
 from mwdn.fourier.convolution import check_fit
 from mwdn.optics.psf import checked_psf
 from mwdn.types import Measurement, Psf, Scene, Size
@@ -88,14 +88,22 @@ class Network(nn.Module, Generic[Prepared]):
 
         Raises:
             ShapeError: batch, channels or size do not fit, or one is empty.
-            ParameterError: not tensors of floats.
+            ParameterError: not tensors of floats, or weights of a precision that the network cannot compute in.
             PsfError: the PSF is negative, not finite, or dark; not checked in training.
         """
         check_fit(measurement, psf, "measurement")
         psf = checked_psf(psf, values=not self.training, scale=not self.stored_psf)
         weights = next(self.parameters(), psf)
         measurement, psf = measurement.to(weights.dtype), psf.to(torch.promote_types(weights.dtype, torch.float32))
-        return self.reconstruct(measurement, self.prepare(psf, (measurement.shape[-2], measurement.shape[-1])))
+        try:
+            return self.reconstruct(measurement, self.prepare(psf, (measurement.shape[-2], measurement.shape[-1])))
+        except RuntimeError as error:  # Fourier transforms give float32, which layers of other weights refuse
+            if weights.dtype == torch.float32 or isinstance(error, torch.OutOfMemoryError):
+                raise
+            raise ParameterError(
+                f"The weights of {type(self).__name__} ({weights.dtype}) must be float32: `network.float()`. For half "
+                "precision: `with torch.autocast(device.type, torch.bfloat16)`."
+            ) from error
 
 
 class OtherNetwork(Network[Tensor]):
