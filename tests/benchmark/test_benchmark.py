@@ -18,7 +18,7 @@ import torch
 from safetensors import safe_open
 
 from cameras import contour_psf
-from mwdn.benchmark import Watch, read_benchmark, run
+from mwdn.benchmark import Watch, read_benchmark, run, scoring
 from mwdn.benchmark.dataset_recipe import DatasetRecipe
 from mwdn.benchmark.recipe import Robustness
 from mwdn.benchmark.robustness import check_axes
@@ -478,6 +478,38 @@ def test_a_grey_camera(folder):
     assert read_metadata(folder / "out" / "runs" / "caustic" / "mwdn" / "best.safetensors")["options"]["channels"] == 1
     for result in results.methods["caustic"].values():
         assert (len(result.pictures), len(result.captures)) == (2, 1)
+
+
+def test_captures_are_reconstructed_again_where_a_frame_has_changed(folder, monkeypatch):
+    """With another dark frame under the same name, the page showed the captures as corrected by the old one."""
+    cv2.imwrite(str(folder / "dark.png"), np.full((48, 64), 10, np.uint8))
+    recipe = grey_camera(folder, dark=folder / "dark.png", psf_corrected=True)
+    (folder / "r.toml").write_text(re.sub(r"networks = .*|ablation = .*|compared = .*", "", recipe), encoding="utf-8")
+
+    def shown():
+        methods = run(read_benchmark(folder / "r.toml"), folder / "out", device="cpu", lpips=False).methods["caustic"]
+        return methods["quick"]
+
+    first = shown()
+    cv2.imwrite(str(folder / "dark.png"), np.full((48, 64), 19, np.uint8))
+    monkeypatch.setattr(scoring, "_measure", None)  # the pairs do not depend on it
+    second = shown()
+    assert second.scores.values == first.scores.values
+    assert (second.captures - first.captures).abs().max() > 0.01 * first.captures.max()
+    monkeypatch.setattr(scoring, "make_reconstructor", None)
+    assert torch.equal(shown().captures, second.captures)
+
+
+def test_a_file_of_other_pairs_needs_another_folder(folder):
+    """Trainings and scores of the old pairs were reported as those of the new ones."""
+    recipe = DatasetRecipe(psf=str(folder / "psf.npy"), background=0.0, pairs=str(folder / "p.h5"), split="random")
+    for value in (0.3, 0.3, 0.4):
+        with PairFile.create(folder / "p.h5", measurement_shape=(48, 64, 3), scene_shape=(48, 64, 3)) as file:
+            file.append(torch.full((10, 3, 48, 64), value), torch.ones(10, 3, 48, 64))
+        if value == 0.3:  # a copy of the file is the same
+            open_dataset("p", recipe, folder / "out" / "data", torch.device("cpu"), lambda _, rows: rows)
+    with pytest.raises(ParameterError, match=r"`.*p\.h5` .*`.*out`"):
+        open_dataset("p", recipe, folder / "out" / "data", torch.device("cpu"), lambda _, rows: rows)
 
 
 @pytest.mark.parametrize(

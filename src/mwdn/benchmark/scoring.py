@@ -12,7 +12,6 @@ from torch import Tensor
 
 from mwdn.benchmark.methods import MEAN, Method
 from mwdn.benchmark.sets import Dataset
-from mwdn.data.captures import find_captures, read_captures
 from mwdn.data.recorded import RecordedPairs
 from mwdn.errors import ImageError, ParameterError
 from mwdn.evaluation import First, Perceptual, Scores, evaluate
@@ -21,14 +20,12 @@ from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import atomic_write, file_sha256, write_text
 from mwdn.io.npy import read_array
 from mwdn.io.reading import read_json, unexpected_content
+from mwdn.optics.psf import psf_hash
 from mwdn.types import Measurement, Psf, Scene
 from mwdn.version import __version__
 
 TIMED = 3
 """Pictures to time on the CPU when the scores come from a GPU."""
-
-CAPTURES = 6
-"""Maximum number of real captures on the page."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,11 +135,15 @@ def score(
         "shown": shown,
         "captures": captures,
     }
+    # Their files and those of the camera may change under the same names. Earlier records lack it.
+    captured = psf_hash(dataset.captures)
     record = read_record(path, record_identity)
-    if record is None:
+    if record is None or (captures and record.get("captured") != captured):
         reconstruct = make_reconstructor(method, checkpoint, dataset, device)
-        record = _measure(reconstruct, dataset, path, perceptual(), shown)
-        write_text(path, json.dumps({"identity": record_identity, **record}, indent=1))  # after the pictures
+        measured = _measure(reconstruct, dataset, path, perceptual(), shown) if record is None else record
+        _write_pictures(path, "captures", [reconstruct(measurement[None]) for measurement in dataset.captures], dataset)
+        record = {"identity": record_identity, **measured, "captured": captured}
+        write_text(path, json.dumps(record, indent=1))  # after the pictures
     return saved_result(path, record)
 
 
@@ -175,7 +176,7 @@ def read_record(path: Path, identity: dict[str, Any]) -> dict[str, Any] | None:
 def _measure(
     reconstruct: Reconstructor, dataset: Dataset, path: Path, perceptual: Perceptual, shown: int
 ) -> dict[str, Any]:
-    """Reconstruct the test pairs and the captures; write the pictures, return the scores."""
+    """Reconstruct the test pairs; write the first pictures, return the scores."""
     report = evaluate({"method": reconstruct}, dataset.test, dataset.protocol, perceptual=perceptual, shown=shown)
     cpu = None
     if reconstruct.device.type != "cpu":
@@ -183,20 +184,13 @@ def _measure(
         few = First(dataset.test, TIMED)
         timing = evaluate({"method": on_cpu}, few, dataset.protocol, perceptual=Perceptual.none())
         cpu = timing.methods["method"].content()
-    pictures = [row[2] for row in report.rows]
-    captures = [reconstruct(measurement[None]) for measurement in captured_measurements(dataset)]
-    for name, batch in (("pictures", pictures), ("captures", captures)):
-        with atomic_write(_pictures_file(path, name)) as temporary:
-            np.save(temporary, torch.cat(batch or [torch.zeros(0, 3, *dataset.calibration.size)]).numpy())
+    _write_pictures(path, "pictures", [row[2] for row in report.rows], dataset)
     return {"scores": report.methods["method"].content(), "cpu": cpu, "missing": report.missing}
 
 
-def captured_measurements(dataset: Dataset) -> Tensor:
-    """The first `CAPTURES` real captures of a data set, (N, C, H, W); N is 0 if it has none."""
-    files = dataset.recipe.captures
-    if not files:
-        return torch.zeros(0, 3, *dataset.calibration.size)
-    return read_captures(find_captures(files)[:CAPTURES], dataset.calibration)
+def _write_pictures(path: Path, name: str, pictures: list[Tensor], dataset: Dataset) -> None:
+    with atomic_write(_pictures_file(path, name)) as temporary:
+        np.save(temporary, torch.cat(pictures or [torch.zeros(0, 3, *dataset.calibration.size)]).numpy())
 
 
 def _pictures_file(path: Path, name: str) -> Path:

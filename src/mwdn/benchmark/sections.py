@@ -15,7 +15,7 @@ from mwdn.benchmark.methods import Method
 from mwdn.benchmark.pages import Block, Code, Picture, Section
 from mwdn.benchmark.recipe import AXES, Benchmark
 from mwdn.benchmark.results import Results, environment
-from mwdn.benchmark.scoring import MethodResult, captured_measurements
+from mwdn.benchmark.scoring import MethodResult
 from mwdn.benchmark.sets import Dataset
 from mwdn.evaluation import Report, bootstrap
 from mwdn.evaluation.metrics import METRICS
@@ -160,7 +160,7 @@ def _grid(dataset: Dataset, method_results: dict[str, MethodResult]) -> Picture:
 
 def _capture_grid(dataset: Dataset, method_results: dict[str, MethodResult]) -> Picture:
     """The real captures and every method."""
-    rows = [_row("measurement", captured_measurements(dataset))]
+    rows = [_row("measurement", dataset.captures)]
     rows += [_row(label, result.captures) for label, result in method_results.items()]
     return figures.grid(f"{dataset.name}-captures.jpg", rows, f"real captures of {dataset.name}")
 

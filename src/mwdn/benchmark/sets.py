@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from mwdn.calibration import Calibration, FrameFormat
 from mwdn.calibration.places import field_camera
 from mwdn.calibration.psf_identity import psf_identity
 from mwdn.calibration.refinement import Refinement
+from mwdn.data.captures import find_captures, read_captures
 from mwdn.data.importers import import_pairs
 from mwdn.data.kinds import KINDS, Layout
 from mwdn.data.mismatch import EXACT
@@ -31,6 +32,10 @@ from mwdn.optics import Deviation, FieldCamera
 from mwdn.optics.psf import psf_hash
 from mwdn.training.experiment import FILE_START, simulated_sensor
 from mwdn.training.validation import START
+from mwdn.types import Measurement
+
+CAPTURES = 6
+"""Maximum number of real captures on the page."""
 
 Track = Callable[[str, list[range]], Iterable[range]]
 """Shows the progress of an iteration under a title."""
@@ -62,6 +67,16 @@ class Dataset:
     def protocol(self) -> Protocol:
         """The part of each picture that is scored."""
         return self.recipe.binned_protocol()
+
+    @cached_property
+    def captures(self) -> Measurement:
+        """The first `CAPTURES` real captures, (N, C, H, W); N is 0 if there are none.
+
+        Raises:
+            MwdnError: one cannot be read, or does not fit the camera.
+        """
+        files = find_captures(self.recipe.captures)[:CAPTURES] if self.recipe.captures else []
+        return read_captures(files, self.calibration) if files else torch.zeros(0, 3, *self.calibration.size)
 
 
 def open_dataset(name: str, recipe: DatasetRecipe, folder: Path, device: torch.device, track: Track) -> Dataset:
@@ -106,9 +121,23 @@ def open_dataset(name: str, recipe: DatasetRecipe, folder: Path, device: torch.d
     rows = _rows(recipe, len(file), simulates)
     refinement = Refinement() if simulates else missing_refinement(file, calibration.refinement)
     pairs = partial(RecordedPairs, file, psf=calibration.psf.to(device), seed=recipe.seed, refinement=refinement)
+    if not own:
+        _refuse_changed(path, note, pairs(rows["test"]).fingerprint)
     training = None if recipe.trained_on else _training(recipe, calibration, pairs, rows, device)
     test = RefinedPairs(Part(file, rows["test"]), refinement)
     return Dataset(name, recipe, calibration, test, training, identity, file.measurement_shape[2])
+
+
+def _refuse_changed(path: Path, note: Path, fingerprint: str) -> None:
+    """Raise a `ParameterError` if a user's file had other pairs when the benchmark began; note those of a new one."""
+    content = {"pairs": fingerprint}
+    if not note.is_file():
+        write_text(note, json.dumps(content))
+    elif read_json(note) != content:
+        raise ParameterError(
+            f"`{path}` holds other pairs than those that `{note.parent.parent}` has results of. Choose another folder, "
+            "`out`, or remove it."
+        )
 
 
 def _identity(recipe: DatasetRecipe, calibration: Calibration) -> dict[str, Any]:

@@ -14,7 +14,6 @@ import torch
 from mwdn.benchmark.methods import Method
 from mwdn.benchmark.published import PUBLISHED
 from mwdn.benchmark.recipe import Benchmark
-from mwdn.benchmark.scoring import captured_measurements
 from mwdn.benchmark.sets import Dataset
 from mwdn.data.recorded import RecordedPairs
 from mwdn.errors import DivergenceError, ParameterError
@@ -93,7 +92,7 @@ def check_networks(benchmark: Benchmark, datasets: Mapping[str, Dataset]) -> Non
         for network in networks:
             check_colours(network, dataset.channels, of=f"`{name}`", way_out=way_out)
         if dataset.recipe.captures and networks:
-            colours = captured_measurements(dataset).shape[1]
+            colours = dataset.captures.shape[1]
             way_out = "For a grey camera set `grey = true` in its camera file; for a mosaic, `mosaic`."
             for network in networks:
                 check_colours(network, colours, of=f"the captures of `{name}`", way_out=way_out)
