@@ -138,6 +138,13 @@ def test_best_gain_does_not_clip_and_an_even_picture_becomes_the_mean(pair):
     torch.testing.assert_close(even, pair[1].mean((1, 2, 3), keepdim=True).expand_as(even))
 
 
+def test_best_gain_of_an_even_picture_has_a_gradient(pair):
+    """It was NaN, and a training with `best_gain` diverged at the first dark reconstruction."""
+    even = torch.zeros_like(pair[1]).requires_grad_()
+    (best_gain(even, pair[1]) - pair[1]).square().sum().backward()
+    assert even.grad.isfinite().all()
+
+
 def test_best_gain_is_of_the_part_that_is_compared(pair):
     scene = pair[1]
     spoilt = 2 * scene + 1

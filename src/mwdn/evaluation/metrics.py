@@ -169,7 +169,8 @@ def best_gain(image: Image, reference: Image, *, axes: tuple[int, ...] = (1, 2, 
     deviation = image - mean
     power = deviation.square().sum(axes, keepdim=True)
     product = (deviation * (reference - target)).sum(axes, keepdim=True)
-    return deviation * torch.where(power > 0, product / power, 0) + target
+    # Not a quotient by 0 that is replaced afterwards: its gradient would be NaN.
+    return deviation * (product / torch.where(power > 0, power, 1)) + target
 
 
 @checked
