@@ -112,6 +112,7 @@ BAD_ARRAYS = {
     "channels first": (PICTURE.transpose(2, 0, 1), "3 x 32 x 40"),
     "two channels": (PICTURE[..., :2], "32 x 40 x 2"),
     "RGBA": (np.concatenate([PICTURE, np.ones((*SIZE, 1), np.float32)], -1), "four channels"),
+    "PIL I": (Image.fromarray(eight(PICTURE)[..., 0].astype(np.int32)), "uint16"),
     "PIL RGBA": (Image.fromarray(eight(PICTURE)).convert("RGBA"), "RGBA"),
     "palette": (Image.fromarray(eight(PICTURE)).convert("P"), "P"),
     "CMYK": (Image.fromarray(eight(PICTURE)).convert("CMYK"), "CMYK"),

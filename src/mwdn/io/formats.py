@@ -203,8 +203,9 @@ def as_frame(picture: ArrayPicture, *, finite: bool = True) -> Frame:
     if np.ma.is_masked(picture):
         raise FrameTypeError(f"A frame ({shown(picture)}) must have no masked pixels. Fill them: `array.filled(0)`.")
     mode = getattr(picture, "mode", "L")
-    if mode not in _PIL_MODES:
-        raise FrameTypeError(f"The picture (mode {mode}) must be grey or RGB. Convert it: `picture.convert('RGB')`.")
+    if mode not in _PIL_MODES:  # Pillow has some pictures of 16 bits in mode I, and clips them for RGB
+        way_out = "numpy.asarray(picture).astype('uint16')" if mode == "I" else "picture.convert('RGB')"
+        raise FrameTypeError(f"The picture (mode {mode}) must be grey or RGB. Convert it: `{way_out}`.")
     try:
         stored = np.asarray(picture)
     except ValueError as error:  # lists of other lengths
@@ -213,8 +214,7 @@ def as_frame(picture: ArrayPicture, *, finite: bool = True) -> Frame:
         if stored.dtype == object:
             raise FrameTypeError(f"({shown(picture)}) must hold numbers: uint8, uint16 or floats, (H, W) or (H, W, C).")
         if stored.ndim > 3:
-            axes = " x ".join(map(str, stored.shape))
-            raise FrameShapeError(f"has the shape ({axes}), one frame (H, W) or (H, W, C). The first one: `array[0]`.")
+            raise FrameShapeError(f"({' x '.join(map(str, stored.shape))}) must be (H, W, C). The first: `array[0]`.")
         if stored.ndim == 3 and stored.shape[2] == 4:
             raise FrameShapeError(f"{stored.shape} has four channels, a frame 1 or 3. Without alpha: `array[..., :3]`.")
         frame = _to_frame(stored, _frame_shape(stored.shape, stored.dtype), copy=False)
