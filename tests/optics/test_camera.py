@@ -94,3 +94,6 @@ def test_simulate_is_the_light_through_the_sensor(generator):
 def test_scene_that_does_not_fit_the_psf_is_refused():
     with pytest.raises(ShapeError, match="channels"):
         Camera(torch.ones(1, 2, 4, 4)).forward(torch.ones(1, 3, 8, 8))
+    for size in ((0, 9), (9, -1)):
+        with pytest.raises(ShapeError, match=rf"`size` \({size[0]}, {size[1]}\)"):
+            Camera(torch.ones(1, 1, 4, 4), size=size)

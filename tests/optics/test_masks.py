@@ -8,9 +8,11 @@ import pytest
 import torch
 
 from mwdn.errors import ParameterError
-from mwdn.optics import amplitude_masks
+from mwdn.optics import MASKS, amplitude_masks
 from mwdn.optics.amplitude_masks import CodedAperture, Pinholes, ZoneAperture
+from mwdn.optics.deviation import Deviation
 from mwdn.optics.drawing import contours
+from mwdn.optics.field import Aberration
 from mwdn.optics.masks import Mask, mask_psf
 from mwdn.optics.phase_masks import Contour, Diffuser, Lenslets
 from mwdn.optics.phase_retrieval import retrieve_phase
@@ -284,12 +286,31 @@ def test_impossible_masks(design, message):
         ({"pixels": (100_000, 100_000), "bin": 1}, "100,000 x 100,000 pixels"),  # 120 GB
         ({"band_nm": (760.0, 400.0)}, "`band_nm` (760.0, 400.0) must be the shortest and the longest"),
         ({"wavelengths": 0}, "`wavelengths` (0) must be positive"),
+        ({"distance_mm": "a"}, "`distance_mm` ('a')"),
+        ({"source_mm": "inf"}, "`source_mm` ('inf')"),
+        ({"aperture_mm": 3.0}, "`aperture_mm` (3.0)"),
+        ({"pixels": 1280}, "`pixels` (1280)"),
     ],
 )
+@pytest.mark.usefixtures("unchecked")
 def test_impossible_setups(change, message):
     with pytest.raises(ParameterError) as caught:
         Setup(**change)
     assert message in str(caught.value)
+
+
+def test_a_star_is_at_infinity():
+    assert Setup(source_mm=math.inf).source_mm == math.inf
+
+
+@pytest.mark.parametrize("kind", [*MASKS.values(), Deviation, Aberration])
+@pytest.mark.usefixtures("unchecked")
+def test_text_for_a_number_is_refused(kind):
+    """It was raw Python's error, for some masks much later."""
+    for name, value in {field.name: field.default for field in dataclasses.fields(kind)}.items():
+        if isinstance(value, float | tuple):
+            with pytest.raises(ParameterError, match=f"`{name}`"):
+                kind(**{name: "a"})
 
 
 def test_pitch_that_cannot_sample_the_surface():

@@ -1,5 +1,6 @@
 """Recipes: their values, and the messages for mistakes in them."""
 
+import dataclasses
 import json
 import re
 
@@ -13,7 +14,7 @@ from mwdn.errors import ParameterError, UnknownNameError
 from mwdn.io.toml import packaged_recipes
 from mwdn.networks import build
 from mwdn.optics import Sensor
-from mwdn.training.recipe import Recipe, Schedule, read_recipe
+from mwdn.training.recipe import TABLES, Recipe, Schedule, read_recipe
 from mwdn.training.schedule import make_lr_schedule
 
 DENOISER = '[network]\nname = "drunet"\n'
@@ -51,6 +52,15 @@ def test_values_and_their_types(read):
     assert recipe.mismatch == Mismatch(shift_px=0.0)
     many = read('[network]\nname = "wiener-bank"\nwidth = 2\nregularisations = [1e-2, 1e-4]\n')
     assert build(**many.network).regularisations == (1e-2, 1e-4)
+
+
+@pytest.mark.parametrize("table", TABLES)
+@pytest.mark.usefixtures("unchecked")
+def test_tables_made_in_python_have_their_types(table):
+    """A wrong one was raw Python's error, or one in the middle of a training."""
+    for field in dataclasses.fields(TABLES[table]):
+        with pytest.raises(ParameterError, match=f"`{field.name}`"):
+            TABLES[table](**{field.name: 1.5 if isinstance(field.default, bool | str) else "a"})
 
 
 def test_options_that_are_off_leave_the_identity_of_earlier_runs(read):

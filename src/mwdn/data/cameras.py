@@ -7,7 +7,7 @@ import torch
 
 from mwdn.data.random import seeded
 from mwdn.data.simulated import Batch, Samples, SimulatedPairs, full_precision
-from mwdn.errors import ParameterError
+from mwdn.errors import ParameterError, checked
 from mwdn.optics.random_psf import FAMILIES, sample_camera
 from mwdn.types import Size
 
@@ -15,6 +15,7 @@ CAMERA_SEED = 7
 """Separates the generators of the cameras from those of the samples."""
 
 
+@checked
 @dataclass(frozen=True)
 class Cameras:
     """The [cameras] of a recipe: learn to reconstruct with any PSF instead of one.

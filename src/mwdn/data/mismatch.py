@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.data.random import uniform
-from mwdn.errors import ParameterError
+from mwdn.errors import ParameterError, checked
 from mwdn.optics.warp import affine, hazed
 from mwdn.types import Psf, Size
 
@@ -22,6 +22,7 @@ TAIL_RADIUS = (0.01, 0.1)
 """Radius of scattered light over the frame's shorter side: from a few pixels to a tenth of it, where haze begins."""
 
 
+@checked
 @dataclass(frozen=True)
 class Mismatch:
     """The [mismatch] of a recipe: how the camera differs from its calibration.

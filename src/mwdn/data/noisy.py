@@ -7,9 +7,10 @@ import torch
 
 from mwdn.data.random import uniform
 from mwdn.data.simulated import Batch, Samples, SimulatedPairs, full_precision
-from mwdn.errors import ParameterError
+from mwdn.errors import ParameterError, checked
 
 
+@checked
 @dataclass(frozen=True)
 class Denoising:
     """The [denoising] of a recipe: train a denoiser of scenes instead of a reconstruction.

@@ -19,7 +19,7 @@ from mwdn.data.pair_writer import Attribute
 from mwdn.data.pairs import PairFile
 from mwdn.data.simulated import Batch, Samples
 from mwdn.data.splits import Split, split
-from mwdn.errors import ParameterError
+from mwdn.errors import ParameterError, checked
 from mwdn.runtime.transfers import to_device
 from mwdn.solvers.alignment import align
 from mwdn.solvers.pose import Pose
@@ -32,6 +32,7 @@ FINGERPRINTED = 16
 """Pairs that identify a file."""
 
 
+@checked
 @dataclass(frozen=True)
 class Division:
     """The [pairs] of a recipe: which pairs of a file are for training and which for validation.

@@ -18,7 +18,7 @@ from mwdn.data.mismatch import Mismatch, perturb, shading
 from mwdn.data.photographs import Photographs
 from mwdn.data.random import seeded, uniform
 from mwdn.data.real_camera import RealCamera
-from mwdn.errors import ParameterError
+from mwdn.errors import ParameterError, checked
 from mwdn.optics.field import FieldCamera
 from mwdn.optics.sensor import Sensor
 from mwdn.optics.warp import affine
@@ -29,6 +29,7 @@ R = TypeVar("R")
 Range = tuple[float, float]
 
 
+@checked
 @dataclass(frozen=True)
 class Placement:
     """The [placement] of a recipe: where a photograph is in the scene, and how it is lit.

@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from mwdn.data.random import seeded
 from mwdn.data.simulated import NumberedSamples, full_precision
-from mwdn.errors import ParameterError
+from mwdn.errors import ParameterError, checked
 from mwdn.fourier.convolution import convolve
 from mwdn.optics.noise import noise_level
 from mwdn.solvers.alignment import align
@@ -18,6 +18,7 @@ from mwdn.solvers.pose import Pose
 from mwdn.types import Image, Measurement, Psf, Scene
 
 
+@checked
 @dataclass(frozen=True)
 class SelfSupervised:
     """The [selfsupervised] of a recipe: learn from captures without scenes.

@@ -7,7 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from mwdn.errors import ParameterError
+from mwdn.errors import ParameterError, checked
 from mwdn.optics.masks import Mask, sample_counts
 from mwdn.optics.propagation import UM_PER_MM, check_positive, coordinates
 from mwdn.optics.setup import Setup
@@ -30,6 +30,7 @@ _TAPS = {
 """Taps of maximum-length shift registers, exponents of primitive polynomials; period ``2^n - 1``."""
 
 
+@checked
 @dataclass(frozen=True)
 class ZoneAperture:
     """Rings of equal area, every other one open: its shadow is a Fresnel zone pattern.
@@ -67,6 +68,7 @@ class ZoneAperture:
         return Mask("amplitude", (torch.cos(torch.pi * (y**2 + x**2) / self.zone_um**2) > 0).float(), self.pitch_um)
 
 
+@checked
 @dataclass(frozen=True)
 class CodedAperture:
     """A pattern of open and opaque squares whose spectrum has no zeros.
@@ -110,6 +112,7 @@ class CodedAperture:
         return Mask("amplitude", code[square][:, square], self.pitch_um)
 
 
+@checked
 @dataclass(frozen=True)
 class Pinholes:
     """Round holes at random places: each casts a dim picture of the scene, and the pictures overlap.

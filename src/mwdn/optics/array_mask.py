@@ -10,7 +10,7 @@ import numpy.typing as npt
 import torch
 from torch.nn import functional as F
 
-from mwdn.errors import ImageError, ParameterError, ShapeError, UnknownNameError, shown
+from mwdn.errors import ImageError, ParameterError, ShapeError, UnknownNameError, checked, shown
 from mwdn.io.images import read_frame
 from mwdn.io.npy import read_array
 from mwdn.optics.mask_files import read_mask
@@ -26,6 +26,7 @@ MAX_RELIEF_UM = 1000.0
 """Largest height of a mask above its lowest point. A larger one is not a thin mask; its numbers are probably in nm."""
 
 
+@checked
 @dataclass(frozen=True)
 class ArrayMask:
     """A mask from a file: heights, phases, amplitudes or transmissions, or the mask.tif of another design.

@@ -25,6 +25,7 @@ class Camera:
     Raises:
         PsfError: the PSF is negative, not finite, or dark.
         ParameterError: an argument is of another type.
+        ShapeError: ``size`` is not positive.
 
     References:
         Eq. (1) of the MWDN paper.
@@ -36,6 +37,8 @@ class Camera:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "psf", checked_psf(self.psf))
+        if min(self.sensor_size) < 1:
+            raise ShapeError(f"`size` {tuple(self.sensor_size)} must be positive: height and width in pixels.")
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.psf.shape[-3:]))

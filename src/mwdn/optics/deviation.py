@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields, replace
 
 import torch
 
-from mwdn.errors import ParameterError
+from mwdn.errors import ParameterError, checked
 from mwdn.optics.field import Aberration, FieldCamera, field_psfs
 from mwdn.optics.warp import hazed, warp
 from mwdn.types import Psf, Size
@@ -34,6 +34,7 @@ def off_axis_change(amount: float, size: Size) -> Aberration:
     return replace(OFF_AXIS * amount, blur_px=BLUR * amount * min(size))
 
 
+@checked
 @dataclass(frozen=True)
 class Deviation:
     """How the true camera differs from its calibration: fixed, signed sizes (`mwdn.data.mismatch` draws random ones).

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from mwdn.errors import ParameterError, ShapeError
+from mwdn.errors import ParameterError, ShapeError, checked
 from mwdn.fourier.convolution import convolve, correlate
 from mwdn.fourier.transforms import fast_length, gaussian_transfer, inverse_spectrum, spectrum
 from mwdn.optics.sensor import Sensor
@@ -19,6 +19,7 @@ FieldPsfs = Float[Tensor, "rows columns psf_channel psf_height psf_width"]
 """PSFs of points on a grid that spans the scene from corner to corner, each centred like the PSF on the axis."""
 
 
+@checked
 @dataclass(frozen=True)
 class Aberration:
     """Change of a PSF at the corner of the field; it grows with the square of the distance from the axis.

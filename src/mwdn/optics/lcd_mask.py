@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from mwdn.errors import ParameterError, ShapeError
+from mwdn.errors import ParameterError, ShapeError, checked
 from mwdn.optics.masks import Mask, check_samples, mask_psf
 from mwdn.optics.propagation import check_positive
 from mwdn.optics.psf import unit_sum
@@ -16,6 +16,7 @@ COLOURS_NM = (605.0, 535.0, 460.0)
 """Middle of the red, green and blue filters of a sensor, as in `mwdn.optics.setup`."""
 
 
+@checked
 @dataclass(frozen=True)
 class Lcd:
     """A display whose cells are switched between opaque and clear.

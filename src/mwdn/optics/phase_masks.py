@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mwdn.errors import ParameterError
+from mwdn.errors import ParameterError, checked
 from mwdn.optics.drawing import contours
 from mwdn.optics.masks import Mask, check_index, check_levels, quantise, sample_counts
 from mwdn.optics.phase_retrieval import retrieve_phase
@@ -16,6 +16,7 @@ from mwdn.optics.setup import Setup
 from mwdn.types import Size
 
 
+@checked
 @dataclass(frozen=True)
 class Contour:
     """A surface in a few levels that concentrates light onto thin contour lines. The defaults are the paper's mask.
@@ -98,6 +99,7 @@ class Contour:
             )
 
 
+@checked
 @dataclass(frozen=True)
 class Diffuser:
     """A smooth random surface whose hills focus light into a net of caustics.
@@ -142,6 +144,7 @@ class Diffuser:
         return Mask("phase", height, self.pitch_um, self.index, step)
 
 
+@checked
 @dataclass(frozen=True)
 class Lenslets:
     """Small lenses at random places: each focuses a point of the scene, and the PSF is a cloud of dots.

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mwdn.errors import ParameterError
+from mwdn.errors import ParameterError, check_options
 from mwdn.io.formats import MAX_PIXELS
 from mwdn.optics.propagation import check_positive
 from mwdn.types import Size
@@ -33,7 +33,7 @@ class Setup:
         colour: a white LED and a sensor with red, green and blue filters; otherwise a flat spectrum on a grey sensor.
 
     Raises:
-        ParameterError: a number is not positive, or out of its range.
+        ParameterError: a number is not positive, out of its range, or of another type.
     """
 
     distance_mm: float = 2.0
@@ -47,6 +47,8 @@ class Setup:
     colour: bool = True
 
     def __post_init__(self) -> None:
+        # Infinity, which is checked below, is a distance of a star.
+        check_options(Setup, "`Setup`", {name: value for name, value in vars(self).items() if value != math.inf})
         check_positive(distance_mm=self.distance_mm, source_mm=self.source_mm, pixel_um=self.pixel_um)
         check_positive(
             aperture_mm=min(self.aperture_mm), pixels=min(self.pixels), bin=self.bin, wavelengths=self.wavelengths

@@ -12,7 +12,7 @@ from mwdn.data.noisy import Denoising
 from mwdn.data.recorded import Division
 from mwdn.data.simulated import Placement
 from mwdn.data.unpaired import SelfSupervised
-from mwdn.errors import MwdnError, ParameterError, UnknownNameError
+from mwdn.errors import MwdnError, ParameterError, UnknownNameError, checked
 from mwdn.io.toml import current_names, find_recipe, read_toml, to_dataclass
 from mwdn.networks import DENOISERS
 from mwdn.networks.empty import build_empty
@@ -31,6 +31,7 @@ LATER = {
 """Keys of tables that the first recipes did not have."""
 
 
+@checked
 @dataclass(frozen=True)
 class Schedule:
     """The [schedule] of a recipe: length, batch, optimiser and learning rate.
@@ -128,6 +129,7 @@ class Schedule:
                 raise UnknownNameError(kind, getattr(self, kind), names)
 
 
+@checked
 @dataclass(frozen=True)
 class Recipe:
     """One experiment.

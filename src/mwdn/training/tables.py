@@ -2,9 +2,10 @@
 
 from dataclasses import dataclass
 
-from mwdn.errors import ParameterError
+from mwdn.errors import ParameterError, checked
 
 
+@checked
 @dataclass(frozen=True)
 class Plateau:
     """The [plateau] of a recipe: reduce the learning rate when the validation loss stops falling.
@@ -32,6 +33,7 @@ class Plateau:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) must not be negative.")
 
 
+@checked
 @dataclass(frozen=True)
 class Sheet:
     """The [sheet] of a recipe: real captures to show on the contact sheet of each validation.
