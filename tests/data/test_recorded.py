@@ -9,7 +9,7 @@ import torch
 
 from cameras import capture_of_rectangles
 from mwdn.calibration.refinement import Refinement
-from mwdn.data.pair_checks import REFINED
+from mwdn.data.pair_checks import REFINED, WHITE
 from mwdn.data.pairs import PairFile
 from mwdn.data.recorded import Division, PrefetchedPairs, RecordedPairs, recorded_pairs
 from mwdn.data.simulated import Samples
@@ -129,6 +129,10 @@ def test_a_number_is_the_same_pair_in_any_batch_and_process(pairs):
     assert [once.row(n) for n in range(5)] == [7, 27, 13, 23, 22]
 
 
+def test_an_empty_file_has_a_fingerprint(pairs):
+    assert RecordedPairs(PairFile(pairs(0)), [], psf()).fingerprint
+
+
 def test_the_file_is_opened_when_the_first_pair_is_read(pairs):
     train, _ = recorded_pairs(pairs(), psf(), Division())
     assert not train.file._opened
@@ -199,6 +203,16 @@ def test_a_refinement_is_applied_once(tmp_path, refined):
     train, _ = recorded_pairs(path, psf(), Division(), refinement=field)
     expected = torch.full((1, 3, 4, 6), 0.5)
     torch.testing.assert_close(train.batch([0]).measurement, expected if refined else field.measurement(expected))
+
+
+def test_stray_light_has_the_units_of_aligned_pairs(tmp_path):
+    """The stray light is a fraction of the full scale; `mwdn align` has divided measurements by the display's white."""
+    with PairFile.create(
+        tmp_path / "a.h5", measurement_shape=(4, 6, 3), scene_shape=(4, 6, 3), attributes={WHITE: 0.4}
+    ) as file:
+        file.append(torch.full((10, 3, 4, 6), (0.2 + 0.04) / 0.4), torch.ones(10, 3, 4, 6))
+    train, _ = recorded_pairs(tmp_path / "a.h5", psf(), Division(), refinement=Refinement(stray_light=((0.04,),)))
+    torch.testing.assert_close(train.batch([0]).measurement, torch.full((1, 3, 4, 6), 0.2 / 0.4))
 
 
 def test_grey_psf_serves_pairs_in_colour(pairs):

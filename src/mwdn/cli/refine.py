@@ -67,15 +67,15 @@ def refine(camera: Path, pairs: Path, report: Path) -> None:
         MwdnError: the pairs do not fit the camera, or a file cannot be written. The camera file stays as it was.
     """
     from mwdn.calibration.refinement_page import write_refinement_page
-    from mwdn.data.pair_checks import REFINED, check_pairs, other_camera
+    from mwdn.data.pair_checks import REFINED, check_pairs, display_white, other_camera
     from mwdn.data.pairs import PairFile
 
     calibration = Calibration.load(camera, **NO_TERMS, white_balance=None)
     with PairFile(pairs) as file:
         check_pairs(file, calibration.psf)
         warn(other_camera(file, calibration))
-        attributes = file.attributes
-        if attributes.get(REFINED) == "align":
+        white = display_white(file)
+        if file.attributes.get(REFINED) == "align":
             raise ParameterError(
                 f"`{pairs}` was aligned with a refined camera, whose terms would be lost. Align the session again with "
                 "the camera file as it was before its refinement."
@@ -89,9 +89,7 @@ def refine(camera: Path, pairs: Path, report: Path) -> None:
     values = {**read_camera(camera), **NO_TERMS}
     values |= {name: getattr(refinement, name) or None for name in TERMS}
     if refinement.stray_light:  # `mwdn align` has divided the measurements by the display's white
-        white = attributes.get("display_white")
-        scale = white if isinstance(white, float) else 1.0
-        values["stray_light"] = tuple(tuple(scale * value for value in row) for row in refinement.stray_light)
+        values["stray_light"] = tuple(tuple(white * value for value in row) for row in refinement.stray_light)
     values.pop("psf_sha256", None)
     write_camera(camera, values)
     content = _content(selection, pictures, best, {name: values[name] for name in TERMS})

@@ -12,7 +12,9 @@ import numpy as np
 from mwdn.calibration import Calibration, FrameFormat
 from mwdn.data.authors_file import AuthorsWriter
 from mwdn.data.kinds import KINDS, Kind, Layout
+from mwdn.data.pair_checks import REFINED, WHITE
 from mwdn.data.pair_writer import Attribute, PairWriter, PixelType, Shape, check_path, quantise
+from mwdn.data.pairs import PairFile
 from mwdn.data.scene_place import bin_scene, place_scene
 from mwdn.data.sources import Listing, Source
 from mwdn.errors import ImageError, MwdnError, ParameterError, UnknownNameError
@@ -75,7 +77,9 @@ def import_pairs(  # noqa: PLR0913
     if first is None:
         reason = f" {len(skipped):,} were skipped; {next(iter(skipped.values()))}" if skipped else ""
         raise ImageError(f"`{path}` has no pair to import.{reason} For the layouts: `mwdn import --help`.")
-    result.count = write_pairs(Path(output), chain([first], pairs), {"source": kind}, authors=authors)
+    marks = PairFile(path).attributes if kind == "pairs" else {}
+    attributes = {"source": kind} | {name: marks[name] for name in (REFINED, WHITE) if name in marks}
+    result.count = write_pairs(Path(output), chain([first], pairs), attributes, authors=authors)
     return result
 
 

@@ -1,5 +1,8 @@
 """Checks of a file of pairs before it is used: its shapes, its kind, and the camera that it belongs to."""
 
+import math
+from dataclasses import replace
+
 from mwdn.calibration.psf import Calibration
 from mwdn.calibration.psf_identity import other_psf
 from mwdn.calibration.refinement import Refinement
@@ -12,9 +15,22 @@ REFINED = "refined"
 made them without its sensor field and stray light."""
 
 
+WHITE = "display_white"
+"""Attribute of aligned files: the display's white as a fraction of the full scale. Measurements are divided by it."""
+
+
 def missing_refinement(file: PairFile, refinement: Refinement) -> Refinement:
-    """The refinement of the camera that a file's measurements still need: none if the file is `REFINED`."""
-    return Refinement() if REFINED in file.attributes else refinement
+    """The refinement that a file's measurements still need, in their units: none if the file is `REFINED`."""
+    if REFINED in file.attributes:
+        return Refinement()
+    white = display_white(file)
+    return replace(refinement, stray_light=tuple(tuple(b / white for b in row) for row in refinement.stray_light))
+
+
+def display_white(file: PairFile) -> float:
+    """`WHITE` of a file; 1 if it has none."""
+    white = file.attributes.get(WHITE)
+    return white if isinstance(white, float) and 0 < white < math.inf else 1.0
 
 
 def check_pairs(file: PairFile, psf: Psf) -> None:

@@ -117,7 +117,7 @@ class RecordedPairs(Samples):
     def fingerprint(self) -> str:
         """Hash of up to 16 pairs, evenly spaced over the file: reading all of a large one would take minutes."""
         digest, count = hashlib.sha256(), len(self.file)
-        for row in range(0, count, -(-count // FINGERPRINTED)):
+        for row in range(0, count, max(1, -(-count // FINGERPRINTED))):
             for picture in self.file[row]:
                 digest.update(picture.numpy().tobytes())
         return digest.hexdigest()
