@@ -41,6 +41,15 @@ def test_exact_is_the_network_and_fast_is_close(name, generator):
     assert psnr(Engine(network, psf)(batch), expected) > 35
 
 
+@pytest.mark.parametrize("name", ["mwdn", "wiener", "unet"])
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float64])
+def test_precision_of_the_measurement_does_not_matter(name, dtype, generator):
+    """The filters rounded their results to that of a measurement in half precision."""
+    psf, batch = psf_and_batch(generator)
+    engine, batch = Engine(trained(small(name), generator), psf, precision="exact"), batch.half()
+    assert torch.equal(engine(batch.to(dtype)), engine(batch.float()))
+
+
 def test_plug_and_play_too(generator):
     """The denoiser between the iterations computes in half precision; its level and the picture do not."""
     psf, batch = psf_and_batch(generator)

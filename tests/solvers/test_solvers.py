@@ -344,6 +344,7 @@ def test_scene_is_float32_in_every_precision(solver, dtype, generator):
     assert result.dtype == torch.float32
     expected = solver(b.float(), h)
     assert (result - expected).norm() < 1e-2 * expected.norm()
+    torch.testing.assert_close(solver(b.to(dtype), h), expected)
 
 
 @pytest.mark.parametrize("psf_batch", [1, 3])

@@ -71,6 +71,7 @@ class Engine(Generic[Prepared]):
     @torch.inference_mode()
     def __call__(self, measurement: Measurement) -> Scene:
         """Reconstruct a batch, (B, C, H, W), on the device of the PSF."""
+        measurement = measurement.float()
         if measurement.device.type != "cuda":
             return self._reconstruct(measurement)
         # CUDA streams belong to the current device. Without TF32, float32 operations keep 23 bits.

@@ -55,7 +55,7 @@ class Wiener:
         grid = deconvolution_grid(size, self.boundary)
         total = psf.sum((-2, -1), keepdim=True)
         H = transfer_function(psf / total, grid)
-        B = spectrum(pad(measurement, grid, self.boundary), grid)
+        B = spectrum(pad(measurement.float(), grid, self.boundary), grid)
         regularisation = self.regularisation or self.discrepancy(measurement, B, H, grid[1])
         V = H.conj() * B / (H.abs().square() + regularisation)
         return (inverse_spectrum(V, grid, size) / total).clamp(min=0)
