@@ -47,6 +47,12 @@ def test_adjoint_of_another_sensors_measurement_is_refused():
         camera.adjoint(torch.ones(1, 2, 5, 5))
 
 
+def test_a_psf_that_is_learned_has_a_hash():
+    """The camera could not be printed, as a notebook does."""
+    psf = torch.ones(1, 1, 4, 4)
+    assert repr(Camera(psf.clone().requires_grad_())) == repr(Camera(psf))
+
+
 def test_adjoint_returns_a_scene_of_the_sensors_size_unless_asked():
     camera = Camera(torch.ones(1, 1, 5, 5), size=(8, 9))
     assert camera.adjoint(torch.ones(1, 2, 8, 9)).shape == (1, 2, 8, 9)

@@ -83,6 +83,8 @@ def test_same_psf_everywhere_is_the_plain_camera(generator):
     assert camera.rank == 1
     torch.testing.assert_close(camera.forward(scene), Camera(psf).forward(scene), rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(camera.adjoint(scene), Camera(psf).adjoint(scene), rtol=1e-4, atol=1e-5)
+    with pytest.raises(ShapeError, match="sensor size"):
+        camera.adjoint(scene[..., 1:])
     for place in ((0, 0), (12, 29)):
         torch.testing.assert_close(camera.psf_at(*place), psf, rtol=1e-4, atol=1e-7)
 

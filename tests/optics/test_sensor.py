@@ -85,6 +85,12 @@ def test_noise_is_that_of_float32_in_every_precision(dtype, generator):
     assert capture.std().item() == pytest.approx((0.875 / 1e5) ** 0.5, rel=0.02)
 
 
+@pytest.mark.usefixtures("unchecked")
+def test_a_seed_is_no_generator():
+    with pytest.raises(ParameterError, match=r"`generator` \(3\)"):
+        Sensor().expose(torch.ones(1, 1, 4, 4), generator=3)
+
+
 def test_light_that_is_no_number_is_refused():
     with pytest.raises(ParameterError, match="`light` holds NaN"):
         Sensor().expose(torch.full((1, 1, 8, 8), math.nan))

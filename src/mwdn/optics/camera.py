@@ -4,10 +4,10 @@ from dataclasses import dataclass, field
 
 import torch
 
-from mwdn.errors import ShapeError, check_batch, checked
+from mwdn.errors import ShapeError, checked
 from mwdn.fourier.convolution import convolve, correlate
 from mwdn.optics.psf import checked_psf, psf_hash
-from mwdn.optics.sensor import Sensor
+from mwdn.optics.sensor import Sensor, check_sensor_size
 from mwdn.types import Image, Measurement, Psf, Scene, Size
 
 
@@ -63,12 +63,7 @@ class Camera:
         Raises:
             ShapeError: the measurement does not have `sensor_size`.
         """
-        check_batch(measurement, "measurement")
-        if (measurement.shape[-2], measurement.shape[-1]) != tuple(self.sensor_size):
-            raise ShapeError(
-                f"`measurement` {tuple(measurement.shape)} must have the camera's sensor size {self.sensor_size}. For "
-                "another sensor: `Camera(psf, size=(height, width))`."
-            )
+        check_sensor_size(measurement, self.sensor_size)
         return correlate(measurement, self.psf, size=scene_size)
 
     def simulate(self, scene: Scene, *, generator: torch.Generator | None = None) -> Image:

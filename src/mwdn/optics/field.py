@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from mwdn.errors import ParameterError, ShapeError, checked
 from mwdn.fourier.convolution import convolve, correlate
 from mwdn.fourier.transforms import fast_length, gaussian_transfer, inverse_spectrum, spectrum
-from mwdn.optics.sensor import Sensor
+from mwdn.optics.sensor import Sensor, check_sensor_size
 from mwdn.optics.warp import warp
 from mwdn.types import Image, Measurement, Psf, Scene, Size
 
@@ -187,7 +187,12 @@ class FieldCamera:
         return self.forward(scene)
 
     def adjoint(self, measurement: Measurement) -> Scene:
-        """Exact adjoint of `forward`."""
+        """Exact adjoint of `forward`.
+
+        Raises:
+            ShapeError: the measurement does not have `sensor_size`.
+        """
+        check_sensor_size(measurement, self.sensor_size)
         parts = (w * correlate(measurement, h[None], size=self.scene_size) for h, w in self._terms())
         return torch.stack(list(parts)).sum(0)
 

@@ -15,7 +15,7 @@ SUM_TOLERANCE = 1e-3
 def psf_hash(psf: Psf) -> str:
     """First 16 hexadecimal digits of the SHA-256 of a PSF's shape and float32 numbers."""
     digest = hashlib.sha256(repr(tuple(psf.shape)).encode())
-    digest.update(psf.float().cpu().contiguous().numpy().tobytes())
+    digest.update(psf.detach().float().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()[:16]
 
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from mwdn.errors import ParameterError, check_batch, checked
-from mwdn.types import Image
+from mwdn.errors import ParameterError, ShapeError, check_batch, checked
+from mwdn.types import Image, Size
 
 
 @checked
@@ -48,6 +48,7 @@ class Sensor:
         n = side**2
         return replace(self, full_well=n * self.full_well, read_noise=n**0.5 * self.read_noise)
 
+    @checked
     def expose(self, light: Image, *, generator: torch.Generator | None = None) -> Image:
         """One capture of the light on the sensor. Its gradient is zero: counts are whole numbers.
 
@@ -59,7 +60,8 @@ class Sensor:
             Same shape, float32. The black level is subtracted and saturation is 1; noise makes dark pixels negative.
 
         Raises:
-            ParameterError: the light holds NaN (not checked on a GPU), or is no tensor of floats.
+            ParameterError: the light holds NaN (not checked on a GPU), or is no tensor of floats; or the generator is
+                something else, such as a seed.
             ShapeError: other axes.
         """
         check_batch(light, "light")
@@ -78,6 +80,21 @@ class Sensor:
         steps = 2**self.bit_depth - 1
         counts = ((electrons / self.full_well * span + self.black_level) * steps).round().clamp(0, steps)
         return (counts / steps - self.black_level) / span
+
+
+def check_sensor_size(measurement: Image, size: Size) -> None:
+    """Check that a measurement is a batch of a camera's sensor size.
+
+    Raises:
+        ShapeError: it is not.
+        ParameterError: it is no tensor of floats.
+    """
+    check_batch(measurement, "measurement")
+    if (measurement.shape[-2], measurement.shape[-1]) != tuple(size):
+        raise ShapeError(
+            f"`measurement` {tuple(measurement.shape)} must have the camera's sensor size {tuple(size)}. For another "
+            "sensor, make the camera with `size=(height, width)`."
+        )
 
 
 def gamma_coded(capture: Image, gamma: float, decoded: float, *, bit_depth: int = 8) -> Image:
