@@ -83,6 +83,13 @@ def test_integers_are_rounded_to_the_nearest_and_kept_exactly(tmp_path, generato
     assert torch.equal(file[2][1], torch.from_numpy(stored / np.float32(peak)).movedim(-1, 0))
 
 
+def test_bfloat16_is_stored_exactly_as_float32(tmp_path, generator):
+    measurement, scene = (part.bfloat16() for part in batch(2, generator))
+    with create(tmp_path / "a.h5") as file:
+        file.append(measurement, scene)
+    assert torch.equal(PairFile(tmp_path / "a.h5")[1][0], measurement[1].float())
+
+
 def test_eight_bits_are_exact_in_sixteen(tmp_path):
     levels = np.resize(np.arange(256, dtype=np.uint8), SCENE)
     with create(tmp_path / "a.h5", "uint16") as file:

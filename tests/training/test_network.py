@@ -4,6 +4,8 @@ import pytest
 import torch
 
 from mwdn.networks import build
+from mwdn.training.network import build_network
+from mwdn.training.recipe import Recipe
 from mwdn.weights.growth import grown
 
 
@@ -18,6 +20,14 @@ def test_new_inputs_and_outputs_start_without_effect(generator, parts):
     with torch.no_grad():
         new.decoder.head.bias[-1] = -100  # a closed gate
         torch.testing.assert_close(new(measurement, psf), old(measurement, psf))
+
+
+def test_random_numbers_of_the_caller_stay():
+    """`mwdn.train` seeded the generator of the notebook that called it."""
+    before = torch.get_rng_state()
+    first, second = (build_network(Recipe({"name": "wiener-unet", "width": 2})) for _ in range(2))
+    assert torch.equal(torch.get_rng_state(), before)
+    assert all(map(torch.equal, first.state_dict().values(), second.state_dict().values()))
 
 
 def test_a_smaller_network_keeps_the_weights_as_they_are():

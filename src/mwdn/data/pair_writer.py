@@ -148,7 +148,9 @@ class PairWriter:
     def _rows(self, name: str, pixels: Tensor | Frame) -> Frame:
         """Convert to (B, H, W, C) in the type of the file."""
         if isinstance(pixels, Tensor):
-            array = pixels.detach().cpu().movedim(-3, -1).numpy() if pixels.ndim >= 3 else pixels.numpy()
+            # numpy has no bfloat16, which autocast may give.
+            stored = pixels.detach().cpu().to(torch.float32 if pixels.dtype == torch.bfloat16 else pixels.dtype)
+            array = stored.movedim(-3, -1).numpy() if stored.ndim >= 3 else stored.numpy()
         else:
             array = pixels
         batch = array[None] if array.ndim == 3 else array

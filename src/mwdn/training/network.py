@@ -33,8 +33,9 @@ def build_network(recipe: Recipe) -> nn.Module:
     Raises:
         CheckpointError: the weights do not fit the network.
     """
-    torch.manual_seed(recipe.schedule.seed)
-    network = build(**recipe.network)
+    with torch.random.fork_rng(devices=[]):  # the caller's random numbers stay theirs
+        torch.default_generator.manual_seed(recipe.schedule.seed)
+        network = build(**recipe.network)
     start, denoiser = recipe.schedule.start, recipe.schedule.denoiser
     weights = (load_network(start) if start else network).state_dict()
     if denoiser:
