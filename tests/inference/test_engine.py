@@ -14,6 +14,7 @@ from mwdn.errors import ParameterError
 from mwdn.inference.engine import Engine
 from mwdn.inference.fusion import MAX_LAYOUTS, FusedConvolution, fuse
 from mwdn.networks import NETWORKS, build
+from mwdn.networks.network import as_network
 
 SIZE = 33, 47
 
@@ -48,6 +49,13 @@ def test_precision_of_the_measurement_does_not_matter(name, dtype, generator):
     psf, batch = psf_and_batch(generator)
     engine, batch = Engine(trained(small(name), generator), psf, precision="exact"), batch.half()
     assert torch.equal(engine(batch.to(dtype)), engine(batch.float()))
+
+
+def test_complex_weights_of_another_package_stay_complex(generator):
+    """They are no float32, to which a network in half precision is converted."""
+    module = nn.Module()
+    module.weight = nn.Parameter(torch.tensor(2 + 3j))
+    assert Engine(as_network(module), psf_and_batch(generator)[0]).network.module.weight == 2 + 3j
 
 
 def test_plug_and_play_too(generator):

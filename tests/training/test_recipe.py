@@ -54,7 +54,7 @@ def test_values_and_their_types(read):
     assert build(**many.network).regularisations == (1e-2, 1e-4)
 
 
-@pytest.mark.parametrize("table", TABLES)
+@pytest.mark.parametrize("table", sorted(TABLES.keys() - {"sheet"}))
 @pytest.mark.usefixtures("unchecked")
 def test_tables_made_in_python_have_their_types(table):
     """A wrong one was raw Python's error, or one in the middle of a training."""

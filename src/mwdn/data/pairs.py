@@ -172,7 +172,8 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
             return self._opened[process]
         for parent in {*self._opened} - {process}:
             # After a fork the handle is the parent's. Closing this copy does not close the parent's.
-            self._opened.pop(parent)[0].close()
+            if opened := self._opened.pop(parent, None):
+                opened[0].close()
         file = open_hdf5(self.path, _MAKE_AGAIN)
         if not self._is_same(file):
             raise ImageError(f"`{self.path}` was replaced by another file meanwhile. Start again.")

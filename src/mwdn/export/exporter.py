@@ -74,7 +74,7 @@ class FixedPsf(nn.Module):
         self.register_buffer("psf", psf)
         if not isinstance(method, nn.Module):
             return
-        network = as_network(copy.deepcopy(method)).to("cpu", torch.float32).eval().requires_grad_(False)
+        network = as_network(copy.deepcopy(method)).cpu().float().eval().requires_grad_(False)
         tensors, self.layout = tree_flatten(network.prepare(psf, (psf.shape[-2], psf.shape[-1])))
         self.names = [f"prepared_{index}" for index in range(len(tensors))]
         for name, tensor in zip(self.names, tensors, strict=True):

@@ -46,7 +46,7 @@ class Engine(Generic[Prepared]):
         if precision not in get_args(Precision):
             raise ParameterError(f"`precision` must be fast or exact, not {precision!r}.")
         self.precision, psf = precision, checked_psf(psf, scale=not network.stored_psf)
-        exact = copy.deepcopy(network).to(psf.device, torch.float32).eval().requires_grad_(False)
+        exact = copy.deepcopy(network).to(psf.device).float().eval().requires_grad_(False)
         half = half_precision(psf.device) if precision == "fast" else None
         self.network = cast(Network[Prepared], fuse(copy.deepcopy(exact), half))
         # Prepares the PSF, because spectra and regularisation need float32.

@@ -47,8 +47,11 @@ class Setup:
     colour: bool = True
 
     def __post_init__(self) -> None:
-        # Infinity, which is checked below, is a distance of a star.
-        check_options(Setup, "`Setup`", {name: value for name, value in vars(self).items() if value != math.inf})
+        # `check_options` refuses infinity, the distance of a star.
+        finite = {
+            key: value for key, value in vars(self).items() if not (isinstance(value, float) and value == math.inf)
+        }
+        check_options(Setup, "`Setup`", finite)
         check_positive(distance_mm=self.distance_mm, source_mm=self.source_mm, pixel_um=self.pixel_um)
         check_positive(
             aperture_mm=min(self.aperture_mm), pixels=min(self.pixels), bin=self.bin, wavelengths=self.wavelengths

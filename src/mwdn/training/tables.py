@@ -33,7 +33,6 @@ class Plateau:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) must not be negative.")
 
 
-@checked
 @dataclass(frozen=True)
 class Sheet:
     """The [sheet] of a recipe: real captures to show on the contact sheet of each validation.
