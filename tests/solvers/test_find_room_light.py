@@ -109,6 +109,14 @@ def test_scale_and_batch_do_not_matter(psf, scene):
     assert math.isclose(float(alone.share), float(found.share[0]), rel_tol=1e-3)
 
 
+def test_darkness_below_zero_has_none(psf, generator):
+    """A lens cap, less the dark frame: the search failed with an error of torch, and ended a stream."""
+    dark = 0.01 * torch.randn(1, 3, *SIZE, generator=generator) - 0.001
+    found = find_room_light(dark, psf)
+    assert found.share == 0
+    assert not found.background.any()
+
+
 def test_a_frame_that_is_not_finite_has_none(psf, scene):
     measurement, light = lit(scene, psf, 0.3 * even_light(SIZE))
     frames = torch.cat([measurement + light, measurement + math.inf])

@@ -91,7 +91,7 @@ class RoomLight(NamedTuple):
 def find_room_light(measurement: Measurement, psf: Psf) -> RoomLight:
     """Find even light, a slope and a narrow spot of light in each capture, from the capture alone.
 
-    Captures of a single row or column have none.
+    Captures of a single row or column have none, nor those with NaN, or with a colour whose mean is negative.
 
     Args:
         measurement: (B, C, H, W), a tensor as `mwdn.Calibration.correct` returns it.
@@ -107,8 +107,9 @@ def find_room_light(measurement: Measurement, psf: Psf) -> RoomLight:
     """
     check_fit(measurement, psf, "measurement")
     psf, b = checked_psf(psf).float(), measurement.float()
-    finite = b.isfinite().flatten(1).all(1)
-    b = torch.where(finite[:, None, None, None], b, 1.0)
+    # The mean is the unit below. That of darkness less its dark frame may be negative.
+    usable = b.isfinite().flatten(1).all(1) & (b.mean((-2, -1)) >= 0).all(1)
+    b = torch.where(usable[:, None, None, None], b, 1.0)
     size = b.shape[-2], b.shape[-1]
     if min(size) < 2:  # a slope needs two pixels
         return RoomLight(torch.zeros_like(measurement), b.new_zeros(len(b)))
@@ -129,7 +130,7 @@ def find_room_light(measurement: Measurement, psf: Psf) -> RoomLight:
         plane = _give_back(b, light, plane, coarsest) if counts.any() else plane
     background = torch.where(counts[:, None, None, None], plane, 0.0) + light
     share = background.mean((1, 2, 3)) / whole
-    share = torch.where(finite & (share > 0) & (share < 1), share, 0.0)  # NaN counts as none
+    share = torch.where(usable & (share > 0) & (share < 1), share, 0.0)  # NaN counts as none
     return RoomLight(torch.where(share[:, None, None, None] > 0, background, 0.0).to(measurement.dtype), share)
 
 
