@@ -238,6 +238,19 @@ def test_stream_keeps_the_pose(refresh, asked, bank, psf, frames, aligned):
         torch.testing.assert_close(scene, at[max(n for n in asked if n <= number)](measurement))
 
 
+def test_stream_aligns_without_the_light_of_the_room(psf, frames, aligned, monkeypatch):
+    """As a call does: even light looks like haze of the PSF."""
+
+    def found(b, h):
+        return solvers.RoomLight(torch.full_like(b, 0.01), b.new_full((len(b),), 0.1))
+
+    monkeypatch.setattr(solvers, "find_room_light", found)
+    reconstruct = Reconstructor("wiener", Calibration(psf), device="cpu", align=True, room_light=True)
+    measurement, scene = next(iter(reconstruct.stream(frames)))
+    torch.testing.assert_close(aligned[0], measurement - 0.01)
+    torch.testing.assert_close(scene, reconstruct(measurement))
+
+
 @pytest.mark.parametrize("solver", [Admm(iterations=30), solvers.Fista(iterations=30)], ids=["admm", "fista"])
 def test_stream_goes_on_where_it_was(solver, psf, frames, aligned):
     warm = solvers.WarmStart(solver)

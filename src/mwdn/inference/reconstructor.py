@@ -168,7 +168,8 @@ class Reconstructor:
             measurement = self.calibration.correct(frame)
             due |= self.align and refresh > 0 and number % refresh == 0
             if due and measurement.isfinite().all():  # else on the next frame
-                reconstruct = aligning.at(solvers.align(to_device(measurement, self.device), self.psf))
+                light_of_scene, _ = self.without_room_light(to_device(measurement, self.device))
+                reconstruct = aligning.at(solvers.align(light_of_scene, self.psf))
                 due = False
             with torch.inference_mode():
                 scene = reconstruct._in_chunks(measurement)

@@ -128,6 +128,7 @@ class LivePictures:
         if reconstruct.align:  # the pose of the first frame holds for those that follow
             with torch.inference_mode():
                 measurement = reconstruct.calibration.correct(frame.array).to(reconstruct.device)
+                measurement, _ = reconstruct.without_room_light(measurement)
                 self._reconstruct = reconstruct = reconstruct.at(align(measurement, reconstruct.psf))
         finish = partial(self._finish, frame, reconstruct, self._used, has_ambient=self._ambient is not None)
         if isinstance(reconstruct.method, WarmStart):  # each frame needs the result of the one before
