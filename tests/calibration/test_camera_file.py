@@ -233,6 +233,30 @@ def test_names_of_any_characters_are_written_so_that_they_can_be_read(folder):
     assert not (folder / "camera.toml").exists()
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="links need a privilege on Windows")
+def test_a_camera_file_in_a_folder_that_is_a_link_names_its_files(folder, monkeypatch):
+    """The system follows `..` from the folder that the link leads to: `link/../lab/psf.png` was another file."""
+    monkeypatch.chdir(folder)
+    Path("disk/deep").mkdir(parents=True)
+    Path("link").symlink_to("disk/deep")
+    write_camera("link/camera.toml", {"psf": Path("lab/psf.png"), "dark": Path("lab/dark.png")})
+    assert Calibration.load("link/camera.toml").size == SIZE
+    assert Calibration.load("disk/deep/camera.toml").size == SIZE
+    shutil.copytree("lab", "link/lab")
+    Path("inner").symlink_to("disk/deep/lab")  # a link beside the camera file stays: both can be moved together
+    write_camera("beside.toml", {"psf": Path("inner/psf.png")})
+    assert read_toml("beside.toml", "camera file")["psf"] == "inner/psf.png"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links need a privilege on Windows")
+def test_a_link_to_a_camera_file_is_the_camera_file(folder):
+    write_camera(folder / "lab/camera.toml", {"psf": folder / "lab/psf.png"})
+    (folder / "link.toml").symlink_to("lab/camera.toml")
+    assert read_camera(folder / "link.toml")["psf"].samefile(folder / "lab/psf.png")
+    shutil.copy(folder / "lab/dark.png", folder / "psf.png")  # one beside the link comes first
+    assert read_camera(folder / "link.toml")["psf"] == folder / "psf.png"
+
+
 def test_a_camera_has_a_psf(tmp_path):
     (tmp_path / "camera.toml").write_text("bin = 2\n")
     with pytest.raises(ParameterError, match=r'`psf = "psf\.png"`'):

@@ -113,9 +113,15 @@ def read_camera(path: str | Path) -> dict[str, Any]:
         _check_range(key, value)
     if "psf" not in table:
         raise ParameterError(f'`{path}` must name the camera\'s PSF: `psf = "psf.png"`.')
-    files = {key: path.parent / table[key] for key in _FILES if key in table}
-    lists = {key: tuple(path.parent / name for name in table[key]) for key in _LISTS if key in table}
+    files = {key: _file(path, table[key]) for key in _FILES if key in table}
+    lists = {key: tuple(_file(path, name) for name in table[key]) for key in _LISTS if key in table}
     return {**{key: _as_tuple(value) for key, value in table.items()}, **files, **lists}
+
+
+def _file(path: Path, name: str) -> Path:
+    """A file that the camera file names: beside it, or if it is a link, beside its target."""
+    file = path.parent / name
+    return file if not path.is_symlink() or os.path.lexists(file) else path.resolve().parent / name
 
 
 def named_files(path: str | Path) -> dict[str, Path]:
@@ -235,7 +241,10 @@ def check_psf_file(path: str | Path, sha256: str, psf: Path) -> None:
 def _relative(path: Path, folder: Path) -> str:
     """A path as seen from a folder, with forward slashes; absolute if it is on another drive."""
     try:
-        return Path(os.path.relpath(path, folder)).as_posix()
+        name = os.path.relpath(path, folder)
+        if os.path.realpath(folder / name) != os.path.realpath(path):  # the folder is a link: `..` leads elsewhere
+            name = os.path.relpath(path.parent.resolve() / path.name, folder.resolve())
+        return Path(name).as_posix()
     except ValueError:
         return path.resolve().as_posix()
 
