@@ -1,5 +1,6 @@
 import sys
 import types
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
@@ -419,6 +420,18 @@ def test_captures_are_corrected_as_the_camera_does(tmp_path, bgr):
     wanted = camera.to_measurement(capture)[0].movedim(0, -1).numpy()
     assert measurement.min() < 0  # not clipped
     assert measurement == pytest.approx(wanted, abs=1e-6)
+
+
+def test_a_flat_field_may_brighten_the_corners_of_a_capture(tmp_path):
+    """A saturated pixel where the flat field is 0.3 became 3.3, which was refused as of another scale."""
+    for folder in ("captures", "scenes"):
+        write(tmp_path / folder / "0.png", np.tile(np.arange(200, 240, 5, dtype=np.uint8)[:, None], (6, 1, 1)))
+    flat = torch.ones(1, 1, 6, 8)
+    flat[..., 0] = 0.3
+    camera = replace(camera_of(FrameFormat(), np.random.default_rng(0)), dark=None, corrections=Corrections(flat))
+    import_pairs("folders", tmp_path, tmp_path / "pairs.h5", camera=camera)
+    assert PairFile(tmp_path / "pairs.h5")[0][0].max() == pytest.approx(200 / 255 / 0.3)
+    assert PairFile(tmp_path / "pairs.h5")[0][1].max() == pytest.approx(235 / 255)
 
 
 def test_a_dark_frame_on_another_scale_is_refused(tmp_path):

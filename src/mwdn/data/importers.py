@@ -235,10 +235,12 @@ def _convert(
     if place is not None:
         scene = bin_scene(place_scene(scene, full_size, place, source.name), frames.bin)
 
-    shifted = camera is not None and (camera.offset is not None or camera.corrections.flat is not None)
+    flat = camera is not None and camera.corrections.flat is not None
+    shifted = flat or (camera is not None and camera.offset is not None)
     floats = shifted or any(frame.dtype.kind == "f" for frame in stored)
     dtype = np.dtype("float32" if floats else "uint8" if capture.dtype == scene.dtype == np.uint8 else "uint16")
-    return quantise(capture, dtype, f"capture of {source.name}"), quantise(scene, dtype, f"scene of {source.name}")
+    capture = quantise(capture, dtype, f"capture of {source.name}", has_flat=flat)
+    return capture, quantise(scene, dtype, f"scene of {source.name}")
 
 
 def _place(kind: Kind, layout: Layout, scene: Size, frame: Size) -> Size | None:

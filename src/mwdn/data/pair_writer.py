@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mwdn.calibration.sensor_frames import LEAST_RESPONSE
 from mwdn.data.hdf5 import PICTURE_BYTES, CheckedFile, add_rows, create_hdf5, write_row
 from mwdn.errors import ImageError, ParameterError, ShapeError
 from mwdn.io.files import as_image_error, atomic
@@ -159,16 +160,17 @@ class PairWriter:
             raise ShapeError(
                 f"`{name}` ({got}: height, width, channels) must be {wanted}, as in `{self.path}`. Crop or resize it."
             )
-        return quantise(batch, self.dtype, name)
+        return quantise(batch, self.dtype, name, has_flat=name == "measurement" and self.dtype.kind == "f")
 
 
-def quantise(pixels: Frame, dtype: np.dtype[Any], name: str = "pixels") -> Frame:
+def quantise(pixels: Frame, dtype: np.dtype[Any], name: str = "pixels", *, has_flat: bool = False) -> Frame:
     """Convert pixels to another type; 1 corresponds to the maximum of an integer type.
 
     Args:
         pixels: uint8, uint16, or floats nominally in [0, 1].
         dtype: uint8 and uint16 clip to [0, 1] and round; float32 keeps numbers slightly outside of it.
         name: of the pixels, for the error message.
+        has_flat: a flat field may have brightened them, where it is dark.
 
     Raises:
         ParameterError: NaN, infinity, another type, or numbers on another scale.
@@ -180,7 +182,7 @@ def quantise(pixels: Frame, dtype: np.dtype[Any], name: str = "pixels") -> Frame
     elif pixels.dtype.kind != "f":
         raise ParameterError(f"`{name}` ({pixels.dtype}) must be floats, uint8 or uint16. Convert it with `astype`.")
     low, high = (float(pixels.min()), float(pixels.max())) if pixels.size else (0.0, 0.0)
-    if not (low >= _LOWEST and high <= _HIGHEST):  # NaN fails this too
+    if not (low >= _LOWEST and high <= (_HIGHEST / LEAST_RESPONSE if has_flat else _HIGHEST)):  # NaN fails this too
         raise ParameterError(f"`{name}` ({low:.4g} to {high:.4g}) must be in [0, 1]. Divide it by its full scale.")
     if dtype.kind == "f":
         return pixels.astype(dtype)
