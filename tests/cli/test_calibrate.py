@@ -53,6 +53,15 @@ def test_camera_file_replaces_the_options(run):
 
 
 @pytest.mark.usefixtures("folder")
+@pytest.mark.parametrize(("options", "pitch"), [("--bin 4", 6.0), ("--crop 48 48", 3.0), ("--bin 4 --pitch-um 5", 5.0)])
+def test_pitch_follows_a_changed_bin(run, options, pitch):
+    """It is the distance between pixels after binning; the new camera file kept that of the old bin."""
+    assert run("calibrate lab/psf.png --bin 2 --pitch-um 3 -o camera.toml")[0] == 0
+    assert run(f"calibrate --camera camera.toml {options} -o camera.toml")[0] == 0
+    assert read_camera("camera.toml")["pitch_um"] == pitch
+
+
+@pytest.mark.usefixtures("folder")
 def test_options_on_the_command_line_take_precedence(run):
     assert run("calibrate lab/psf.png --background 0 --upside-down --bin 2 --white-balance psf -o camera.toml")[0] == 0
     assert run(f"{RECONSTRUCT} a --psf lab/psf.png --background 0.1 --no-upside-down --bin 4")[0] == 0

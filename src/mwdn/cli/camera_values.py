@@ -24,10 +24,13 @@ def from_camera_file(app: App, commands: tuple[str, ...], arguments: Any) -> Non
         given.tokens[:], psf.tokens[:] = [psf.tokens[0].evolve(keyword="--camera")], []
     if given is None or not given.tokens:
         return
-    from mwdn.calibration.camera_file import read_camera
+    from mwdn.calibration.camera_file import read_camera, with_changes
 
     path = given.tokens[0].value
-    options = {key.replace("_", "-"): value for key, value in read_camera(path).items()}
+    camera, bin = read_camera(path), by_name.get("--bin")
+    if bin is not None and bin.tokens and bin.tokens[-1].value.isdecimal():
+        camera = with_changes(camera, {"bin": int(bin.tokens[-1].value)})
+    options = {key.replace("_", "-"): value for key, value in camera.items()}
     if commands[-1:] == ("import",):
         options.pop("background", None)  # of the PSF; the option of `import` is the room's light of a data set
     # Not every command has all of them, and some take unknown options for those of a method or a recipe.
