@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 from mwdn.calibration.photographs import Photographs, expanded, grouped
 from mwdn.calibration.sensor_frames import SensorFiles
+from mwdn.errors import ParameterError
 
 Files = Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative=())]
 Numbers = Annotated[tuple[float, ...], Parameter(consume_multiple=True, negative=())]
@@ -47,6 +48,11 @@ class PhotographOptions:
     distances: Numbers = ()
     field: Files = ()
     centre: bool | None = None
+
+    def __post_init__(self) -> None:
+        if not self.flat and (self.flat_dark or self.flat_through_mask):
+            given = "flat_dark" if self.flat_dark else "flat_through_mask"
+            raise ParameterError(f"`{given}` needs flat frames: `flat`. Give them, or leave it out.")
 
     @property
     def dark_files(self) -> tuple[Path, ...]:
