@@ -144,6 +144,23 @@ def test_dark_frame_is_subtracted_from_psf_and_captures(tmp_path, caustic):
     np.testing.assert_allclose(calibration.correct(light // 2 + pattern)[0, 0], light[..., 0] // 2 / 65535, atol=1e-6)
 
 
+@pytest.mark.parametrize("name", ["dark", "ambient"])
+def test_a_subtracted_frame_on_another_scale_is_refused(caustic, name):
+    """An average of 8-bit frames, saved as it is, made every pixel of a capture darker than the dark frame."""
+    picture, average = (200 * caustic).astype(np.uint8), np.full(SIZE, 12.25, np.float32)
+    with pytest.raises(ParameterError, match=rf"`{name}`.* 12\.25\b.*`bit_depth`"):
+        Calibration.from_array(picture, **{name: average})
+    by_hand = Calibration.from_array(picture, **{name: average / 255})
+    given = Calibration.from_array(picture, bit_depth=8, **{name: average})
+    torch.testing.assert_close(given.correct(picture), by_hand.correct(picture))
+
+
+def test_a_dark_frame_needs_the_scale_of_a_psf_of_floats(caustic):
+    with pytest.raises(ParameterError, match=r"`psf`.*`dark`.* 180\b"):
+        Calibration.from_array(200 * caustic, dark=np.full(SIZE, 5, np.uint8))
+    assert Calibration.from_array(200 * caustic).psf.sum() == pytest.approx(1)
+
+
 def test_dark_frame_is_cropped_and_binned_with_the_frame(tmp_path, caustic):
     pattern = np.random.default_rng(2).integers(500, 4000, (*SIZE, 1)).astype(np.uint16)
     light = (caustic * 50000).astype(np.uint16)[..., None]

@@ -176,6 +176,8 @@ def test_outlying_frames_are_named(run, folder, photographs):
         ("psf_1 --dark dark dark --dark-exposures 1 2 --exposures 1 --flat flat", "`--flat-dark` must name"),
         ("psf_1 --dark dark --dark-exposures 1 2 --exposures 4", "must have one for each of `--exposures`"),
         ("psf_1 --dark dark dark --dark-exposures 1 2 --bit-depth 12", "Give `--exposures`"),
+        ("psf_1/frame_1.png --flat-dark dark --bit-depth 12", "`--flat-dark` needs flat frames: `--flat`"),
+        ("psf_1 --flat-through-mask --bit-depth 12", "`--flat-through-mask` needs flat frames: `--flat`"),
         ("psf_1 --flat small --bit-depth 12", "Frames of the point source, as `frame_"),
         ("empty --dark dark", "holds no frame"),
     ],
@@ -317,8 +319,9 @@ def test_several_distances(run, folder):
     save("scene", [bench.point()])
     code, _, err = run("reconstruct scene --psf camera.toml --distance 160 --method wiener --no-trust --device cpu")
     assert (code, "magnified by" in err) == (0, True)
-    code, _, err = run("reconstruct scene --psf at_100/frame_1.png --distance 160 --method wiener")
-    assert (code, "`--distance`" in err, "several distances" in err) == (2, True, True)
+    for camera in ("", "--camera camera.toml"):  # the camera file's other PSFs do not belong to another one
+        code, _, err = run(f"reconstruct scene {camera} --psf at_100/frame_1.png --distance 160 --method wiener")
+        assert (code, "`--distance`" in err, "several distances" in err) == (2, True, True)
 
 
 def test_several_positions_make_a_field_of_psfs(run, folder):

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mwdn.calibration.corrections import Corrections
+from mwdn.calibration.float_scale import check_float_scale
 from mwdn.calibration.frame_operations import bin_pixels, crop_centre, demosaic, subtract_dark
 from mwdn.errors import ParameterError, checked
 from mwdn.io.formats import as_frame
@@ -188,6 +189,15 @@ class FrameFormat:
         if self.gamma is None:
             return image
         return srgb_decode(image) if self.gamma == "srgb" else image.clamp(min=0) ** self.gamma
+
+    def offset(self, frame: Frame | None, name: str) -> Image | None:
+        """`normalise` for a frame that is subtracted from others.
+
+        Raises:
+            ParameterError: it holds floats on another scale than [0, 1], and there is no bit depth.
+        """
+        check_float_scale(frame, self.bit_depth, f"`{name}`")
+        return None if frame is None else self.normalise(frame)
 
     def denormalise(self, image: Image) -> Frame:
         """Inverse of `read` and `normalise`: a frame of floats (H, W, C) in the order of the camera's files."""

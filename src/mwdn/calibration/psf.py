@@ -91,6 +91,7 @@ class Calibration:
         else:  # nothing is known about another PSF file
             camera["psf_corrected"] = options.get("psf_corrected", False)
             terms = replace(terms, psf_gain=(), envelope_shift=None)
+            pop_places(camera)
         extra = {name: camera.pop(name, None) for name in ("white_balance", "pitch_um", "distance_mm")}
         extra |= {"sensor": pop_sensor(camera), "places": pop_places(camera)}
         files = (camera.pop(name, None) for name in ("flat_field", "hot_pixels"))
@@ -120,12 +121,10 @@ class Calibration:
         Args:
             path: PNG, TIFF or NPY of 8 to 16 bits or floats, grey or colour; a camera's raw file; or a ``.toml`` for
                 `load`, where only options that differ are given.
-            frames: format of the PSF, the dark frame and the captures; without a mosaic, that of the PSF's raw file is
-                added.
+            frames: format of the PSF, the other frames and the captures; a raw file of the PSF adds its mosaic.
             psf_format: where the PSF's file differs from it.
             dark: frame taken with the same exposure and no light; subtracted from the PSF and from captures.
-            ambient: frame taken with the room's light alone and the exposure of the captures; subtracted from captures,
-                not from the PSF.
+            ambient: frame of the room's light alone, with the captures' exposure; subtracted from captures alone.
             corrections: flat field and hot pixels; a camera file has its own.
             **options: fields of `FrameFormat` and `PsfFormat`, which replace those of ``frames`` and ``psf_format``:
                 ``bin=4, bit_depth=12, gamma="srgb", background=0.0, psf_bin=8``.
@@ -174,8 +173,8 @@ class Calibration:
             MwdnError: as for `from_file`.
         """
         frames, psf_format = with_options(frames, psf_format, options)
-        dark_frame, ambient_frame = (None if frame is None else as_frame(frame) for frame in (dark, ambient))
-        return cls._from_frame(as_frame(picture), frames, psf_format, dark=dark_frame, ambient=ambient_frame)
+        dark, ambient = (None if frame is None else as_frame(frame) for frame in (dark, ambient))
+        return cls._from_frame(as_frame(picture), frames, psf_format, dark=dark, ambient=ambient)
 
     @classmethod
     def _from_frame(
@@ -192,8 +191,8 @@ class Calibration:
         draft = cls(
             torch.ones(1, 1, 1, 1),
             frames,
-            None if dark is None else frames.normalise(dark),
-            ambient=None if ambient is None else frames.normalise(ambient),
+            frames.offset(dark, "dark"),
+            ambient=frames.offset(ambient, "ambient"),
             psf_format=psf_format,
             corrections=corrections,
         )
@@ -212,6 +211,8 @@ class Calibration:
         own_frames = self.psf_format.own_frames(self.frames)
         if self.corrections.psf_done or not self.psf_format.shares_pixels(self.frames):
             return own_frames.to_measurement(frame)
+        if self.dark is not None:
+            check_float_scale(frame, self.frames.bit_depth, "`psf`, from which `dark` is subtracted,")
         return own_frames.to_measurement(frame, self.dark, self.corrections)
 
     def __post_init__(self) -> None:
@@ -262,10 +263,9 @@ class Calibration:
         """Turn a raw frame into a measurement of the PSF's size.
 
         Args:
-            frame: (H, W) or (H, W, 1 or 3) raw pixel values: from `FrameFormat.read`, or another numpy array or PIL
-                picture. Always RGB. Row 0 at the top; with `FrameFormat.upside_down` at the bottom, and turned here.
-                Integers, uint8 or uint16, saturate at their type's maximum and floats at 1, unless
-                `FrameFormat.bit_depth` is given. They are linear in light unless ``gamma`` is given.
+            frame: (H, W) or (H, W, 1 or 3) raw pixel values: from `FrameFormat.read`, or another array or PIL picture.
+                RGB, row 0 at the top; with `FrameFormat.upside_down` at the bottom, and turned here. Without a
+                ``bit_depth`` integers saturate at their type's maximum, floats at 1; without a ``gamma`` all is linear.
 
         Returns:
             (1, C, *size), linear light; 1 is saturation.
@@ -295,6 +295,6 @@ class Calibration:
             )
         if measurement.shape[1] == 1 and self.psf.shape[1] == 3:
             raise ShapeError(
-                "The capture is grey, but `psf` has colours. Use both as grey: `grey=True`. If the capture is the raw "
-                "frame of a colour sensor, give the order of its filters: `mosaic='rggb'`."
+                "The capture is grey, but `psf` has colours. Use both as grey: `grey=True`. For the raw frame of a "
+                "colour sensor, give the order of its filters: `mosaic='rggb'`."
             )

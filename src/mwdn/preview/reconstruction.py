@@ -135,7 +135,7 @@ def with_ambient(calibration: Calibration, ambient: bytes, limits: Limits) -> Ca
     if not ambient:
         return calibration
     frame = read_upload(ambient, "ambient", limits.frame_pixels, calibration.frames.read)
-    return replace(calibration, ambient=calibration.frames.normalise(frame))
+    return replace(calibration, ambient=calibration.frames.offset(frame, "ambient"))
 
 
 def _report(order: Order, reconstruct: Reconstructor, seconds: float) -> dict[str, Any]:
