@@ -33,6 +33,17 @@ def test_import_writes_pairs_and_says_so(folders, capsys):
     assert shown.splitlines()[-1] == f"3 pairs written to {out}, 0 skipped"
 
 
+def test_files_that_are_not_read_are_named(folders, capsys):
+    """Captures of a camera's raw files were left out without a word."""
+    for name in ("captures/a.dng", "captures/b.txt", "scenes/c.gif"):
+        (folders / name).touch()
+    (folders / "captures/[0].json").touch()
+    assert run("folders", folders, "-o", folders / "pairs.h5") == 0
+    said = capsys.readouterr().err
+    assert all(name in said for name in ("a.dng", "b.txt", "c.gif"))
+    assert ".json" not in said
+
+
 def test_camera_file_says_how_captures_are_stored(folders, tmp_path):
     (tmp_path / "camera.toml").write_text('psf = "psf.png"\ncrop = [4, 6]\nbin = 2\nwhite_balance = "psf"\n')
     assert run("folders", folders, "-o", tmp_path / "pairs.h5", "--camera", tmp_path / "camera.toml") == 0

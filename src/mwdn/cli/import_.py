@@ -10,11 +10,12 @@ from rich.markup import escape
 from mwdn.calibration import Calibration, FrameFormat
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.progress import track
-from mwdn.cli.terminal import counted, if_interrupted, notes, say
+from mwdn.cli.terminal import counted, if_interrupted, note, notes, say
 from mwdn.data.digicam import DigiCam, import_digicam
 from mwdn.data.importers import import_pairs, refuse_corrections
-from mwdn.data.kinds import Layout
+from mwdn.data.kinds import KINDS, Layout
 from mwdn.errors import ParameterError
+from mwdn.io.listing import unused_photographs
 
 
 @no_empty_folder
@@ -53,6 +54,7 @@ def import_(  # noqa: PLR0913
     if kind == "digicam" and authors:
         raise ParameterError("`authors` is for one camera, but digicam has one for each mask. Leave it out.")
     calibration = None if camera is None else Calibration.load(camera, **vars(frames))
+    note(*_unused(kind, path, layout))
     if kind == "digicam":
         refuse_corrections(kind, calibration)
         with if_interrupted(lambda: f"Interrupted. Files that are complete are kept: {out.parent}."):
@@ -80,6 +82,13 @@ def import_(  # noqa: PLR0913
     names = f": {', '.join(result.skipped)}" if result.skipped else ""
     summary = f"{counted(result.count, 'pair')} written to {out}, {len(result.skipped):,} skipped{names}"
     say(summary)
+
+
+def _unused(kind: str, path: Path, layout: Layout) -> list[str]:
+    """One sentence for each kind of file in the folders of a data set that is not read."""
+    usual = KINDS[kind].layout if kind in KINDS else layout
+    folders = (layout.captures or usual.captures, layout.scenes or usual.scenes)
+    return [line for name in folders if name and (path / name).is_dir() for line in unused_photographs(path / name)]
 
 
 def _name_skipped(skipped: dict[str, str]) -> None:
