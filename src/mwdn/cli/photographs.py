@@ -49,11 +49,6 @@ class PhotographOptions:
     field: Files = ()
     centre: bool | None = None
 
-    def __post_init__(self) -> None:
-        if not self.flat and (self.flat_dark or self.flat_through_mask):
-            given = "flat_dark" if self.flat_dark else "flat_through_mask"
-            raise ParameterError(f"`{given}` needs flat frames: `flat`. Give them, or leave it out.")
-
     @property
     def dark_files(self) -> tuple[Path, ...]:
         """Files of --dark; --dark none does without."""
@@ -61,16 +56,21 @@ class PhotographOptions:
 
     def are_one_picture(self, files: Sequence[Path]) -> bool:
         """Whether a camera file can name these pictures as they are."""
-        others = (self.exposures, self.dark_exposures, self.flat, self.distances, self.field, self.centre)
-        is_plain = not any(others) and self.capture_exposure is None
+        others = (self.exposures, self.dark_exposures, self.distances, self.field, self.centre)
+        flats = (self.flat, self.flat_dark, self.flat_through_mask)
+        is_plain = not any((*others, *flats)) and self.capture_exposure is None
         return is_plain and len(expanded(files)) <= 1 and len(expanded(self.dark_files)) <= 1
 
     def of(self, pictures: Sequence[Path]) -> Photographs:
         """The photographs, with these pictures of the point source.
 
         Raises:
-            ParameterError: a folder is empty, or the pictures cannot be divided into exposures and distances.
+            ParameterError: a folder is empty, the pictures cannot be divided into exposures and distances, or options
+                for flat frames are given without those.
         """
+        if not self.flat and (self.flat_dark or self.flat_through_mask):
+            given = "flat_dark" if self.flat_dark else "flat_through_mask"
+            raise ParameterError(f"`{given}` needs flat frames: `flat`. Give them, or leave it out.")
         dark = grouped(self.dark_files, max(1, len(self.dark_exposures)), "dark") if self.dark_files else ()
         flat, flat_dark = (tuple(expanded(each)) for each in (self.flat, self.flat_dark))
         groups = max(1, len(self.exposures)) * max(1, len(self.distances))
