@@ -108,6 +108,13 @@ def test_a_file_where_a_folder_should_be(tmp_path: Path) -> None:
         write_picture(tmp_path / "taken" / "a.png", torch.rand(3, 4, 4))
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="other limits of names")
+def test_a_name_that_is_too_long_asks_for_another_name(tmp_path: Path) -> None:
+    """It asked for another folder, where the name is as long."""
+    with pytest.raises(ImageError, match="shorter name"):
+        write_picture(tmp_path / f"{252 * 'a'}.png", torch.zeros(1, 3, 2, 2))
+
+
 def test_a_folder_where_the_file_should_be(tmp_path: Path) -> None:
     (tmp_path / "a.png").mkdir()
     with pytest.raises(ImageError, match="cannot be written: Is a directory"):

@@ -132,7 +132,7 @@ def as_image_error(path: str | Path, at: str = "") -> Iterator[None]:
         # numpy's own errors have no number, only "1000 requested and 10 written".
         full = error.errno is None or error.errno in FULL
         advice = "Make room, or choose another folder." if full else "Choose another folder."
-        advice = "Rename it." if error.errno == errno.ENAMETOOLONG else advice
+        advice = "Choose a shorter name." if error.errno == errno.ENAMETOOLONG else advice
         why = error.strerror or f"The disk may be full ({error})"
         raise ImageError(f"`{path}` cannot be written{at}: {why}. {advice}") from error
 
