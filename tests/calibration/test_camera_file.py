@@ -130,6 +130,12 @@ def test_pitch_follows_the_bin(folder):
     assert pitches == [4.0, 8.0, 5.0]
 
 
+def test_a_bin_of_0_is_named_also_with_a_pitch(folder):
+    (folder / "camera.toml").write_text('psf = "lab/psf.png"\nbin = 0\npitch_um = 2.4\n')
+    with pytest.raises(ParameterError, match=r"`bin` \(0\)"):
+        Calibration.load(folder / "camera.toml")
+
+
 def test_a_picture_is_no_camera_file(folder):
     with pytest.raises(ParameterError, match=r"psf\.png` is a picture.*`--psf`"):
         Calibration.load(folder / "lab/psf.png")

@@ -147,7 +147,7 @@ def with_changes(camera: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[
     """The keys of a camera file with some of them replaced; `pitch_um`, a distance after binning, follows `bin`."""
     changed = {**camera, **changes}
     if "pitch_um" in camera and "pitch_um" not in changes:
-        changed["pitch_um"] = camera["pitch_um"] * changed.get("bin", 1) / camera.get("bin", 1)
+        changed["pitch_um"] = camera["pitch_um"] * changed.get("bin", 1) / (camera.get("bin") or 1)
     return changed
 
 
