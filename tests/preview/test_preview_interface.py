@@ -15,8 +15,9 @@ from mwdn import Reconstructor
 from mwdn.calibration import Calibration
 from mwdn.errors import ParameterError
 from mwdn.preview.cameras import Cameras
+from mwdn.preview.reconstruction import with_ambient
 from mwdn.preview.server import make_server
-from preview_server import LIMITS, SIDE, hostile
+from preview_server import LIMITS, SIDE, hostile, npy
 
 
 def order(client, capture, expect=200, /, files=None, **fields):
@@ -119,6 +120,11 @@ def test_hostile_captures_are_refused(client, capture, kind):
 )
 def test_wrong_fields_are_named(client, capture, fields, status, named):
     assert named in order(client, capture, status, **fields).json()["error"]
+
+
+def test_an_ambient_frame_on_another_scale_is_refused(psf):
+    with pytest.raises(ParameterError, match=r"`ambient`.* 12\.5\b"):
+        with_ambient(Calibration(psf), npy(np.full((SIDE, SIDE, 3), 12.5, np.float32)), LIMITS)
 
 
 @pytest.mark.parametrize("option", ["dark", "ambient", "corrections", "path"])

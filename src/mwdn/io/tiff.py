@@ -75,7 +75,7 @@ def read_tiff(file: BinaryIO, check: Any) -> TiffPicture:  # noqa: ANN401
     with tifffile.TiffFile(file, name="", is_ome=False) as tiff:
         every: list[Any] = [tiff.pages[number] for number in range(pages)]
         if _DNG_VERSION in every[0].tags:
-            raise ImageError("is a camera's raw file (DNG). Give its name the suffix .dng, or export it as TIFF.")
+            raise ImageError("is a camera's raw file (DNG). Export it as TIFF; commands also read it as .dng.")
         first = max(every, key=lambda page: page.imagelength * page.imagewidth)  # smaller ones are copies of it
         _check_page(first)
         planes = [page for page in every if page.shape == first.shape]
