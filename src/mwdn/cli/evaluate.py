@@ -4,10 +4,11 @@ from collections.abc import Iterable
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
+from mwdn import evaluation
 from mwdn.cli.camera import CameraOptions
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.method_options import MethodOptions, read_options
@@ -18,36 +19,12 @@ from mwdn.data.pair_checks import check_pairs, missing_refinement, other_camera
 from mwdn.data.pairs import PairFile, Part
 from mwdn.data.recorded import Division, RefinedPairs
 from mwdn.errors import ParameterError
-from mwdn.evaluation import Perceptual, Variant
+from mwdn.evaluation import Perceptual, Report, Variant
 from mwdn.evaluation.alexnet import SMALLEST
+from mwdn.evaluation.evaluate import Pairs
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import check_folder, refuse_foreign, refuse_overwrite
 from mwdn.weights.checkpoint import read_metadata
-
-
-def _division(split: str, methods: Iterable[str]) -> Division:
-    """The division of the pairs that the checkpoints were trained with, if it is this split; else its defaults.
-
-    Raises:
-        ParameterError: they were trained with different ones, of which one trained on what another left out.
-    """
-    trained: set[Division] = set()
-    for method in methods:
-        if method.endswith(".safetensors") and Path(method).is_file():
-            table = read_metadata(method).get("recipe", {}).get("pairs", {})
-            if table.get("split") == split:
-                known = {name: table[name] for name in ("seed", "folds", "fold") if name in table}
-                trained.add(Division(split, tuple(table.get("fractions", Division.fractions)), **known))
-    if len(trained) > 1:
-        raise ParameterError(f"The checkpoints divided '{split}' in different ways. Evaluate each by itself.")
-    return trained.pop() if trained else Division(split)
-
-
-def _part(file: PairFile, split: str, name: str, methods: Iterable[str]) -> Part:
-    rows = _division(split, methods).parts(len(file))[name]
-    if not rows:
-        raise ParameterError(f"The split '{split}' of {len(file):,} pairs has no {name} part. Choose another `--part`.")
-    return Part(file, rows)
 
 
 @no_empty_folder
@@ -89,23 +66,23 @@ def evaluate(  # noqa: PLR0913
         json: print the content of report.json instead of a table.
         **options: options of the methods.
     """
-    from mwdn import evaluation
-
     method_options = read_options(methods, options, evaluate)
     region, file = evaluation.Protocol.parse(protocol), PairFile(data)
     calibration = replace(camera.load(), white_balance=None)  # scenes of pairs are in the camera's own colours
     check_pairs(file, calibration.psf)
-    if part and not split:
+    pairs: Pairs = file
+    if split is not None:
+        pairs = _part(file, split, part or "test", methods)
+    elif part is not None:
         raise ParameterError(f"`--part {part}` is a part of a split. Say which one: `--split paper`, as in training.")
-    pairs: Any = file if split is None else _part(file, split, part or "test", methods)
-    pairs = pairs if first is None else evaluation.First(pairs, first)
-    refinement = missing_refinement(file, calibration.refinement)
-    pairs = RefinedPairs(pairs, refinement) if refinement else pairs
+    if first is not None:
+        pairs = evaluation.First(pairs, first)
+    if refinement := missing_refinement(file, calibration.refinement):
+        pairs = RefinedPairs(pairs, refinement)
     reconstructors = {
         method: Reconstructor(method, calibration, device=device, **own) for method, own in method_options.items()
     }
-    warnings = [reconstruct.warning for reconstruct in reconstructors.values()]
-    warn(*warnings, other_camera(file, calibration))
+    warn(*(reconstruct.warning for reconstruct in reconstructors.values()), other_camera(file, calibration))
     refuse_overwrite(out / evaluation.SHEET, *camera.files)
     refuse_foreign(out, (evaluation.JSON, evaluation.SHEET), b'"protocol"')
     if min(region.crop(calibration.psf).shape[-2:]) >= SMALLEST:
@@ -123,11 +100,42 @@ def evaluate(  # noqa: PLR0913
             perceptual=perceptual,
             progress=lambda name, _: progress.update(next(done), name),
         )
-    if json:
-        results.out(report.json(), highlight=False)
-    else:
-        table = report.table()
-        width = results.measure(table, options=results.options.update(width=1000)).maximum
-        results.print(report.table(narrow=True) if width > results.width else table)
+    _print_report(report, json=json)
     report.write(out)
     say(f"Look at {out}")
+
+
+def _part(file: PairFile, split: str, name: str, methods: Iterable[str]) -> Part:
+    """The pairs of one part of a split, divided as in the training of the methods."""
+    rows = _division(split, methods).parts(len(file))[name]
+    if not rows:
+        raise ParameterError(f"The split '{split}' of {len(file):,} pairs has no {name} part. Choose another `--part`.")
+    return Part(file, rows)
+
+
+def _division(split: str, methods: Iterable[str]) -> Division:
+    """The division of the pairs that the checkpoints were trained with, if it is this split; else its defaults.
+
+    Raises:
+        ParameterError: they were trained with different ones, of which one trained on what another left out.
+    """
+    trained: set[Division] = set()
+    for method in methods:
+        if method.endswith(".safetensors") and Path(method).is_file():
+            table = read_metadata(method).get("recipe", {}).get("pairs", {})
+            if table.get("split") == split:
+                known = {name: table[name] for name in ("seed", "folds", "fold") if name in table}
+                trained.add(Division(split, tuple(table.get("fractions", Division.fractions)), **known))
+    if len(trained) > 1:
+        raise ParameterError(f"The checkpoints divided '{split}' in different ways. Evaluate each by itself.")
+    return trained.pop() if trained else Division(split)
+
+
+def _print_report(report: Report, *, json: bool) -> None:
+    """Print the content of report.json, or a table; a narrow one if the terminal has too few columns."""
+    if json:
+        results.out(report.json(), highlight=False)
+        return
+    table = report.table()
+    width = results.measure(table, options=results.options.update(width=1000)).maximum
+    results.print(report.table(narrow=True) if width > results.width else table)

@@ -87,34 +87,22 @@ def reconstruct(  # noqa: PLR0913
         raise ParameterError("`map` needs the check that `--no-trust` skips. Leave out one of them.")
     method_options = read_options([method], options, reconstruct)[method]
     with distributed.process_group():
-        is_first = distributed.rank() == 0
-        calibration, is_binned = camera.load(), ""
+        calibration, remark = camera.load(), ""
         check_size(calibration.psf)
         # Listed by the first process: files may be added to a folder meanwhile.
         files: list[str] = distributed.broadcast_json(lambda: _list_files(captures, camera, out, format))
         if auto_bin:
-            calibration, is_binned = binned(calibration, camera, method, files)
-        calibration = replace(calibration, white_balance=None)  # the camera file's is `white_balance` unless `none`
-        local_device = distributed.local_device(device)
+            calibration, remark = binned(calibration, camera, method, files)
         reconstructor = Reconstructor(
             method,
-            calibration,
+            replace(calibration, white_balance=None),  # the camera file's is `white_balance` unless `none`
             align=align,
-            device=local_device,
+            device=distributed.local_device(device),
             white_balance=white_balance,
             ensemble=ensemble,
             room_light=room_light,
             **method_options,
         )
-        if is_first:
-            warn(reconstructor.warning)
-            detail(f"{method} on {reconstructor.device}")
-            note(*filter(None, [is_binned]))
-            background = ", ".join(f"{level:.4f}" for level in calibration.background)
-            say(f"PSF {calibration.psf_hash}, background {background} of the full scale subtracted")
-        resume = distributed.world_size() > 1 if resume is None else resume
-        if is_first:
-            _name_turn((camera.psf_file, *files[:SHOWN]))
         batch = Batch(
             reconstructor,
             method,
@@ -122,10 +110,14 @@ def reconstruct(  # noqa: PLR0913
             format,
             check_consistency=trust,
             map=map,
-            resume=resume,
+            resume=distributed.world_size() > 1 if resume is None else resume,
             psf_file=Path(camera.psf_file),
             full_size=full_size,
         )
+        is_first = distributed.rank() == 0
+        if is_first:
+            _announce(batch, remark)
+            _name_turn((camera.psf_file, *files[:SHOWN]))
         failed, existing = _run(batch, files)
         if is_first:
             batch.summarise(files)
@@ -133,11 +125,20 @@ def reconstruct(  # noqa: PLR0913
                 print_json([_entry(batch, file, failed.get(file)) for file in files])
             before = f", {existing} of them before" if existing else ""
             done = f"{len(files) - len(failed):,} of " if failed else ""
-            line = f"{done}{counted(len(files), 'capture')} reconstructed into {out}{before}"
-            say(line)
+            say(f"{done}{counted(len(files), 'capture')} reconstructed into {out}{before}")
     status = 1 if failed else 0
     distributed.set_exit_status(status)
     return status
+
+
+def _announce(batch: Batch, remark: str) -> None:
+    """Print method, device and PSF, with the warning and the remark about them."""
+    reconstructor = batch.reconstruct
+    warn(reconstructor.warning)
+    detail(f"{batch.method} on {reconstructor.device}")
+    note(*filter(None, [remark]))
+    background = ", ".join(f"{level:.4f}" for level in reconstructor.calibration.background)
+    say(f"PSF {reconstructor.calibration.psf_hash}, background {background} of the full scale subtracted")
 
 
 def _name_turn(files: Iterable[str | Path]) -> None:
@@ -214,5 +215,4 @@ def _report(job: Job) -> None:
         complain("[red]Error:[/]" if named else f"[red]{escape(one_line(str(job.capture)))}:[/]", job.error)
     elif job.trust:
         lit = f"; {job.room_light:.0%} of its light was the room's" if job.room_light else ""
-        line = f"{one_line(job.capture.name)}: {job.trust.sentence}{lit}"
-        say(line)
+        say(f"{one_line(job.capture.name)}: {job.trust.sentence}{lit}")
