@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch
@@ -73,8 +73,7 @@ class FrameFormat:
             )
 
     def __repr__(self) -> str:
-        values = ((field.name, getattr(self, field.name), field.default) for field in fields(self))
-        return f"FrameFormat({', '.join(f'{name}={value!r}' for name, value, default in values if value != default)})"
+        return f"FrameFormat({', '.join(f'{name}={value!r}' for name, value in changed_fields(self).items())})"
 
     @property
     def cell(self) -> int:
@@ -260,6 +259,12 @@ class FrameFormat:
         """The format of frames of the same view at another resolution: ``crop`` is scaled with ``bin``."""
         height, width = (length // self.cell * bin // self.bin * self.cell for length in self.crop or (0, 0))
         return replace(self, bin=bin, crop=self.crop and (height, width))
+
+
+def changed_fields(format: Any) -> dict[str, Any]:  # noqa: ANN401
+    """The fields of a dataclass that differ from their defaults, by name."""
+    values = ((field, getattr(format, field.name)) for field in fields(format))
+    return {field.name: value for field, value in values if value != field.default}
 
 
 def check_gamma(name: str, gamma: Gamma | None) -> None:

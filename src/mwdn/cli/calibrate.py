@@ -15,6 +15,7 @@ from mwdn.calibration import Calibration, FrameFormat, PsfFormat
 from mwdn.calibration.camera_file import check_camera_path, read_camera
 from mwdn.calibration.camera_parts import draft_of, write_camera_with_parts
 from mwdn.calibration.corrections import Corrections
+from mwdn.calibration.frame_format import changed_fields
 from mwdn.calibration.photographs import Photographed, develop, expanded
 from mwdn.calibration.report import inspect_psf
 from mwdn.calibration.verdict import headline
@@ -98,34 +99,29 @@ def calibrate(  # noqa: PLR0913
             photographs = _with_exposure(photographs, kept.get("dark_exposure"), camera)
         own = {
             "ambient": ambient,
-            **_changes(psf_format),
-            **_changes(frames),
+            **changed_fields(psf_format),
+            **changed_fields(frames),
             "bin": None if auto_bin else frames.bin,
             "white_balance": white_balance,
             "pitch_um": pitch_um,
             "distance_mm": distance_mm,
         }
         if photographs.are_one_picture(pictures):
-            options = CameraOptions(pictures[0], frames, psf_format=psf_format, ambient=ambient)
             dark = next(iter(expanded(photographs.dark_files)), None)
+            options = CameraOptions(pictures[0], frames, psf_format=psf_format, dark=dark, ambient=ambient)
             refuse_overwrite(out, options.psf, dark, ambient)
-            _written(out, pairs, partial(_of_one_picture, replace(options, dark=dark), kept, own))
-            return
-        _refuse_psf_format(psf_format)
-        if kept.get("psf_corrected") and pictures == [kept["psf"]]:
-            raise ParameterError(
-                f"The PSF of `{camera}` is corrected already. To correct it by other frames, name the photographs of "
-                "the point source again, with all that belong to them: `mwdn calibrate POINT --dark DARK ...`."
-            )
-        known = Corrections.read(kept.get("flat_field"), kept.get("hot_pixels"))
-        for file in (*expanded(pictures), *expanded(photographs.dark_files), *expanded(photographs.flat)):
-            refuse_overwrite(out, file)
-        done = develop(photographs.of(pictures), frames, known)
-        has_dark = bool(photographs.dark_files)
-        _written(out, pairs, partial(_of_photographs, done, {**kept, **own}, has_dark=has_dark))
+            write = partial(_write_one_picture, options, kept, own)
+        else:
+            _refuse_psf_format(psf_format)
+            _refuse_corrected(camera, kept, pictures)
+            known = Corrections.read(kept.get("flat_field"), kept.get("hot_pixels"))
+            refuse_overwrite(out, *expanded((*pictures, *photographs.dark_files, *photographs.flat)))
+            done = develop(photographs.of(pictures), frames, known)
+            write = partial(_write_photographs, done, {**kept, **own}, has_dark=bool(photographs.dark_files))
+        _write_and_refine(out, pairs, write)
 
 
-def _written(out: Path, pairs: Path | None, write: Callable[[Path], tuple[str, Calibration]]) -> None:
+def _write_and_refine(out: Path, pairs: Path | None, write: Callable[[Path], tuple[str, Calibration]]) -> None:
     """Write the camera file, refined if there are pairs: it appears when it is complete.
 
     Args:
@@ -176,16 +172,15 @@ def _with_exposure(photographs: PhotographOptions, exposure: float | None, camer
     return replace(photographs, dark_exposures=(exposure,))
 
 
-def _of_one_picture(
+def _write_one_picture(
     options: CameraOptions, kept: dict[str, Any], own: dict[str, Any], out: Path
 ) -> tuple[str, Calibration]:
-    """Write a camera file that names the PSF's picture as it is. The PSF's verdict, and the calibration."""
+    """Write a camera file that names the PSF's picture as it is; returns the PSF's verdict and the calibration."""
     if options.psf != kept.get("psf"):
         of_a_psf = {"psf_corrected", "psf_gain", "envelope_shift", *chain.from_iterable(_ELSEWHERE)}
         kept = {key: value for key, value in kept.items() if key not in of_a_psf}
-    corrections = Corrections.read(
-        kept.get("flat_field"), kept.get("hot_pixels"), psf_done=kept.get("psf_corrected", False)
-    )
+    psf_done = kept.get("psf_corrected", False)
+    corrections = Corrections.read(kept.get("flat_field"), kept.get("hot_pixels"), psf_done=psf_done)
     calibration = options.load(corrections)
     balance = own["white_balance"]
     if balance == "flat":
@@ -197,10 +192,10 @@ def _of_one_picture(
     return headline(report), calibration
 
 
-def _of_photographs(
+def _write_photographs(
     done: Photographed, content: dict[str, Any], out: Path, *, has_dark: bool
 ) -> tuple[str, Calibration]:
-    """Write a camera file with the pictures made of photographs. The PSF's verdict, and the calibration."""
+    """Write a camera file with the pictures made of photographs; returns the PSF's verdict and the calibration."""
     content = {key: value for key, value in content.items() if value is not None or key not in done.content}
     if content.get("white_balance") == "flat":
         content["white_balance"] = _flat_balance(done.flat_colour)
@@ -238,6 +233,14 @@ def _refuse_psf_format(psf_format: PsfFormat) -> None:
         )
 
 
+def _refuse_corrected(camera: Path | None, kept: dict[str, Any], pictures: Sequence[Path]) -> None:
+    if kept.get("psf_corrected") and [*pictures] == [kept["psf"]]:
+        raise ParameterError(
+            f"The PSF of `{camera}` is corrected already. To correct it by other frames, name the photographs of the "
+            "point source again, with all that belong to them: `mwdn calibrate POINT --dark DARK ...`."
+        )
+
+
 def _finish(verdict: str, calibration: Calibration, out: Path) -> None:
     height, width = calibration.size
     say(
@@ -261,9 +264,3 @@ def _watch(folder: Path, frames: FrameFormat, exposures: tuple[float, ...]) -> N
         for sentence, _ in guide_exposure(watch_folder(folder, frames, wait), frames, exposure_ms=exposure):
             count += 1
             say(sentence)
-
-
-def _changes(format: FrameFormat | PsfFormat) -> dict[str, Any]:
-    """The fields that differ from their defaults."""
-    defaults = vars(type(format)())
-    return {name: value for name, value in vars(format).items() if value != defaults[name]}

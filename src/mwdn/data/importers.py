@@ -1,15 +1,15 @@
 """Convert a public data set, in its own layout, to a file of pairs."""
 
-import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import cast
 
 import numpy as np
 
 from mwdn.calibration import Calibration, FrameFormat
+from mwdn.calibration.frame_format import changed_fields
 from mwdn.data.authors_file import AuthorsWriter
 from mwdn.data.kinds import KINDS, Kind, Layout
 from mwdn.data.pair_checks import REFINED, WHITE
@@ -20,8 +20,6 @@ from mwdn.data.sources import Listing, Source
 from mwdn.errors import ImageError, MwdnError, ParameterError, UnknownNameError
 from mwdn.io.files import refuse_overwrite
 from mwdn.types import Frame, Psf, Size
-
-T = TypeVar("T", "Layout", FrameFormat)
 
 Pair = tuple[str, Frame, Frame]
 """A name, a measurement and a scene, both (H, W, C), RGB, row 0 at the top, integers or floats in [0, 1]."""
@@ -157,7 +155,7 @@ def read_pairs(
         camera = None
     of_folder = KINDS[kind].of_folder
     chosen = of_folder if of_folder and Path(path).is_dir() else KINDS[kind]
-    layout = _override(chosen.layout, layout)
+    layout = replace(chosen.layout, **changed_fields(layout))
     listing = chosen.list_pairs(Path(path), layout.captures or "", layout.scenes or "")
     return read_listing(listing, chosen, layout, frames, camera=camera, skipped=skipped, track=track)
 
@@ -205,12 +203,6 @@ def read_listing(
         yield source.name, *pair
 
 
-def _override(usual: T, changes: T) -> T:
-    """Replace the fields of ``usual`` that ``changes`` sets to something other than their default."""
-    values = {f.name: (getattr(changes, f.name), f.default) for f in dataclasses.fields(changes)}
-    return replace(usual, **{name: value for name, (value, default) in values.items() if value != default})
-
-
 def _convert(
     source: Source, kind: Kind, layout: Layout, changes: FrameFormat, camera: Calibration | None
 ) -> tuple[Frame, Frame]:
@@ -218,7 +210,7 @@ def _convert(
     stored = source.load()
     capture, scene = stored
     usual = kind.raw_frames if kind.raw_frames is not None and capture.shape[2] == 1 else kind.frames
-    frames = _override(usual, changes)
+    frames = replace(usual, **changed_fields(changes))
     full_size = frames.full_size(capture)
     if frames.bgr:
         capture, scene = (np.ascontiguousarray(frame[..., ::-1]) for frame in stored)
