@@ -11,7 +11,7 @@ from mwdn.calibration import Calibration, FrameFormat
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.progress import track
 from mwdn.cli.terminal import counted, if_interrupted, note, notes, say
-from mwdn.data.digicam import DigiCam, import_digicam
+from mwdn.data.digicam import DigiCam, ImportedMasks, import_digicam
 from mwdn.data.importers import import_pairs, refuse_corrections
 from mwdn.data.kinds import KINDS, Layout
 from mwdn.errors import ParameterError
@@ -58,13 +58,10 @@ def import_(  # noqa: PLR0913
     if kind == "digicam":
         refuse_corrections(kind, calibration)
         with if_interrupted(lambda: f"Interrupted. Files that are complete are kept: {out.parent}."):
-            done = import_digicam(
+            masks = import_digicam(
                 path, out, digicam, layout=layout, frames=frames, skip_damaged=skip_damaged, track=progress
             )
-        _name_skipped(done.skipped)
-        for (file, (label, count)), psf in zip(done.files.items(), done.psfs, strict=True):
-            mask = f" of mask {label}" if label else ""
-            say(f"{counted(count, 'pair')}{mask} written to {file}, its PSF to {psf}")
+        _report_masks(masks)
         return
     with if_interrupted(lambda: f"Interrupted. Nothing is kept: {out} is written when all pairs are done."):
         result = import_pairs(
@@ -80,8 +77,14 @@ def import_(  # noqa: PLR0913
         )
     _name_skipped(result.skipped)
     names = f": {', '.join(result.skipped)}" if result.skipped else ""
-    summary = f"{counted(result.count, 'pair')} written to {out}, {len(result.skipped):,} skipped{names}"
-    say(summary)
+    say(f"{counted(result.count, 'pair')} written to {out}, {len(result.skipped):,} skipped{names}")
+
+
+def _report_masks(masks: ImportedMasks) -> None:
+    _name_skipped(masks.skipped)
+    for (file, (label, count)), psf in zip(masks.files.items(), masks.psfs, strict=True):
+        mask = f" of mask {label}" if label else ""
+        say(f"{counted(count, 'pair')}{mask} written to {file}, its PSF to {psf}")
 
 
 def _unused(kind: str, path: Path, layout: Layout) -> list[str]:
