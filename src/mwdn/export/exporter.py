@@ -19,7 +19,7 @@ from torch.utils._pytree import tree_flatten, tree_unflatten
 from mwdn.calibration import Calibration
 from mwdn.errors import ExportError, ParameterError
 from mwdn.export.loops import as_loops
-from mwdn.export.model_file import as_export_error, publish, run_file, write_file
+from mwdn.export.model_file import as_export_error, publish, require_onnx, run_file, write_file
 from mwdn.inference.fusion import fuse
 from mwdn.inference.methods import Method, as_method, psf_for
 from mwdn.inference.reconstructor import Reconstructor
@@ -27,7 +27,6 @@ from mwdn.io.files import refuse_overwrite
 from mwdn.io.pictures import dark_scene
 from mwdn.networks.network import Network, as_network
 from mwdn.optics import Camera, Sensor
-from mwdn.runtime.requirement import require
 from mwdn.types import Measurement, Psf, Scene
 from mwdn.version import __version__
 
@@ -149,13 +148,7 @@ def export(
             with as_export_error(file):
                 quantise(file, simulate_captures(calibration, ("cat", "coffee"), channels))
         reached = agreement(run_file(file, measurement), expected)
-        required = MIN_AGREEMENT[precision] if least is None else least
-        if not reached >= required:  # also refuses NaN
-            raise ExportError(
-                f"`{out}` must agree with `{name}` to {required:.1f} dB, but does to {reached:.1f} dB; it is not "
-                f"written. {'Report this' if precision == 'float32' else 'Use `--precision float32`'}, or lower "
-                "`--least`."
-            )
+        check_agreement(reached, f"`{out}`", name, least=least, precision=precision)
         publish(file, out)
     return Exported(out, reached, about)
 
@@ -164,6 +157,26 @@ def agreement(result: Scene, expected: Scene) -> float:
     """PSNR in dB of the worst picture of a batch; the peak is the brightest expected pixel of the batch."""
     error = (result - expected).square().mean((1, 2, 3)).amax()
     return float(10 * torch.log10(expected.abs().max().square() / error))
+
+
+def check_agreement(
+    reached: float, output: str, method: str, *, least: float | None = None, precision: Precision = "float32"
+) -> None:
+    """Raise an `ExportError` unless an output agrees with its method well enough.
+
+    Args:
+        reached: result of `agreement`.
+        output: what is exported, for the message.
+        method: its name.
+        least: minimum in dB; that of the precision, see `MIN_AGREEMENT`, unless given.
+        precision: of the output.
+    """
+    required = MIN_AGREEMENT[precision] if least is None else least
+    if not reached >= required:  # also refuses NaN
+        raise ExportError(
+            f"{output} must agree with `{method}` to {required:.1f} dB, but does to {reached:.1f} dB; it is not "
+            f"written. {'Report this' if precision == 'float32' else 'Use `--precision float32`'}, or lower `--least`."
+        )
 
 
 def simulate_captures(calibration: Calibration, names: tuple[str, ...], channels: int) -> Measurement:
@@ -195,8 +208,7 @@ def _check(out: Path, precision: str, channels: int | None) -> None:
     if out.is_dir():
         raise ParameterError(f"`{out}` must be a file, but is a folder.")
     if out.suffix == ".onnx":
-        for module in ("onnx", "onnxruntime"):
-            require(module, "export", purpose="ONNX")
+        require_onnx()
 
 
 def _about(name: str, calibration: Calibration, channels: int, precision: str) -> dict[str, str]:

@@ -21,6 +21,12 @@ ABOUT = "mwdn.json"
 """Name of the description inside a ``.pt2`` file; an ONNX file holds it as its metadata."""
 
 
+def require_onnx() -> None:
+    """Raise a `MissingPackageError` unless onnx and onnxruntime are installed."""
+    for module in ("onnx", "onnxruntime"):
+        require(module, "export", purpose="ONNX")
+
+
 def write_file(file: Path, program: ExportedProgram, about: dict[str, str]) -> None:
     """Write a program in the format of the file's suffix.
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.utils._pytree import TreeSpec, tree_flatten, tree_unflatten
 
 from mwdn.errors import ExportError
-from mwdn.export.model_file import as_export_error
+from mwdn.export.model_file import as_export_error, require_onnx
 from mwdn.export.onnx_program import to_onnx
 from mwdn.inference.fusion import fuse
 from mwdn.networks.network import Network, as_network
@@ -72,8 +72,7 @@ def network_models(network: Network[Any], size: Size, channels: int) -> NetworkM
         MissingPackageError: onnx or onnxruntime is not installed.
         ExportError: an operation has no ONNX form.
     """
-    for module in ("onnx", "onnxruntime"):
-        require(module, "export", purpose="ONNX")
+    require_onnx()
     network = copy.deepcopy(network).cpu().eval().requires_grad_(False)
     psf = torch.full((1, channels, *size), 1 / (size[0] * size[1]))
     with torch.no_grad():

@@ -10,8 +10,8 @@ from torch import Tensor
 from mwdn.calibration import Calibration
 from mwdn.calibration.pixel_repair import PixelRepair
 from mwdn.calibration.refinement import DIMMEST
-from mwdn.errors import ExportError, ParameterError
-from mwdn.export.exporter import MIN_AGREEMENT, Exported, agreement, simulate_captures
+from mwdn.errors import ParameterError
+from mwdn.export.exporter import Exported, agreement, check_agreement, simulate_captures
 from mwdn.export.network_models import NetworkModels, network_models, run_models
 from mwdn.export.site_scripts import constant, joined_modules, read_static, stored
 from mwdn.export.web_runtime import BINARIES, LIBRARIES, PACKAGE, VERSION, read_runtime
@@ -87,12 +87,7 @@ def export_site(
     exact = Reconstructor(network, calibration, align=False, device="cpu", precision="exact")
     scenes = exact.as_recorded(exact.on_device(captures.float() / 65535))
     reached = _compare(models, calibration, captures, scenes, channels)
-    required = MIN_AGREEMENT["float32"] if least is None else least
-    if not reached >= required:  # also refuses NaN
-        raise ExportError(
-            f"The page must agree with `{_title(method)}` to {required:.1f} dB, but does to {reached:.1f} dB; it is "
-            "not written. Report this, or lower `--least`."
-        )
+    check_agreement(reached, "The page", _title(method), least=least)
     about = {"method": _title(method), "version": __version__, "runtime": f"{PACKAGE} {VERSION}"}
     camera = _camera(calibration, about | {"name": name}, channels, scenes)
     images = {key: _bytes(image) for key, image in _images(calibration).items()}
