@@ -210,8 +210,9 @@ def _simulate(
 ) -> None:
     """Training, validation and test, in this order, from three sets of photographs that share none."""
     learned, held_out = Photographs(recipe.photos).split(HELD_OUT)
+    source = simulated_pairs(recipe, calibration, learned, device)
     parts = [
-        (simulated_pairs(recipe, calibration, photographs, device), range(start, start + count))
+        (replace(source, photographs=photographs.to(device)), range(start, start + count))
         for photographs, start, count in (
             (learned, 0, recipe.train),
             (held_out, START, recipe.validation),
