@@ -22,6 +22,9 @@ LEAST = 0.02
 HIGHEST = {"envelope": 1, "psf_gain": 3, "sensor_field": 2, "stray_light": 2, "field_dependence": 2}
 """Terms, and the highest order of each."""
 
+LAST = "field_dependence"
+"""Term that is tried when no other one is taken any more."""
+
 KERNELS = Terms(psf_gain=3, field_dependence=2).kernels
 
 LEAST_PAIRS = 2
@@ -113,26 +116,24 @@ def select_terms(
         raise ParameterError(f"`pairs` ({len(model)}) must be {LEAST_PAIRS} or more: each in turn is left out.")
     steps = [_tried(model, "", 0, Terms())]
     report(steps[0])
-    names, last = HIGHEST.keys() - {"field_dependence"}, HIGHEST.keys() & {"field_dependence"}
-    while True:
-        before = [step for step in steps if step.taken][-1]
-        tried = [
-            _tried(model, term, order, replace(before.terms, **{term: order}))
-            for term, highest in HIGHEST.items()
-            for order in range(getattr(before.terms, term) + 1, highest + 1)
-            if term in names
-        ]
-        best = min(tried, key=lambda step: step.mean, default=None)
-        taken = best if best is not None and _is_better(best, before) else None
-        for step in tried:
-            steps.append(replace(step, taken=step is taken))
-            report(steps[-1])
-        if taken is None and not last:
-            return Selection(plain, displaced, tuple(steps))
-        if taken is None:
-            names, last = last, set()
-        elif taken.term == "envelope":
-            displaced = model = _displaced(model, taken.terms, psf, pairs)
+    for names in ([name for name in HIGHEST if name != LAST], [LAST]):
+        while True:
+            before = [step for step in steps if step.taken][-1]
+            tried = [
+                _tried(model, term, order, replace(before.terms, **{term: order}))
+                for term in names
+                for order in range(getattr(before.terms, term) + 1, HIGHEST[term] + 1)
+            ]
+            best = min(tried, key=lambda step: step.mean, default=None)
+            taken = best if best is not None and _is_better(best, before) else None
+            for step in tried:
+                steps.append(replace(step, taken=step is taken))
+                report(steps[-1])
+            if taken is None:
+                break
+            if taken.term == "envelope":
+                displaced = model = _displaced(model, taken.terms, psf, pairs)
+    return Selection(plain, displaced, tuple(steps))
 
 
 def _displaced(model: PairModel, terms: Terms, psf: Psf, pairs: Callable[[], Pairs]) -> PairModel:
