@@ -225,6 +225,20 @@ def _check(benchmark: Benchmark) -> None:
     for label in (*benchmark.ablation, *([benchmark.compared] if benchmark.compared else [])):
         if label not in labels:
             raise UnknownNameError("method of this recipe", label, labels)
+    _check_training(benchmark)
+    for name, recipe in benchmark.data.items():
+        _check_dataset(name, recipe, benchmark.data)
+    simulated = [name for name, recipe in benchmark.data.items() if not recipe.pairs]
+    if benchmark.robustness.sizes and not benchmark.robustness.data:
+        raise ParameterError(
+            f"[robustness] ({', '.join(benchmark.robustness.sizes)}) must name the simulated data set to test: "
+            f'`data = "{(simulated or ["mwdn-sim"])[0]}"`.'
+        )
+    if benchmark.robustness.data not in ("", *simulated):
+        raise UnknownNameError("simulated data set of this recipe", benchmark.robustness.data, simulated)
+
+
+def _check_training(benchmark: Benchmark) -> None:
     # Raises the errors of the schedule, the plateau and the losses.
     Recipe({}, benchmark.schedule, benchmark.loss, benchmark.plateau, benchmark.later_loss)
     endless = [name for name, recipe in benchmark.data.items() if not recipe.pairs and not recipe.train]
@@ -243,16 +257,6 @@ def _check(benchmark: Benchmark) -> None:
         raise ParameterError(f"`trial` ({benchmark.trial}) must be a part of the steps, such as 0.1.")
     if not benchmark.rate_factor > 0:
         raise ParameterError(f"`rate_factor` ({benchmark.rate_factor}) must be positive.")
-    for name, recipe in benchmark.data.items():
-        _check_dataset(name, recipe, benchmark.data)
-    simulated = [name for name, recipe in benchmark.data.items() if not recipe.pairs]
-    if benchmark.robustness.sizes and not benchmark.robustness.data:
-        raise ParameterError(
-            f"[robustness] ({', '.join(benchmark.robustness.sizes)}) must name the simulated data set to test: "
-            f'`data = "{(simulated or ["mwdn-sim"])[0]}"`.'
-        )
-    if benchmark.robustness.data not in ("", *simulated):
-        raise UnknownNameError("simulated data set of this recipe", benchmark.robustness.data, simulated)
 
 
 def _check_dataset(name: str, recipe: DatasetRecipe, names: Iterable[str]) -> None:

@@ -98,31 +98,22 @@ def open_dataset(name: str, recipe: DatasetRecipe, folder: Path, device: torch.d
     if simulates:
         recipe = replace(recipe, sensor=simulated_sensor(recipe.sensor, calibration))
     identity = _identity(recipe, calibration)
-    note = folder / f"{name}.json"
-    own = simulates or recipe.kind  # else the user's file, which is only read
-    path = folder / f"{name}.h5" if own else Path(recipe.pairs)
-    made = read_json(note) if own and note.is_file() and path.is_file() else None
-    if made not in (None, identity):
-        raise ParameterError(
-            f"`{path}` holds pairs that another recipe made. Choose another folder, `out`, or remove it."
-        )
-    if own and made is None:
-        if simulates:
-            _simulate(recipe, calibration, path, device, lambda rows: track(f"{name}: simulating", rows))
-        else:
-            resized = (recipe.camera or recipe.bin > 1) and KINDS[recipe.kind].place is None
-            layout = Layout(scene_size=calibration.size if resized else None)
-            camera = calibration if recipe.camera else None
-            frames = camera.frames if camera else FrameFormat(bin=recipe.bin)
-            import_pairs(recipe.kind, recipe.pairs, path, layout=layout, frames=frames, camera=camera)
-        write_text(note, json.dumps(identity, indent=2))
+    path = Path(recipe.pairs)  # the user's file, which is only read, unless the pairs are simulated or imported
+    if simulates or recipe.kind:
+        path = folder / f"{name}.h5"
+        if not _is_made(path, identity):
+            if simulates:
+                _simulate(recipe, calibration, path, device, lambda rows: track(f"{name}: simulating", rows))
+            else:
+                _import(recipe, calibration, path)
+            write_text(path.with_suffix(".json"), json.dumps(identity, indent=2))
     file = PairFile(path)
     check_pairs(file, calibration.psf)
     rows = _rows(recipe, len(file), simulates)
     refinement = Refinement() if simulates else missing_refinement(file, calibration.refinement)
     pairs = partial(RecordedPairs, file, psf=calibration.psf.to(device), seed=recipe.seed, refinement=refinement)
-    if not own:
-        _refuse_changed(path, note, pairs(rows["test"]).fingerprint)
+    if path == Path(recipe.pairs):
+        _refuse_changed(path, folder / f"{name}.json", pairs(rows["test"]).fingerprint)
     training = None if recipe.trained_on else _training(recipe, calibration, pairs, rows, device)
     test = RefinedPairs(Part(file, rows["test"]), refinement)
     return Dataset(name, recipe, calibration, test, training, identity, file.measurement_shape[2])
@@ -138,6 +129,21 @@ def _refuse_changed(path: Path, note: Path, fingerprint: str) -> None:
             f"`{path}` holds other pairs than those that `{note.parent.parent}` has results of. Choose another folder, "
             "`out`, or remove it."
         )
+
+
+def _is_made(path: Path, identity: dict[str, Any]) -> bool:
+    """Whether a file of pairs is there, of this identity.
+
+    Raises:
+        ParameterError: it is of another one.
+    """
+    note = path.with_suffix(".json")
+    made = read_json(note) if note.is_file() and path.is_file() else None
+    if made not in (None, identity):
+        raise ParameterError(
+            f"`{path}` holds pairs that another recipe made. Choose another folder, `out`, or remove it."
+        )
+    return made is not None
 
 
 def _identity(recipe: DatasetRecipe, calibration: Calibration) -> dict[str, Any]:
@@ -222,6 +228,15 @@ def _simulate(
     attributes: dict[str, Attribute] = {**psf_identity(calibration), "seed": recipe.seed, REFINED: "simulate"}
     channels = 1 if calibration.frames.grey else 3
     record(path, parts, calibration.psf, channels=channels, attributes=attributes, track=track)
+
+
+def _import(recipe: DatasetRecipe, calibration: Calibration, path: Path) -> None:
+    """Convert a public data set, in the format of the recipe's camera if it names one."""
+    is_resized = (recipe.camera or recipe.bin > 1) and KINDS[recipe.kind].place is None
+    layout = Layout(scene_size=calibration.size if is_resized else None)
+    camera = calibration if recipe.camera else None
+    frames = camera.frames if camera else FrameFormat(bin=recipe.bin)
+    import_pairs(recipe.kind, recipe.pairs, path, layout=layout, frames=frames, camera=camera)
 
 
 def _rows(recipe: DatasetRecipe, count: int, simulates: bool) -> dict[str, range | list[int]]:
