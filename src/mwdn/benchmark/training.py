@@ -150,8 +150,7 @@ def _trainer(
     training, validation = dataset.training
     network = {"name": method.name, **options(method, dataset)}
     recipe = Recipe(network, schedule, benchmark.loss, benchmark.plateau, benchmark.later_loss)
-    stored = stored_psf(recipe, dataset.calibration)
-    stored = None if stored is None else stored.to(device)
+    stored = stored_psf(recipe, dataset.calibration, device)
     psf = dataset.calibration.psf.to(device) if stored is None else stored
     return Trainer(
         recipe,

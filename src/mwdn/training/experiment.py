@@ -6,6 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+import torch
+
 from mwdn.calibration import Calibration
 from mwdn.calibration.places import field_camera
 from mwdn.calibration.psf_identity import psf_identity
@@ -119,21 +121,16 @@ def prepare(
     recipe = _with_sensor(recipe, calibration)
     psf = calibration.psf.to(place)
     _check_one_source(recipe, photos, pairs)
-    captures = _read_captures(recipe, calibration, exclude)
-    captures = None if captures is None else captures.to(place)
+    captures = _read_captures(recipe, calibration, exclude, place)
     if recipe.selfsupervised.consistency and captures is not None:
         data = captures_alone(recipe, captures, psf)
         captures = None  # shown as samples of the validation
     elif pairs is not None:
         data = recorded_pairs_of(recipe, pairs, psf, refinement=calibration.refinement)
     elif photos is not None:
-        one_camera = not (recipe.cameras.sizes or recipe.denoising.levels[1])
-        if calibration.frames.grey and one_camera:
-            _check_colours(recipe, 1, "this camera (`grey`)")
-        data = simulated_captures(recipe, photos, psf)
+        data = simulated_captures(recipe, photos, psf, is_grey=calibration.frames.grey)
     recipe = _in_steps(recipe, data)
-    stored = stored_psf(recipe, calibration)
-    stored = None if stored is None else stored.to(place)
+    stored = stored_psf(recipe, calibration, place)
     task, validation = (with_stored_psf(part, stored) for part in (data.task, data.validation))
     validator = Validator(recipe, validation, psf if stored is None else stored, captures)
     trainer = Trainer(recipe, task, out=out, calibration=calibration, validator=validator, device=place)
@@ -147,8 +144,14 @@ def prepare(
     return trainer
 
 
-def simulated_captures(recipe: Recipe, photos: Path, psf: Psf) -> TrainingData:
-    """Captures simulated from photographs, through one camera or random ones; or noisy scenes for a denoiser."""
+def simulated_captures(recipe: Recipe, photos: Path, psf: Psf, *, is_grey: bool = False) -> TrainingData:
+    """Captures simulated from photographs, through one camera or random ones; or noisy scenes for a denoiser.
+
+    Raises:
+        ParameterError: the one camera is grey, but the network takes colours.
+    """
+    if is_grey and not (recipe.cameras.sizes or recipe.denoising.levels[1]):
+        _check_colours(recipe, 1, "this camera (`grey`)")
     photographs, held_out = Photographs(photos).to(psf.device).split(HELD_OUT)
     grey = getattr(build_empty(**recipe.network), "channels", 0) == 1
     pairs, held_out_pairs = (_simulated_pairs(recipe, part, psf, grey=grey) for part in (photographs, held_out))
@@ -205,12 +208,14 @@ def _check_one_source(recipe: Recipe, photos: Path | None, pairs: Path | None) -
         raise ParameterError(f"`--photos` ({photos}) and `--pairs` ({pairs}) exclude each other. Leave one out.")
 
 
-def _read_captures(recipe: Recipe, calibration: Calibration, exclude: Mapping[str, Path] | None) -> Measurement | None:
+def _read_captures(
+    recipe: Recipe, calibration: Calibration, exclude: Mapping[str, Path] | None, device: torch.device
+) -> Measurement | None:
     """Captures of [sheet]: all to learn from them, otherwise as many as a contact sheet shows."""
     if not recipe.sheet.captures:
         return None
     files = find_captures(recipe.sheet.captures, exclude=exclude)
-    return read_captures(files if recipe.selfsupervised.consistency else files[:SHOWN], calibration)
+    return read_captures(files if recipe.selfsupervised.consistency else files[:SHOWN], calibration).to(device)
 
 
 def _simulated_pairs(recipe: Recipe, photographs: Photographs, psf: Psf, *, grey: bool) -> SimulatedPairs:

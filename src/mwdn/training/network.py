@@ -76,7 +76,7 @@ def check_colours(network: Mapping[str, Any], colours: int, *, of: str, way_out:
         )
 
 
-def stored_psf(recipe: Recipe, calibration: Calibration) -> Psf | None:
+def stored_psf(recipe: Recipe, calibration: Calibration, device: torch.device) -> Psf | None:
     """The PSF (1, C, H, W) for a network that takes it as stored; ``None`` for the others, which take the samples'.
 
     Raises:
@@ -90,7 +90,7 @@ def stored_psf(recipe: Recipe, calibration: Calibration) -> Psf | None:
             f"[network] {recipe.network} takes the PSF as stored, of one camera: leave [cameras], [selfsupervised] and "
             "`aligned` of [pairs] out of the recipe."
         )
-    return psf_for(network, calibration)
+    return psf_for(network, calibration).to(device)
 
 
 @torch.no_grad()

@@ -82,8 +82,8 @@ class Trainer:
         self.optimiser = make_optimiser(self.network, self.schedule)
         self.lr_schedule = make_lr_schedule(recipe)
         # Copied before a saved run resumes: these are the weights of `start`.
-        held = self.schedule.anchor > 0 or self.schedule.start_share > 0
-        weights = self.network.state_dict().items() if held else ()
+        needs_start = self.schedule.anchor > 0 or self.schedule.start_share > 0
+        weights = self.network.state_dict().items() if needs_start else ()
         self.start = {name: value.clone() for name, value in weights if name not in MEASURED_BUFFERS}
         self.gradient = Gradient(self.network, task, self.distance, self.schedule, self.device)
         self.step, self.best, self.fingerprint = 0, -math.inf, ""
