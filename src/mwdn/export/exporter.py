@@ -21,7 +21,7 @@ from mwdn.errors import ExportError, ParameterError
 from mwdn.export.loops import as_loops
 from mwdn.export.model_file import as_export_error, publish, require_onnx, run_file, write_file
 from mwdn.inference.fusion import fuse
-from mwdn.inference.methods import Method, as_method, psf_for
+from mwdn.inference.methods import Method, as_method, method_name, psf_for
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import refuse_overwrite
 from mwdn.io.pictures import dark_scene
@@ -125,7 +125,7 @@ def export(
     out = Path(out)
     _check(out, precision, channels)
     refuse_overwrite(out)
-    name = str(method) if isinstance(method, str | Path) else type(method).__name__
+    name = method_name(method)
     method = as_method(method, **options)
     channels = channels or calibration.psf.shape[1]
     about = _about(name, calibration, channels, precision)

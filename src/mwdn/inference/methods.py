@@ -71,6 +71,11 @@ def as_method(method: Method | str | Path, **options: Any) -> Method:  # noqa: A
     return method
 
 
+def method_name(method: Method | str | Path) -> str:
+    """The name or path of a method as given, or the name of an object's type."""
+    return str(method) if isinstance(method, str | Path) else type(method).__name__
+
+
 def psf_for(method: object, calibration: Calibration) -> Psf:
     """The PSF that a method takes, (1, C, H, W).
 

@@ -15,7 +15,7 @@ from mwdn.errors import ParameterError, ShapeError, check_batch, check_light, ch
 from mwdn.fourier.convolution import check_fit
 from mwdn.inference.engine import Engine, Precision
 from mwdn.inference.ensemble import Ensemble
-from mwdn.inference.methods import Method, as_method, background_warning, psf_for, psf_warning
+from mwdn.inference.methods import Method, as_method, background_warning, method_name, psf_for, psf_warning
 from mwdn.io.formats import as_frame
 from mwdn.networks.blocks import check_channels
 from mwdn.networks.network import Network, as_network
@@ -91,13 +91,11 @@ class Reconstructor:
         self.calibration = calibration
         self.white_balance = calibration.white_balance if white_balance is None else white_balance
         check_white_balance(self.white_balance, calibration.light)
-        self.warning = None
-        self.name = str(method) if isinstance(method, str | Path) else type(method).__name__
-        if isinstance(method, str | Path):
-            self.warning = psf_warning(method, calibration)
+        self.name = method_name(method)
+        warning = psf_warning(method, calibration) if isinstance(method, str | Path) else None
         self.method: Method = as_method(method, **options)
         method = self.method
-        self.warning = self.warning or background_warning(self.name, method, calibration)
+        self.warning = warning or background_warning(self.name, method, calibration)
         aligns = isinstance(method, Network) and method.align
         self.align = aligns if align is None else align
         sought = aligns and self.align and calibration.ambient is None
