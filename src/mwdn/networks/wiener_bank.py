@@ -119,10 +119,11 @@ class WienerBank(Network[BankTransfers]):
                 f"`mean_light` ({mean_light}) and `evidence` ({evidence}) need iterations: `finest` 1, 2, 4 or 8."
             )
         positive = {"width": width, "fold": fold, "block": block}
-        for name, value in (positive | {"rounds": rounds, "distortion": distortion, "shading": shading or 0}).items():
-            minimum = int(name in positive)
-            if value < minimum:
-                raise ParameterError(f"`{name}` ({value}) must be at least {minimum}.")
+        others = {"rounds": rounds, "distortion": distortion, "shading": shading or 0}
+        for least, numbers in ((1, positive), (0, others)):
+            for name, value in numbers.items():
+                if value < least:
+                    raise ParameterError(f"`{name}` ({value}) must be at least {least}.")
         self.channels, self.fold, self.regularisations = channels, fold, regularisations
         self.finest, self.align, self.block = finest, align, block
         self.levels = pyramid_levels(finest)
