@@ -3,7 +3,7 @@
 import io
 import math
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -103,6 +103,11 @@ def as_damage(what: str, advice: str) -> Iterator[None]:
         raise ImageError(f"{what}: {reason(error)}. {advice}") from error
 
 
+def as_incomplete(path: Path, advice: str) -> AbstractContextManager[None]:
+    """`as_damage` for the structure of a whole file."""
+    return as_damage(f"`{path}` is not a complete HDF5 file", advice)
+
+
 def open_hdf5(path: Path, advice: str) -> Any:  # noqa: ANN401
     """Open a file for reading.
 
@@ -116,7 +121,7 @@ def open_hdf5(path: Path, advice: str) -> Any:  # noqa: ANN401
     import h5py
 
     open_regular(path).close()
-    with as_damage(f"`{path}` is not a complete HDF5 file", advice):
+    with as_incomplete(path, advice):
         # No lock: finished files never change, and many shared file systems of clusters do not support locks. A file
         # that this process has open with a lock, as in a notebook, can only be opened in the same way.
         for locking in (False, None):
@@ -160,7 +165,7 @@ def open_hdf5_header(path: Path, advice: str) -> Iterator[Any]:
 
     open_regular(path).close()
     with ExitStack() as stack:
-        with as_damage(f"`{path}` is not a complete HDF5 file", advice):
+        with as_incomplete(path, advice):
             file = stack.enter_context(h5py.File(stack.enter_context(_CheckedHeaps(path)), "r"))
             if file.id.get_create_plist().get_sizes() != (8, 8):
                 raise ImageError(f"`{path}` has addresses or lengths of other than 8 bytes. {advice}")
@@ -270,5 +275,5 @@ def read_attributes(path: Path, file: Any, advice: str) -> dict[str, Numbers]:  
 
 def names_in(path: Path, file: Any) -> str:  # noqa: ANN401
     """The first names in a file, for a message."""
-    with as_damage(f"`{path}` is not a complete HDF5 file", "It is damaged."):
+    with as_incomplete(path, "It is damaged."):
         return str(sorted(islice(file, 4)))[:80]

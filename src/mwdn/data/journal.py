@@ -27,7 +27,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from mwdn.data.hdf5 import CheckedFile, as_damage, open_hdf5_header, read_attributes
+from mwdn.data.hdf5 import CheckedFile, as_damage, as_incomplete, open_hdf5_header, read_attributes
 from mwdn.errors import ImageError
 from mwdn.io.files import check_regular
 from mwdn.io.reading import open_regular, read_bytes
@@ -176,7 +176,7 @@ def open_growing(path: Path) -> Iterator[Growing]:
             if IDENTITY not in read_attributes(path, file, advice):
                 raise ImageError(f"`{path}` was not made by this command: it cannot grow. {advice}")
         with JournalledFile(path, "r+") as disk:
-            with as_damage(f"`{path}` is not a complete HDF5 file", advice):
+            with as_incomplete(path, advice):
                 file = h5py.File(disk, "r+")
             with _finished(Growing(path, disk, file)) as growing:
                 yield growing

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from mwdn.data.hdf5 import as_damage, find_rows, names_in, open_hdf5, open_hdf5_header, read_attributes
+from mwdn.data.hdf5 import as_damage, as_incomplete, find_rows, names_in, open_hdf5, open_hdf5_header, read_attributes
 from mwdn.data.journal import IDENTITY
 from mwdn.data.pair_writer import NAMES, VERSION, VERSION_KEY, Attribute, PairWriter, PixelType, Shape
 from mwdn.errors import ImageError, ParameterError, shown
@@ -208,7 +208,7 @@ def _read_header(path: Path, file: Any) -> _Header:  # noqa: ANN401
 
 
 def _read_shapes(path: Path, file: Any) -> tuple[int, Shape, Shape]:  # noqa: ANN401
-    with as_damage(f"`{path}` is not a complete HDF5 file", _MAKE_AGAIN):
+    with as_incomplete(path, _MAKE_AGAIN):
         if "gt" in file and "blur" in file:
             raise ImageError(f"`{path}` is the authors' file: `mwdn import mwdn {path} -o pairs.h5`.")
     shapes = []

@@ -90,15 +90,18 @@ def fit_points(
     if matrix is None or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-12:
         raise AlignmentError(f"No homography fits the {count} points. Three of them may lie on a line.")
     inliers = found.ravel() > 0 if count > 4 else np.ones(count, bool)
-    if inliers.sum() < 4:
-        raise AlignmentError(f"No homography fits 4 of the {count} points within {tolerance_px:g} px.")
+    _check_inliers(inliers, tolerance_px)
     start = Projection.from_homography(matrix, picture_size, camera_size)
     best = _descend(start, _Seen.of(picture, camera, errors).part(inliers), radial=False)
     residuals = camera - best.to_camera(picture)
     inliers = np.hypot(*residuals.T) <= tolerance_px
-    if inliers.sum() < 4:
-        raise AlignmentError(f"No homography fits 4 of the {count} points within {tolerance_px:g} px.")
+    _check_inliers(inliers, tolerance_px)
     return PointFit(best, residuals, inliers)
+
+
+def _check_inliers(inliers: npt.NDArray[np.bool_], tolerance_px: float) -> None:
+    if inliers.sum() < 4:
+        raise AlignmentError(f"No homography fits 4 of the {len(inliers)} points within {tolerance_px:g} px.")
 
 
 def correct(
