@@ -15,7 +15,7 @@ from mwdn.cli.camera import CameraOptions
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.method_options import MethodOptions, read_options
 from mwdn.cli.progress import track
-from mwdn.cli.terminal import Json, counted, if_interrupted, print_json, say, warn
+from mwdn.cli.terminal import Json, all_or_nothing, counted, print_json, say, warn
 from mwdn.data.captures import read_capture
 from mwdn.data.pair_writer import SUFFIXES, check_path
 from mwdn.errors import ParameterError
@@ -135,7 +135,7 @@ def _align_session(task: _Task, capture: Path, out: Path, count: int, *, levels:
     task.check_outputs(out, page, sidecar)
     with (
         CapturedPairs(capture, task.calibration, display_gamma=task.gamma or 1.0) as pairs,
-        if_interrupted(lambda: f"Interrupted. Nothing is kept: {out} is written when all pairs are done."),
+        all_or_nothing(out),
     ):
         rows = chosen(len(pairs), count)
         reconstructor = task.prepare(pairs.calibration)

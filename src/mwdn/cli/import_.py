@@ -10,7 +10,7 @@ from rich.markup import escape
 from mwdn.calibration import Calibration, FrameFormat
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.progress import track
-from mwdn.cli.terminal import counted, if_interrupted, note, notes, say
+from mwdn.cli.terminal import all_or_nothing, counted, if_interrupted, note, notes, say
 from mwdn.data.digicam import DigiCam, ImportedMasks, import_digicam
 from mwdn.data.importers import import_pairs, refuse_corrections
 from mwdn.data.kinds import KINDS, Layout
@@ -63,7 +63,7 @@ def import_(  # noqa: PLR0913
             )
         _report_masks(masks)
         return
-    with if_interrupted(lambda: f"Interrupted. Nothing is kept: {out} is written when all pairs are done."):
+    with all_or_nothing(out):
         result = import_pairs(
             kind,
             path,

@@ -1,7 +1,8 @@
 """Output to the terminal, by what it is: set for each command by --quiet, --verbose and --json."""
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
 from typing import Annotated, Any
 
 from cyclopts import Parameter
@@ -107,3 +108,8 @@ def if_interrupted(message: Callable[[], str]) -> Iterator[None]:
         yield
     except KeyboardInterrupt as interrupt:
         raise KeyboardInterrupt(str(interrupt) or message()) from interrupt
+
+
+def all_or_nothing(pairs: Path) -> AbstractContextManager[None]:
+    """`if_interrupted` while a file of pairs is written, which appears when it is complete."""
+    return if_interrupted(lambda: f"Interrupted. Nothing is kept: {pairs} is written when all pairs are done.")

@@ -14,7 +14,7 @@ from mwdn.cli.camera import CameraOptions
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.progress import Progressing, show_progress, track
 from mwdn.cli.recipe_keys import RecipeKeys, recipe_changes
-from mwdn.cli.terminal import counted, if_interrupted, note, notes, say, warn
+from mwdn.cli.terminal import all_or_nothing, counted, note, notes, say, warn
 from mwdn.data.captures import list_captures
 from mwdn.data.pair_checks import other_camera
 from mwdn.data.pairs import PairFile
@@ -194,6 +194,6 @@ def simulate(
     note(*unused_photographs(photos))
     calibration = camera.load()
     _note_colours(calibration, "--grey")
-    with if_interrupted(lambda: f"Interrupted. Nothing is kept: {out} is written when all pairs are done."):
+    with all_or_nothing(out):
         experiment.simulate(simulation, calibration, photos=photos, out=out, count=count, exact=exact, track=progress)
     say(f"{counted(count, 'pair')} written to {out}")
