@@ -179,14 +179,7 @@ def _score_all(
 ) -> dict[str, MethodResult]:
     """Scores of all methods on a data set, by label."""
     sides = dataset.protocol.crop(dataset.calibration.psf).shape[-2:]
-
-    def perceptual() -> Perceptual:
-        if min(sides) < SMALLEST:
-            return Perceptual.none(
-                f"the part {dataset.protocol.name} has less than {SMALLEST} pixels a side, for AlexNet"
-            )
-        return load_perceptual()
-
+    perceptual = Perceptual.none if min(sides) < SMALLEST else load_perceptual  # `evaluate` says why
     results = {}
     watch.stage(f"{dataset.name}: scoring", len(benchmark.methods))
     for number, method in enumerate(benchmark.methods):
