@@ -9,7 +9,8 @@ from mwdn.diagnosis.encoding import gamma
 from mwdn.diagnosis.mosaic import mosaic
 from mwdn.diagnosis.noise import noise
 from mwdn.diagnosis.verdict import Verdict
-from mwdn.types import Frame
+from mwdn.errors import ImageError
+from mwdn.types import Frame, Measurement
 
 DIM = 0.03
 """Fraction of the full scale that the brightest thousandth of a capture must reach."""
@@ -33,6 +34,12 @@ def examine_capture(frame: Frame, calibration: Calibration, *, for_viewing: bool
     if raw.state == "doubt":  # the noise test needs a known mosaic
         return verdicts
     return *verdicts, gamma(frame, calibration, for_viewing=for_viewing)
+
+
+def refuse_dark(measurement: Measurement) -> None:
+    """Raise an `ImageError` if a measurement has no light."""
+    if measurement.amax() <= 0:
+        raise ImageError("The sensor saw no light: no pixel is brighter than the dark frame, or black.")
 
 
 def saturation(frame: Frame, calibration: Calibration) -> Verdict:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from mwdn.calibration.frame_operations import enlarge
 from mwdn.data.captures import read_capture
 from mwdn.diagnosis import Verdict
-from mwdn.diagnosis.captures import examine_capture
+from mwdn.diagnosis.captures import examine_capture, refuse_dark
 from mwdn.diagnosis.exif import exif_turn, settle_exif
 from mwdn.diagnosis.psf_encoding import psf_gamma
 from mwdn.diagnosis.sizes import mismatch
@@ -164,8 +164,7 @@ class Batch:
         frame = calibration.frames.read(job.capture)
         measurement = calibration.to_measurement(frame)
         self._check_fit(measurement)
-        if measurement.amax() <= 0:
-            raise ImageError("The sensor saw no light: no pixel is brighter than the dark frame, or black.")
+        refuse_dark(measurement)
         measurement = to_device(measurement, self.reconstruct.device)
         full_size = calibration.frames.full_size(frame) if self.full_size else None
         measurement, share = self.reconstruct.without_room_light(measurement)

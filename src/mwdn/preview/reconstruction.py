@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from mwdn.calibration import Calibration
-from mwdn.diagnosis.captures import examine_capture
+from mwdn.diagnosis.captures import examine_capture, refuse_dark
 from mwdn.diagnosis.sizes import mismatch
 from mwdn.diagnosis.trust import check_size, examine_picture
 from mwdn.errors import ImageError, ShapeError
@@ -177,8 +177,7 @@ def to_measurement(frame: Frame, calibration: Calibration, limits: Limits) -> Me
         calibration.check_fit(measurement)
     except ShapeError as error:
         raise mismatch(error, measurement, calibration) from None
-    if measurement.amax() <= 0:
-        raise ImageError("The sensor saw no light: no pixel is brighter than the dark frame, or black.")
+    refuse_dark(measurement)
     return measurement
 
 
