@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from display_geometry import from_picture
 from mwdn.capture.patterns import dot_centres, dots, grey, point
 from mwdn.capture.rig import EXPOSURE_S, Rig, RigOptions, open_rig
 from mwdn.capture.screen import Place, Screen, place_picture, put
@@ -39,7 +40,7 @@ def test_the_homography_is_that_of_the_frames():
     camera.show(put(dots((126, 126)), place, SCREEN))
     light = camera.read().array[..., 1].astype(float)
     centres = dot_centres((126, 126))
-    whole = camera.homography @ place.from_picture((126, 126))
+    whole = camera.homography @ from_picture(place, (126, 126))
     y, x = np.mgrid[:96, :96]
     for column, row in centres:
         u, v, w = whole @ [column, row, 1]

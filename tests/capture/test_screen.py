@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from display_geometry import from_picture
 from mwdn.capture.screen import Place, Pose, Screen, place_picture, project, put
 from mwdn.errors import ParameterError
 
@@ -58,7 +59,7 @@ def test_a_placed_picture_and_its_matrix_agree():
     picture[3, 6] = 255
     canvas = put(picture, place, SCREEN)
     rows, columns = np.nonzero(canvas[..., 0])
-    x, y = at(place.from_picture((10, 10)), 6, 3)
+    x, y = at(from_picture(place, (10, 10)), 6, 3)
     assert (columns.mean(), rows.mean()) == pytest.approx((x, y))
     assert canvas.shape == (54, 96, 3)
 

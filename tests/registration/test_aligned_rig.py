@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from displayed import natural_pictures
 
+from display_geometry import from_picture
 from mwdn.capture.display import RigDisplay
 from mwdn.capture.recipe import read_capture_recipe
 from mwdn.capture.session import Session
@@ -53,7 +54,7 @@ def test_a_session_on_the_rig_is_aligned(tmp_path, run, patterns, most):
     with open_camera(recipe) as rig:
         session = Session(recipe, rig, RigDisplay(rig), tmp_path / "captured.h5")
         session.run()
-        truth = rig.homography @ session._place.from_picture((120, 120))
+        truth = rig.homography @ from_picture(session._place, (120, 120))
         write_frame(tmp_path / "psf.npy", rig.psf[0].movedim(0, -1).numpy())
     out = tmp_path / "aligned.h5"
     method = ("--method", "admm", "--iterations", "60")

@@ -113,11 +113,6 @@ class Place:
     width: int
     height: int
 
-    def from_picture(self, size: tuple[int, int]) -> Projection:
-        """From the pixels of a picture (height, width) to the display's, over which it is spread."""
-        down, across = self.height / size[0], self.width / size[1]
-        return np.array([[across, 0, (across - 1) / 2 + self.left], [0, down, (down - 1) / 2 + self.top], [0, 0, 1.0]])
-
 
 def place_picture(screen: Screen, size: tuple[int, int], fill: float) -> Place:
     """The largest place of a picture's proportions (in centimetres) within a part of the display, in its middle.
