@@ -11,7 +11,7 @@ from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.method_options import MethodOptions, read_options
 from mwdn.cli.terminal import say
 from mwdn.errors import ParameterError
-from mwdn.export.exporter import MIN_AGREEMENT, Exported, Precision
+from mwdn.export.exporter import Exported, Precision, required_agreement
 
 
 def export(  # noqa: PLR0913
@@ -56,7 +56,7 @@ def export(  # noqa: PLR0913
         exported = write(
             method, camera.load(), out, precision=precision, channels=channels, least=least, **method_options
         )
-        _report(exported, out.stat().st_size, MIN_AGREEMENT[precision] if least is None else least)
+        _report(exported, out.stat().st_size, required_agreement(least, precision))
         return
     if precision != "float32" or channels is not None:
         raise ParameterError("`precision` and `channels` are for files: a page computes in float32, grey and RGB.")
@@ -82,7 +82,7 @@ def _export_page(
 
     exported = export_site(method, camera.load(), out, runtime=runtime, name=web.name, least=least)
     size = sum((out / name).stat().st_size for name in FILES)
-    _report(exported, size, MIN_AGREEMENT["float32"] if least is None else least)
+    _report(exported, size, required_agreement(least))
     say(f"Open {out / FILES[0]}, or copy the folder to a static host.")
 
 

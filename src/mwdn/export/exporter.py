@@ -159,6 +159,11 @@ def agreement(result: Scene, expected: Scene) -> float:
     return float(10 * torch.log10(expected.abs().max().square() / error))
 
 
+def required_agreement(least: float | None, precision: Precision = "float32") -> float:
+    """Minimum agreement in dB: ``least`` if it is given, otherwise that of the precision."""
+    return MIN_AGREEMENT[precision] if least is None else least
+
+
 def check_agreement(
     reached: float, output: str, method: str, *, least: float | None = None, precision: Precision = "float32"
 ) -> None:
@@ -168,10 +173,10 @@ def check_agreement(
         reached: result of `agreement`.
         output: what is exported, for the message.
         method: its name.
-        least: minimum in dB; that of the precision, see `MIN_AGREEMENT`, unless given.
+        least: see `required_agreement`.
         precision: of the output.
     """
-    required = MIN_AGREEMENT[precision] if least is None else least
+    required = required_agreement(least, precision)
     if not reached >= required:  # also refuses NaN
         raise ExportError(
             f"{output} must agree with `{method}` to {required:.1f} dB, but does to {reached:.1f} dB; it is not "
