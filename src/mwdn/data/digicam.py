@@ -26,10 +26,11 @@ from mwdn.calibration import FrameFormat
 from mwdn.data.importers import read_listing, write_pairs
 from mwdn.data.kinds import Kind, Layout
 from mwdn.data.pair_writer import Attribute, check_path
-from mwdn.data.shards import COPY_AGAIN, Shard, find_shards
+from mwdn.data.shards import Shard, find_shards
 from mwdn.data.sources import Listing, Source, files_by_stem, list_folders
 from mwdn.errors import ImageError, ParameterError
 from mwdn.io.files import refuse_overwrite
+from mwdn.io.headers import COPY_AGAIN
 from mwdn.io.images import read_frame, write_linear
 from mwdn.io.npy import read_array
 from mwdn.io.reading import read_text

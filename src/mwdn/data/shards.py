@@ -9,6 +9,7 @@ import numpy as np
 
 from mwdn.data.hdf5 import as_damage
 from mwdn.errors import ImageError
+from mwdn.io.headers import COPY_AGAIN
 from mwdn.io.images import decode_frame
 from mwdn.io.reading import open_regular
 from mwdn.runtime.requirement import require
@@ -19,8 +20,6 @@ SMALLEST_PICTURE = 67
 
 UNPACKED_BYTES, PACKED_PART = 2**28, 20
 """Pictures are compressed already: rows that unpack to over 256 MiB and 20 times the file are refused."""
-
-COPY_AGAIN = "Copy it from its source again."
 
 
 def find_shards(path: Path, patterns: tuple[str, ...] = ("*.parquet",)) -> list[Path]:

@@ -11,8 +11,9 @@ import numpy as np
 from mwdn.data.hdf5 import as_damage, find_rows, names_in, open_hdf5
 from mwdn.data.pair_checks import refuse_raw
 from mwdn.data.pairs import PairFile
-from mwdn.data.shards import COPY_AGAIN, Shard, find_shards, natural_order
+from mwdn.data.shards import Shard, find_shards, natural_order
 from mwdn.errors import ImageError
+from mwdn.io.headers import COPY_AGAIN
 from mwdn.io.images import READABLE, read_frame
 from mwdn.types import Frame
 
