@@ -83,7 +83,7 @@ class Fit:
 
     @property
     def displacement(self) -> tuple[float, float]:
-        """Of the envelope, the mean of the colours; it is linear in the last two kernels."""
+        """Displacement of the envelope, mean of the colours: the gains of the last two kernels."""
         down, right = self.gain[:, -2:].mean(0).tolist()
         return round(down, 5), round(right, 5)
 

@@ -34,7 +34,7 @@ def open_camera(recipe: CaptureRecipe) -> CameraSource:
 
 
 def open_lamp(camera: CameraSource, ask: Callable[[str], None]) -> Callable[[bool], None]:
-    """What switches the point source of a session: the simulated rig's, or a person.
+    """A function that switches the point source of a session: the simulated rig's lamp, or a person is asked.
 
     Args:
         camera: of the session.

@@ -148,7 +148,7 @@ def _kept(camera: Path | None) -> dict[str, Any]:
 
 
 def _by_kept_path(files: Sequence[Path], kept: Path | None) -> list[Path]:
-    """These files; one that is the camera file's, by the path that is there, by which it is known again."""
+    """The files. If the only one is the camera file's own, its path as in the camera file, so that both are equal."""
     if kept is not None and [os.path.realpath(file) for file in files] == [os.path.realpath(kept)]:
         return [kept]
     return [*files]

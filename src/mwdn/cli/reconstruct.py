@@ -167,7 +167,7 @@ def _list_files(captures: Iterable[Path], camera: CameraOptions, out: Path, form
 
 
 def _entry(batch: Batch, capture: str, error: str | None) -> dict[str, object]:
-    """What --json says of one capture."""
+    """Entry of --json for one capture."""
     if error is not None:
         return {"capture": capture, "picture": None, "error": error}
     picture = batch.out / output_name(capture, batch.format)

@@ -86,13 +86,13 @@ def _is_full(error: BaseException) -> TypeGuard[OSError]:
 
 
 def _discard_output() -> None:
-    """What is left in standard output and standard error goes nowhere: Python would try again at its end."""
+    """Discard what is left in standard output and standard error: at its end, Python would try again to write it."""
     for stream in (sys.stdout, sys.stderr):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def how_to_go_on(arguments: Sequence[str]) -> str:
-    """What is kept of an interrupted command, and how to go on; empty if only help was asked for."""
+    """Sentence about what an interrupted command keeps, and how to go on; empty if only help was asked for."""
     command = next((word for word in arguments if not word.startswith("-")), None)
     if command is None or not {"--help", "-h"}.isdisjoint(arguments):
         return ""

@@ -143,7 +143,7 @@ def _train(trainer: Trainer, progress: Progressing, board: TensorBoard | None) -
 
 
 def _measured(trainer: Trainer) -> Iterator[str]:
-    """What was measured of the scenes of recorded pairs; nothing of what fits."""
+    """Sentences about the distortion and the shading of recorded pairs' scenes, if the scenes have any."""
     network, cache = trainer.network, trainer.task.cache
     if cache is None:
         return

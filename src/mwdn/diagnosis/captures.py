@@ -67,9 +67,10 @@ def darkness(frame: Frame, calibration: Calibration) -> Verdict:
 
 
 def ambient_light(frame: Frame, calibration: Calibration) -> Verdict:
-    """How much of the light may be the room's, even or from one side: the darkest spot of the brightest half.
+    """Largest share of the light that can be the room's: that of the darkest spot of the brightest half.
 
-    One capture cannot tell it from bright surroundings, so this is never a doubt.
+    The room's light is even, or comes from one side. One capture cannot tell it from bright surroundings, so this is
+    never a doubt.
     """
     measurement = calibration.correct(frame)
     smooth = F.avg_pool2d(measurement, min(5, *measurement.shape[-2:]), 1)

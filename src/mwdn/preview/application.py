@@ -193,7 +193,7 @@ class Preview:
     async def add_job(self, request: Request) -> Response:
         """Start a reconstruction, and answer at once."""
         form = await read_form(request, self.limits, FILES, TEXTS)
-        parse_look(form.texts)  # of no use here, but never wrong without a word
+        parse_look(form.texts)  # not used here: only checked, so that a mistake is reported now
         job = self._submit(form)
         return JSONResponse(job.content(), 202, {"Location": f"/jobs/{job.id}"})
 
@@ -236,7 +236,7 @@ class Preview:
         return job
 
     def _calibration(self, form: Form) -> Callable[[], Calibration]:
-        """How to get the calibration of a form: an uploaded PSF is read later, in its turn."""
+        """A function that returns the calibration of a form. It reads an uploaded PSF when the job runs."""
         named, options = form.texts.get("camera", ""), form.json("calibration")
         if ("psf" in form.files) == bool(named):
             raise ParameterError("Give either `psf`, a file, or `camera`, the name of a stored calibration.")

@@ -72,7 +72,7 @@ class LivePicture:
 
 
 def finite(value: float) -> float | None:
-    """The number, or ``None`` for JSON if it is none."""
+    """The number; ``None``, for JSON, if it is NaN or infinity."""
     return value if math.isfinite(value) else None
 
 
@@ -152,7 +152,7 @@ class LivePictures:
         return LivePicture(frame, shown, scene, settings, calibration, has_ambient=has_ambient, wrong=wrong)
 
     def _prepared(self, frame: Frame) -> Reconstructor:
-        """The method for the settings of now; those of before if it is refused."""
+        """The method for the current settings; if it is refused, that of the settings before."""
         with self._lock:
             settings, takes_ambient, self._takes_ambient = self.settings, self._takes_ambient, None
         if takes_ambient is not None:

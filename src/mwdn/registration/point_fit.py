@@ -173,7 +173,10 @@ def _evidence(before: Projection, after: Projection, seen: _Seen, free: int) -> 
 
 
 def _prediction(flat: Projection, seen: _Seen) -> float:
-    """Error at points that are left out, with a radial term over without: each row and column of points in turn."""
+    """Error at left-out points of a fit with a radial term, over that of a fit without.
+
+    Each row and each column of points is left out in turn.
+    """
     errors = np.zeros(2)
     count = int(np.clip(np.sqrt(len(seen.picture)), 3, 6))
     for axis in (0, 1):

@@ -40,7 +40,7 @@ class Place:
 
     @classmethod
     def of(cls, corners: Points) -> "Place":
-        """Of corners (4, 2): of the picture's own top left, top right, bottom right and bottom left."""
+        """The place of a picture with these corners (4, 2): its own top left, top right, bottom right, bottom left."""
         edges = np.roll(corners, -1, 0) - corners
         mirrored = edges[0, 0] * edges[1, 1] - edges[0, 1] * edges[1, 0] < 0
         along = edges[0] - edges[2]  # the picture's own rows

@@ -88,10 +88,7 @@ def unexplained(explained: Image, measurement: Measurement) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class SelfSupervisedTask:
-    """Learn from captures alone.
-
-    Validation reports the loss in dB below 1 in place of a PSNR, on the same captures.
-    """
+    """Learn from captures without scenes. Validation is on the same captures."""
 
     samples: UnpairedCaptures
 
@@ -109,6 +106,6 @@ class SelfSupervisedTask:
         return result.loss, result.parts
 
     def score(self, network: nn.Module, distance: Loss, numbers: range) -> Scores:
-        """The same loss; its distance has the weights of the training's current phase."""
+        """The same loss, with the weights of the training's current phase; ``psnr`` is the loss in dB below 1."""
         result = selfsupervised_loss(self.samples, network, distance, numbers)
         return Scores(-10 * torch.log10(result.loss).expand(len(numbers)), float(result.loss), result.pictures)
