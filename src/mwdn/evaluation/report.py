@@ -151,7 +151,7 @@ class Report:
         return json.dumps(self._content(), indent=2, allow_nan=False)
 
     def _content(self) -> dict[str, Any]:
-        content = {
+        return {
             "version": __version__,
             "torch": torch.__version__,
             "protocol": self.protocol,
@@ -160,7 +160,6 @@ class Report:
             "missing": self.missing,
             "methods": {name: scores.content() for name, scores in self.methods.items()},
         }
-        return _finite(content)
 
     def sheet(self) -> Tensor:
         """Contact sheet of the first pictures, (1, 3, H, W) in linear light: scene, measurement, each method."""
