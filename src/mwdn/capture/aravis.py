@@ -108,14 +108,11 @@ class AravisCamera(CameraSource):
             if self._lost:
                 break
             buffer = self._stream.timeout_pop_buffer(int(min(left, 0.5) * 1e6))
-            newer = buffer
-            while newer is not None:
-                newer = self._stream.try_pop_buffer()
-                if newer is not None:
-                    self._stream.push_buffer(buffer)
-                    buffer = newer
             if buffer is None:
                 continue
+            while (newer := self._stream.try_pop_buffer()) is not None:
+                self._stream.push_buffer(buffer)
+                buffer = newer
             try:
                 if buffer.get_status() == library.BufferStatus.SUCCESS:
                     return self._frame(buffer)
