@@ -136,7 +136,8 @@ def inspect_psf(
     psf = calibration.psf.float().cpu()
     colours = [psf[:, [c]] for c in range(psf.shape[1])]
     pairs = [(a, b) for i, a in enumerate(colours) for b in colours[:i]]
-    peak, weak = psf_measures.autocorrelation(psf), psf_spectrum.spectral_zeros(psf)
+    peak = psf_measures.autocorrelation(psf)
+    weak_part, dark_rings = psf_spectrum.spectral_zeros(psf)
     levels = _levels(calibration, frame) if frame is not None else None
     return PsfReport(
         psf_hash=calibration.psf_hash,
@@ -147,8 +148,8 @@ def inspect_psf(
         bin=calibration.frames.bin,
         coarsest_bin=calibration.frames.bin * psf_measures.coarsest_bin(psf),
         side_lobe=(peak.lobe, peak.lobe_at),
-        weak_part=weak[0],
-        dark_rings=weak[1],
+        weak_part=weak_part,
+        dark_rings=dark_rings,
         effective_rank=psf_measures.effective_rank(psf),
         colour_likeness=min((psf_measures.likeness(a, b) for a, b in pairs), default=1.0),
         noise_gain={value: max(psf_spectrum.noise_gain(psf, value)) for value in LAMBDAS},

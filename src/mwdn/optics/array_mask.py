@@ -108,9 +108,8 @@ def _check_slope(mask: Mask, setup: Setup, subdivide: int) -> None:
     if subdivide * largest_step > 0.5 * (mask.values.max() - mask.values.min()).item():
         advice = "Its steps are as high as the whole surface, as those of a wrapped phase: `levels=256`."
     else:
-        parts = math.ceil(
-            1.3 * subdivide * mask.pitch_um / needed
-        )  # between samples slopes are up to 1.3 times steeper
+        # Between samples slopes are up to 1.3 times steeper.
+        parts = math.ceil(1.3 * subdivide * mask.pitch_um / needed)
         advice = f"Interpolate between them: `subdivide={parts}`."
     raise ParameterError(
         f"`mask` deflects light by {deflection:.2g} degrees, and its samples, {mask.pitch_um:.3g} um apart, must be at "

@@ -69,8 +69,9 @@ def read_projection(path: str | Path) -> Projection:
     """
     path = Path(path)
     if path.suffix.lower() in SUFFIXES:
-        with open_hdf5_header(path, "Align again: `mwdn align`.") as file:
-            attributes = read_attributes(path, file, "Align again: `mwdn align`.")
+        advice = "Align again: `mwdn align`."
+        with open_hdf5_header(path, advice) as file:
+            attributes = read_attributes(path, file, advice)
         if KEY not in attributes:
             raise ParameterError(f"`{path}` has no `{KEY}`: it was not written by `mwdn align`. Align it first.")
         content = parse_json(str(attributes[KEY]), path)
