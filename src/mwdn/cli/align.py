@@ -30,9 +30,10 @@ from mwdn.registration.overlay import draw_outline, overlay
 from mwdn.registration.pairs import chosen, fit_levels, reconstruct_views, write_aligned
 from mwdn.registration.projection import Points, Projection
 from mwdn.registration.registration import Place, read_projection
+from mwdn.registration.residuals import Residuals
 from mwdn.registration.views import Views
 from mwdn.registration.warp import warp_pictures
-from mwdn.types import Image, Scene
+from mwdn.types import Image, Scene, Size
 
 
 @no_empty_folder
@@ -121,6 +122,16 @@ class _Task:
         warn(reconstructor.warning)
         return reconstructor
 
+    def register(
+        self, picture_size: Size, views: Callable[[], Views]
+    ) -> tuple[Projection, dict[str, Any], Residuals | None]:
+        """The given projection for pictures of a size, or the estimate from views; its content, and its residuals."""
+        if self.given is not None:
+            projection = self.given.for_picture(picture_size)
+            return projection, projection.to_dict(), None
+        result = estimate(views(), corners=self.corners)
+        return result.projection, result.content(), result.residuals
+
     def check_outputs(self, *outputs: Path) -> None:
         """Check that files can be written, before any work starts."""
         for output in outputs:
@@ -139,14 +150,10 @@ def _align_session(task: _Task, capture: Path, out: Path, count: int, *, levels:
     ):
         rows = chosen(len(pairs), count)
         reconstructor = task.prepare(pairs.calibration)
-        if task.given is None:
-            progress = partial(track, title="Reconstructing")
-            views = reconstruct_views(pairs, reconstructor, rows, progress)
-            found = estimate(views, corners=task.corners)
-            projection, content = found.projection, found.content()
-        else:
-            found, projection = None, task.given.for_picture(pairs.picture_size)
-            content = projection.to_dict()
+        progress = partial(track, title="Reconstructing")
+        projection, content, residuals = task.register(
+            pairs.picture_size, lambda: reconstruct_views(pairs, reconstructor, rows, progress)
+        )
         psf = pairs.calibration.psf
         white = fit_levels(pairs, projection, psf, rows) if levels else None
         write_aligned(out, pairs, projection, content, levels=white, track=partial(track, title="Writing pairs"))
@@ -154,7 +161,7 @@ def _align_session(task: _Task, capture: Path, out: Path, count: int, *, levels:
             reconstructor(pairs.measurement(rows[0])),
             warp_pictures(pairs.picture(rows[0]), projection),
             projection.corners(),
-            found and found.residuals,
+            residuals,
         )
         number = len(pairs)
     write_picture(page, sheet)
@@ -206,13 +213,9 @@ def _outline(scene: Scene, linear: Scene, corners: Points | None) -> _Placed:
 
 def _known_picture(task: _Task, shown: Image, scene: Scene) -> _Placed:
     """The displayed picture in the reconstruction, unless its homography is given."""
-    if task.given is None:
-        found = estimate(Views.of(list(shown), list(scene)), corners=task.corners)
-        projection, content = found.projection, found.content()
-    else:
-        found, projection = None, task.given.for_picture((shown.shape[-2], shown.shape[-1]))
-        content = projection.to_dict()
-    sheet = overlay(scene, warp_pictures(shown, projection), projection.corners(), found and found.residuals)
+    size = shown.shape[-2], shown.shape[-1]
+    projection, content, residuals = task.register(size, lambda: Views.of(list(shown), list(scene)))
+    sheet = overlay(scene, warp_pictures(shown, projection), projection.corners(), residuals)
     return _Placed(projection, content, sheet)
 
 

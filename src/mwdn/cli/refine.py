@@ -1,5 +1,6 @@
 """`mwdn calibrate --pairs`: refine a camera file with known pictures."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,6 +43,11 @@ class Pictures:
     psnr: tuple[float, ...]
     ssim: tuple[float, ...]
     lpips: tuple[float, ...]
+
+    @property
+    def has_lpips(self) -> bool:
+        """Whether the weights of LPIPS were there."""
+        return not math.isnan(self.lpips[0])
 
 
 def check_pair_file(pairs: Path) -> None:
@@ -169,7 +175,7 @@ def _lines(pictures: list[Pictures], best: Pictures) -> list[str]:
     for each in pictures:
         name = f"with {_name(each.step)}" if each.step.term else "as calibrated"
         kept = " (kept up to here)" if each is best else ""
-        lpips = "" if each.lpips[0] != each.lpips[0] else f", LPIPS {fmean(each.lpips):.3f}"
+        lpips = f", LPIPS {fmean(each.lpips):.3f}" if each.has_lpips else ""
         lines.append(f"{counted(len(each.psnr), 'left-out pair')} {name}: {fmean(each.psnr):.2f} dB{lpips}{kept}")
     return lines
 
@@ -184,7 +190,7 @@ def _content(selection: Selection, pictures: list[Pictures], best: Pictures, ter
             "terms": _orders(each.step.terms),
             "psnr": each.psnr,
             "ssim": each.ssim,
-            "lpips": None if each.lpips[0] != each.lpips[0] else each.lpips,
+            "lpips": each.lpips if each.has_lpips else None,
         }
         for each in pictures
     ]
