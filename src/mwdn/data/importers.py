@@ -71,13 +71,12 @@ def import_pairs(  # noqa: PLR0913
     result = Imported()
     skipped = result.skipped if skip_damaged else None
     pairs = read_pairs(kind, path, layout=layout, frames=frames, camera=camera, skipped=skipped, track=track)
-    first = next(pairs, None)
-    if first is None:
-        reason = f" {len(skipped):,} were skipped; {next(iter(skipped.values()))}" if skipped else ""
-        raise ImageError(f"`{path}` has no pair to import.{reason} For the layouts: `mwdn import --help`.")
     marks = PairFile(path).attributes if kind == "pairs" else {}
     attributes = {"source": kind} | {name: marks[name] for name in (REFINED, WHITE) if name in marks}
-    result.count = write_pairs(Path(output), chain([first], pairs), attributes, authors=authors)
+    result.count = write_pairs(Path(output), pairs, attributes, authors=authors)
+    if not result.count:
+        reason = f" {len(skipped):,} were skipped; {next(iter(skipped.values()))}" if skipped else ""
+        raise ImageError(f"`{path}` has no pair to import.{reason} For the layouts: `mwdn import --help`.")
     return result
 
 
@@ -89,7 +88,7 @@ def write_pairs(
     *,
     authors: bool = False,
 ) -> int:
-    """Write pairs to a file, of which there is at least one; returns how many.
+    """Write pairs to a file; returns how many. Without pairs there is no file.
 
     Args:
         output: the new file.
@@ -103,7 +102,9 @@ def write_pairs(
         ImageError: the file cannot be written.
     """
     pairs = iter(pairs)
-    first = next(pairs)
+    first = next(pairs, None)
+    if first is None:
+        return 0
     shapes: tuple[Shape, Shape] = first[1].shape, first[2].shape
     writer = (
         AuthorsWriter(output, *shapes)
