@@ -1,6 +1,6 @@
 """The training loss: a weighted sum of distances between images."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,16 @@ from mwdn.evaluation.distances import feature_mse, l1, log_mse, lpips, mse, ssim
 from mwdn.evaluation.vgg import load_vgg16
 from mwdn.types import Image
 
-NAMES = ("feature_mse", "l1", "log_mse", "lpips", "mse", "ssim", "vgg_mse")
+DISTANCES: dict[str, Callable[..., Tensor]] = {
+    "feature_mse": feature_mse,
+    "l1": l1,
+    "log_mse": log_mse,
+    "lpips": lpips,
+    "mse": mse,
+    "ssim": lambda image, reference: 1 - ssim(image, reference),
+    "vgg_mse": vgg_mse,
+}
+NAMES = tuple(DISTANCES)
 """Parts of a `Loss`."""
 NEED_ALEXNET = {"feature_mse", "lpips"}
 """Parts that compare AlexNet's features."""
@@ -63,21 +72,15 @@ class Loss(nn.Module):
         total, parts = reconstruction.new_zeros((), dtype=torch.float32), {}
         for name, weight in self.weights.items():
             with torch.set_grad_enabled(weight > 0 and torch.is_grad_enabled()):
-                part = self._part(name, reconstruction, scene).mean()
+                part = DISTANCES[name](reconstruction, scene, *self._networks(name)).mean()
             total = total + weight * part if weight > 0 else total
             parts[name] = part.detach()
         return total, parts
 
-    def _part(self, name: str, image: Tensor, reference: Tensor) -> Tensor:
-        if name == "ssim":
-            return 1 - ssim(image, reference)
-        if name == "feature_mse" and self.alexnet is not None:
-            return feature_mse(image, reference, self.alexnet)
-        if name == "vgg_mse" and self.vgg is not None:
-            return vgg_mse(image, reference, self.vgg)
-        if name == "lpips" and self.alexnet is not None and self.heads is not None:
-            return lpips(image, reference, self.alexnet, self.heads)
-        return {"mse": mse, "l1": l1, "log_mse": log_mse}[name](image, reference)
+    def _networks(self, name: str) -> tuple[nn.Module | None, ...]:
+        """Networks that a distance takes."""
+        own = {"feature_mse": (self.alexnet,), "vgg_mse": (self.vgg,), "lpips": (self.alexnet, self.heads)}
+        return own.get(name, ())
 
 
 def checked_weights(weights: Mapping[str, Any]) -> dict[str, float]:
