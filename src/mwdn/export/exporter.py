@@ -167,15 +167,7 @@ def required_agreement(least: float | None, precision: Precision = "float32") ->
 def check_agreement(
     reached: float, output: str, method: str, *, least: float | None = None, precision: Precision = "float32"
 ) -> None:
-    """Raise an `ExportError` unless an output agrees with its method well enough.
-
-    Args:
-        reached: result of `agreement`.
-        output: what is exported, for the message.
-        method: its name.
-        least: see `required_agreement`.
-        precision: of the output.
-    """
+    """Raise an `ExportError`, which names output and method, unless the agreement is the `required_agreement`."""
     required = required_agreement(least, precision)
     if not reached >= required:  # also refuses NaN
         raise ExportError(
