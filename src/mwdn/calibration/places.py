@@ -12,6 +12,7 @@ from mwdn.calibration.frame_operations import bin_pixels
 from mwdn.calibration.psf import Calibration
 from mwdn.errors import ParameterError
 from mwdn.optics.field import FieldCamera
+from mwdn.optics.psf import unit_sum
 from mwdn.optics.psf_measures import likeness
 from mwdn.optics.sensor import Sensor
 from mwdn.optics.warp import warp
@@ -70,7 +71,7 @@ def at_distance(calibration: Calibration, distance_mm: float) -> tuple[Calibrati
         f"PSF for {distance_mm:g} mm: that of {nearest:g} mm, magnified by {scale:.4f}; that of {other:g} mm has "
         f"{magnification:.4f} times its size (correlation {alike:.2f}).{without}"
     )
-    return replace(chosen, psf=moved / moved.sum((-2, -1), keepdim=True)), sentence
+    return replace(chosen, psf=unit_sum(moved)), sentence
 
 
 def relative_magnification(psf: Psf, reference: Psf) -> tuple[float, float]:

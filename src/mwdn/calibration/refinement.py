@@ -17,6 +17,7 @@ from torch import Tensor
 from mwdn.errors import ParameterError, checked
 from mwdn.optics.aperture import displaced_envelope
 from mwdn.optics.polynomials import frame_places, polynomial, polynomial_order
+from mwdn.optics.psf import unit_sum
 from mwdn.types import Image, Measurement, Psf, Size
 
 Coefficients = tuple[tuple[float, ...], ...]
@@ -75,7 +76,7 @@ class Refinement:
             psf = displaced_envelope(psf, shift.expand(len(psf), -1))
         if self.psf_gain:
             psf = psf * self._field("psf_gain", psf).clamp(min=DIMMEST)
-        return psf / psf.sum((-2, -1), keepdim=True)
+        return unit_sum(psf)
 
     def measurement(self, measurement: Measurement) -> Measurement:
         """``(b - B) / S``: the measurement of an even sensor without stray light.

@@ -28,6 +28,7 @@ from mwdn.calibration import Calibration
 from mwdn.calibration.frame_operations import bin_pixels
 from mwdn.diagnosis.verdict import Verdict
 from mwdn.io.raw import Mosaic
+from mwdn.optics.psf import unit_sum
 from mwdn.solvers.alignment import fine_detail
 from mwdn.solvers.levels import Level
 from mwdn.solvers.pyramid import halve, solve
@@ -203,8 +204,7 @@ def as_linear_and_coded(calibration: Calibration) -> tuple[Psf, Psf]:
     light = torch.tensor(calibration.light or [1.0]).reshape(channels)
     level = torch.tensor(calibration.background or [0.0]).reshape(channels)
     power = 2.2 if calibration.psf_format.psf_gamma is None else 1 / 2.2
-    other = (psf * light + level) ** power - level**power
-    other = other / other.sum((-2, -1), keepdim=True)
+    other = unit_sum((psf * light + level) ** power - level**power)
     return (psf, other) if calibration.psf_format.psf_gamma is None else (other, psf)
 
 

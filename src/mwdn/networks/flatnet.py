@@ -12,6 +12,7 @@ from mwdn.fourier.wiener import deconvolution_grid
 from mwdn.networks.blocks import check_channels, normalise_psf, resize
 from mwdn.networks.flatnet_unet import FlatNetUNet
 from mwdn.networks.network import Network
+from mwdn.optics.psf import unit_sum
 from mwdn.types import Measurement, Psf, Scene, Size, Transfer
 
 
@@ -64,7 +65,7 @@ class FlatNet(Network[Tensor]):
         """Transfer function of the learned filter."""
         psf = normalise_psf(psf, size, self.channels)
         grid = deconvolution_grid(size, self.boundary)
-        H = transfer_function(psf / psf.sum((-2, -1), keepdim=True), grid)
+        H = transfer_function(unit_sum(psf), grid)
         W = H.conj() / (H.abs().square() + self.regularisation)
         if self.correction is not None:
             # If all N taps change by s, W changes by N s at frequency 0, where W is about 1. The unit 1 / sqrt(N)

@@ -21,6 +21,7 @@ from mwdn.networks.blocks import (
     paper_widths,
 )
 from mwdn.networks.network import Network
+from mwdn.optics.psf import unit_sum
 from mwdn.types import Measurement, Psf, Scene, Size
 
 
@@ -124,7 +125,7 @@ class Ifin(Network[IfinPsfs]):
         """PSF for the first Wiener filter, and kernels of each scale."""
         psf = normalise_psf(psf, size, self.channels)
         check_sides(psf, len(self.scales))
-        return IfinPsfs(psf / psf.sum((-2, -1), keepdim=True), self.kernels(psf))
+        return IfinPsfs(unit_sum(psf), self.kernels(psf))
 
     def reconstruct(self, measurement: Measurement, prepared: IfinPsfs) -> Scene:
         """Scene (B, C, H, W)."""

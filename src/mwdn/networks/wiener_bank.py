@@ -18,6 +18,7 @@ from mwdn.networks.evidence import MAPS, against_psf, doubt_of_psf
 from mwdn.networks.network import Network
 from mwdn.optics.distortion import distort, undistort
 from mwdn.optics.polynomials import coefficient_count
+from mwdn.optics.psf import unit_sum
 from mwdn.optics.shading import shade
 from mwdn.solvers.levels import LEVELS, pyramid_levels
 from mwdn.solvers.plug_and_play import Denoiser, plug_and_play
@@ -143,8 +144,7 @@ class WienerBank(Network[BankTransfers]):
 
     def prepare(self, psf: Psf, size: Size) -> BankTransfers:
         """Transfer functions and norms for the iterations, and the transfer functions of the bank."""
-        psf = normalise_psf(psf, size)
-        psf = psf / psf.sum((-2, -1), keepdim=True)
+        psf = unit_sum(normalise_psf(psf, size))
         bands = PsfPyramid.from_psf(psf, size, self.levels).bands if self.levels else ()
         levels = tuple((band.transfer, band.norm) for band in bands)
         if self.finest == 1:  # the bank uses the transfer function of the finest level

@@ -35,7 +35,7 @@ from torch.nn import functional as F
 
 from mwdn.errors import checked
 from mwdn.fourier.convolution import check_fit
-from mwdn.optics.psf import checked_psf
+from mwdn.optics.psf import checked_psf, unit_sum
 from mwdn.optics.saturation import saturated_pixels, subtract_light
 from mwdn.solvers.alignment import halve_psf
 from mwdn.solvers.levels import LEVELS
@@ -139,7 +139,7 @@ def _halved(y: Measurement, psf: Psf, pixels: int) -> tuple[Tensor, Tensor, Tens
     parts = saturated_pixels(y).float()
     while y.shape[-2] * y.shape[-1] > pixels:
         y, psf, parts = halve(y), halve_psf(psf), halve(parts)
-    psf = psf / psf.sum((-2, -1), keepdim=True)
+    psf = unit_sum(psf)
     return y, psf.expand(*y.shape[:2], -1, -1), parts > MIXED
 
 
