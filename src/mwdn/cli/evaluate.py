@@ -117,7 +117,7 @@ def _division(split: str, methods: Iterable[str]) -> Division:
     """The division of the pairs that the checkpoints were trained with, if it is this split; else its defaults.
 
     Raises:
-        ParameterError: they were trained with different ones, of which one trained on what another left out.
+        ParameterError: they were trained with different ones: the test part of one is in the training part of another.
     """
     trained: set[Division] = set()
     for method in methods:
