@@ -116,7 +116,7 @@ def select_terms(
         raise ParameterError(f"`pairs` ({len(model)}) must be {LEAST_PAIRS} or more: each in turn is left out.")
     steps = [_tried(model, "", 0, Terms())]
     report(steps[0])
-    for names in ([name for name in HIGHEST if name != LAST], [LAST]):
+    for names in ([name for name in HIGHEST if name != LAST], [name for name in HIGHEST if name == LAST]):
         while True:
             before = [step for step in steps if step.taken][-1]
             tried = [
