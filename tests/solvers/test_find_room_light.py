@@ -10,6 +10,8 @@ from cameras import contour_psf
 from mwdn import Calibration, Reconstructor, fourier
 from mwdn.optics.room_light import even_light, sloping_light, spot_light
 from mwdn.solvers import Pyramid, find_room_light
+from mwdn.solvers.light_spot import cosines
+from mwdn.solvers.smooth_light import SmoothLight
 from mwdn.solvers.unexplained import energy, unexplained
 
 SIZE = 48, 64
@@ -57,6 +59,25 @@ def test_a_known_spot_in_three_colours(psf, scene, centre, sigma, error):
     measurement, light = lit(scene, psf, 0.3 * colour * spot_light(SIZE, centre, sigma))
     found = find_room_light(measurement + light, psf)
     assert float((found.background - light).norm() / light.norm()) < error
+
+
+def test_a_spot_as_wide_as_the_psf_is_found_by_its_glow(psf, scene):
+    """A scene explains it completely, by a glow around the object; in the dark part there should be none."""
+    measurement, light = lit(scene, psf, 0.3 * spot_light(SIZE, (0.4, 0.6), 0.4))
+    assert float(energy(unexplained((measurement + light) / measurement.mean(), psf, measurement > 2)).sqrt()) < 0.01
+    found = find_room_light(measurement + light, psf)
+    assert float((found.background - light).norm() / light.norm()) < 0.1
+
+
+def test_smooth_light_is_a_plane_or_a_spot():
+    """Each is fitted exactly; a slope that falls below zero gives no negative light."""
+    basis = cosines(SIZE, torch.device("cpu"))
+    slope = (3 * sloping_light(SIZE, 0.6) - 1).expand(1, 3, -1, -1)
+    spot = 2 * spot_light(SIZE, (0.4, 0.6), 0.3).expand(1, 3, -1, -1)
+    torch.testing.assert_close(SmoothLight.fit(slope, basis).on(SIZE), slope.clamp(min=0), rtol=0, atol=1e-4)
+    fit = SmoothLight.fit(spot, basis, advantage=2.0)
+    assert (fit.plane == 0).all()
+    assert float((fit.on(SIZE) - spot).norm() / spot.norm()) < 0.02
 
 
 def test_a_scene_on_dark_keeps_its_light(psf, scene):

@@ -1,14 +1,15 @@
 """Find a Gaussian spot of light in the part of a capture that no scene explains.
 
-With ``r(a) = b - B a - C H v(a)`` as in `mwdn.solvers.room_light`, for cosines B up to `ORDER`, and ``J = dr / da``, a
-spot of shape B s and amplitude A changes r by ``A J s``. For each s of a grid of centres and widths, the best amplitude
-of a colour is ``A = -(s^T q) / (s^T G s)`` with ``q = J^T r``, ``G = J^T J``. It explains ``(s^T q)^2 / (s^T G s)`` of
-the energy ``|r|^2``. The spot that explains most in all colours together is taken. Only G and q are needed for all
-shapes: thousands of them cost less than one iteration of the solver. (The code keeps J transposed, one row a cosine.)
+With ``r(a) = b - B a - C H v(a)``, where v(a) is the best scene for the background B a of cosines up to `ORDER`, and
+``J = dr / da``, a spot of shape B s and amplitude A changes r by ``A J s``. For each s of a grid of centres and widths,
+the best amplitude of a colour is ``A = -(s^T q) / (s^T G s)`` with ``q = J^T r``, ``G = J^T J``. It explains ``(s^T
+q)^2 / (s^T G s)`` of the energy ``|r|^2``. The spot that explains most in all colours together is taken. Only G and q
+are needed for all shapes: thousands of them cost less than one iteration of the solver. (The code keeps J transposed,
+one row a cosine.)
 
 A scene can imitate the smoothest part of a spot, so this part is not in r. It follows from the rest through the shape,
 because a spot has five numbers, not one for each cosine. Narrow spots are estimated best; a spot as wide as the PSF is
-not found.
+not found (but by `mwdn.solvers.smooth_light`).
 """
 
 import math
@@ -53,7 +54,7 @@ for one with 0.037, and 0.033 to 0.22 where one is found."""
 
 
 class Cosines(NamedTuple):
-    """Cosines of whole half periods up to `ORDER` over a frame, (T, h, w), each of mean square 1."""
+    """Cosines of whole half periods over a frame, (T, h, w), each of mean square 1."""
 
     light: Tensor
 
@@ -67,12 +68,12 @@ class Cosines(NamedTuple):
         return light.flatten(-2) @ self.light.flatten(1).T / self.light[0].numel()
 
 
-def cosines(size: Size, device: torch.device) -> Cosines:
-    """All cosines for a frame of this size."""
+def cosines(size: Size, device: torch.device, order: float = ORDER) -> Cosines:
+    """All cosines up to a frequency, in half periods over the width, for a frame of this size."""
     height, width = size
     down, right = (torch.arange(n, device=device) for n in size)
     frequency = ((down[:, None] * (width / height)).square() + right.square()).sqrt()
-    orders = (frequency <= ORDER).nonzero()
+    orders = (frequency <= order).nonzero()
     rows, columns = _waves(height, orders[:, 0]), _waves(width, orders[:, 1])
     return Cosines(rows[:, :, None] * columns[:, None])
 

@@ -1,4 +1,4 @@
-"""The part of a capture that no scene explains, at the coarse size of the search in `mwdn.solvers.room_light`."""
+"""The part of a capture that no scene explains, at the coarse size of the search in `mwdn.solvers.light_spot`."""
 
 import torch
 from torch import Tensor
@@ -7,8 +7,7 @@ from mwdn.solvers.splitting import Penalties, Problem, initial_state, make_filte
 from mwdn.types import Measurement, Psf
 
 ITERATIONS = 40
-"""ADMM iterations for each scene. With 20 the best scenes are not reached; with 60 photographs that fill the frame lose
-twice as much of their own light."""
+"""ADMM iterations for each scene. With 20 the best scenes are not reached."""
 
 DELTA = 0.05
 """Step of the finite differences of the background, as a part of the mean measurement."""

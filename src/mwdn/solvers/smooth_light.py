@@ -1,0 +1,193 @@
+"""Find a plane of light, or a wide spot, where the scene of a capture should be dark.
+
+The capture b is a scene v through the PSF, and a background l:
+
+1. ``b = C H v + l + noise`` with ``v >= 0`` and ``l >= 0``. C crops to the sensor; l is a plane of light or a Gaussian
+   spot. Where b is saturated, the right side may be larger.
+
+A scene can imitate smooth light completely, by a glow and by light from outside the frame, so the residual does not
+tell how much of it is the room's. The dark part of the scene does. With v the best scene for ``b - l``, and v' the part
+of v that is not such a glow,
+
+2. ``l <- P(l + a (b - C H v' - l))``: what v' does not explain. P is the best plane or spot (`SmoothLight.fit`).
+
+It is repeated with three kinds of v', `CAUTIOUS`, `THOROUGH` and `GIVE_BACK`, in coarse pixels.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from mwdn.fourier.transforms import inverse_spectrum, spectrum
+from mwdn.optics.saturation import subtract_light
+from mwdn.solvers.levels import LEVELS, brightness
+from mwdn.solvers.light_spot import Cosines, Spot, best_spot, cosines
+from mwdn.solvers.pyramid import PsfPyramid
+from mwdn.types import Measurement, Psf, Scene, Size
+
+FAINT = 0.06
+"""Least share of the light that the first phase must find. It finds at most 0.05 in 20 real captures without room
+light, and 0.08 to 0.2 where the room's light is 0.17 to 0.23 of the capture."""
+
+MISFIT = 0.07
+"""Largest part of the light by which a plane or spot and the bright part of the frame may miss the capture. It is at
+most 0.04 for light of the room over objects on dark, and 0.06 to 0.5 where photographs fill the frame."""
+
+DARK_PART = 0.55
+"""Least part of the frame that a scene must leave dark, below a quarter of its mean. Objects on dark, half as high as
+the frame, leave 0.6 to 0.8, photographs that fill the frame 0.1 to 0.6."""
+
+BRIGHT = 0.1
+"""A pixel of the scene is bright above this part of the 95 % quantile. The pixels around it count as bright, too."""
+
+SURFACE_ORDER = 3.0
+"""Highest frequency of the surface below the dark part, in half periods over the frame's width."""
+
+ABOVE = 0.05
+"""Weight of pixels above the surface; pixels below it have a weight of 1."""
+
+
+class SmoothLight(NamedTuple):
+    """A plane of light, or a spot, on each sensor.
+
+    Args:
+        plane: (B, C, 3), coefficients of even light, and of light that rises down and to the right.
+        spot: its amplitude is 0 where there is a plane.
+    """
+
+    plane: Tensor
+    spot: Spot
+
+    @classmethod
+    def fit(cls, light: Tensor, basis: Cosines, advantage: float = 1.0) -> "SmoothLight":
+        """The best plane or spot for light (B, C, h, w) of any sign, by least squares.
+
+        Args:
+            light: to fit.
+            basis: of the frame.
+            advantage: a spot, which has more shapes, is taken if its error is smaller by this factor.
+        """
+        X, t = planes(basis.size, light.device).flatten(1), light.flatten(2)
+        plane = t @ X.T @ torch.linalg.inv(X @ X.T)
+        spot = best_spot(-t, basis.light.flatten(1).expand(len(light), -1, -1), basis)
+        errors = [(each - t).square().mean((1, 2)) for each in (plane @ X, spot.light(basis.size).flatten(2))]
+        is_plane = errors[0] <= advantage * errors[1]
+        none = spot._replace(amplitude=torch.zeros_like(spot.amplitude))
+        return cls(torch.where(is_plane[:, None, None], plane, 0.0), none.where(is_plane, spot))
+
+    def on(self, size: Size) -> Tensor:
+        """The light on a frame, (B, C, h, w), not negative."""
+        plane = self.plane @ planes(size, self.plane.device).flatten(1)
+        return plane.reshape(*plane.shape[:2], *size).clamp(min=0) + self.spot.light(size)
+
+
+class Phase(NamedTuple):
+    """Some steps of equation (2).
+
+    Args:
+        steps: how many.
+        part: v' of a scene v, both (B, C, *grid), for a frame at the top left of the grid.
+        a: length of a step.
+        advantage: of a plane over a spot, see `SmoothLight.fit`.
+    """
+
+    steps: int
+    part: Callable[[Scene, Size], Tensor]
+    a: float
+    advantage: float
+
+
+def find_smooth_light(b: Measurement, psf: Psf) -> tuple[SmoothLight, Tensor]:
+    """The light in measurements (B, C, h, w) of mean 1, through PSFs (B, C, h, w), and whether it counts, bool (B,)."""
+    size = b.shape[-2], b.shape[-1]
+    pyramid = PsfPyramid.from_psf(psf, size, (replace(LEVELS[0], downsampling=1),))
+    basis = cosines(size, b.device)
+    light, _ = _run(CAUTIOUS, SmoothLight.fit(torch.zeros_like(b), basis), b, pyramid, basis)
+    found = light.on(size).mean((1, 2, 3)) >= FAINT
+    if not found.any():
+        return light, found
+    light, misfit = _run(THOROUGH, light, b, pyramid, basis)
+    light, _ = _run(GIVE_BACK, light, b, pyramid, basis)
+    scene = pyramid.solve(subtract_light(b, light.on(size))).scene
+    return light, found & (misfit <= MISFIT) & (dark_part(scene) >= DARK_PART)
+
+
+def _run(
+    phase: Phase, light: SmoothLight, b: Measurement, pyramid: PsfPyramid, basis: Cosines
+) -> tuple[SmoothLight, Tensor]:
+    """Steps of equation (2): the light, and the part (B,) of it by which v' and the light missed b before the last."""
+    (band,) = pyramid.bands
+    misfit = torch.zeros(len(b), device=b.device)
+    for _ in range(phase.steps):
+        known = light.on(basis.size)
+        own = phase.part(pyramid.solve(subtract_light(b, known)).grid_scene, basis.size)
+        seen = inverse_spectrum(band.transfer * band.norm * spectrum(own, band.grid), band.grid, basis.size)
+        missing = b - seen - known
+        misfit = brightness(missing).flatten() / brightness(known).flatten()
+        light = SmoothLight.fit(known + phase.a * missing, basis, phase.advantage)
+    return light, misfit
+
+
+def dark_part(frame: Scene) -> Tensor:
+    """Part (B,) of the frame, in 12 x 12 blocks, where a scene is darker than a quarter of its mean."""
+    blocks = F.adaptive_avg_pool2d(frame.mean(1), 12).flatten(1)
+    return (blocks < blocks.mean(1, keepdim=True) / 4).float().mean(1)
+
+
+def planes(size: Size, device: torch.device) -> Tensor:
+    """Even light, and light that rises linearly from -1 to 1 down and to the right: (3, H, W)."""
+    down, right = ((2 * torch.arange(length, device=device) + 1) / length - 1 for length in size)
+    return torch.stack([torch.ones(size, device=device), down[:, None].expand(size), right.expand(size)])
+
+
+def _without_surface(scene: Scene, size: Size) -> Tensor:
+    """The scene without the smooth surface below the dark part of its frame.
+
+    Asymmetric least squares: pixels above the surface have a small weight.
+    """
+    frame = scene[..., : size[0], : size[1]]
+    dark = ~_bright(frame)
+    X, y = cosines(size, scene.device, SURFACE_ORDER).light.flatten(1), frame.flatten(2)
+    ridge = 1e-3 * X.shape[1] * torch.eye(len(X), device=X.device)
+    inside = dark.flatten(2).float()
+    weight, surface = inside.expand_as(y), y
+    for _ in range(10):
+        XW = X * weight[:, :, None]
+        surface = torch.linalg.solve(XW @ X.T + ridge, XW @ y[..., None])[..., 0] @ X
+        weight = inside * torch.where(surface < y, ABOVE, 1.0)
+    below = torch.minimum(surface.reshape(frame.shape).clamp(min=0), frame) * dark
+    return scene - _on_grid(below, scene)
+
+
+def _bright_part(scene: Scene, size: Size) -> Tensor:
+    """The bright part of the frame."""
+    frame = scene[..., : size[0], : size[1]]
+    return _on_grid(frame * _bright(frame), scene)
+
+
+def _bright(frame: Scene) -> Tensor:
+    """The bright part of scenes and the pixels around it, bool (B, 1, h, w)."""
+    grey = frame.mean(1, keepdim=True)
+    limit = BRIGHT * grey.flatten(1).quantile(0.95, dim=1)
+    return F.max_pool2d((grey > limit[:, None, None, None]).float(), 3, 1, 1) > 0
+
+
+def _on_grid(frame: Tensor, scene: Scene) -> Tensor:
+    """A frame on the grid of a scene, with zeros around it."""
+    return F.pad(frame, (0, scene.shape[-1] - frame.shape[-1], 0, scene.shape[-2] - frame.shape[-2]))
+
+
+CAUTIOUS = Phase(4, _without_surface, a=1.5, advantage=1.0)
+"""v' keeps faint objects and all light from outside the frame. So only a part of the room's light is found, but next to
+nothing of the scene's. If it is too little (`FAINT`), there is no more to do."""
+
+THOROUGH = Phase(8, _bright_part, a=1.5, advantage=2.0)
+"""v' is the bright part of the frame: all other light is the room's."""
+
+GIVE_BACK = Phase(3, lambda scene, _: scene, a=1.0, advantage=2.0)
+"""v' is the whole scene. Its residual is negative where too much has been subtracted, and gives it back: 0.1 to 0.9 dB
+at even light."""
