@@ -247,7 +247,7 @@ def test_stream_aligns_without_the_light_of_the_room(psf, frames, aligned, monke
     monkeypatch.setattr(solvers, "find_room_light", found)
     reconstruct = Reconstructor("wiener", Calibration(psf), device="cpu", align=True, room_light=True)
     measurement, scene = next(iter(reconstruct.stream(frames)))
-    torch.testing.assert_close(aligned[0], measurement - 0.01)
+    torch.testing.assert_close(aligned[0][0], measurement - 0.01)
     torch.testing.assert_close(scene, reconstruct(measurement))
 
 

@@ -670,7 +670,7 @@ def test_divergence_leaves_the_state(trainer, tmp_path):
 
 def test_divergence_in_the_validation(trainer, tmp_path):
     """It is reported before a picture or weights are written."""
-    run = trainer(few(steps=1, validate_every=1, warmup=0, learning_rate=1e30, clip=0.0, bfloat16=False))
+    run = trainer(few(steps=1, validate_every=1, warmup=0, learning_rate=1e18, clip=0.0, bfloat16=False))
     with pytest.raises(DivergenceError, match="The loss of the validation after step 1 is not finite"):
         run.run()
     assert {path.name for path in (tmp_path / "run").iterdir()} <= {"recipe.json", "log.jsonl"}

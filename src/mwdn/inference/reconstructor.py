@@ -45,7 +45,7 @@ class Reconstructor:
         white_balance: of the pictures, see `mwdn.calibration.white_balance`; that of the calibration unless given.
         ensemble: average a network's results for the measurement and its three mirror images, see
             `mwdn.inference.ensemble.Ensemble`. It takes four times as long; for a network that takes any PSF.
-        room_light: whether to find and subtract even light, a slope and a narrow spot of light of the room in each
+        room_light: whether to find and subtract even light, a slope and spots of light of the room in each
             measurement first, see `mwdn.solvers.room_light`. ``None`` does so where a network aligns, as ``universal``
             does, and the calibration has no ambient frame.
         **options: of a solver given by its name, for example ``regularisation=1e-4``.

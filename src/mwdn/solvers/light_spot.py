@@ -137,14 +137,14 @@ def _fit(b: Measurement, psf: Psf, saturated: Tensor, spot: Spot, *, promising: 
 
 def grid(device: torch.device) -> Tensor:
     """Shapes (N, 3) of all spots that are tried."""
-    places = torch.linspace(-OUTSIDE, 1 + OUTSIDE, CENTRES, device=device)
-    return torch.cartesian_prod(places, places, torch.tensor(SIGMAS, device=device))
+    places = torch.linspace(-OUTSIDE, 1 + OUTSIDE, CENTRES, device=device, dtype=torch.float32)
+    return torch.cartesian_prod(places, places, torch.tensor(SIGMAS, device=device, dtype=torch.float32))
 
 
 def gaussians(size: Size, shapes: Tensor) -> Tensor:
     """Spots (N, h, w) of shapes (N, 3), with a maximum of 1 at their centres."""
     height, width = size
-    y, x = (torch.arange(length, device=shapes.device) + 0.5 for length in size)
+    y, x = (torch.arange(length, device=shapes.device, dtype=torch.float32) + 0.5 for length in size)
     centre_y, centre_x, sigma = (shapes[:, :, None] * shapes.new_tensor([[height], [width], [width]])).unbind(1)
     rows = torch.exp(-0.5 * ((y - centre_y) / sigma).square())
     return rows[:, :, None] * torch.exp(-0.5 * ((x - centre_x) / sigma).square())[:, None]
@@ -172,5 +172,6 @@ def _best_of(shapes: Tensor, G: Tensor, q: Tensor, basis: Cosines) -> tuple[Tens
 
 
 def _waves(length: int, orders: Tensor) -> Tensor:
-    phase = (torch.arange(length, device=orders.device) + 0.5) * (math.pi / length)
-    return torch.cos(orders[:, None] * phase) * torch.where(orders > 0, math.sqrt(2), 1.0)[:, None]
+    phase = (torch.arange(length, device=orders.device, dtype=torch.float32) + 0.5) * (math.pi / length)
+    amplitude = torch.where(orders > 0, math.sqrt(2), 1.0).to(phase.dtype)
+    return torch.cos(orders[:, None] * phase) * amplitude[:, None]

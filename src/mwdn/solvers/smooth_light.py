@@ -121,7 +121,7 @@ def _run(
 ) -> tuple[SmoothLight, Tensor]:
     """Steps of equation (2): the light, and the part (B,) of it by which v' and the light missed b before the last."""
     (band,) = pyramid.bands
-    misfit = torch.zeros(len(b), device=b.device)
+    misfit = b.new_zeros(len(b))
     for _ in range(phase.steps):
         known = light.on(basis.size)
         own = phase.part(pyramid.solve(subtract_light(b, known)).grid_scene, basis.size)
@@ -140,8 +140,9 @@ def dark_part(frame: Scene) -> Tensor:
 
 def planes(size: Size, device: torch.device) -> Tensor:
     """Even light, and light that rises linearly from -1 to 1 down and to the right: (3, H, W)."""
-    down, right = ((2 * torch.arange(length, device=device) + 1) / length - 1 for length in size)
-    return torch.stack([torch.ones(size, device=device), down[:, None].expand(size), right.expand(size)])
+    lengths = (torch.arange(length, device=device, dtype=torch.float32) for length in size)
+    down, right = ((2 * each + 1) / len(each) - 1 for each in lengths)
+    return torch.stack([torch.ones_like(down[:, None]).expand(size), down[:, None].expand(size), right.expand(size)])
 
 
 def _without_surface(scene: Scene, size: Size) -> Tensor:
@@ -152,13 +153,13 @@ def _without_surface(scene: Scene, size: Size) -> Tensor:
     frame = scene[..., : size[0], : size[1]]
     dark = ~_bright(frame)
     X, y = cosines(size, scene.device, SURFACE_ORDER).light.flatten(1), frame.flatten(2)
-    ridge = 1e-3 * X.shape[1] * torch.eye(len(X), device=X.device)
+    ridge = 1e-3 * X.shape[1] * torch.eye(len(X), device=X.device, dtype=X.dtype)
     inside = dark.flatten(2).float()
     weight, surface = inside.expand_as(y), y
     for _ in range(10):
         XW = X * weight[:, :, None]
         surface = torch.linalg.solve(XW @ X.T + ridge, XW @ y[..., None])[..., 0] @ X
-        weight = inside * torch.where(surface < y, ABOVE, 1.0)
+        weight = torch.where(surface < y, ABOVE * inside, inside)
     below = torch.minimum(surface.reshape(frame.shape).clamp(min=0), frame) * dark
     return scene - _on_grid(below, scene)
 
@@ -188,6 +189,6 @@ nothing of the scene's. If it is too little (`FAINT`), there is no more to do.""
 THOROUGH = Phase(8, _bright_part, a=1.5, advantage=2.0)
 """v' is the bright part of the frame: all other light is the room's."""
 
-GIVE_BACK = Phase(3, lambda scene, _: scene, a=1.0, advantage=2.0)
-"""v' is the whole scene. Its residual is negative where too much has been subtracted, and gives it back: 0.1 to 0.9 dB
-at even light."""
+GIVE_BACK = Phase(10, lambda scene, _: scene, a=1.0, advantage=2.0)
+"""v' is the whole scene. Its residual is negative where too much has been subtracted, and gives it back. With 3 steps
+`universal` loses 0.4 dB at even light and at a slope, with 10 it loses 0.06."""
