@@ -69,24 +69,6 @@ def test_a_spot_as_wide_as_the_psf_is_found_by_its_glow(psf, scene):
     assert float((found.background - light).norm() / light.norm()) < 0.1
 
 
-@pytest.mark.parametrize("beyond", ["bright side", "veil"])
-def test_light_of_a_wall_is_not_the_rooms(psf, scene, beyond):
-    """More than a fifth of the capture's light comes from beside the frame, or from behind the object."""
-    height, width = SIZE
-    around = (width // 2, width // 2, height // 2, height // 2)
-    whole = F.pad(scene, around)
-    if beyond == "bright side":
-        whole[..., : width // 2] = 0.3
-    else:
-        whole += 0.1
-    frame = slice(height // 2, height // 2 + height), slice(width // 2, width // 2 + width)
-    measurement, own = (
-        fourier.convolve(each, F.pad(psf, around))[..., *frame] for each in (whole, F.pad(scene, around))
-    )
-    assert float(own.sum() / measurement.sum()) < 0.8
-    assert float(find_room_light(measurement, psf).share) == 0.0
-
-
 def test_smooth_light_is_a_plane_or_a_spot():
     """Each is fitted exactly; a slope that falls below zero gives no negative light."""
     basis = cosines(SIZE, torch.device("cpu"))

@@ -37,7 +37,7 @@ MISFIT = 0.07
 """Largest part of the light by which a plane or spot and the bright part of the frame may miss the capture. It is at
 most 0.04 for light of the room over objects on dark, and 0.06 to 0.5 where photographs fill the frame."""
 
-DARK_PART = 0.55
+MOSTLY_DARK = 0.55
 """Least part of the frame that a scene must leave dark, below a quarter of its mean. Objects on dark, half as high as
 the frame, leave 0.6 to 0.8, photographs that fill the frame 0.1 to 0.6."""
 
@@ -113,7 +113,7 @@ def find_smooth_light(b: Measurement, psf: Psf) -> tuple[SmoothLight, Tensor]:
     light, misfit = _run(THOROUGH, light, b, pyramid, basis)
     light, _ = _run(GIVE_BACK, light, b, pyramid, basis)
     scene = pyramid.solve(subtract_light(b, light.on(size))).scene
-    return light, found & (misfit <= MISFIT) & (dark_part(scene) >= DARK_PART)
+    return light, found & (misfit <= MISFIT) & (dark_part(scene) >= MOSTLY_DARK)
 
 
 def _run(
