@@ -161,8 +161,9 @@ def _give_back(b: Measurement, light: Tensor, plane: Tensor, coarsest: PsfPyrami
 
 def _planes(size: Size, device: torch.device) -> Tensor:
     """Even light, and light that rises linearly down and to the right: (3, H, W), each of mean square 1 (nearly)."""
-    down, right = (math.sqrt(3) * ((2 * torch.arange(length, device=device) + 1) / length - 1) for length in size)
-    return torch.stack([torch.ones(size, device=device), down[:, None].expand(size), right.expand(size)])
+    lengths = (torch.arange(length, device=device, dtype=torch.float32) for length in size)
+    down, right = (math.sqrt(3) * ((2 * each + 1) / len(each) - 1) for each in lengths)
+    return torch.stack([torch.ones_like(down[:, None]).expand(size), down[:, None].expand(size), right.expand(size)])
 
 
 def _search(b: Measurement, psf: Psf, saturated: Tensor) -> Tensor:
@@ -194,7 +195,7 @@ def _gauss_newton_step(J: Tensor, r: Tensor, limit: Tensor) -> Tensor:
     SJ = J * spread[:, None]
     e, U = torch.linalg.eigh(SJ @ SJ.mT / pixels)
     g = (U.mT @ (SJ @ r[..., None]))[..., 0] / pixels
-    mu = torch.logspace(-8, 2, 60, device=r.device)[:, None, None]
+    mu = torch.logspace(-8, 2, 60, device=r.device, dtype=r.dtype)[:, None, None]
     d = -g / (e.clamp(min=0) + mu)  # (60, n, 3)
     energy = r.square().mean(1)
     fits = (energy + 2 * (d * g).sum(-1) + (d.square() * e).sum(-1)) <= limit
@@ -214,5 +215,5 @@ def _largest_plane(b: Measurement, B: Tensor) -> Tensor:
     for _ in range(15):
         XW = X * weight[:, None]
         c = torch.linalg.solve(XW @ X.mT, XW @ y[..., None])[..., 0]
-        weight = torch.where(c @ X < y, ABOVE, 1.0)
+        weight = torch.where(c @ X < y, ABOVE, 1.0).to(y.dtype)
     return c
