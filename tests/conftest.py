@@ -45,12 +45,6 @@ def _seed() -> None:
     torch.manual_seed(0)
 
 
-@pytest.fixture(autouse=True)
-def _interrupt() -> None:
-    """Ctrl-C interrupts, whatever handler an unfinished run of an earlier test has left."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
 @pytest.fixture
 def generator() -> torch.Generator:
     """Source of a test's own random numbers."""

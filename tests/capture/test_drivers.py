@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -118,6 +119,8 @@ def test_harvesters_reads_a_gentl_producer(producer):
         assert (frame.array.shape, frame.array.dtype, frame.bit_depth) == ((400, 400, 1), np.uint8, 8)
         with pytest.raises(CameraError, match=r"`exposure_s` \(0\.1\)"):
             camera.configure(exposure_s=0.1)
+        with pytest.raises(KeyboardInterrupt):  # though harvesters sets a handler of its own
+            signal.raise_signal(signal.SIGINT)
     with pytest.raises(CameraError, match="names 3 of 3"), open_source("harvesters:Viky", cti=str(producer)):
         pass
     with pytest.raises(CameraError, match="does not exist"), open_source("harvesters:0", cti="none.cti"):

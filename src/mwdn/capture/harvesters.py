@@ -11,6 +11,7 @@ from mwdn.capture.pixel_formats import choose_format, unpack
 from mwdn.capture.source import TIMEOUT_S, CameraSource, Frame
 from mwdn.capture.sources import load_driver
 from mwdn.errors import CameraError
+from mwdn.runtime.interrupts import kept_interrupt
 
 PRODUCERS = "GENICAM_GENTL64_PATH"
 """Variable in which installers of producers put their folders (GenTL standard 1.5, section 3.1)."""
@@ -43,7 +44,8 @@ class HarvestersCamera(CameraSource):
             for file in self._producers():
                 self._harvester.add_file(str(file), check_existence=True, check_validity=True)
             self._harvester.update()
-            self._acquirer = self._harvester.create(self._index())
+            with kept_interrupt():  # harvesters' own handler closes the camera and does not interrupt
+                self._acquirer = self._harvester.create(self._index())
             self._start()
 
     def _producers(self) -> list[Path]:
