@@ -13,6 +13,7 @@ not found (but by `mwdn.solvers.smooth_light`).
 """
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -89,6 +90,11 @@ class Spot(NamedTuple):
     shape: Tensor
     amplitude: Tensor
 
+    @classmethod
+    def none(cls, b: Measurement) -> "Spot":
+        """No spot in captures (B, C, h, w)."""
+        return cls(b.new_ones(len(b), 3), b.new_zeros(b.shape[:2]))
+
     def light(self, size: Size) -> Tensor:
         """The spot on a frame, (B, C, h, w)."""
         return self.amplitude[..., None, None] * gaussians(size, self.shape)[:, None]
@@ -103,7 +109,7 @@ def find_spot(b: Measurement, psf: Psf, saturated: Tensor) -> Spot:
 
     Its amplitude is 0 where there is none.
     """
-    none = Spot(b.new_ones(len(b), 3), b.new_zeros(b.shape[:2]))
+    none = Spot.none(b)
     spot, without, least = _fit(b, psf, saturated, none, promising=PROMISING)
     enough = (without - least) * without > SLIGHT**2 * least
     return spot.where((without > EVIDENCE * least) & enough, none)
@@ -153,18 +159,31 @@ def gaussians(size: Size, shapes: Tensor) -> Tensor:
 def best_spot(r: Tensor, J: Tensor, basis: Cosines) -> Spot:
     """The best spot for the residual r (B, C, P) without a spot, and J (B, T, P): the best of the grid, refined."""
     G, q, steps = J @ J.mT, -r @ J.mT, r.new_tensor(_STEP)
-    shape, amplitude = _best_of(grid(r.device).expand(len(r), -1, -1), G, q, basis)
+    shapes = grid(r.device).expand(len(r), -1, -1)
+    shape, amplitude = _best_of(shapes, _grid_coefficients(basis.size, r.device), G, q)
     offsets = torch.cartesian_prod(*r.new_tensor([-1.0, 0.0, 1.0]).expand(3, -1))
     for halving in range(1, 7):
-        near = shape[:, None] + steps * offsets / 2**halving
-        shape, amplitude = _best_of(near.clamp(min=r.new_tensor([-1.0, -1.0, SIGMAS[0]])), G, q, basis)
+        near = (shape[:, None] + steps * offsets / 2**halving).clamp(min=r.new_tensor([-1.0, -1.0, SIGMAS[0]]))
+        s = basis.coefficients(gaussians(basis.size, near.flatten(0, 1)).reshape(*near.shape[:2], *basis.size))
+        shape, amplitude = _best_of(near, s, G, q)
     return Spot(shape, amplitude)
 
 
-def _best_of(shapes: Tensor, G: Tensor, q: Tensor, basis: Cosines) -> tuple[Tensor, Tensor]:
-    """Shape (B, 3) and amplitudes (B, C) of the best of some shapes (B, N, 3), for G (B, T, T) and -q (B, C, T)."""
-    one = shapes[:1] if shapes.stride(0) == 0 else shapes  # the same shapes for each capture
-    s = basis.coefficients(gaussians(basis.size, one.flatten(0, 1)).reshape(*one.shape[:2], *basis.size))
+@lru_cache(2)
+def _grid_coefficients(size: Size, device: torch.device) -> Tensor:
+    """Coefficients (1, N, T) of all spots of the grid: as expensive as several iterations of the solver."""
+    return cosines(size, device).coefficients(gaussians(size, grid(device)))[None]
+
+
+def _best_of(shapes: Tensor, s: Tensor, G: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
+    """Shape (B, 3) and amplitudes (B, C) of the best of some shapes (B, N, 3).
+
+    Args:
+        shapes: to compare.
+        s: their coefficients, (1 or B, N, T).
+        G: (B, T, T).
+        q: minus that of the module's text, (B, C, T).
+    """
     against = (q @ s.mT).clamp(min=0)  # light is not negative
     power = ((s @ G) * s).sum(-1).clamp(min=torch.finfo(q.dtype).tiny)
     best, chosen = (against.square().sum(1) / power).argmax(-1), torch.arange(len(q), device=q.device)

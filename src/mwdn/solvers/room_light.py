@@ -1,9 +1,9 @@
 """Find the light of the room in a capture: smooth light on the sensor that has not come from the scene.
 
 First a narrow spot is found by what no scene explains (`mwdn.solvers.light_spot`), then a plane of light or a wide spot
-by the glow that it leaves where most of the scene is dark (`mwdn.solvers.smooth_light`). If there is none, a plane is
-searched that is not so clear, because less of the scene is dark, or the PSF is wrong. The capture b is then a scene v
-through the PSF, and a background B c of even light and a slope:
+by the glow that it leaves where most of the scene is dark (`mwdn.solvers.smooth_light`). If the second search finds
+nothing, because the PSF is wrong or less of the scene is dark, this module searches a plane by the residual. The
+capture b is then a scene v through the PSF, and a background B c of even light and a slope:
 
 1. ``b = C H v + B c + noise`` with ``v >= 0`` and ``B c >= 0``. C crops to the sensor. Where b is saturated, the right
    side may be larger.
@@ -28,7 +28,6 @@ separated from a scene only where the scene is dark: a plane is subtracted only 
 colours, and is fitted again in pixels of half the side.
 """
 
-import math
 from typing import NamedTuple
 
 import torch
@@ -43,9 +42,9 @@ from mwdn.solvers.alignment import halve_psf
 from mwdn.solvers.levels import LEVELS
 from mwdn.solvers.light_spot import find_spot, refine_spot
 from mwdn.solvers.pyramid import MIXED, PsfPyramid, halve
-from mwdn.solvers.smooth_light import dark_part, find_smooth_light
+from mwdn.solvers.smooth_light import dark_part, find_smooth_light, fit_below, planes
 from mwdn.solvers.unexplained import DELTA, energy, unexplained
-from mwdn.types import Measurement, Psf, Size
+from mwdn.types import Measurement, Psf
 
 PIXELS = 4000
 """The capture is halved until it has at most so many pixels."""
@@ -123,21 +122,35 @@ def find_room_light(measurement: Measurement, psf: Psf) -> RoomLight:
         spot = refine_spot(*_halved(b / mean, psf, 4 * PIXELS), spot)
     narrow = spot.light((y.shape[-2], y.shape[-1]))
     smooth, clear = find_smooth_light(subtract_light(y, narrow), h)
-    y = y - narrow
-    c = _search(*(each.reshape(-1, 1, *each.shape[-2:]) for each in (y, h, saturated)))
-    plane = (c @ _planes(size, c.device).flatten(1)).reshape(b.shape).mul_(mean).clamp_(min=0)
-    whole = mean.mean((1, 2, 3))
     light = spot.light(size) * mean
-    counts = ~clear & (plane.mean((1, 2, 3)) >= FAINT * whole)
+    background = light + torch.where(clear[:, None, None, None], smooth.on(size) * mean, 0.0)
+    if not clear.all():
+        plane = _plane(b, psf, light, mean, (y - narrow, h, saturated))
+        background += torch.where(clear[:, None, None, None], 0.0, plane)
+    share = background.mean((1, 2, 3)) / mean.mean((1, 2, 3))
+    share = torch.where(usable & (share > 0) & (share < 1), share, 0.0)  # NaN counts as none
+    return RoomLight(torch.where(share[:, None, None, None] > 0, background, 0.0).to(measurement.dtype), share)
+
+
+def _plane(b: Measurement, psf: Psf, light: Tensor, mean: Tensor, coarse: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+    """The plane of light in captures, (B, C, H, W); 0 where it does not count.
+
+    Args:
+        b: (B, C, H, W).
+        psf: of these captures.
+        light: that of the spot, (B, C, H, W).
+        mean: of the captures, (B, C, 1, 1).
+        coarse: the captures less the spot, over their mean, with PSFs and saturated pixels, all (B, C, h, w).
+    """
+    size = b.shape[-2], b.shape[-1]
+    c = _search(*(each.reshape(-1, 1, *each.shape[-2:]) for each in coarse))
+    plane = (c @ planes(size, c.device).flatten(1)).reshape(b.shape).mul_(mean).clamp_(min=0)
+    counts = plane.mean((1, 2, 3)) >= FAINT * mean.mean((1, 2, 3))
     if counts.any():
         coarsest = PsfPyramid.from_psf(psf, size, LEVELS[:1])
         counts &= dark_part(coarsest.solve(subtract_light(b, light + plane)).scene) >= DARK_PART
         plane = _give_back(b, light, plane, coarsest) if counts.any() else plane
-    clear, counts = clear[:, None, None, None], counts[:, None, None, None]
-    background = light + torch.where(clear, smooth.on(size) * mean, torch.where(counts, plane, 0.0))
-    share = background.mean((1, 2, 3)) / whole
-    share = torch.where(usable & (share > 0) & (share < 1), share, 0.0)  # NaN counts as none
-    return RoomLight(torch.where(share[:, None, None, None] > 0, background, 0.0).to(measurement.dtype), share)
+    return torch.where(counts[:, None, None, None], plane, 0.0)
 
 
 def _halved(y: Measurement, psf: Psf, pixels: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -153,23 +166,16 @@ def _give_back(b: Measurement, light: Tensor, plane: Tensor, coarsest: PsfPyrami
     """The plane (B, C, H, W) after equation (4), beside the spot's light."""
     for _ in range(GIVE_BACKS):
         r = coarsest.solve(subtract_light(b, light + plane)).residual
-        B, fine = (_planes((each.shape[-2], each.shape[-1]), b.device).flatten(1) for each in (r, plane))
+        B, fine = (planes((each.shape[-2], each.shape[-1]), b.device).flatten(1) for each in (r, plane))
         c = r.flatten(2) @ B.T / B.shape[1]
         plane = (plane + (c @ fine).reshape(plane.shape)).clamp(min=0)
     return plane
 
 
-def _planes(size: Size, device: torch.device) -> Tensor:
-    """Even light, and light that rises linearly down and to the right: (3, H, W), each of mean square 1 (nearly)."""
-    lengths = (torch.arange(length, device=device, dtype=torch.float32) for length in size)
-    down, right = (math.sqrt(3) * ((2 * each + 1) / len(each) - 1) for each in lengths)
-    return torch.stack([torch.ones_like(down[:, None]).expand(size), down[:, None].expand(size), right.expand(size)])
-
-
 def _search(b: Measurement, psf: Psf, saturated: Tensor) -> Tensor:
     """Equation (3) for measurements (n, 1, h, w) of mean 1, ``saturated`` in places, through PSFs: c (n, 3)."""
     size = b.shape[-2], b.shape[-1]
-    B = _planes(size, b.device)
+    B = planes(size, b.device)
     delta = b.new_tensor([-DELTA, DELTA, DELTA])  # less even light, because more is impossible at first
     c = _largest_plane(b, B)
     limit = energy(unexplained(b, psf, saturated))
@@ -205,15 +211,6 @@ def _gauss_newton_step(J: Tensor, r: Tensor, limit: Tensor) -> Tensor:
 
 
 def _largest_plane(b: Measurement, B: Tensor) -> Tensor:
-    """Coefficients (n, 3) of the largest plane of light below captures (n, 1, h, w), whose noise is smoothed.
-
-    Asymmetric least squares: pixels above the plane have a small weight.
-    """
+    """Coefficients (n, 3) of the largest plane of light below captures (n, 1, h, w), whose noise is smoothed."""
     y = F.avg_pool2d(F.pad(b, (1, 1, 1, 1), mode="replicate"), 3, 1).flatten(1)
-    X = B.flatten(1)
-    weight, c = torch.ones_like(y), y
-    for _ in range(15):
-        XW = X * weight[:, None]
-        c = torch.linalg.solve(XW @ X.mT, XW @ y[..., None])[..., 0]
-        weight = torch.where(c @ X < y, ABOVE, 1.0).to(y.dtype)
-    return c
+    return fit_below(y, B.flatten(1), above=ABOVE, steps=15)

@@ -14,6 +14,7 @@ of v that is not such a glow,
 It is repeated with three kinds of v', `CAUTIOUS`, `THOROUGH` and `GIVE_BACK`, in coarse pixels.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
@@ -30,12 +31,12 @@ from mwdn.solvers.pyramid import PsfPyramid
 from mwdn.types import Measurement, Psf, Scene, Size
 
 FAINT = 0.06
-"""Least share of the light that the first phase must find. It finds at most 0.05 in 20 real captures without room
+"""Least share of the light that the first phase must find. It finds 0.00 to 0.06 in 20 real captures without room
 light, and 0.08 to 0.2 where the room's light is 0.17 to 0.23 of the capture."""
 
 MISFIT = 0.07
-"""Largest part of the light by which a plane or spot and the bright part of the frame may miss the capture. It is at
-most 0.04 for light of the room over objects on dark, and 0.06 to 0.5 where photographs fill the frame."""
+"""Largest misfit (`_run`) of the light and the bright part of the frame. It is at most 0.04 for light of the room over
+objects on dark, and 0.06 to 0.5 where photographs fill the frame."""
 
 MOSTLY_DARK = 0.55
 """Least part of the frame that a scene must leave dark, below a quarter of its mean. Objects on dark, half as high as
@@ -76,8 +77,7 @@ class SmoothLight(NamedTuple):
         spot = best_spot(-t, basis.light.flatten(1).expand(len(light), -1, -1), basis)
         errors = [(each - t).square().mean((1, 2)) for each in (plane @ X, spot.light(basis.size).flatten(2))]
         is_plane = errors[0] <= advantage * errors[1]
-        none = spot._replace(amplitude=torch.zeros_like(spot.amplitude))
-        return cls(torch.where(is_plane[:, None, None], plane, 0.0), none.where(is_plane, spot))
+        return cls(torch.where(is_plane[:, None, None], plane, 0.0), Spot.none(light).where(is_plane, spot))
 
     def on(self, size: Size) -> Tensor:
         """The light on a frame, (B, C, h, w), not negative."""
@@ -106,7 +106,8 @@ def find_smooth_light(b: Measurement, psf: Psf) -> tuple[SmoothLight, Tensor]:
     size = b.shape[-2], b.shape[-1]
     pyramid = PsfPyramid.from_psf(psf, size, (replace(LEVELS[0], downsampling=1),))
     basis = cosines(size, b.device)
-    light, _ = _run(CAUTIOUS, SmoothLight.fit(torch.zeros_like(b), basis), b, pyramid, basis)
+    none = SmoothLight(b.new_zeros(*b.shape[:2], 3), Spot.none(b))
+    light, _ = _run(CAUTIOUS, none, b, pyramid, basis)
     found = light.on(size).mean((1, 2, 3)) >= FAINT
     if not found.any():
         return light, found
@@ -119,7 +120,10 @@ def find_smooth_light(b: Measurement, psf: Psf) -> tuple[SmoothLight, Tensor]:
 def _run(
     phase: Phase, light: SmoothLight, b: Measurement, pyramid: PsfPyramid, basis: Cosines
 ) -> tuple[SmoothLight, Tensor]:
-    """Steps of equation (2): the light, and the part (B,) of it by which v' and the light missed b before the last."""
+    """Steps of equation (2): the light, and the misfit (B,) at the last step.
+
+    The misfit is the root mean square of ``b - C H v' - l`` over that of l.
+    """
     (band,) = pyramid.bands
     misfit = b.new_zeros(len(b))
     for _ in range(phase.steps):
@@ -139,28 +143,42 @@ def dark_part(frame: Scene) -> Tensor:
 
 
 def planes(size: Size, device: torch.device) -> Tensor:
-    """Even light, and light that rises linearly from -1 to 1 down and to the right: (3, H, W)."""
+    """Even light, and light that rises linearly down and to the right: (3, H, W), each of mean square 1 (nearly)."""
     lengths = (torch.arange(length, device=device, dtype=torch.float32) for length in size)
-    down, right = ((2 * each + 1) / len(each) - 1 for each in lengths)
+    down, right = (math.sqrt(3) * ((2 * each + 1) / len(each) - 1) for each in lengths)
     return torch.stack([torch.ones_like(down[:, None]).expand(size), down[:, None].expand(size), right.expand(size)])
 
 
-def _without_surface(scene: Scene, size: Size) -> Tensor:
-    """The scene without the smooth surface below the dark part of its frame.
+def fit_below(
+    y: Tensor, X: Tensor, *, above: float, steps: int, inside: Tensor | None = None, ridge: float = 0.0
+) -> Tensor:
+    """Coefficients (..., T) of the largest combination of X (T, P) below y (..., P): asymmetric least squares.
 
-    Asymmetric least squares: pixels above the surface have a small weight.
+    Args:
+        y: the values.
+        X: the basis.
+        above: weight of values above the fit; those below it have a weight of 1.
+        steps: of the iteration, which finds out what is above.
+        inside: (..., P), 0 where a value does not count, else 1; ``None`` if all count.
+        ridge: added to the diagonal, over P, so that there is a solution if few values count.
     """
+    penalty = ridge * X.shape[1] * torch.eye(len(X), device=X.device, dtype=X.dtype)
+    inside = torch.ones_like(y) if inside is None else inside.expand_as(y)
+    weight, c = inside, y
+    for _ in range(steps):
+        XW = X * weight[..., None, :]
+        c = torch.linalg.solve(XW @ X.mT + penalty, XW @ y[..., None])[..., 0]
+        weight = torch.where(c @ X < y, above * inside, inside)
+    return c
+
+
+def _without_surface(scene: Scene, size: Size) -> Tensor:
+    """The scene without the smooth surface below the dark part of its frame."""
     frame = scene[..., : size[0], : size[1]]
     dark = ~_bright(frame)
-    X, y = cosines(size, scene.device, SURFACE_ORDER).light.flatten(1), frame.flatten(2)
-    ridge = 1e-3 * X.shape[1] * torch.eye(len(X), device=X.device, dtype=X.dtype)
-    inside = dark.flatten(2).float()
-    weight, surface = inside.expand_as(y), y
-    for _ in range(10):
-        XW = X * weight[:, :, None]
-        surface = torch.linalg.solve(XW @ X.T + ridge, XW @ y[..., None])[..., 0] @ X
-        weight = torch.where(surface < y, ABOVE * inside, inside)
-    below = torch.minimum(surface.reshape(frame.shape).clamp(min=0), frame) * dark
+    X = cosines(size, scene.device, SURFACE_ORDER).light.flatten(1)
+    c = fit_below(frame.flatten(2), X, above=ABOVE, steps=10, inside=dark.flatten(2).float(), ridge=1e-3)
+    below = torch.minimum((c @ X).reshape(frame.shape).clamp(min=0), frame) * dark
     return scene - _on_grid(below, scene)
 
 
