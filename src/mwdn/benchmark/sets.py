@@ -98,22 +98,22 @@ def open_dataset(name: str, recipe: DatasetRecipe, folder: Path, device: torch.d
     if simulates:
         recipe = replace(recipe, sensor=simulated_sensor(recipe.sensor, calibration))
     identity = _identity(recipe, calibration)
-    path = Path(recipe.pairs)  # the user's file, which is only read, unless the pairs are simulated or imported
-    if simulates or recipe.kind:
-        path = folder / f"{name}.h5"
-        if not _is_made(path, identity):
-            if simulates:
-                _simulate(recipe, calibration, path, device, lambda rows: track(f"{name}: simulating", rows))
-            else:
-                _import(recipe, calibration, path)
-            write_text(path.with_suffix(".json"), json.dumps(identity, indent=2))
+    note = folder / f"{name}.json"
+    own = simulates or bool(recipe.kind)  # else the user's file, which is only read
+    path = folder / f"{name}.h5" if own else Path(recipe.pairs)
+    if own and not _is_made(path, note, identity):
+        if simulates:
+            _simulate(recipe, calibration, path, device, lambda rows: track(f"{name}: simulating", rows))
+        else:
+            _import(recipe, calibration, path)
+        write_text(note, json.dumps(identity, indent=2))
     file = PairFile(path)
     check_pairs(file, calibration.psf)
     rows = _rows(recipe, len(file), simulates)
     refinement = Refinement() if simulates else missing_refinement(file, calibration.refinement)
     pairs = partial(RecordedPairs, file, psf=calibration.psf.to(device), seed=recipe.seed, refinement=refinement)
-    if path == Path(recipe.pairs):
-        _refuse_changed(path, folder / f"{name}.json", pairs(rows["test"]).fingerprint)
+    if not own:
+        _refuse_changed(path, note, pairs(rows["test"]).fingerprint)
     training = None if recipe.trained_on else _training(recipe, calibration, pairs, rows, device)
     test = RefinedPairs(Part(file, rows["test"]), refinement)
     return Dataset(name, recipe, calibration, test, training, identity, file.measurement_shape[2])
@@ -131,13 +131,12 @@ def _refuse_changed(path: Path, note: Path, fingerprint: str) -> None:
         )
 
 
-def _is_made(path: Path, identity: dict[str, Any]) -> bool:
-    """Whether a file of pairs is there, of this identity.
+def _is_made(path: Path, note: Path, identity: dict[str, Any]) -> bool:
+    """Whether a file of pairs is there, of this identity, which is in a note beside it.
 
     Raises:
         ParameterError: it is of another one.
     """
-    note = path.with_suffix(".json")
     made = read_json(note) if note.is_file() and path.is_file() else None
     if made not in (None, identity):
         raise ParameterError(
