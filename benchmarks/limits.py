@@ -17,7 +17,7 @@ from mwdn import Calibration, convolve, correlate
 from mwdn.data.importers import import_pairs
 from mwdn.data.pairs import PairFile
 from mwdn.evaluation.metrics import Protocol, best_gain, psnr
-from mwdn.networks.blocks import block_means
+from mwdn.networks.block_means import block_means
 from mwdn.solvers import Pyramid, align
 
 PART = Protocol.parse("60:270,60:440")

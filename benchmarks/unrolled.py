@@ -32,7 +32,7 @@ from mwdn.data.recorded import HELD_OUT
 from mwdn.data.simulated import SimulatedPairs
 from mwdn.evaluation.distances import log_mse
 from mwdn.networks import build
-from mwdn.networks.blocks import block_means
+from mwdn.networks.block_means import block_means
 from mwdn.optics.warp import hazed
 from mwdn.training.losses import Loss
 from mwdn.training.recipe import read_recipe

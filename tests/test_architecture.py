@@ -177,8 +177,9 @@ def bound(tree: ast.Module) -> set[str]:
         if isinstance(node, ast.ImportFrom):
             names |= {alias.asname or alias.name for alias in node.names}
     for node in tree.body:
-        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
-        names |= {target.id for target in targets if isinstance(target, ast.Name)}
+        if isinstance(node, ast.Assign | ast.AnnAssign):
+            stored = (each for each in ast.walk(node) if isinstance(getattr(each, "ctx", None), ast.Store))
+            names |= {each.id for each in stored if isinstance(each, ast.Name)}
     return names
 
 
@@ -203,6 +204,21 @@ def test_a_folder_lists_its_names_once_and_has_them():
         elif names and "__getattr__" not in known and not set(names) <= known:
             wrong.append(f"{place(path)} lists {set(names) - known}, which it does not have")
     assert not wrong
+
+
+def test_scripts_import_names_that_exist():
+    """Those of benchmarks, documents and examples, most of which no test runs."""
+    known = {dotted(path): bound(tree) | set(listed(tree) or ()) for path, tree in TREES.items()}
+    missing = [
+        f"{place(path, node.lineno)} imports {alias.name} from {node.module}"
+        for folder in ("benchmarks", "docs", "examples")
+        for path in sorted((ROOT / folder).rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "mwdn"
+        for alias in node.names
+        if alias.name not in known.get(node.module, ()) and f"{node.module}.{alias.name}" not in MODULES
+    ]
+    assert not missing
 
 
 def test_no_message_names_a_page_that_a_wheel_lacks():
