@@ -7,7 +7,7 @@ MAX_FLOAT = 2.0
 """Largest number of a capture of floats, where 1 is saturation; noise and other steps of a pipeline exceed 1."""
 
 
-def check_float_scale(frame: Frame | None, bit_depth: int | None, what: str = "The frame") -> None:
+def check_float_scale(frame: Frame | None, bit_depth: int | None, *, of: str | None = None) -> None:
     """Raise a `ParameterError` for floats far above 1, such as the numbers of 8 bits, without a bit depth.
 
     For captures, and for frames that are subtracted. The scale of a PSF from which nothing is subtracted does not
@@ -16,18 +16,17 @@ def check_float_scale(frame: Frame | None, bit_depth: int | None, what: str = "T
     Args:
         frame: (H, W, C); ``None`` if there is none.
         bit_depth: of the frame's format.
-        what: the frame, for the message. The bits of ``"The frame"`` are guessed from its largest number; other frames,
-            as dark ones, may be far below saturation.
+        of: what the frame is, for the message; ``None`` for a capture. The bits of a capture are guessed from its
+            largest number; a dark frame, for example, may be far below saturation.
     """
     if frame is None or bit_depth is not None or frame.dtype.kind != "f":
         return
     if not (largest := float(frame.max())) > MAX_FLOAT:
         return
-    bits = next((bits for bits in (8, 10, 12, 14, 16) if largest < 2**bits), None)
-    way_out = "" if bits is None else f", or give `bit_depth={bits}`"
-    if what != "The frame":
-        way_out = ", or give the sensor's `bit_depth`"
+    way_out = ", or give the sensor's `bit_depth`" if of else ""
+    if not of and (bits := next((bits for bits in (8, 10, 12, 14, 16) if largest < 2**bits), None)):
+        way_out = f", or give `bit_depth={bits}`"
     raise ParameterError(
-        f"{what} holds floats up to {largest:g}, but 1 is saturation. Divide them by the camera's largest "
+        f"{of or 'The frame'} holds floats up to {largest:g}, but 1 is saturation. Divide them by the camera's largest "
         f"number{way_out}."
     )

@@ -195,7 +195,7 @@ class FrameFormat:
         Raises:
             ParameterError: it holds floats on another scale than [0, 1], and there is no bit depth.
         """
-        check_float_scale(frame, self.bit_depth, f"`{name}`")
+        check_float_scale(frame, self.bit_depth, of=f"`{name}`")
         return None if frame is None else self.normalise(frame)
 
     def denormalise(self, image: Image) -> Frame:

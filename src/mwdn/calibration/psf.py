@@ -212,7 +212,7 @@ class Calibration:
         if self.corrections.psf_done or not self.psf_format.shares_pixels(self.frames):
             return own_frames.to_measurement(frame)
         if self.dark is not None:
-            check_float_scale(frame, self.frames.bit_depth, "`psf`, from which `dark` is subtracted,")
+            check_float_scale(frame, self.frames.bit_depth, of="`psf`, from which `dark` is subtracted,")
         return own_frames.to_measurement(frame, self.dark, self.corrections)
 
     def __post_init__(self) -> None:

@@ -92,6 +92,8 @@ class SupervisedTask:
         """The same for a batch."""
         measurement, scene, psf = batch
         reconstruction = network(measurement.contiguous(memory_format=torch.channels_last), psf)
+        if isinstance(network, Network):
+            scene = network.as_reconstructed(scene)
         return distance(self._in_units(reconstruction.float(), scene), scene)
 
     def score(self, network: nn.Module, distance: Loss, numbers: range) -> Scores:
@@ -150,7 +152,9 @@ def few_pairs_tasks(
 
 
 def reconstruct_aligned(network: nn.Module, measurement: Measurement, psf: Psf) -> Scene:
-    """Reconstruct as `mwdn.Reconstructor` does: with the PSF aligned to each capture if ``network.align``."""
-    if isinstance(network, Network) and network.align:
+    """Reconstruct as `mwdn.Reconstructor` does: the PSF aligned if ``network.align``, the scene as recorded."""
+    if not isinstance(network, Network):
+        return network(measurement, psf)
+    if network.align:
         psf = align(measurement, psf).move(psf)
-    return network(measurement, psf)
+    return network.as_recorded(network(measurement, psf))
