@@ -155,6 +155,14 @@ def test_a_subtracted_frame_on_another_scale_is_refused(caustic, name):
     torch.testing.assert_close(given.correct(picture), by_hand.correct(picture))
 
 
+@pytest.mark.parametrize("name", ["psf", "dark", "ambient"])
+def test_too_many_bits_name_their_frame(caustic, name):
+    frames = dict.fromkeys(("psf", "dark", "ambient"), (1000 * caustic).astype(np.uint16))
+    frames[name] = frames[name] * 9
+    with pytest.raises(ParameterError, match=rf"`bit_depth` \(12\) .* 4,095, but `{name}` holds 8,091: .* 13 bits"):
+        Calibration.from_array(frames.pop("psf"), bit_depth=12, **frames)
+
+
 def test_a_dark_frame_needs_the_scale_of_a_psf_of_floats(caustic):
     with pytest.raises(ParameterError, match=r"`psf`.*`dark`.* 180\b"):
         Calibration.from_array(200 * caustic, dark=np.full(SIZE, 5, np.uint8))

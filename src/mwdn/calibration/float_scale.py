@@ -7,19 +7,19 @@ MAX_FLOAT = 2.0
 """Largest number of a capture of floats, where 1 is saturation; noise and other steps of a pipeline exceed 1."""
 
 
-def check_float_scale(frame: Frame | None, bit_depth: int | None, *, of: str | None = None) -> None:
+def check_float_scale(frame: Frame, bit_depth: int | None, *, of: str | None = None) -> None:
     """Raise a `ParameterError` for floats far above 1, such as the numbers of 8 bits, without a bit depth.
 
     For captures, and for frames that are subtracted. The scale of a PSF from which nothing is subtracted does not
     matter.
 
     Args:
-        frame: (H, W, C); ``None`` if there is none.
+        frame: (H, W, C).
         bit_depth: of the frame's format.
         of: what the frame is, for the message; ``None`` for a capture. The bits of a capture are guessed from its
             largest number; a dark frame, for example, may be far below saturation.
     """
-    if frame is None or bit_depth is not None or frame.dtype.kind != "f":
+    if bit_depth is not None or frame.dtype.kind != "f":
         return
     if not (largest := float(frame.max())) > MAX_FLOAT:
         return

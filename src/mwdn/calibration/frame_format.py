@@ -193,10 +193,13 @@ class FrameFormat:
         """`normalise` for a frame that is subtracted from others.
 
         Raises:
-            ParameterError: it holds floats on another scale than [0, 1], and there is no bit depth.
+            ParameterError: see `check_bits`; or it holds floats on another scale than [0, 1], without a bit depth.
         """
+        if frame is None:
+            return None
         check_float_scale(frame, self.bit_depth, of=f"`{name}`")
-        return None if frame is None else self.normalise(frame)
+        self.check_bits(frame, f"`{name}`")
+        return self.normalise(frame)
 
     def denormalise(self, image: Image) -> Frame:
         """Inverse of `read` and `normalise`: a frame of floats (H, W, C) in the order of the camera's files."""
@@ -210,24 +213,35 @@ class FrameFormat:
         """Largest number of the sensor: ``2^bit_depth - 1``; without a bit depth the file type's maximum, 1 for floats.
 
         Raises:
-            ParameterError: the frame holds a larger number, or the file's type has fewer bits.
+            ParameterError: see `check_bits`.
         """
         frame = as_frame(frame, finite=False)
+        self.check_bits(frame)
         if self.bit_depth is None:
             return 1.0 if frame.dtype.kind == "f" else float(np.iinfo(frame.dtype).max)
+        return float(2**self.bit_depth - 1)
+
+    def check_bits(self, frame: Frame, of: str = "the frame") -> None:
+        """Raise a `ParameterError` if a frame's type has fewer bits than ``bit_depth``, or its numbers have more.
+
+        Args:
+            frame: (H, W, C).
+            of: what the frame is, for the message.
+        """
+        if self.bit_depth is None:
+            return
         if frame.dtype.kind != "f" and self.bit_depth > 8 * frame.dtype.itemsize:
             raise ParameterError(
-                f"`bit_depth` ({self.bit_depth}) must be at most {8 * frame.dtype.itemsize}, the bits of the file's "
-                "numbers. Save frames with 16 bits, or leave out `bit_depth`."
+                f"`bit_depth` ({self.bit_depth}) must be at most {8 * frame.dtype.itemsize}, the bits of the numbers "
+                f"of {of}. Save frames with 16 bits, or leave out `bit_depth`."
             )
         maximum = 2**self.bit_depth - 1
         if frame.max() > maximum:
             raise ParameterError(
-                f"`bit_depth` ({self.bit_depth}) allows numbers up to {maximum:,}, but the frame holds "
-                f"{frame.max():,}: it has at least {int(frame.max()).bit_length()} bits. Leave out `bit_depth` if "
-                "the numbers fill the file's type."
+                f"`bit_depth` ({self.bit_depth}) allows numbers up to {maximum:,}, but {of} holds {frame.max():,}: it "
+                f"has at least {int(frame.max()).bit_length()} bits. Leave out `bit_depth` if the numbers fill the "
+                "file's type."
             )
-        return float(maximum)
 
     def saturated(self, frame: Frame) -> tuple[int, int]:
         """Number of saturated pixels, and the number at which the sensor saturates; (0, 1) for floats."""

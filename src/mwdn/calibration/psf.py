@@ -15,7 +15,7 @@ from mwdn.calibration.float_scale import check_float_scale
 from mwdn.calibration.frame_format import FrameFormat
 from mwdn.calibration.place_files import PlaceFiles
 from mwdn.calibration.psf_format import PsfFormat, with_options
-from mwdn.calibration.psf_levels import background_level, empty, refuse_saturated
+from mwdn.calibration.psf_levels import background_level, check_psf_frame, empty
 from mwdn.calibration.refinement import TERMS, Refinement
 from mwdn.calibration.size_advice import advise_size
 from mwdn.calibration.white_balance import WhiteBalance, check_white_balance
@@ -187,7 +187,7 @@ class Calibration:
         ambient: Frame | None,
         corrections: Corrections = Corrections(),
     ) -> "Calibration":
-        refuse_saturated(frames, frame)
+        check_psf_frame(frames, frame)
         draft = cls(
             torch.ones(1, 1, 1, 1),
             frames,

@@ -24,8 +24,14 @@ def estimate_background(image: Image) -> Tensor:
     return pixels[..., int(0.05 * pixels.shape[-1])][..., None, None]
 
 
-def refuse_saturated(frames: FrameFormat, frame: Frame) -> None:
-    """Raise a `PsfError` if more than `SATURATED_PART` of a PSF's raw frame is saturated."""
+def check_psf_frame(frames: FrameFormat, frame: Frame) -> None:
+    """Check the raw frame of a PSF.
+
+    Raises:
+        ParameterError: see `FrameFormat.check_bits`.
+        PsfError: more than `SATURATED_PART` of it is saturated.
+    """
+    frames.check_bits(frame, "`psf`")
     count, maximum = frames.saturated(frame)
     pixels = frame.shape[0] * frame.shape[1]
     if count > SATURATED_PART * pixels:
