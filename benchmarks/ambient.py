@@ -1,7 +1,7 @@
 """Light of a room on the sensor: what it costs, and what --ambient and --room-light bring back.
 
     python benchmarks/ambient.py ../shared/data [--methods universal-small universal] [--psfs "mwdn-camera 320x320"]
-                                              [--filling 2] [--dark 2] [--spots]
+                                              [--filling 2] [--dark 2] [--spots | --real]
 
 Test photographs that fill the frame and objects on dark, 15,000 electrons at saturation, exact PSF. The light is a
 share of the mean measurement: even 20 %, a slope of 0 to 50 %, Gaussian spots of 30 % with a standard deviation of 0.4
@@ -11,8 +11,9 @@ the numbers of each picture.
 `ambient` subtracts a frame of the room's light alone, without its noise, as `mwdn.Calibration` does. Two rows say
 what no method can recover. `exact` subtracts the light itself, so that only its photon noise remains. `dark room` has
 no such light, but the exposure of the capture that has: a bright spot saturates earlier, so the scene gets less light.
-`--spots` reconstructs nothing: it says which narrow spots are found, and with which error (root mean square over the
-mean measurement).
+`--spots` and `--real` reconstruct nothing. The first says which narrow spots are found, and with which error (root mean
+square over the mean measurement). The second adds these lights to the real captures, which have none that is found, and
+says how much of them is found and left: room light with the PSFs and the stray light of real cameras.
 """
 
 import argparse
@@ -25,6 +26,7 @@ import torch
 from torch.nn import functional as F
 
 import mwdn
+from known_captures import real_captures
 from mwdn import Camera, Reconstructor, psnr
 from mwdn.calibration.ambient_frame import denoise_ambient
 from mwdn.data.photographs import Photographs
@@ -44,6 +46,14 @@ def lights(size):
         "slope": 0.25 * sloping_light(size, 0.6),
         "wide spot": 0.3 * spot_light(size, (0.4, 0.6), 0.4),
         "narrow spot": 0.3 * spot_light(size, (0.4, 0.6), 0.15),
+    }
+
+
+def mixed_lights(size):
+    """A plane of light and a wide spot together."""
+    return {
+        "even and wide": 0.12 * even_light(size) + 0.2 * spot_light(size, (0.3, 0.7), 0.4),
+        "slope and wide": 0.15 * sloping_light(size, 0.6) + 0.15 * spot_light(size, (0.6, 0.3), 0.4),
     }
 
 
@@ -94,6 +104,20 @@ def spots(calibration, picture, *, fills):
         yield f"{'filling' if fills else 'dark'} | {share} | {float(found.share):.3f} | {float(error):.4f}"
 
 
+def real(data):
+    """Lines of a table: light added to each real capture, what is found and what is left, over the mean measurement."""
+    for capture in real_captures(data):
+        if "," in capture.name.replace(", ", "", 1) or capture.truth["bin"] != "1" or capture.truth["mosaic"]:
+            continue  # another state of the same capture
+        calibration = capture.calibration("light")
+        b = calibration.correct(capture.frame)
+        for name, shape in (lights(calibration.size) | mixed_lights(calibration.size)).items():
+            room = shape * b.mean()
+            found = find_room_light(b + room, calibration.psf)
+            errors = [(each / (b + room).mean()).square().mean().sqrt() for each in (room, found.background - room)]
+            yield f"{capture.name} | {name} | {errors[0]:.3f} | {float(found.share):.3f} | {errors[1]:.3f}"
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path)
@@ -102,10 +126,16 @@ def main():
     parser.add_argument("--filling", type=int, default=2)
     parser.add_argument("--dark", type=int, default=2)
     parser.add_argument("--spots", action="store_true")
+    parser.add_argument("--real", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/ambient.json"))
     arguments = parser.parse_args()
     mwdn.keep_memory()
     photographs = Photographs(arguments.data / "photos" / "test", limit=arguments.filling + arguments.dark)
+    if arguments.real:
+        print("| capture | light | added | found | left |\n|" + " --- |" * 5)
+        for line in real(arguments.data):
+            print(f"| {line} |", flush=True)
+        return
     if arguments.spots:
         print("| PSF | scene | spot | found | error |\n|" + " --- |" * 5)
         for name, number in itertools.product(arguments.psfs, range(arguments.filling + arguments.dark)):
