@@ -107,8 +107,8 @@ def spots(calibration, picture, *, fills):
 def real(data):
     """Lines of a table: light added to each real capture, what is found and what is left, over the mean measurement."""
     for capture in real_captures(data):
-        if "," in capture.name.replace(", ", "", 1) or capture.truth["bin"] != "1" or capture.truth["mosaic"]:
-            continue  # another state of the same capture
+        if capture.name.count(",") > 1 or capture.truth["bin"] != "1":
+            continue  # the same capture in another state, or with another PSF
         calibration = capture.calibration("light")
         b = calibration.correct(capture.frame)
         for name, shape in (lights(calibration.size) | mixed_lights(calibration.size)).items():
@@ -130,12 +130,12 @@ def main():
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/ambient.json"))
     arguments = parser.parse_args()
     mwdn.keep_memory()
-    photographs = Photographs(arguments.data / "photos" / "test", limit=arguments.filling + arguments.dark)
     if arguments.real:
         print("| capture | light | added | found | left |\n|" + " --- |" * 5)
         for line in real(arguments.data):
             print(f"| {line} |", flush=True)
         return
+    photographs = Photographs(arguments.data / "photos" / "test", limit=arguments.filling + arguments.dark)
     if arguments.spots:
         print("| PSF | scene | spot | found | error |\n|" + " --- |" * 5)
         for name, number in itertools.product(arguments.psfs, range(arguments.filling + arguments.dark)):

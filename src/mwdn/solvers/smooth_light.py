@@ -36,9 +36,8 @@ light, and 0.08 to 0.2 where the room's light is 0.17 to 0.23 of the capture."""
 
 MISFIT = 0.1
 """Largest misfit (`_run`) of the light and the bright part of the frame. Light of the room over objects on dark has at
-most 0.04 through an exact PSF. In real captures to which it was added it has 0.03 to 0.09, and a wide spot up to 0.13
-(``benchmarks/ambient.py --real``). Real captures without it, where more than `FAINT` is found, have 0.12 to 0.14, and
-photographs that fill the frame 0.05 to 0.5."""
+most 0.04 through an exact PSF. Added to real captures of such objects it has 0.03 to 0.09, a wide spot up to 0.13.
+Without it these captures have 0.12 to 0.14, and photographs that fill the frame 0.05 to 0.5."""
 
 MOSTLY_DARK = 0.55
 """Least part of the frame that a scene must leave dark, below a quarter of its mean. Objects on dark, half as high as
