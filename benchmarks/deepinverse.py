@@ -4,7 +4,8 @@
 
 Pictures of half the size, 135 x 240. `tv` is total variation by DeepInverse's ADMM. `ram` is its network for any linear
 camera, whose weights `--ram` names. The others are methods of mwdn. Scored as in docs/universal.md: best gain and
-offset, rows 30:135, columns 30:220. Methods in the record are not measured again. Needs the extra `deepinverse`.
+offset, rows 30:135, columns 30:220. Methods in the record are not measured again. `tv` and `ram` need the extra
+`deepinverse`.
 """
 
 import argparse
@@ -16,7 +17,6 @@ import torch
 from torch.nn import functional as F
 
 from mwdn import Calibration, Reconstructor
-from mwdn.bridges import DeepInverseSolver
 from mwdn.data.importers import read_pairs
 from mwdn.evaluation import Perceptual, Protocol
 from mwdn.evaluation.metrics import measure
@@ -30,15 +30,17 @@ nothing over 20 and stays below."""
 
 
 def find(name, weights):
-    """A method of DeepInverse or of mwdn."""
+    """A method of DeepInverse or of mwdn, which needs no deepinv."""
+    if name not in ("ram", "tv"):
+        return name
     from deepinv.models import RAM
     from deepinv.optim import ADMM, L2, TVPrior
 
+    from mwdn.bridges import DeepInverseSolver
+
     if name == "ram":
         return DeepInverseSolver(RAM(pretrained=str(weights)).eval())
-    if name == "tv":
-        return DeepInverseSolver(ADMM(L2(), TVPrior(n_it_max=20), **TV))
-    return name
+    return DeepInverseSolver(ADMM(L2(), TVPrior(n_it_max=20), **TV))
 
 
 def main():
