@@ -30,6 +30,7 @@ from known_captures import real_captures
 from mwdn import Camera, Reconstructor, psnr
 from mwdn.calibration.ambient_frame import denoise_ambient
 from mwdn.data.photographs import Photographs
+from mwdn.inference.room_light import estimate_room_light
 from mwdn.optics.room_light import even_light, sloping_light, spot_light
 from mwdn.optics.sensor import Sensor
 from mwdn.solvers import find_room_light
@@ -113,9 +114,12 @@ def real(data):
         b = calibration.correct(capture.frame)
         for name, shape in (lights(calibration.size) | mixed_lights(calibration.size)).items():
             room = shape * b.mean()
-            found = find_room_light(b + room, calibration.psf)
-            errors = [(each / (b + room).mean()).square().mean().sqrt() for each in (room, found.background - room)]
-            yield f"{capture.name} | {name} | {errors[0]:.3f} | {float(found.share):.3f} | {errors[1]:.3f}"
+            ways = [find_room_light(b + room, calibration.psf, estimate=each) for each in (None, estimate_room_light)]
+            lights_left = (room, *(way.background - room for way in ways))
+            added, left, left_if_sure = ((each / (b + room).mean()).square().mean().sqrt() for each in lights_left)
+            shares = (f"{float(way.share):.3f}" for way in ways)
+            cells = f"{added:.3f}", *(f"{a} | {e:.3f}" for a, e in zip(shares, (left, left_if_sure), strict=True))
+            yield f"{capture.name} | {name} | {' | '.join(cells)}"
 
 
 def main():
@@ -131,7 +135,7 @@ def main():
     arguments = parser.parse_args()
     mwdn.keep_memory()
     if arguments.real:
-        print("| capture | light | added | found | left |\n|" + " --- |" * 5)
+        print("| capture | light | added | found | left | found if known | left if known |\n|" + " --- |" * 7)
         for line in real(arguments.data):
             print(f"| {line} |", flush=True)
         return

@@ -241,7 +241,7 @@ def test_stream_keeps_the_pose(refresh, asked, bank, psf, frames, aligned):
 def test_stream_aligns_without_the_light_of_the_room(psf, frames, aligned, monkeypatch):
     """As a call does: even light looks like haze of the PSF."""
 
-    def found(b, h):
+    def found(b, h, **_):
         return solvers.RoomLight(torch.full_like(b, 0.01), b.new_full((len(b),), 0.1))
 
     monkeypatch.setattr(solvers, "find_room_light", found)

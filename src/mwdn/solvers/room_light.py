@@ -28,6 +28,7 @@ separated from a scene only where the scene is dark: a plane is subtracted only 
 colours, and is fitted again in pixels of half the side.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -76,6 +77,10 @@ ABOVE = 0.002
 _SPREAD = 1.0, 0.15, 0.15  # S: changes of the even light are taken first
 
 
+Estimator = Callable[[Measurement, Psf], Measurement]
+"""Light (B, C, h, w) in captures of mean 1 and at most `PIXELS` pixels, through PSFs of sum 1, all of this shape."""
+
+
 class RoomLight(NamedTuple):
     """Light of the room in captures.
 
@@ -90,7 +95,7 @@ class RoomLight(NamedTuple):
 
 @checked
 @torch.no_grad()
-def find_room_light(measurement: Measurement, psf: Psf) -> RoomLight:
+def find_room_light(measurement: Measurement, psf: Psf, *, estimate: Estimator | None = None) -> RoomLight:
     """Find even light or a slope, and spots of light, in each capture, from the capture alone.
 
     Captures of a single row or column have none, nor those with NaN, or with a colour whose mean is negative.
@@ -98,6 +103,8 @@ def find_room_light(measurement: Measurement, psf: Psf) -> RoomLight:
     Args:
         measurement: (B, C, H, W), a tensor as `mwdn.Calibration.correct` returns it.
         psf: (1 or B, 1 or C, h, w), centred. Its scale does not matter.
+        estimate: of smooth light where none is found clearly, in place of a plane by the residual; for captures that
+            have some (`mwdn.inference.room_light.estimate_room_light`).
 
     Raises:
         ShapeError: batch or channels do not fit.
@@ -116,24 +123,31 @@ def find_room_light(measurement: Measurement, psf: Psf) -> RoomLight:
     if min(size) < 2:  # a slope needs two pixels
         return RoomLight(torch.zeros_like(measurement), b.new_zeros(len(b)))
     mean = b.mean((-2, -1), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
-    y, h, saturated = _halved(b / mean, psf, PIXELS)
+    y, h, saturated = halved(b / mean, psf, PIXELS)
     spot = find_spot(y, h, saturated)
     if spot.amplitude.any():
-        spot = refine_spot(*_halved(b / mean, psf, 4 * PIXELS), spot)
+        spot = refine_spot(*halved(b / mean, psf, 4 * PIXELS), spot)
     narrow = spot.light((y.shape[-2], y.shape[-1]))
     smooth, clear = find_smooth_light(subtract_light(y, narrow), h)
     light = spot.light(size) * mean
     background = light + torch.where(clear[:, None, None, None], smooth.on(size) * mean, 0.0)
     if not clear.all():
-        plane = _plane(b, psf, light, mean, (y - narrow, h, saturated))
+        plane = _plane(b, psf, light, mean, (y - narrow, h, saturated), estimate)
         background += torch.where(clear[:, None, None, None], 0.0, plane)
     share = background.mean((1, 2, 3)) / mean.mean((1, 2, 3))
     share = torch.where(usable & (share > 0) & (share < 1), share, 0.0)  # NaN counts as none
     return RoomLight(torch.where(share[:, None, None, None] > 0, background, 0.0).to(measurement.dtype), share)
 
 
-def _plane(b: Measurement, psf: Psf, light: Tensor, mean: Tensor, coarse: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-    """The plane of light in captures, (B, C, H, W); 0 where it does not count.
+def _plane(
+    b: Measurement,
+    psf: Psf,
+    light: Tensor,
+    mean: Tensor,
+    coarse: tuple[Tensor, Tensor, Tensor],
+    estimate: Estimator | None,
+) -> Tensor:
+    """The plane of light in captures, (B, C, H, W), or what ``estimate`` finds; 0 where it does not count.
 
     Args:
         b: (B, C, H, W).
@@ -141,19 +155,24 @@ def _plane(b: Measurement, psf: Psf, light: Tensor, mean: Tensor, coarse: tuple[
         light: that of the spot, (B, C, H, W).
         mean: of the captures, (B, C, 1, 1).
         coarse: the captures less the spot, over their mean, with PSFs and saturated pixels, all (B, C, h, w).
+        estimate: as for `find_room_light`.
     """
     size = b.shape[-2], b.shape[-1]
-    c = _search(*(each.reshape(-1, 1, *each.shape[-2:]) for each in coarse))
-    plane = (c @ planes(size, c.device).flatten(1)).reshape(b.shape).mul_(mean).clamp_(min=0)
+    if estimate is None:
+        c = _search(*(each.reshape(-1, 1, *each.shape[-2:]) for each in coarse))
+        plane = (c @ planes(size, c.device).flatten(1)).reshape(b.shape).mul_(mean).clamp_(min=0)
+    else:
+        plane = F.interpolate(estimate(*coarse[:2]), size, mode="bilinear") * mean
     counts = plane.mean((1, 2, 3)) >= FAINT * mean.mean((1, 2, 3))
     if counts.any():
         coarsest = PsfPyramid.from_psf(psf, size, LEVELS[:1])
         counts &= dark_part(coarsest.solve(subtract_light(b, light + plane)).scene) >= DARK_PART
-        plane = _give_back(b, light, plane, coarsest) if counts.any() else plane
+        if estimate is None and counts.any():
+            plane = _give_back(b, light, plane, coarsest)
     return torch.where(counts[:, None, None, None], plane, 0.0)
 
 
-def _halved(y: Measurement, psf: Psf, pixels: int) -> tuple[Tensor, Tensor, Tensor]:
+def halved(y: Measurement, psf: Psf, pixels: int) -> tuple[Tensor, Tensor, Tensor]:
     """Captures of at most so many pixels, a PSF of sum 1 for each, and where they are saturated: all (B, C, h, w)."""
     parts = saturated_pixels(y).float()
     while y.shape[-2] * y.shape[-1] > pixels:

@@ -30,6 +30,9 @@ from mwdn.solvers.light_spot import Cosines, Spot, best_spot, cosines
 from mwdn.solvers.pyramid import PsfPyramid
 from mwdn.types import Measurement, Psf, Scene, Size
 
+COARSEST = replace(LEVELS[0], downsampling=1)
+"""The iterations for a scene in these coarse pixels."""
+
 FAINT = 0.06
 """Least share of the light that the first phase must find. It finds 0.00 to 0.06 in 20 real captures without room
 light, and 0.08 to 0.2 where the room's light is 0.17 to 0.23 of the capture."""
@@ -105,7 +108,7 @@ class Phase(NamedTuple):
 def find_smooth_light(b: Measurement, psf: Psf) -> tuple[SmoothLight, Tensor]:
     """The light in measurements (B, C, h, w) of mean 1, through PSFs (B, C, h, w), and whether it counts, bool (B,)."""
     size = b.shape[-2], b.shape[-1]
-    pyramid = PsfPyramid.from_psf(psf, size, (replace(LEVELS[0], downsampling=1),))
+    pyramid = PsfPyramid.from_psf(psf, size, (COARSEST,))
     basis = cosines(size, b.device)
     none = SmoothLight(b.new_zeros(*b.shape[:2], 3), Spot.none(b))
     light, _ = _run(CAUTIOUS, none, b, pyramid, basis)
@@ -176,27 +179,27 @@ def fit_below(
 def _without_surface(scene: Scene, size: Size) -> Tensor:
     """The scene without the smooth surface below the dark part of its frame."""
     frame = scene[..., : size[0], : size[1]]
-    dark = ~_bright(frame)
+    dark = ~bright_mask(frame)
     X = cosines(size, scene.device, SURFACE_ORDER).light.flatten(1)
     c = fit_below(frame.flatten(2), X, above=ABOVE, steps=10, inside=dark.flatten(2).float(), ridge=1e-3)
     below = torch.minimum((c @ X).reshape(frame.shape).clamp(min=0), frame) * dark
-    return scene - _on_grid(below, scene)
+    return scene - on_grid(below, scene)
 
 
 def _bright_part(scene: Scene, size: Size) -> Tensor:
     """The bright part of the frame."""
     frame = scene[..., : size[0], : size[1]]
-    return _on_grid(frame * _bright(frame), scene)
+    return on_grid(frame * bright_mask(frame), scene)
 
 
-def _bright(frame: Scene) -> Tensor:
+def bright_mask(frame: Scene) -> Tensor:
     """The bright part of scenes and the pixels around it, bool (B, 1, h, w)."""
     grey = frame.mean(1, keepdim=True)
     limit = BRIGHT * grey.flatten(1).quantile(0.95, dim=1)
     return F.max_pool2d((grey > limit[:, None, None, None]).float(), 3, 1, 1) > 0
 
 
-def _on_grid(frame: Tensor, scene: Scene) -> Tensor:
+def on_grid(frame: Tensor, scene: Scene) -> Tensor:
     """A frame on the grid of a scene, with zeros around it."""
     return F.pad(frame, (0, scene.shape[-1] - frame.shape[-1], 0, scene.shape[-2] - frame.shape[-2]))
 

@@ -20,6 +20,11 @@ HUB = "hub:"
 _FOLDER = Path(str(files("mwdn") / "weights"))
 
 
+def bundled_file(name: str) -> Path:
+    """Weights of the package: a network of `BUNDLED`, or ``room-light``, that of `mwdn.inference.find_room_light`."""
+    return _FOLDER / f"{name}.safetensors"
+
+
 def find_weights(name: str) -> Path | None:
     """File of a bundled network, of a folder with one, or of one on the hub, downloaded once; ``None`` for other names.
 
@@ -27,7 +32,7 @@ def find_weights(name: str) -> Path | None:
         CheckpointError: it is not on the hub, or the hub cannot be reached.
     """
     if name in BUNDLED:
-        return _FOLDER / f"{name}.safetensors"
+        return bundled_file(name)
     if (path := Path(name) / "model.safetensors").is_file():
         return path
     return _download(name) if name.startswith(HUB) else None
