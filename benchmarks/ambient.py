@@ -105,6 +105,10 @@ def spots(calibration, picture, *, fills):
         yield f"{'filling' if fills else 'dark'} | {share} | {float(found.share):.3f} | {float(error):.4f}"
 
 
+def rms(light):
+    return float(light.square().mean().sqrt())
+
+
 def real(data):
     """Lines of a table: light added to each real capture, what is found and what is left, over the mean measurement."""
     for capture in real_captures(data):
@@ -114,12 +118,12 @@ def real(data):
         b = calibration.correct(capture.frame)
         for name, shape in (lights(calibration.size) | mixed_lights(calibration.size)).items():
             room = shape * b.mean()
-            ways = [find_room_light(b + room, calibration.psf, estimate=each) for each in (None, estimate_room_light)]
-            lights_left = (room, *(way.background - room for way in ways))
-            added, left, left_if_sure = ((each / (b + room).mean()).square().mean().sqrt() for each in lights_left)
-            shares = (f"{float(way.share):.3f}" for way in ways)
-            cells = f"{added:.3f}", *(f"{a} | {e:.3f}" for a, e in zip(shares, (left, left_if_sure), strict=True))
-            yield f"{capture.name} | {name} | {' | '.join(cells)}"
+            lit = b + room
+            cells = [rms(room / lit.mean())]
+            for estimate in (None, estimate_room_light):
+                found = find_room_light(lit, calibration.psf, estimate=estimate)
+                cells += [float(found.share), rms((found.background - room) / lit.mean())]
+            yield f"{capture.name} | {name} | {' | '.join(f'{each:.3f}' for each in cells)}"
 
 
 def main():

@@ -8,7 +8,7 @@ no light; the others have light of 3 to 53 % of the scene's: even, a slope, a sp
 captures are made once, in coarse pixels, eight at a time, and kept in the folder; a stopped run makes only the rest.
 The loss is the root mean square error of the light over the mean of the capture, twice as heavy where there is none.
 Too much light counts three times as much as too little (`TOO_MUCH`): the scene cannot get back what is subtracted. The
-file of weights gets their moving average. An hour on two cores: half for the captures, half for the steps in bfloat16.
+file of weights gets their moving average. About an hour on two cores, half of it for the captures.
 """
 
 import argparse
@@ -38,7 +38,6 @@ SIZES = (160, 160), (136, 240), (240, 240), (152, 200), (192, 192)
 TOGETHER = 8
 SHARES = 0.03, 0.53
 """Range of the light over the scene's; a small one is more frequent than a large one."""
-
 
 TOO_MUCH = 3.0
 """Factor on the error where there is more light than the room's."""

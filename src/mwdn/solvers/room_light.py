@@ -2,7 +2,8 @@
 
 First a narrow spot is found by what no scene explains (`mwdn.solvers.light_spot`), then a plane of light or a wide spot
 by the glow that it leaves where most of the scene is dark (`mwdn.solvers.smooth_light`). If the second search finds
-nothing, because the PSF is wrong or less of the scene is dark, this module searches a plane by the residual. The
+nothing, because the PSF is wrong or less of the scene is dark, this module searches a plane by the residual, unless
+the caller gives an estimator (`mwdn.inference.room_light`) for captures that are known to have such light. The
 capture b is then a scene v through the PSF, and a background B c of even light and a slope:
 
 1. ``b = C H v + B c + noise`` with ``v >= 0`` and ``B c >= 0``. C crops to the sensor. Where b is saturated, the right

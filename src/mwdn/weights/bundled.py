@@ -21,7 +21,7 @@ _FOLDER = Path(str(files("mwdn") / "weights"))
 
 
 def bundled_file(name: str) -> Path:
-    """Weights of the package: a network of `BUNDLED`, or ``room-light``, that of `mwdn.inference.find_room_light`."""
+    """Weights of the package: a network of `BUNDLED`, or ``room-light``, that of `mwdn.inference.room_light`."""
     return _FOLDER / f"{name}.safetensors"
 
 
