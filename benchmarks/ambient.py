@@ -30,10 +30,9 @@ from known_captures import real_captures
 from mwdn import Camera, Reconstructor, psnr
 from mwdn.calibration.ambient_frame import denoise_ambient
 from mwdn.data.photographs import Photographs
-from mwdn.inference.room_light import estimate_room_light
+from mwdn.inference.room_light import find_room_light
 from mwdn.optics.room_light import even_light, sloping_light, spot_light
 from mwdn.optics.sensor import Sensor
-from mwdn.solvers import find_room_light
 from universal import PSFS, camera, keep
 
 HANDLINGS = ("nothing", "room-light", "ambient", "exact", "dark room")
@@ -120,9 +119,8 @@ def real(data):
             room = shape * b.mean()
             lit = b + room
             cells = [rms(room / lit.mean())]
-            for estimate in (None, estimate_room_light):
-                found = find_room_light(lit, calibration.psf, estimate=estimate)
-                cells += [float(found.share), rms((found.background - room) / lit.mean())]
+            found = find_room_light(lit, calibration.psf)
+            cells += [float(found.share), rms((found.background - room) / lit.mean())]
             yield f"{capture.name} | {name} | {' | '.join(f'{each:.3f}' for each in cells)}"
 
 
@@ -139,7 +137,7 @@ def main():
     arguments = parser.parse_args()
     mwdn.keep_memory()
     if arguments.real:
-        print("| capture | light | added | found | left | found if known | left if known |\n|" + " --- |" * 7)
+        print("| capture | light | added | found | left |\n|" + " --- |" * 5)
         for line in real(arguments.data):
             print(f"| {line} |", flush=True)
         return

@@ -27,9 +27,9 @@ from mwdn.data.cameras import CameraPairs, Cameras
 from mwdn.data.mismatch import EXACT
 from mwdn.data.photographs import Photographs
 from mwdn.data.simulated import SimulatedPairs
+from mwdn.inference.room_light import PIXELS, halved
 from mwdn.networks.room_light import RoomLightUNet, clues
 from mwdn.optics.room_light import even_light, sloping_light, spot_light
-from mwdn.solvers.room_light import PIXELS, halved
 from mwdn.training.network import update_average
 from mwdn.training.recipe import read_recipe
 from mwdn.weights.checkpoint import save_network

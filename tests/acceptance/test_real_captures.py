@@ -10,7 +10,7 @@ import torch
 from mwdn import Calibration, convolve, read_frame
 from mwdn.calibration.isolated_pixels import find_isolated_pixels
 from mwdn.cli.app import main
-from mwdn.solvers import find_room_light
+from mwdn.inference.room_light import find_room_light
 
 pytestmark = pytest.mark.acceptance
 OUT = Path("results/acceptance")
@@ -45,8 +45,11 @@ def test_objects_of_the_papers_camera(data: Path, pattern: str, psf: str, count:
         assert scene[middle - 40 : middle + 40, middle - 40 : middle + 40].mean() > 3 * border
 
 
-def test_no_room_light_is_found_in_real_captures(data: Path) -> None:
-    """Nor where the brightest tenth of a capture is cut off: `universal` looks for it by default."""
+def test_room_light_in_real_captures(data: Path) -> None:
+    """Only the four objects have some, and as much where the brightest tenth of a capture is cut off.
+
+    Their darkest pixel has 0.07 to 0.15 of the mean; that of the same camera's scenes has none.
+    """
     camera, diffusercam, tutorial = data / "mwdn-camera", data / "diffusercam", data / "diffusercam-tutorial"
     small, large = (Calibration.from_file(camera / name) for name in ("psf_320.png", "psf_480.tif"))
     other = Calibration.from_file(tutorial / "psf_sample.tif", bin=4)
@@ -63,7 +66,8 @@ def test_no_room_light_is_found_in_real_captures(data: Path) -> None:
     for calibration, file in captures:
         measurement = calibration.correct(calibration.frames.read(file))
         for b in (measurement, measurement.clamp(max=float(measurement.quantile(0.9)))):
-            assert float(find_room_light(b, calibration.psf).share) == 0.0, file.stem
+            share = float(find_room_light(b, calibration.psf).share)
+            assert (0.1 < share < 0.2) if calibration is small else share == 0.0, file.stem
 
 
 def test_one_pixel_of_all_real_captures_is_hot(data: Path) -> None:

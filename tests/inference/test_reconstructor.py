@@ -17,6 +17,7 @@ from mwdn.calibration import Calibration, FrameFormat
 from mwdn.errors import CheckpointError, ParameterError, ShapeError, UnknownNameError
 from mwdn.inference.methods import find_method
 from mwdn.inference.reconstructor import Reconstructor
+from mwdn.inference.room_light import RoomLight
 from mwdn.networks import NETWORKS, build
 from mwdn.solvers import SOLVERS, Admm, Wiener
 from mwdn.weights.checkpoint import save_network
@@ -241,10 +242,10 @@ def test_stream_keeps_the_pose(refresh, asked, bank, psf, frames, aligned):
 def test_stream_aligns_without_the_light_of_the_room(psf, frames, aligned, monkeypatch):
     """As a call does: even light looks like haze of the PSF."""
 
-    def found(b, h, **_):
-        return solvers.RoomLight(torch.full_like(b, 0.01), b.new_full((len(b),), 0.1))
+    def found(b, h):
+        return RoomLight(torch.full_like(b, 0.01), b.new_full((len(b),), 0.1))
 
-    monkeypatch.setattr(solvers, "find_room_light", found)
+    monkeypatch.setattr("mwdn.inference.reconstructor.find_room_light", found)
     reconstruct = Reconstructor("wiener", Calibration(psf), device="cpu", align=True, room_light=True)
     measurement, scene = next(iter(reconstruct.stream(frames)))
     torch.testing.assert_close(aligned[0][0], measurement - 0.01)

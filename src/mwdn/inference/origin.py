@@ -79,8 +79,7 @@ def _camera(calibration: Calibration) -> dict[str, object]:
 def _method(reconstruct: Reconstructor) -> tuple[object, ...]:
     """The hashed attributes of the method. Alignment, first an option of some networks, is now one of every method."""
     method, aligned = reconstruct.method, ("aligned",) if reconstruct.align else ()
-    sure = ("estimated",) if reconstruct.estimate_light else ()
-    lit = ("room light", *sure) if reconstruct.room_light else ()
+    lit = ("room light",) if reconstruct.room_light else ()
     if not isinstance(method, nn.Module):
         return (method, *aligned, *lit)
     kind = type(method).__name__

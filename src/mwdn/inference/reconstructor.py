@@ -16,7 +16,7 @@ from mwdn.fourier.convolution import check_fit
 from mwdn.inference.engine import Engine, Precision
 from mwdn.inference.ensemble import Ensemble
 from mwdn.inference.methods import Method, as_method, background_warning, method_name, psf_for, psf_warning
-from mwdn.inference.room_light import estimate_room_light
+from mwdn.inference.room_light import find_room_light
 from mwdn.io.formats import as_frame
 from mwdn.networks.blocks import check_channels
 from mwdn.networks.network import Network, as_network
@@ -46,10 +46,9 @@ class Reconstructor:
         white_balance: of the pictures, see `mwdn.calibration.white_balance`; that of the calibration unless given.
         ensemble: average a network's results for the measurement and its three mirror images, see
             `mwdn.inference.ensemble.Ensemble`. It takes four times as long; for a network that takes any PSF.
-        room_light: whether each measurement has even light, a slope or spots of light of the room, to find and
-            subtract first (`mwdn.solvers.find_room_light`). ``True``: it has; where nothing is found clearly, a network
-            estimates it (`mwdn.inference.room_light`). ``None``: it may have; what is found clearly is subtracted where
-            a network aligns, as ``universal`` does, and the calibration has no ambient frame.
+        room_light: whether to find and subtract even light, a slope and spots of light of the room in each
+            measurement first, see `mwdn.inference.room_light`. ``None`` does so where a network aligns, as
+            ``universal`` does, and the calibration has no ambient frame.
         **options: of a solver given by its name, for example ``regularisation=1e-4``.
 
     It can be copied and pickled if its method can.
@@ -102,7 +101,6 @@ class Reconstructor:
         self.align = aligns if align is None else align
         sought = aligns and self.align and calibration.ambient is None
         self.room_light = sought if room_light is None else room_light
-        self.estimate_light = estimate_room_light if room_light else None
         self.psf = psf_for(method, calibration).to(self.device)
         self.engine: Engine[Any] | Ensemble[Any] | None = None
         if isinstance(method, nn.Module):
@@ -180,7 +178,7 @@ class Reconstructor:
         """The measurement less the light of the room, and its share (B,); unchanged and `None` if the option is off."""
         if not self.room_light:
             return measurement, None
-        found = solvers.find_room_light(measurement, self.psf, estimate=self.estimate_light)
+        found = find_room_light(measurement, self.psf)
         return subtract_light(measurement, found.background), found.share
 
     def _reconstruct(self, measurement: Measurement) -> Scene:

@@ -119,7 +119,7 @@ def _order() -> dict[str, Any]:
         align={"enum": ["true", "false"], "description": "Fit the pose of the PSF first."},
         room_light={
             "enum": ["true", "false"],
-            "description": "Subtract the room's light; default: universal, if it is clear.",
+            "description": "Find and subtract the room's light; default: universal.",
         },
         trust={"enum": ["true", "false"], "default": "true", "description": "Check the picture."},
         format={"enum": list(get_args(PictureFormat)), "default": "png"},

@@ -6,7 +6,7 @@
 - `Pyramid`: ADMM from coarse to fine. Better than `Admm`, in a fraction of its time.
 
 `WarmStart` continues `Admm` or `Fista` from frame to frame of a stream; `align` corrects the PSF of a camera that has
-changed since its calibration; `find_room_light` finds the light of the room in a capture.
+changed since its calibration.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,6 @@ from mwdn.solvers.alignment import align
 from mwdn.solvers.fista import Fista
 from mwdn.solvers.pose import Pose
 from mwdn.solvers.pyramid import Pyramid
-from mwdn.solvers.room_light import RoomLight, find_room_light
 from mwdn.solvers.splitting import TEXTBOOK, Penalties
 from mwdn.solvers.warm_start import WarmStart
 from mwdn.solvers.wiener import Wiener
@@ -76,12 +75,10 @@ __all__ = [
     "Penalties",
     "Pose",
     "Pyramid",
-    "RoomLight",
     "Solver",
     "WarmStart",
     "Wiener",
     "align",
     "build",
-    "find_room_light",
     "noise_level",
 ]
