@@ -59,7 +59,7 @@ function orderFields(method = byId("method").value, trust = byId("trust").checke
   const options = method === byId("method").value ? readSliders() : {};
   const align = byId("align").checked ? "true" : "";
   const room = byId("room-light").value;
-  const light = { room_light: String(room === "found"), ambient: room === "frame" ? chosen.ambient : null };
+  const light = room === "frame" ? { room_light: "false", ambient: chosen.ambient } : { room_light: room };
   return { ...cameraFields(), ...light, capture: chosen.capture, method, align, trust: String(trust), options: JSON.stringify(options) };
 }
 
@@ -69,7 +69,7 @@ const look = (format = "png") =>
 // What all viewers of the live picture share.
 function wishLive() {
   wish({
-    method: byId("method").value, options: readSliders(), align: byId("align").checked, room_light: byId("room-light").value === "found",
+    method: byId("method").value, options: readSliders(), align: byId("align").checked, room_light: byId("room-light").value === "true",
     stops: Number(byId("exposure").value), white_balance: byId("balance").value,
   });
 }
@@ -101,7 +101,8 @@ async function reconstruct() {
       }
     }, mine.signal);
     const report = job.report;
-    say(`${report.method}: ${report.width} × ${report.height} pixels in ${report.seconds.toFixed(2)} s.`);
+    const lit = report.room_light ? ` ${Math.round(100 * report.room_light)} % of its light was the room’s.` : "";
+    say(`${report.method}: ${report.width} × ${report.height} pixels in ${report.seconds.toFixed(2)} s.${lit}`);
     showVerdicts(report);
   } catch (error) {
     if (error.name === "AbortError") return;
@@ -221,7 +222,7 @@ async function removeCamera() {
 function followLive({ method, options, align, room_light }) {
   byId("method").value = method;
   byId("align").checked = align;
-  byId("room-light").value = room_light ? "found" : "";
+  byId("room-light").value = String(room_light);
   byId("ambient-zone").hidden = true;
   chooseMethod(options);
 }
