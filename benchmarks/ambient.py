@@ -12,8 +12,8 @@ the numbers of each picture.
 what no method can recover. `exact` subtracts the light itself, so that only its photon noise remains. `dark room` has
 no such light, but the exposure of the capture that has: a bright spot saturates earlier, so the scene gets less light.
 `--spots` and `--real` reconstruct nothing. The first says which narrow spots are found, and with which error (root mean
-square over the mean measurement). The second adds these lights to the real captures, which have none that is found, and
-says how much of them is found and left: room light with the PSFs and the stray light of real cameras.
+square over the mean measurement). The second adds these lights to real captures, and says how much of them is found and
+left: room light with the PSFs and the stray light of real cameras.
 """
 
 import argparse
@@ -118,9 +118,8 @@ def real(data):
         for name, shape in (lights(calibration.size) | mixed_lights(calibration.size)).items():
             room = shape * b.mean()
             lit = b + room
-            cells = [rms(room / lit.mean())]
             found = find_room_light(lit, calibration.psf)
-            cells += [float(found.share), rms((found.background - room) / lit.mean())]
+            cells = rms(room / lit.mean()), float(found.share), rms((found.background - room) / lit.mean())
             yield f"{capture.name} | {name} | {' | '.join(f'{each:.3f}' for each in cells)}"
 
 

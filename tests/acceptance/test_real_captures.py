@@ -48,7 +48,7 @@ def test_objects_of_the_papers_camera(data: Path, pattern: str, psf: str, count:
 def test_room_light_in_real_captures(data: Path) -> None:
     """Only the four objects have some, and as much where the brightest tenth of a capture is cut off.
 
-    Their darkest pixel has 0.07 to 0.15 of the mean; that of the same camera's scenes has none.
+    Their darkest pixel has 0.07 to 0.15 of the mean; that of the same camera's scenes is black.
     """
     camera, diffusercam, tutorial = data / "mwdn-camera", data / "diffusercam", data / "diffusercam-tutorial"
     small, large = (Calibration.from_file(camera / name) for name in ("psf_320.png", "psf_480.tif"))

@@ -17,9 +17,6 @@ from mwdn.solvers.unexplained import energy, unexplained
 
 SIZE = 48, 64
 
-fast = pytest.mark.usefixtures("unchecked")
-"""Without the import hook's checks, which take most of the time of thousands of small steps. Other tests have them."""
-
 
 @pytest.fixture
 def psf(generator):
@@ -39,7 +36,6 @@ def lit(scene, psf, light):
     return measurement, light * measurement.mean((1, 2, 3), keepdim=True)
 
 
-@fast
 def test_known_light_over_a_scene_on_dark(psf, scene):
     shapes = [0.3 * even_light(SIZE), 0.25 * sloping_light(SIZE, 0.0), 0.25 * sloping_light(SIZE, 0.6)]
     measurement, light = lit(scene, psf, torch.stack(shapes)[:, None])
@@ -60,7 +56,6 @@ def test_a_known_spot_in_three_colours(psf, scene, centre, sigma, error):
     assert float((found.background - light).norm() / light.norm()) < error
 
 
-@fast
 def test_a_spot_as_wide_as_the_psf_is_found_by_its_glow(psf, scene):
     """A scene explains it completely, by a glow around the object; in the dark part there should be none."""
     measurement, light = lit(scene, psf, 0.3 * spot_light(SIZE, (0.4, 0.6), 0.4))
@@ -120,7 +115,6 @@ def test_even_light_through_a_delta_psf_is_the_floor_of_the_scene(scene):
     assert float(found.background.amax()) <= 0.1 + 0.02 * 1.5
 
 
-@fast
 def test_scale_and_other_frames_do_not_matter(psf, scene):
     measurement, light = lit(scene, psf, 0.3 * even_light(SIZE))
     frames = torch.cat([measurement + light, 7 * measurement, measurement + math.inf])
@@ -140,7 +134,6 @@ def test_darkness_below_zero_has_none(psf, generator):
     assert not found.background.any()
 
 
-@fast
 def test_a_reconstructor_subtracts_it(psf, scene):
     measurement, light = lit(scene, psf, 0.3 * even_light(SIZE))
     calibration = Calibration(psf / psf.sum((-2, -1), keepdim=True))
@@ -153,7 +146,6 @@ def test_a_reconstructor_subtracts_it(psf, scene):
     assert torch.equal(*dark)
 
 
-@fast
 def test_a_spot_is_fitted_again_in_finer_pixels():
     """A frame of 96 x 128 is searched at half its size. That alone leaves an error of a third of the spot's light."""
     size, generator = (96, 128), torch.Generator().manual_seed(1)

@@ -55,6 +55,9 @@ SURFACE_ORDER = 3.0
 ABOVE = 0.05
 """Weight of pixels above the surface; pixels below it have a weight of 1."""
 
+RIDGE = 1e-3
+"""Added to the mean square of each basis function, so that there is a surface if few pixels are dark."""
+
 
 class SmoothLight(NamedTuple):
     """A plane of light, or a spot, on each sensor.
@@ -76,7 +79,7 @@ class SmoothLight(NamedTuple):
             basis: of the frame.
             advantage: a spot, which has more shapes, is taken if its error is smaller by this factor.
         """
-        X, t = planes(basis.size, light.device).flatten(1), light.flatten(2)
+        X, t = _planes(basis.size, light.device).flatten(1), light.flatten(2)
         plane = t @ X.T @ torch.linalg.inv(X @ X.T)
         spot = best_spot(-t, basis.light.flatten(1).expand(len(light), -1, -1), basis)
         errors = [(each - t).square().mean((1, 2)) for each in (plane @ X, spot.light(basis.size).flatten(2))]
@@ -85,7 +88,7 @@ class SmoothLight(NamedTuple):
 
     def on(self, size: Size) -> Tensor:
         """The light on a frame, (B, C, h, w), not negative."""
-        plane = self.plane @ planes(size, self.plane.device).flatten(1)
+        plane = self.plane @ _planes(size, self.plane.device).flatten(1)
         return plane.reshape(*plane.shape[:2], *size).clamp(min=0) + self.spot.light(size)
 
 
@@ -146,33 +149,28 @@ def dark_part(frame: Scene) -> Tensor:
     return (blocks < blocks.mean(1, keepdim=True) / 4).float().mean(1)
 
 
-def planes(size: Size, device: torch.device) -> Tensor:
+def _planes(size: Size, device: torch.device) -> Tensor:
     """Even light, and light that rises linearly down and to the right: (3, H, W), each of mean square 1 (nearly)."""
     lengths = (torch.arange(length, device=device, dtype=torch.float32) for length in size)
     down, right = (math.sqrt(3) * ((2 * each + 1) / len(each) - 1) for each in lengths)
     return torch.stack([torch.ones_like(down[:, None]).expand(size), down[:, None].expand(size), right.expand(size)])
 
 
-def fit_below(
-    y: Tensor, X: Tensor, *, above: float, steps: int, inside: Tensor | None = None, ridge: float = 0.0
-) -> Tensor:
+def _fit_below(y: Tensor, X: Tensor, inside: Tensor) -> Tensor:
     """Coefficients (..., T) of the largest combination of X (T, P) below y (..., P): asymmetric least squares.
 
     Args:
         y: the values.
         X: the basis.
-        above: weight of values above the fit; those below it have a weight of 1.
-        steps: of the iteration, which finds out what is above.
-        inside: (..., P), 0 where a value does not count, else 1; ``None`` if all count.
-        ridge: added to the diagonal, over P, so that there is a solution if few values count.
+        inside: (..., P), 0 where a value does not count, else 1.
     """
-    penalty = ridge * X.shape[1] * torch.eye(len(X), device=X.device, dtype=X.dtype)
-    inside = torch.ones_like(y) if inside is None else inside.expand_as(y)
+    penalty = RIDGE * X.shape[1] * torch.eye(len(X), device=X.device, dtype=X.dtype)
+    inside = inside.expand_as(y)
     weight, c = inside, y
-    for _ in range(steps):
+    for _ in range(10):  # finds out what is above
         XW = X * weight[..., None, :]
         c = torch.linalg.solve(XW @ X.mT + penalty, XW @ y[..., None])[..., 0]
-        weight = torch.where(c @ X < y, above * inside, inside)
+        weight = torch.where(c @ X < y, ABOVE * inside, inside)
     return c
 
 
@@ -181,7 +179,7 @@ def _without_surface(scene: Scene, size: Size) -> Tensor:
     frame = scene[..., : size[0], : size[1]]
     dark = ~bright_mask(frame)
     X = cosines(size, scene.device, SURFACE_ORDER).light.flatten(1)
-    c = fit_below(frame.flatten(2), X, above=ABOVE, steps=10, inside=dark.flatten(2).float(), ridge=1e-3)
+    c = _fit_below(frame.flatten(2), X, dark.flatten(2).float())
     below = torch.minimum((c @ X).reshape(frame.shape).clamp(min=0), frame) * dark
     return scene - on_grid(below, scene)
 
