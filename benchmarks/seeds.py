@@ -47,7 +47,8 @@ def row(label, sets, folders, name, than):
     values = [method["values"] for method, _ in have]
     means = [fmean(each["psnr"]) for each in values]
     scores = mean_scores(label, sets)
-    lpips = f"{fmean(fmean(each['lpips']) for each in values):.3f}" if "lpips" in values[0] else ""
+    measured = [each["lpips"] for each in values if None not in each.get("lpips", [None])]
+    lpips = f"{fmean(map(fmean, measured)):.3f}" if measured else ""
     seeds = f"{min(means):.2f} to {max(means):.2f}" if len(have) > 1 else ""
     tenths = [last_tenth(folder, name, label) for _, folder in have]
     tenth = "" if None in tenths else f"{fmean(tenths):+.2f}"
@@ -65,7 +66,11 @@ def main():
     parser.add_argument("--than")
     arguments = parser.parse_args()
     files = [run / "benchmark.json" if run.is_dir() else run for run in arguments.runs]
-    sets = [json.loads(file.read_text())["sets"][arguments.set] for file in files]
+    contents = [json.loads(file.read_text())["sets"] for file in files]
+    for file, content in zip(files, contents, strict=True):
+        if arguments.set not in content:
+            parser.error(f"`{file}` has no set '{arguments.set}'. Known: {', '.join(content)}.")
+    sets = [content[arguments.set] for content in contents]
     columns = ["method", "learned numbers", "PSNR / dB", "LPIPS", "runs", "range over runs", "last tenth / dB"]
     columns += [f"over {arguments.than} / dB"] if arguments.than else []
     print("| " + " | ".join(columns) + " |\n" + "| --- " * len(columns) + "|")

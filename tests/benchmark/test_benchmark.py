@@ -7,6 +7,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
@@ -23,7 +24,7 @@ from mwdn.benchmark.dataset_recipe import DatasetRecipe
 from mwdn.benchmark.recipe import Robustness
 from mwdn.benchmark.robustness import check_axes
 from mwdn.benchmark.sets import Dataset, open_dataset
-from mwdn.benchmark.training import schedule_on, train
+from mwdn.benchmark.training import schedule_on, seconds, train
 from mwdn.calibration import Calibration
 from mwdn.calibration.camera_file import write_camera
 from mwdn.calibration.places import field_camera
@@ -33,7 +34,7 @@ from mwdn.data.pairs import PairFile
 from mwdn.data.recorded import RecordedPairs
 from mwdn.data.simulated import Placement
 from mwdn.errors import CheckpointError, ParameterError, UnknownNameError
-from mwdn.evaluation import alexnet, bootstrap
+from mwdn.evaluation import Perceptual, alexnet, bootstrap
 from mwdn.fourier import convolve
 from mwdn.optics import Deviation, Sensor
 from mwdn.training.recipe import Schedule
@@ -325,7 +326,10 @@ def test_rates_seeds_mismatch_and_the_mean_picture(tmp_path):
     """Each network is trained at the better of two rates; the mean of the training scenes is a row."""
     folder = laid_out(tmp_path)
     text = RECIPE.replace('robustness = { data = "caustic", count = 2, noise = [2], shift_px = [1] }', "")
-    text = text.replace("networks = { wiener = {}, mwdn = {} }", "networks = { wiener = { schedule = { seed = 7 } } }")
+    text = text.replace(
+        "networks = { wiener = {}, mwdn = {} }",
+        "networks = { wiener = { schedule = { seed = 7 } }, own = { name = 'wiener', schedule.learning_rate = 0.5 } }",
+    )
     text = text.replace('ablation = ["wiener", "mwdn"]', "rates = [1e-3, 1e-2]\ntrial = 0.5\nmean_picture = true")
     text = text.replace("deviation = { turn_degrees = 1, off_axis = 1 }", "mismatch = { tails = 0.1 }")
     text = text.replace('compared = "mwdn"', "")
@@ -340,6 +344,9 @@ def test_rates_seeds_mismatch_and_the_mean_picture(tmp_path):
     psnr = {part: read_metadata(runs / part / "best.safetensors")["psnr"] for part in recipes}
     assert {(s["steps"], s["seed"]) for part, s in recipes.items() if part != "."} == {(3, 7)}
     assert (recipes["."]["steps"], recipes["."]["seed"]) == (6, 7)
+    own = runs.with_name("own")  # has a rate of its own
+    assert json.loads((own / "recipe.json").read_text())["recipe"]["schedule"]["learning_rate"] == 0.5
+    assert not [*own.glob("rate-*")]
     better = max(("rate-0.001", "rate-0.01"), key=lambda part: psnr[part])
     assert recipes["."]["learning_rate"] == recipes[better]["learning_rate"]
     pairs = PairFile(folder / "out" / "data" / "caustic.h5")
@@ -588,6 +595,80 @@ def test_a_training_does_not_hash_its_pairs(folder, monkeypatch):
     train(benchmark.methods[-1], dataset, benchmark, folder / "run", device=torch.device("cpu"), show=lambda _: None)
     with safe_open(folder / "run" / "state.safetensors", "pt") as state:
         assert state.metadata()["samples"] == ""
+
+
+def only(solvers="{}", networks="{}"):
+    """The recipe with these methods alone."""
+    text = re.sub("robustness = .*", "", RECIPE).replace('ablation = ["wiener", "mwdn"]\ncompared = "mwdn"', "")
+    text = text.replace('{ quick = { name = "admm", iterations = 3 } }', solvers)
+    return text.replace("{ wiener = {}, mwdn = {} }", networks)
+
+
+def test_metrics_that_were_not_requested_are_measured_when_they_are(folder, monkeypatch):
+    """Scores without LPIPS were kept for ever, and a method added later had a column of its own."""
+    (folder / "r.toml").write_text(only('{ quick = { name = "admm", iterations = 3 } }'), encoding="utf-8")
+    calls = []
+    measure = scoring.evaluate
+    monkeypatch.setattr(scoring, "evaluate", lambda *args, **options: calls.append(1) or measure(*args, **options))
+    monkeypatch.setattr(Perceptual, "load", lambda *_, **__: Perceptual(None, None, {}))
+    seen = []
+    for lpips in (False, None, False):
+        run(read_benchmark(folder / "r.toml"), folder / "out", device="cpu", lpips=lpips)
+        missing = json.loads((folder / "out" / "benchmark.json").read_text())["sets"]["caustic"]["missing"]
+        seen.append((sorted(missing), len(calls)))
+    assert seen == [(["feature_mse", "lpips"], 1), ([], 2), ([], 2)]
+    (folder / "r.toml").write_text(only("{ pyramid = {}, admm = { iterations = 1 } }"), encoding="utf-8")
+    run(read_benchmark(folder / "r.toml"), folder / "out", device="cpu", lpips=False)
+    assert "lpips is missing: not requested" in (folder / "out" / "benchmark.md").read_text()
+
+
+def test_another_split_of_recorded_pairs_needs_another_folder(folder):
+    """Networks were tested on pairs that they were trained on, and `mwdn evaluate` was told the wrong split."""
+    with PairFile.create(folder / "p.h5", measurement_shape=(48, 64, 3), scene_shape=(48, 64, 3)) as file:
+        file.append(torch.rand(10, 3, 48, 64), torch.rand(10, 3, 48, 64))
+    text = only(networks="{ wiener = {} }").partition("[data]")[0].replace("steps = 6", "steps = 1")
+    for split in ("paper", "random"):
+        data = f'[data]\nreal = {{ psf = "psf.npy", pairs = "p.h5", split = "{split}", seed = 5 }}\n'
+        (folder / f"{split}.toml").write_text(text + data, encoding="utf-8")
+    run(read_benchmark(folder / "random.toml"), folder / "out", device="cpu", lpips=False)
+    known = read_metadata(folder / "out" / "runs" / "real" / "wiener" / "best.safetensors")["recipe"]["pairs"]
+    assert (known["split"], known["seed"]) == ("random", 5)
+    with pytest.raises(CheckpointError, match="another recipe"):
+        run(read_benchmark(folder / "paper.toml"), folder / "out", device="cpu", lpips=False)
+
+
+def test_two_lines_that_are_one_training_are_refused(folder):
+    """`--seed 1` made `mwdn` the same as a line with the seed 1."""
+    (folder / "r.toml").write_text(
+        only(networks='{ wiener = {}, second = { name = "wiener", schedule = { seed = 1 } } }'), encoding="utf-8"
+    )
+    benchmark = read_benchmark(folder / "r.toml")
+    benchmark = replace(benchmark, schedule=replace(benchmark.schedule, seed=1))
+    with pytest.raises(ParameterError, match=r"`wiener` and `second` are the same network with the same seed \(1\)"):
+        run(benchmark, folder / "out", device="cpu", lpips=False)
+
+
+def test_the_time_before_an_interruption_counts(folder):
+    """Its steps are kept: the times of interrupted trainings were too short."""
+    (folder / "r.toml").write_text(RECIPE.replace("validate_every = 2", "validate_every = 6"), encoding="utf-8")
+    benchmark = read_benchmark(folder / "r.toml")
+    dataset = open_dataset("caustic", benchmark.data["caustic"], folder, torch.device("cpu"), lambda _, rows: rows)
+
+    def go(show):
+        method = benchmark.methods[1]
+        train(method, dataset, benchmark, folder / "run", device=torch.device("cpu"), show=show)
+
+    def slow(report):
+        if report.step == 3:
+            time.sleep(1)
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt, match="after step 3"):
+        go(slow)
+    assert seconds(folder / "run") >= 1
+    go(lambda _: None)
+    assert seconds(folder / "run") >= 1
+    assert json.loads((folder / "run" / "clock.json").read_text())["step"] == 6
 
 
 def test_samples_are_a_stage_before_the_steps():

@@ -258,6 +258,10 @@ def test_a_checkpoint_is_evaluated_on_the_pairs_that_its_training_left_out(run, 
         return json.loads(out)["methods"]["runs/x/best.safetensors"]["values"]["psnr"]
 
     every, held_out = psnr(), Division("folds", fold=1).parts(20)["validation"]
+    said = []
+    for options in ("", " --first 4", " --split folds --part validation", " --split paper"):
+        said += [re.findall(r"was trained on (\d+) of these (\d+)", flat(run(evaluate + options)[2]))]
+    assert said == [[("15", "20")], [("4", "4")], [], [("2", "2")]]
     assert psnr(" --split folds --part validation") == pytest.approx([every[n] for n in held_out], abs=1e-3)
     assert run(line.replace("runs/x", "runs/y") + network)[0] == 0
     code, _, err = run(

@@ -94,6 +94,34 @@ def test_phlatcams_scenes_are_in_the_middle(tmp_path):
     assert outside.sum() == 0 < scene[1:3, 1:5].min() + 1
 
 
+@pytest.mark.parametrize("crop", [(300, 300), (260, 310)])
+def test_the_authors_place_is_known_in_the_middle_of_their_frames(distributed, tmp_path, crop):
+    folder, captures, scenes = distributed
+    _, capture, scene = next(read_pairs("mwdn", folder, frames=FrameFormat(crop=crop)))
+    padded = np.pad(scenes[0], ((94, 89), (94, 89), (0, 0)))
+    top, left = ((320 - length) // 2 for length in crop)
+    middle = np.s_[top : top + crop[0], left : left + crop[1]]
+    assert np.array_equal(capture // 257, captures[0][middle])
+    assert np.array_equal(scene // 257, padded[middle])
+
+
+def test_a_scene_without_a_place_is_no_silent_success(tmp_path, capsys):
+    """The place is published for 320 x 320 pixels. Other files were written without a word."""
+    write(tmp_path / "theirs" / "blur" / "0.png", noise(40, 40))
+    write(tmp_path / "theirs" / "gt" / "0.png", noise(17, 17))
+    line = ["import", "mwdn", str(tmp_path / "theirs"), "-o", str(tmp_path / "pairs.h5")]
+    with pytest.raises(SystemExit) as ended:
+        main(line)
+    assert ended.value.code == 0
+    assert "17 x 17" in (said := capsys.readouterr().err)
+    assert "--scene-place" in said
+    with pytest.raises(SystemExit) as ended:
+        main([*line[:-1], str(tmp_path / "authors.h5"), "--authors"])
+    assert ended.value.code == 2
+    assert "--scene-place" in capsys.readouterr().err
+    assert not (tmp_path / "authors.h5").exists()
+
+
 @pytest.mark.parametrize("place", [(184, 0), (0, 184)])
 def test_a_scene_must_lie_within_the_frame(distributed, tmp_path, place):
     with pytest.raises(ImageError, match=r"137 x 137.*320 x 320.*--scene-place"):

@@ -6,6 +6,7 @@ from typing import Any
 
 from mwdn.calibration import Calibration
 from mwdn.data.mismatch import EXACT, Mismatch
+from mwdn.data.recorded import Division
 from mwdn.data.simulated import Placement
 from mwdn.evaluation import Protocol
 from mwdn.optics import Deviation, Sensor
@@ -65,6 +66,10 @@ class DatasetRecipe:
     trained_on: str = ""
     captures: tuple[str, ...] = ()
     protocol: str = "full"
+
+    def division(self) -> Division:
+        """How recorded pairs are divided; the default where there is no ``split``."""
+        return Division(self.split, seed=self.seed) if self.split else Division()
 
     def binned_protocol(self) -> Protocol:
         """The protocol at the size of the binned pictures: "centre-128" binned by 2 is "centre-64"."""

@@ -28,7 +28,7 @@ def _dataset_content(results: Results, name: str) -> dict[str, Any]:
     return {
         "protocol": dataset.protocol.name,
         "variant": dataset.protocol.variant,
-        "missing": next(iter(method_results.values())).missing,
+        "missing": results.missing(name),
         "data": dataset.identity,
         "methods": {
             label: {

@@ -96,6 +96,10 @@ class Benchmark:
     heads: str = ""
     path: str = ""
 
+    def rates_of(self, method: Method) -> tuple[float, ...]:
+        """Learning rates to try for a network; none if its line of the recipe gives one."""
+        return () if "learning_rate" in method.schedule else self.rates
+
 
 def read_benchmark(path: str | Path) -> Benchmark:
     """Read a recipe.

@@ -39,10 +39,13 @@ class Results:
 
     def report(self, name: str) -> Report:
         """The comparison on one data set."""
-        protocol, results = self.datasets[name].protocol, self.methods[name]
-        missing = next(iter(results.values())).missing
-        scores = {label: result.scores for label, result in results.items()}
-        return Report(protocol.name, protocol.variant, scores, missing, [])
+        protocol = self.datasets[name].protocol
+        scores = {label: result.scores for label, result in self.methods[name].items()}
+        return Report(protocol.name, protocol.variant, scores, self.missing(name), [])
+
+    def missing(self, name: str) -> dict[str, str]:
+        """Metrics that a method or more on a data set have no scores of, with the reason."""
+        return {metric: why for result in self.methods[name].values() for metric, why in result.missing.items()}
 
     def training_seconds(self, name: str, label: str) -> float | None:
         """Training time of a network; ``None`` for a solver."""

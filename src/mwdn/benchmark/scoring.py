@@ -121,7 +121,7 @@ def score(
         dataset: its test pairs are reconstructed.
         folder: for the scores of this data set.
         device: where to compute.
-        perceptual: loads the networks of the metrics; called only if there are no saved scores.
+        perceptual: loads the networks of the metrics; called only if the saved scores, if any, lack a metric.
         shown: how many reconstructions to save.
 
     Raises:
@@ -138,6 +138,8 @@ def score(
     # Their files and those of the camera may change under the same names. Earlier records lack it.
     captured = psf_hash(dataset.captures)
     record = read_record(path, record_identity)
+    if record is not None and not perceptual().missing.keys() >= record.get("missing", {}).keys():
+        record = None  # measured without weights that are here now
     if record is None or (captures and record.get("captured") != captured):
         reconstruct = make_reconstructor(method, checkpoint, dataset, device)
         measured = _measure(reconstruct, dataset, path, perceptual(), shown) if record is None else record

@@ -233,6 +233,6 @@ def _training_cells(method: Method, benchmark: Benchmark) -> list[str]:
     settings = training.settings(method, benchmark)
     schedule = settings.schedule
     rate = f"{schedule.learning_rate:g}"
-    if benchmark.rates:
-        rate = f"best of {', '.join(f'{tried:g}' for tried in benchmark.rates)}"
+    if rates := benchmark.rates_of(method):
+        rate = f"best of {', '.join(f'{tried:g}' for tried in rates)}"
     return [schedule.optimiser, rate, f"{schedule.weight_decay:g}", settings.source]

@@ -22,7 +22,7 @@ from mwdn.data.pair_checks import REFINED, check_pairs, missing_refinement
 from mwdn.data.pair_writer import Attribute
 from mwdn.data.pairs import PairFile, Part
 from mwdn.data.photographs import Photographs
-from mwdn.data.recorded import HELD_OUT, Division, RecordedPairs, RefinedPairs, record
+from mwdn.data.recorded import HELD_OUT, RecordedPairs, RefinedPairs, record
 from mwdn.data.simulated import Samples, SimulatedPairs
 from mwdn.errors import ParameterError
 from mwdn.evaluation import Protocol
@@ -244,7 +244,7 @@ def _rows(recipe: DatasetRecipe, count: int, simulates: bool) -> dict[str, range
         return {"train": range(first), "validation": range(first, second), "test": range(second, count)}
     if not recipe.split:
         return {"test": range(min(recipe.test or count, count))}
-    parts = Division(recipe.split, seed=recipe.seed).parts(count)
+    parts = recipe.division().parts(count)
     if not parts["test"]:
         raise ParameterError(
             f"`split` ({recipe.split}) of {count:,} pairs must have a test part, to score the methods."

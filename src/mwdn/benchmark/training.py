@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from inspect import signature
+from itertools import combinations
 from pathlib import Path
 from typing import Any, cast
 
@@ -76,13 +77,15 @@ def options(method: Method, dataset: Dataset) -> dict[str, Any]:
 
 
 def check_networks(benchmark: Benchmark, datasets: Mapping[str, Dataset]) -> None:
-    """Check that each network takes the channels of the pairs and captures that it is tested on.
+    """Check that the networks differ, and take the channels of the pairs and captures that they are tested on.
 
     Raises:
-        ParameterError: the recipe gives it another number, or it is trained on pairs of another number.
+        ParameterError: two are the same; or the recipe gives one another number, or it is trained on pairs of another
+            number.
         MwdnError: captures cannot be read, or do not fit the camera.
     """
     learned = [method for method in benchmark.methods if method.learned]
+    _refuse_repetition(learned, benchmark)
     for name, dataset in datasets.items():
         trained_on = dataset.recipe.trained_on
         networks = [{"name": method.name, **options(method, datasets[trained_on or name])} for method in learned]
@@ -96,6 +99,17 @@ def check_networks(benchmark: Benchmark, datasets: Mapping[str, Dataset]) -> Non
             way_out = "For a grey camera set `grey = true` in its camera file; for a mosaic, `mosaic`."
             for network in networks:
                 check_colours(network, colours, of=f"the captures of `{name}`", way_out=way_out)
+
+
+def _refuse_repetition(learned: list[Method], benchmark: Benchmark) -> None:
+    """Raise a `ParameterError` if two lines of the recipe are one training: `--seed` may equal the seed of a line."""
+    for one, other in combinations(learned, 2):
+        first, second = ((method.name, method.options, settings(method, benchmark)) for method in (one, other))
+        if first == second:
+            raise ParameterError(
+                f"`{one.label}` and `{other.label}` are the same network with the same seed "
+                f"({first[2].schedule.seed}). Remove one of them, or choose another seed."
+            )
 
 
 def train(
@@ -128,18 +142,25 @@ def train(
     if dataset.training is None:
         raise ParameterError(f"Nothing is trained on `{dataset.name}`: its networks are those of `trained_on`.")
     schedule = replace(schedule_on(method, benchmark, dataset), validation=len(dataset.training[1]))
-    if benchmark.rates:
+    if benchmark.rates_of(method):
         schedule = replace(schedule, learning_rate=_best_rate(method, dataset, benchmark, schedule, folder, device))
     trainer = _trainer(method, dataset, benchmark, schedule, folder, device)
     seconds_before, start = seconds(folder) or 0.0, time.perf_counter()
 
-    def save_time(report: Report) -> None:
+    def save_time() -> None:
+        total = seconds_before + time.perf_counter() - start
+        write_text(folder / CLOCK, json.dumps({"step": trainer.step, "seconds": total}))
+
+    def after_step(report: Report) -> None:
         if report.validation is not None:  # the state has just been saved
-            total = seconds_before + time.perf_counter() - start
-            write_text(folder / CLOCK, json.dumps({"step": report.step, "seconds": total}))
+            save_time()
         show(report)
 
-    trainer.run(save_time, samples=samples)
+    try:
+        trainer.run(after_step, samples=samples)
+    except KeyboardInterrupt:  # here, too
+        save_time()
+        raise
     return folder / "best.safetensors"
 
 
@@ -149,7 +170,8 @@ def _trainer(
     assert dataset.training is not None
     training, validation = dataset.training
     network = {"name": method.name, **options(method, dataset)}
-    recipe = Recipe(network, schedule, benchmark.loss, benchmark.plateau, benchmark.later_loss)
+    division = dataset.recipe.division()
+    recipe = Recipe(network, schedule, benchmark.loss, benchmark.plateau, benchmark.later_loss, division)
     stored = stored_psf(recipe, dataset.calibration, device)
     psf = dataset.calibration.psf.to(device) if stored is None else stored
     return Trainer(

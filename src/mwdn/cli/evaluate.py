@@ -70,11 +70,12 @@ def evaluate(  # noqa: PLR0913
     region, file = evaluation.Protocol.parse(protocol), PairFile(data)
     calibration = replace(camera.load(), white_balance=None)  # scenes of pairs are in the camera's own colours
     check_pairs(file, calibration.psf)
-    pairs: Pairs = file
+    rows: range | list[int] = range(len(file))
     if split is not None:
-        pairs = _part(file, split, part or "test", methods)
+        rows = _rows(file, split, part or "test", methods)
     elif part is not None:
         raise ParameterError(f"`--part {part}` is a part of a split. Say which one: `--split paper`, as in training.")
+    pairs: Pairs = Part(file, rows)
     if first is not None:
         pairs = evaluation.First(pairs, first)
     if refinement := missing_refinement(file, calibration.refinement):
@@ -82,7 +83,8 @@ def evaluate(  # noqa: PLR0913
     reconstructors = {
         method: Reconstructor(method, calibration, device=device, **own) for method, own in method_options.items()
     }
-    warn(*(reconstruct.warning for reconstruct in reconstructors.values()), other_camera(file, calibration))
+    learned = [] if part == "train" else [_learned(method, file, rows[:first]) for method in methods]
+    warn(*(reconstruct.warning for reconstruct in reconstructors.values()), other_camera(file, calibration), *learned)
     refuse_overwrite(out / evaluation.SHEET, *camera.files)
     refuse_foreign(out, (evaluation.JSON, evaluation.SHEET), b'"protocol"')
     if min(region.crop(calibration.psf).shape[-2:]) >= SMALLEST:
@@ -105,12 +107,12 @@ def evaluate(  # noqa: PLR0913
     say(f"Look at {out}")
 
 
-def _part(file: PairFile, split: str, name: str, methods: Iterable[str]) -> Part:
-    """The pairs of one part of a split, divided as in the training of the methods."""
+def _rows(file: PairFile, split: str, name: str, methods: Iterable[str]) -> range | list[int]:
+    """Positions of one part of a split, divided as in the training of the methods."""
     rows = _division(split, methods).parts(len(file))[name]
     if not rows:
         raise ParameterError(f"The split '{split}' of {len(file):,} pairs has no {name} part. Choose another `--part`.")
-    return Part(file, rows)
+    return rows
 
 
 def _division(split: str, methods: Iterable[str]) -> Division:
@@ -119,16 +121,35 @@ def _division(split: str, methods: Iterable[str]) -> Division:
     Raises:
         ParameterError: they were trained with different ones: the test part of one is in the training part of another.
     """
-    trained: set[Division] = set()
-    for method in methods:
-        if method.endswith(".safetensors") and Path(method).is_file():
-            table = read_metadata(method).get("recipe", {}).get("pairs", {})
-            if table.get("split") == split:
-                known = {name: table[name] for name in ("seed", "folds", "fold") if name in table}
-                trained.add(Division(split, tuple(table.get("fractions", Division.fractions)), **known))
+    trained = {division for method in methods if (division := _trained_with(method)) and division.split == split}
     if len(trained) > 1:
         raise ParameterError(f"The checkpoints divided '{split}' in different ways. Evaluate each by itself.")
     return trained.pop() if trained else Division(split)
+
+
+def _trained_with(method: str) -> Division | None:
+    """The division of the pairs that a checkpoint was trained with; ``None`` for other methods."""
+    if not (method.endswith(".safetensors") and Path(method).is_file()):
+        return None
+    table = read_metadata(method).get("recipe", {}).get("pairs", {})
+    known = {name: table[name] for name in ("split", "seed", "folds", "fold") if name in table}
+    return Division(fractions=tuple(table.get("fractions", Division.fractions)), **known)
+
+
+def _learned(method: str, file: PairFile, rows: range | list[int]) -> str | None:
+    """A warning if a checkpoint was trained on pairs that it is evaluated on, otherwise ``None``."""
+    division = _trained_with(method)
+    if division is None or not str(read_metadata(method).get("pairs", "")).endswith(f" of {len(file):,} recorded"):
+        return None
+    parts = division.parts(len(file))
+    known = len({*parts["train"]} & {*rows})
+    if not known:
+        return None
+    other = "test" if parts.get("test") else "validation"
+    return (
+        f"`{method}` was trained on {known:,} of these {len(rows):,} pairs if `{file.path}` is the file of its "
+        f"training. It was not trained on those of `--split {division.split} --part {other}`."
+    )
 
 
 def _print_report(report: Report, *, json: bool) -> None:

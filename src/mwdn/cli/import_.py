@@ -10,10 +10,12 @@ from rich.markup import escape
 from mwdn.calibration import Calibration, FrameFormat
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.progress import track
-from mwdn.cli.terminal import all_or_nothing, counted, if_interrupted, note, notes, say
+from mwdn.cli.terminal import all_or_nothing, counted, if_interrupted, note, notes, say, warn
 from mwdn.data.digicam import DigiCam, ImportedMasks, import_digicam
 from mwdn.data.importers import import_pairs, refuse_corrections
 from mwdn.data.kinds import KINDS, Layout
+from mwdn.data.pair_checks import other_scene_size
+from mwdn.data.pairs import PairFile
 from mwdn.errors import ParameterError
 from mwdn.io.listing import unused_photographs
 
@@ -78,6 +80,8 @@ def import_(  # noqa: PLR0913
     _name_skipped(result.skipped)
     names = f": {', '.join(result.skipped)}" if result.skipped else ""
     say(f"{counted(result.count, 'pair')} written to {out}, {len(result.skipped):,} skipped{names}")
+    if not authors:
+        warn(other_scene_size(PairFile(out)))
 
 
 def _report_masks(masks: ImportedMasks) -> None:

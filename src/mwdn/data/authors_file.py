@@ -5,6 +5,7 @@ from typing import Any
 
 from mwdn.data.hdf5 import add_rows
 from mwdn.data.pair_writer import PairWriter, Shape
+from mwdn.errors import ShapeError
 from mwdn.types import Frame
 
 AUTHORS_NAMES = {"measurement": "blur", "scene": "gt"}
@@ -19,10 +20,19 @@ class AuthorsWriter(PairWriter):
     Args:
         path: ends in .h5 or .hdf5.
         measurement_shape: (H, W, C) of the measurements.
-        scene_shape: (H, W, C) of the scenes; their code needs that of the measurements.
+        scene_shape: (H, W, C) of the scenes.
+
+    Raises:
+        ShapeError: the scenes have another shape than the measurements, which the authors' code does not take.
     """
 
     def __init__(self, path: Path, measurement_shape: Shape, scene_shape: Shape) -> None:
+        if measurement_shape != scene_shape:
+            sizes = (" x ".join(map(str, shape)) for shape in (scene_shape, measurement_shape))
+            raise ShapeError(
+                "The scenes of the authors' file ({}) must have the size of its measurements ({}). Give "
+                "`--scene-place TOP LEFT` if they show a part of the frame.".format(*sizes)
+            )
         super().__init__(path, (measurement_shape, scene_shape), "uint8", {}, None)
 
     def _set_up(self, file: Any) -> None:  # noqa: ANN401

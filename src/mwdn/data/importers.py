@@ -212,7 +212,7 @@ def _convert(
     capture, scene = stored
     usual = kind.raw_frames if kind.raw_frames is not None and capture.shape[2] == 1 else kind.frames
     frames = replace(usual, **changed_fields(changes))
-    full_size = frames.full_size(capture)
+    full_size, whole = frames.full_size(capture), replace(frames, crop=None).full_size(capture)
     if frames.bgr:
         capture, scene = (np.ascontiguousarray(frame[..., ::-1]) for frame in stored)
     capture = _upright(_correct_levels(capture, frames, source.name, camera), frames)
@@ -224,7 +224,7 @@ def _convert(
     if layout.scene_size is not None:
         scene = _resize(scene, layout.scene_size)
     scene = _upright(scene, frames)
-    place = _place(kind, layout, (scene.shape[0], scene.shape[1]), full_size)
+    place = _place(kind, layout, (scene.shape[0], scene.shape[1]), full_size, whole)
     if place is not None:
         scene = bin_scene(place_scene(scene, full_size, place, source.name), frames.bin)
 
@@ -236,13 +236,14 @@ def _convert(
     return capture, quantise(scene, dtype, f"scene of {source.name}")
 
 
-def _place(kind: Kind, layout: Layout, scene: Size, frame: Size) -> Size | None:
-    """Where a scene is in the frame; ``None`` if it has the size of the frame."""
+def _place(kind: Kind, layout: Layout, scene: Size, frame: Size, whole: Size) -> Size | None:
+    """Where a scene is in the frame, the middle of the whole one; ``None`` if it is not placed."""
     if layout.scene_place is not None or kind.place is None:
         return layout.scene_place
     if scene == frame:
         return 0, 0
-    return kind.place(scene, frame) if scene[0] <= frame[0] and scene[1] <= frame[1] else None
+    place = kind.place(scene, whole)
+    return place and (place[0] + frame[0] // 2 - whole[0] // 2, place[1] + frame[1] // 2 - whole[1] // 2)
 
 
 def _correct_levels(frame: Frame, frames: FrameFormat, name: str, camera: Calibration | None = None) -> Frame:

@@ -57,18 +57,26 @@ def check_pairs(file: PairFile, psf: Psf) -> None:
             f"`psf` ({colours} channels) must be grey, or have the channels of the measurements of `{file.path}` "
             f"({channels}). Calibrate in the mode in which they were taken."
         )
-    a, b, scene_channels = file.scene_shape
-    if (a, b) != (h, w):
-        raise ShapeError(
-            f"The scenes of `{file.path}` ({a} x {b}) must have the size of its measurements ({h} x {w}). Import them "
-            "again: with `--scene-place TOP LEFT` if they show a part of the frame; with `--crop` of the captures if "
-            "these show more; with `--scene-size` only if both show the same."
-        )
+    if message := other_scene_size(file):
+        raise ShapeError(message)
+    scene_channels = file.scene_shape[2]
     if scene_channels != channels:
         raise ShapeError(
             f"The scenes of `{file.path}` ({scene_channels} channels) must have the channels of its measurements "
             f"({channels}). Import them again: `mwdn import` averages the scenes' colours for a grey camera."
         )
+
+
+def other_scene_size(file: PairFile) -> str | None:
+    """Why pairs whose scenes have another size than the measurements cannot be used; ``None`` for others."""
+    (h, w, _), (a, b, _) = file.measurement_shape, file.scene_shape
+    if (a, b) == (h, w):
+        return None
+    return (
+        f"The scenes of `{file.path}` ({a} x {b}) must have the size of its measurements ({h} x {w}). Import them "
+        "again: with `--scene-place TOP LEFT` if they show a part of the frame; with `--crop` of the captures if "
+        "these show more; with `--scene-size` only if both show the same."
+    )
 
 
 def refuse_raw(file: PairFile) -> None:
