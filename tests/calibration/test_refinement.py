@@ -1,10 +1,12 @@
 """Terms that known pictures tell of a camera: found again where they are true, and not taken where they are not."""
 
 import json
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import pytest
 import torch
 
@@ -160,6 +162,25 @@ def test_calibrate_with_pairs(psf, generator, run, tmp_path, monkeypatch):
     assert (tmp_path / "camera-refinement.png").exists()
     calibration = Calibration.load("camera.toml")
     assert bool(calibration.refinement) == bool(report["kept"])
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [("scene", 0.0, "scene of pair 1, counted from 0, is black"), ("measurement", math.nan, "holds NaN")],
+)
+def test_pairs_that_cannot_be_fitted_are_named(psf, generator, run, tmp_path, monkeypatch, name, value, said):
+    """They ended in a traceback, after minutes."""
+    monkeypatch.chdir(tmp_path)
+    write_frame("psf.npy", (psf / psf.max())[0].movedim(0, -1).contiguous().numpy())
+    shape = (*SIZE, 3)
+    with PairFile.create("pairs.h5", measurement_shape=shape, scene_shape=shape, dtype="float32") as file:
+        for light, scene in pairs(psf, Refinement(), generator, count=3):
+            file.append(light[0], scene[0])
+    with h5py.File("pairs.h5", "a") as file:
+        file[name][1] = value
+    code, _, err = run("calibrate psf.npy --background 0 --pairs pairs.h5 -o camera.toml")
+    assert (code, said in " ".join(err.split())) == (2, True), err
+    assert not (tmp_path / "camera.toml").exists()
 
 
 def test_pairs_and_weights_of_a_camera_stay_its_own_when_it_is_refined(psf, tmp_path):

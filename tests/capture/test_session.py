@@ -231,6 +231,7 @@ def test_a_file_of_other_settings_is_not_mixed(tmp_path, recipe):
         replace(recipe, pictures=replace(recipe.pictures, size=(40, 40))),
         replace(recipe, rig=replace(recipe.rig, bit_depth=10)),
         replace(recipe, rig=replace(recipe.rig, height=recipe.rig.height // 2)),
+        replace(recipe, rig=replace(recipe.rig, seed=recipe.rig.seed + 1)),
         replace(recipe, camera=replace(recipe.camera, exposure_s=0.011)),
         replace(recipe, camera=replace(recipe.camera, gain=1.1)),
         replace(recipe, display=replace(recipe.display, gamma=1.8)),

@@ -4,6 +4,7 @@ import itertools
 import re
 import threading
 
+import h5py
 import pytest
 import torch
 
@@ -228,3 +229,16 @@ def test_no_such_file(tmp_path):
 def test_pairs_are_put_on_the_device_of_the_psf(pairs):
     file = PairFile(pairs())
     assert RecordedPairs(file, [0], psf().to("meta")).batch([0]).scene.device.type == "meta"
+
+
+def test_a_pair_with_nan_is_named(tmp_path):
+    """Not the batch that it was in, with the advice to lower the learning rate."""
+    path = tmp_path / "pairs.h5"
+    with PairFile.create(path, measurement_shape=(4, 6, 3), scene_shape=(4, 6, 3), dtype="float32") as file:
+        file.append(torch.full((4, 3, 4, 6), 0.5), torch.full((4, 3, 4, 6), 0.5))
+    with h5py.File(path, "a") as file:
+        file["scene"][2, 1, 1, 1] = torch.nan
+    source = RecordedPairs(PairFile(path), [0, 2, 3], psf(), shuffled=False)
+    with pytest.raises(ParameterError, match="scene of pair 2, counted from 0, holds NaN"):
+        source.batch([0, 1])
+    assert source.batch([0, 2]).scene.isfinite().all()

@@ -341,6 +341,21 @@ def test_turned_square_stays_a_square(turn):
     assert abs(float((square * y[:, None] * x).sum() / square.sum())) < 0.005 * side**2 / 12
 
 
+@pytest.mark.parametrize("blur", [0.7, 2.0, 6.0])
+def test_blur_has_its_standard_deviation(blur):
+    """Seven taps held 2 pixels at most."""
+    point = torch.zeros(20, 1, 65, 65)
+    point[..., 32, 32] = 1
+    rows = perturb(point, replace(EXACT, blur_px=blur), generators(20)).sum(-1)[:, 0]
+    widths = (rows * (torch.arange(65) - 32.0).square()).sum(-1).sqrt()
+    assert 0.85 * blur < widths.max() < 1.03 * blur
+
+
+def test_a_psf_is_not_moved_out_of_its_frame():
+    with pytest.raises(ParameterError, match=r"`shift_px` \(20\) must be at most 16"):
+        perturb(torch.ones(1, 1, 64, 80), replace(EXACT, shift_px=20.0), generators(1))
+
+
 # --- perturb ------------------------------------------------------------------------------------------
 
 

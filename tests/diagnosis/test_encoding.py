@@ -94,3 +94,10 @@ def test_the_file_type_decides_where_the_evidence_is_weak(psf, light):
 
 def test_an_empty_frame_cannot_tell(psf):
     assert gamma(np.zeros((SIDE, SIDE, 1), np.uint8), Calibration(psf)).state == "unknown"
+
+
+def test_a_capture_with_numbers_below_0_is_not_coded(psf, light):
+    """`--gamma srgb` was advised for floats of which too much had been subtracted."""
+    frame = (light - light.mean())[0].movedim(0, -1).contiguous().numpy()
+    verdict = gamma(frame, Calibration(psf))
+    assert (verdict.state, verdict.value, verdict.options) == ("good", "linear", "")

@@ -239,6 +239,24 @@ def test_stream_keeps_the_pose(refresh, asked, bank, psf, frames, aligned):
         torch.testing.assert_close(scene, at[max(n for n in asked if n <= number)](measurement))
 
 
+def test_stream_aligns_on_the_first_frame_that_shows_something(bank, psf, frames, aligned):
+    """The pose of a dark frame was kept for a hundred frames."""
+    reconstruct = Reconstructor(bank, Calibration(psf), device="cpu", precision="exact", room_light=False)
+    noise = np.random.default_rng(0).integers(0, 200, frames[0].shape, np.uint16)
+    (_, dark), *seen = reconstruct.stream([noise, *frames[:2]])
+    assert dark.isfinite().all()
+    assert torch.equal(aligned[-1][0], seen[0][0])
+    for measurement, scene in seen:
+        torch.testing.assert_close(scene, reconstruct.at(aligned[-1][1])(measurement))
+
+
+@pytest.mark.parametrize(("align", "ambient"), [(None, False), (False, False), (None, True)])
+def test_the_light_of_the_room_is_found_with_or_without_alignment(psf, align, ambient):
+    """`--no-align` switched it off, too."""
+    calibration = Calibration(psf, ambient=torch.zeros_like(psf) if ambient else None)
+    assert Reconstructor(build("wiener-bank", width=2), calibration, align=align).room_light is not ambient
+
+
 def test_stream_aligns_without_the_light_of_the_room(psf, frames, aligned, monkeypatch):
     """As a call does: even light looks like haze of the PSF."""
 

@@ -98,7 +98,9 @@ def test_method_and_options_change(live, viewer):
     viewer.send('{"options": {"iterations": 0}}')  # refused by the solver: the settings before stay
     said = until(viewer, lambda said: said["refused"])
     assert "iterations" in said["refused"]
-    viewer.send('{"method": "no-such"}')
+    viewer.send('{"gain": 1e9}')
+    assert "gain" in until(viewer, lambda said: "gain" in said["refused"])["refused"]
+    viewer.send('{"method": "no-such"}')  # the newest reason is told
     said = until(viewer, lambda said: "no-such" in said["refused"])
     assert (said["method"], said["options"]) == ("admm", {"iterations": 2})
     viewer.send('{"stops": 1.5, "white_balance": "grey-world", "room_light": true}')
@@ -181,7 +183,10 @@ def test_frames_without_light_do_not_end_the_picture(live, viewer):
     until(viewer, lambda said: not said["refused"])
 
 
-@pytest.mark.parametrize("message", ["no JSON", "[]", '{"path": "/etc/passwd"}', '{"record": 1}', '{"gain": "x"}'])
+@pytest.mark.parametrize(
+    "message",
+    ["no JSON", "[]", '{"path": "/etc/passwd"}', '{"record": 1}', '{"gain": "x"}', f'{{"gain": {"9" * 500}}}'],
+)
 def test_wrong_messages_end_the_connection(live, message):
     from websockets.exceptions import ConnectionClosed
 

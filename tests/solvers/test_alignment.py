@@ -13,7 +13,7 @@ from mwdn.optics.camera import Camera
 from mwdn.optics.drawing import contour_lines
 from mwdn.optics.warp import hazed
 from mwdn.solvers import alignment
-from mwdn.solvers.alignment import align
+from mwdn.solvers.alignment import align, has_detail
 from mwdn.solvers.pose import ENVELOPE_BLUR, Pose
 from mwdn.solvers.pyramid import Pyramid
 
@@ -48,6 +48,19 @@ def test_a_capture_with_nan_keeps_the_calibrated_psf(psf, scenes):
             value, rel=1e-3
         )
         assert Pose(*(None if part is None else part[1:] for part in pose)).numbers()[name] == 0
+
+
+def test_frames_that_show_nothing_have_no_pose(psf, scenes, generator):
+    """A lens cap, or even light: the noise had a turn, a scale and haze. Poor light is no reason to give up."""
+    noise = torch.randn(1, 3, *SIZE, generator=generator)
+    paper = torch.full((1, 3, *SIZE), 0.5)
+    for frame in (0.003 * noise, (0.003 * noise).clamp(min=0), paper, paper + 0.005 * noise):
+        pose = align(frame, psf)
+        assert not any(pose.numbers().values())
+        assert not has_detail(frame).any()
+    light = Camera(turned(psf, 1.0, 1.0)).forward(scenes[:1])
+    poor = light / light.max() + 0.05 * noise  # of about 400 electrons
+    assert align(torch.cat([0.003 * noise, poor]), psf).turn_degrees.tolist() == [0, pytest.approx(1.0, abs=0.5)]
 
 
 @pytest.mark.usefixtures("unchecked")

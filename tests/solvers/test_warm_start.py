@@ -98,6 +98,16 @@ def test_frame_after_one_that_is_not_finite_starts_cold(solver, bad, psf, film):
 
 
 @pairs_of(solvers(10))
+def test_the_frame_after_a_dark_one_starts_cold(solver, psf, film, generator):
+    """The noise of a dark frame, as bright as a scene in the solver's units, took more than 40 frames to go."""
+    warm = WarmStart(solver, iterations=2)
+    warm(film[0], psf)
+    warm(1e-3 * torch.randn(film[0].shape, generator=generator), psf)
+    assert torch.equal(warm(film[1], psf), solver(film[1], psf))
+    assert not torch.equal(warm(film[2], psf), solver(film[2], psf))
+
+
+@pairs_of(solvers(10))
 def test_streams_of_a_batch_are_one_by_one(solver, psf, film):
     together, alone = WarmStart(solver), WarmStart(solver)
     for one, two in zip(film[:3], film[3:6], strict=True):

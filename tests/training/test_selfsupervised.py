@@ -11,7 +11,7 @@ from torch import nn
 from cameras import contour_psf
 from mwdn.calibration import Calibration
 from mwdn.data.unpaired import SelfSupervised, UnpairedCaptures
-from mwdn.errors import CheckpointError, ParameterError, ShapeError
+from mwdn.errors import CheckpointError, ImageError, ParameterError, ShapeError
 from mwdn.fourier.convolution import convolve
 from mwdn.fourier.wiener import wiener
 from mwdn.networks.activation_checkpointing import batch_norms
@@ -239,6 +239,12 @@ def test_what_is_missing_or_does_not_fit(run, calibration, tmp_path):
         SelfSupervised(shift=1.0)
     np.save(tmp_path / "captures" / "9.npy", np.ones((32, 40, 3), np.float32))
     with pytest.raises(ShapeError, match=r"9.npy`: .*same height and width"):
+        run()
+
+
+def test_a_capture_without_light_is_refused(run, tmp_path):
+    np.save(tmp_path / "captures" / "black.npy", np.zeros((64, 64, 3), np.float32))
+    with pytest.raises(ImageError, match=r"black\.npy`: the sensor saw no light"):
         run()
 
 

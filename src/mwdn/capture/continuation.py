@@ -1,5 +1,6 @@
 """Check that a session is continued as it was begun: pairs of different settings are not one data set."""
 
+import json
 import math
 from dataclasses import asdict
 from typing import Any
@@ -22,7 +23,7 @@ def describe_place(screen: Screen, place: Place) -> dict[str, Any]:
 
 
 def check_continued(pairs: CapturedPairs, recipe: CaptureRecipe, first: Frame, screen: Screen, place: Place) -> None:
-    """Check that a file was begun with this display, place, pictures, kind of frames, exposure, gain and gamma.
+    """Check that a file was begun with this display, place, pictures, kind of frames, exposure, gain, gamma and rig.
 
     Args:
         pairs: the file.
@@ -45,6 +46,9 @@ def check_continued(pairs: CapturedPairs, recipe: CaptureRecipe, first: Frame, s
     if pairs.has_pattern("grey"):  # whose first step is a dark display; before it nothing is recorded
         stored |= {**pairs.first_settings("patterns/grey"), "gamma": stored.get("display_gamma")}
         now |= {"exposure_s": first.exposure_s, "gain": first.gain, "gamma": recipe.display.gamma or stored["gamma"]}
+    begun = json.loads(stored.get("recipe", "{}")).get("rig", {})
+    if recipe.display.kind == "rig" and "seed" in begun:  # another seed is another camera
+        stored, now = stored | {"rig.seed": begun["seed"]}, now | {"rig.seed": recipe.rig.seed}
     for name, value in now.items():
         if not _is_same(stored.get(name), value, ROUNDING if name in _ROUNDED else 0.0):
             raise ParameterError(

@@ -71,8 +71,8 @@ def reconstruct(  # noqa: PLR0913
             that has changed since its calibration; by default for universal, and not for solvers.
         ensemble: average a network's pictures of the capture and its three mirror images: four times the time; on
             average 0.2 dB for universal-small, 0.02 dB for universal.
-        room_light: find even light, a slope or a spot of light of the room in each capture and subtract it, if
-            there is no frame of it for --ambient; by default for universal. The .json and a line say its share.
+        room_light: find even light, a slope or a spot of light of the room in each capture and subtract it; by
+            default for universal without --ambient. The .json and a line say its share.
         white_balance: of the pictures: grey-world, psf (the point source is white), or gains of red, green and blue.
         trust: check how well each picture explains its capture; takes a second or two for a small one.
         map: also draw which parts of each picture its capture supports, as NAME.support.png; not with --no-trust.

@@ -51,14 +51,20 @@ class Pictures:
 
 
 def check_pair_file(pairs: Path) -> None:
-    """Raise an `MwdnError` unless this is a file of enough pairs."""
+    """Raise an `MwdnError` unless this is a file of enough pairs, none of them black or with NaN."""
     from mwdn.data.pair_checks import refuse_raw
-    from mwdn.data.pairs import PairFile
+    from mwdn.data.pair_writer import NAMES
+    from mwdn.data.pairs import PairFile, refuse_non_finite
 
     with PairFile(pairs) as file:
         refuse_raw(file)
         if len(file) < LEAST_PAIRS:
             raise ParameterError(f"`pairs` ({len(file)}) must be {LEAST_PAIRS} or more: each in turn is left out.")
+        for number in range(len(file)):
+            refuse_non_finite(file[number], number)
+            for name, picture in zip(NAMES, file[number], strict=True):
+                if picture.amax() <= 0:
+                    raise ParameterError(f"The {name} of pair {number}, counted from 0, is black. Leave this pair out.")
 
 
 def refine(camera: Path, pairs: Path, report: Path) -> None:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 
 from mwdn.calibration import Calibration
-from mwdn.errors import ParameterError, ShapeError
+from mwdn.errors import ImageError, ParameterError, ShapeError
 from mwdn.io.files import path_resolver
 from mwdn.io.listing import FRAMES, enumerate_names, list_folder
 from mwdn.types import Measurement
@@ -70,11 +70,16 @@ def read_capture(path: Path, calibration: Calibration) -> Measurement:
     return calibration.correct(calibration.frames.read(path))
 
 
-def read_captures(paths: Iterable[Path], calibration: Calibration) -> Measurement:
+def read_captures(paths: Iterable[Path], calibration: Calibration, *, lit: bool = False) -> Measurement:
     """Read raw frames as one batch of measurements, (B, C, H, W).
 
+    Args:
+        paths: of the files.
+        calibration: the camera's.
+        lit: refuse captures without light.
+
     Raises:
-        MwdnError: a file cannot be read, does not fit the camera, or has other channels than the first.
+        MwdnError: a file cannot be read, does not fit the camera, is refused, or has other channels than the first.
     """
     measurements: list[Measurement] = []
     for path in paths:
@@ -88,5 +93,7 @@ def read_captures(paths: Iterable[Path], calibration: Calibration) -> Measuremen
                 f"`{path}` ({measurement.shape[1]} channels) must have as many as the captures before it ({channels}). "
                 "Take all captures in the same mode of the camera."
             )
+        if lit and measurement.amax() <= 0:
+            raise ImageError(f"`{path}`: the sensor saw no light. Leave this capture out.")
         measurements.append(measurement)
     return torch.cat(measurements)

@@ -149,6 +149,11 @@ def perturb(psf: Psf, mismatch: Mismatch, generators: list[torch.Generator]) -> 
     if mismatch == EXACT:
         return psf
     batch, channels, height, width = psf.shape
+    if mismatch.shift_px > min(height, width) / 4:
+        raise ParameterError(
+            f"`shift_px` ({mismatch.shift_px:g}) must be at most {min(height, width) // 4}, a quarter of the PSF's "
+            "shorter side: a larger shift moves the PSF out of the frame."
+        )
     colours = torch.tensor([-1.0, 0.0, 1.0]) if channels == 3 else torch.zeros(channels)
     base = mismatch.signed(generators, mismatch.shift_px, 2)
     spread = mismatch.signed(generators, mismatch.colour_shift_px, 2)
@@ -169,7 +174,7 @@ def perturb(psf: Psf, mismatch: Mismatch, generators: list[torch.Generator]) -> 
         fine = moved - _blur(moved, torch.ones(len(moved), device=moved.device))
         moved = (moved + amount.to(moved) * fine).clamp(min=0)
     sigma = mismatch.size(generators, mismatch.blur_px)[:, 0].repeat_interleave(channels)
-    blurred = _blur(moved, sigma.to(psf)).reshape(psf.shape)
+    blurred = _blur(moved, sigma.to(psf), mismatch.blur_px).reshape(psf.shape)
     if mismatch.grain:
         noise = torch.stack([torch.randn(blurred.shape[1:], generator=g) for g in generators]).to(blurred)
         blurred = blurred * (1 + mismatch.grain * noise).clamp(min=0)
@@ -177,11 +182,12 @@ def perturb(psf: Psf, mismatch: Mismatch, generators: list[torch.Generator]) -> 
     return hazed(blurred, mismatch.size(generators, mismatch.background)[..., None, None].to(psf))
 
 
-def _blur(planes: Tensor, sigma: Tensor) -> Tensor:
-    """Gaussian blur of planes (N, 1, H, W) with 7 taps; sigma (N,) in pixels."""
-    distance = torch.arange(-3, 4, device=planes.device)
+def _blur(planes: Tensor, sigma: Tensor, largest: float = 1.0) -> Tensor:
+    """Gaussian blur of planes (N, 1, H, W); sigma (N,) in pixels, at most ``largest``; taps to three times that."""
+    reach = max(3, math.ceil(3 * largest))
+    distance = torch.arange(-reach, reach + 1, device=planes.device)
     weights = torch.exp(-0.5 * (distance / sigma.clamp(min=1e-3)[:, None]).square())
     weights = weights / weights.sum(1, keepdim=True)
     stacked = planes.movedim(0, 1)
-    stacked = F.conv2d(stacked, weights[:, None, :, None], padding=(3, 0), groups=len(planes))
-    return F.conv2d(stacked, weights[:, None, None, :], padding=(0, 3), groups=len(planes)).movedim(0, 1)
+    stacked = F.conv2d(stacked, weights[:, None, :, None], padding=(reach, 0), groups=len(planes))
+    return F.conv2d(stacked, weights[:, None, None, :], padding=(0, reach), groups=len(planes)).movedim(0, 1)

@@ -224,3 +224,12 @@ def _read_shapes(path: Path, file: Any) -> tuple[int, Shape, Shape]:  # noqa: AN
     if shapes[0][0] != shapes[1][0]:
         raise ImageError(f"`{path}` has {shapes[0][0]:,} measurements and {shapes[1][0]:,} scenes. {_MAKE_AGAIN}")
     return shapes[0][0], shapes[0][1:], shapes[1][1:]
+
+
+def refuse_non_finite(pair: tuple[Tensor, Tensor], number: int) -> None:
+    """Raise a `ParameterError` if measurement or scene of the pair of this number hold NaN or infinity."""
+    for name, picture in zip(NAMES, pair, strict=True):
+        if not picture.isfinite().all():
+            raise ParameterError(
+                f"The {name} of pair {number}, counted from 0, holds NaN or infinity. Make the file anew without it."
+            )

@@ -16,7 +16,7 @@ from torch import Tensor
 from mwdn.calibration.refinement import Refinement
 from mwdn.data.pair_checks import check_pairs, missing_refinement
 from mwdn.data.pair_writer import Attribute
-from mwdn.data.pairs import PairFile
+from mwdn.data.pairs import PairFile, refuse_non_finite
 from mwdn.data.simulated import Batch, Samples
 from mwdn.data.splits import Split, split
 from mwdn.errors import ParameterError, checked
@@ -131,9 +131,12 @@ class RecordedPairs(Samples):
 
         Raises:
             ImageError: a pair cannot be read.
+            ParameterError: a pair holds NaN or infinity.
         """
         rows = [self.row(number) for number in numbers]
         pairs = [self.file[row] for row in rows]
+        for row, pair in zip(rows, pairs, strict=True):
+            refuse_non_finite(pair, row)
         measurement, scene = (to_device(torch.stack(part), self.psf.device) for part in zip(*pairs, strict=True))
         measurement = self.refinement.measurement(measurement)
         if not self.aligned:

@@ -132,6 +132,10 @@ def gamma(frame: Frame, calibration: Calibration, *, for_viewing: bool = False) 
     """
     if min(calibration.size) < SMALLEST:
         return Verdict("capture", "gamma", "unknown", "The capture is too small to show whether it is gamma-coded.")
+    if frame.min() < 0 and calibration.frames.gamma is None:
+        return Verdict(
+            "capture", "gamma", "good", "The capture has numbers below 0, so it is not gamma-coded.", "linear"
+        )
     slope = noise_slope(frame, calibration)
     evidence, reasons = slope.evidence, [f"its noise has a variance proportional to level^{slope.slope:.1f}"]
     if abs(evidence) < 3 * SURE:

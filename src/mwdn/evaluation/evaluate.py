@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from mwdn.data.pair_writer import NAMES
+from mwdn.data.pairs import refuse_non_finite
 from mwdn.errors import ParameterError
 from mwdn.evaluation.alexnet import SMALLEST
 from mwdn.evaluation.metrics import METRICS, Perceptual, Protocol, Variant, measure
@@ -118,11 +118,7 @@ def _check_pairs(pairs: Pairs) -> None:
     if not len(pairs):
         raise ParameterError("`pairs` must not be empty: the file holds none. Make it anew with `mwdn import`.")
     for i in range(len(pairs)):
-        for name, picture in zip(NAMES, pairs[i], strict=True):
-            if not picture.isfinite().all():
-                raise ParameterError(
-                    f"The {name} of pair {i}, counted from 0, holds NaN or infinity. Make the file anew without it."
-                )
+        refuse_non_finite(pairs[i], i)
 
 
 def learnable_numbers(method: Method) -> int:

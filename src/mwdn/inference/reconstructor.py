@@ -23,6 +23,7 @@ from mwdn.networks.network import Network, as_network
 from mwdn.optics.saturation import subtract_light
 from mwdn.runtime.devices import select_device
 from mwdn.runtime.transfers import to_device, to_host
+from mwdn.solvers.alignment import has_detail
 from mwdn.types import ArrayPicture, FloatFrame, Frame, Measurement, Scene
 
 PIXELS_PER_CHUNK = {"cpu": 2**17, "cuda": 2**24}
@@ -47,8 +48,8 @@ class Reconstructor:
         ensemble: average a network's results for the measurement and its three mirror images, see
             `mwdn.inference.ensemble.Ensemble`. It takes four times as long; for a network that takes any PSF.
         room_light: whether to find and subtract even light, a slope and spots of light of the room in each
-            measurement first, see `mwdn.inference.room_light`. ``None`` does so where a network aligns, as
-            ``universal`` does, and the calibration has no ambient frame.
+            measurement first, see `mwdn.inference.room_light`. ``None`` does so for a network that aligns by default,
+            as ``universal`` does, if the calibration has no ambient frame.
         **options: of a solver given by its name, for example ``regularisation=1e-4``.
 
     It can be copied and pickled if its method can.
@@ -99,8 +100,7 @@ class Reconstructor:
         self.warning = warning or background_warning(self.name, method, calibration)
         aligns = isinstance(method, Network) and method.align
         self.align = aligns if align is None else align
-        sought = aligns and self.align and calibration.ambient is None
-        self.room_light = sought if room_light is None else room_light
+        self.room_light = (aligns and calibration.ambient is None) if room_light is None else room_light
         self.psf = psf_for(method, calibration).to(self.device)
         self.engine: Engine[Any] | Ensemble[Any] | None = None
         if isinstance(method, nn.Module):
@@ -137,8 +137,8 @@ class Reconstructor:
     def stream(self, frames: Iterable[Frame], *, refresh: int = 100) -> Iterator[tuple[Measurement, Scene]]:
         """Reconstruct the frames of a video, faster than one by one because successive frames are similar.
 
-        With alignment, the pose of the first frame is reused. ADMM and FISTA start from the previous result
-        (`mwdn.solvers.WarmStart`). Other methods treat frames independently.
+        With alignment, the pose of the first frame that shows something is reused. ADMM and FISTA start from the
+        previous result (`mwdn.solvers.WarmStart`). Other methods treat frames independently.
 
         All frames are reconstructed. To skip to the newest frame of a live camera:
         ``stream(mwdn.runtime.latest(camera))``.
@@ -166,10 +166,11 @@ class Reconstructor:
         for number, frame in enumerate(frames):
             measurement = self.calibration.correct(frame)
             due |= self.align and refresh > 0 and number % refresh == 0
-            if due and measurement.isfinite().all():  # else on the next frame
+            if due:
                 light_of_scene, _ = self.without_room_light(to_device(measurement, self.device))
-                reconstruct = aligning.at(solvers.align(light_of_scene, self.psf))
-                due = False
+                if has_detail(light_of_scene).all():  # else on the next frame
+                    reconstruct = aligning.at(solvers.align(light_of_scene, self.psf))
+                    due = False
             with torch.inference_mode():
                 scene = reconstruct._in_chunks(measurement)
             yield measurement, to_host(self.finish(scene))

@@ -120,7 +120,7 @@ class Live:
 
     def control(self, message: dict[str, Any]) -> None:
         """Follow a message, of `mwdn.preview.live_settings.check_message`."""
-        message = dict(message)
+        message, self._refused = dict(message), ""
         self._pending |= {name: float(message.pop(name)) for name in CAMERA if name in message}
         self._is_recording = message.pop("record", self._is_recording)
         if message:

@@ -17,7 +17,7 @@ from mwdn.inference.reconstructor import Reconstructor
 from mwdn.preview.live_encoding import brightest, encode_jpeg
 from mwdn.preview.live_settings import LiveSettings
 from mwdn.preview.result import Result
-from mwdn.solvers.alignment import align
+from mwdn.solvers.alignment import align, has_detail
 from mwdn.solvers.warm_start import WarmStart
 from mwdn.types import Measurement, Scene
 
@@ -125,11 +125,12 @@ class LivePictures:
             MwdnError: the frame does not fit the camera, or the method does not.
         """
         reconstruct = self._prepared(frame)
-        if reconstruct.align:  # the pose of the first frame holds for those that follow
+        if reconstruct.align:  # the pose of the first frame that shows something holds for those that follow
             with torch.inference_mode():
                 measurement = reconstruct.calibration.correct(frame.array).to(reconstruct.device)
                 measurement, _ = reconstruct.without_room_light(measurement)
-                self._reconstruct = reconstruct = reconstruct.at(align(measurement, reconstruct.psf))
+                if has_detail(measurement).all():
+                    self._reconstruct = reconstruct = reconstruct.at(align(measurement, reconstruct.psf))
         finish = partial(self._finish, frame, reconstruct, self._used, has_ambient=self._ambient is not None)
         if isinstance(reconstruct.method, WarmStart):  # each frame needs the result of the one before
             picture = finish()

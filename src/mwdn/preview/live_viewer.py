@@ -81,7 +81,7 @@ async def serve_viewer(live: Live, socket: Any) -> None:  # noqa: ANN401
         await viewer.receive()
     except (WebSocketDisconnect, RuntimeError):
         pass
-    except (MwdnError, ValueError, KeyError, RecursionError):  # not from our page
+    except (MwdnError, ValueError, KeyError, RecursionError, OverflowError):  # not from our page
         await socket.close(1003)
     finally:
         live.leave(number)

@@ -215,7 +215,8 @@ def _read_captures(
     if not recipe.sheet.captures:
         return None
     files = find_captures(recipe.sheet.captures, exclude=exclude)
-    return read_captures(files if recipe.selfsupervised.consistency else files[:SHOWN], calibration).to(device)
+    learns = recipe.selfsupervised.consistency > 0
+    return read_captures(files if learns else files[:SHOWN], calibration, lit=learns).to(device)
 
 
 def _simulated_pairs(recipe: Recipe, photographs: Photographs, psf: Psf, *, grey: bool) -> SimulatedPairs:
