@@ -122,6 +122,7 @@ CAMERAS = st.fixed_dictionaries(
         "background": st.floats(0, 0.5),
         "bit_depth": st.integers(8, 16),
         "gamma": st.floats(1, 3),
+        "psf_bit_depth": st.integers(8, 16),
         "psf_gamma": st.sampled_from(["srgb", 2.2]),
         "psf_orientation": st.sampled_from(get_args(Orientation)),
         "crop": st.tuples(st.integers(1, 5000), st.integers(1, 5000)),

@@ -44,6 +44,7 @@ def everything(folder):
         "ambient": folder / "lab/ambient.png",
         "background": 0.01,
         "psf_bin": 2,
+        "psf_bit_depth": 8,
         "psf_gamma": "srgb",
         "psf_orientation": "rotate-180",
         "bgr": True,

@@ -540,3 +540,17 @@ def test_old_keywords_work_and_name_the_new_ones(tmp_path, caustic):
     with pytest.warns(DeprecationWarning, match="`bin=2`"), pytest.warns(DeprecationWarning, match="`psf_bin=4`"):
         old = Calibration.from_file(path, binning=2, psf_binning=4)
     assert (old.frames.bin, old.psf_hash) == (2, Calibration.from_file(path, bin=2, psf_bin=4).psf_hash)
+
+
+def test_the_psf_may_have_other_bits_than_the_captures():
+    """`--bit-depth 12` for the captures was refused with a PSF of 8 bits, and there was no other way."""
+    psf = np.zeros((20, 24, 3), np.uint8)
+    psf[8:12, 9:14] = 200
+    with pytest.raises(ParameterError, match=r"`bit_depth` \(12\) must be at most 8.*`psf_bit_depth`"):
+        Calibration.from_array(psf, bit_depth=12)
+    calibration = Calibration.from_array(psf, bit_depth=12, psf_bit_depth=8, background=0.0)
+    torch.testing.assert_close(calibration.psf, Calibration.from_array(psf, background=0.0).psf)
+    assert calibration.correct(np.full((20, 24, 3), 4095, np.uint16)).max() == 1
+    for bits in (0, 17):
+        with pytest.raises(ParameterError, match=rf"`psf_bit_depth` \({bits}\)"):
+            Calibration.from_array(psf, psf_bit_depth=bits)

@@ -45,6 +45,7 @@ KEYS: dict[str, tuple[str, Any]] = {
     "psf_corrected": ("The PSF's file has been corrected: no dark frame, flat field and hot pixels for it.", True),
     "background": ('Uniform light under the PSF, as a fraction of the full scale, or "estimate".', "estimate"),
     "psf_bin": ("`bin` of the PSF, if it was taken at another resolution than the captures.", 4),
+    "psf_bit_depth": ("Bits of the PSF's numbers, if they are not those of the captures.", 8),
     "psf_gamma": ('Encoding of the PSF\'s file: "srgb", or a power such as 2.2. Linear unless given.', "srgb"),
     "psf_orientation": ("How the PSF must be turned to fit the captures.", "rotate-180"),
     "bgr": ("The files' channels are blue, green, red.", True),

@@ -187,7 +187,7 @@ class Calibration:
         ambient: Frame | None,
         corrections: Corrections = Corrections(),
     ) -> "Calibration":
-        check_psf_frame(frames, frame)
+        check_psf_frame(psf_format.own_frames(frames), frame)
         draft = cls(
             torch.ones(1, 1, 1, 1),
             frames,
@@ -212,7 +212,7 @@ class Calibration:
         if self.corrections.psf_done or not self.psf_format.shares_pixels(self.frames):
             return own_frames.to_measurement(frame)
         if self.dark is not None:
-            check_float_scale(frame, self.frames.bit_depth, of="`psf`, from which `dark` is subtracted,")
+            check_float_scale(frame, own_frames.bit_depth, of="`psf`, from which `dark` is subtracted,")
         return own_frames.to_measurement(frame, self.dark, self.corrections)
 
     def __post_init__(self) -> None:

@@ -24,6 +24,7 @@ class PsfFormat:
             ``"estimate"`` (see `mwdn.calibration.psf_levels.estimate_background`). 0 for a PSF without background.
         psf_bin: ``bin`` of the PSF, if it was taken at another resolution than the captures. ``crop`` is scaled to
             cover the same part of the view, and the dark frame is not subtracted from the PSF.
+        psf_bit_depth: bits of the PSF's numbers, if it was taken with others than the captures.
         psf_gamma: encoding of the PSF's file, as ``gamma`` for captures: linear unless given.
         psf_orientation: how the PSF must be turned to fit the captures, about its centre. It is turned last, so crop
             is that of the captures; the dark frame is not subtracted from the PSF.
@@ -35,6 +36,7 @@ class PsfFormat:
 
     background: Background = "estimate"
     psf_bin: int | None = None
+    psf_bit_depth: int | None = None
     psf_gamma: Gamma | None = None
     psf_orientation: Orientation | None = None
 
@@ -45,6 +47,8 @@ class PsfFormat:
             )
         if self.psf_bin is not None and self.psf_bin < 1:
             raise ParameterError(f"`psf_bin` ({self.psf_bin}) must be at least 1.")
+        if self.psf_bit_depth is not None and not 1 <= self.psf_bit_depth <= 16:
+            raise ParameterError(f"`psf_bit_depth` ({self.psf_bit_depth}) must be 1 to 16.")
         check_gamma("psf_gamma", self.psf_gamma)
         if self.psf_orientation is not None:
             check_orientation(self.psf_orientation)
@@ -53,7 +57,8 @@ class PsfFormat:
         """Format of the PSF's own file, before `turn`."""
         frames = captures if self.psf_bin is None else captures.with_bin(self.psf_bin)
         crop = frames.crop[::-1] if frames.crop and swaps_axes(self.psf_orientation) else frames.crop
-        return replace(frames, gamma=self.psf_gamma, crop=crop, upside_down=False)
+        bits = self.psf_bit_depth or frames.bit_depth
+        return replace(frames, bit_depth=bits, gamma=self.psf_gamma, crop=crop, upside_down=False)
 
     def shares_pixels(self, captures: FrameFormat) -> bool:
         """Whether the pixels of the PSF's file are those of the captures, so that their dark frame fits it."""

@@ -6,7 +6,7 @@ from torch import Tensor
 from mwdn.calibration.exposure import measure_exposure
 from mwdn.calibration.frame_format import FrameFormat
 from mwdn.calibration.psf_format import Background
-from mwdn.errors import PsfError
+from mwdn.errors import ParameterError, PsfError
 from mwdn.types import Frame, Image
 
 SATURATED_PART = 1e-3
@@ -31,7 +31,10 @@ def check_psf_frame(frames: FrameFormat, frame: Frame) -> None:
         ParameterError: see `FrameFormat.check_bits`.
         PsfError: more than `SATURATED_PART` of it is saturated.
     """
-    frames.check_bits(frame, "`psf`")
+    try:
+        frames.check_bits(frame, "`psf`")
+    except ParameterError as error:
+        raise ParameterError(f"{error} If the PSF has other bits than the captures: `psf_bit_depth`.") from error
     count, maximum = frames.saturated(frame)
     pixels = frame.shape[0] * frame.shape[1]
     if count > SATURATED_PART * pixels:

@@ -203,7 +203,14 @@ def _write_photographs(
     background = content.get("background") or (0.0 if has_dark else None)
     own_distance = {"distance_mm": content["distance_mm"]} if content.get("distance_mm") else {}
     content |= {"psf_gain": None, "envelope_shift": None}  # of an earlier PSF
-    content = {**content, "background": background, **done.content, **own_distance, "psf_gamma": None}
+    content = {
+        **content,
+        "background": background,
+        **done.content,
+        **own_distance,
+        "psf_gamma": None,
+        "psf_bit_depth": None,
+    }
     for psfs, places in _ELSEWHERE:  # those of an earlier PSF do not fit this one
         if psfs not in done.parts:
             content |= {psfs: None, places: None}
@@ -226,10 +233,10 @@ def _flat_balance(colour: tuple[float, ...]) -> tuple[float, float, float]:
 
 
 def _refuse_psf_format(psf_format: PsfFormat) -> None:
-    if psf_format.psf_bin is not None or psf_format.psf_orientation is not None:
+    if any(value is not None for value in (psf_format.psf_bin, psf_format.psf_bit_depth, psf_format.psf_orientation)):
         raise ParameterError(
-            "`psf_bin` and `psf_orientation` are for one picture from another source. Frames of the camera itself have "
-            "the captures' pixels: leave them out."
+            "`psf_bin`, `psf_bit_depth` and `psf_orientation` are for one picture from another source. Frames of the "
+            "camera itself have the captures' pixels: leave them out."
         )
 
 
