@@ -61,7 +61,15 @@ def test_correlated_noise_widens_the_bounds(light):
 
 def test_dark_capture_and_lower_bits(light, calibration):
     assert darkness(stored(0.02 * light), calibration).state == "doubt"
-    assert darkness(np.float32(0.02) * stored(light).astype(np.float32), calibration).state == "unknown"
+    assert darkness(np.float32(0.02 / 65535) * stored(light).astype(np.float32), calibration).state == "unknown"
+
+
+def test_more_was_subtracted_than_the_sensor_saw(light, calibration):
+    """A capture that is half negative was accepted without a word."""
+    frame = (light - light.mean())[0].movedim(0, -1).numpy()
+    verdict = darkness(frame, calibration)
+    assert (verdict.state, "more was subtracted" in verdict.text) == ("doubt", True)
+    assert darkness(stored(light), Calibration(calibration.psf, dark=light + 0.2)).state == "doubt"
 
 
 def test_bit_depth_is_advised_only_where_it_can_be_given(light, calibration):
