@@ -231,7 +231,7 @@ class Live:
             "number": frame.number,
             "exposure_s": finite(frame.exposure_s),
             "gain": finite(frame.gain),
-            "refused": self._refused or self.pictures.refused or picture.wrong,
+            "refused": " ".join(filter(None, (self._refused, self.pictures.refused, picture.wrong))),
             "recorded": self._recorded,
             "recording": self._recording,
             "method": settings.method,
