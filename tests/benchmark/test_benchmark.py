@@ -617,6 +617,8 @@ def test_metrics_that_were_not_requested_are_measured_when_they_are(folder, monk
         missing = json.loads((folder / "out" / "benchmark.json").read_text())["sets"]["caustic"]["missing"]
         seen.append((sorted(missing), len(calls)))
     assert seen == [(["feature_mse", "lpips"], 1), ([], 2), ([], 2)]
+    monkeypatch.setattr(Perceptual, "load", lambda *_, **__: pytest.fail("all metrics are saved"))
+    run(read_benchmark(folder / "r.toml"), folder / "out", device="cpu")
     (folder / "r.toml").write_text(only("{ pyramid = {}, admm = { iterations = 1 } }"), encoding="utf-8")
     run(read_benchmark(folder / "r.toml"), folder / "out", device="cpu", lpips=False)
     assert "lpips is missing: not requested" in (folder / "out" / "benchmark.md").read_text()

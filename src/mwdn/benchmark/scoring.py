@@ -138,7 +138,8 @@ def score(
     # Their files and those of the camera may change under the same names. Earlier records lack it.
     captured = psf_hash(dataset.captures)
     record = read_record(path, record_identity)
-    if record is not None and not perceptual().missing.keys() >= record.get("missing", {}).keys():
+    lacking = record.get("missing", {}) if record else {}
+    if lacking and not perceptual().missing.keys() >= lacking.keys():
         record = None  # measured without weights that are here now
     if record is None or (captures and record.get("captured") != captured):
         reconstruct = make_reconstructor(method, checkpoint, dataset, device)

@@ -61,8 +61,9 @@ def check_pair_file(pairs: Path) -> None:
         if len(file) < LEAST_PAIRS:
             raise ParameterError(f"`pairs` ({len(file)}) must be {LEAST_PAIRS} or more: each in turn is left out.")
         for number in range(len(file)):
-            refuse_non_finite(file[number], number)
-            for name, picture in zip(NAMES, file[number], strict=True):
+            pair = file[number]
+            refuse_non_finite(pair, number)
+            for name, picture in zip(NAMES, pair, strict=True):
                 if picture.amax() <= 0:
                     raise ParameterError(f"The {name} of pair {number}, counted from 0, is black. Leave this pair out.")
 

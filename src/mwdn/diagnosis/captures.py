@@ -60,11 +60,12 @@ def darkness(frame: Frame, calibration: Calibration) -> Verdict:
 
     Floats have no known range.
     """
-    measurement = calibration.correct(frame)
-    below = float(measurement.clamp(max=0).abs().sum() / measurement.abs().sum().clamp(min=1e-30))
-    if below > NEGATIVE:
-        text = f"{below:.0%} of the capture's light is below 0: more was subtracted than the sensor saw."
-        return Verdict("capture", "darkness", "doubt", text)
+    if frame.dtype.kind == "f" or calibration.offset is not None:
+        measurement = calibration.correct(frame)
+        below = float(measurement.clamp(max=0).abs().sum() / measurement.abs().sum().clamp(min=1e-30))
+        if below > NEGATIVE:
+            text = f"{below:.0%} of the capture's light is below 0: more was subtracted than the sensor saw."
+            return Verdict("capture", "darkness", "doubt", text)
     if frame.dtype.kind == "f":
         return Verdict("capture", "darkness", "unknown", "The file holds floats, so its full scale is not known.")
     pixels = torch.from_numpy(frame.max(axis=-1).astype("float32")).flatten()

@@ -178,7 +178,6 @@ class Live:
         """Set what viewers want of the camera; a value that it refuses must not end the picture."""
         while self._pending:
             name, value = self._pending.popitem()
-            self._refused = ""
             try:
                 self.camera.configure(**{name: value})
             except MwdnError as error:
