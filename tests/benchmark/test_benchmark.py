@@ -29,6 +29,7 @@ from mwdn.calibration import Calibration
 from mwdn.calibration.camera_file import write_camera
 from mwdn.calibration.places import field_camera
 from mwdn.cli.app import main
+from mwdn.data import recorded
 from mwdn.data.pair_checks import REFINED
 from mwdn.data.pairs import PairFile
 from mwdn.data.recorded import RecordedPairs
@@ -37,6 +38,7 @@ from mwdn.errors import CheckpointError, ParameterError, UnknownNameError
 from mwdn.evaluation import Perceptual, alexnet, bootstrap
 from mwdn.fourier import convolve
 from mwdn.optics import Deviation, Sensor
+from mwdn.solvers import align
 from mwdn.training.recipe import Schedule
 from mwdn.weights.checkpoint import read_metadata
 
@@ -637,6 +639,19 @@ def test_another_split_of_recorded_pairs_needs_another_folder(folder):
     assert (known["split"], known["seed"]) == ("random", 5)
     with pytest.raises(CheckpointError, match="another recipe"):
         run(read_benchmark(folder / "paper.toml"), folder / "out", device="cpu", lpips=False)
+
+
+@pytest.mark.parametrize(("aligns", "count"), [("true", 4), ("false", 0)])
+def test_a_network_with_an_aligned_psf_learns_from_aligned_pairs(folder, monkeypatch, aligns, count):
+    """As it is tested. Each of the two pairs for training and the two for validation is aligned once."""
+    aligned = []
+    monkeypatch.setattr(recorded, "align", lambda one, psf: aligned.append(one) or align(one, psf))
+    network = f'"wiener-bank", finest = 4, align = {aligns}, schedule = {{ pool = 2 }}'
+    (folder / "r.toml").write_text(only(networks=f"{{ net = {{ name = {network} }} }}"), encoding="utf-8")
+    benchmark = read_benchmark(folder / "r.toml")
+    dataset = open_dataset("caustic", benchmark.data["caustic"], folder, torch.device("cpu"), lambda _, rows: rows)
+    train(benchmark.methods[0], dataset, benchmark, folder / "run", device=torch.device("cpu"), show=lambda _: None)
+    assert len(aligned) == count
 
 
 def test_two_lines_that_are_one_training_are_refused(folder):

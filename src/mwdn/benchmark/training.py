@@ -21,10 +21,11 @@ from mwdn.errors import DivergenceError, ParameterError
 from mwdn.io.files import write_text
 from mwdn.io.reading import LOG_BYTES, parse_json, read_json, read_text, unexpected_content
 from mwdn.networks import NETWORKS
+from mwdn.networks.empty import build_empty
 from mwdn.training.network import check_colours, stored_psf
 from mwdn.training.recipe import Recipe, Schedule
 from mwdn.training.report import Report
-from mwdn.training.tasks import SupervisedTask, supervised_task, with_stored_psf
+from mwdn.training.tasks import SupervisedTask, few_pairs_tasks, supervised_task, with_stored_psf
 from mwdn.training.trainer import Trainer
 from mwdn.training.validation import Validator
 
@@ -174,12 +175,18 @@ def _trainer(
     recipe = Recipe(network, schedule, benchmark.loss, benchmark.plateau, benchmark.later_loss, division)
     stored = stored_psf(recipe, dataset.calibration, device)
     psf = dataset.calibration.psf.to(device) if stored is None else stored
+    if schedule.pool and isinstance(training, RecordedPairs) and getattr(build_empty(**network), "align", False):
+        # It is tested with a PSF aligned to each capture.
+        training, validation = (replace(part, aligned=True, poses={}) for part in (training, validation))
+        task, held_out = few_pairs_tasks(training, validation, schedule, best_gain=False)
+    else:
+        task, held_out = supervised_task(training, schedule), SupervisedTask(validation)
     return Trainer(
         recipe,
-        with_stored_psf(supervised_task(training, schedule), stored),
+        with_stored_psf(task, stored),
         out=folder,
         calibration=dataset.calibration,
-        validator=Validator(recipe, with_stored_psf(SupervisedTask(validation), stored), psf),
+        validator=Validator(recipe, with_stored_psf(held_out, stored), psf),
         device=device,
         alexnet=Path(benchmark.alexnet) if benchmark.alexnet else None,
     )
