@@ -296,3 +296,10 @@ def test_a_distance_needs_two_of_a_kind():
     for integers in (BAD_TENSORS["uint8"], BAD_TENSORS["int32"]):
         with pytest.raises(ParameterError, match=str(integers.dtype)):
             mse(integers, integers)
+
+
+def test_an_array_in_a_file(tmp_path):
+    """The mode of the file was taken for that of a picture."""
+    np.save(tmp_path / "frame.npy", PICTURE)
+    mapped = np.load(tmp_path / "frame.npy", mmap_mode="r")
+    np.testing.assert_array_equal(as_frame(mapped), as_frame(PICTURE))

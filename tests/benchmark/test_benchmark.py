@@ -654,6 +654,30 @@ def test_a_network_with_an_aligned_psf_learns_from_aligned_pairs(folder, monkeyp
     assert len(aligned) == count
 
 
+def test_pairs_of_a_camera_that_is_upside_down_and_bgr(folder):
+    """Its PSF was turned upright, its captures and scenes were not."""
+    picture = np.random.default_rng(1).integers(0, 200, (48, 64, 3), np.uint8)
+    for place in ("captures", "scenes"):
+        (folder / "pairs" / place).mkdir(parents=True)
+        for number in range(10):
+            cv2.imwrite(str(folder / "pairs" / place / f"{number}.png"), picture)
+    recipe = DatasetRecipe(psf=str(folder / "psf.npy"), kind="folders", pairs=str(folder / "pairs"), split="random")
+    for turned in (False, True):
+        changed = replace(recipe, upside_down=turned, bgr=turned)
+        test = open_dataset(f"turned-{turned}", changed, folder, torch.device("cpu"), lambda _, rows: rows).test
+        wanted = picture[::-1] if turned else picture[..., ::-1]
+        for part in test[0]:
+            assert (255 * part.movedim(0, -1).numpy()).round().astype(int).tolist() == wanted.tolist()
+
+
+def test_a_camera_that_is_drawn_for_each_pair_has_no_robustness_but_to_noise(folder):
+    """Shift and turn changed nothing, so that every method looked perfectly robust."""
+    text = RECIPE.replace("deviation = { turn_degrees = 1, off_axis = 1 }", "mismatch = { blur_px = 0.5 }")
+    (folder / "r.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(ParameterError, match=r"`noise` for `caustic`, not `shift_px`: its `mismatch`"):
+        run(read_benchmark(folder / "r.toml"), folder / "out", device="cpu", lpips=False)
+
+
 def test_two_lines_that_are_one_training_are_refused(folder):
     """`--seed 1` made `mwdn` the same as a line with the seed 1."""
     (folder / "r.toml").write_text(

@@ -36,7 +36,12 @@ def test_random_follows_its_seed_and_its_fractions():
     assert split(7, "random", fractions=(1.0, 0.0, 0.0)) == {"train": list(range(7)), "validation": [], "test": []}
 
 
-@pytest.mark.parametrize("fractions", [(0.8, 0.1), (0.8, 0.1, 0.2), (1.1, 0.0, -0.1)])
+def test_a_negative_seed_is_refused():
+    with pytest.raises(ParameterError, match=r"`seed` \(-1\)"):
+        split(10, "random", seed=-1)
+
+
+@pytest.mark.parametrize("fractions", [(0.8, 0.1), (0.8, 0.1, 0.2), (1.1, 0.0, -0.1), (float("nan"), 0.5, 0.5)])
 def test_fractions_are_three_of_sum_one(fractions):
     with pytest.raises(ParameterError, match=r"`fractions` .* sum 1"):
         split(100, "random", fractions=fractions)

@@ -48,6 +48,17 @@ def test_each_solver_by_its_name(name, psf, measurement):
     torch.testing.assert_close(result, SOLVERS[name]()(measurement, psf))
 
 
+def test_the_scene_can_be_changed_and_learned_from(psf, measurement):
+    """Inference tensors were returned, which no layer can be trained on."""
+    reconstruct = Reconstructor("wiener", Calibration(psf))
+    streamed = next(iter(reconstruct.stream([measurement[0].movedim(0, -1).numpy()])))[1]
+    for scene in (reconstruct(measurement), streamed):
+        gain = torch.ones(1, requires_grad=True)
+        (gain * scene).sum().backward()
+        assert gain.grad == pytest.approx(float(scene.sum()), rel=1e-3)
+        scene.clamp_(0, 1)
+
+
 def test_solver_object_and_function(psf, measurement):
     calibration = Calibration(psf)
     fixed = Wiener(regularisation=1e-3)

@@ -73,6 +73,8 @@ def test_overrides(read):
     text = NETWORK + "[schedule]\nsteps = 10\nbatch = 3\n"
     assert read(text, steps=7, batch=None, seed=5).schedule == Schedule(steps=7, batch=3, seed=5)
     assert read(NETWORK, steps=7).schedule == Schedule(steps=7)
+    with pytest.raises(ParameterError, match=r"`steps` \(7\) and `epochs` \(3\) exclude each other"):
+        read(text, steps=7, epochs=3)
     with pytest.raises(ParameterError, match=r"`steps` \(0\) must be positive"):
         read(text, steps=0)
     other = read(text, network={"width": 6}, mismatch={"blur_px": 1}, schedule={"crop": 8}, pool=5, loss={"l1": 2})

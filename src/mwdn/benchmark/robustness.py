@@ -12,6 +12,7 @@ from torch import Tensor
 from mwdn.benchmark.recipe import AXES, Robustness
 from mwdn.benchmark.scoring import read_record
 from mwdn.benchmark.sets import Dataset, simulated_pairs
+from mwdn.data.mismatch import EXACT
 from mwdn.data.photographs import Photographs
 from mwdn.errors import ParameterError
 from mwdn.evaluation import measure
@@ -34,8 +35,13 @@ def noisier(sensor: Sensor, factor: float) -> Sensor:
 
 
 def check_axes(robustness: Robustness, dataset: Dataset) -> None:
-    """Raise a `ParameterError` if more than the noise is to change of a camera with measured PSFs over its field."""
+    """Raise a `ParameterError` if more than the noise is to change of a camera whose PSFs are measured or random."""
     axes = [axis for axis in robustness.sizes if axis != "noise"]
+    if axes and dataset.recipe.mismatch != EXACT:
+        raise ParameterError(
+            f"[robustness] can only have `noise` for `{dataset.name}`, not `{axes[0]}`: its `mismatch` draws another "
+            "camera for each pair. Set `deviation` instead of `mismatch`."
+        )
     if axes and dataset.calibration.places.field_psfs:
         raise ParameterError(
             f"[robustness] can only have `noise` for `{dataset.name}`, not `{axes[0]}`: its camera's `field_psfs` are "

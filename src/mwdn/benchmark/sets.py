@@ -230,11 +230,12 @@ def _simulate(
 
 
 def _import(recipe: DatasetRecipe, calibration: Calibration, path: Path) -> None:
-    """Convert a public data set, in the format of the recipe's camera if it names one."""
+    """Convert a public data set, in the format of the recipe's camera if it names one, otherwise in the recipe's."""
     is_resized = (recipe.camera or recipe.bin > 1) and KINDS[recipe.kind].place is None
     layout = Layout(scene_size=calibration.size if is_resized else None)
     camera = calibration if recipe.camera else None
-    frames = camera.frames if camera else FrameFormat(bin=recipe.bin)
+    own = FrameFormat(bin=recipe.bin, bgr=recipe.bgr, upside_down=recipe.upside_down)
+    frames = camera.frames if camera else own
     import_pairs(recipe.kind, recipe.pairs, path, layout=layout, frames=frames, camera=camera)
 
 

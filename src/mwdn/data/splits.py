@@ -78,7 +78,9 @@ def _require(count: int, least: int, kind: str) -> None:
 
 
 def _random(count: int, fractions: Sequence[float], seed: int) -> Split:
-    if len(fractions) != 3 or min(fractions) < 0 or abs(sum(fractions) - 1) > 1e-6:
+    if seed < 0:
+        raise ParameterError(f"`seed` ({seed}) of the split 'random' must not be negative.")
+    if len(fractions) != 3 or not (min(fractions) >= 0 and abs(sum(fractions) - 1) <= 1e-6):
         raise ParameterError(f"`fractions` {tuple(fractions)} must be three numbers >= 0 with sum 1: (0.8, 0.1, 0.1).")
     parts = dict(zip(("train", "validation", "test"), fractions, strict=True))
     ends = np.rint(np.cumsum(list(fractions)) * count).astype(int)

@@ -173,7 +173,7 @@ class Reconstructor:
                     due = False
             with torch.inference_mode():
                 scene = reconstruct._in_chunks(measurement)
-            yield measurement, to_host(self.finish(scene))
+            yield measurement, _plain(to_host(self.finish(scene)))
 
     def without_room_light(self, measurement: Measurement) -> tuple[Measurement, Tensor | None]:
         """The measurement less the light of the room, and its share (B,); unchanged and `None` if the option is off."""
@@ -234,7 +234,7 @@ class Reconstructor:
                 memory for pictures of this size.
         """
         if isinstance(measurement, Tensor):
-            return self._to_host(measurement)
+            return _plain(self._to_host(measurement))
         return self._to_host(self.calibration.correct(as_frame(measurement)))[0].movedim(0, -1).numpy()
 
     @torch.inference_mode()
@@ -281,3 +281,8 @@ class Reconstructor:
                 f"`measurement` {tuple(measurement.shape)} needs more memory than {self.device} has free. Bin or crop "
                 "it: `bin=2`, `crop=(1000, 1000)`; or try `device='cpu'`, `method='wiener'`."
             ) from error
+
+
+def _plain(scene: Scene) -> Scene:
+    """A tensor that can be changed in place, and be the input of a network in training; inference tensors cannot."""
+    return scene.clone() if scene.is_inference() else scene

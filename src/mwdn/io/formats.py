@@ -202,7 +202,7 @@ def as_frame(picture: ArrayPicture, *, finite: bool = True) -> Frame:
         )
     if np.ma.is_masked(picture):
         raise FrameTypeError(f"A frame ({shown(picture)}) must have no masked pixels. Fill them: `array.filled(0)`.")
-    mode = getattr(picture, "mode", "L")
+    mode = "L" if isinstance(picture, np.ndarray) else getattr(picture, "mode", "L")  # a memmap's is that of its file
     if mode not in _PIL_MODES:  # Pillow has some pictures of 16 bits in mode I, and clips them for RGB
         way_out = "numpy.asarray(picture).astype('uint16')" if mode == "I" else "picture.convert('RGB')"
         raise FrameTypeError(f"The picture (mode {mode}) must be grey or RGB. Convert it: `{way_out}`.")

@@ -270,6 +270,10 @@ def _by_table(changes: dict[str, Any]) -> dict[str, dict[str, Any]]:
     tables: dict[str, dict[str, Any]] = {name: value for name, value in changes.items() if isinstance(value, dict)}
     loose = {name: value for name, value in changes.items() if name not in tables and value is not None}
     schedule = tables.get("schedule", {}) | loose
+    if schedule.get("steps") and schedule.get("epochs"):
+        raise ParameterError(
+            f"`steps` ({schedule['steps']}) and `epochs` ({schedule['epochs']}) exclude each other. Leave one out."
+        )
     if "steps" in schedule:  # replaces the recipe's length, in whichever unit it is given
         schedule["epochs"] = 0
     return tables | {"schedule": schedule}
