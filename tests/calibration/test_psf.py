@@ -554,3 +554,12 @@ def test_the_psf_may_have_other_bits_than_the_captures():
     for bits in (0, 17):
         with pytest.raises(ParameterError, match=rf"`psf_bit_depth` \({bits}\)"):
             Calibration.from_array(psf, psf_bit_depth=bits)
+
+
+def test_fractions_of_saturation_are_no_numbers_of_the_sensor(caustic):
+    """Floats up to 1 were divided by 4,095, and the capture was called dark."""
+    frame = (0.9 * caustic / caustic.max())[..., None].astype(np.float32)
+    calibration = Calibration.from_array((frame * 4095).astype(np.uint16), bit_depth=12)
+    with pytest.raises(ParameterError, match=r"floats up to 0\.9, but `bit_depth` \(12\).*by 4,095"):
+        calibration.correct(frame)
+    assert calibration.correct(frame * 4095).max() == pytest.approx(0.9, rel=1e-3)

@@ -14,7 +14,7 @@ from mwdn.calibration.place_files import PlaceFiles
 from mwdn.calibration.places import psfs_elsewhere
 from mwdn.calibration.report import inspect_psf
 from mwdn.calibration.verdict import headline, verdict
-from mwdn.errors import ImageError
+from mwdn.errors import ImageError, PsfError
 from mwdn.io.files import write_json
 from mwdn.io.images import read_frame
 from mwdn.optics import psf_measures, psf_spectrum, sample_camera
@@ -252,3 +252,31 @@ def test_measured_psfs(file, options, words, data):
     assert not [finding for finding in verdict(report) if finding.weight == "bad"]
     assert report.side_lobe[0] < 0.2
     assert 1 < report.resolution_px[0.001] < 6
+
+
+@pytest.mark.parametrize("at", [(32, 32), (0, 0)])
+def test_a_spot_has_no_light_between_its_lines(at):
+    """All light of a pinhole's PSF is in one pixel; it was called even light without detail."""
+    psf = torch.zeros(1, 1, 64, 64)
+    psf[0, 0, at[0], at[1]] = 1
+    report = inspect_psf(Calibration(psf))
+    assert (report.support.glow, report.support.contrast) == (0, 1)
+    assert not [text for _, text in verdict(report) if "no detail" in text]
+
+
+def test_a_psf_that_shows_nothing():
+    with pytest.raises(PsfError, match="single pixel"):
+        inspect_psf(Calibration(torch.ones(1, 1, 1, 1)))
+    text = " ".join(text for _, text in verdict(inspect_psf(Calibration(torch.ones(1, 1, 64, 64)))))
+    assert "none at 1.0 %" in text
+    assert "inf" not in text
+
+
+def test_light_that_is_left_after_a_dark_frame_is_the_psfs(tmp_path, psf):
+    """The camera file had `background = 0` from `mwdn calibrate`, and the advice was not to give that."""
+    frame = (60000 * (0.99 * psf / psf.max() + 0.002)).clamp(max=65535)[0].movedim(0, -1).numpy().astype(np.uint16)
+    for dark, weight, said in ((None, "mind", "Leave out"), (np.zeros_like(frame), "good", "which belongs to the PSF")):
+        calibration = Calibration.from_array(frame, background=0.0, dark=dark)
+        (found,) = [each for each in verdict(inspect_psf(calibration, frame)) if "A uniform background" in each.text]
+        assert said in found.text
+        assert found.weight == weight

@@ -134,3 +134,24 @@ def test_a_point_that_is_larger_than_the_display_is_refused_before_anything_is_r
     with pytest.raises(ParameterError, match="size_cm"):
         session(recipe, tmp_path / "captured.h5")
     assert not (tmp_path / "captured.h5").exists()
+
+
+def test_a_bright_room_adds_nothing_to_the_read_noise(tmp_path, run, recipe):
+    """Its photon noise was in it: 6.9 electrons instead of 3."""
+    lit = replace(recipe, rig=replace(recipe.rig, room_light=0.1), point=replace(recipe.point, lamp=True, ratio=20.0))
+    session(lit, tmp_path / "captured.h5")[1].run()
+    assert run("calibrate", tmp_path / "captured.h5", "-o", tmp_path / "camera.toml")[0] == 0
+    sensor = Calibration.load(tmp_path / "camera.toml").sensor
+    assert sensor.read_noise == pytest.approx(3, abs=0.5)
+    assert sensor.black_level == pytest.approx(0.01, rel=0.02)
+
+
+@pytest.mark.parametrize("seed", [2, 7])
+def test_hot_pixels_are_not_taken_for_the_point(tmp_path, recipe, seed):
+    """The search for the exposure took them for its peak, until the point was too faint."""
+    rig = replace(recipe.rig, seed=seed, hot_pixels=0.003)
+    rig, made = session(replace(recipe, rig=rig, point=replace(recipe.point, lamp=True)), tmp_path / "captured.h5")
+    assert made.run() == 1
+    with h5py.File(tmp_path / "captured.h5") as file:
+        point, dark = (file[f"calibration/{name}/measurement"][:].mean(0).max(-1) for name in ("point-1", "dark-1"))
+    assert 0.3 < np.quantile(point - dark, 0.999) / 4095 < 0.95

@@ -85,6 +85,9 @@ def test_a_session_becomes_aligned_pairs_that_the_psf_explains(session, run):
     assert projection.to_camera(corners) == pytest.approx(truth, abs=0.7)
     assert read_frame(out.with_suffix(".png")).shape[2] == 3
 
+    status, _, said = run("align", out, "--psf", folder / "psf.npy", "-o", folder / "twice.h5")
+    assert (status, "is aligned already" in said) == (2, True)
+
     again = folder / "again.h5"
     line = ("align", folder / "session.h5", "--psf", folder / "psf.npy", "--method", "wiener", "-o", again)
     for source in (out, out.with_suffix(".json")):

@@ -15,7 +15,8 @@ from mwdn.calibration.camera_file import read_camera
 from mwdn.calibration.camera_parts import write_camera_with_parts
 from mwdn.calibration.watching import guide_exposure, watch_folder
 from mwdn.errors import ImageError, PsfError
-from mwdn.optics.displacement import displacement
+from mwdn.io.images import read_frame
+from mwdn.optics.displacement import displacement, shifted
 from photographed_camera import STEPS, Bench, save
 
 FORMAT = FrameFormat(bit_depth=12)
@@ -344,6 +345,46 @@ def test_several_positions_make_a_field_of_psfs(run, folder):
     assert float(right.sum() / centre.sum()) == pytest.approx(0.8, abs=0.05)
     assert math.isclose(float(field.weights.sum(0).mean()), 1, rel_tol=1e-3)
     assert STEPS == 4095
+
+
+def test_points_of_the_field_keep_their_light_behind_a_weak_sensor(run, folder):
+    """Each corrected PSF that exceeded 1 was divided by its own peak: 0.97 of the light instead of 0.8."""
+    bench = Bench(hot=0)
+    y, x = (torch.linspace(-1, 1, n) for n in bench.light.shape[-2:])
+    middle = torch.exp(-3 * (y[:, None].square() + x.square()))
+    response = 1 - 0.7 * middle
+    light = bench.light * middle
+    light = 0.9 * light / (response * light).max()
+    assert light.max() * response.mean() > 1.1  # a flat field has the mean 1
+    save("axis", [bench.frame(response * light) for _ in range(8)])
+    save("right", [bench.frame(0.8 * response * shifted(light, 0, 20)) for _ in range(8)])
+    save("darks", [bench.dark() for _ in range(8)])
+    save("flats", [bench.frame((0.6 * response).expand_as(bench.light)) for _ in range(4)])
+    assert run("calibrate axis --field right --dark darks --flat flats --bit-depth 12")[0] == 0
+    camera = read_camera("camera.toml")
+    axis, right = (float(read_frame(file).sum()) for file in (camera["psf"], camera["field_psfs"][0]))
+    assert right / axis == pytest.approx(0.8 * float(shifted(light, 0, 20).sum() / light.sum()), abs=0.02)
+
+
+def test_watching_goes_on_after_a_file_that_does_not_fit(folder, photographs):
+    watched, bench = folder / "live", photographs[0]
+    watched.mkdir()
+    cv2.imwrite(str(watched / "thumbnail.jpg"), np.zeros((8, 8, 3), np.uint8))
+    times = iter(range(10))
+
+    def wait():
+        time = next(times, None)
+        if time == 0:
+            (watched / "half.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+        if time == 7:
+            save(watched, [bench.point()], "good")
+        return time is not None
+
+    seen = dict(sentence.split(": ", 1) for sentence, _ in guide_exposure(watch_folder(watched, FORMAT, wait), FORMAT))
+    assert [*seen] == ["thumbnail.jpg", "half.png", "good_1.png"]
+    assert "left out. `bit_depth` (12)" in seen["thumbnail.jpg"]
+    assert "left out. `" in seen["half.png"]
+    assert "well exposed" in seen["good_1.png"]
 
 
 def test_saturation_of_an_averaged_frame_is_an_error_of_the_psf(photographs):

@@ -10,6 +10,8 @@ MAX_FLOAT = 2.0
 def check_float_scale(frame: Frame, bit_depth: int | None, *, of: str | None = None) -> None:
     """Raise a `ParameterError` for floats far above 1, such as the numbers of 8 bits, without a bit depth.
 
+    With one, for a capture whose floats are all at most 1: they are fractions of saturation, not the sensor's numbers.
+
     For captures, and for frames that are subtracted. The scale of a PSF from which nothing is subtracted does not
     matter.
 
@@ -19,9 +21,15 @@ def check_float_scale(frame: Frame, bit_depth: int | None, *, of: str | None = N
         of: what the frame is, for the message; ``None`` for a capture. The bits of a capture are guessed from its
             largest number; a dark frame, for example, may be far below saturation.
     """
-    if bit_depth is not None or frame.dtype.kind != "f":
+    if frame.dtype.kind != "f":
         return
-    if not (largest := float(frame.max())) > MAX_FLOAT:
+    largest = float(frame.max())
+    if bit_depth is not None and of is None and 0 < largest <= 1:
+        raise ParameterError(
+            f"The frame holds floats up to {largest:g}, but `bit_depth` ({bit_depth}) expects the sensor's numbers. "
+            f"Multiply them by {2**bit_depth - 1:,}, or calibrate without a bit depth."
+        )
+    if bit_depth is not None or not largest > MAX_FLOAT:
         return
     way_out = ", or give the sensor's `bit_depth`" if of else ""
     if not of and (bits := next((bits for bits in (8, 10, 12, 14, 16) if largest < 2**bits), None)):

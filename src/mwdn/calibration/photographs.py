@@ -104,8 +104,12 @@ def develop(photographs: Photographs, frames: FrameFormat, known: Corrections = 
         for start in range(0, len(groups), count)
     ]
     own = points[0]
+    places = [
+        photograph_point([group], [min(exposures)] if exposures else [], sensor, frames) for group in photographs.field
+    ]
     shift = centring_shift(own.image, frames.cell) if photographs.centre else (0, 0)
-    parts: dict[str, Frame | list[Frame]] = {"psf": psf_frame(shifted(own.image, *shift), frames)}
+    reference, *elsewhere = within_full_scale(own.image, *(place.image for place in places))
+    parts: dict[str, Frame | list[Frame]] = {"psf": psf_frame(shifted(reference, *shift), frames)}
     content: dict[str, Any] = {"mosaic": frames.mosaic, "psf_corrected": True}
     notes = [*sensor.notes, *(note for point in points for note in point.notes)]
     if len(distances) > 1:
@@ -114,9 +118,7 @@ def develop(photographs: Photographs, frames: FrameFormat, known: Corrections = 
     elif distances:
         content["distance_mm"] = distances[0]
     if photographs.field:
-        exposure = [min(exposures)] if exposures else []
-        places = [photograph_point([group], exposure, sensor, frames) for group in photographs.field]
-        content["field_positions"], parts["field_psfs"] = _field(places, own.image, shift, frames)
+        content["field_positions"], parts["field_psfs"] = _field(elsewhere, reference, shift, frames)
         notes += [note for place in places for note in place.notes]
     sensor_content, sensor_parts = of_sensor(sensor, frames)
     results = [_summary(own, shift), *describe_sensor(sensor)]
@@ -128,21 +130,28 @@ def psf_frame(image: Image, frames: FrameFormat) -> Frame:
     return FrameFormat(bit_depth=frames.bit_depth, bgr=frames.bgr).denormalise(image)
 
 
+def within_full_scale(*images: Image) -> list[Image]:
+    """The images over their brightest pixel if that is above 1, which no file can hold; their ratios stay."""
+    brightest = max(1.0, *(float(image.amax()) for image in images))
+    return [image / brightest for image in images]
+
+
 def _centred(point: PointSource, photographs: Photographs, frames: FrameFormat) -> Image:
-    return shifted(point.image, *centring_shift(point.image, frames.cell)) if photographs.centre else point.image
+    (image,) = within_full_scale(point.image)
+    return shifted(image, *centring_shift(image, frames.cell)) if photographs.centre else image
 
 
 def _field(
-    places: Sequence[PointSource], reference: Image, shift: tuple[int, int], frames: FrameFormat
+    places: Sequence[Image], reference: Image, shift: tuple[int, int], frames: FrameFormat
 ) -> tuple[tuple[tuple[float, float], ...], list[Frame]]:
     """Displacements of the points off the axis, and their PSFs moved back onto the one on the axis."""
     positions, pictures = [], []
     for place in places:
-        down, right, _ = displacement(place.image, reference)
+        down, right, _ = displacement(place, reference)
         positions.append((round(down, 2), round(right, 2)))
         back = (round(-moved / frames.cell) * frames.cell for moved in (down, right))
         total = [step + own for step, own in zip(back, shift, strict=True)]
-        pictures.append(psf_frame(shifted(place.image, total[0], total[1]), frames))
+        pictures.append(psf_frame(shifted(place, total[0], total[1]), frames))
     return tuple(positions), pictures
 
 

@@ -49,7 +49,12 @@ class PhotonTransfer:
 
 
 def photon_transfer(
-    flats: Sequence[Frame], darks: Sequence[Frame], format: FrameFormat = FrameFormat(), *, bad: Tensor | None = None
+    flats: Sequence[Frame],
+    darks: Sequence[Frame],
+    format: FrameFormat = FrameFormat(),
+    *,
+    bad: Tensor | None = None,
+    black: float | None = None,
 ) -> PhotonTransfer:
     """Measure gain, read noise and full well from pairs of flat frames and a pair of dark ones.
 
@@ -63,6 +68,8 @@ def photon_transfer(
         darks: (H, W, C), at least two, of the same exposure as the flats.
         format: of the frames; linear in light.
         bad: (1, 1, H, W), bool, pixels that are left out.
+        black: level without any light, as a fraction of the full scale; that of the dark frames unless given. If they
+            are brighter, light of the room is in them, and its noise is no read noise.
 
     Raises:
         ParameterError: too few frames, an encoded file, unequal light within a pair, or nothing but saturated flats.
@@ -76,9 +83,10 @@ def photon_transfer(
         )
     good = ~(np.zeros(flats[0].shape[:2], bool) if bad is None else bad[0, 0].numpy())
     full = format.full_scale(darks[0])
-    black = float(np.mean([frame[good].mean(dtype=np.float64) for frame in darks[:2]]))
+    dark_level = float(np.mean([frame[good].mean(dtype=np.float64) for frame in darks[:2]]))
+    black = dark_level if black is None else min(black * full, dark_level)
     dark_variance = _half_variance(darks[0], darks[1], good)
-    signals, variances = [0.0], [max(dark_variance, 1 / 12)]
+    signals, variances = [dark_level - black], [max(dark_variance, 1 / 12)]
     for first, second in zip(flats[::2], flats[1::2], strict=False):
         means = [float(frame[good].mean(dtype=np.float64)) - black for frame in (first, second)]
         if min(means) <= 0 or max(means) / min(means) > 1 + SAME_LIGHT:
@@ -118,7 +126,7 @@ def _fit(signals: list[float], variances: list[float], black: float, full: float
         )
     gain = 1 / slope
     well = float(x[used - 1]) if used < len(x) else full - black
-    read = max(float(y[0]) - 1 / 12, 0.0) ** 0.5 * gain
+    read = max(float(y[0]) - slope * float(x[0]) - 1 / 12, 0.0) ** 0.5 * gain  # x[0]: of the dark pair
     spread = 2**0.5 * float(y[used - 1]) / count**0.5 / (slope * float(x[used - 1]))
     deviation = float(y[0]) ** 0.5
     return PhotonTransfer(

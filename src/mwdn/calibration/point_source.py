@@ -25,8 +25,9 @@ class PointSource:
     """The picture of a point source.
 
     Args:
-        image: (1, C, H, W), in the pixels of the raw frame, linear; 1 is saturation at the shortest exposure. Dark
-            frame, flat field and hot pixels are corrected; noise is of either sign.
+        image: (1, C, H, W), in the pixels of the raw frame, linear; 1 is saturation at the shortest exposure, but the
+            flat field can amplify more light. Dark frame, flat field and hot pixels are corrected; noise is of either
+            sign.
         exposures: relative to the shortest, as measured.
         count: number of frames averaged, of all exposures.
         decades: from the noise of a dark pixel to the brightest one.
@@ -74,7 +75,6 @@ def photograph_point(
     dark_noise = float(merged.noise.median())
     peak = max(float(image.amax()), 1e-12)
     decades = float(torch.log10(torch.tensor(peak / max(dark_noise, 1e-12)))) if averages[0].noise else 0.0
-    image = image / max(peak, 1.0)  # `FrameFormat.full_scale` allows at most 1
     return PointSource(image, merged.exposures, sum(a.count for a in averages), max(decades, 0.0), tuple(notes))
 
 

@@ -9,6 +9,7 @@ import torch
 
 from mwdn.calibration.psf import Calibration
 from mwdn.calibration.psf_levels import estimate_background
+from mwdn.errors import PsfError
 from mwdn.optics import psf_measures, psf_spectrum
 from mwdn.optics.noise import noise_level
 from mwdn.optics.sensor import Sensor
@@ -33,6 +34,7 @@ class Levels:
         background: 5th percentile of each channel, as a fraction of the full scale.
         subtracted: level that was subtracted from each channel.
         pedestal: fraction of the file's light in this background.
+        has_dark: whether a dark frame was subtracted from the PSF.
         between: level between the lines, as a fraction of the full scale; mean of the colours.
         noise: standard deviation of a pixel's noise, as a fraction of the full scale.
         noise_floor: power of the noise in |H|^2, for the PSF of unit sum.
@@ -46,6 +48,7 @@ class Levels:
     background: tuple[float, ...]
     subtracted: tuple[float, ...]
     pedestal: float
+    has_dark: bool
     between: float
     noise: float
     noise_floor: float
@@ -132,8 +135,15 @@ def inspect_psf(
         depth: PSFs of points at other distances, by the distance.
         angle: PSFs of points off the axis, by the angle.
         off_axis: PSFs of points off the axis, each with its displacement in raw pixels.
+
+    Raises:
+        PsfError: the PSF is a single pixel.
     """
     psf = calibration.psf.float().cpu()
+    if psf.shape[-2:].numel() == 1:
+        raise PsfError(
+            "The PSF is a single pixel, which has no shape. Give the whole frame: without `--crop`, `--bin`."
+        )
     colours = [psf[:, [c]] for c in range(psf.shape[1])]
     pairs = [(a, b) for i, a in enumerate(colours) for b in colours[:i]]
     peak = psf_measures.autocorrelation(psf)
@@ -208,6 +218,7 @@ def _levels(calibration: Calibration, frame: Frame) -> Levels:
         steps=int(frame.max()) if integers else 0,
         saturated=frames.saturated(frame)[0],
         background=tuple(background.flatten().tolist()),
+        has_dark=calibration.dark is not None or calibration.corrections.psf_done,
         subtracted=calibration.background,
         pedestal=float(share.max()),
         between=psf_measures.level_between_lines(upright[psf_measures.support_box(calibration.psf)]),

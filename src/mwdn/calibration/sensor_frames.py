@@ -13,6 +13,7 @@ from mwdn.calibration.frame_average import FrameAverage, Kind, average_frames
 from mwdn.calibration.frame_format import FrameFormat
 from mwdn.calibration.frame_operations import demosaic
 from mwdn.calibration.hot_pixels import find_dead_pixels, find_hot_pixels
+from mwdn.calibration.noise_model import fit_line
 from mwdn.calibration.photon_transfer import SAME_LIGHT, PhotonTransfer, photon_transfer
 from mwdn.errors import ParameterError, ShapeError
 from mwdn.types import Frame, Image, Size
@@ -197,12 +198,29 @@ def _with_flats(sensor: SensorFrames, files: SensorFiles, frames: FrameFormat) -
     tint = tuple(colour.mean((0, 2, 3)).tolist()) if colour.shape[1] == 3 else ()
     transfer = None
     if len(flats) > 1 and len(darks) > 1 and frames.gamma is None:
-        transfer = photon_transfer(flats, darks, frames, bad=defects)
+        transfer = photon_transfer(flats, darks, frames, bad=defects, black=_black(sensor, defects))
     else:
         notes.append("Gain and read noise need two flat frames of the same exposure and two dark ones.")
     response = relative_response(flat, frames.cell) if files.flat_field else sensor.corrections.flat
     corrections = Corrections(response, defects)
     return replace(sensor, corrections=corrections, transfer=transfer, flat_colour=tint, notes=tuple(notes))
+
+
+def _black(sensor: SensorFrames, defects: Tensor) -> float | None:
+    """Level without any light, as a fraction of the full scale: dark frames of several exposures, extrapolated to none.
+
+    The light of the room, and dark current, grow with the exposure.
+    """
+    levels = {
+        time: float(dark.image[(~defects).expand_as(dark.image)].double().mean())
+        for time, dark in sensor.darks.items()
+        if time is not None
+    }
+    if len(levels) < 2:
+        return None
+    times, means = (torch.tensor([*numbers], dtype=torch.float64) for numbers in (levels.keys(), levels.values()))
+    # Fluctuations of the light are in proportion to it.
+    return max(fit_line(times, means, 1 / times.square())[1], 0.0)
 
 
 def _mean_flat(

@@ -95,7 +95,11 @@ def _background(levels: Levels) -> Iterator[Finding]:
     level, subtracted = (
         ", ".join(f"{value / scale:.3f}" for value in values) for values in (levels.background, levels.subtracted)
     )
-    if levels.integers and levels.between - max(levels.subtracted, default=0.0) > 0.05 * levels.peak:
+    if (
+        levels.integers
+        and not levels.has_dark
+        and levels.between - max(levels.subtracted, default=0.0) > 0.05 * levels.peak
+    ):
         text = (
             f"Between its lines the PSF is at {levels.between:.2f} of the full scale, but "
             + (f"only {subtracted} was subtracted" if any(levels.subtracted) else "no background was subtracted")
@@ -106,9 +110,15 @@ def _background(levels: Levels) -> Iterator[Finding]:
     if levels.pedestal > 0.02 and not any(levels.subtracted):
         text = (
             f"A uniform background of {level} of the {unit} contains {_percent(levels.pedestal)} of the light and was "
-            "kept. Leave out `--background 0` to estimate and subtract it."
         )
-        yield Finding("bad" if levels.pedestal > 0.3 else "mind", text)
+        if levels.has_dark:
+            text += (
+                "kept: after a dark frame it is light that the mask scatters, which belongs to the PSF. To subtract it "
+                'nevertheless, set `background = "estimate"` in the camera file.'
+            )
+        else:
+            text += "kept. Leave out `--background 0` to estimate and subtract it."
+        yield Finding("bad" if levels.pedestal > 0.3 else "good" if levels.has_dark else "mind", text)
     elif levels.pedestal > 0.02:
         whole = max(abs(a - b) for a, b in zip(levels.background, levels.subtracted, strict=True)) < 0.005 * scale
         text = (
@@ -201,7 +211,10 @@ def _frequencies(report: PsfReport) -> Iterator[Finding]:
 
 
 def _noise(report: PsfReport) -> Iterator[Finding]:
-    widths = ", ".join(f"{width:.1f} px at {_percent(noise)}" for noise, width in report.resolution_px.items())
+    widths = ", ".join(
+        f"{f'{width:.1f} px' if math.isfinite(width) else 'none'} at {_percent(noise)}"
+        for noise, width in report.resolution_px.items()
+    )
     middle = sorted(report.resolution_px.values())[len(report.resolution_px) // 2]
     gains = ", ".join(f"{report.noise_gain[value] ** 0.5:.3g} at {value:g}" for value in (1e-4, 1e-3, 1e-2))
     text = (

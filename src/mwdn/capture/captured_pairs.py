@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import numpy.typing as npt
 
@@ -219,7 +220,7 @@ def create_captured(
         set_format(file.attrs, first)
         add_rows(file, "scene", (*scene_size, 3), np.dtype(np.uint16))
         for name in ("photograph", "planned"):
-            add_rows(file, name, (), np.dtype(f"S{NAME_BYTES}"))
+            add_rows(file, name, (), h5py.string_dtype("utf-8", NAME_BYTES))
         FrameRows(file, "measurement", "frame_data", first)
         growing.commit()
         yield CapturedPairs(growing)

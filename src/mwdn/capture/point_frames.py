@@ -20,9 +20,12 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from mwdn.calibration.exposure import BRIGHTEST, measure_exposure
+from mwdn.calibration.frame_average import average_frames
 from mwdn.calibration.frame_format import FrameFormat
+from mwdn.calibration.hot_pixels import find_hot_pixels
 from mwdn.capture.captured_pairs import CapturedPairs
 from mwdn.capture.patterns import grey, point
 from mwdn.capture.recipe import PointTable
@@ -89,14 +92,16 @@ def record_point(pairs: CapturedPairs, table: PointTable, shooting: Shooting, *,
             "0, and photograph a point source: `mwdn calibrate --help`."
         )
     black = grey(0, (screen.height_px, screen.width_px))
+    series = {}
     for name, level in (("dark", 0), ("white", 255), ("half", HALF)):
         first = shooting.frame_of(np.full_like(black, level))
-        _add(pairs, name, _series(shooting, first, table.frames), usual_s)
+        series[name] = _series(shooting, first, table.frames)
+        _add(pairs, name, series[name], usual_s)
     try:
         shooting.frame_of(black if table.lamp else point(screen, table.size_cm))
         if table.lamp:
             shooting.lamp(True)
-        exposures = _exposures(shooting, table, usual_s)
+        exposures = _exposures(shooting, table, usual_s, hot_pixels(series["dark"]))
         for kind in ("point", "dark"):
             if kind == "dark":
                 if table.lamp:
@@ -131,11 +136,19 @@ def _add(pairs: CapturedPairs, name: str, frames: list[Frame], exposure_s: float
     pairs.add_frames(f"{GROUPS}/{name}", frames, {"exposure_s": exposure_s})
 
 
-def _exposures(shooting: Shooting, table: PointTable, exposure_s: float) -> list[float]:
+def hot_pixels(dark: list[Frame]) -> npt.NDArray[np.bool_]:
+    """(H, W, 1), pixels that are brighter than their surroundings in the dark, and would be taken for the point."""
+    format = dark[0].format
+    average = average_frames([frame.array for frame in dark], format, kind="dark")
+    return find_hot_pixels(average, cell=format.cell)[0, 0, :, :, None].numpy()
+
+
+def _exposures(shooting: Shooting, table: PointTable, exposure_s: float, hot: npt.NDArray[np.bool_]) -> list[float]:
     """The exposure at which the point's peak is well below saturation, and the longer ones."""
     for _ in range(_TRIES):
         frame = shooting.expose(exposure_s)
-        exposure = measure_exposure(frame.array, FrameFormat(bit_depth=frame.bit_depth))
+        array = np.where(hot, 0, frame.array).astype(frame.array.dtype)
+        exposure = measure_exposure(array, FrameFormat(bit_depth=frame.bit_depth))
         longer = min(exposure_s * exposure.factor, table.most_s)
         if exposure.is_good or longer == exposure_s:
             break

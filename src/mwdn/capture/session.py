@@ -16,7 +16,7 @@ from mwdn.capture.display import Display
 from mwdn.capture.gamma import fit_gamma
 from mwdn.capture.patterns import grey, grey_levels, pattern, point
 from mwdn.capture.photograph_list import list_photographs, read_photograph
-from mwdn.capture.point_frames import Shooting, record_point
+from mwdn.capture.point_frames import Shooting, hot_pixels, record_point
 from mwdn.capture.recipe import CaptureRecipe
 from mwdn.capture.screen import Picture, Place, Screen, place_picture, put
 from mwdn.capture.source import CameraSource, Frame, check_like
@@ -224,7 +224,7 @@ class Session:
 
     def _check_exposure(self, dark: Frame, white: Frame) -> None:
         full = 2**white.bit_depth - 1
-        part = float((white.array >= full).mean())
+        part = float(((white.array >= full) & ~hot_pixels([dark])).mean())
         if part > SATURATED:
             raise CameraError(
                 f"A white display saturates {part:.1%} of the camera's pixels. Lower `exposure_s` "
@@ -284,6 +284,6 @@ class Session:
         free = shutil.disk_usage(folder).free
         if needed > free:
             raise ParameterError(
-                f"{count:,} pairs need {needed / 1e9:,.1f} GB, but `{folder}` has {free / 1e9:,.1f} GB left. "
+                f"{count:,} pairs need {needed / 1e6:,.0f} MB, but `{folder}` has {free / 1e6:,.0f} MB left. "
                 "Make room, choose another folder for `out`, or a smaller `count` or `size` of [pictures]."
             )

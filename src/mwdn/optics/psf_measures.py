@@ -16,6 +16,9 @@ from mwdn.types import Psf, Size
 LOSSLESS_WIDTH = 6.0
 """Full width of the autocorrelation, in binned pixels, down to which binning loses little; see `coarsest_bin`."""
 
+LEAST_BOX = 5
+"""Pixels along each side of the lit part of a PSF, below which it is a spot without lines and gaps."""
+
 SMALLEST_SIDE = 100
 """Fewest pixels of the shorter side of a frame that is binned automatically."""
 
@@ -179,7 +182,12 @@ def support_box(psf: Psf) -> tuple[slice, slice]:
 
 
 def level_between_lines(box: Tensor) -> float:
-    """Brightness between the lines of a PSF: 10th percentile of the middle half (h/2, w/2) of its support box."""
+    """Brightness between the lines of a PSF: 10th percentile of the middle half (h/2, w/2) of its support box.
+
+    0 for a box below `LEAST_BOX`, which holds a single spot.
+    """
+    if min(box.shape) < LEAST_BOX:
+        return 0.0
     rows, columns = (slice(n // 4, max(3 * n // 4, n // 4 + 1)) for n in box.shape)
     ordered = box[rows, columns].flatten().sort().values
     return float(ordered[int(0.1 * (len(ordered) - 1))])

@@ -15,6 +15,7 @@ from mwdn.data.pair_writer import NAMES
 from mwdn.data.pairs import PairFile
 from mwdn.errors import ImageError, ParameterError
 from mwdn.io.images import srgb_decode
+from mwdn.registration.registration import KEY
 from mwdn.types import Frame, Image, Measurement
 
 _ADVICE = "Capture it again: `mwdn capture`."
@@ -37,7 +38,7 @@ class CapturedPairs:
 
     Raises:
         ImageError: no such file, damaged, or not of pairs; it holds none.
-        ParameterError: the gamma is not a power from 0.5 to 4.
+        ParameterError: the pairs are aligned already, or the gamma is not a power from 0.5 to 4.
     """
 
     def __init__(self, path: Path, calibration: Calibration, *, display_gamma: float | str = 1.0) -> None:
@@ -45,6 +46,8 @@ class CapturedPairs:
         with PairFile(path) as file:
             attributes, self._count = file.attributes, len(file)
             self.picture_size = file.scene_shape[0], file.scene_shape[1]
+        if KEY in attributes:
+            raise ParameterError(f"`{path}` is aligned already. Give the file of `mwdn capture` that it was made from.")
         if not self._count:
             raise ImageError(f"`{path}` holds no pair. {_ADVICE}")
         frames = calibration.frames.completed(attributes.get("bit_depth"), attributes.get("mosaic"), of=f"`{path}`")

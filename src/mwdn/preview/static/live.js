@@ -182,7 +182,10 @@ export function setUpLive(name, parts) {
   };
   toggle("live-record", "record");
   toggle("live-ambient", "ambient");
-  byId("live-exposure").onchange = () => wish({ exposure_s: Number(byId("live-exposure").value) / 1000 });
-  byId("live-gain").onchange = () => wish({ gain: Number(byId("live-gain").value) });
+  const whenGiven = (id, wanted) => { // an empty field, or one that holds no number, is no wish
+    byId(id).onchange = () => byId(id).value && wish(wanted(Number(byId(id).value)));
+  };
+  whenGiven("live-exposure", (milliseconds) => ({ exposure_s: milliseconds / 1000 }));
+  whenGiven("live-gain", (gain) => ({ gain }));
   setUpSnapshots(page.use);
 }
