@@ -85,3 +85,12 @@ def test_titles_are_drawn_above_their_columns():
 def test_each_row_has_as_many_pictures_as_there_are_titles():
     with pytest.raises(ValueError, match="zip"):
         contact_sheet([[plain(1.0)]], ["a", "b"])
+
+
+def test_a_long_title_stays_above_its_column():
+    """It ran into the title of the next one."""
+    sheet = contact_sheet(
+        [[plain(1.0, size=(100, 100))] * 2], ["a title of thirty-nine letters, in all", ""], height=100
+    )
+    assert sheet[..., :HEAD, :100].min() < 0.5
+    assert sheet[..., :HEAD, 100 + GAP :].min() == 1

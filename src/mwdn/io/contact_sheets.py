@@ -88,8 +88,10 @@ def _draw_titles(titles: list[str], widths: list[int], height: int, total: int) 
     import cv2
 
     canvas = np.full((height, total), 255, np.uint8)
-    left = 0
+    font, size, left = cv2.FONT_HERSHEY_SIMPLEX, 0.5, 0
     for title, width in zip(titles, widths, strict=True):
-        cv2.putText(canvas, title, (left + 2, height - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.5, 0, 1, cv2.LINE_AA)
+        (needed, _), _ = cv2.getTextSize(title, font, size, 1)
+        fitting = size * min(1.0, (width - 4) / max(needed, 1))  # smaller letters where the column is narrow
+        cv2.putText(canvas, title, (left + 2, height - 8), font, fitting, 0, 1, cv2.LINE_AA)
         left += width
     return srgb_decode(torch.from_numpy(canvas / np.float32(255)))[None, None].expand(1, 3, -1, -1)
