@@ -199,6 +199,7 @@ def test_psf_of_another_size(run, camera):
         ("captures --psf psf.png --crop 3", "`--crop` must be followed by two whole numbers or none."),
         ("captures --psf psf.png --map --no-trust", "`--map` needs the check that `--no-trust` skips"),
         ("captures --psf psf.png --psf psf.png", "`--psf` is given more than once."),
+        ("captures --psf psf.png --resume --no-resume", "`--resume` and `--no-resume` exclude each other."),
     ],
 )
 def test_wrong_call_is_one_message_and_exit_2(run, camera, line, message):
@@ -235,6 +236,7 @@ def test_o_is_out(run, command):
         ("train a.toml b.toml", "Too many arguments: b.toml."),
         ("demo --pictures dog", "`--pictures` (dog) must be astronaut, coffee or cat."),
         ("design --mask a.npy --pitch-um x", "`--pitch-um` (x) must be a number or none."),
+        ("design --foo", "Unknown option: --foo. Name the mask first"),
         ("design lens", "No mask named 'lens'. Did you mean 'lenslets'? Known: array, "),
     ],
 )

@@ -157,6 +157,10 @@ def test_mistyped_names_get_the_nearest(read, text, said):
         (NETWORK + "[schedule]\nepochs = -1", "`epochs` (-1) must not be negative."),
         (NETWORK + "[plateau]\nfactor = 1", "`factor` (1.0) must be in (0, 1)"),
         (NETWORK + "[plateau]\npatience = -1", "`patience` (-1) must not be negative"),
+        (
+            NETWORK + '[schedule]\nlr_schedule = "plateau"\nlearning_rate = 1e-9',
+            "`learning_rate` (1e-09) must be at least `stop` (2e-08) of [plateau]",
+        ),
         (NETWORK + "[plateau]\npatience = 3", "[plateau] needs `lr_schedule` (cosine) to be plateau."),
         (NETWORK + "[later_loss]\nmse = 1", "[later_loss] needs `lr_schedule` (cosine) to be plateau."),
         (

@@ -795,6 +795,14 @@ def test_samples_are_not_kept_on_a_disk_without_room(trainer, tmp_path, monkeypa
     assert not (tmp_path / "run" / "samples").exists()
 
 
+def test_a_denoiser_of_grey_scenes(trainer):
+    """Its scenes kept their colours, and the first step failed."""
+    grey = replace(few(steps=1), network=DRUNET | {"channels": 1}, denoising=Denoising((0.05, 0.1)))
+    run = trainer(grey, "a")
+    assert run.task.samples.batch(range(2)).scene.shape[1] == 1
+    run.run()
+
+
 def test_a_denoiser_is_trained_alone_and_then_frozen(trainer, tmp_path):
     """Trained on noisy scenes, then part of a network whose U-Net learns, with a cache or without."""
     alone = few(steps=20, learning_rate=3e-3, validate_every=20)

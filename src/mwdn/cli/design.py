@@ -9,7 +9,7 @@ from cyclopts import App, Parameter
 from cyclopts.config import Toml
 
 from mwdn.cli.terminal import say, warn
-from mwdn.errors import UnknownNameError
+from mwdn.errors import ParameterError, UnknownNameError
 from mwdn.io.files import refuse_overwrite
 from mwdn.io.toml import find_recipe
 from mwdn.optics import MASKS, ArrayMask, Setup
@@ -123,6 +123,10 @@ def array(
 @design.default
 def default(*tokens: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)]) -> None:
     """Print the help, or refuse an unknown kind of mask."""
+    if tokens and tokens[0].startswith("-"):
+        raise ParameterError(
+            f"Unknown option: {tokens[0]}. Name the mask first, then its options: `mwdn design --help`."
+        )
     if tokens:
         raise UnknownNameError("mask", tokens[0], [*MASKS, "array"])
     design.help_print()

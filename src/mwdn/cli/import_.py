@@ -16,7 +16,7 @@ from mwdn.data.importers import import_pairs, refuse_corrections
 from mwdn.data.kinds import KINDS, Layout
 from mwdn.data.pair_checks import other_scene_size
 from mwdn.data.pairs import PairFile
-from mwdn.errors import ParameterError
+from mwdn.errors import ParameterError, UnknownNameError
 from mwdn.io.listing import unused_photographs
 
 
@@ -50,6 +50,8 @@ def import_(  # noqa: PLR0913
             captures.
     """
     progress = partial(track, title="Importing")
+    if kind not in (*KINDS, "digicam"):
+        raise UnknownNameError("kind of data set", kind, [*KINDS, "digicam"])
     if kind != "digicam" and digicam != DigiCam():
         options = "`mask_distance_mm`, `source_mm`, `sensor_mm`, `psf_turn`, `background`"
         raise ParameterError(f"Only the kind digicam has {options}. Leave them out.")

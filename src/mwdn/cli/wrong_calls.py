@@ -31,7 +31,7 @@ def wrong_call(error: CycloptsError, commands: Iterable[str]) -> ParameterError:
         case MissingArgumentError(argument=Argument() as argument):
             return ParameterError(_missing(error, argument))
         case RepeatArgumentError():
-            return ParameterError(f"`{error.token.keyword}` is given more than once.")
+            return ParameterError(_repeated(error.token.keyword or "", error.root_input_tokens or ()))
         case UnusedCliTokensError(unused_tokens=list() as rest):
             return ParameterError(f"Too many arguments: {' '.join(rest)}. {_see_help(error)}")
     return ParameterError(str(error))
@@ -48,6 +48,14 @@ def _wrong_value(argument: Argument, token: Token | None) -> str:
         else:  # a file, where a table is its keyword
             given += f" in `{token.source}`"
     return f"`{name}`{given} must be {type_in_words(_one_word(argument.hint))}."
+
+
+def _repeated(option: str, given: Sequence[str]) -> str:
+    switch = option.removeprefix("--no-").removeprefix("--")
+    both = [f"--{switch}", f"--no-{switch}"]
+    if all(each in given for each in both):
+        return f"`{both[0]}` and `{both[1]}` exclude each other."
+    return f"`{option}` is given more than once."
 
 
 def _unknown_option(error: UnknownOptionError) -> str:

@@ -25,13 +25,15 @@ class Photographs:
         limit: read only this many, in the order of their names.
 
     Raises:
-        ParameterError: the folder holds no picture.
+        ParameterError: there is no such folder, or it holds no picture.
         ImageError: a picture cannot be read; the message has its path.
     """
 
     def __init__(self, folder: str | Path, *, side: int = 208, limit: int | None = None) -> None:
         paths = sorted(p for p in Path(folder).rglob("*") if _is_picture(p))[:limit]
         if not paths:
+            if not Path(folder).is_dir():
+                raise ParameterError(f"`{folder}` is no folder. Give one of photographs.")
             raise ParameterError(f"The folder `{folder}` holds no photograph. Readable: {', '.join(sorted(READABLE))}.")
         self.names = [path.name for path in paths]
         with ThreadPoolExecutor() as pool:

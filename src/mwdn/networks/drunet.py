@@ -64,7 +64,7 @@ class Drunet(nn.Module):
         conditions: int = 1,
     ) -> None:
         super().__init__()
-        self.fold = fold
+        self.channels, self.fold = channels, fold
         self.head = convolution((channels + conditions) * fold**2, widths[0], 3)
         *left, self.centre = (_scale(width, blocks) for width in widths)
         self.encoder = nn.ModuleList(left)

@@ -176,6 +176,11 @@ class Recipe:
                 f"[{name}] needs `lr_schedule` ({self.schedule.lr_schedule}) to be plateau. "
                 f'Set `lr_schedule = "plateau"` in [schedule], or leave [{name}] out.'
             )
+        if self.schedule.lr_schedule == "plateau" and self.schedule.learning_rate < self.plateau.stop:
+            raise ParameterError(
+                f"`learning_rate` ({self.schedule.learning_rate:g}) must be at least `stop` ({self.plateau.stop:g}) of "
+                "[plateau], below which the training ends."
+            )
         if self.later_loss and self.later_loss.keys() != self.loss.keys():
             raise ParameterError(
                 f"[later_loss] ({', '.join(self.later_loss)}) must have the parts of [loss] ({', '.join(self.loss)}). "
