@@ -37,7 +37,7 @@ from mwdn.optics.shading import shading
 from mwdn.training.recipe import read_recipe
 from mwdn.training.sample_cache import SampleCache
 from mwdn.training.sample_files import Sample
-from mwdn.training.tasks import few_pairs_tasks
+from mwdn.training.tasks import pair_tasks
 from mwdn.training.trainer import Trainer
 from mwdn.training.validation import Validation
 
@@ -76,7 +76,7 @@ def tuned(recipe, calibration, parts, samples, path):
     file = PairFile(path)
     train, test = (RecordedPairs(file, rows, calibration.psf, shuffled=False, aligned=True) for rows in parts)
     recipe = replace(recipe, schedule=replace(recipe.schedule, validation=len(test)))
-    tasks = few_pairs_tasks(train, test, recipe.schedule, best_gain=True)
+    tasks = pair_tasks(train, test, recipe.schedule, best_gain=True)
     for task in tasks:
         task.cache.samples = {number: samples[task.samples.row(number)] for number in range(task.cache.size)}
     with tempfile.TemporaryDirectory() as folder:

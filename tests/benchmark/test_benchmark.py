@@ -424,13 +424,18 @@ def opened(folder, camera, **changes):
     return open_dataset(name, recipe, folder, torch.device("cpu"), lambda _, rows: rows)
 
 
-def test_imported_captures_lose_the_dark_frame_of_the_camera(folder):
-    """Without a word they were scored, and trained on, with the light that the sensor shows without any."""
-    capture = np.random.default_rng(0).integers(90, 200, (48, 64, 3), np.uint8)
+def ten_pairs(folder, picture):
+    """pairs/captures and pairs/scenes, which hold the picture ten times each."""
     for place in ("captures", "scenes"):
         (folder / "pairs" / place).mkdir(parents=True)
         for number in range(10):
-            cv2.imwrite(str(folder / "pairs" / place / f"{number}.png"), capture)
+            cv2.imwrite(str(folder / "pairs" / place / f"{number}.png"), picture)
+
+
+def test_imported_captures_lose_the_dark_frame_of_the_camera(folder):
+    """Without a word they were scored, and trained on, with the light that the sensor shows without any."""
+    capture = np.random.default_rng(0).integers(90, 200, (48, 64, 3), np.uint8)
+    ten_pairs(folder, capture)
     cv2.imwrite(str(folder / "dark.png"), np.full((48, 64, 3), 51, np.uint8))
     np.save(folder / "flat.npy", np.full((48, 64, 1), 1.25, np.float32))
     changes = {"kind": "folders", "pairs": str(folder / "pairs"), "split": "random"}
@@ -657,10 +662,7 @@ def test_a_network_with_an_aligned_psf_learns_from_aligned_pairs(folder, monkeyp
 def test_pairs_of_a_camera_that_is_upside_down_and_bgr(folder):
     """Its PSF was turned upright, its captures and scenes were not."""
     picture = np.random.default_rng(1).integers(0, 200, (48, 64, 3), np.uint8)
-    for place in ("captures", "scenes"):
-        (folder / "pairs" / place).mkdir(parents=True)
-        for number in range(10):
-            cv2.imwrite(str(folder / "pairs" / place / f"{number}.png"), picture)
+    ten_pairs(folder, picture)
     recipe = DatasetRecipe(psf=str(folder / "psf.npy"), kind="folders", pairs=str(folder / "pairs"), split="random")
     for turned in (False, True):
         changed = replace(recipe, upside_down=turned, bgr=turned)

@@ -122,7 +122,7 @@ def test_warning_of_a_reconstructor(camera):
     ("line", "said"),
     [
         (TRAIN.replace("runs/x", "r.toml"), "`r.toml` must be a folder that can be written to"),
-        (TRAIN.replace("--photos photos", "--photos runs"), "`runs` is no folder"),
+        (TRAIN.replace("--photos photos", "--photos runs"), "`runs` is not a folder"),
         (TRAIN.replace("--photos photos", ""), "`--photos FOLDER`"),
         (
             TRAIN + " --pairs p.h5",
@@ -139,7 +139,7 @@ def test_warning_of_a_reconstructor(camera):
         ("simulate photos --psf psf.npy -o photos/0.png", "`0.png` must end in .h5 or .hdf5"),
         ("simulate photos --psf psf.npy -o psf.npy", "`psf.npy` would overwrite an input"),
         (f"simulate photos --psf psf.npy --seed {10**23}", f"`--seed` ({10**23}) must have 63 bits at most"),
-        ("simulate nothing --psf psf.npy", "`nothing` is no folder. Give one of photographs."),
+        ("simulate nothing --psf psf.npy", "`nothing` is not a folder. Name a folder of photographs."),
     ],
 )
 def test_wrong_call_is_one_message_and_exit_2(run, camera, line, said):

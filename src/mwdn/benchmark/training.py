@@ -25,7 +25,7 @@ from mwdn.networks.empty import build_empty
 from mwdn.training.network import check_colours, stored_psf
 from mwdn.training.recipe import Recipe, Schedule
 from mwdn.training.report import Report
-from mwdn.training.tasks import SupervisedTask, few_pairs_tasks, supervised_task, with_stored_psf
+from mwdn.training.tasks import pair_tasks, with_stored_psf
 from mwdn.training.trainer import Trainer
 from mwdn.training.validation import Validator
 
@@ -178,9 +178,7 @@ def _trainer(
     if schedule.pool and isinstance(training, RecordedPairs) and getattr(build_empty(**network), "align", False):
         # It is tested with a PSF aligned to each capture.
         training, validation = (replace(part, aligned=True, poses={}) for part in (training, validation))
-        task, held_out = few_pairs_tasks(training, validation, schedule, best_gain=False)
-    else:
-        task, held_out = supervised_task(training, schedule), SupervisedTask(validation)
+    task, held_out = pair_tasks(training, validation, schedule)
     return Trainer(
         recipe,
         with_stored_psf(task, stored),

@@ -108,7 +108,7 @@ def develop(photographs: Photographs, frames: FrameFormat, known: Corrections = 
         photograph_point([group], [min(exposures)] if exposures else [], sensor, frames) for group in photographs.field
     ]
     shift = centring_shift(own.image, frames.cell) if photographs.centre else (0, 0)
-    reference, *elsewhere = within_full_scale(own.image, *(place.image for place in places))
+    reference, *elsewhere = _within_full_scale(own.image, *(place.image for place in places))
     parts: dict[str, Frame | list[Frame]] = {"psf": psf_frame(shifted(reference, *shift), frames)}
     content: dict[str, Any] = {"mosaic": frames.mosaic, "psf_corrected": True}
     notes = [*sensor.notes, *(note for point in points for note in point.notes)]
@@ -130,14 +130,14 @@ def psf_frame(image: Image, frames: FrameFormat) -> Frame:
     return FrameFormat(bit_depth=frames.bit_depth, bgr=frames.bgr).denormalise(image)
 
 
-def within_full_scale(*images: Image) -> list[Image]:
+def _within_full_scale(*images: Image) -> list[Image]:
     """The images over their brightest pixel if that is above 1, which no file can hold; their ratios stay."""
     brightest = max(1.0, *(float(image.amax()) for image in images))
     return [image / brightest for image in images]
 
 
 def _centred(point: PointSource, photographs: Photographs, frames: FrameFormat) -> Image:
-    (image,) = within_full_scale(point.image)
+    (image,) = _within_full_scale(point.image)
     return shifted(image, *centring_shift(image, frames.cell)) if photographs.centre else image
 
 

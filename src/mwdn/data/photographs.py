@@ -33,7 +33,7 @@ class Photographs:
         paths = sorted(p for p in Path(folder).rglob("*") if _is_picture(p))[:limit]
         if not paths:
             if not Path(folder).is_dir():
-                raise ParameterError(f"`{folder}` is no folder. Give one of photographs.")
+                raise ParameterError(f"`{folder}` is not a folder. Name a folder of photographs.")
             raise ParameterError(f"The folder `{folder}` holds no photograph. Readable: {', '.join(sorted(READABLE))}.")
         self.names = [path.name for path in paths]
         with ThreadPoolExecutor() as pool:

@@ -30,7 +30,7 @@ from mwdn.training.network import check_colours, stored_psf
 from mwdn.training.recipe import Recipe, read_recipe
 from mwdn.training.report import Report
 from mwdn.training.selfsupervised import SelfSupervisedTask
-from mwdn.training.tasks import SupervisedTask, Task, few_pairs_tasks, supervised_task, with_stored_psf
+from mwdn.training.tasks import SupervisedTask, Task, pair_tasks, supervised_task, with_stored_psf
 from mwdn.training.trainer import Trainer
 from mwdn.training.validation import SHOWN, Validator
 from mwdn.types import Measurement, Psf
@@ -173,12 +173,7 @@ def recorded_pairs_of(recipe: Recipe, pairs: Path, psf: Psf, *, refinement: Refi
     seed = recipe.schedule.seed
     training, validation = recorded_pairs(pairs, psf, recipe.pairs, seed=seed, device=psf.device, refinement=refinement)
     _check_colours(recipe, training.file.measurement_shape[2], f"`{pairs}`")
-    best_gain = recipe.pairs.best_gain
-    if recipe.schedule.pool and recipe.pairs.aligned:
-        task, held_out = few_pairs_tasks(training, validation, recipe.schedule, best_gain=best_gain)
-    else:
-        task = replace(supervised_task(training, recipe.schedule), best_gain=best_gain)
-        held_out = SupervisedTask(validation, best_gain=best_gain)
+    task, held_out = pair_tasks(training, validation, recipe.schedule, best_gain=recipe.pairs.best_gain)
     return TrainingData(task, held_out, len(training), len(validation))
 
 

@@ -132,18 +132,24 @@ def with_stored_psf(task: Task, psf: Psf | None) -> Task:
     return replace(task, stored_psf=psf) if isinstance(task, SupervisedTask) else task
 
 
-def few_pairs_tasks(
-    training: RecordedPairs, validation: RecordedPairs, schedule: Schedule, *, best_gain: bool
+def pair_tasks(
+    training: Samples, validation: RecordedPairs, schedule: Schedule, *, best_gain: bool = False
 ) -> tuple[SupervisedTask, SupervisedTask]:
-    """Tasks of training and validation on pairs that are all cached: each is aligned and estimated once.
+    """Tasks of training and validation on pairs.
+
+    Pairs that are aligned and cached are few, so that all are cached, those for validation, too: each is aligned and
+    estimated once.
 
     Args:
-        training: at most ``pool`` of them are used. The cache is a multiple of the batch: the last pairs may be twice
-            in it.
+        training: at most ``pool`` are used, if they are cached. The cache of aligned ones is a multiple of the batch:
+            the last pairs may be twice in it.
         validation: as many as the schedule says.
         schedule: has the batch and the size of the cache.
         best_gain: see `SupervisedTask`.
     """
+    if not (schedule.pool and isinstance(training, RecordedPairs) and training.aligned):
+        task = replace(supervised_task(training, schedule), best_gain=best_gain)
+        return task, SupervisedTask(validation, best_gain=best_gain)
     batch, crop, seed = schedule.batch, schedule.crop, schedule.seed
     size = -(-min(schedule.pool, len(training)) // batch) * batch
     cache = SampleCache(training, size=size, batch=batch, crop=crop, seed=seed)
