@@ -234,6 +234,10 @@ def test_o_is_out(run, command):
         ("train", "`RECIPE` is missing. See `mwdn train --help`."),
         ("evaluate admm", "`--data` is missing."),
         ("train a.toml b.toml", "Too many arguments: b.toml."),
+        (
+            "train a.toml --pictures.size 96 96",
+            "Too many arguments: 96. A list of a recipe is one argument, in quotes: '[96, 96]'.",
+        ),
         ("demo --pictures dog", "`--pictures` (dog) must be astronaut, coffee or cat."),
         ("design --mask a.npy --pitch-um x", "`--pitch-um` (x) must be a number or none."),
         ("design --foo", "Unknown option: --foo. Name the mask first"),

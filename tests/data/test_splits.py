@@ -69,7 +69,12 @@ def test_folds_hold_out_each_pair_once(count, folds):
 
 @pytest.mark.parametrize(
     ("options", "said"),
-    [({"folds": 1}, "`folds`"), ({"folds": 9}, "`folds`"), ({"fold": 4}, "`fold`"), ({"fold": -1}, "`fold`")],
+    [
+        ({"folds": 1}, "`folds`"),
+        ({"folds": 9}, "Use 8: `--pairs.folds 8`"),
+        ({"fold": 4}, "`fold`"),
+        ({"fold": -1}, "`fold`"),
+    ],
 )
 def test_folds_that_do_not_exist(options, said):
     with pytest.raises(ParameterError, match=said):

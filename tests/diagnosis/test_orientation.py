@@ -57,6 +57,14 @@ def test_noise_cannot_judge_a_psf(capture):
     assert fit_orientations(noise, capture[0]).verdict.state == "unknown"
 
 
+def test_saturated_capture_judges_no_wrong_psf(capture):
+    psf, measurement = capture
+    clipped = measurement.clamp(max=float(measurement.flatten().quantile(0.7)))
+    assert fit_orientations(measurement, psf.flip(-1)).verdict.state == "doubt"
+    verdict = fit_orientations(clipped, psf.flip(-1)).verdict
+    assert (verdict.state, "30% of the capture's pixels" in verdict.text) == ("unknown", True)
+
+
 def test_frames_that_are_not_square_have_no_quarter_turns(capture):
     psf, measurement = (image[..., 8:-8, :] for image in capture)
     assert set(fit_orientations(measurement, psf.flip(-1)).misfits) == {

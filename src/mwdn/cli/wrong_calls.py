@@ -1,6 +1,7 @@
 """A wrong call in one sentence: which option or argument, what was given, what is allowed."""
 
 import difflib
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import UnionType
@@ -33,7 +34,7 @@ def wrong_call(error: CycloptsError, commands: Iterable[str]) -> ParameterError:
         case RepeatArgumentError():
             return ParameterError(_repeated(error.token.keyword or "", error.root_input_tokens or ()))
         case UnusedCliTokensError(unused_tokens=list() as rest):
-            return ParameterError(f"Too many arguments: {' '.join(rest)}. {_see_help(error)}")
+            return ParameterError(f"Too many arguments: {' '.join(rest)}. {_list_hint(rest)}{_see_help(error)}")
     return ParameterError(str(error))
 
 
@@ -56,6 +57,12 @@ def _repeated(option: str, given: Sequence[str]) -> str:
     if all(each in given for each in both):
         return f"`{both[0]}` and `{both[1]}` exclude each other."
     return f"`{option}` is given more than once."
+
+
+def _list_hint(rest: Sequence[str]) -> str:
+    """A sentence for `--pictures.size 96 96`, whose second number is no argument."""
+    numbers = all(re.fullmatch(r"-?\d+(\.\d+)?", each) for each in rest)
+    return "A list of a recipe is one argument, in quotes: '[96, 96]'. " if numbers else ""
 
 
 def _unknown_option(error: UnknownOptionError) -> str:

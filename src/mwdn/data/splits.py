@@ -93,7 +93,10 @@ def _random(count: int, fractions: Sequence[float], seed: int) -> Split:
 
 def _folds(count: int, folds: int, fold: int) -> Split:
     if not 2 <= folds <= count:
-        raise ParameterError(f"`folds` ({folds}) must be 2 or more, and at most the number of pairs ({count:,}).")
+        advice = f" Use {count}: `--pairs.folds {count}`." if 2 <= count < folds else ""
+        raise ParameterError(
+            f"`folds` ({folds}) must be 2 or more, and at most the number of pairs ({count:,}).{advice}"
+        )
     if not 0 <= fold < folds:
         raise ParameterError(f"`fold` ({fold}) must be from 0 to {folds - 1}, for {folds} `folds`.")
     first, end = (count * part // folds for part in (fold, fold + 1))
