@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mwdn.capture import CameraSource, Frame, Kind
+from mwdn.capture import CameraFrame, CameraSource, Kind
 from mwdn.errors import ParameterError
 from mwdn.fourier import convolve, correlate, wiener
 from mwdn.networks import Network
@@ -106,14 +106,14 @@ class TestCard(CameraSource):
         """Start at the first frame."""
         self._number = 0
 
-    def read(self) -> Frame:
+    def read(self) -> CameraFrame:
         """The next frame, 12 bits."""
         if self._number < 0:
             raise self.not_open()
         height, width = self.size
         row = (np.arange(width) + self._number) % width * 4095 // width
         self._number += 1
-        return Frame(array=np.broadcast_to(row, (height, width)).astype(np.uint16)[..., None], bit_depth=12)
+        return CameraFrame(array=np.broadcast_to(row, (height, width)).astype(np.uint16)[..., None], bit_depth=12)
 
     def close(self) -> None:
         """Stop."""

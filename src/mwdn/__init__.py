@@ -1,9 +1,9 @@
 """Image reconstruction for lensless cameras, in PyTorch.
 
->>> from mwdn import Calibration, Reconstructor, read_frame, to_display, write_picture
+>>> from mwdn import Calibration, Reconstructor, to_display, write_picture
 >>> calibration = Calibration.from_file("psf.png")
 >>> reconstruct = Reconstructor("universal", calibration)
->>> scene = reconstruct(read_frame("capture.png"))
+>>> scene = reconstruct(calibration.frames.read("capture.png"))
 >>> write_picture("scene.png", to_display(scene))
 
 Subpackages: `mwdn.solvers` (ADMM, FISTA, ...), `mwdn.networks` (MWDN, MWDN-CPSF, ...),
@@ -35,6 +35,7 @@ if TYPE_CHECKING:  # the names of _MODULES and _PACKAGES, for mypy and editors
     from mwdn import networks as networks
     from mwdn import optics as optics
     from mwdn import preview as preview
+    from mwdn import registration as registration
     from mwdn import runtime as runtime
     from mwdn import solvers as solvers
     from mwdn import training as training

@@ -122,11 +122,11 @@ def test_memory_that_ends(here):
 RECORD = """
 import sys, numpy as np
 from mwdn.capture.recording import record
-from mwdn.capture.source import Frame
+from mwdn.capture.source import CameraFrame
 with record(sys.argv[1]) as recorder:
     for number in range(100_000):
         array = np.full((48, 64, 1), number % 4096, np.uint16)
-        recorder.append(Frame(array=array, bit_depth=12, timestamp=float(number), number=number))
+        recorder.append(CameraFrame(array=array, bit_depth=12, timestamp=float(number), number=number))
         print(number, flush=True)
 """
 

@@ -11,7 +11,7 @@ import pytest
 from browser import CHROMIUM, fetch_axe, open_page, violations
 from mwdn.calibration import Calibration
 from mwdn.capture import open_source
-from mwdn.preview.cameras import Cameras
+from mwdn.preview.cameras import StoredCameras
 from mwdn.preview.limits import Limits
 from mwdn.preview.live import Live
 from mwdn.preview.server import make_server
@@ -35,7 +35,7 @@ def page(tmp_path_factory):
     folder = tmp_path_factory.mktemp("preview")
     rig = open_source("rig,height=96,width=96,fps=10,prepared=4")
     live = Live(rig, Calibration(rig.psf), method="wiener", folder=folder, device="cpu")
-    server = make_server(Cameras(Limits(), folder / "cameras"), live=live, device="cpu")
+    server = make_server(StoredCameras(Limits(), folder / "cameras"), live=live, device="cpu")
     server.start()
     try:
         with open_page(server.url, folder / "profile") as opened:

@@ -9,7 +9,7 @@ import pytest
 
 from mwdn.calibration import Calibration
 from mwdn.capture import open_source
-from mwdn.preview.cameras import Cameras
+from mwdn.preview.cameras import StoredCameras
 from mwdn.preview.live import Live
 from mwdn.preview.server import make_server
 from preview_server import LIMITS, SIDE
@@ -26,7 +26,7 @@ def test_answers_are_those_of_the_document(tmp_path):
     """All checks but one: that a valid request succeeds. No schema says which bytes are a picture of a point source."""
     rig = open_source(f"rig,height={SIDE},width={SIDE},fps=10,prepared=4")
     live = Live(rig, Calibration(rig.psf), method="wiener", folder=tmp_path, device="cpu")
-    server = make_server(Cameras(LIMITS, tmp_path / "cameras"), LIMITS, device="cpu", live=live)
+    server = make_server(StoredCameras(LIMITS, tmp_path / "cameras"), LIMITS, device="cpu", live=live)
     server.start()
     try:
         line = [sys.executable, "-m", "schemathesis.cli", "run", f"{server.url}openapi.json"]

@@ -91,6 +91,10 @@ def test_repair_of_a_mosaic_takes_pixels_of_the_same_colour(generator):
     block[2:5, 2:5] = True
     ones = torch.ones(1, 1, 8, 8)
     torch.testing.assert_close(PixelRepair(block)(torch.where(block, 9.0, ones)), ones)
+    wide = torch.ones(24, 24, dtype=torch.bool)
+    wide[:4] = False
+    repaired = PixelRepair(wide)(torch.where(wide, 9.0, torch.ones(1, 1, 24, 24)))  # up to 8 pixels away
+    assert repaired[0, 0, :, 12].tolist() == pytest.approx([1.0] * 12 + [9.0] * 12)
 
 
 def test_merged_exposures_are_right_over_four_decades(bench, dark):
@@ -158,7 +162,7 @@ def test_photon_transfer_refuses_what_tells_nothing(bench):
     darks, flats = [bench.dark() for _ in range(2)], [bench.flat(0.5) for _ in range(2)]
     for wrong, message in (
         ((flats[:1], darks), "two flat frames"),
-        (([flats[0], bench.flat(0.8)], darks), "must have the same light"),
+        (([bench.flat(4.0)] * 2 + [flats[0], bench.flat(0.8)], darks), "frames 3 and 4 must have the same light"),
         (([bench.flat(4.0)] * 2, darks), "saturated"),
         (([flats[0]] * 2, darks), "no noisier"),
     ):

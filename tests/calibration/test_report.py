@@ -79,7 +79,7 @@ def test_background_is_reported(tmp_path, psf):
     assert report.levels.background == pytest.approx((0.1,) * 3, abs=2e-3)
     share = 0.1 * SIZE[0] * SIZE[1] / (frame / 65535).sum((0, 1)).min()
     assert report.levels.pedestal == pytest.approx(share, rel=0.02)
-    assert [finding.weight for finding in said(report, "0.100", "was subtracted")] == ["mind"]
+    assert [finding.weight for finding in said(report, "0.100", "was subtracted")] == ["weak"]
     assert said(report_of(tmp_path, frame, background=0.05), "0.100", "found, and 0.050, 0.050, 0.050 subtracted")
     kept = report_of(tmp_path, frame, background=0.0)
     assert said(kept, "0.100", "was kept", "--background 0")
@@ -137,7 +137,7 @@ def test_exposure(tmp_path, psf):
 def test_floats_have_no_full_scale(tmp_path, psf):
     np.save(tmp_path / "psf.npy", psf[0].movedim(0, -1).numpy())
     report = inspect_psf(Calibration.from_file(tmp_path / "psf.npy"), read_frame(tmp_path / "psf.npy"))
-    assert report.levels.steps == 0
+    assert report.levels.largest == 0
     assert said(report, "floats", "saturation")
     level = 0.05 * psf.max() + psf
     np.save(tmp_path / "psf.npy", level[0].movedim(0, -1).numpy())
@@ -275,7 +275,7 @@ def test_a_psf_that_shows_nothing():
 def test_light_that_is_left_after_a_dark_frame_is_the_psfs(tmp_path, psf):
     """The camera file had `background = 0` from `mwdn calibrate`, and the advice was not to give that."""
     frame = (60000 * (0.99 * psf / psf.max() + 0.002)).clamp(max=65535)[0].movedim(0, -1).numpy().astype(np.uint16)
-    for dark, weight, said in ((None, "mind", "Leave out"), (np.zeros_like(frame), "good", "which belongs to the PSF")):
+    for dark, weight, said in ((None, "weak", "Leave out"), (np.zeros_like(frame), "good", "which belongs to the PSF")):
         calibration = Calibration.from_array(frame, background=0.0, dark=dark)
         (found,) = [each for each in verdict(inspect_psf(calibration, frame)) if "A uniform background" in each.text]
         assert said in found.text

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from display_geometry import from_picture
-from mwdn.capture.screen import Place, Pose, Screen, place_picture, project, put
+from mwdn.capture.screen import DisplayPose, Place, Screen, place_picture, project, put
 from mwdn.errors import ParameterError
 
 SCREEN = Screen(width_px=96, height_px=54, width_cm=48.0, height_cm=27.0, distance_cm=20.0)
@@ -19,7 +19,7 @@ def at(homography, x, y):
 
 
 def test_a_display_that_faces_the_camera_is_scaled_by_focal_length_over_distance():
-    h = project(SCREEN, Pose(), SIZE, FOCAL)
+    h = project(SCREEN, DisplayPose(), SIZE, FOCAL)
     middle = (96 - 1) / 2, (54 - 1) / 2
     assert at(h, *middle) == pytest.approx((50, 40))  # pixel (W // 2, H // 2)
     ten_cm = 10 * 2  # 2 pixels per centimetre
@@ -28,7 +28,7 @@ def test_a_display_that_faces_the_camera_is_scaled_by_focal_length_over_distance
 
 
 def test_a_turn_is_clockwise_and_an_offset_is_right_and_down():
-    h = project(SCREEN, Pose(turn_degrees=90.0, offset_cm=(2.0, 1.0)), SIZE, FOCAL)
+    h = project(SCREEN, DisplayPose(turn_degrees=90.0, offset_cm=(2.0, 1.0)), SIZE, FOCAL)
     middle = (96 - 1) / 2, (54 - 1) / 2
     assert at(h, *middle) == pytest.approx((50 + FOCAL * 2 / 20, 40 + FOCAL * 1 / 20))
     right = at(h, middle[0] + 20, middle[1])  # what lies to the right moves downwards
@@ -38,9 +38,9 @@ def test_a_turn_is_clockwise_and_an_offset_is_right_and_down():
 def test_a_tilt_brings_one_edge_nearer():
     a, b = math.radians(30), math.radians(20)
     middle = (96 - 1) / 2, (54 - 1) / 2
-    down = at(project(SCREEN, Pose(tilt_degrees=(30.0, 0.0)), SIZE, FOCAL), middle[0], middle[1] + 20)
+    down = at(project(SCREEN, DisplayPose(tilt_degrees=(30.0, 0.0)), SIZE, FOCAL), middle[0], middle[1] + 20)
     assert down == pytest.approx((50, 40 + FOCAL * 10 * math.cos(a) / (20 - 10 * math.sin(a))))
-    right = at(project(SCREEN, Pose(tilt_degrees=(0.0, 20.0)), SIZE, FOCAL), middle[0] + 20, middle[1])
+    right = at(project(SCREEN, DisplayPose(tilt_degrees=(0.0, 20.0)), SIZE, FOCAL), middle[0] + 20, middle[1])
     assert right == pytest.approx((50 + FOCAL * 10 * math.cos(b) / (20 - 10 * math.sin(b)), 40))
 
 

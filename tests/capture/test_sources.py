@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from mwdn.capture import SOURCES, CameraSource, Frame, open_source
+from mwdn.capture import SOURCES, CameraFrame, CameraSource, open_source
 from mwdn.capture.folder import WatchedFolder
 from mwdn.capture.recording import record
 from mwdn.capture.source import check_like
@@ -19,7 +19,7 @@ from mwdn.runtime.streams import latest
 def frame(number=0, shape=(6, 8, 1), **metadata):
     array = np.random.default_rng(number).integers(0, 4096, shape, np.uint16)
     values = {"bit_depth": 12, "mosaic": "rggb", "exposure_s": 0.5, "gain": 2.0, "timestamp": 100.0 + number}
-    return Frame(**{"array": array, "number": number, **values, **metadata})
+    return CameraFrame(**{"array": array, "number": number, **values, **metadata})
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from cameras import contour_psf
-from mwdn import Camera, read_frame
+from mwdn import Calibration, Camera, read_frame
 from mwdn.calibration.camera_file import read_camera, write_camera
 
 SIZE = 64, 80
@@ -59,6 +59,18 @@ def test_pitch_follows_a_changed_bin(run, options, pitch):
     assert run("calibrate lab/psf.png --bin 2 --pitch-um 3 -o camera.toml")[0] == 0
     assert run(f"calibrate --camera camera.toml {options} -o camera.toml")[0] == 0
     assert read_camera("camera.toml")["pitch_um"] == pitch
+
+
+@pytest.mark.usefixtures("folder")
+def test_psf_by_another_path_is_the_camera_files_own():
+    """Another spelling made it another PSF: its corrections were applied twice, its refinement was dropped."""
+    content = {"psf": Path("lab/psf.png"), "psf_corrected": True, "envelope_shift": (1.0, 2.0)}
+    write_camera("camera.toml", content)
+    expected = Calibration.load("camera.toml")
+    assert expected.refinement
+    for path in ("lab/psf.png", Path("lab/psf.png").absolute(), "lab/../lab/psf.png"):
+        calibration = Calibration.load("camera.toml", psf=path)
+        assert (calibration.psf_hash, calibration.corrections.psf_done) == (expected.psf_hash, True)
 
 
 @pytest.mark.usefixtures("folder")

@@ -137,6 +137,16 @@ def test_a_camera_file_appears_with_all_its_pictures_or_not_at_all(folder, monke
     assert {path.name: path.read_bytes() for path in folder.glob("camera*")} == old
 
 
+def test_a_calibration_that_fails_leaves_the_camera_as_it_was(run, folder, photographs):
+    """The new file was written before it was checked, and no command could read it."""
+    assert run(EVERYTHING)[0] == 0
+    old = {path.name: path.read_bytes() for path in folder.glob("camera*")}
+    code, out, err = run(f"{EVERYTHING} --white-balance psf")
+    assert (code, out, "needs a PSF in colour" in err) == (2, "", True)
+    assert {path.name: path.read_bytes() for path in folder.glob("camera*")} == old
+    assert not list(folder.glob(".*"))
+
+
 def test_saturated_frames_are_refused_with_the_exposure_to_use(run, folder, photographs):
     bench, _ = photographs
     save("bright", [bench.point(3) for _ in range(3)])
@@ -389,10 +399,10 @@ def test_watching_goes_on_after_a_file_that_does_not_fit(folder, photographs):
 
 def test_saturation_of_an_averaged_frame_is_an_error_of_the_psf(photographs):
     _, folder = photographs
-    from mwdn.calibration.photographs import Photographs, develop
+    from mwdn.calibration.photographs import CalibrationFrames, calibrate_frames
 
     with pytest.raises(PsfError, match="maximum, 4,095"):
-        develop(Photographs((tuple(sorted((folder / "psf_64").iterdir())),)), FORMAT)
+        calibrate_frames(CalibrationFrames((tuple(sorted((folder / "psf_64").iterdir())),)), FORMAT)
 
 
 def test_white_flats_need_colour(run, folder):

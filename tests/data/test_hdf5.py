@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from mwdn.capture.recording import Replay, record
-from mwdn.capture.source import Frame
+from mwdn.capture.source import CameraFrame
 from mwdn.data import PairFile
 from mwdn.data.hdf5 import read_attributes
 from mwdn.data.sources import list_hdf5
@@ -89,7 +89,7 @@ def test_a_heap_that_never_ends_is_refused(tmp_path):
     with PairFile.create(tmp_path / "a.h5", measurement_shape=SHAPE[1:], scene_shape=SHAPE[1:], attributes={"a": "b"}):
         pass
     with record(tmp_path / "b.h5", camera="c") as recorder:
-        recorder.append(Frame(array=np.zeros((4, 4, 1), np.uint8), bit_depth=8))
+        recorder.append(CameraFrame(array=np.zeros((4, 4, 1), np.uint8), bit_depth=8))
     for path, read in (("a.h5", PairFile), ("b.h5", lambda path: Replay(path).open())):
         content = bytearray((tmp_path / path).read_bytes())
         start = content.index(b"GCOL") + 16

@@ -21,7 +21,7 @@ from mwdn.calibration import Calibration
 from mwdn.capture.captured_pairs import create_captured, open_captured
 from mwdn.capture.recipe import read_capture_recipe
 from mwdn.capture.recording import record
-from mwdn.capture.source import Frame
+from mwdn.capture.source import CameraFrame
 from mwdn.capture.sources import open_source
 from mwdn.data.journal import journal_of
 from mwdn.io.toml import RECIPES
@@ -93,9 +93,9 @@ def _place(name: str) -> Iterator[Path]:
         yield Path(folder) / name
 
 
-def _frame(number: int) -> Frame:
+def _frame(number: int) -> CameraFrame:
     array = np.random.default_rng(number).integers(0, 4096, (8, 10, 1), np.uint16)
-    return Frame(array=array, bit_depth=12, mosaic="rggb", timestamp=float(number), number=number)
+    return CameraFrame(array=array, bit_depth=12, mosaic="rggb", timestamp=float(number), number=number)
 
 
 def _recording(path: Path) -> None:

@@ -10,7 +10,8 @@ import torch
 from cameras import contour_psf
 from made import trained
 from mwdn.errors import ParameterError
-from mwdn.inference.interpretation import interpret
+from mwdn.inference.interpretation import Panel, interpret
+from mwdn.inference.interpretation_page import display
 from mwdn.networks import build
 from mwdn.solvers import align
 from mwdn.solvers.admm import Admm
@@ -104,6 +105,13 @@ def test_methods_without_filters_are_refused(measurement, psf):
     for method in (Admm(), build("unet", width=2)):
         with pytest.raises(ParameterError, match=r"has no learned Wiener filters.*universal-small, or the checkpoint"):
             interpret(method, measurement, psf)
+
+
+def test_panels_of_millions_of_pixels_are_drawn():
+    """torch.quantile takes 2^24 numbers at most."""
+    picture = torch.linspace(0, 1, 2**24 + 2**20).reshape(1, 1, 4096, -1)
+    for kind in ("change", "features"):
+        assert display(Panel("", picture, kind)).isfinite().all()
 
 
 def test_the_command_writes_a_sheet_pictures_and_numbers(run, psf, tmp_path, monkeypatch):

@@ -3,7 +3,7 @@ import pytest
 from mwdn.calibration import Calibration
 from mwdn.data.random import seeded
 from mwdn.optics import Camera, sample_camera
-from mwdn.preview.cameras import Cameras
+from mwdn.preview.cameras import StoredCameras
 from preview_server import LIMITS, SIDE, npy
 
 pytest.importorskip("uvicorn", reason="needs the extra `page`")
@@ -43,7 +43,7 @@ def serve():
     servers = []
 
     def start(cameras=None, limits=LIMITS, **options):
-        server = make_server(cameras or Cameras(limits), limits, device="cpu", **options)
+        server = make_server(cameras or StoredCameras(limits), limits, device="cpu", **options)
         server.start()
         servers.append(server)
         return server
@@ -55,6 +55,6 @@ def serve():
 
 @pytest.fixture(scope="module")
 def client(serve, psf):
-    server = serve(Cameras(LIMITS, None, {"camera": Calibration(psf)}))
+    server = serve(StoredCameras(LIMITS, None, {"camera": Calibration(psf)}))
     with httpx.Client(base_url=server.url, timeout=120) as client:
         yield client

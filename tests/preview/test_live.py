@@ -12,7 +12,7 @@ from websockets.sync.client import connect
 from mwdn.calibration import Calibration
 from mwdn.capture import open_source
 from mwdn.io.formats import as_frame
-from mwdn.preview.cameras import Cameras
+from mwdn.preview.cameras import StoredCameras
 from mwdn.preview.live import Live
 from mwdn.preview.live_pictures import LivePictures
 from mwdn.preview.live_settings import LiveSettings
@@ -24,7 +24,7 @@ from preview_server import LIMITS, SIDE
 def live(tmp_path, request):
     rig = open_source(f"rig,height={SIDE},width={SIDE},drop=0.2{getattr(request, 'param', '')}")
     live = Live(rig, Calibration(rig.psf), method="wiener", folder=tmp_path, device="cpu", retry_s=0.01)
-    server = make_server(Cameras(LIMITS), LIMITS, device="cpu", live=live)
+    server = make_server(StoredCameras(LIMITS), LIMITS, device="cpu", live=live)
     server.start()
     yield server.url.replace("http", "ws") + "live", live
     server.stop()

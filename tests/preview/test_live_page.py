@@ -12,7 +12,7 @@ import pytest
 from browser import CHROMIUM, open_page
 from mwdn.calibration import Calibration
 from mwdn.capture import open_source
-from mwdn.preview.cameras import Cameras
+from mwdn.preview.cameras import StoredCameras
 from mwdn.preview.live import Live
 from preview_server import LIMITS, SIDE
 
@@ -33,7 +33,7 @@ def choose(page, id, value):
 def test_live_picture_is_started_used_and_stopped(serve, tmp_path):
     rig = open_source(f"rig,height={SIDE},width={SIDE},fps=20,prepared=4")
     live = Live(rig, Calibration(rig.psf), method="wiener", folder=tmp_path, device="cpu")
-    server = serve(Cameras(LIMITS), live=live)
+    server = serve(StoredCameras(LIMITS), live=live)
     with open_page(server.url, tmp_path / "profile") as page:
         page.wait("document.getElementById('live')?.hidden === false")
         page.run("document.getElementById('live-start').click()")

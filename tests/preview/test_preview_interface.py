@@ -14,7 +14,7 @@ import pytest
 from mwdn import Reconstructor
 from mwdn.calibration import Calibration
 from mwdn.errors import ParameterError
-from mwdn.preview.cameras import Cameras
+from mwdn.preview.cameras import StoredCameras
 from mwdn.preview.reconstruction import with_ambient
 from mwdn.preview.server import make_server
 from preview_server import LIMITS, SIDE, hostile, npy
@@ -69,7 +69,7 @@ def test_exposure_and_white_balance(client, capture):
 
 def test_white_balance_of_the_camera_unless_another_is_asked_for(serve, psf, capture):
     calibration = Calibration(psf, white_balance=(1.0, 1.0, 4.0))
-    server = serve(Cameras(LIMITS, None, {"camera": calibration}))
+    server = serve(StoredCameras(LIMITS, None, {"camera": calibration}))
 
     with httpx.Client(base_url=server.url, timeout=120) as client:
 
@@ -185,15 +185,16 @@ def test_job_can_be_cancelled(client, capture):
 
 
 def test_cameras_are_listed_added_and_removed(serve, tmp_path, psf_file):
-    server = serve(Cameras(LIMITS, tmp_path))
+    server = serve(StoredCameras(LIMITS, tmp_path))
     with httpx.Client(base_url=server.url, timeout=120) as client:
         added = client.post("/cameras", files={"psf": psf_file}, data={"name": "mine"})
         assert added.status_code == 201, added.text
         assert client.post("/cameras", files={"psf": psf_file}, data={"name": "mine"}).status_code == 409
+        assert client.post("/cameras", files={"psf": psf_file}, data={"name": "live"}).status_code == 409
         assert client.post("/cameras", files={"psf": psf_file}, data={"name": "../mine"}).status_code == 422
         assert {path.suffix for path in tmp_path.iterdir()} == {".json", ".psf"}
         assert "mine" not in "".join(path.name for path in tmp_path.iterdir())
-        again = Cameras(LIMITS, tmp_path)  # another start of the server
+        again = StoredCameras(LIMITS, tmp_path)  # another start of the server
         assert again.get("mine").psf_hash == added.json()["psf_hash"]
         assert client.delete("/cameras/sample").status_code == 409
         assert client.delete("/cameras/mine").status_code == 204
@@ -204,7 +205,7 @@ def test_cameras_are_listed_added_and_removed(serve, tmp_path, psf_file):
 def test_inspect(client):
     report = client.post("/inspect", files={"camera": (None, "camera")}).json()
     assert report["headline"]
-    assert {finding["weight"] for finding in report["verdict"]} <= {"bad", "mind", "good"}
+    assert {finding["weight"] for finding in report["verdict"]} <= {"bad", "weak", "good"}
 
 
 def test_the_document_names_every_route(client):
@@ -271,7 +272,7 @@ def test_other_sites_pages_are_refused(client, headers):
 
 def test_other_addresses_need_a_token(serve):
     with pytest.raises(ParameterError, match="token"):
-        make_server(Cameras(LIMITS), LIMITS, host="0.0.0.0")
+        make_server(StoredCameras(LIMITS), LIMITS, host="0.0.0.0")
     server = serve(host="0.0.0.0", token="secret")
     with httpx.Client(base_url=f"http://127.0.0.1:{urlsplit(server.url).port}") as client:
         assert client.get("/cameras").status_code == 401

@@ -6,7 +6,7 @@ import pytest
 
 from browser import CHROMIUM, open_page
 from mwdn.calibration import Calibration
-from mwdn.preview.cameras import Cameras
+from mwdn.preview.cameras import StoredCameras
 from mwdn.preview.limits import Limits
 from preview_server import LIMITS
 
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt in
 def test_dropped_files_become_a_picture(serve, psf, psf_file, capture, tmp_path):
     for name, data in (("psf.npy", psf_file), ("capture.npy", capture), ("wrong.png", b"no picture")):
         (tmp_path / name).write_bytes(data)
-    server = serve(Cameras(LIMITS, None, {"camera": Calibration(psf)}))
+    server = serve(StoredCameras(LIMITS, None, {"camera": Calibration(psf)}))
     with open_page(server.url, tmp_path / "profile") as page:
         page.wait("document.querySelectorAll('#samples button').length === 3")
         page.run("document.getElementById('method').value = 'admm', document.getElementById('method').onchange()")
@@ -58,7 +58,7 @@ def test_dropped_files_become_a_picture(serve, psf, psf_file, capture, tmp_path)
 
 
 def test_keyboard_alone_is_enough(serve, tmp_path):
-    server = serve(Cameras(Limits()), limits=Limits())
+    server = serve(StoredCameras(Limits()), limits=Limits())
     with open_page(server.url, tmp_path / "profile") as page:
         page.wait("document.querySelectorAll('#samples button').length === 3")
         page.run("document.getElementById('trust').checked = false")
@@ -79,7 +79,7 @@ def test_keyboard_alone_is_enough(serve, tmp_path):
 def test_a_capture_is_not_reconstructed_through_the_camera_of_the_samples(serve, psf_file, capture, tmp_path):
     for name, data in (("psf.npy", psf_file), ("capture.npy", capture)):
         (tmp_path / name).write_bytes(data)
-    server = serve(Cameras(LIMITS))
+    server = serve(StoredCameras(LIMITS))
     with open_page(server.url, tmp_path / "profile") as page:
         page.wait("document.querySelectorAll('#samples button').length === 3")
         assert page.run("document.getElementById('camera').value") == "sample"
@@ -98,7 +98,7 @@ def test_verdicts_are_not_those_of_the_picture_before(serve, psf, capture, tmp_p
     check, may_check = reconstruction._check, threading.Event()
     may_check.set()
     monkeypatch.setattr(reconstruction, "_check", lambda *a, **b: may_check.wait(60) and check(*a, **b))
-    server = serve(Cameras(LIMITS, None, {"camera": Calibration(psf)}))
+    server = serve(StoredCameras(LIMITS, None, {"camera": Calibration(psf)}))
     hidden = "document.getElementById('trust-section').hidden"
     with open_page(server.url, tmp_path / "profile") as page:
         page.wait("document.querySelectorAll('#samples button').length === 3")

@@ -6,16 +6,16 @@ import torch
 
 from mwdn import Calibration, FrameFormat
 from mwdn.capture.captured_pairs import create_captured
-from mwdn.capture.source import Frame
+from mwdn.capture.source import CameraFrame
 from mwdn.errors import ParameterError
-from mwdn.registration.captured import CapturedPairs
+from mwdn.registration.captured import SessionPairs
 
 
 def test_the_mosaic_of_a_session_is_taken_or_must_be_the_cameras(tmp_path, generator):
     path, psf = tmp_path / "pairs.h5", torch.rand(1, 3, 16, 16, generator=generator)
-    frame = Frame(array=np.ones((32, 32, 1), np.uint16), bit_depth=12, mosaic="gbrg")
+    frame = CameraFrame(array=np.ones((32, 32, 1), np.uint16), bit_depth=12, mosaic="gbrg")
     with create_captured(path, frame, (8, 8), {}) as pairs:
         pairs.append(frame, np.ones((8, 8, 3), np.uint16), "a.png")
-    assert CapturedPairs(path, Calibration(psf)).calibration.frames == FrameFormat(bit_depth=12, mosaic="gbrg")
+    assert SessionPairs(path, Calibration(psf)).calibration.frames == FrameFormat(bit_depth=12, mosaic="gbrg")
     with pytest.raises(ParameterError, match=r"rggb.*pairs\.h5.*gbrg"):
-        CapturedPairs(path, Calibration(psf, FrameFormat(mosaic="rggb")))
+        SessionPairs(path, Calibration(psf, FrameFormat(mosaic="rggb")))

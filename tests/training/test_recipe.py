@@ -197,6 +197,7 @@ def test_captures_are_beside_the_recipe(read, tmp_path):
     recipe = read(NETWORK + f'[sheet]\ncaptures = ["a.png", "../b", "{tmp_path}/c"]')
     assert recipe.sheet.captures == (f"{tmp_path}/a.png", f"{tmp_path}/../b", f"{tmp_path}/c")
     assert read(NETWORK + "[sheet]\ncaptures = []").sheet.captures == ()
+    assert read_recipe("quick-cpu", sheet={"captures": ["caps"]}).sheet.captures == ("caps",)
 
 
 def test_steps_replace_epochs(read):

@@ -6,7 +6,7 @@ import torch
 from mwdn.data.simulated import Batch, Samples
 from mwdn.errors import ParameterError
 from mwdn.networks import build
-from mwdn.networks.network import Network
+from mwdn.networks.network import FixedFront
 from mwdn.training.sample_cache import SampleCache
 
 
@@ -25,7 +25,7 @@ class Counted(Samples):
         return Batch(picture, picture + 100, torch.ones(1, 1, *self.size))
 
 
-class Same(Network):
+class Same(FixedFront):
     def estimates(self, measurement, psf):
         return measurement
 
@@ -93,7 +93,7 @@ def test_each_place_in_the_batch_has_its_own_samples():
 
 def test_a_network_without_a_fixed_first_part_is_refused():
     with pytest.raises(ParameterError, match=r"`pool` \(5\) .*UNet .*`pool = 0`"):
-        SampleCache(Counted(), size=5, batch=1, crop=0, seed=0).check(build("unet", width=2))
+        SampleCache(Counted(), size=5, batch=1, crop=0, seed=0).front(build("unet", width=2))
     with pytest.raises(ParameterError, match=r"`pool` \(5\) must be a multiple of `batch` \(2\)"):
         cached(Counted(), size=5)
 

@@ -77,6 +77,7 @@ def draft_of(path: Path) -> Iterator[Path]:
     """
     before = _own_parts(path)
     with as_parameter_error(path.parent):
+        path.parent.mkdir(parents=True, exist_ok=True)
         folder = TemporaryDirectory(prefix=f".{path.stem}-", dir=path.parent)
     with folder as name:
         draft = Path(name) / path.name

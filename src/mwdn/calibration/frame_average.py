@@ -129,7 +129,7 @@ def _band(image: Image | None, rows: slice) -> Image | None:
 
 
 def _small(frame: Frame, format: FrameFormat, dark: Image | None) -> Image:
-    """A frame in linear units of the full scale less its darkest level, binned to at most `_SIDE` pixels a side."""
+    """A frame less the dark frame, in units of the full scale, binned to at most `_SIDE` pixels a side."""
     image = format.normalise(frame)
     image = image if dark is None else image - dark
     return bin_pixels(image, max(1, -(-max(image.shape[-2:]) // _SIDE)))

@@ -11,7 +11,7 @@ from mwdn.calibration.camera_parts import picture_of
 from mwdn.calibration.corrections import Corrections
 from mwdn.calibration.frame_average import Kind
 from mwdn.calibration.frame_format import FrameFormat
-from mwdn.calibration.point_source import PointSource, centring_shift, photograph_point
+from mwdn.calibration.point_source import PointSource, average_point, centring_shift
 from mwdn.calibration.sensor_frames import SensorFiles, SensorFrames, equal_parts, measure_sensor
 from mwdn.errors import ParameterError
 from mwdn.io.listing import list_folder
@@ -20,7 +20,7 @@ from mwdn.types import Frame, Image
 
 
 @dataclass(frozen=True)
-class Photographs:
+class CalibrationFrames:
     """Frames of a point source, and of the sensor.
 
     Args:
@@ -74,8 +74,8 @@ def grouped(paths: Sequence[Path], count: int, kind: Kind) -> tuple[tuple[Path, 
 
 
 @dataclass(frozen=True, eq=False)
-class Photographed:
-    """Result of `develop`: the content of a camera file, its pictures, and sentences for the user."""
+class CameraContent:
+    """Result of `calibrate_frames`: the content of a camera file, its pictures, and sentences for the user."""
 
     content: dict[str, Any]
     parts: dict[str, Frame | list[Frame]]
@@ -84,7 +84,9 @@ class Photographed:
     flat_colour: tuple[float, ...] = ()
 
 
-def develop(photographs: Photographs, frames: FrameFormat, known: Corrections = Corrections()) -> Photographed:
+def calibrate_frames(
+    photographs: CalibrationFrames, frames: FrameFormat, known: Corrections = Corrections()
+) -> CameraContent:
     """Average, merge, correct and centre the frames of a point source; measure the sensor.
 
     Args:
@@ -100,12 +102,12 @@ def develop(photographs: Photographs, frames: FrameFormat, known: Corrections = 
     exposures, distances = photographs.exposures, photographs.distances_mm
     groups, count = photographs.groups, max(1, len(exposures))
     points = [
-        photograph_point(groups[start : start + count], exposures, sensor, frames)
+        average_point(groups[start : start + count], exposures, sensor, frames)
         for start in range(0, len(groups), count)
     ]
     own = points[0]
     places = [
-        photograph_point([group], [min(exposures)] if exposures else [], sensor, frames) for group in photographs.field
+        average_point([group], [min(exposures)] if exposures else [], sensor, frames) for group in photographs.field
     ]
     shift = centring_shift(own.image, frames.cell) if photographs.centre else (0, 0)
     reference, *elsewhere = _within_full_scale(own.image, *(place.image for place in places))
@@ -122,7 +124,7 @@ def develop(photographs: Photographs, frames: FrameFormat, known: Corrections = 
         notes += [note for place in places for note in place.notes]
     sensor_content, sensor_parts = of_sensor(sensor, frames)
     results = [_summary(own, shift), *describe_sensor(sensor)]
-    return Photographed(content | sensor_content, parts | sensor_parts, notes, results, sensor.flat_colour)
+    return CameraContent(content | sensor_content, parts | sensor_parts, notes, results, sensor.flat_colour)
 
 
 def psf_frame(image: Image, frames: FrameFormat) -> Frame:
@@ -136,7 +138,7 @@ def _within_full_scale(*images: Image) -> list[Image]:
     return [image / brightest for image in images]
 
 
-def _centred(point: PointSource, photographs: Photographs, frames: FrameFormat) -> Image:
+def _centred(point: PointSource, photographs: CalibrationFrames, frames: FrameFormat) -> Image:
     (image,) = _within_full_scale(point.image)
     return shifted(image, *centring_shift(image, frames.cell)) if photographs.centre else image
 

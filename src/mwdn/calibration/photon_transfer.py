@@ -65,7 +65,7 @@ def photon_transfer(
 
     Args:
         flats: (H, W, C), consecutive pairs of the same light, at any number of levels; 20 to 80 % of saturation.
-        darks: (H, W, C), at least two, of the same exposure as the flats.
+        darks: (H, W, C), consecutive pairs, at least one, of the same exposure as the flats.
         format: of the frames; linear in light.
         bad: (1, 1, H, W), bool, pixels that are left out.
         black: level without any light, as a fraction of the full scale; that of the dark frames unless given. If they
@@ -83,15 +83,16 @@ def photon_transfer(
         )
     good = ~(np.zeros(flats[0].shape[:2], bool) if bad is None else bad[0, 0].numpy())
     full = format.full_scale(darks[0])
-    dark_level = float(np.mean([frame[good].mean(dtype=np.float64) for frame in darks[:2]]))
+    dark_level = float(np.mean([frame[good].mean(dtype=np.float64) for frame in darks]))
     black = dark_level if black is None else min(black * full, dark_level)
-    dark_variance = _half_variance(darks[0], darks[1], good)
+    dark_pairs = zip(darks[::2], darks[1::2], strict=False)
+    dark_variance = float(np.mean([_half_variance(*pair, good) for pair in dark_pairs]))
     signals, variances = [dark_level - black], [max(dark_variance, 1 / 12)]
-    for first, second in zip(flats[::2], flats[1::2], strict=False):
+    for number, (first, second) in enumerate(zip(flats[::2], flats[1::2], strict=False), 1):
         means = [float(frame[good].mean(dtype=np.float64)) - black for frame in (first, second)]
         if min(means) <= 0 or max(means) / min(means) > 1 + SAME_LIGHT:
             raise ParameterError(
-                f"Flat frames {2 * len(signals) - 1} and {2 * len(signals)} must have the same light, but have levels "
+                f"Flat frames {2 * number - 1} and {2 * number} must have the same light, but have levels "
                 f"of {means[0]:.0f} and {means[1]:.0f} counts above black. Give them in pairs of the same exposure."
             )
         if max(format.saturated(frame)[0] for frame in (first, second)) > 1e-3 * good.size:

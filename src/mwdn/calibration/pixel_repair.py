@@ -6,9 +6,14 @@ from torch import Tensor
 from mwdn.errors import ShapeError
 from mwdn.types import Image
 
+MOST_RINGS = 8
+"""Distance, in pixels of the same colour, to which a good pixel is searched: the rings of defects that are 16 wide."""
+
 
 class PixelRepair:
     """Replaces defective pixels by the mean of the nearest good ones of the same colour.
+
+    A pixel without a good one within `MOST_RINGS` stays as it is.
 
     Args:
         defects: (H, W), true at a defective pixel.
@@ -22,7 +27,7 @@ class PixelRepair:
         good = ~defects
         neighbours, weights, alone = [], [], torch.ones(len(rows))
         # Rings of growing size, until each defective pixel has a good neighbour.
-        for ring in (1, 2, 3):
+        for ring in range(1, MOST_RINGS + 1):
             found = torch.zeros(len(rows))
             for down, right in _ring(ring):
                 y, x = rows + down * cell, columns + right * cell
@@ -32,6 +37,10 @@ class PixelRepair:
                 weights.append((inside & good[y, x]).float() * alone)
                 found += weights[-1]
             alone = alone * (found == 0)
+            if not alone.any():
+                break
+        neighbours.append(self.index)
+        weights.append(alone)
         self.neighbours = torch.stack(neighbours)
         total = torch.stack(weights)
         self.weights = total / total.sum(0).clamp(min=1e-30)

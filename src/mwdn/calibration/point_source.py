@@ -41,7 +41,7 @@ class PointSource:
     notes: tuple[str, ...] = ()
 
 
-def photograph_point(
+def average_point(
     groups: Sequence[Sequence[Path]], exposures: Sequence[float], sensor: SensorFrames, frames: FrameFormat
 ) -> PointSource:
     """Make the picture of a point source.

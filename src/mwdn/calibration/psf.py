@@ -86,7 +86,7 @@ class Calibration:
         sha256, own_psf = camera.pop("psf_sha256", ""), camera["psf"]
         camera = with_changes(camera, options)
         terms = Refinement(**{name: camera.pop(name) for name in TERMS if name in camera})
-        if camera["psf"] == own_psf:
+        if Path(camera["psf"]).resolve() == own_psf.resolve():
             check_psf_file(path, sha256, own_psf)
         else:  # nothing is known about another PSF file
             camera["psf_corrected"] = options.get("psf_corrected", False)

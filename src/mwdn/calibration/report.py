@@ -29,7 +29,7 @@ class Levels:
     Args:
         integers: the file holds a sensor's integers; floats have no full scale.
         peak: largest number, as a fraction of the full scale.
-        steps: largest number as stored; 0 for floats.
+        largest: largest number as stored; 0 for floats.
         saturated: number of pixels at the sensor's maximum.
         background: 5th percentile of each channel, as a fraction of the full scale.
         subtracted: level that was subtracted from each channel.
@@ -43,7 +43,7 @@ class Levels:
 
     integers: bool
     peak: float
-    steps: int
+    largest: int
     saturated: int
     background: tuple[float, ...]
     subtracted: tuple[float, ...]
@@ -215,7 +215,7 @@ def _levels(calibration: Calibration, frame: Frame) -> Levels:
     return Levels(
         integers=integers,
         peak=float(frame.max()) / scale,
-        steps=int(frame.max()) if integers else 0,
+        largest=int(frame.max()) if integers else 0,
         saturated=frames.saturated(frame)[0],
         background=tuple(background.flatten().tolist()),
         has_dark=calibration.dark is not None or calibration.corrections.psf_done,

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_COLOURS = {"bad": "#b00020", "mind": "#b36b00", "good": "#1b7837"}
-_MARKS = {"bad": "!!", "mind": "!", "good": "+"}
+_COLOURS = {"bad": "#b00020", "weak": "#b36b00", "good": "#1b7837"}
+_MARKS = {"bad": "!!", "weak": "!", "good": "+"}
 
 
 def draw_page(report: PsfReport, psf: Psf, title: str) -> "Figure":
@@ -85,7 +85,7 @@ def _draw_spectrum(axes: "Axes", psf: Psf, report: PsfReport) -> None:
         frequency, power = psf_spectrum.radial_power(psf[:, [channel]])
         axes.plot(frequency[1:], 10 * power[1:].clamp(min=1e-12).log10(), colour, lw=1)
     for ring in report.dark_rings:
-        axes.axvline(ring, color=_COLOURS["mind"], lw=0.7)
+        axes.axvline(ring, color=_COLOURS["weak"], lw=0.7)
     if report.levels and report.levels.noise_floor > 0:
         axes.axhline(10 * np.log10(report.levels.noise_floor), color="grey", ls=":", label="noise of the file")
         axes.legend(fontsize=8)

@@ -6,8 +6,8 @@ from typing import Literal, NamedTuple
 
 from mwdn.calibration.report import Levels, PsfReport
 
-Weight = Literal["bad", "mind", "good"]
-"""``bad`` costs most of the quality, ``mind`` some of it, ``good`` none."""
+Weight = Literal["bad", "weak", "good"]
+"""``bad`` costs most of the quality, ``weak`` some of it, ``good`` none."""
 
 
 class Finding(NamedTuple):
@@ -21,17 +21,17 @@ def verdict(report: PsfReport) -> tuple[Finding, ...]:
     """Say what the numbers of a report mean, the worst first."""
     parts = (_levels, _sensor, _light, _detail, _frequencies, _noise, _colours, _places)
     findings = [finding for part in parts for finding in part(report)]
-    return tuple(sorted(findings, key=lambda finding: ("bad", "mind", "good").index(finding.weight)))
+    return tuple(sorted(findings, key=lambda finding: ("bad", "weak", "good").index(finding.weight)))
 
 
 def headline(report: PsfReport) -> str:
     """Summarise the verdict in one sentence."""
     weights = [finding.weight for finding in verdict(report)]
-    bad, mind = weights.count("bad"), weights.count("mind")
+    bad, weak = weights.count("bad"), weights.count("weak")
     if bad:
         return f"A poor PSF: {_count(bad, 'fault')} that cost{'' if bad > 1 else 's'} most of the quality."
-    if mind:
-        return f"A usable PSF with {_count(mind, 'weakness', 'weaknesses')}."
+    if weak:
+        return f"A usable PSF with {_count(weak, 'weakness', 'weaknesses')}."
     return "A good PSF: no weaknesses."
 
 
@@ -52,28 +52,28 @@ def _levels(report: PsfReport) -> Iterator[Finding]:
         text = f"Averaged and corrected: {decades:.1f} decades from the noise to the brightest pixel."
         # The tails of a PSF lie three decades below its peak.
         if decades < 3:
-            yield Finding("mind", f"{text} Average more frames, or merge exposures, to see its tails.")
+            yield Finding("weak", f"{text} Average more frames, or merge exposures, to see its tails.")
         else:
             yield Finding("good", text)
     elif not levels.integers:
-        yield Finding("mind", "The file holds floats, so saturation of the sensor cannot be detected.")
+        yield Finding("weak", "The file holds floats, so saturation of the sensor cannot be detected.")
     elif levels.saturated > 1:
         text = f"{levels.saturated:,} pixels are at the sensor's maximum: the brightest lines may be cut. Expose less."
-        yield Finding("mind", text)
+        yield Finding("weak", text)
     elif levels.peak < 0.3:
         bits = levels.possible_bit_depth
         text = f"The brightest pixel reaches only {_percent(levels.peak)} of the full scale. Expose longer" + (
             f", unless the sensor has {bits} bits: `--bit-depth {bits}`." if bits else "."
         )
-        yield Finding("mind", text)
+        yield Finding("weak", text)
     else:
         yield Finding("good", f"Well exposed: the brightest pixel reaches {_percent(levels.peak)} of the full scale.")
-    if 0 < levels.steps < 256:
+    if 0 < levels.largest < 256:
         text = (
-            f"The file has {levels.steps} levels from black to the brightest line, so faint light is rounded away. "
+            f"The file has {levels.largest} levels from black to the brightest line, so faint light is rounded away. "
             "Save 16 bits, or average frames."
         )
-        yield Finding("mind", text)
+        yield Finding("weak", text)
     yield from _background(levels)
 
 
@@ -106,7 +106,7 @@ def _background(levels: Levels) -> Iterator[Finding]:
             + f"; the darkest 5 % of the frame are at {level}. Take a frame with the source switched off and pass it "
             "as `--dark`: this removes stray light and keeps light from the mask, which belongs to the PSF."
         )
-        yield Finding("mind", text)
+        yield Finding("weak", text)
     if levels.pedestal > 0.02 and not any(levels.subtracted):
         text = (
             f"A uniform background of {level} of the {unit} contains {_percent(levels.pedestal)} of the light and was "
@@ -118,7 +118,7 @@ def _background(levels: Levels) -> Iterator[Finding]:
             )
         else:
             text += "kept. Leave out `--background 0` to estimate and subtract it."
-        yield Finding("bad" if levels.pedestal > 0.3 else "good" if levels.has_dark else "mind", text)
+        yield Finding("bad" if levels.pedestal > 0.3 else "good" if levels.has_dark else "weak", text)
     elif levels.pedestal > 0.02:
         whole = max(abs(a - b) for a, b in zip(levels.background, levels.subtracted, strict=True)) < 0.005 * scale
         text = (
@@ -126,7 +126,7 @@ def _background(levels: Levels) -> Iterator[Finding]:
             f"{'subtracted' if whole else f'found, and {subtracted} subtracted'}. Other programs that use this file "
             "must do the same."
         )
-        yield Finding("mind", text)
+        yield Finding("weak", text)
     else:
         yield Finding("good", "No uniform background.")
 
@@ -139,7 +139,7 @@ def _light(report: PsfReport) -> Iterator[Finding]:
             f"{extent}, but the border of the frame is still {_percent(support.border)} as bright as the mean: the PSF "
             "is cut off, or has a background. Use a larger `--crop` if the frame is larger."
         )
-        yield Finding("bad" if support.border > 0.5 else "mind", text)
+        yield Finding("bad" if support.border > 0.5 else "weak", text)
     else:
         yield Finding("good", f"{extent}, all within the frame.")
     off_centre = max(abs(offset) / length for offset, length in zip(support.offset, report.size, strict=True))
@@ -150,13 +150,13 @@ def _light(report: PsfReport) -> Iterator[Finding]:
             f"{'right' if right > 0 else 'left'} of the frame's centre, so the field of view is shifted to the "
             "opposite side by as much: the point source or the mask was off the axis."
         )
-        yield Finding("mind" if off_centre > 0.1 else "good", text)
+        yield Finding("weak" if off_centre > 0.1 else "good", text)
     if support.glow > 0.15:
         text = (
             f"{_percent(support.glow)} of its light is spread uniformly over the lit area: it carries no detail, but "
             f"adds noise. Contrast is {support.contrast:.2f}."
         )
-        yield Finding("bad" if support.contrast < 0.4 else "mind", text)
+        yield Finding("bad" if support.contrast < 0.4 else "weak", text)
     else:
         yield Finding("good", f"Dark between its lines: contrast {support.contrast:.2f}.")
 
@@ -168,7 +168,7 @@ def _detail(report: PsfReport) -> Iterator[Finding]:
             f"It repeats itself {rows} rows and {columns} columns away (correlation {lobe:.2f}): expect ghosts at this "
             "distance. An irregular mask has none."
         )
-        yield Finding("bad" if lobe > 0.6 else "mind", text)
+        yield Finding("bad" if lobe > 0.6 else "weak", text)
     else:
         yield Finding("good", f"It does not repeat itself: the highest side lobe is {lobe:.2f} of the peak.")
     width = report.peak_width_px
@@ -176,7 +176,7 @@ def _detail(report: PsfReport) -> Iterator[Finding]:
         text = f"Its lines are about {width / 2**0.5:.1f} px wide: finer detail is reconstructed faint and noisy."
         if report.coarsest_bin > report.bin:
             text += f" Binning loses little: `--bin {report.coarsest_bin}`, the default of `mwdn reconstruct`."
-        yield Finding("mind", text)
+        yield Finding("weak", text)
     else:
         yield Finding("good", f"Sharp: its lines are about {width / 2**0.5:.1f} px wide.")
 
@@ -189,13 +189,13 @@ def _frequencies(report: PsfReport) -> Iterator[Finding]:
             + " cycles per pixel in any direction: detail of this size is missing from every reconstruction. A mask "
             "in focus, with lines in all directions, has no such rings."
         )
-        yield Finding("mind", text)
+        yield Finding("weak", text)
     if report.weak_part > 0.03:
         text = (
             f"{_percent(report.weak_part)} of the frequencies are nearly dark; for a random mask it is 1 %. Straight "
             "lines and separable patterns cause this."
         )
-        yield Finding("mind", text)
+        yield Finding("weak", text)
     if not report.dark_rings and report.weak_part <= 0.03:
         text = (
             f"Its spectrum has no dark rings, and {_percent(report.weak_part)} of its frequencies are nearly dark; for "
@@ -207,7 +207,7 @@ def _frequencies(report: PsfReport) -> Iterator[Finding]:
             f"Above {report.known_frequency:.2f} cycles per pixel this picture of the PSF is mostly noise. Average "
             "more frames."
         )
-        yield Finding("mind", text)
+        yield Finding("weak", text)
 
 
 def _noise(report: PsfReport) -> Iterator[Finding]:
@@ -221,7 +221,7 @@ def _noise(report: PsfReport) -> Iterator[Finding]:
         f"Finest visible lines of a photograph, by the noise of the measurement: {widths}. The Wiener estimate "
         f"multiplies the standard deviation of this noise, by lambda: {gains}."
     )
-    yield Finding("bad" if middle > 16 else "mind" if middle > 8 else "good", text)
+    yield Finding("bad" if middle > 16 else "weak" if middle > 8 else "good", text)
 
 
 def _colours(report: PsfReport) -> Iterator[Finding]:
@@ -243,4 +243,4 @@ def _places(report: PsfReport) -> Iterator[Finding]:
             text += ", ".join(f"{place:g}" for place in invalid) + " the camera needs another PSF."
         else:
             text = f"This PSF is valid at every {what} compared: correlation {min(by_place.values()):.2f} or more."
-        yield Finding("mind" if invalid else "good", text)
+        yield Finding("weak" if invalid else "good", text)

@@ -9,7 +9,7 @@ from importlib.machinery import PathFinder
 from typing import Any
 
 from mwdn.capture.pixel_formats import PixelFormat, choose_format, unpack
-from mwdn.capture.source import TIMEOUT_S, CameraSource, Frame
+from mwdn.capture.source import TIMEOUT_S, CameraFrame, CameraSource
 from mwdn.capture.sources import load_driver
 from mwdn.errors import CameraError
 
@@ -98,7 +98,7 @@ class AravisCamera(CameraSource):
                 set_value(value * scale)
         self._settings()
 
-    def read(self) -> Frame:
+    def read(self) -> CameraFrame:
         """The newest frame that has not been read, or the next one."""
         if self._stream is None:
             raise self.not_open()
@@ -128,13 +128,13 @@ class AravisCamera(CameraSource):
             )
         raise self.silent()
 
-    def _frame(self, buffer: Any) -> Frame:  # noqa: ANN401
+    def _frame(self, buffer: Any) -> CameraFrame:  # noqa: ANN401
         format: PixelFormat = self._format
         size = buffer.get_image_height(), buffer.get_image_width()
         number = int(buffer.get_frame_id())
         dropped = max(number - self._last - 1, 0) if self._last >= 0 else 0
         self._last = number
-        return Frame(
+        return CameraFrame(
             array=unpack(buffer.get_data(), format, size),
             bit_depth=format.bit_depth,
             mosaic=format.mosaic,

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from mwdn.capture.recording import COLUMNS, FrameRows, set_format
 from mwdn.capture.screen import Picture
-from mwdn.capture.source import Frame
+from mwdn.capture.source import CameraFrame
 from mwdn.data.hdf5 import add_rows, as_damage, find_rows, open_hdf5, write_row
 from mwdn.data.journal import Growing, create_growing, open_growing
 from mwdn.data.pair_writer import VERSION, VERSION_KEY
@@ -36,7 +36,7 @@ def displayed_light(picture: Picture, gamma: float) -> Light:
     return levels[picture]
 
 
-class CapturedPairs:
+class SessionFile:
     """A file of pairs that grows, from `create_captured` or `open_captured`."""
 
     def __init__(self, growing: Growing) -> None:
@@ -93,7 +93,7 @@ class CapturedPairs:
             data[before:] = [name.encode() for name in names]
             self._growing.commit()
 
-    def append(self, frame: Frame, light: Light, name: str) -> None:
+    def append(self, frame: CameraFrame, light: Light, name: str) -> None:
         """Add a pair. When this returns, the pair is on the disk and has been verified by reading it.
 
         Raises:
@@ -108,7 +108,7 @@ class CapturedPairs:
             self._growing.commit()
         self._verify(frame, light)
 
-    def _verify(self, frame: Frame, light: Light) -> None:
+    def _verify(self, frame: CameraFrame, light: Light) -> None:
         """Read the last pair as another process does."""
         with open_hdf5(self.path, _ADVICE) as file:
             complete = len(file["measurement"]) == len(file["scene"]) == len(file["photograph"]) == len(self)
@@ -118,7 +118,7 @@ class CapturedPairs:
                     f"`{self.path}`: pair {len(self):,} is not on the disk as it was written. Check the disk."
                 )
 
-    def add_pattern(self, name: str, frames: Sequence[Frame], lights: Sequence[Light]) -> None:
+    def add_pattern(self, name: str, frames: Sequence[CameraFrame], lights: Sequence[Light]) -> None:
         """Add frames of a pattern, and the pattern as displayed, replacing earlier ones.
 
         Args:
@@ -141,7 +141,7 @@ class CapturedPairs:
         """Whether frames of a pattern are there."""
         return self.has_group(f"patterns/{name}")
 
-    def add_frames(self, place: str, frames: Sequence[Frame], attributes: Mapping[str, float]) -> None:
+    def add_frames(self, place: str, frames: Sequence[CameraFrame], attributes: Mapping[str, float]) -> None:
         """Add a group of frames with attributes of its own, replacing an earlier one."""
         with self._disk():
             self._delete(place)
@@ -176,7 +176,7 @@ class CapturedPairs:
         if place in self._file:
             del self._file[place]
 
-    def add_references(self, frames: Mapping[str, Frame]) -> None:
+    def add_references(self, frames: Mapping[str, CameraFrame]) -> None:
         """Add frames of known displays, taken before the next pair."""
         with self._disk():
             for name, frame in frames.items():
@@ -201,8 +201,8 @@ class CapturedPairs:
 
 @contextmanager
 def create_captured(
-    path: Path, first: Frame, scene_size: tuple[int, int], attributes: Mapping[str, Any]
-) -> Iterator[CapturedPairs]:
+    path: Path, first: CameraFrame, scene_size: tuple[int, int], attributes: Mapping[str, Any]
+) -> Iterator[SessionFile]:
     """Create a file.
 
     Args:
@@ -223,11 +223,11 @@ def create_captured(
             add_rows(file, name, (), h5py.string_dtype("utf-8", NAME_BYTES))
         FrameRows(file, "measurement", "frame_data", first)
         growing.commit()
-        yield CapturedPairs(growing)
+        yield SessionFile(growing)
 
 
 @contextmanager
-def open_captured(path: Path) -> Iterator[CapturedPairs]:
+def open_captured(path: Path) -> Iterator[SessionFile]:
     """Open a file to add pairs.
 
     Raises:
@@ -238,4 +238,4 @@ def open_captured(path: Path) -> Iterator[CapturedPairs]:
         missing = [name for name in names if find_rows(path, growing.file, name, _ADVICE) is None]
         if missing:
             raise ImageError(f"`{path}` has no {', '.join(missing)}: it is of another command. {_ADVICE}")
-        yield CapturedPairs(growing)
+        yield SessionFile(growing)

@@ -5,10 +5,10 @@ import math
 from dataclasses import asdict
 from typing import Any
 
-from mwdn.capture.captured_pairs import CapturedPairs
+from mwdn.capture.captured_pairs import SessionFile
 from mwdn.capture.recipe import CaptureRecipe
 from mwdn.capture.screen import Place, Screen
-from mwdn.capture.source import Frame
+from mwdn.capture.source import CameraFrame
 from mwdn.errors import ParameterError
 
 ROUNDING = 0.01
@@ -22,7 +22,9 @@ def describe_place(screen: Screen, place: Place) -> dict[str, Any]:
     return {**asdict(screen), **{f"place_{name}": value for name, value in asdict(place).items()}}
 
 
-def check_continued(pairs: CapturedPairs, recipe: CaptureRecipe, first: Frame, screen: Screen, place: Place) -> None:
+def check_continued(
+    pairs: SessionFile, recipe: CaptureRecipe, first: CameraFrame, screen: Screen, place: Place
+) -> None:
     """Check that a file was begun with this display, place, pictures, kind of frames, exposure, gain, gamma and rig.
 
     Args:

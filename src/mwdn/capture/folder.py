@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mwdn.calibration import FrameFormat
-from mwdn.capture.source import TIMEOUT_S, CameraSource, Frame
+from mwdn.capture.source import TIMEOUT_S, CameraFrame, CameraSource
 from mwdn.errors import CameraError, ImageError
 from mwdn.io.listing import FRAMES
 from mwdn.io.raw import Mosaic
@@ -63,7 +63,7 @@ class WatchedFolder(CameraSource):
     def close(self) -> None:
         """Nothing is held open."""
 
-    def read(self) -> Frame:
+    def read(self) -> CameraFrame:
         """Wait for the next file.
 
         Raises:
@@ -102,7 +102,7 @@ class WatchedFolder(CameraSource):
                 raise CameraError(f"`{self.folder}` cannot be read any more: {error.strerror}. Restore it.") from error
         return states
 
-    def _frame(self, key: tuple[str, int], *, last: bool) -> Frame | None:
+    def _frame(self, key: tuple[str, int], *, last: bool) -> CameraFrame | None:
         """Read a file that is stable; ``None`` if it is not complete yet."""
         try:
             array, frames = self._format.read_stored(self.folder / key[0])
@@ -115,7 +115,9 @@ class WatchedFolder(CameraSource):
         if array.dtype not in (np.uint8, np.uint16):
             raise ImageError(f"`{self.folder / key[0]}` holds {array.dtype}; raw frames have 8 or 16 bits.")
         bits = frames.bit_depth or 8 * array.dtype.itemsize
-        return Frame(array=array, bit_depth=bits, mosaic=frames.mosaic, timestamp=key[1] / 1e9, number=self._number - 1)
+        return CameraFrame(
+            array=array, bit_depth=bits, mosaic=frames.mosaic, timestamp=key[1] / 1e9, number=self._number - 1
+        )
 
     def _done(self, key: tuple[str, int]) -> None:
         if self._seen is not None:

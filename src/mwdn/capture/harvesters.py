@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mwdn.capture.pixel_formats import choose_format, unpack
-from mwdn.capture.source import TIMEOUT_S, CameraSource, Frame
+from mwdn.capture.source import TIMEOUT_S, CameraFrame, CameraSource
 from mwdn.capture.sources import load_driver
 from mwdn.errors import CameraError
 from mwdn.runtime.interrupts import kept_interrupt
@@ -103,7 +103,7 @@ class HarvestersCamera(CameraSource):
             return float(getattr(self._acquirer.remote_device.node_map, node).value)
         return math.nan
 
-    def read(self) -> Frame:
+    def read(self) -> CameraFrame:
         """The newest frame that has not been read, or the next one."""
         if self._acquirer is None:
             raise self.not_open()
@@ -122,7 +122,7 @@ class HarvestersCamera(CameraSource):
             array = unpack(part.data, self._format, (int(part.height), int(part.width)))
         finally:
             newest.queue()
-        return Frame(
+        return CameraFrame(
             array=array,
             bit_depth=self._format.bit_depth,
             mosaic=self._format.mosaic,

@@ -8,6 +8,7 @@ import numpy as np
 from mwdn.capture.screen import Picture
 from mwdn.errors import ImageError, ParameterError
 from mwdn.io.images import READABLE, read_frame
+from mwdn.io.listing import pictures_in
 
 
 def list_photographs(folder: Path, seed: int, known: list[str] | None = None) -> list[str]:
@@ -25,8 +26,7 @@ def list_photographs(folder: Path, seed: int, known: list[str] | None = None) ->
         raise ParameterError(
             f"`folder` (`{folder}`) of [pictures] is not a folder. Give the folder of the photographs."
         )
-    paths = (path for path in folder.rglob("*") if path.suffix.lower() in READABLE and path.name[0] != ".")
-    names = sorted(path.relative_to(folder).as_posix() for path in paths)
+    names = [path.relative_to(folder).as_posix() for path in pictures_in(folder)]
     if not names:
         raise ParameterError(f"`{folder}` holds no photograph. Readable: {', '.join(sorted(READABLE))}.")
     left = sorted(set(names) - set(known or ()))

@@ -10,7 +10,7 @@ from contextlib import suppress
 from typing import Any
 
 from mwdn.capture.pixel_formats import libcamera_format, unpack
-from mwdn.capture.source import TIMEOUT_S, CameraSource, Frame
+from mwdn.capture.source import TIMEOUT_S, CameraFrame, CameraSource
 from mwdn.capture.sources import load_driver
 from mwdn.errors import CameraError, reason
 
@@ -90,7 +90,7 @@ class PiCamera(CameraSource):
             controls[name] = value
         self._camera.set_controls(controls)
 
-    def read(self) -> Frame:
+    def read(self) -> CameraFrame:
         """The next frame."""
         if self._camera is None:
             raise self.not_open()
@@ -106,7 +106,7 @@ class PiCamera(CameraSource):
         finally:
             request.release()
         self._number += 1
-        return Frame(
+        return CameraFrame(
             array=array,
             bit_depth=self._format.bit_depth,
             mosaic=self._format.mosaic,

@@ -13,6 +13,7 @@ from mwdn.capture.photograph_list import fit_photograph, read_photograph
 from mwdn.capture.screen import Picture
 from mwdn.errors import ImageError, ParameterError
 from mwdn.io.images import READABLE
+from mwdn.io.listing import pictures_in
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,8 +72,7 @@ class PictureFolder(Playlist):
     """The pictures of a folder in alphabetical order."""
 
     def __init__(self, folder: Path, size: tuple[int, int], seconds: float, **clock: Any) -> None:  # noqa: ANN401
-        paths = (path for path in folder.iterdir() if path.suffix.lower() in READABLE and path.name[0] != ".")
-        self.paths = sorted(paths)
+        self.paths = pictures_in(folder, subfolders=False)
         if not self.paths:
             raise ParameterError(f"`pictures` ({folder}) holds no picture. Readable: {', '.join(sorted(READABLE))}.")
         super().__init__(size, len(self.paths), seconds, **clock)

@@ -26,11 +26,11 @@ from mwdn.calibration.exposure import BRIGHTEST, measure_exposure
 from mwdn.calibration.frame_average import average_frames
 from mwdn.calibration.frame_format import FrameFormat
 from mwdn.calibration.hot_pixels import find_hot_pixels
-from mwdn.capture.captured_pairs import CapturedPairs
+from mwdn.capture.captured_pairs import SessionFile
 from mwdn.capture.patterns import grey, point
 from mwdn.capture.recipe import PointTable
 from mwdn.capture.screen import Picture, Screen
-from mwdn.capture.source import CameraSource, Frame
+from mwdn.capture.source import CameraFrame, CameraSource
 from mwdn.errors import CameraError
 
 GROUPS = "calibration"
@@ -61,17 +61,17 @@ class Shooting(NamedTuple):
 
     camera: CameraSource
     screen: Screen
-    frame_of: Callable[[Picture], Frame]
-    grab: Callable[[float], Frame]
+    frame_of: Callable[[Picture], CameraFrame]
+    grab: Callable[[float], CameraFrame]
     lamp: Callable[[bool], None]
 
-    def expose(self, exposure_s: float) -> Frame:
+    def expose(self, exposure_s: float) -> CameraFrame:
         """Set an exposure, and return the first frame that has it."""
         self.camera.configure(exposure_s=exposure_s)
         return self.grab(time.time())
 
 
-def record_point(pairs: CapturedPairs, table: PointTable, shooting: Shooting, *, usual_s: float) -> None:
+def record_point(pairs: SessionFile, table: PointTable, shooting: Shooting, *, usual_s: float) -> None:
     """Record the groups that the file does not have yet.
 
     Args:
@@ -116,12 +116,12 @@ def record_point(pairs: CapturedPairs, table: PointTable, shooting: Shooting, *,
         shooting.camera.configure(exposure_s=usual_s)
 
 
-def _series(shooting: Shooting, first: Frame, count: int) -> list[Frame]:
+def _series(shooting: Shooting, first: CameraFrame, count: int) -> list[CameraFrame]:
     """The first frame and the next ones, an even number: photon transfer takes pairs."""
     return [first, *(shooting.camera.read() for _ in range(count + count % 2 - 1))]
 
 
-def _add(pairs: CapturedPairs, name: str, frames: list[Frame], exposure_s: float) -> None:
+def _add(pairs: SessionFile, name: str, frames: list[CameraFrame], exposure_s: float) -> None:
     """Store frames, after a check that they have this exposure.
 
     Raises:
@@ -136,7 +136,7 @@ def _add(pairs: CapturedPairs, name: str, frames: list[Frame], exposure_s: float
     pairs.add_frames(f"{GROUPS}/{name}", frames, {"exposure_s": exposure_s})
 
 
-def hot_pixels(dark: list[Frame]) -> npt.NDArray[np.bool_]:
+def hot_pixels(dark: list[CameraFrame]) -> npt.NDArray[np.bool_]:
     """(H, W, 1), pixels that are brighter than their surroundings in the dark, and would be taken for the point."""
     format = dark[0].format
     average = average_frames([frame.array for frame in dark], format, kind="dark")
@@ -156,7 +156,7 @@ def _exposures(shooting: Shooting, table: PointTable, exposure_s: float, hot: np
     return [exposure_s * table.ratio**number for number in range(table.exposures)]
 
 
-def _check_contrast(pairs: CapturedPairs, dark: Frame, table: PointTable) -> None:
+def _check_contrast(pairs: SessionFile, dark: CameraFrame, table: PointTable) -> None:
     """Raise an error for a point that is faint compared with the light of a dark display.
 
     Raises:

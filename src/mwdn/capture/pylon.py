@@ -6,7 +6,7 @@ from contextlib import suppress
 from typing import Any
 
 from mwdn.capture.pixel_formats import choose_format, unpack
-from mwdn.capture.source import TIMEOUT_S, CameraSource, Frame
+from mwdn.capture.source import TIMEOUT_S, CameraFrame, CameraSource
 from mwdn.capture.sources import load_driver
 from mwdn.errors import CameraError
 
@@ -19,8 +19,7 @@ class PylonCamera(CameraSource):
 
     Args:
         address: serial number, or a part of the camera's name; ``first`` for any.
-        pixel_format: GenICam's name, ``Mono12``; by default the camera's own if that is raw and unpacked, otherwise the
-            one with the most bits.
+        pixel_format: GenICam's name, ``Mono12``; by default the unpacked raw format with the most bits.
         timeout_s: seconds to wait for a frame, besides its exposure.
     """
 
@@ -69,21 +68,17 @@ class PylonCamera(CameraSource):
         """
         if self._camera is None:
             raise self.not_open()
-        for label, nodes, value in (
-            ("exposure_s", _EXPOSURES, None if exposure_s is None else exposure_s * 1e6),
-            ("gain", _GAINS, gain),
-        ):
+        for label, nodes, value, scale in (("exposure_s", _EXPOSURES, exposure_s, 1e6), ("gain", _GAINS, gain, 1.0)):
             if value is None:
                 continue
             node = self._node(nodes)
             if node is None:
                 raise CameraError(f"{self.name} has no setting `{label}`. Leave it out.")
             try:
-                node.Value = value
+                node.Value = value * scale
             except Exception as error:  # of pypylon, of several kinds
                 raise CameraError(
-                    f"{self.name} takes `{label}` ({exposure_s if label == 'exposure_s' else gain:g}) from "
-                    f"{node.Min:g} to {node.Max:g}{' microseconds' if label == 'exposure_s' else ''}."
+                    f"{self.name} takes `{label}` ({value:g}) from {node.Min / scale:g} to {node.Max / scale:g}."
                 ) from error
 
     def _node(self, names: tuple[str, ...]) -> Any:  # noqa: ANN401
@@ -99,7 +94,7 @@ class PylonCamera(CameraSource):
         node = self._node(names)
         return math.nan if node is None else float(node.Value)
 
-    def read(self) -> Frame:
+    def read(self) -> CameraFrame:
         """The newest frame that has not been read, or the next one."""
         if self._camera is None:
             raise self.not_open()
@@ -117,7 +112,7 @@ class PylonCamera(CameraSource):
         finally:
             result.Release()
         self._number += 1 + dropped
-        return Frame(
+        return CameraFrame(
             array=array,
             bit_depth=self._format.bit_depth,
             mosaic=self._format.mosaic,

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mwdn.capture.source import TIMEOUT_S, CameraSource, Frame, check_like
+from mwdn.capture.source import TIMEOUT_S, CameraFrame, CameraSource, check_like
 from mwdn.data.hdf5 import (
     add_rows,
     as_damage,
@@ -37,13 +37,13 @@ class Recorder:
 
     def __init__(self, growing: Growing, commit_every: int) -> None:
         self._growing, self._every, self._since = growing, commit_every, 0
-        self._first: Frame | None = None
+        self._first: CameraFrame | None = None
         self._rows: FrameRows | None = None
 
     def __len__(self) -> int:
         return 0 if self._rows is None else len(self._rows)
 
-    def append(self, frame: Frame) -> None:
+    def append(self, frame: CameraFrame) -> None:
         """Add a frame. With ``commit_every`` 1 it is on the disk when this returns.
 
         Raises:
@@ -104,7 +104,7 @@ class FrameRows:
         first: a frame of the format that all have.
     """
 
-    def __init__(self, file: Any, name: str, columns: str, first: Frame) -> None:  # noqa: ANN401
+    def __init__(self, file: Any, name: str, columns: str, first: CameraFrame) -> None:  # noqa: ANN401
         self.data = add_rows(file, name, first.array.shape, first.array.dtype)
         group = file.require_group(columns)
         self.columns = {key: add_rows(group, key, (), np.dtype(kind)) for key, kind in COLUMNS.items()}
@@ -112,14 +112,14 @@ class FrameRows:
     def __len__(self) -> int:
         return len(self.data)
 
-    def append(self, frame: Frame) -> None:
+    def append(self, frame: CameraFrame) -> None:
         """Add a frame."""
         write_row(self.data, frame.array)
         for key, column in self.columns.items():
             write_row(column, getattr(frame, key))
 
 
-def set_format(attributes: Any, frame: Frame) -> None:  # noqa: ANN401
+def set_format(attributes: Any, frame: CameraFrame) -> None:  # noqa: ANN401
     """Store what all frames have in common: ``bit_depth``, and ``mosaic`` or an empty text."""
     attributes["bit_depth"], attributes["mosaic"] = frame.bit_depth, frame.mosaic or ""
 
@@ -185,7 +185,7 @@ class Replay(CameraSource):
             self._file.close()
             self._file = None
 
-    def read(self) -> Frame:
+    def read(self) -> CameraFrame:
         """The next frame, with the metadata of its recording.
 
         Raises:
@@ -198,7 +198,7 @@ class Replay(CameraSource):
             if not self.loop:
                 raise CameraError(f"{self.name} has ended, after {len(self._data):,} frames. Play it again: `loop`.")
             self._number, self._started = 0, time.monotonic()
-        with as_damage(f"Frame {self._number} of `{self.path}` cannot be read", _ADVICE):
+        with as_damage(f"CameraFrame {self._number} of `{self.path}` cannot be read", _ADVICE):
             array = self._data[self._number]
             values = {key: column[self._number].item() for key, column in self._columns.items()}
             first = float(self._columns["timestamp"][0]) if self._columns else math.nan
@@ -206,4 +206,4 @@ class Replay(CameraSource):
         if self.realtime and values:
             self._wait(max(values["timestamp"] - first - (time.monotonic() - self._started), 0.0))
         frame = {"number": self._number - 1, "timestamp": 0.0, **values}
-        return Frame(array=array, bit_depth=self._bits, mosaic=self._mosaic, **frame)  # type: ignore[arg-type]
+        return CameraFrame(array=array, bit_depth=self._bits, mosaic=self._mosaic, **frame)  # type: ignore[arg-type]

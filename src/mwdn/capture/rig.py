@@ -19,8 +19,8 @@ from mwdn.capture.playlist import Playlist, PlaylistOptions, open_playlist
 from mwdn.capture.prepared_frames import PreparedFrames
 from mwdn.capture.rig_options import RigOptions
 from mwdn.capture.rig_view import view
-from mwdn.capture.screen import Picture, Pose, Projection, Screen, project
-from mwdn.capture.source import TIMEOUT_S, CameraSource, Frame
+from mwdn.capture.screen import DisplayPose, Homography, Picture, Screen, project
+from mwdn.capture.source import TIMEOUT_S, CameraFrame, CameraSource
 from mwdn.data.mismatch import shading
 from mwdn.data.random import seeded
 from mwdn.data.real_camera import RealCamera
@@ -75,8 +75,10 @@ class Rig(CameraSource):
         self.psf: Psf = self._real.psf(psf)
         """(1, 3, H, W): the true response to a point on the axis."""
         focal_px = options.fill * size[1] * screen.distance_cm / screen.width_cm
-        pose = Pose(tilt_degrees=options.tilt_degrees, turn_degrees=options.turn_degrees, offset_cm=options.offset_cm)
-        self.homography: Projection = project(screen, pose, size, focal_px)
+        pose = DisplayPose(
+            tilt_degrees=options.tilt_degrees, turn_degrees=options.turn_degrees, offset_cm=options.offset_cm
+        )
+        self.homography: Homography = project(screen, pose, size, focal_px)
         """(3, 3), from the display's pixels (x, y, 1) to those of a measurement."""
         self._noise, self._chance = seeded(options.seed), random.Random(options.seed)
         self._wait, self._is_open, self._reads = wait, False, 0
@@ -132,7 +134,7 @@ class Rig(CameraSource):
         """Disconnect."""
         self._is_open = False
 
-    def read(self) -> Frame:
+    def read(self) -> CameraFrame:
         """The next frame.
 
         Raises:
@@ -149,7 +151,7 @@ class Rig(CameraSource):
         self._number += 1 + dropped
         self._entry = self._entry if self.playlist is None else self.playlist.entry
         self._drift += options.drift * self._chance.gauss(0, 1)
-        return Frame(
+        return CameraFrame(
             array=self._frames.next((self._entry, self.exposure_s, self.gain), lambda: self._expose(self._seen())),
             bit_depth=options.bit_depth,
             mosaic=options.mosaic or None,  # type: ignore[arg-type]

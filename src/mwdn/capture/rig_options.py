@@ -19,9 +19,9 @@ class RigOptions:
         family: kind of the mask, see `mwdn.optics.FAMILIES`; drawn if empty.
         mosaic: colours of a 2 x 2 cell of raw frames, ``"rggb"``; RGB frames if empty.
         fill: width of the display in the camera's view, over the frame's.
-        tilt_degrees: see `Pose`.
-        turn_degrees: see `Pose`.
-        offset_cm: see `Pose`.
+        tilt_degrees: see `DisplayPose`.
+        turn_degrees: see `DisplayPose`.
+        offset_cm: see `DisplayPose`.
         display_gamma: light of the display is the coded number to this power.
         display_black: light of a black pixel of the display, over that of a white one.
         white: brightest pixel of a frame of a white display at `EXPOSURE_S`, over the full scale.

@@ -1,18 +1,18 @@
-"""Projection of a flat display's light to a camera's pixels."""
+"""Homography of a flat display's light to a camera's pixels."""
 
 import math
 
 import numpy as np
 import torch
 
-from mwdn.capture.screen import Projection
+from mwdn.capture.screen import Homography
 from mwdn.types import FloatFrame, Scene, Size
 
 SAMPLES = 3
 """Points along each side of a camera's pixel whose light is averaged."""
 
 
-def view(light: FloatFrame, homography: Projection, size: Size) -> Scene:
+def view(light: FloatFrame, homography: Homography, size: Size) -> Scene:
     """Project a display's light to a camera's pixels.
 
     Args:
@@ -39,12 +39,12 @@ def view(light: FloatFrame, homography: Projection, size: Size) -> Scene:
     return torch.nn.functional.avg_pool2d(seen, SAMPLES)
 
 
-def _scaled(factor: float) -> Projection:
+def _scaled(factor: float) -> Homography:
     """To pixels that are smaller by a factor: (x + 1/2) factor - 1/2."""
     return np.array([[factor, 0, (factor - 1) / 2], [0, factor, (factor - 1) / 2], [0, 0, 1.0]])
 
 
-def _magnification(homography: Projection, size: tuple[int, ...]) -> float:
+def _magnification(homography: Homography, size: tuple[int, ...]) -> float:
     """Camera pixels per display pixel at the display's middle."""
     x, y = (size[1] - 1) / 2, (size[0] - 1) / 2
     corners = homography @ np.array([[x, x + 1, x], [y, y, y + 1], [1, 1, 1]])

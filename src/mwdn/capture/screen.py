@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from mwdn.errors import ParameterError
 
-Projection = npt.NDArray[np.float64]
+Homography = npt.NDArray[np.float64]
 """(3, 3), from (x, y, 1) of one picture's pixels to another's; whole numbers are centres of pixels."""
 
 Picture = npt.NDArray[np.uint8]
@@ -47,14 +47,14 @@ class Screen:
         """Pixels per centimetre, across and down; they differ if the display stretches its picture."""
         return self.width_px / self.width_cm, self.height_px / self.height_cm
 
-    def to_cm(self) -> Projection:
+    def to_cm(self) -> Homography:
         """From pixels to centimetres on the display, from its middle to the right and down."""
         (across, down), (x, y) = self.px_per_cm, ((self.width_px - 1) / 2, (self.height_px - 1) / 2)
         return np.array([[1 / across, 0, -x / across], [0, 1 / down, -y / down], [0, 0, 1]])
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pose:
+class DisplayPose:
     """How a display stands in front of a camera.
 
     Args:
@@ -68,7 +68,7 @@ class Pose:
     turn_degrees: float = 0.0
     offset_cm: tuple[float, float] = (0.0, 0.0)
 
-    def rotation(self) -> Projection:
+    def rotation(self) -> Homography:
         """(3, 3), of (right, down, away)."""
         a, b = (math.radians(angle) for angle in self.tilt_degrees)
         c = math.radians(self.turn_degrees)
@@ -78,8 +78,8 @@ class Pose:
         return about_z @ about_y @ about_x
 
 
-def project(screen: Screen, pose: Pose, size: tuple[int, int], focal_px: float) -> Projection:
-    """Projection from a display's pixels to a camera's: exact for a thin mask.
+def project(screen: Screen, pose: DisplayPose, size: tuple[int, int], focal_px: float) -> Homography:
+    """Homography from a display's pixels to a camera's: exact for a thin mask.
 
     A point at (X, Y, Z) casts its pattern displaced by ``focal_px (X, Y) / Z`` from the middle ``(H // 2, W // 2)``.
 

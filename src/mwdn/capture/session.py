@@ -10,7 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from mwdn.capture.captured_pairs import CapturedPairs, create_captured, displayed_light, open_captured
+from mwdn.capture.captured_pairs import SessionFile, create_captured, displayed_light, open_captured
 from mwdn.capture.continuation import ROUNDING, check_continued, describe_place
 from mwdn.capture.display import Display
 from mwdn.capture.gamma import fit_gamma
@@ -19,7 +19,7 @@ from mwdn.capture.photograph_list import list_photographs, read_photograph
 from mwdn.capture.point_frames import Shooting, hot_pixels, record_point
 from mwdn.capture.recipe import CaptureRecipe
 from mwdn.capture.screen import Picture, Place, Screen, place_picture, put
-from mwdn.capture.source import CameraSource, Frame, check_like
+from mwdn.capture.source import CameraFrame, CameraSource, check_like
 from mwdn.data.pair_writer import check_path
 from mwdn.errors import CameraError, ImageError, ParameterError
 
@@ -69,7 +69,7 @@ class Session:
         check_path(out)
         self.recipe, self.camera, self.display, self.out = recipe, camera, display, out
         self._wait, self._progress, self._lamp = wait, progress, lamp
-        self._first: Frame | None = None
+        self._first: CameraFrame | None = None
         self._screen: Screen = display.screen
         self._place: Place = place_picture(self._screen, recipe.pictures.size, recipe.pictures.fill)
         self._gamma = 1.0
@@ -95,7 +95,7 @@ class Session:
         with create_captured(self.out, self._first, self.recipe.pictures.size, self._attributes()) as pairs:
             return self._capture(pairs)
 
-    def _capture(self, pairs: CapturedPairs) -> int:
+    def _capture(self, pairs: SessionFile) -> int:
         planned, taken = pairs.planned, pairs.names
         new = self._names(planned)
         pairs.plan(new)
@@ -130,7 +130,7 @@ class Session:
     def _whole(self, level: int) -> Picture:
         return grey(level, (self._screen.height_px, self._screen.width_px))
 
-    def _frame_of(self, picture: Picture) -> Frame:
+    def _frame_of(self, picture: Picture) -> CameraFrame:
         """Show a picture, let it settle, and grab a frame of it."""
         shown = self.display.show(picture)
         self._wait(self.recipe.session.settle_s)
@@ -145,7 +145,7 @@ class Session:
         table = self.recipe.camera
         self.camera.configure(table.exposure_s or None, table.gain if table.gain >= 0 else None)
 
-    def _first_frame(self) -> Frame:
+    def _first_frame(self) -> CameraFrame:
         """A frame of a dark display; frames that were in progress when the camera was set have its old settings."""
         self.display.show(self._whole(0))
         frame, table = self._grab(time.time()), self.recipe.camera
@@ -156,7 +156,7 @@ class Session:
             frame = self._grab(time.time())
         return frame
 
-    def _grab(self, shown: float) -> Frame:
+    def _grab(self, shown: float) -> CameraFrame:
         """The first frame whose exposure began after a moment; a camera that fails is opened again.
 
         Raises:
@@ -191,7 +191,7 @@ class Session:
 
     # Calibration of camera and display
 
-    def _calibrate(self, pairs: CapturedPairs) -> None:
+    def _calibrate(self, pairs: SessionFile) -> None:
         """Capture the point source, grey steps and patterns, unless an earlier run has."""
         if not pairs.has_pattern("grey"):
             levels = grey_levels()
@@ -212,7 +212,7 @@ class Session:
                 frames = [first, *(self.camera.read() for _ in range(self.recipe.session.frames - 1))]
                 pairs.add_pattern(name, frames, [displayed_light(picture, self._gamma)] * len(frames))
 
-    def _measured_gamma(self, levels: list[int], frames: list[Frame]) -> float:
+    def _measured_gamma(self, levels: list[int], frames: list[CameraFrame]) -> float:
         fit = fit_gamma(levels, [float(frame.array.mean()) for frame in frames])
         if fit.error > GAMMA_ERROR:
             warnings.warn(
@@ -222,7 +222,7 @@ class Session:
             )
         return fit.gamma
 
-    def _check_exposure(self, dark: Frame, white: Frame) -> None:
+    def _check_exposure(self, dark: CameraFrame, white: CameraFrame) -> None:
         full = 2**white.bit_depth - 1
         part = float(((white.array >= full) & ~hot_pixels([dark])).mean())
         if part > SATURATED:
@@ -237,7 +237,7 @@ class Session:
                 f"camera to the display, or raise `exposure_s` ({white.exposure_s:g}) of [camera]."
             )
 
-    def _take_references(self, pairs: CapturedPairs) -> None:
+    def _take_references(self, pairs: SessionFile) -> None:
         """Ambient and white frames every `references_every` pairs, with a warning if the light has drifted."""
         every = self.recipe.session.references_every
         if not every or len(pairs) % every:

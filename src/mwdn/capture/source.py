@@ -17,7 +17,7 @@ TIMEOUT_S = 5.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Frame:
+class CameraFrame:
     """A raw frame and its metadata.
 
     Args:
@@ -78,9 +78,9 @@ class CameraSource(ABC):
         """
 
     def configure(self, exposure_s: float | None = None, gain: float | None = None) -> None:
-        """Set the exposure in seconds and the gain in the camera's unit (`Frame`); ``None`` changes nothing.
+        """Set the exposure in seconds and the gain in the camera's unit (`CameraFrame`); ``None`` changes nothing.
 
-        Frames that are in progress may still have the old values: each `Frame` says its own.
+        Frames that are in progress may still have the old values: each `CameraFrame` says its own.
 
         Raises:
             CameraError: the camera is not open, refuses a value, or has no such setting.
@@ -90,7 +90,7 @@ class CameraSource(ABC):
                 raise CameraError(f"{self.name} has no setting `{name}` ({value:g}). Leave it out.")
 
     @abstractmethod
-    def read(self) -> Frame:
+    def read(self) -> CameraFrame:
         """Wait for the next frame. If the camera is faster than its reader, the oldest frames are dropped.
 
         Raises:
@@ -108,7 +108,7 @@ class CameraSource(ABC):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def __iter__(self) -> Iterator[Frame]:
+    def __iter__(self) -> Iterator[CameraFrame]:
         """All frames, without end; `mwdn.runtime.latest` yields the newest of them each time."""
         while True:
             yield self.read()
@@ -144,7 +144,7 @@ class CameraSource(ABC):
             raise CameraError(f"{self.name} {what}: {reason(error)}. {advice}") from error
 
 
-def check_like(frame: Frame, first: Frame, name: str) -> None:
+def check_like(frame: CameraFrame, first: CameraFrame, name: str) -> None:
     """Check that a frame has the size, type, bit depth and mosaic of an earlier one.
 
     Raises:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mwdn.capture.pixel_formats import PixelFormat, unpack, v4l2_format
-from mwdn.capture.source import TIMEOUT_S, CameraSource, Frame
+from mwdn.capture.source import TIMEOUT_S, CameraFrame, CameraSource
 from mwdn.errors import CameraError, ParameterError
 
 EXPOSURE_UNIT_S = 1e-4
@@ -116,7 +116,7 @@ class V4l2Camera(CameraSource):
                 raise CameraError(f"{self.name} refuses `gain` ({gain:g}). Its range: `v4l2-ctl --list-ctrls`.")
             self._gain = gain
 
-    def read(self) -> Frame:
+    def read(self) -> CameraFrame:
         """The next frame."""
         if self._capture is None:
             raise self.not_open()
@@ -127,7 +127,7 @@ class V4l2Camera(CameraSource):
             raise self.silent()
         self._number += 1
         array, format = self._unpacked(data)
-        return Frame(
+        return CameraFrame(
             array=array,
             bit_depth=format.bit_depth,
             mosaic=format.mosaic,
@@ -138,7 +138,7 @@ class V4l2Camera(CameraSource):
         )
 
     def _unpacked(self, data: Any) -> tuple[Any, PixelFormat]:  # noqa: ANN401
-        """Frame and format; raw buffers come as rows of bytes or of numbers."""
+        """CameraFrame and format; raw buffers come as rows of bytes or of numbers."""
         import cv2
 
         if self._format is None:

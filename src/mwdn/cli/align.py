@@ -23,7 +23,7 @@ from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.contact_sheets import contact_sheet
 from mwdn.io.files import check_folder, refuse_overwrite, write_json
 from mwdn.io.images import read_frame, write_picture
-from mwdn.registration.captured import SRGB, CapturedPairs, as_gamma, as_light
+from mwdn.registration.captured import SRGB, SessionPairs, as_gamma, as_light
 from mwdn.registration.estimate import estimate, through_corners
 from mwdn.registration.outline import find_outline
 from mwdn.registration.overlay import draw_outline, overlay
@@ -68,7 +68,8 @@ def align(  # noqa: PLR0913
         points: start from the corners of the picture as seen in the reconstruction, from its own top left clockwise:
             x,y,x,y,x,y,x,y in pixels.
         homography: take the homography from this .json or file of aligned pairs instead of estimating it.
-        display_gamma: light of the display is PICTURE's numbers to this power; srgb unless given.
+        display_gamma: light of the display is PICTURE's numbers to this power, srgb unless given. For a session that
+            of its stored pictures, 1 unless given, because `mwdn capture` stores light.
         levels: scale scenes and measurements of a session so that the PSF leads from one to the other.
         device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
         json: print the content of the .json to standard output, all else to standard error.
@@ -145,7 +146,7 @@ def _align_session(task: _Task, capture: Path, out: Path, count: int, *, levels:
     page, sidecar = out.with_suffix(".png"), out.with_suffix(".json")
     task.check_outputs(out, page, sidecar)
     with (
-        CapturedPairs(capture, task.calibration, display_gamma=task.gamma or 1.0) as pairs,
+        SessionPairs(capture, task.calibration, display_gamma=task.gamma or 1.0) as pairs,
         all_or_nothing(out),
     ):
         rows = chosen(len(pairs), count)

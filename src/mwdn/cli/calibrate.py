@@ -16,7 +16,7 @@ from mwdn.calibration.camera_file import check_camera_path, read_camera
 from mwdn.calibration.camera_parts import draft_of, write_camera_with_parts
 from mwdn.calibration.corrections import Corrections
 from mwdn.calibration.frame_format import changed_fields
-from mwdn.calibration.photographs import Photographed, develop, expanded
+from mwdn.calibration.photographs import CameraContent, calibrate_frames, expanded
 from mwdn.calibration.report import inspect_psf
 from mwdn.calibration.verdict import headline
 from mwdn.calibration.watching import guide_exposure, watch_folder
@@ -116,26 +116,27 @@ def calibrate(  # noqa: PLR0913
             _refuse_corrected(camera, kept, pictures)
             known = Corrections.read(kept.get("flat_field"), kept.get("hot_pixels"))
             refuse_overwrite(out, *expanded((*pictures, *photographs.dark_files, *photographs.flat)))
-            done = develop(photographs.of(pictures), frames, known)
+            done = calibrate_frames(photographs.of(pictures), frames, known)
             write = partial(_write_photographs, done, {**kept, **own}, has_dark=bool(photographs.dark_files))
         _write_and_refine(out, pairs, write)
 
 
 def _write_and_refine(out: Path, pairs: Path | None, write: Callable[[Path], tuple[str, Calibration]]) -> None:
-    """Write the camera file, refined if there are pairs: it appears when it is complete.
+    """Write the camera file, refined if there are pairs: it appears when it is complete and checked.
 
     Args:
         out: the camera file.
         pairs: to refine it with.
         write: writes it to a path; returns the PSF's verdict and the calibration.
     """
-    if pairs is None:
-        _finish(*write(out), out)
-        return
-    interrupted = f"Interrupted. {out} is written when the refinement is done: nothing has changed."
+    interrupted = f"Interrupted. {out} is written at the end: nothing has changed."
     with if_interrupted(lambda: interrupted), draft_of(out) as draft:
-        _finish(*write(draft), out)
-        refine(draft, pairs, out.with_name(f"{out.stem}-refinement.json"))
+        verdict, calibration = write(draft)
+        if pairs is not None:
+            _finish(verdict, calibration, out)
+            refine(draft, pairs, out.with_name(f"{out.stem}-refinement.json"))
+    if pairs is None:
+        _finish(verdict, calibration, out)
 
 
 def _kept(camera: Path | None) -> dict[str, Any]:
@@ -193,7 +194,7 @@ def _write_one_picture(
 
 
 def _write_photographs(
-    done: Photographed, content: dict[str, Any], out: Path, *, has_dark: bool
+    done: CameraContent, content: dict[str, Any], out: Path, *, has_dark: bool
 ) -> tuple[str, Calibration]:
     """Write a camera file with the pictures made of photographs; returns the PSF's verdict and the calibration."""
     content = {key: value for key, value in content.items() if value is not None or key not in done.content}
@@ -217,9 +218,10 @@ def _write_photographs(
     written = write_camera_with_parts(out, content, done.parts)
     calibration = Calibration.load(out)
     check_white_balance(calibration.white_balance, calibration.light)
+    verdict = headline(inspect_psf(calibration, calibration.frames.read(written["psf"])))
     note(*done.notes)
     say(*done.results)
-    return headline(inspect_psf(calibration, calibration.frames.read(written["psf"]))), calibration
+    return verdict, calibration
 
 
 def _flat_balance(colour: tuple[float, ...]) -> tuple[float, float, float]:

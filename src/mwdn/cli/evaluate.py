@@ -102,8 +102,8 @@ def evaluate(  # noqa: PLR0913
             perceptual=perceptual,
             progress=lambda name, _: progress.update(next(done), name),
         )
-    _print_report(report, json=json)
     report.write(out)
+    _print_report(report, json=json)
     say(f"Look at {out}")
 
 

@@ -17,7 +17,7 @@ from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.terminal import Json, print_json, results, say
 from mwdn.io.files import check_folder, refuse_foreign, refuse_overwrite, write_json
 
-_STYLES = {"bad": "bold red", "mind": "yellow", "good": "green"}
+_STYLES = {"bad": "bold red", "weak": "yellow", "good": "green"}
 
 
 @no_empty_folder

@@ -5,15 +5,15 @@ from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
+from torch.nn import Module
 
 from mwdn.cli.camera import CameraOptions
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.terminal import Json, counted, print_json, say, warn
 from mwdn.inference.interpretation import interpret as look_into
 from mwdn.inference.interpretation_page import JSON, SHEET, write_interpretation
-from mwdn.inference.methods import background_warning, find_method, psf_for, psf_warning
+from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import check_folder, refuse_foreign, refuse_overwrite
-from mwdn.runtime.devices import select_device
 
 
 @no_empty_folder
@@ -37,15 +37,20 @@ def interpret(
         device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
         json: print the content of interpretation.json.
     """
-    calibration, network, place = replace(camera.load(), white_balance=None), find_method(method), select_device(device)
-    warn(psf_warning(method, calibration), background_warning(method, network, calibration))
+    calibration = replace(camera.load(), white_balance=None)
+    reconstruct = Reconstructor(method, calibration, device=device)
+    warn(reconstruct.warning)
     refuse_overwrite(out / SHEET, capture, *camera.files)
     refuse_foreign(out, (JSON, SHEET), b'"parts"')
-    measurement = calibration.correct(calibration.frames.read(capture)).to(place)
-    network = network.to(place) if hasattr(network, "to") else network
-    result = look_into(network, measurement, psf_for(network, calibration).to(place))
+    measurement = calibration.correct(calibration.frames.read(capture)).to(reconstruct.device)
+    measurement, share = reconstruct.without_room_light(measurement)
+    network = reconstruct.method
+    result = look_into(
+        network.to(reconstruct.device) if isinstance(network, Module) else network, measurement, reconstruct.psf
+    )
     check_folder(out)
-    about = {"capture": str(capture), "method": method, "psf_hash": calibration.psf_hash}
+    about: dict[str, object] = {"capture": str(capture), "method": method, "psf_hash": calibration.psf_hash}
+    about["room_light"] = None if share is None else round(float(share), 4)
     paths = write_interpretation(out, result, **about)
     if json:
         print_json({**about, **result.content()})

@@ -14,11 +14,6 @@ from mwdn.solvers import SOLVERS
 from mwdn.weights.bundled import BUNDLED, find_weights
 from mwdn.weights.checkpoint import read_metadata
 
-_BUNDLED = {
-    "universal": "Any camera, no training: alignment, plug-and-play ADMM, U-Net.",
-    "universal-small": "The same, faster: no alignment, no plug and play.",
-}
-
 
 def methods(name: str | None = None, /) -> None:
     """List the reconstruction methods, or the options of one.
@@ -48,8 +43,8 @@ def _overview() -> Table:
     table = Table("name", "kind", "description")
     for name, solver in SOLVERS.items():
         table.add_row(name, "solver", escape(summary(solver)))
-    for name in BUNDLED:
-        table.add_row(name, "bundled network", _BUNDLED[name])
+    for name, description in BUNDLED.items():
+        table.add_row(name, "bundled network", description)
     for name, network in NETWORKS.items():
         table.add_row(name, "network type, to be trained", escape(summary(network)))
     return table

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from mwdn.calibration.photographs import Photographs, expanded, grouped
+from mwdn.calibration.photographs import CalibrationFrames, expanded, grouped
 from mwdn.calibration.sensor_frames import SensorFiles
 from mwdn.errors import ParameterError
 
@@ -18,7 +18,7 @@ Numbers = Annotated[tuple[float, ...], Parameter(consume_multiple=True, negative
 @Parameter(name="*")
 @dataclass(frozen=True)
 class PhotographOptions:
-    """Photographs that describe the camera, and how they were taken. A folder stands for the frames in it.
+    """CalibrationFrames that describe the camera, and how they were taken. A folder stands for the frames in it.
 
     Args:
         exposures: exposure of each equal part of the frames, in order: --exposures 1 8 64, in milliseconds. Two to four
@@ -61,7 +61,7 @@ class PhotographOptions:
         is_plain = not any((*others, *flats)) and self.capture_exposure is None
         return is_plain and len(expanded(files)) <= 1 and len(expanded(self.dark_files)) <= 1
 
-    def of(self, pictures: Sequence[Path]) -> Photographs:
+    def of(self, pictures: Sequence[Path]) -> CalibrationFrames:
         """The photographs, with these pictures of the point source.
 
         Raises:
@@ -74,7 +74,7 @@ class PhotographOptions:
         dark = grouped(self.dark_files, max(1, len(self.dark_exposures)), "dark") if self.dark_files else ()
         flat, flat_dark = (tuple(expanded(each)) for each in (self.flat, self.flat_dark))
         groups = max(1, len(self.exposures)) * max(1, len(self.distances))
-        return Photographs(
+        return CalibrationFrames(
             grouped(pictures, groups, "PSF"),
             exposures=self.exposures,
             sensor=SensorFiles(

@@ -13,7 +13,7 @@ from mwdn.capture.sources import parse_source
 from mwdn.cli.camera import CameraOptions
 from mwdn.cli.terminal import say
 from mwdn.errors import ParameterError
-from mwdn.preview.cameras import Cameras
+from mwdn.preview.cameras import StoredCameras
 from mwdn.preview.limits import Limits
 from mwdn.preview.live import Live
 from mwdn.preview.server import log_to_stderr, make_server
@@ -58,7 +58,7 @@ def preview(  # noqa: PLR0913
     if camera.psf is not None:
         given[OWN] = camera.load()
     limits = Limits()
-    cameras = Cameras(limits, out / "cameras", given)
+    cameras = StoredCameras(limits, out / "cameras", given)
     token = token or ("" if host in LOOPBACK else secrets.token_urlsafe(16))
     watched = None if live is None else _open_live(live, given.get(OWN), out / "recordings", device)
     server = make_server(cameras, limits, host=host, port=port, token=token, device=device, live=watched)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from mwdn.errors import ImageError, ParameterError
 from mwdn.io.images import READABLE, read_frame, srgb_decode
+from mwdn.io.listing import pictures_in
 from mwdn.types import Frame
 
 
@@ -30,7 +31,7 @@ class Photographs:
     """
 
     def __init__(self, folder: str | Path, *, side: int = 208, limit: int | None = None) -> None:
-        paths = sorted(p for p in Path(folder).rglob("*") if _is_picture(p))[:limit]
+        paths = pictures_in(Path(folder))[:limit]
         if not paths:
             if not Path(folder).is_dir():
                 raise ParameterError(f"`{folder}` is not a folder. Name a folder of photographs.")
@@ -69,10 +70,6 @@ class Photographs:
         """Move the pictures to a device, on which `light` then works."""
         self._pixels, self._light = self._pixels.to(device), self._light.to(device)
         return self
-
-
-def _is_picture(path: Path) -> bool:
-    return path.suffix.lower() in READABLE and not path.name.startswith(".") and path.is_file()
 
 
 def _square(path: Path, side: int) -> Frame:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mwdn.data.hdf5 import as_damage
-from mwdn.errors import ImageError
+from mwdn.errors import ImageError, reason
 from mwdn.io.headers import COPY_AGAIN
 from mwdn.io.images import decode_frame
 from mwdn.io.reading import open_regular
@@ -137,7 +137,6 @@ def _download(name: Path, patterns: tuple[str, ...]) -> Path:
             )
         )
     except Exception as error:  # the errors of its network library, which changes between versions
-        reason = str(error).partition("\n")[0].rstrip(".")
         raise ImageError(
-            f"`{name}` cannot be downloaded from the hub: {reason}. Download it and name its folder."
+            f"`{name}` cannot be downloaded from the hub: {reason(error)}. Download it and name its folder."
         ) from error

@@ -14,7 +14,8 @@ from mwdn.data.pairs import PairFile
 from mwdn.data.shards import Shard, find_shards, natural_order
 from mwdn.errors import ImageError
 from mwdn.io.headers import COPY_AGAIN
-from mwdn.io.images import READABLE, read_frame
+from mwdn.io.images import read_frame
+from mwdn.io.listing import pictures_in
 from mwdn.types import Frame
 
 MOST_ROWS = 2**21
@@ -181,9 +182,7 @@ def files_by_stem(folder: Path) -> dict[str, Path]:
             f"`{folder}` is not a folder. Name the folders inside the data set: `--captures A --scenes B`."
         )
     paths: dict[str, Path] = {}
-    for file in sorted(folder.rglob("*")):
-        if file.suffix.lower() not in READABLE or file.name.startswith(".") or not file.is_file():
-            continue
+    for file in pictures_in(folder):
         stem = file.relative_to(folder).with_suffix("").as_posix()
         if stem in paths:
             raise ImageError(f"`{paths[stem]}` and `{file}` differ only in their suffix. Remove one of them.")

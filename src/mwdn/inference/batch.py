@@ -3,7 +3,7 @@
 import copy
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -119,6 +119,8 @@ class Batch:
     resume: bool = False
     psf_file: Path | None = None
     full_size: bool = False
+    _psf_verdicts: list[Verdict] = field(default_factory=list, init=False, repr=False)
+    _mismatches: dict[tuple[int, ...], ShapeError] = field(default_factory=dict, init=False, repr=False)
 
     def run(
         self,
@@ -188,10 +190,6 @@ class Batch:
             known.append(psf_gamma(frame, self.reconstruct.calibration, gamma[0], for_viewing=for_viewing))
         return tuple(known[-1:])
 
-    @cached_property
-    def _psf_verdicts(self) -> list[Verdict]:
-        return []
-
     def _check_fit(self, measurement: Measurement) -> None:
         """Check the size; the first capture of each wrong size is compared with the PSF at other bins."""
         try:
@@ -202,22 +200,21 @@ class Batch:
                 self._mismatches[size] = mismatch(error, measurement, self.reconstruct.calibration)
             raise self._mismatches[size] from None
 
-    @cached_property
-    def _mismatches(self) -> dict[tuple[int, ...], ShapeError]:
-        return {}
-
     @_step
     def _reconstruct(self, job: Job) -> Job:
         if job.measurement is None:
             return job
-        reconstruct = self._dark.at(job.pose) if job.pose else self._dark
+        reconstruct = self._without_room_light
+        if job.pose:
+            reconstruct = reconstruct.at(job.pose)
         return replace(job, scene=reconstruct.on_device(job.measurement))
 
     @cached_property
-    def _dark(self) -> Reconstructor:  # for measurements without the room's light
-        dark = copy.copy(self.reconstruct)
-        dark.room_light = False
-        return dark
+    def _without_room_light(self) -> Reconstructor:
+        """For measurements whose room light is subtracted."""
+        reconstruct = copy.copy(self.reconstruct)
+        reconstruct.room_light = False
+        return reconstruct
 
     @_step
     def _finish(self, job: Job) -> Job:

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-import torch
+import numpy as np
 from torch import Tensor
 
 from mwdn.inference.interpretation import Interpretation, Panel, Row
@@ -54,11 +54,17 @@ def display(panel: Panel) -> Tensor:
         if panel.kind == "psf":
             shown = to_display(picture.clamp(min=0)).sqrt()
     elif panel.kind == "change":
-        shown = 0.5 + 0.5 * picture / picture.abs().flatten().quantile(0.997).clamp(min=1e-12)
+        shown = 0.5 + 0.5 * picture / max(_quantiles(picture.abs(), 0.997)[0], 1e-12)
     else:
-        low, high = picture.flatten().quantile(torch.tensor([0.003, 0.997]))
-        shown = (picture - low) / (high - low).clamp(min=1e-12)
+        low, high = _quantiles(picture, 0.003, 0.997)
+        shown = (picture - low) / max(high - low, 1e-12)
     return shown.clamp(0, 1).expand(-1, 3, -1, -1)
+
+
+def _quantiles(picture: Tensor, *parts: float) -> list[float]:
+    """As `torch.quantile`, which takes at most 2^24 numbers."""
+    values: list[float] = np.quantile(picture.numpy(), parts).tolist()
+    return values
 
 
 def draw_sheet(path: Path, interpretation: Interpretation) -> None:

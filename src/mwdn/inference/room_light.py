@@ -40,8 +40,8 @@ PIXELS = 4000
 """The capture is halved until it has at most so many pixels. A spot is fitted again in four times as many."""
 
 FAINT = 0.08
-"""Smaller shares of light that the network finds are not subtracted. In 54 captures of real-like cameras without any,
-it finds more in two. In 384 captures of the 16 rows in docs/universal.md it finds more in two, which lose 0.9 dB."""
+"""Smaller shares of light that the network finds are not subtracted. It wrongly finds larger ones in 2 of 54 captures
+of real-like cameras without room light, and in 2 of the 384 captures of docs/universal.md, which lose 0.9 dB."""
 
 DARK_PART = 0.5
 """Least part of the frame that a scene must leave dark, below a quarter of its mean. Objects on dark leave 0.55 to 0.8

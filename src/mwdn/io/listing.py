@@ -51,6 +51,12 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
     return False
 
 
+def pictures_in(folder: Path, *, subfolders: bool = True) -> list[Path]:
+    """The readable pictures of a folder, in alphabetical order; hidden files are left out."""
+    found = folder.rglob("*") if subfolders else folder.iterdir()
+    return sorted(path for path in found if path.suffix.lower() in READABLE and path.name[0] != "." and path.is_file())
+
+
 def unused_photographs(folder: Path) -> list[str]:
     """One sentence for each kind of file in a folder of photographs, or its subfolders, that is not read."""
     files = (path for path in folder.rglob("*") if not path.name.startswith(".") and path.is_file())

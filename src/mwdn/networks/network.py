@@ -106,6 +106,25 @@ class Network(nn.Module, Generic[Prepared]):
             ) from error
 
 
+class FixedFront(Network[Prepared]):
+    """A network that learns nothing before its `estimates`, so that they can be computed once for each sample.
+
+    Its forward pass is ``correct(estimates, unit(estimates))``.
+    """
+
+    def estimates(self, measurement: Measurement, psf: Psf) -> Tensor:
+        """Inputs (B, channels, H, W) of the learned part."""
+        raise NotImplementedError
+
+    def unit(self, estimates: Tensor) -> Tensor:
+        """Scale (B, 1, 1, 1) of the estimates."""
+        raise NotImplementedError
+
+    def correct(self, estimates: Tensor, unit: Tensor) -> Scene:
+        """Scene (B, C, H, W) from the estimates or a crop of them: the learned part."""
+        raise NotImplementedError
+
+
 class OtherNetwork(Network[Tensor]):
     """A module of another package, called as ``module(measurement, psf)``; its preparation is the PSF itself."""
 

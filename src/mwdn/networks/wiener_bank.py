@@ -15,7 +15,7 @@ from mwdn.networks.block_means import block_means
 from mwdn.networks.blocks import Decoder, Encoder, check_channels, normalise_psf, paper_widths
 from mwdn.networks.drunet import Drunet
 from mwdn.networks.evidence import MAPS, against_psf, doubt_of_psf
-from mwdn.networks.network import Network
+from mwdn.networks.network import FixedFront
 from mwdn.optics.distortion import distort, undistort
 from mwdn.optics.polynomials import coefficient_count
 from mwdn.optics.psf import unit_sum
@@ -52,7 +52,7 @@ class BankTransfers(NamedTuple):
     filters: tuple[Tensor, ...]
 
 
-class WienerBank(Network[BankTransfers]):
+class WienerBank(FixedFront[BankTransfers]):
     """Wiener estimates with strong to weak regularisation, corrected by a U-Net.
 
     A strong lambda gives a smooth picture of correct brightness, a weak one keeps detail and amplifies noise; no single

@@ -1,7 +1,7 @@
 """A page and an HTTP interface that reconstruct captures, for people and programs."""
 
-from mwdn.preview.cameras import Cameras
+from mwdn.preview.cameras import StoredCameras
 from mwdn.preview.limits import Limits
 from mwdn.preview.server import PreviewServer, make_server
 
-__all__ = ["Cameras", "Limits", "PreviewServer", "make_server"]
+__all__ = ["StoredCameras", "Limits", "PreviewServer", "make_server"]

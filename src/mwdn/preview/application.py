@@ -18,7 +18,7 @@ from starlette.staticfiles import StaticFiles
 
 from mwdn.calibration import Calibration
 from mwdn.errors import MwdnError, ParameterError
-from mwdn.preview.cameras import OPTIONS, Cameras, checked_camera, describe
+from mwdn.preview.cameras import OPTIONS, StoredCameras, checked_camera, describe
 from mwdn.preview.guard import Guard, failed, log
 from mwdn.preview.jobs import ENDED, Job, Jobs
 from mwdn.preview.limits import Limits, RefusedError
@@ -52,7 +52,7 @@ class Preview:
     """
 
     def __init__(
-        self, cameras: Cameras, limits: Limits = Limits(), *, device: str | None = None, live: Live | None = None
+        self, cameras: StoredCameras, limits: Limits = Limits(), *, device: str | None = None, live: Live | None = None
     ) -> None:
         self.cameras, self.limits, self.metrics = cameras, limits, Metrics()
         self.live = live

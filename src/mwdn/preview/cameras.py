@@ -21,11 +21,14 @@ NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,39}")
 OPTIONS = tuple(sorted(field.name for kind in (FrameFormat, PsfFormat) for field in fields(kind)))
 """Options of a calibration that a client may set: those that name no file."""
 
+LIVE_CAMERA = "live"
+"""Name of the live camera's calibration, which no client can take."""
+
 KEPT = 8
 """Calibrations of uploaded PSFs that are kept, for the next capture of the same camera."""
 
 
-class Cameras:
+class StoredCameras:
     """Calibrations by name.
 
     Args:
@@ -65,7 +68,7 @@ class Cameras:
             RefusedError: no such name.
         """
         with self._lock:
-            known = {**self.given, **self._stored}
+            known = {**self._stored, **self.given}
         if name == CAMERA and name not in known:
             return sample_calibration()
         if name not in known:
@@ -98,6 +101,11 @@ class Cameras:
                 self._recent.popitem(last=False)
         return calibration
 
+    def give(self, name: str, calibration: Calibration) -> None:
+        """Add or replace a calibration of the server itself."""
+        with self._lock:
+            self.given[name] = calibration
+
     def add(self, name: str, psf: bytes, options: dict[str, Any]) -> Calibration:
         """Store a calibration.
 
@@ -108,7 +116,7 @@ class Cameras:
         _checked_name(name)
         calibration = self.calibrate(psf, options)
         with self._lock:
-            if name in (*self.given, *self._stored, CAMERA):
+            if name in (*self.given, *self._stored, CAMERA, LIVE_CAMERA):
                 raise RefusedError(409, f"`name` ({name}) is taken. Remove that camera, or choose another name.")
             if len(self._stored) >= self.limits.cameras:
                 raise RefusedError(

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from mwdn.calibration import Calibration
 from mwdn.capture.recording import Recorder, record
-from mwdn.capture.source import CameraSource, Frame
+from mwdn.capture.source import CameraFrame, CameraSource
 from mwdn.errors import MwdnError
 from mwdn.preview.limits import RefusedError
 from mwdn.preview.live_pictures import LivePicture, LivePictures, finite
@@ -155,7 +155,7 @@ class Live:
                     self._thread = None
                     return
 
-    def _frames(self, recording: ExitStack) -> Iterator[Frame]:
+    def _frames(self, recording: ExitStack) -> Iterator[CameraFrame]:
         """All frames; settings change between them, and each is recorded if that is wanted."""
         recorder: Recorder | None = None
         self._recorded = None
@@ -186,15 +186,14 @@ class Live:
     def _results(self, recording: ExitStack) -> Generator["_Result", None, None]:
         """The newest picture each time.
 
-        On a CPU two frames are in progress at the same time, on half the processors each: 18 frames a second against 12
-        of one frame on both of two processors, because most operations on a small picture gain nothing from a second
-        thread (docs/performance.md). A GPU works on one.
+        On a CPU two frames are in progress, each on half of the processors: 18 frames/s on two processors, against 12
+        with one frame on both (docs/performance.md). On a GPU one frame is in progress.
         """
         workers = min(2, usable_processors()) if self._device.type == "cpu" else 1
         threads = max(1, usable_processors() // workers)
         return latest_results(self._begin, self._frames(recording), workers=workers, threads=threads)
 
-    def _begin(self, frame: Frame) -> Callable[[], "_Result"]:
+    def _begin(self, frame: CameraFrame) -> Callable[[], "_Result"]:
         start, finish = time.time(), self.pictures.begin(frame)
 
         def work() -> _Result:
@@ -207,7 +206,7 @@ class Live:
 
     def _show(self, results: Iterator["_Result"]) -> None:
         times: deque[float] = deque(maxlen=RATE_FRAMES)
-        before: Frame | None = None
+        before: CameraFrame | None = None
         dropped = 0
         for picture, encoded, start in results:
             self._picture, frame = picture, picture.frame

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from mwdn.calibration import Calibration
-from mwdn.capture.source import Frame
+from mwdn.capture.source import CameraFrame
 from mwdn.errors import MwdnError, ParameterError
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.preview.live_encoding import brightest, encode_jpeg
@@ -36,7 +36,7 @@ class LivePicture:
         wrong: what is wrong with the frame.
     """
 
-    frame: Frame
+    frame: CameraFrame
     measurement: Measurement
     scene: Scene
     settings: LiveSettings
@@ -103,7 +103,7 @@ class LivePictures:
         self._takes_ambient: bool | None = None
         self._reconstruct: Reconstructor | None = None
         self._used = settings
-        self._ambient: Frame | None = None
+        self._ambient: CameraFrame | None = None
 
     def change(self, message: dict[str, Any]) -> None:
         """Take over the settings of a message, from any thread; why one is not possible becomes `refused`."""
@@ -115,7 +115,7 @@ class LivePictures:
             except MwdnError as error:
                 self.refused = str(error)
 
-    def begin(self, frame: Frame) -> Callable[[], LivePicture]:
+    def begin(self, frame: CameraFrame) -> Callable[[], LivePicture]:
         """Prepare the reconstruction of a frame with the present settings, for one frame at a time.
 
         Returns:
@@ -138,7 +138,7 @@ class LivePictures:
         return finish
 
     def _finish(
-        self, frame: Frame, reconstruct: Reconstructor, settings: LiveSettings, *, has_ambient: bool
+        self, frame: CameraFrame, reconstruct: Reconstructor, settings: LiveSettings, *, has_ambient: bool
     ) -> LivePicture:
         start = time.perf_counter()
         measurement = reconstruct.calibration.correct(frame.array)
@@ -152,7 +152,7 @@ class LivePictures:
         shown, calibration = measurement.clamp(min=0), reconstruct.calibration
         return LivePicture(frame, shown, scene, settings, calibration, has_ambient=has_ambient, wrong=wrong)
 
-    def _prepared(self, frame: Frame) -> Reconstructor:
+    def _prepared(self, frame: CameraFrame) -> Reconstructor:
         """The method for the current settings; if it is refused, that of the settings before."""
         with self._lock:
             settings, takes_ambient, self._takes_ambient = self.settings, self._takes_ambient, None
@@ -174,14 +174,14 @@ class LivePictures:
         self._used = settings
         return self._reconstruct
 
-    def _calibration(self, frame: Frame) -> Calibration:
+    def _calibration(self, frame: CameraFrame) -> Calibration:
         """The calibration, with what the camera says about its frames, and the room's light."""
         frames = self._given.frames.completed(frame.bit_depth, frame.mosaic, of="the camera")
         ambient = self._given.ambient if self._ambient is None else frames.normalise(self._ambient.array)
         return replace(self._given, frames=frames, ambient=ambient)
 
 
-def _is_alike(a: Frame, b: Frame) -> bool:
+def _is_alike(a: CameraFrame, b: CameraFrame) -> bool:
     """Whether two frames have the same exposure and gain, or the camera does not say."""
     return all(
         not math.isfinite(x - y) or math.isclose(x, y, rel_tol=0.01)

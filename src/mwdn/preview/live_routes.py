@@ -10,14 +10,11 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket
 
 from mwdn.io.images import encode_png
-from mwdn.preview.cameras import Cameras
+from mwdn.preview.cameras import LIVE_CAMERA, StoredCameras
 from mwdn.preview.jobs import Jobs
 from mwdn.preview.limits import Limits, RefusedError
 from mwdn.preview.live import Live
 from mwdn.preview.live_viewer import serve_viewer
-
-CAMERA = "live"
-"""Name of the live camera's calibration, once there is a snapshot."""
 
 
 class LiveRoutes:
@@ -30,7 +27,7 @@ class LiveRoutes:
         limits: of the server.
     """
 
-    def __init__(self, live: Live | None, cameras: Cameras, jobs: Jobs, limits: Limits) -> None:
+    def __init__(self, live: Live | None, cameras: StoredCameras, jobs: Jobs, limits: Limits) -> None:
         self.live, self.cameras, self.jobs, self.limits = live, cameras, jobs, limits
 
     @property
@@ -54,9 +51,9 @@ class LiveRoutes:
         if self.live is None:
             raise RefusedError(409, "This server has no live camera. Start it with one: `mwdn preview --live rig`.")
         picture = self.live.snapshot()
-        self.cameras.given[CAMERA] = picture.calibration  # for this camera's captures: it knows their bit depth
+        self.cameras.give(LIVE_CAMERA, picture.calibration)  # for this camera's captures: it knows their bit depth
         job = self.jobs.keep(picture.result())
-        return JSONResponse({**job.content(), "camera": CAMERA}, 201, {"Location": f"/jobs/{job.id}"})
+        return JSONResponse({**job.content(), "camera": LIVE_CAMERA}, 201, {"Location": f"/jobs/{job.id}"})
 
     async def raw_frame(self, request: Request) -> Response:
         """The raw frame of a snapshot, as a PNG with the sensor's numbers."""

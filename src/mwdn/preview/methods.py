@@ -3,23 +3,19 @@
 from typing import Any, get_args, get_origin
 
 from mwdn.errors import ParameterError, UnknownNameError, type_in_words
-from mwdn.inference.method_options import list_options, summary
+from mwdn.inference.method_options import Option, list_options, summary
 from mwdn.solvers import SOLVERS
 from mwdn.weights.bundled import BUNDLED
 
-KINDS = (int, float)
 RANGES = {"regularisation": (1e-7, 1.0), "iterations": (1, 500)}
 """Useful values of options, for sliders; the first is logarithmic."""
-
-_NETWORKS = {
-    "universal": "Network for any camera, with alignment and plug-and-play ADMM: the best pictures.",
-    "universal-small": "The faster network for any camera.",
-}
 
 
 def list_methods() -> list[dict[str, Any]]:
     """For JSON: each method with its description and options."""
-    networks = [{"name": name, "kind": "network", "about": _NETWORKS.get(name, ""), "options": []} for name in BUNDLED]
+    networks = [
+        {"name": name, "kind": "network", "about": description, "options": []} for name, description in BUNDLED.items()
+    ]
     solvers = [
         {"name": name, "kind": "solver", "about": summary(solver), "options": _options(name)}
         for name, solver in SOLVERS.items()
@@ -29,18 +25,20 @@ def list_methods() -> list[dict[str, Any]]:
 
 def _options(name: str) -> list[dict[str, Any]]:
     listed = []
-    for option in list_options(SOLVERS[name]):
-        if option.type not in KINDS and not _is_number(option.type):
-            continue
+    for option in _numbers(name):
         low, high = RANGES.get(option.name, (None, None))
         entry = {"name": option.name, "type": type_in_words(option.type), "default": option.default}
         listed.append({**entry, "about": option.meaning, "low": low, "high": high})
     return listed
 
 
-def _is_number(kind: Any) -> bool:  # noqa: ANN401
-    """Whether a type allows a number beside others, such as ``float | None``."""
-    return get_origin(kind) is not None and any(part in KINDS for part in get_args(kind))
+def _numbers(name: str) -> list[Option]:
+    """Options of a solver that are numbers, or may be, such as ``float | None``."""
+    return [option for option in list_options(SOLVERS[name]) if _kinds(option.type) & {int, float}]
+
+
+def _kinds(kind: Any) -> set[Any]:  # noqa: ANN401
+    return {kind} if get_origin(kind) is None else {*get_args(kind)}
 
 
 def checked_options(name: str, options: dict[str, Any]) -> dict[str, Any]:
@@ -52,10 +50,10 @@ def checked_options(name: str, options: dict[str, Any]) -> dict[str, Any]:
     """
     if name not in BUNDLED and name not in SOLVERS:
         raise UnknownNameError("method", name, [*BUNDLED, *SOLVERS])
-    known = {option["name"]: option["type"] for option in _options(name)} if name in SOLVERS else {}
+    known = {option.name: option.type for option in _numbers(name)} if name in SOLVERS else {}
     for option, value in options.items():
         if option not in known:
             raise UnknownNameError(f"option of method '{name}'", option, known)
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise ParameterError(f"`{option}` ({value!r}) of the method must be a number.")
-    return {option: value if "whole" in known[option] else float(value) for option, value in options.items()}
+    return {option: value if int in _kinds(known[option]) else float(value) for option, value in options.items()}

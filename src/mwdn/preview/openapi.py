@@ -3,6 +3,7 @@
 from typing import Any, get_args
 
 from mwdn.preview.cameras import NAME
+from mwdn.preview.jobs import State
 from mwdn.preview.limits import Limits
 from mwdn.preview.result import MEDIA, STOPS, PictureFormat
 from mwdn.preview.samples import NAMES
@@ -132,11 +133,10 @@ def _order() -> dict[str, Any]:
 
 
 def _job() -> dict[str, Any]:
-    states = ["waiting", "reconstructing", "checking", "done", "failed", "cancelled"]
     return _object(
         required=["id", "state", "progress"],
         id={"type": "string"},
-        state={"enum": states},
+        state={"enum": list(get_args(State))},
         progress={"type": "number", "minimum": 0, "maximum": 1},
         error={"type": "string"},
         report={"type": "object"},

@@ -23,8 +23,10 @@ from mwdn.preview.jobs import Job
 from mwdn.preview.limits import Limits
 from mwdn.preview.result import Result
 from mwdn.runtime.iterations import watch_iterations
+from mwdn.runtime.transfers import to_device
 from mwdn.solvers.alignment import align
-from mwdn.types import Frame, Measurement
+from mwdn.solvers.pose import Pose
+from mwdn.types import Frame, Measurement, Scene
 
 KEPT = 4
 """Prepared methods that are kept for the next capture; one of 1 Mpixel takes about 100 MB."""
@@ -100,30 +102,31 @@ class Reconstructions:
         reconstruct, start = self.prepare(order, order.calibration()), time.perf_counter()
         calibration = reconstruct.calibration
         frame, for_viewing = read_capture(order.capture, calibration, self.limits)
-        measurement = to_measurement(frame, calibration, self.limits)
+        measurement = to_device(to_measurement(frame, calibration, self.limits), reconstruct.device)
         job.advance(0.0)
         measurement, share = reconstruct.without_room_light(measurement)
+        pose = align(measurement, reconstruct.psf) if reconstruct.align else None
         with watch_iterations(lambda part: job.advance(0.9 * part)):
-            scene = _without_light(reconstruct, measurement).on_device(measurement).cpu()
+            scene = _prepared(reconstruct, pose).on_device(measurement)
         if not scene.isfinite().all():
             raise ImageError("The reconstruction holds NaN or infinity. Scale the capture, or use another method.")
         report = _report(order, reconstruct, time.perf_counter() - start)
         report["room_light"] = None if share is None else round(float(share), 4)
-        shown = reconstruct.as_recorded(scene)
-        job.result = Result(measurement, shown, calibration.light, calibration.white_balance, report)
+        shown = reconstruct.as_recorded(scene).cpu()
+        job.result = Result(measurement.cpu(), shown, calibration.light, calibration.white_balance, report)
         if order.trust:
             job.advance(0.9)
             job.state = "checking"
             with torch.inference_mode():
-                found = _check(frame, measurement, reconstruct, scene, for_viewing=for_viewing)
+                found = _check(frame, measurement, reconstruct, scene, pose, for_viewing=for_viewing)
             job.result = replace(job.result, report=report | found)
 
 
-def _without_light(reconstruct: Reconstructor, measurement: Measurement) -> Reconstructor:
-    """For a measurement whose room light is subtracted: with the pose of its PSF, if that is wanted."""
-    ready = copy.copy(reconstruct)
-    ready.room_light = False
-    return ready.at(align(measurement, ready.psf)) if ready.align else ready
+def _prepared(reconstruct: Reconstructor, pose: Pose | None) -> Reconstructor:
+    """For a measurement whose room light is subtracted, and whose pose is known."""
+    prepared = copy.copy(reconstruct)
+    prepared.room_light = False
+    return prepared if pose is None else prepared.at(pose)
 
 
 def with_ambient(calibration: Calibration, ambient: bytes, limits: Limits) -> Calibration:
@@ -182,12 +185,19 @@ def to_measurement(frame: Frame, calibration: Calibration, limits: Limits) -> Me
 
 
 def _check(
-    frame: Frame, measurement: Measurement, reconstruct: Reconstructor, scene: torch.Tensor, *, for_viewing: bool
+    frame: Frame,
+    measurement: Measurement,
+    reconstruct: Reconstructor,
+    scene: Scene,
+    pose: Pose | None,
+    *,
+    for_viewing: bool,
 ) -> dict[str, Any]:
     """Verdicts on the capture, the PSF and the picture, and the numbers behind them."""
     calibration = reconstruct.calibration
     verdicts = examine_capture(frame, calibration, for_viewing=for_viewing)
-    trust = examine_picture(measurement, calibration.psf, scene, given=calibration.psf_format.psf_orientation)
+    given = calibration.psf_format.psf_orientation
+    trust = examine_picture(measurement, reconstruct.psf, scene, pose=pose, given=given)
     if not trust.finite:
         raise ImageError("The numbers of the capture are too large or too small to be judged. Scale it.")
     listed = [{**asdict(verdict), "sentence": verdict.sentence} for verdict in (*verdicts, *trust.verdicts)]

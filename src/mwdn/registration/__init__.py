@@ -1,6 +1,6 @@
 """Where displayed pictures are in a camera's reconstructions, and aligned pairs for training."""
 
-from mwdn.registration.captured import CapturedPairs
+from mwdn.registration.captured import SessionPairs
 from mwdn.registration.estimate import Estimate, estimate, through_corners
 from mwdn.registration.outline import find_outline
 from mwdn.registration.projection import Projection
@@ -9,7 +9,7 @@ from mwdn.registration.views import Views
 from mwdn.registration.warp import warp_pictures
 
 __all__ = [
-    "CapturedPairs",
+    "SessionPairs",
     "Estimate",
     "Place",
     "Projection",

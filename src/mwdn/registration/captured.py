@@ -27,7 +27,7 @@ _FRAMES = 16
 SRGB = "srgb"
 
 
-class CapturedPairs:
+class SessionPairs:
     """The pairs of a session as the camera and the display had them. Use it in a ``with`` statement.
 
     Args:
@@ -59,7 +59,7 @@ class CapturedPairs:
     def __len__(self) -> int:
         return self._count
 
-    def __enter__(self) -> "CapturedPairs":
+    def __enter__(self) -> "SessionPairs":
         self._file = open_hdf5(self.path, _ADVICE)
         self._rows = {name: find_rows(self.path, self._file, name, _ADVICE) for name in NAMES}
         return self

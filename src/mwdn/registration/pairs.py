@@ -14,7 +14,7 @@ from mwdn.data.pairs import PairFile
 from mwdn.errors import AlignmentError, ShapeError
 from mwdn.fourier.convolution import convolve
 from mwdn.inference.reconstructor import Reconstructor
-from mwdn.registration.captured import CapturedPairs
+from mwdn.registration.captured import SessionPairs
 from mwdn.registration.projection import Projection
 from mwdn.registration.registration import KEY, as_attribute
 from mwdn.registration.views import Views
@@ -30,7 +30,7 @@ def chosen(count: int, most: int) -> list[int]:
     return [int(step * number) for number in range(min(count, most))]
 
 
-def reconstruct_views(pairs: CapturedPairs, reconstruct: Reconstructor, rows: list[int], track: Track = iter) -> Views:
+def reconstruct_views(pairs: SessionPairs, reconstruct: Reconstructor, rows: list[int], track: Track = iter) -> Views:
     """Reconstruct the session's patterns and some of the captures, for `mwdn.registration.estimate`.
 
     Raises:
@@ -46,7 +46,7 @@ def reconstruct_views(pairs: CapturedPairs, reconstruct: Reconstructor, rows: li
     return Views.of(pictures, scenes)
 
 
-def fit_levels(pairs: CapturedPairs, projection: Projection, psf: Psf, rows: list[int]) -> Tensor:
+def fit_levels(pairs: SessionPairs, projection: Projection, psf: Psf, rows: list[int]) -> Tensor:
     """Light of the display's white in each colour of the measurements, (C,), by least squares over some pairs.
 
     A measurement is ``g_c h * s_c + o_c``, with s the displayed picture in the camera's frame, and o the room's light.
@@ -73,7 +73,7 @@ def fit_levels(pairs: CapturedPairs, projection: Projection, psf: Psf, rows: lis
 
 def write_aligned(
     path: Path,
-    pairs: CapturedPairs,
+    pairs: SessionPairs,
     projection: Projection,
     content: Mapping[str, Any],
     *,

@@ -12,6 +12,7 @@ from mwdn.errors import CheckpointError, ParameterError
 from mwdn.inference.methods import psf_for
 from mwdn.networks import Network, build
 from mwdn.networks.empty import build_empty
+from mwdn.networks.network import FixedFront
 from mwdn.optics.polynomials import polynomial_order
 from mwdn.registration.distortion import measure_distortion
 from mwdn.registration.shading import measure_shading
@@ -51,9 +52,9 @@ def build_network(recipe: Recipe) -> nn.Module:
 
 
 def takes_channels(network: nn.Module, colours: int) -> bool:
-    """Whether a network takes measurements of so many channels; one with `estimates` takes grey as equal colours."""
+    """Whether a network takes measurements of so many channels; a `FixedFront` takes grey as equal colours."""
     channels = getattr(network, "channels", colours)
-    return channels in (0, colours) or (colours == 1 and hasattr(network, "estimates"))  # 0 is any number
+    return channels in (0, colours) or (colours == 1 and isinstance(network, FixedFront))  # 0 is any number
 
 
 def check_colours(network: Mapping[str, Any], colours: int, *, of: str, way_out: str) -> None:

@@ -257,7 +257,8 @@ def read_recipe(path: str | Path | None, **changes: Any) -> Recipe:  # noqa: ANN
         content[table] = checked_weights(content[table])
     tables = {name: to_dataclass(TABLES[name], name, table) for name, table in content.items() if name in TABLES}
     recipe = Recipe(**(content | tables))
-    captures = tuple(str(Path(path or "").parent / capture) for capture in recipe.sheet.captures)
+    folder = Path() if "captures" in replaced.get("sheet", {}) else Path(path or "").parent
+    captures = tuple(str(folder / capture) for capture in recipe.sheet.captures)
     return dataclasses.replace(recipe, sheet=Sheet(captures))
 
 

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from mwdn.data.random import seeded
 from mwdn.data.simulated import Samples, full_precision
 from mwdn.errors import ParameterError
+from mwdn.networks.network import FixedFront
 from mwdn.training.sample_files import Sample, SampleFiles
 from mwdn.types import Image, Scene
 
@@ -25,9 +26,8 @@ Progress = Callable[[int, int], None]
 class SampleCache:
     """A finite number of samples, used repeatedly, each time mirrored or transposed another way.
 
-    For networks whose forward pass is ``correct(estimates, unit(estimates))``, where the ``estimates`` from measurement
-    and PSF are not learned. `fill` computes samples before training and keeps them on the disk; a sample that it did
-    not compute is computed when it is first needed. A resumed run continues exactly.
+    `fill` computes samples before training and keeps them on the disk; a sample that it did not compute is computed
+    when it is first needed. A resumed run continues exactly.
 
     Args:
         pairs: source of the samples; its numbers 0 to ``size`` - 1 are used.
@@ -47,20 +47,21 @@ class SampleCache:
         self.pairs, self.size, self.batch_size, self.crop, self.seed = pairs, size, batch, crop, seed
         self.samples: dict[int, Sample] = {}
 
-    def check(self, network: nn.Module) -> None:
-        """Check that the network has a part to cache.
+    def front(self, network: nn.Module) -> FixedFront[Any]:
+        """The network, whose part before its learned one is cached.
 
         Raises:
             ParameterError: it learns from its first layer on.
         """
-        if not (hasattr(network, "estimates") and hasattr(network, "correct")):
+        if not isinstance(network, FixedFront):
             raise ParameterError(
                 f"`pool` ({self.size}) caches what a network computes before its learned part; "
                 f"{type(network).__name__} learns from its first layer on. Set `pool = 0`."
             )
+        return network
 
     @full_precision
-    def fill(self, network: Any, numbers: Iterable[int], files: SampleFiles, progress: Progress) -> None:  # noqa: ANN401
+    def fill(self, network: FixedFront[Any], numbers: Iterable[int], files: SampleFiles, progress: Progress) -> None:
         """Compute the samples of these numbers; read those that an interrupted run left on the disk.
 
         Args:
@@ -93,32 +94,34 @@ class SampleCache:
         progress(len(rows), len(rows))
 
     @full_precision
-    def reconstruct_whole(self, network: Any, numbers: range | list[int]) -> Image:  # noqa: ANN401
+    def reconstruct_whole(self, network: nn.Module, numbers: range | list[int]) -> Image:
         """Reconstructions in the order of the numbers, neither mirrored nor cropped: for validation."""
-        samples = [self._cached(network, number % self.size) for number in numbers]
+        front = self.front(network)
+        samples = [self._cached(front, number % self.size) for number in numbers]
         estimates, units, _ = (torch.stack(part).float() for part in zip(*samples, strict=True))
-        return network.as_recorded(network.correct(estimates, units))
+        return front.as_recorded(front.correct(estimates, units))
 
     @torch.no_grad()
-    def measured(self, measure: Measure, network: Any, order: int) -> Tensor:  # noqa: ANN401
+    def measured(self, measure: Measure, network: nn.Module, order: int) -> Tensor:
         """Apply a measure to the reconstructions and scenes of the samples computed so far, `MEASURED` at most."""
         rows = sorted(self.samples)[:: -(-len(self.samples) // MEASURED)]
         pictures = [self.reconstruct_whole(network, [row])[0] for row in rows]
         return measure(pictures, [self.samples[row].scene for row in rows], order)
 
-    def reconstruct(self, network: Any, numbers: range | list[int]) -> tuple[Image, Scene]:  # noqa: ANN401
+    def reconstruct(self, network: nn.Module, numbers: range | list[int]) -> tuple[Image, Scene]:
         """Reconstructions of the samples of these numbers, and their scenes."""
-        estimates, unit, scene = self.batch(network, numbers)
-        return network.correct(estimates, unit), scene
+        front = self.front(network)
+        estimates, unit, scene = self.batch(front, numbers)
+        return front.correct(estimates, unit), scene
 
     @full_precision
-    def batch(self, network: Any, numbers: range | list[int]) -> tuple[Tensor, Tensor, Scene]:  # noqa: ANN401
+    def batch(self, network: FixedFront[Any], numbers: range | list[int]) -> tuple[Tensor, Tensor, Scene]:
         """Estimates, units and scenes of the samples of these numbers, which may belong to any epoch."""
         samples = [self._sample(network, number) for number in numbers]
         estimates, units, scenes = (torch.stack(part).float() for part in zip(*samples, strict=True))
         return estimates, units, scenes
 
-    def _sample(self, network: Any, number: int) -> tuple[Tensor, Tensor, Tensor]:  # noqa: ANN401
+    def _sample(self, network: FixedFront[Any], number: int) -> tuple[Tensor, Tensor, Tensor]:
         """A cached sample, mirrored, transposed and cropped."""
         epoch, place = divmod(number, self.size)
         estimates, unit, scene = self._cached(network, self._row(epoch, place))
@@ -149,7 +152,7 @@ class SampleCache:
         return ..., slice(top, top + height), slice(left, left + width)
 
     @torch.no_grad()
-    def _cached(self, network: Any, row: int) -> Sample:  # noqa: ANN401
+    def _cached(self, network: FixedFront[Any], row: int) -> Sample:
         if row not in self.samples:
             measurement, scene, psf = self.pairs.batch([row])
             estimates = network.estimates(measurement, psf)

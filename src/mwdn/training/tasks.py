@@ -79,7 +79,7 @@ class SupervisedTask:
     def check(self, network: nn.Module) -> None:
         """Check that the network can use the cache."""
         if self.cache is not None:
-            self.cache.check(network)
+            self.cache.front(network)
 
     def loss(self, network: nn.Module, distance: Loss, numbers: range) -> tuple[Tensor, dict[str, Tensor]]:
         """Distance of the reconstructions and the scenes of these numbers, and its parts."""

@@ -42,9 +42,9 @@ def load_authors(state: dict[str, Tensor]) -> nn.Module:
     """
     name = "mwdn-cpsf" if "inc0.double_conv.0.weight" in state else "mwdn"
     extra = {"authors_scalars": True} if name == "mwdn-cpsf" else {"psf_pooling": "average"}
-    dense = [key for key, value in state.items() if not _is_dense(value)]
-    if dense:
-        raise CheckpointError(f"`{dense[0][:80]}` must be a plain tensor of numbers. Save it with `contiguous()`.")
+    not_dense = [key for key, value in state.items() if not _is_dense(value)]
+    if not_dense:
+        raise CheckpointError(f"`{not_dense[0][:80]}` must be a plain tensor of numbers. Save it with `contiguous()`.")
     first = state["inc.double_conv.0.weight"]
     scalars = {"w": 1, "delta": 5} if name == "mwdn-cpsf" else {"w": 4, "delta": 4}
     wrong = [key for key, length in scalars.items() if state[key].shape != (length,)]

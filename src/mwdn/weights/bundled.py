@@ -6,12 +6,15 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from mwdn.errors import CheckpointError, checked
+from mwdn.errors import CheckpointError, checked, reason
 from mwdn.runtime.requirement import require
 from mwdn.weights.checkpoint import load_checkpoint, read_metadata, save_network
 from mwdn.weights.growth import grown
 
-BUNDLED = ("universal", "universal-small")
+BUNDLED = {
+    "universal": "Any camera, no training, the best pictures: alignment, plug-and-play ADMM, U-Net.",
+    "universal-small": "Any camera, no training, faster: no alignment, no plug and play.",
+}
 """Bundled networks, for any camera. Model card: `mwdn/weights/README.md`."""
 
 HUB = "hub:"
@@ -63,10 +66,9 @@ def _download(name: str) -> Path:
     try:
         return Path(hf_hub_download(f"{owner}/{repository}", file or "model.safetensors"))
     except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError, OSError, ValueError) as error:
-        reason = str(error).strip().splitlines()[0]
         raise CheckpointError(
-            f"`{name}` cannot be fetched from the hub: {reason} Check the name and the network, or download the file "
-            "and give its path."
+            f"`{name}` cannot be fetched from the hub: {reason(error)}. Check the name and the network, or "
+            "download the file and give its path."
         ) from error
 
 

@@ -2,7 +2,7 @@
 
 import { pageWords } from "./hints.js";
 
-const WORDS = { good: "good", doubt: "doubtful", unknown: "cannot tell", bad: "bad", mind: "mind" };
+const WORDS = { good: "good", doubt: "doubtful", unknown: "cannot tell", bad: "bad", weak: "weak" };
 
 // "psf, little explained" as a title.
 function titled(text) {
