@@ -66,7 +66,7 @@ def main():
         spectra.append(radial_spectrum(psf))
         if arguments.count:
             record[name] = scores(psf, Photographs(arguments.photographs), arguments.count)
-    ratio = spectra[1] / spectra[0]  # entry i is at i / 120 periods a pixel
+    ratio = spectra[1] / spectra[0]  # entry i is at i / 120 cycles per pixel
     print("diffuser over contour:", ", ".join(f"{i / 120:.2f}: {ratio[i]:.2f}" for i in (2, 4, 6, 8, 12, 24, 36, 48)))
     if not record:
         return

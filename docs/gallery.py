@@ -7,6 +7,7 @@ only into results/gallery/, which git ignores.
 """
 
 import os
+import re
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
@@ -19,11 +20,11 @@ from torch.nn import functional as F
 from mwdn import Calibration, Camera, Reconstructor, read_picture, write_picture
 from mwdn.evaluation import psnr
 from mwdn.io.contact_sheets import contact_sheet, to_display
-from mwdn.io.files import atomic
+from mwdn.io.files import atomic, write_text
 from mwdn.io.images import srgb_encode
 from mwdn.optics import CodedAperture, Contour, Diffuser, Lenslets, Mask, Pinholes, Setup, ZoneAperture, mask_psf
 from mwdn.optics.design import Designed, design_camera
-from mwdn.optics.psf_measures import radial_autocorrelation, sharpness
+from mwdn.optics.psf_measures import autocorrelation_width, radial_autocorrelation
 from mwdn.optics.psf_spectrum import radial_spectrum
 from mwdn.types import Psf, Scene
 
@@ -42,71 +43,8 @@ CAMERAS = {
 """All on the paper's sensor behind its aperture, nearer where diffraction would blur the shadow. The contour mask is
 the open part of the paper's mask, at every 30 nm of the band: a minute instead of three."""
 
-PAGE = """# Masks
-
-Six kinds of masks, compared by `python docs/gallery.py`. Every mask has the same sensor (1280 x 1280 pixels of 2.4 um,
-binned by 4) and white light. The same scene is captured through `Camera` and `Sensor` (15,000 electrons, brightest
-pixel at 90 %), and reconstructed by two methods without training.
-
-The scene fills the same fraction of each sensor. A mask nearer to the sensor has a wider field, so its scene covers a
-larger angle. [Design a camera](optics.md) explains the kinds and their parameters, and how to compute the PSF of your
-own mask. Terms are in the [glossary](glossary.md#the-camera).
-
-![mask, PSF, spectrum, measurement, Wiener and ADMM for each mask](masks.jpg)
-
-| mask | to sensor | light | exposure | resolution | Wiener | ADMM |
-| --- | --- | --- | --- | --- | --- | --- |
-{rows}
-
-- *Light*: fraction of the light on the aperture that reaches the sensor.
-- *Exposure*: time until the brightest pixel is at 90 %, contour mask = 1.
-- *Resolution*: width of the PSF's autocorrelation as an angle.
-- *Wiener*, *ADMM*: PSNR in dB with the exact PSF; real cameras add calibration errors. One scene and one noise sample:
-  differences below a dB are not significant.
-
-A method can recover frequencies that the mask does not pass only by prior knowledge of pictures. A PSF of few bright
-spots (pinholes) gives the best picture if there is plenty of light, but it needs the longest exposure.
-
-## Contour mask or diffuser
-
-The paper prefers the contour mask for its contrast. Here the diffuser is ahead, in the table above and over six
-photographs. These fill 137 of 320 pixels, as the paper's display does. The table has the PSNR in dB of the central
-128 x 128 pixels, and the difference with its interval over the photographs
-(`python benchmarks/masks.py ../shared/data/photos/test`, [record](../benchmarks/results/masks.json)):
-
-| light and PSF | method | contour | diffuser | difference |
-| --- | --- | --- | --- | --- |
-| 15,000 e, exact | Wiener | 19.54 | 21.29 | +1.75 (+1.29 to +2.17) |
-| | pyramid | 35.24 | 35.43 | +0.19 (-0.32 to +0.63) |
-| 1,000 e, exact | Wiener | 17.82 | 18.22 | +0.40 (+0.24 to +0.63) |
-| | pyramid | 30.57 | 31.46 | +0.89 (+0.33 to +1.40) |
-| 15,000 e, rotated by 0.5 degrees, haze, field | Wiener | 19.21 | 20.53 | +1.33 (+0.96 to +1.65) |
-| | pyramid | 29.12 | 29.31 | +0.19 (+0.00 to +0.35) |
-
-The spectra of the two PSFs explain it (the same command with `--count 0` prints them):
-
-| periods a pixel | modulus of the diffuser over that of the contour mask |
-| --- | --- |
-| 0.02 to 0.07 | 1.5 to 4.1 |
-| 0.1 and more | 0.82 to 0.89 |
-
-Photographs have most of their contrast at low frequencies, where the diffuser passes more. The contour mask resolves
-finer angles, so it may be better for scenes that have only fine detail. This was not measured.
-
-## Designed and measured PSF of the paper's camera
-
-The PSF of the designed contour mask, and its curves beside those of the paper's measured PSF:
-
-![designed PSF, and its curves beside the measured ones](paper-camera.jpg)
-
-- **What agrees**: the ring in the spectrum, from the even line spacing (a period of 11 to 12 pixels), and the fall
-  towards high frequencies, from the line width.
-- **What differs**: about half of the light of the measured PSF fills the shadow of the aperture evenly. The design
-  lacks this haze. Etching errors and reflections are its likely sources.
-- **With the haze added**: if this fraction of the designed PSF's light is left undeflected, the modulus is 0.6 to 1.15
-  times the measured one from 0.05 periods a pixel on, lowest below the ring. The autocorrelation differs by at most
-  0.07. The fraction was chosen so that the medians of the spectra agree.
-"""
+ROWS = re.compile(r"(?<=\| --- \|\n)\| contour \|.*?(?=\n\n- \*Light)", re.DOTALL)
+"""Rows of the first table of docs/masks.md."""
 
 
 def scene() -> Scene:
@@ -181,7 +119,8 @@ def compare(designed: Psf, measured: Psf) -> None:
     for name, psf in both.items():
         ratios = spectra[name][6:] / spectra["measured"][6:]
         error = abs(correlations[name] - correlations["measured"]).max()
-        print(f"{name}: autocorrelation {sharpness(psf):.2f} px wide, at most {error:.2f} from the measured one;")
+        width = autocorrelation_width(psf)
+        print(f"{name}: autocorrelation {width:.2f} px wide, at most {error:.2f} from the measured one;")
         print(
             f"  ring at {spectra[name][6:].argmax() + 6} / 120; "
             f"spectrum {ratios.min():.2f} to {ratios.max():.2f} of measured"
@@ -190,7 +129,7 @@ def compare(designed: Psf, measured: Psf) -> None:
     sheet = np.concatenate(
         [
             picture[..., ::-1],
-            plot(spectra, "modulus of the transfer function / periods a pixel", (0, 0.5), log=True),
+            plot(spectra, "modulus of the transfer function / cycles per pixel", (0, 0.5), log=True),
             plot(correlations, "autocorrelation / pixels of 9.6 um", (0, 30), log=False),
         ],
         axis=1,
@@ -218,8 +157,8 @@ def main() -> None:
         print(table[-1], flush=True)
     titles = ["mask (middle)", "PSF", "spectrum (3 decades)", "measurement", "Wiener", "ADMM"]
     write_jpeg(DOCS / "masks.jpg", contact_sheet(rows, titles))
-    with atomic(DOCS / "masks.md") as temporary:
-        temporary.write_text(PAGE.format(rows="\n".join(table)), encoding="utf-8")
+    page = (DOCS / "masks.md").read_text(encoding="utf-8")
+    write_text(DOCS / "masks.md", ROWS.sub(lambda _: "\n".join(table), page, count=1))
     data = Path(os.environ.get("MWDN_DATA", DOCS.parents[1] / "shared" / "data"))
     measured = data / "mwdn-camera" / "psf_320.png"
     if measured.is_file() and contour is not None:

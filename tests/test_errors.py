@@ -9,7 +9,8 @@ import mwdn
 from mwdn import Calibration, Camera, FrameFormat, Reconstructor, Sensor
 from mwdn.errors import MwdnError, ParameterError, UnknownNameError
 from mwdn.networks import DENOISERS, NETWORKS, FlatNet, LeAdmm, Mwdn, WienerBank
-from mwdn.solvers import _NETWORKS, SOLVERS, Admm, Fista, Pyramid, WarmStart, Wiener
+from mwdn.solvers import BUNDLED_NAMES, NETWORK_NAMES, SOLVERS, Admm, Fista, Pyramid, WarmStart, Wiener
+from mwdn.weights.bundled import BUNDLED
 
 PSF = torch.ones(1, 3, 8, 8)
 
@@ -107,7 +108,8 @@ def test_what_json_and_numpy_hold_is_accepted():
 
 def test_solvers_and_networks_name_each_other():
     """The solvers' list of networks is written by hand: networks are above solvers."""
-    assert (NETWORKS.keys() | DENOISERS.keys()) - SOLVERS.keys() == _NETWORKS
+    assert (NETWORKS.keys() | DENOISERS.keys()) - SOLVERS.keys() == NETWORK_NAMES
+    assert BUNDLED.keys() == BUNDLED_NAMES
     with pytest.raises(ParameterError, match=r"'le-admm' is a network, .*`mwdn\.networks\.build\('le-admm'\)`"):
         mwdn.solvers.build("le-admm")
     with pytest.raises(ParameterError, match=r"'admm' is a solver, .*`mwdn\.solvers\.build\('admm'\)`"):

@@ -18,10 +18,8 @@ HERE = Path(__file__).resolve().parent
 
 
 def scripts():
-    """Every script of the gallery by its name, in the order of the site: the easy ones first."""
-    first = ("forward_model", "wiener_or_admm", "cropping", "wrong_psf", "zero_shot")
-    found = {path.stem: path for path in sorted(HERE.glob("*.py")) if path.stem != "__main__"}
-    return {**{name: found[name] for name in first}, **found}
+    """Every script of the gallery by its name."""
+    return {path.stem: path for path in sorted(HERE.glob("*.py")) if path.stem != "__main__"}
 
 
 def main():

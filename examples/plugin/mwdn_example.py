@@ -82,7 +82,9 @@ class Ring:
     def build(self, setup: Setup) -> Mask:
         """The mask; it fills the aperture."""
         height, width = (round(1000 * side / self.pitch_um) for side in setup.aperture_mm)
-        y, x = torch.meshgrid(torch.arange(height) - height / 2, torch.arange(width) - width / 2, indexing="ij")
+        y, x = torch.meshgrid(
+            torch.arange(float(height)) - height // 2, torch.arange(float(width)) - width // 2, indexing="ij"
+        )
         away_mm = (torch.hypot(y, x) * self.pitch_um / 1000 - self.radius_mm).abs()
         return Mask("amplitude", (away_mm < self.width_mm / 2).float(), self.pitch_um)
 

@@ -119,8 +119,9 @@ def checked(decorated: _Checked) -> _Checked:
 @cache
 def _annotations(of: Callable[..., Any]) -> tuple[dict[str, Any], bool]:
     """Annotated type of each argument, `Any` if there is none; and whether the function takes any other name."""
+    function: Any = of
     try:
-        hints = get_type_hints(vars(of)["__init__"] if isinstance(of, type) else of)
+        hints = get_type_hints(function.__init__ if isinstance(of, type) else function)
     except NameError:  # annotations as text, of names that are local to a function
         hints = {}
     parameters = signature(of).parameters.values()

@@ -27,7 +27,7 @@ def test_designed_camera_looks_like_the_measured_one(data: Path) -> None:
     rings = [spectrum[6:].argmax() + 6 for spectrum in (ours, theirs)]
     assert abs(rings[0] - rings[1]) <= 1
     # The measured PSF has more even light under its lines, which divides all of its spectrum by one number: that
-    # number is free. From 0.2 periods a pixel on, the fall is that of the lines' width and of diffraction (measured:
+    # number is free. From 0.2 cycles per pixel on, the fall is that of the lines' width and of diffraction (measured:
     # within 14 %); nearer the ring it depends on how even the lines' distances are (measured: within 35 %).
     ratio = ours[12:] / theirs[12:]
     assert 1.5 < np.median(ratio) < 3.0

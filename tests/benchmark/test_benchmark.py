@@ -280,7 +280,7 @@ def test_another_method_and_another_set_are_a_line_each(done):
         ('compared = "mwdn"', 'compered = "mwdn"', UnknownNameError, "Did you mean 'compared'?"),
         ('compared = "mwdn"', "compared = 3", ParameterError, "must be of the same kind as its default"),
         ("off_axis = 1 }", "of_axis = 1 }", UnknownNameError, "Did you mean 'off_axis'?"),
-        ("off_axis = 1 }", "off_axis = -1 }", ParameterError, "must not be negative"),
+        ("off_axis = 1 }", "off_axis = -1 }", ParameterError, "must be from 0 to 3.3"),
         ("train = 4", "train = -4", ParameterError, "at least 0"),
         ('psf = "psf.npy", ', "", ParameterError, "must name a PSF"),
         ('psf = "psf.npy"', 'psf = "$MWDN_NOWHERE/psf.npy"', ParameterError, "`MWDN_NOWHERE`.*is not set"),
@@ -677,6 +677,21 @@ def test_a_camera_that_is_drawn_for_each_pair_has_no_robustness_but_to_noise(fol
     text = RECIPE.replace("deviation = { turn_degrees = 1, off_axis = 1 }", "mismatch = { blur_px = 0.5 }")
     (folder / "r.toml").write_text(text, encoding="utf-8")
     with pytest.raises(ParameterError, match=r"`noise` for `caustic`, not `shift_px`: its `mismatch`"):
+        run(read_benchmark(folder / "r.toml"), folder / "out", device="cpu", lpips=False)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("count = 0, noise = [2]", r"`count` \(0\) of \[robustness\] must be at least 1"),
+        ("count = 2, noise = [0]", r"`noise` \(0\) of \[robustness\] must be positive"),
+        ("count = 2, off_axis = [3]", r"`off_axis` \(4.0\) must be from 0 to 3.3"),
+    ],
+)
+def test_sizes_of_robustness_are_checked_before_the_training(folder, line, message):
+    text = RECIPE.replace("count = 2, noise = [2], shift_px = [1]", line)
+    (folder / "r.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(ParameterError, match=message):
         run(read_benchmark(folder / "r.toml"), folder / "out", device="cpu", lpips=False)
 
 

@@ -11,7 +11,7 @@ from mwdn.calibration.frame_average import average_frames
 from mwdn.calibration.hot_pixels import find_hot_pixels
 from mwdn.calibration.photon_transfer import photon_transfer
 from mwdn.calibration.pixel_repair import PixelRepair
-from mwdn.errors import ImageError, ParameterError
+from mwdn.errors import ImageError, ParameterError, ShapeError
 from mwdn.optics import Sensor
 from mwdn.optics.displacement import displacement, shifted
 from photographed_camera import SENSOR, STEPS, Bench
@@ -203,4 +203,6 @@ def test_displacement_between_pixels(bench):
         assert found[:2] == pytest.approx((down, right), abs=0.01)
     half = (image + shifted(image, 1, 0)) / 2
     assert displacement(half, image).down == pytest.approx(0.5, abs=0.01)
+    with pytest.raises(ShapeError, match="must have the same height and width"):
+        displacement(image, image[..., 1:])
     assert torch.equal(shifted(image, 200, 0), torch.zeros_like(image))

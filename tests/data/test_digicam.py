@@ -8,9 +8,11 @@ from pyarrow import parquet
 from test_importers import flag, png, write
 
 from mwdn import Camera, read_frame
+from mwdn.calibration import FrameFormat
 from mwdn.data import PairFile
 from mwdn.data.digicam import DigiCam, import_digicam
 from mwdn.errors import ImageError, ParameterError, ShapeError
+from mwdn.io.images import write_frame
 from mwdn.optics.lcd_mask import Lcd, lcd_psf
 from mwdn.optics.psf_measures import likeness
 from mwdn.optics.setup import Setup
@@ -77,6 +79,41 @@ def test_folders_with_metadata_and_one_room(tmp_path):
     kept = import_digicam(folder, tmp_path / "kept.h5", DigiCam(sensor_mm=2.0, background="none"))
     with PairFile(next(iter(kept.files))) as pairs:
         assert torch.equal(pairs[0][0].movedim(0, -1), torch.from_numpy(flag(100, 38, 50) / np.float32(255)))
+
+
+@pytest.mark.parametrize("frames", [FrameFormat(bit_depth=12), FrameFormat(gamma=2.2), FrameFormat(gamma="srgb")])
+def test_room_light_is_subtracted_from_linear_light(frames, tmp_path):
+    """The bit depth divided twice, and the gamma decoded the difference."""
+    folder, times = tmp_path / "set", 16 if frames.bit_depth else 1
+    patterns(folder, (0,))
+    capture, room = (flag(seed, 38, 50).astype(np.uint16 if frames.bit_depth else np.uint8) * times for seed in (1, 2))
+    for name, picture in (("lensless", capture), ("background", room // 4), ("lensed", flag(0, 38, 50))):
+        (folder / name).mkdir()
+        write_frame(folder / f"{name}/a.png", picture)
+    import_digicam(folder, tmp_path / "pairs.h5", CAMERA, frames=frames)
+    with PairFile(tmp_path / "pairs.h5") as pairs:
+        expected = frames.to_measurement(capture) - frames.to_measurement(room // 4)
+        torch.testing.assert_close(pairs[0][0], expected[0], rtol=0, atol=1e-6)
+
+
+def test_metadata_of_subfolders_and_an_empty_line(run, tmp_path):
+    folder = tmp_path / "set"
+    patterns(folder, (1, 2))
+    for name in ("a/0", "b/0"):
+        write(folder / f"lensless/{name}.png", flag(5, 38, 50))
+        write(folder / f"lensed/{name}.png", flag(6, 38, 50))
+    (folder / "metadata.csv").write_text("file_name,mask_label\na/0.png,1\nb/0.png,2\n,\n")
+    done = import_digicam(folder, tmp_path / "pairs.h5", CAMERA)
+    assert list(done.files.values()) == [("1", 1), ("2", 1)]
+    with pytest.raises(ImageError, match=r"`background` \(backgroud\) must be a column or a folder"):
+        import_digicam(folder, tmp_path / "pairs.h5", DigiCam(background="backgroud"))
+
+
+def test_labels_beside_a_missing_one_are_whole_numbers(tmp_path):
+    folder = tmp_path / "set"
+    patterns(folder, (0, 1))
+    shard(folder / "a.parquet", labels=[0.0, 1.0, 1.0, 1.0])
+    assert list(import_digicam(folder, tmp_path / "pairs.h5", CAMERA).files.values()) == [("0", 1), ("1", 3)]
 
 
 def test_a_column_of_room_light_is_subtracted_and_one_pattern_needs_no_label(tmp_path):

@@ -33,6 +33,7 @@ def test_the_turn_makes_a_psf_fit_whose_pixels_were_turned(number):
 def test_two_other_tags_name_no_turn():
     verdict = exif_turn(6, 8)
     assert (verdict.state, verdict.value, verdict.options) == ("doubt", "", "")
+    assert "a program has turned" not in verdict.text  # it would have reset the tag to 1
 
 
 def test_the_capture_itself_settles_the_doubt():

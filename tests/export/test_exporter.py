@@ -486,6 +486,7 @@ def test_options_of_an_object_are_refused(tmp_path):
         ("camera.pt2", {"precision": "int8"}, r"`precision` int8 .*\.onnx"),
         ("camera.onnx", {"precision": "half"}, r"`precision` must be float32, float16 or int8, not 'half'"),
         ("camera.onnx", {"channels": 2}, r"`channels` \(2\) must be 1 or 3"),
+        ("camera.onnx", {"channels": 1}, r"`channels` \(1\) must be 3, because the PSF has colours"),
     ],
 )
 def test_wrong_calls(out, options, message, tmp_path):

@@ -72,7 +72,9 @@ def test_plus_changes_one_number():
         start.plus("turn", 1.0)
 
 
-@pytest.mark.parametrize("wrong", [{"background": 1.0}, {"background": -0.1}, {"scale": -1.0}, {"off_axis": -1.0}])
+@pytest.mark.parametrize(
+    "wrong", [{"background": 1.0}, {"background": -0.1}, {"scale": -1.0}, {"off_axis": -1.0}, {"off_axis": 4.0}]
+)
 def test_what_no_camera_can_have(wrong):
     with pytest.raises(ParameterError, match="must"):
         Deviation(**wrong)

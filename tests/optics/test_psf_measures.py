@@ -101,7 +101,7 @@ def test_sharpness_of_a_known_spot():
     """A Gaussian of width s has an autocorrelation of width sqrt(2) s; without its mean, on rings, 4 % less."""
     y, x = torch.arange(81.0)[:, None] - 40, torch.arange(91.0) - 45
     spot = torch.exp(-(y**2 + x**2) / (2 * 3.0**2))[None, None]
-    assert psf_measures.sharpness(spot / spot.sum()) == pytest.approx(2.355 * 2**0.5 * 3.0, rel=0.05)
+    assert psf_measures.autocorrelation_width(spot / spot.sum()) == pytest.approx(2.355 * 2**0.5 * 3.0, rel=0.05)
 
 
 def test_radial_autocorrelation_is_1_at_0(generator):

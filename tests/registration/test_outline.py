@@ -40,18 +40,25 @@ def test_a_linear_estimate_of_noise_alone_changes_nothing():
     assert (find_outline(drawn(), noise) == find_outline(drawn())).all()
 
 
+def test_an_even_linear_estimate_changes_nothing():
+    """It ended in numpy's error: no profile falls."""
+    assert (find_outline(drawn(), np.ones((200, 200), np.float32)) == find_outline(drawn())).all()
+
+
 def test_turned_a_quarter_the_corners_turn_too():
     turned = np.rot90(drawn()).copy()  # (x, y) moves to (y, 199 - x)
     expected = np.stack([CORNERS[:, 1], 199 - CORNERS[:, 0]], -1)
     assert find_outline(turned) == pytest.approx(np.roll(expected, -1, 0), abs=1.5)
 
 
-@pytest.mark.parametrize("kind", ["noise", "disc", "dark"])
+@pytest.mark.parametrize("kind", ["noise", "disc", "dark", "even"])
 def test_no_display_is_refused(kind):
     image = 0.3 * np.random.default_rng(1).random((160, 160)).astype(np.float32)
     if kind == "disc":
         cv2.circle(image, (80, 80), 40, 1.0, -1, cv2.LINE_AA)
     if kind == "dark":
         image[:] = 0
+    if kind == "even":
+        image[:] = 0.5
     with pytest.raises(AlignmentError, match="--points"):
         find_outline(image)

@@ -154,11 +154,51 @@ def test_a_broken_plugin_is_named_and_the_others_work(install, run):
 
 def test_a_plugin_cannot_replace_a_method_of_this_package_or_of_another(install):
     install("a-first", {"mwdn.solvers": {"mine": "mwdn.solvers:Fista"}})
-    install("b-second", {"mwdn.solvers": {"mine": "mwdn.solvers:Wiener", "admm": "mwdn.solvers:Wiener"}})
+    taken = dict.fromkeys(("mine", "admm", "universal", "unet"), "mwdn.solvers:Wiener")
+    install("b-second", {"mwdn.solvers": taken})
     with pytest.warns(UserWarning, match="is ignored") as caught:
         assert SOLVERS["mine"] is mwdn.solvers.Fista
     assert SOLVERS["admm"] is mwdn.solvers.Admm
-    assert [str(warning.message).split("`")[-2] for warning in caught] == ["mwdn", "a-first"]
+    assert "universal" not in SOLVERS
+    assert [str(warning.message).split("`")[-2] for warning in caught] == ["mwdn", "a-first", "mwdn", "mwdn"]
+
+
+WRONG = """
+from dataclasses import dataclass
+
+class Base:
+    def __init__(self, gain: float = 1.0):
+        self.gain = gain
+
+class Inherits(Base):
+    def __call__(self, measurement, psf):
+        return measurement * self.gain
+
+class Numpy:
+    def __call__(self, measurement, psf):
+        return measurement.numpy()
+
+@dataclass(frozen=True)
+class Plane:
+    def build(self, setup):
+        return 3
+"""
+
+
+@pytest.mark.filterwarnings("always")
+def test_what_plugins_return_is_checked_and_inherited_options_work(install, run, files):
+    """Each ended in a traceback."""
+    groups = {"mwdn.solvers": {"heir": "wrongs:Inherits", "numeric": "wrongs:Numpy"}}
+    folder = install("mwdn-wrong", groups | {"mwdn.masks": {"plane": "wrongs:Plane", "lost": "no_such_module:Mask"}})
+    (folder / "wrongs.py").write_text(WRONG)
+    line = "reconstruct capture.npy --psf psf.npy --background 0 --bin 1 --no-trust --out out --method"
+    assert run(f"{line} heir --gain 2")[0] == 0
+    code, _, err = run(f"{line} numeric")
+    assert (code, "must return a tensor (B, C, H, W), not ndarray" in err) == (1, True), err
+    code, _, err = run("design plane")
+    assert (code, "must return a `mwdn.optics.Mask`, not 3" in err) == (2, True), err
+    code, _, err = run("design lost")
+    assert (code, "No module named 'no_such_module'" in err) == (2, True), err
 
 
 @pytest.mark.parametrize("line", ["--help", "reconstruct --help", "design contour --help", "recipes"])

@@ -12,7 +12,7 @@ from cameras import contour_psf
 from mwdn.fourier.convolution import convolve
 from mwdn.networks import build
 from mwdn.solvers import Penalties
-from mwdn.solvers.levels import REFERENCE_NOISE, Level, brightness
+from mwdn.solvers.levels import REFERENCE_NOISE, Level, root_mean_square
 from mwdn.solvers.plug_and_play import certainty, plug_and_play
 from mwdn.solvers.pyramid import solve
 
@@ -67,7 +67,7 @@ def test_fixed_point_minimises_data_and_prior(generator):
         estimate, denoise, 1501, noise_levels=(level, level), noise_exponent=0.0, prior_weight=weight
     )
     torch.testing.assert_close(result.scene, z.float()[None, None])
-    noise = estimate.noise.clamp(min=REFERENCE_NOISE) * brightness(estimate.measurement)
+    noise = estimate.noise.clamp(min=REFERENCE_NOISE) * root_mean_square(estimate.measurement)
     rho = weight * float(noise / (level * brightest)) ** 2
     inside = np.zeros((7, 8), bool)
     inside[centre] = True
@@ -161,7 +161,7 @@ def test_residual_of_a_wrong_psf_counts_as_noise(solved):
     """With constant denoiser levels, which follow the sensor's noise alone."""
     estimate, _, psf = solved
     wrong = solve(estimate.measurement, psf.flip(-1))
-    relative = brightness(wrong.residual) / brightness(wrong.measurement)
+    relative = root_mean_square(wrong.residual) / root_mean_square(wrong.measurement)
     assert (relative > 1.5 * wrong.noise.clamp(min=REFERENCE_NOISE)).all()
     blur = lambda picture, level: torch.nn.functional.avg_pool2d(picture, 3, 1, 1)  # noqa: E731
     expected, result = (

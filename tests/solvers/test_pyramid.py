@@ -15,7 +15,7 @@ from mwdn.errors import ParameterError
 from mwdn.optics.noise import noise_level
 from mwdn.solvers import Penalties
 from mwdn.solvers.levels import LEVELS, Level
-from mwdn.solvers.pyramid import Pyramid, even_light, halve, low_band, solve
+from mwdn.solvers.pyramid import Pyramid, even_start, halve, low_band, solve
 from mwdn.solvers.splitting import Problem
 from mwdn.solvers.wiener import Wiener
 
@@ -50,7 +50,7 @@ def test_even_light_is_that_of_an_evenly_lit_frame(generator):
     colours = torch.tensor([0.2, 1.0, 0.5])[:, None, None]
     b = Camera(psf).forward(colours.expand(1, 3, *size))
     problem = Problem.from_psf(b, psf.expand(1, 3, -1, -1))
-    light = even_light(problem)
+    light = even_start(problem)
     torch.testing.assert_close(light[..., : size[0], : size[1]], colours.expand(1, 3, *size), rtol=1e-4, atol=1e-4)
     assert light.sum((-2, -1)) == pytest.approx(light[..., : size[0], : size[1]].sum((-2, -1)))
 
@@ -142,7 +142,7 @@ def test_coarse_scene_is_enlarged_and_cropped(downsampling, size, generator):
 def test_impossible_constants_are_refused():
     with pytest.raises(ParameterError, match=r"`regularisation` \(0.0\) must be positive"):
         Pyramid(0.0)
-    for sizes in ((), (2, 4), (3, 1), (2, 2)):
+    for sizes in ((), (2, 4), (3, 1), (2, 2), (4, 2), (1, 0)):
         with pytest.raises(ParameterError, match=r"`levels` .* powers of two"):
             Pyramid(levels=tuple(Level(size, 1, FINE) for size in sizes))
 

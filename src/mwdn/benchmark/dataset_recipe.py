@@ -100,7 +100,7 @@ _PHLATCAM = DatasetRecipe(background=0.0)
 _REAL = Deviation(turn_degrees=0.5, background=0.1, off_axis=1.0)
 
 PRESETS: dict[str, DatasetRecipe] = {
-    # The display took 137 of 320 pixels, 2.5 of the 91.5 beside it off the centre.
+    # The display fills 137 of 320 pixels and lies 2.5 off the centre; 91.5 are free on each side (0.027 of them).
     "mwdn-sim": replace(_PAPER, placement=Placement((0.428, 0.428), 1.0, 0.0, 0.027), deviation=_REAL),
     # Scenes of many sizes about the 210 x 380 that its display filled; the noise explains its captures.
     "diffusercam-sim": replace(

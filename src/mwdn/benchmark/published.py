@@ -60,7 +60,7 @@ PUBLISHED: dict[str, Published] = {
     "flatnet": Published(
         "adam",
         3e-4,
-        "code of Khan et al. 2020 (FlatNet-gen): 4e-10 for the inverse, in its units; also an adversarial part, 0.6",
+        "code of Khan et al. 2022 (FlatNet-gen): 4e-10 for the inverse, in its units; also an adversarial part, 0.6",
         batch=5,
         epochs=31,
         lr_schedule="cosine",

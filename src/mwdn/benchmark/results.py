@@ -59,9 +59,11 @@ def environment(device: torch.device) -> dict[str, str]:
 
 def _commit() -> str:
     """Commit of the checkout that mwdn runs from, marked as dirty if files have changed since."""
-    call = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40"]
-    try:
-        process = subprocess.run(call, capture_output=True, text=True, check=True, timeout=20)
+    own = Path(__file__)
+    git = ["git", "-C", str(own.parent)]
+    try:  # another project's repository may hold the environment that mwdn is installed in
+        subprocess.run([*git, "ls-files", "--error-unmatch", own.name], capture_output=True, check=True, timeout=20)
+        call = [*git, "describe", "--always", "--dirty", "--abbrev=40"]
+        return subprocess.run(call, capture_output=True, text=True, check=True, timeout=20).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return "not a checkout"
-    return process.stdout.strip()

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from mwdn.benchmark.dataset_recipe import DatasetRecipe
 from mwdn.benchmark.recipe import AXES, Robustness
 from mwdn.benchmark.scoring import read_record
 from mwdn.benchmark.sets import Dataset, simulated_pairs
@@ -30,12 +31,27 @@ def noisier(sensor: Sensor, factor: float) -> Sensor:
     """A sensor with ``factor`` times the noise at every brightness.
 
     The variance of shot noise is signal / full well; read noise is a standard deviation in electrons.
+
+    Raises:
+        ParameterError: the factor is not positive.
     """
+    if not factor > 0:
+        raise ParameterError(f"`noise` ({factor:g}) of [robustness] must be positive: a factor.")
     return replace(sensor, full_well=sensor.full_well / factor**2, read_noise=sensor.read_noise / factor)
 
 
 def check_axes(robustness: Robustness, dataset: Dataset) -> None:
-    """Raise a `ParameterError` if more than the noise is to change of a camera whose PSFs are measured or random."""
+    """Check before the training that all sizes can be tested later.
+
+    Raises:
+        ParameterError: a size is out of range; or more than the noise is to change of a camera whose PSFs are measured
+            or random.
+    """
+    if robustness.sizes and robustness.count < 1:
+        raise ParameterError(f"`count` ({robustness.count}) of [robustness] must be at least 1.")
+    for axis, sizes in robustness.sizes.items():
+        for size in sizes:
+            _changed(dataset.recipe, axis, size)
     axes = [axis for axis in robustness.sizes if axis != "noise"]
     if axes and dataset.recipe.mismatch != EXACT:
         raise ParameterError(
@@ -62,14 +78,17 @@ def pairs_at(dataset: Dataset, photographs: Photographs, count: int, axis: str, 
     Returns:
         measurements and scenes, (count, C, H, W).
     """
-    recipe = dataset.recipe
-    if axis == "noise":
-        recipe = replace(recipe, sensor=noisier(recipe.sensor, size))
-    else:
-        recipe = replace(recipe, deviation=recipe.deviation.plus(axis, size))
+    recipe = _changed(dataset.recipe, axis, size)
     source = simulated_pairs(recipe, dataset.calibration, photographs, torch.device("cpu"))
     batches = [source.batch([FILE_START + number]) for number in range(count)]
     return torch.cat([batch.measurement for batch in batches]), torch.cat([batch.scene for batch in batches])
+
+
+def _changed(recipe: DatasetRecipe, axis: str, size: float) -> DatasetRecipe:
+    """A data set with more noise, or with a larger deviation."""
+    if axis == "noise":
+        return replace(recipe, sensor=noisier(recipe.sensor, size))
+    return replace(recipe, deviation=recipe.deviation.plus(axis, size))
 
 
 def sweep(

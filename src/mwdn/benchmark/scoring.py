@@ -23,6 +23,7 @@ from mwdn.io.reading import read_json, unexpected_content
 from mwdn.optics.psf import psf_hash
 from mwdn.types import Measurement, Psf, Scene
 from mwdn.version import __version__
+from mwdn.weights.bundled import find_weights
 
 TIMED = 3
 """Pictures to time on the CPU when the scores come from a GPU."""
@@ -91,9 +92,10 @@ def make_reconstructor(
 
 def identity(method: Method, checkpoint: Path | None, dataset: Dataset) -> dict[str, Any]:
     """Everything the scores depend on: saved scores with another identity are measured again."""
+    weights = checkpoint or find_weights(method.name)
     content = {
         "method": [method.name, method.options],
-        "weights": file_sha256(checkpoint)[:16] if checkpoint is not None else None,
+        "weights": file_sha256(weights)[:16] if weights is not None else None,
         "version": __version__,
         "pairs": len(dataset.test),
         "data": dataset.identity,

@@ -181,7 +181,7 @@ def _ablation(results: Results) -> list[Block]:
 
 def _robustness(results: Results) -> list[Block]:
     robustness = results.benchmark.robustness
-    largest = {axis: sizes[-1] for axis, sizes in robustness.sizes.items()}
+    largest = {axis: max(sizes, key=lambda size: abs(size - AXES[axis])) for axis, sizes in robustness.sizes.items()}
     columns = ["as trained", *(f"{axis} {size:g}" for axis, size in largest.items())]
     table = _method_table(columns, "PSNR / dB as trained, and its change at the largest mismatch")
     for label, sweep in results.sweeps.items():

@@ -196,15 +196,21 @@ def _best_rate(
     """The rate that is best on validation after `trial` of the steps; finished trials are not repeated."""
     steps = max(1, round(benchmark.trial * schedule.steps))
     every = min(schedule.validate_every, steps)
-    scores = {}
+    scores: dict[float, float] = {}
     for rate in benchmark.rates:
         short = replace(schedule, learning_rate=rate, steps=steps, epochs=0, validate_every=every)
         warmup = min(short.warmup, steps // 10)
-        trial = _trainer(method, dataset, benchmark, replace(short, warmup=warmup), folder / f"rate-{rate:g}", device)
+        trial_folder = folder / f"rate-{rate:g}"
+        diverged = trial_folder / "diverged"
+        if diverged.is_file() and read_text(diverged) == str(steps):
+            scores[rate] = -math.inf
+            continue
+        trial = _trainer(method, dataset, benchmark, replace(short, warmup=warmup), trial_folder, device)
         try:
             scores[rate] = trial.run()
         except DivergenceError:
             scores[rate] = -math.inf
+            write_text(diverged, str(steps))
     return max(scores, key=lambda rate: scores[rate])
 
 

@@ -123,7 +123,7 @@ def _documentation(exported: Exported) -> str:
 
 _TEXT = """# Reconstruction for one lensless camera
 
-The network turns captures of one lensless camera into pictures. Its PSF and its picture size are fixed in the file: for
+This file turns captures of one lensless camera into pictures. Its PSF and its picture size are fixed in the file: for
 another camera, or after the mask was touched, export again with `mwdn export`.
 
 | | |

@@ -10,6 +10,7 @@ from mwdn.bridges.forward_model import ForwardModel
 from mwdn.errors import SMALLEST_LIGHT, check_options
 from mwdn.fourier import convolve, correlate
 from mwdn.optics import Camera, Sensor
+from mwdn.optics.psf import checked_psf
 from mwdn.runtime.requirement import require
 from mwdn.types import Image, Measurement, Psf, Scene, Size
 
@@ -51,6 +52,10 @@ class LenslessPhysics(_physics.LinearPhysics):  # type: ignore[misc]
         self.scene_size, self.sensor_size = model.scene[1:], camera.sensor_size
         self.psf: Tensor
         self.register_buffer("psf", camera.psf)
+
+    def update_parameters(self, psf: Psf | None = None, **others: object) -> None:
+        """Replace the PSF; each channel is scaled to unit sum."""
+        super().update_parameters(psf=None if psf is None else checked_psf(psf, values=False), **others)
 
     def A(self, x: Scene, psf: Psf | None = None, **_: object) -> Measurement:  # noqa: N802
         """Light on the sensor, without noise."""

@@ -102,8 +102,17 @@ for _name, _kind in MASKS.own.items():
 
 
 def add_plugins(words: Collection[str]) -> None:
-    """Add the commands of the masks of plugins, unless the command line names a mask of this package."""
-    for name in MASKS if {*MASKS.own, "array"}.isdisjoint(words) else ():
+    """Add the commands of the masks of plugins, unless the command line names a mask of this package.
+
+    Raises:
+        ParameterError: the command line names the mask of a plugin that cannot be loaded.
+    """
+    if not {*MASKS.own, "array"}.isdisjoint(words):
+        return
+    for word in words:
+        if word in MASKS:
+            _ = MASKS[word]
+    for name in MASKS:
         if name not in {*MASKS.own, *design}:
             _add_command(name, MASKS[name])
 

@@ -5,7 +5,8 @@ import sys
 from rich.prompt import Confirm
 
 from mwdn.cli.terminal import notes
-from mwdn.evaluation.alexnet import cache_folder, download_mebibytes
+from mwdn.evaluation.alexnet import download_mebibytes
+from mwdn.io.files import cache_folder
 
 
 def ask_for_lpips(lpips: bool | None, alexnet: str = "", heads: str = "") -> bool | None:

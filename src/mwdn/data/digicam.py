@@ -14,7 +14,7 @@ import csv
 import io
 import re
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -129,7 +129,10 @@ def import_digicam(
     check_path(output)
     refuse_overwrite(output, path)
     names = layout.captures or CAPTURES, layout.scenes or SCENES
-    listing, folder = list_digicam(path, *names, background=camera.background)
+    levels = FrameFormat(bit_depth=frames.bit_depth, gamma=frames.gamma)
+    listing, folder, is_subtracted = list_digicam(path, *names, background=camera.background, levels=levels)
+    if is_subtracted:  # the captures are linear floats then
+        frames = replace(frames, bit_depth=None, gamma=None)
     patterns = find_patterns(folder)
     labels = sorted({source.mask for source in listing.sources}, key=lambda label: (len(label), label))
     for label in labels:
@@ -161,8 +164,10 @@ def import_digicam(
     return result
 
 
-def list_digicam(path: Path, captures: str, scenes: str, *, background: str) -> tuple[Listing, Path]:
-    """The pairs of a data set with the label of each pattern, and its folder.
+def list_digicam(
+    path: Path, captures: str, scenes: str, *, background: str, levels: FrameFormat
+) -> tuple[Listing, Path, bool]:
+    """The pairs of a data set with the label of each pattern, its folder, and whether the room's light is subtracted.
 
     Args:
         path: folder with parquet shards, or with the folders of pictures ``captures`` and ``scenes``; or a name on the
@@ -170,48 +175,64 @@ def list_digicam(path: Path, captures: str, scenes: str, *, background: str) -> 
         captures: column or folder.
         scenes: column or folder.
         background: column or folder of the room's light, subtracted if it is there; "none" for no such.
+        levels: bit depth and gamma of captures and background.
 
     Raises:
-        ImageError: nothing there, a label is missing, or a named background.
+        ImageError: nothing there, a label is missing, or a background that was named.
     """
     if (path / captures).is_dir():
-        return _list_pictures(path, captures, scenes, background), path
-    sources, refused, folder = [], {}, path
+        listing, is_subtracted = _list_pictures(path, captures, scenes, background, levels)
+        return listing, path, _check_background(is_subtracted, background, path)
+    sources, refused, folder, is_subtracted = [], {}, path, False
     for file in find_shards(path, DOWNLOADED):
         try:
             shard = Shard(file, (captures, scenes))
-            if background in shard.names:
-                shard = Shard(file, (captures, scenes, background))
+            if is_subtracted or background in shard.names:
+                shard, is_subtracted = Shard(file, (captures, scenes, background)), True
             labels = shard.numbers(LABEL) if LABEL in shard.names else [""] * shard.count
         except ImageError as error:
             refused[file.name] = str(error)
             continue
         folder = file.parent if path.is_file() else folder
         rows = range(shard.count)
-        sources += [Source(f"{file.name} row {n}", partial(_read_row, shard, n), _label(labels[n])) for n in rows]
+        load = partial(_read_row, shard, levels)
+        sources += [Source(f"{file.name} row {n}", partial(load, n), _label(labels[n])) for n in rows]
     if not path.exists():  # downloaded: the patterns are beside the folder of the shards
         folder = next((p for p in file.parents if (p / "masks").is_dir() or (p / PATTERN).is_file()), file.parent)
-    return Listing(sources, refused), folder
+    return Listing(sources, refused), folder, _check_background(is_subtracted, background, path)
+
+
+def _check_background(is_subtracted: bool, background: str, path: Path) -> bool:
+    if not is_subtracted and background not in ("none", DigiCam.background):
+        raise ImageError(f"`background` ({background}) must be a column or a folder of `{path}`, or none.")
+    return is_subtracted
 
 
 def _label(value: object) -> str:
+    """A label as text; where one is missing, tables hold the others as floats."""
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
     return "" if value is None else str(value)
 
 
-def _read_row(shard: Shard, row: int) -> tuple[Frame, Frame]:
+def _read_row(shard: Shard, levels: FrameFormat, row: int) -> tuple[Frame, Frame]:
     capture, scene, *ambient = shard.load(row)
-    return _without(capture, ambient[0], f"row {row}") if ambient else capture, scene
+    return _without(capture, ambient[0], f"row {row}", levels) if ambient else capture, scene
 
 
-def _without(capture: Frame, ambient: Frame, name: str) -> Frame:
-    """The capture less the room's light, as floats of either sign; 1 is saturation."""
+def _without(capture: Frame, ambient: Frame, name: str, levels: FrameFormat) -> Frame:
+    """The capture less the room's light, as linear floats of either sign; 1 is saturation."""
     if capture.shape != ambient.shape or capture.dtype != ambient.dtype:
         raise ImageError(f"The background of {name} {ambient.shape} must be like its capture {capture.shape}.")
-    scale = np.float32(1 if capture.dtype.kind == "f" else np.iinfo(capture.dtype).max)
-    return (capture.astype(np.float32) - ambient) / scale
+    for frame in (capture, ambient):
+        levels.check_bits(frame, f"{name} or its background")
+    light = levels.normalise(capture) - levels.normalise(ambient)
+    return light[0].movedim(0, -1).contiguous().numpy()
 
 
-def _list_pictures(path: Path, captures: str, scenes: str, background: str) -> Listing:
+def _list_pictures(
+    path: Path, captures: str, scenes: str, background: str, levels: FrameFormat
+) -> tuple[Listing, bool]:
     listing, labels = list_folders(path, captures, scenes), _read_labels(path)
     rooms = files_by_stem(path / background) if (path / background).is_dir() else {}
     if rooms and len(rooms) > 1:  # one for each capture
@@ -222,25 +243,26 @@ def _list_pictures(path: Path, captures: str, scenes: str, background: str) -> L
         if one.name in listing.refused:
             continue
         room = next(iter(rooms.values())) if len(rooms) == 1 else rooms.get(one.name)
-        load = one.load if room is None else partial(_read_room, one, room)
-        sources.append(Source(one.name, load, labels.get(one.name, "")))
-    return Listing(sources, listing.refused)
+        load = one.load if room is None else partial(_read_room, one, room, levels)
+        names = f"{captures}/{one.name}", one.name, Path(one.name).name  # metadata.csv may have any of these
+        sources.append(Source(one.name, load, next((labels[name] for name in names if name in labels), "")))
+    return Listing(sources, listing.refused), bool(rooms)
 
 
-def _read_room(source: Source, room: Path) -> tuple[Frame, Frame]:
+def _read_room(source: Source, room: Path, levels: FrameFormat) -> tuple[Frame, Frame]:
     capture, scene = source.load()
-    return _without(capture, read_frame(room), source.name), scene
+    return _without(capture, read_frame(room), source.name, levels), scene
 
 
 def _read_labels(path: Path) -> dict[str, str]:
-    """Label of each picture by its stem, from metadata.csv."""
+    """Label of each picture by its path without suffix, from metadata.csv."""
     file = path / "metadata.csv"
     if not file.is_file():
         return {}
     rows = csv.DictReader(io.StringIO(read_text(file, most=2**26, error=ImageError)))
     if not {"file_name", LABEL} <= set(rows.fieldnames or ()):
         raise ImageError(f"`{file}` must have the columns file_name and {LABEL}.")
-    return {Path(row["file_name"] or "").with_suffix("").name: row[LABEL] or "" for row in rows}
+    return {Path(row["file_name"]).with_suffix("").as_posix(): row[LABEL] or "" for row in rows if row["file_name"]}
 
 
 def find_patterns(folder: Path) -> dict[str, Path]:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from mwdn.errors import CheckpointError, ShapeError
-from mwdn.io.files import atomic
+from mwdn.io.files import atomic, cache_folder
 from mwdn.types import Image
 from mwdn.weights.checkpoint import first_difference
 from mwdn.weights.torch_file import read_plain
@@ -143,11 +143,6 @@ _HEADS = PublicWeights(
     "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0",
     1,
 )
-
-
-def cache_folder() -> Path:
-    """Folder where downloaded weights are kept: ``~/.cache/mwdn``."""
-    return Path.home() / ".cache" / "mwdn"
 
 
 def load_alexnet(path: str | Path | None = None, *, download: bool = True) -> AlexNet:

@@ -127,6 +127,8 @@ def export(
     refuse_overwrite(out)
     name = method_name(method)
     method = as_method(method, **options)
+    if channels == 1 < calibration.psf.shape[1]:
+        raise ParameterError("`channels` (1) must be 3, because the PSF has colours. For a grey camera: `grey`.")
     channels = channels or calibration.psf.shape[1]
     about = _about(name, calibration, channels, precision)
     if isinstance(method, Network) and method.align:

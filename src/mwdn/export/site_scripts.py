@@ -12,10 +12,10 @@ from collections.abc import Mapping
 from importlib.resources import files
 from typing import Any
 
-MODULES = ("png", "npy", "hot_pixels", "frames", "psf", "display", "network", "divider", "dropping", "site")
+MODULES = ("png", "npy", "hot_pixels", "frames", "psf", "display", "network", "divider", "dropping", "saving", "site")
 """Each after those that it imports; those in `_SHARED` are of `mwdn preview`. Their top-level names differ."""
 
-_SHARED = {"divider.js", "dropping.js", "page.css", "icon.svg", "welcome.svg"}
+_SHARED = {"divider.js", "dropping.js", "saving.js", "page.css", "icon.svg", "welcome.svg"}
 
 
 def read_static(name: str) -> str:

@@ -12,8 +12,7 @@ import zlib
 from pathlib import Path
 
 from mwdn.errors import ExportError
-from mwdn.evaluation.alexnet import cache_folder
-from mwdn.io.files import atomic
+from mwdn.io.files import atomic, cache_folder
 
 PACKAGE = "onnxruntime-web"
 VERSION = "1.30.0"

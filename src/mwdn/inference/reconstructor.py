@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from mwdn import solvers
 from mwdn.calibration import Calibration
 from mwdn.calibration.white_balance import WhiteBalance, apply_white_balance, check_white_balance
-from mwdn.errors import ParameterError, ShapeError, check_batch, check_light, check_options, checked
+from mwdn.errors import ParameterError, ShapeError, check_batch, check_light, check_options, checked, shown
 from mwdn.fourier.convolution import check_fit
 from mwdn.inference.engine import Engine, Precision
 from mwdn.inference.ensemble import Ensemble
@@ -185,7 +185,13 @@ class Reconstructor:
     def _reconstruct(self, measurement: Measurement) -> Scene:
         if self.align:
             return self.at(solvers.align(measurement, self.psf))._reconstruct(measurement)
-        return self.engine(measurement) if self.engine else self.method(measurement, self.psf)
+        return self.engine(measurement) if self.engine else self._checked(self.method(measurement, self.psf))
+
+    def _checked(self, scene: object) -> Scene:
+        """The result of a method, which may be a plugin's or the caller's own."""
+        if not isinstance(scene, Tensor) or scene.ndim != 4:
+            raise ParameterError(f"The method {self.name} must return a tensor (B, C, H, W), not {shown(scene)}.")
+        return scene
 
     def _pictures_per_chunk(self, measurement: Measurement) -> int:
         """Pictures of a batch that are reconstructed together."""

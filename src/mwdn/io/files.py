@@ -225,6 +225,11 @@ def refuse_foreign(folder: Path, files: Sequence[str], mark: bytes) -> None:
         )
 
 
+def cache_folder() -> Path:
+    """Folder where downloads are kept: ``~/.cache/mwdn``."""
+    return Path.home() / ".cache" / "mwdn"
+
+
 def file_sha256(path: Path) -> str:
     """SHA-256 of a file, 64 hexadecimal digits."""
     with path.open("rb") as file:

@@ -21,7 +21,7 @@ from mwdn.networks.wiener import WienerNetwork
 from mwdn.networks.wiener_bank import WienerBank
 from mwdn.networks.wiener_unet import WienerUNet
 from mwdn.runtime.plugins import Registry
-from mwdn.solvers import SOLVERS
+from mwdn.solvers import BUNDLED_NAMES, SOLVERS
 
 _OWN: dict[str, type[Network[Any]]] = {
     "wiener": WienerNetwork,
@@ -44,6 +44,7 @@ NETWORKS: Registry[type[Network[Any]]] = Registry(
     "mwdn.networks",
     accepts=lambda entry: isinstance(entry, type) and issubclass(entry, Network),
     must_be="a subclass of `mwdn.networks.Network`",
+    reserved=frozenset(SOLVERS.own) | BUNDLED_NAMES,
 )
 """Networks by the names used in recipes and on the command line, those of plugins included."""
 

@@ -26,7 +26,7 @@ class _Counted(TorchFunctionMode):
         result = func(*args, **(kwargs or {}))
         self.count += isinstance(result, Tensor)
         if self.count > MOST_TENSORS:
-            raise ParameterError("it has too many layers. Lower its depth.")
+            raise ParameterError("the network has too many layers. Lower its depth.")
         return result
 
 

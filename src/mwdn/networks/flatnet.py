@@ -68,9 +68,9 @@ class FlatNet(Network[Tensor]):
         H = transfer_function(unit_sum(psf), grid)
         W = H.conj() / (H.abs().square() + self.regularisation)
         if self.correction is not None:
-            # If all N taps change by s, W changes by N s at frequency 0, where W is about 1. The unit 1 / sqrt(N)
-            # limits the effect of a step of 3e-4 to 3e-4 sqrt(129,600) = 0.1 there, and to 3e-4 for random signs.
-            # (The source's learning rate for the filter is 1e-6 of the U-Net's.) At N' pixels taps scale by N / N'.
+            # A step of 3e-4 in all N = 129,600 taps changes W by at most 3e-4 sqrt(N) = 0.1 at frequency 0, where W is
+            # about 1. Without the unit 1 / sqrt(N) it would be 3e-4 N = 39. (The source's learning rate for the filter
+            # is 1e-6 of the U-Net's.) At N' pixels taps scale by N / N'.
             taps = resize(self.correction, size) * (math.sqrt(self.correction.numel()) / (size[0] * size[1]))
             W = W + transfer_function(taps, grid)
         return W

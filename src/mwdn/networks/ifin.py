@@ -56,9 +56,9 @@ class Exchange(nn.Module):
 
 
 class IfinPsfs(NamedTuple):
-    """The measured PSF at unit sum, and the kernels of each scale, one per channel."""
+    """Transfer function of the first Wiener filter, and the kernels of each scale, one per channel."""
 
-    measured: Tensor
+    first: Tensor
     kernels: list[Tensor]
 
 
@@ -125,12 +125,12 @@ class Ifin(Network[IfinPsfs]):
         """PSF for the first Wiener filter, and kernels of each scale."""
         psf = normalise_psf(psf, size, self.channels)
         check_sides(psf, len(self.scales))
-        return IfinPsfs(unit_sum(psf), self.kernels(psf))
+        return IfinPsfs(self.first.prepare(unit_sum(psf)), self.kernels(psf))
 
     def reconstruct(self, measurement: Measurement, prepared: IfinPsfs) -> Scene:
         """Scene (B, C, H, W)."""
         check_channels(measurement, self.channels)
-        sensor, scene = measurement, self.first(measurement, prepared.measured)
+        sensor, scene = measurement, self.first.deconvolve(measurement, prepared.first)
         skips: list[Tensor] = []
         for scale, kernels in zip(self.scales, prepared.kernels, strict=True):
             if skips:

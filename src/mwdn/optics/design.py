@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from mwdn.errors import ParameterError
+from mwdn.errors import ParameterError, shown
 from mwdn.io.contact_sheets import contact_sheet, thumbnail
 from mwdn.io.files import write_json
 from mwdn.io.images import write_linear, write_picture
@@ -16,7 +16,7 @@ from mwdn.io.reading import read_json
 from mwdn.optics.mask_files import write_mask
 from mwdn.optics.masks import Mask, MaskDesign, describe_mask, mask_psf
 from mwdn.optics.psf import psf_hash, unit_sum
-from mwdn.optics.psf_measures import likeness, sharpness
+from mwdn.optics.psf_measures import autocorrelation_width, likeness
 from mwdn.optics.psf_spectrum import modulus_image
 from mwdn.optics.setup import Setup
 from mwdn.types import Psf
@@ -57,7 +57,7 @@ class Designed:
         """All parameters and results, as plain values for JSON; an infinite distance or focal length is None."""
         rows, columns = self.setup.size
         pitch_mm = self.setup.pitch_um / 1e3
-        width = sharpness(self.psf)
+        width = autocorrelation_width(self.psf)
         return {
             "mask": {"name": self.name} | _plain(dataclasses.asdict(self.design)),  # type: ignore[call-overload]
             "setup": _plain(dataclasses.asdict(self.setup)),
@@ -126,6 +126,8 @@ def design_camera(name: str, design: MaskDesign, setup: Setup) -> Designed:
         ParameterError: a parameter is invalid for this mask or camera.
     """
     mask = design.build(setup)
+    if not isinstance(mask, Mask):
+        raise ParameterError(f"`build` of the mask '{name}' must return a `mwdn.optics.Mask`, not {shown(mask)}.")
     return Designed(name, design, setup, mask, mask_psf(mask, setup))
 
 

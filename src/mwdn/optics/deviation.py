@@ -16,7 +16,8 @@ OFF_AXIS = Aberration(scale=0.005, stretch=0.02, vignetting=0.3)
 The corner of a 14 cm display at 20 cm is 26 degrees off the axis: cos^4 leaves 65 % of the light. The path from the
 mask to the sensor is longer there: light that the mask deflects by d on the axis, up to 0.27 mm in a pattern of 2.5 mm,
 lands farther out by (1 / cos^3 - 1) d = 0.38 d radially and by (1 / cos - 1) d = 0.1 d tangentially. With the mean
-deflection, half of the largest, the pattern grows by 2 % and 0.5 %.
+deflection, half of the largest, the pattern grows by 2 % radially (here 2.5 %: `scale` and `stretch`) and by 0.5 %
+tangentially.
 """
 
 BLUR = 0.005
@@ -43,12 +44,12 @@ class Deviation:
         shift_px: displacement of the PSF down, and the same to the right; its length is sqrt(2) times this.
         turn_degrees: rotation of the PSF, clockwise.
         scale: relative magnification of the PSF.
-        background: part of the PSF's light that is spread evenly over the frame.
+        background: haze, the part of the PSF's light that is spread evenly over the frame.
         off_axis: change of the PSF from the axis to the corner, in units of `OFF_AXIS`; 1 is about the paper's
             camera in front of its display.
 
     Raises:
-        ParameterError: `background` outside [0, 1), `scale` of -0.9 or less, negative `off_axis`.
+        ParameterError: `background` outside [0, 1), `scale` of -0.9 or less, `off_axis` outside its range.
     """
 
     shift_px: float = 0.0
@@ -62,8 +63,11 @@ class Deviation:
             raise ParameterError(f"`background` ({self.background}) must be in [0, 1): a fraction of the light.")
         if not self.scale > -0.9:
             raise ParameterError(f"`scale` ({self.scale}) must be above -0.9: a relative change.")
-        if not self.off_axis >= 0:
-            raise ParameterError(f"`off_axis` ({self.off_axis}) must not be negative.")
+        if not 0 <= self.off_axis < 1 / OFF_AXIS.vignetting:
+            raise ParameterError(
+                f"`off_axis` ({self.off_axis}) must be from 0 to {1 / OFF_AXIS.vignetting:.1f}: beyond it no light is "
+                "left in the corners."
+            )
 
     def plus(self, name: str, size: float) -> "Deviation":
         """The same deviation with one number larger by ``size``.

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from mwdn.errors import check_batch
+from mwdn.errors import ShapeError, check_batch
 from mwdn.fourier.transforms import fast_length, frequency_grid, inverse_spectrum, spectrum
 from mwdn.types import Psf, Size, Spectrum
 
@@ -47,6 +47,11 @@ def displacement(image: Psf, reference: Psf) -> Displacement:
     """
     check_batch(image, "image")
     check_batch(reference, "reference")
+    if image.shape[-2:] != reference.shape[-2:]:
+        raise ShapeError(
+            f"`image` {tuple(image.shape)} and `reference` {tuple(reference.shape)} must have the same height and "
+            "width."
+        )
     planes = [one.mean((0, 1)) - one.mean() for one in (image, reference)]
     grid = fast_length(2 * image.shape[-2]), fast_length(2 * image.shape[-1])
     first, second = (spectrum(plane[None, None], grid) for plane in planes)

@@ -99,6 +99,8 @@ def quantise(height_um: Plane, levels: int | None) -> tuple[Plane, float]:
     if levels is None:
         return height_um, 0.0
     check_levels(levels)
+    if not height_um.max() > 0:  # flat
+        return height_um, 0.0
     step = height_um.max().item() / (levels - 1)
     return (height_um / step).round() * step, step
 

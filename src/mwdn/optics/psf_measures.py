@@ -138,7 +138,7 @@ def radial_autocorrelation(psf: Psf, reach: int = 40) -> Tensor:
     return means / means[0]
 
 
-def sharpness(psf: Psf) -> float:
+def autocorrelation_width(psf: Psf) -> float:
     """Full width at half maximum, in pixels, of the PSF's autocorrelation, averaged over directions and channels.
 
     Correlating a measurement with the PSF turns a point into a spot of this width: about 1.4 times the width of the

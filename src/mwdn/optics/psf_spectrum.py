@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mwdn.errors import ParameterError
-from mwdn.fourier.transforms import frequencies, frequency_grid, spectrum
+from mwdn.fourier.transforms import frequency_grid, spectrum
 from mwdn.types import Image, Psf
 
 CONTRAST = 0.5
@@ -79,21 +79,18 @@ class RadialPower(NamedTuple):
     power: Tensor
 
 
-def radial_power(psf: Psf) -> RadialPower:
-    """Radial profile of |H|^2, averaged over the channels."""
+def radial_power(psf: Psf, count: int | None = None) -> RadialPower:
+    """Radial profile of |H|^2, averaged over the channels, at ``count`` + 1 frequencies from 0 to 0.5."""
     power, counts, frequency = _power(psf)
-    count = max(min(psf.shape[-2:]) // 2, 1)
+    count = count or max(min(psf.shape[-2:]) // 2, 1)
     mean = ring_means(power.mean((0, 1)), frequency * 2 * count, count + 1, counts=counts)
     return RadialPower(torch.arange(count + 1) / (2 * count), mean.float().cpu())
 
 
 def radial_spectrum(psf: Psf, bins: int = 60) -> Tensor:
     """Radial profile of |H| on ``bins`` frequencies from 0 up to 0.5: root mean square over directions and channels."""
-    size = (psf.shape[-2], psf.shape[-1])
-    power = spectrum(psf, size).abs().square().mean((0, 1))
-    v, u = frequencies(size[0]), frequencies(size[1])[: size[1] // 2 + 1].abs()
-    means = ring_means(power, torch.hypot(v[:, None], u) * 2 * bins, bins)
-    return (means / means[0] * power[0, 0]).sqrt()
+    power = radial_power(psf, bins).power[:-1]
+    return (power / power[0] * psf.sum((-2, -1)).square().mean()).sqrt()
 
 
 def modulus_image(psf: Psf) -> Image:

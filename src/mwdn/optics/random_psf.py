@@ -139,7 +139,7 @@ def _contours(draw: _Draw, aperture: _Aperture) -> Tensor:
     """Contour phase mask (PhlatCam): sharp lines at even distances that rarely meet."""
     spacing = draw.detail()
     field = draw.field(2 * spacing, draw.uniform(0.03, 0.5))
-    # A tenth of the steepest slopes, pi / spacing: flatter places would become wide blots.
+    # Three tenths of the steepest slopes, pi / spacing: flatter places would become wide blots.
     return contour_lines(field, draw.range("line_px"), 0.3 * math.pi / spacing) * aperture.light
 
 

@@ -104,8 +104,9 @@ class Reconstructions:
         frame, for_viewing = read_capture(order.capture, calibration, self.limits)
         measurement = to_device(to_measurement(frame, calibration, self.limits), reconstruct.device)
         job.advance(0.0)
-        measurement, share = reconstruct.without_room_light(measurement)
-        pose = align(measurement, reconstruct.psf) if reconstruct.align else None
+        with watch_iterations(lambda _: job.advance(0.0)):  # which may cancel
+            measurement, share = reconstruct.without_room_light(measurement)
+            pose = align(measurement, reconstruct.psf) if reconstruct.align else None
         with watch_iterations(lambda part: job.advance(0.9 * part)):
             scene = _prepared(reconstruct, pose).on_device(measurement)
         if not scene.isfinite().all():

@@ -1,7 +1,7 @@
 """Where displayed pictures are in a camera's reconstructions, and aligned pairs for training."""
 
 from mwdn.registration.captured import SessionPairs
-from mwdn.registration.estimate import Estimate, estimate, through_corners
+from mwdn.registration.estimate import Registered, estimate, through_corners
 from mwdn.registration.outline import find_outline
 from mwdn.registration.projection import Projection
 from mwdn.registration.registration import Place, read_projection
@@ -10,7 +10,7 @@ from mwdn.registration.warp import warp_pictures
 
 __all__ = [
     "SessionPairs",
-    "Estimate",
+    "Registered",
     "Place",
     "Projection",
     "Views",

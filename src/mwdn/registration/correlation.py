@@ -95,7 +95,7 @@ def refine(projection: Projection, views: Views, *, blurs: tuple[float, ...]) ->
     return result
 
 
-def correlate(projection: Projection, views: Views, blur: float, *, robust: bool = False) -> float:
+def correlation_at(projection: Projection, views: Views, blur: float, *, robust: bool = False) -> float:
     """Correlation of pictures and reconstructions smoothed by ``blur``.
 
     Args:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mwdn.errors import AlignmentError
-from mwdn.registration.correlation import Refined, correlate, refine
+from mwdn.registration.correlation import Refined, correlation_at, refine
 from mwdn.registration.features import match_features
 from mwdn.registration.markers import match_markers
 from mwdn.registration.point_fit import correct, fit_points
@@ -44,7 +44,7 @@ _ENOUGH_PARTS = 12
 _ROUNDS = 2
 
 
-class Estimate(NamedTuple):
+class Registered(NamedTuple):
     """A projection, and how well it fits.
 
     Args:
@@ -70,8 +70,8 @@ class Estimate(NamedTuple):
         }
 
 
-def estimate(views: Views, *, corners: Points | None = None) -> Estimate:
-    """Estimate the projection from displayed pictures to reconstructions.
+def estimate(views: Views, *, corners: Points | None = None) -> Registered:
+    """Registered the projection from displayed pictures to reconstructions.
 
     Markers of a board, features (SIFT), or a search over all places, sizes, turns and mirrorings give a start. The
     correlation over all pictures then refines it (ECC), and the displacements of the picture's parts correct what
@@ -94,9 +94,9 @@ def estimate(views: Views, *, corners: Points | None = None) -> Estimate:
     result, name = _single(tried, few)
     result = refine(result.projection, views, blurs=(2.0, 1.0))
     projection, residuals = _through_parts(result.projection, views)
-    result = Refined(projection, correlate(projection, views, 1.0, robust=True))
+    result = Refined(projection, correlation_at(projection, views, 1.0, robust=True))
     _check(result, residuals)
-    return Estimate(result.projection, result.correlation, residuals, name)
+    return Registered(result.projection, result.correlation, residuals, name)
 
 
 def through_corners(corners: Points, picture_size: Size, camera_size: Size) -> Projection:
@@ -130,7 +130,7 @@ def _single(tried: list[tuple[Refined, str]], few: Views) -> tuple[Refined, str]
     close = [(each, name) for each, name in tried if best - each.correlation < _CLOSE]
     if len(close) > 1:
         detailed = [(refine(each.projection, few, blurs=(1.0,)).projection, name) for each, name in close]
-        close = [(Refined(each, correlate(each, few, 1.0)), name) for each, name in detailed]
+        close = [(Refined(each, correlation_at(each, few, 1.0)), name) for each, name in detailed]
     result, name = max(close, key=lambda each: each[0].correlation)
     corners = result.projection.corners()
     size = float(np.ptp(corners, axis=0).max())

@@ -49,7 +49,9 @@ class Projection:
         if len(self.parameters) != 9 or not np.isfinite(self.parameters).all():
             raise ParameterError(f"`parameters` ({self.parameters}) must be nine finite numbers.")
         if min(*self.picture_size, *self.camera_size) < 2:
-            raise ParameterError(f"`picture_size` {self.picture_size} and `camera_size` {self.camera_size} are empty.")
+            raise ParameterError(
+                f"`picture_size` {self.picture_size} and `camera_size` {self.camera_size} must be at least 2 x 2."
+            )
         if abs(np.linalg.det(self._matrix)) < 1e-9:
             raise AlignmentError("`parameters` map the whole picture onto a line. Pick other points.")
 

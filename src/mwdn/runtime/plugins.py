@@ -23,10 +23,19 @@ class Registry(Mapping[str, Entry]):
         group: of the entry points: ``mwdn.solvers``.
         accepts: whether an object may be an entry.
         must_be: the same in words, for the message.
+        reserved: further names that no plugin can have, of other things that are named in the same places.
     """
 
-    def __init__(self, own: Mapping[str, Entry], group: str, *, accepts: Callable[[Any], bool], must_be: str) -> None:
-        self.own, self.group, self._accepts, self._must_be = own, group, accepts, must_be
+    def __init__(
+        self,
+        own: Mapping[str, Entry],
+        group: str,
+        *,
+        accepts: Callable[[Any], bool],
+        must_be: str,
+        reserved: frozenset[str] = frozenset(),
+    ) -> None:
+        self.own, self.group, self._accepts, self._must_be, self._reserved = own, group, accepts, must_be, reserved
         self._loaded: dict[str, Entry] = {}
         self._broken: set[str] = set()
 
@@ -35,7 +44,8 @@ class Registry(Mapping[str, Entry]):
         """Entry points of plugins by name. Of two with the same name, the alphabetically first package's is used."""
         points: dict[str, EntryPoint] = {}
         for point in sorted(entry_points(group=self.group), key=lambda point: (point.name, _package(point))):
-            owner = "mwdn" if point.name in self.own else _package(points.get(point.name))
+            is_own = point.name in {*self.own, *self._reserved}
+            owner = "mwdn" if is_own else _package(points.get(point.name))
             if not owner:
                 points[point.name] = point
             elif owner != _package(point):

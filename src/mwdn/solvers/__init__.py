@@ -30,19 +30,23 @@ survive_forks()  # here, because every method imports the solvers
 
 Solver = Admm | Fista | Pyramid | Wiener
 
+NETWORK_NAMES = frozenset(
+    {"drunet", "flatnet", "ifin", "le-admm", "le-admm-u", "mmcn", "mwdn", "mwdn-cpsf", "svdeconv", "unet", "updn"}
+    | {"wiener-bank", "wiener-unet"}
+)
+"""Names of networks, except ``wiener``, which is also a solver: this folder cannot import `mwdn.networks`."""
+
+BUNDLED_NAMES = frozenset({"universal", "universal-small"})
+"""Names of the networks of `mwdn.weights.BUNDLED`, for the same reason."""
+
 SOLVERS: Registry[type[Solver]] = Registry(
     {"admm": Admm, "fista": Fista, "pyramid": Pyramid, "wiener": Wiener},
     "mwdn.solvers",
     accepts=lambda entry: isinstance(entry, type) and any("__call__" in vars(base) for base in entry.__mro__),
     must_be="a class whose objects are called as `solver(measurement, psf)`",
+    reserved=NETWORK_NAMES | BUNDLED_NAMES,
 )
 """Every solver by its name on the command line, those of plugins included."""
-
-_NETWORKS = frozenset(
-    {"drunet", "flatnet", "ifin", "le-admm", "le-admm-u", "mmcn", "mwdn", "mwdn-cpsf", "svdeconv", "unet", "updn"}
-    | {"wiener-bank", "wiener-unet"}
-)
-"""Names of networks, only for the error message of `build`: this folder cannot import `mwdn.networks`."""
 
 
 def build(name: str, **options: Any) -> Callable[[Measurement, Psf], Scene]:  # noqa: ANN401
@@ -56,7 +60,7 @@ def build(name: str, **options: Any) -> Callable[[Measurement, Psf], Scene]:  # 
         UnknownNameError: there is no such solver, or it has no such option.
         ParameterError: ``name`` is a network, or an option is of another type or out of range.
     """
-    if name in _NETWORKS:
+    if name in NETWORK_NAMES:
         raise ParameterError(
             f"'{name}' is a network, not a solver: `mwdn.networks.build('{name}')` builds it without weights, "
             "`mwdn.load_network(path)` loads a trained one."

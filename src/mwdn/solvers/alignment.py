@@ -38,7 +38,7 @@ from mwdn.optics.aperture import displaced_envelope
 from mwdn.optics.psf import checked_psf
 from mwdn.optics.saturation import saturated_pixels
 from mwdn.optics.warp import hazed
-from mwdn.solvers.levels import Level, brightness, relative_noise
+from mwdn.solvers.levels import Level, relative_noise, root_mean_square
 from mwdn.solvers.pose import ENVELOPE_BLUR, Pose
 from mwdn.solvers.pyramid import halve, solve
 from mwdn.solvers.splitting import Penalties
@@ -145,8 +145,8 @@ def align(measurement: Measurement, psf: Psf, *, steps: int = 2, min_gain: float
 
 def has_detail(measurement: Measurement) -> Tensor:
     """Whether each capture shows more than noise and even light, (B,); false for one with NaN or infinity."""
-    unit, noise = brightness(measurement), relative_noise(measurement)
-    detail = brightness(fine_detail(halve(halve(measurement.float() / unit))))
+    unit, noise = root_mean_square(measurement), relative_noise(measurement)
+    detail = root_mean_square(fine_detail(halve(halve(measurement.float() / unit))))
     return (detail > (MIN_DETAIL * _QUARTER_NOISE * noise).clamp(min=_LEAST_DETAIL)).flatten()
 
 

@@ -22,7 +22,7 @@ class Level:
             gradient's mu are multiplied by `smoothing_scale`.
         min_smoothing: lower limit of `smoothing_scale`. In real captures the errors of the PSF exceed the noise.
         relaxation: alpha of the over-relaxation (`mwdn.solvers.splitting`), 1 to 2.
-        lit: whether the level starts at even light in the frame (`mwdn.solvers.pyramid.even_light`). Otherwise it
+        lit: whether the level starts at even light in the frame (`mwdn.solvers.pyramid.even_start`). Otherwise it
             starts at the coarser level's scene, and the coarsest level at black.
     """
 
@@ -78,16 +78,16 @@ def pyramid_levels(finest: int) -> tuple[Level, ...]:
     return tuple(level for level in levels if finest and level.downsampling >= finest)
 
 
-def brightness(measurement: Measurement) -> Tensor:
+def root_mean_square(measurement: Measurement) -> Tensor:
     """Root mean square of each sample, (B, 1, 1, 1); never 0."""
     square = measurement.float().square().mean((1, 2, 3), keepdim=True)
     return square.sqrt().clamp(min=torch.finfo(torch.float32).tiny)
 
 
 def relative_noise(measurement: Measurement) -> Tensor:
-    """Standard deviation of each sample's noise over its `brightness`, (B, 1, 1, 1)."""
+    """Standard deviation of each sample's noise over its `root_mean_square`, (B, 1, 1, 1)."""
     b = measurement.detach().float()
-    return noise_level(b / brightness(b)).square().mean(1, keepdim=True).sqrt()
+    return noise_level(b / root_mean_square(b)).square().mean(1, keepdim=True).sqrt()
 
 
 def smoothing_scale(noise: Tensor) -> Tensor:

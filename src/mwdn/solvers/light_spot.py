@@ -7,9 +7,9 @@ q)^2 / (s^T G s)`` of the energy ``|r|^2``. The spot that explains most in all c
 are needed for all shapes: thousands of them cost less than one iteration of the solver. (The code keeps J transposed,
 one row a cosine.)
 
-A scene can imitate the smoothest part of a spot, so this part is not in r. It follows from the rest through the shape,
+A scene can imitate the smoothest part of a spot, so that part is missing from r. It follows from the spot's shape,
 because a spot has five numbers, not one for each cosine. Narrow spots are estimated best; a spot as wide as the PSF is
-not found (but by `mwdn.solvers.smooth_light`).
+left to `mwdn.solvers.smooth_light`.
 """
 
 import math

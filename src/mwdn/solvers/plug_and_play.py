@@ -22,7 +22,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.fourier.transforms import inverse_spectrum, spectrum
-from mwdn.solvers.levels import REFERENCE_NOISE, brightness, smoothing_scale
+from mwdn.runtime.iterations import iterations
+from mwdn.solvers.levels import REFERENCE_NOISE, root_mean_square, smoothing_scale
 from mwdn.solvers.pyramid import Estimate
 from mwdn.solvers.splitting import Problem, deficit
 
@@ -73,15 +74,15 @@ def plug_and_play(
     grid, (height, width) = problem.grid, problem.sensor
     z = (estimate.grid_scene * band.norm).expand(*estimate.measurement.shape[:2], *grid)
     brightest = z[..., :height, :width].amax((1, 2, 3), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
-    sensor_noise = estimate.noise.clamp(min=REFERENCE_NOISE) * brightness(estimate.measurement)
-    noise = torch.maximum(sensor_noise, brightness(estimate.residual))
+    sensor_noise = estimate.noise.clamp(min=REFERENCE_NOISE) * root_mean_square(estimate.measurement)
+    noise = torch.maximum(sensor_noise, root_mean_square(estimate.residual))
     power = problem.transfer.abs().square()
     adjoint = problem.transfer.conj().resolve_conj()  # a lazy conjugate would be copied in each round
     V, Hv = spectrum(z, grid), problem.measurement - estimate.residual
     target, W = Hv, certainty(Hv)
     first, last = noise_levels
     scale = smoothing_scale(estimate.noise).clamp(min=1) ** noise_exponent
-    for step in range(rounds):
+    for step in iterations(rounds, start=1.0):  # a server may cancel; the share of the work is not known here
         sigma = scale * first * (last / first) ** (step / max(1, rounds - 1))
         rho = prior_weight * (noise / (sigma * brightest)).square()
         target = deficit(problem, Hv, target).mul_(W / (1 + W)).add_(Hv)

@@ -20,8 +20,8 @@ from mwdn.solvers.levels import (
     REFERENCE_NOISE,
     REFERENCE_SIDE,
     Level,
-    brightness,
     relative_noise,
+    root_mean_square,
     smoothing_scale,
 )
 from mwdn.solvers.splitting import Problem, initial_state, make_filters, update_copies, update_scene
@@ -62,10 +62,11 @@ class Pyramid:
 
     def __post_init__(self) -> None:
         if not self.regularisation > 0:
-            raise ParameterError(f"`regularisation` ({self.regularisation}) must be positive; try 1e-4.")
+            raise ParameterError(f"`regularisation` ({self.regularisation}) must be positive; try 1e-3.")
         sizes = [level.downsampling for level in self.levels]
-        if not sizes or sizes != sorted(set(sizes), reverse=True) or any(s & (s - 1) for s in sizes):
-            raise ParameterError(f"`levels` {sizes} must be powers of two, falling: for example 4, 2, 1.")
+        falling = sorted(set(sizes), reverse=True)
+        if sizes[-1:] != [1] or sizes != falling or any(s < 1 or s & (s - 1) for s in sizes):
+            raise ParameterError(f"`levels` {sizes} must be powers of two, falling to 1: for example 4, 2, 1.")
 
     @torch.no_grad()
     def __call__(self, measurement: Measurement, psf: Psf) -> Scene:
@@ -130,8 +131,8 @@ class Estimate:
         The root mean square of the residual's mean in blocks of s x s pixels, over ``n / s``, which white noise n would
         leave. 1 to 3 with a right PSF, 5 to 100 with a wrong one.
         """
-        means = brightness(F.avg_pool2d(self.residual, side, ceil_mode=True))
-        return means * (side / (self.noise.clamp(min=REFERENCE_NOISE / 10) * brightness(self.measurement)))
+        means = root_mean_square(F.avg_pool2d(self.residual, side, ceil_mode=True))
+        return means * (side / (self.noise.clamp(min=REFERENCE_NOISE / 10) * root_mean_square(self.measurement)))
 
     def detail(self, regularisation: float | Tensor) -> Scene:
         """Wiener deconvolution of the residual, to add to the scene. The finest level must have the full size.
@@ -186,7 +187,7 @@ class PsfPyramid:
         """Estimate a smooth non-negative scene (B, C, H, W), from coarse to fine. Differentiable."""
         size = measurement.shape[-2], measurement.shape[-1]
         # tau is stated for a measurement of unit mean square.
-        unit = brightness(measurement)
+        unit = root_mean_square(measurement)
         b = measurement.float() / unit
         noise = relative_noise(measurement)
         smooth = any(band.level.regularisation for band in self.bands)
@@ -250,7 +251,7 @@ def low_band(transfer: Spectrum, grid: Size, downsampling: int) -> Tensor:
     return low[..., : columns // 2 + 1].mT.contiguous().mT  # the memory layout of `spectrum`
 
 
-def even_light(problem: Problem) -> Tensor:
+def even_start(problem: Problem) -> Tensor:
     """Even light in the frame, black around it, (B, C, *grid): as bright in each colour as fits the measurement."""
     b, (rows, columns), (height, width) = problem.measurement, problem.grid, problem.sensor
     V = spectrum(torch.full_like(b, 1.0), problem.grid)
@@ -265,7 +266,7 @@ def _solve(
     """Scene on the whole grid after the iterations of one level, started at the coarser scene."""
     # The penalties are stated for a PSF whose colours have a mean square sum of 1, so the scene is times that norm.
     level = band.level
-    start = even_light(problem) if level.lit else enlarge(coarser, band.grid).clamp(min=0) * band.norm
+    start = even_start(problem) if level.lit else enlarge(coarser, band.grid).clamp(min=0) * band.norm
     mu, tau = level.smoothing(scale)
     tau = size_factor * tau
     smooth = level.regularisation > 0

@@ -25,7 +25,7 @@ from torch.nn import functional as F
 
 from mwdn.fourier.transforms import inverse_spectrum, spectrum
 from mwdn.optics.saturation import subtract_light
-from mwdn.solvers.levels import LEVELS, brightness
+from mwdn.solvers.levels import LEVELS, root_mean_square
 from mwdn.solvers.light_spot import Cosines, Spot, best_spot, cosines
 from mwdn.solvers.pyramid import PsfPyramid
 from mwdn.types import Measurement, Psf, Scene, Size
@@ -138,7 +138,7 @@ def _run(
         own = phase.part(pyramid.solve(subtract_light(b, known)).grid_scene, basis.size)
         seen = inverse_spectrum(band.transfer * band.norm * spectrum(own, band.grid), band.grid, basis.size)
         missing = b - seen - known
-        misfit = brightness(missing).flatten() / brightness(known).flatten()
+        misfit = root_mean_square(missing).flatten() / root_mean_square(known).flatten()
         light = SmoothLight.fit(known + phase.a * missing, basis, phase.advantage)
     return light, misfit
 

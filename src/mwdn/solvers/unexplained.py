@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from mwdn.runtime.iterations import iterations
 from mwdn.solvers.splitting import Penalties, Problem, initial_state, make_filters, update_copies, update_scene
 from mwdn.types import Measurement, Psf
 
@@ -28,7 +29,7 @@ def unexplained(b: Measurement, psf: Psf, saturated: Tensor) -> Tensor:
     saturated = saturated.reshape(planes.shape)
     problem = Problem.from_psf(planes, h / norm)._replace(saturated=saturated)
     filters, state = make_filters(problem, _PENALTIES, smooth=False), initial_state(problem, smooth=False)
-    for _ in range(ITERATIONS):
+    for _ in iterations(ITERATIONS):
         state = update_scene(update_copies(state, problem, _PENALTIES, 0.0, "colour"), problem, filters)
     r = planes - state.Hv
     return torch.where(saturated, r.clamp(min=0), r).reshape(*b.shape[:2], -1)

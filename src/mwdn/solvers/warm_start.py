@@ -8,7 +8,7 @@ import torch
 from mwdn.errors import ParameterError, checked
 from mwdn.solvers.admm import Admm
 from mwdn.solvers.fista import Fista
-from mwdn.solvers.levels import brightness
+from mwdn.solvers.levels import root_mean_square
 from mwdn.types import Measurement, Psf, Scene
 
 CUT = 4.0
@@ -40,7 +40,7 @@ class WarmStart:
 
     def __call__(self, measurement: Measurement, psf: Psf) -> Scene:
         """Reconstruct the next frame, or a batch of frames of as many streams."""
-        light = brightness(measurement)
+        light = root_mean_square(measurement)
         warm = self.last is not None and psf is self.psf and measurement.shape == self.shape
         warm = warm and bool(((light < CUT * self.brightness) & (self.brightness < CUT * light)).all())
         solver: Any = self.following if warm else self.first

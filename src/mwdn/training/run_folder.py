@@ -111,6 +111,11 @@ class RunFolder:
         return read_bytes(recipe, most=TEXT_BYTES, error=CheckpointError) if recipe.exists() else b"null"
 
     def _check(self, owner: str) -> None:
+        if owner == "null":
+            raise CheckpointError(
+                f"`{self.path}` holds weights, but no recipe.json that says of which run. Choose another folder, "
+                "`--out`, or remove it."
+            )
         try:
             difference = _difference(_with_current_names(json.loads(owner)), json.loads(json.dumps(self.identity)))
         except (ValueError, RecursionError):

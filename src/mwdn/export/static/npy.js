@@ -18,7 +18,7 @@ export function decodeNpy(bytes) {
   const [height, width, channels = 1] = shape;
   const axes = `${kind} (${shape.join(", ")})`;
   if (!(kind in TYPES) || /'fortran_order': True/.test(header) || ![2, 3].includes(shape.length) || ![1, 3].includes(channels)) {
-    throw new FileError(`holds an array ${axes}, which must be uint8, uint16 or float32 in C order, (height, width) or (height, width, 1 or 3).`);
+    throw new FileError(`holds an array ${axes}, which must be uint8, uint16, float32 or float64 in C order, (height, width) or (height, width, 1 or 3).`);
   }
   const Numbers = TYPES[kind];
   const length = height * width * channels;

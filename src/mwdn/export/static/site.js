@@ -7,6 +7,7 @@ import { agreement, openNetwork, PageError, unpack } from "./network.js";
 import { encodeNpy } from "./npy.js";
 import { encodePng, FileError } from "./png.js";
 import { ORIENTATIONS, toPsf } from "./psf.js";
+import { saveBlob } from "./saving.js";
 
 const byId = (id) => document.getElementById(id);
 const camera = globalThis.mwdnCamera;
@@ -74,7 +75,9 @@ function captureFormat(capture) {
 function currentPsf() {
   if (!dropped) return own;
   const format = { ...chosenFormat(), psf_gamma: gammaOf("psf-gamma"), orientation: byId("orientation").value };
-  return toPsf(dropped.frame, format, camera.size);
+  const key = JSON.stringify(format);
+  if (dropped.key !== key) Object.assign(dropped, { key, psf: toPsf(dropped.frame, format, camera.size) });
+  return dropped.psf;
 }
 
 async function measure(capture, psf) {
@@ -97,8 +100,8 @@ async function preparePsf({ psf }) {
   prepared = psf;
 }
 
-async function solve(measurement) {
-  const scene = await network.reconstruct(measurement, camera.channels);
+async function solve(candidate, measurement) {
+  const scene = await candidate.reconstruct(measurement, camera.channels);
   return measurement.channels === 1 && scene.channels > 1 ? averageColours(scene) : scene;
 }
 
@@ -110,7 +113,7 @@ async function reconstruct(capture) {
   say(`Reconstructing ${capture.name} …`);
   await painted();
   const start = performance.now();
-  const scene = await solve(measurement);
+  const scene = await solve(network, measurement);
   const seconds = (performance.now() - start) / 1000;
   shown = { name: capture.name, measurement, scene, light: used.light, seconds };
   await show(true);
@@ -131,12 +134,8 @@ async function show(both = false) {
   await setPicture(byId("scene"), await picture(8));
 }
 
-async function save(link, extension, make) {
-  if (!shown) return;
-  const blob = await make();
-  const address = Object.assign(document.createElement("a"), { href: URL.createObjectURL(blob), download: `${shown.name.replace(/\.[^.]*$/, "")}-scene${extension}` });
-  address.click();
-  setTimeout(() => URL.revokeObjectURL(address.href), 60000);
+async function save(extension, make) {
+  if (shown) saveBlob(await make(), `${shown.name.replace(/\.[^.]*$/, "")}-scene${extension}`);
 }
 
 function choose(capture) {
@@ -245,7 +244,7 @@ async function loadCamera() {
 async function check(candidate) {
   await candidate.setPsf(own.psf, camera.channels);
   const measurement = toMeasurement(captures[0].frame, RAW);
-  return agreement(await candidate.reconstruct(measurement, camera.channels), camera.expected);
+  return agreement(await solve(candidate, measurement), camera.expected);
 }
 
 async function start() {
@@ -277,9 +276,9 @@ byId("exposure").oninput = () => {
 };
 byId("balance").onchange = () => enqueue(() => show());
 byId("beside").onchange = () => byId("stack").classList.toggle("beside", byId("beside").checked);
-byId("save-png").onclick = () => enqueue(() => save(byId("save-png"), ".png", () => picture(8)));
-byId("save-png16").onclick = () => enqueue(() => save(byId("save-png16"), "-16bit.png", () => picture(16)));
-byId("save-npy").onclick = () => enqueue(() => save(byId("save-npy"), ".npy", async () => encodeNpy(shown.scene)));
+byId("save-png").onclick = () => enqueue(() => save(".png", () => picture(8)));
+byId("save-png16").onclick = () => enqueue(() => save("-16bit.png", () => picture(16)));
+byId("save-npy").onclick = () => enqueue(() => save(".npy", async () => encodeNpy(shown.scene)));
 // A file that misses its zone must not replace the page.
 for (const name of ["dragover", "drop"]) document.addEventListener(name, (event) => event.preventDefault());
 enqueue(start).then(() => network && !byId("chosen").dataset.current && choose(captures[0]));

@@ -17,7 +17,11 @@ export function setUpDivider(stack, split, zoom) {
 
 export async function setPicture(image, blob) {
   const before = image.src;
-  image.src = URL.createObjectURL(blob);
-  await image.decode();
+  const address = (image.src = URL.createObjectURL(blob));
+  try {
+    await image.decode();
+  } catch (error) {
+    if (image.src === address) throw error; // else a newer picture has taken its place
+  }
   if (before.startsWith("blob:")) URL.revokeObjectURL(before);
 }

@@ -17,6 +17,7 @@ let socket = null;
 let isStarted = false;
 let isDrawing = false;
 let next = null;
+let retry = 0; // timer of the next attempt to connect
 
 function show(text, wrong = false) {
   byId("live-state").textContent = text;
@@ -119,13 +120,15 @@ async function drawNewest() {
 function connect() {
   const address = new URL(`live${location.search}`, location.href);
   address.protocol = location.protocol === "https:" ? "wss:" : "ws:";
-  socket = new WebSocket(address);
-  socket.binaryType = "arraybuffer";
-  socket.onopen = () => {
+  const own = (socket = new WebSocket(address));
+  own.binaryType = "arraybuffer";
+  own.onopen = () => {
+    if (socket !== own) return;
     compareClocks(send);
     if (Object.keys(wishes).length) send(wishes);
   };
-  socket.onmessage = (event) => {
+  own.onmessage = (event) => {
+    if (socket !== own) return;
     if (typeof event.data === "string") {
       tellClock(JSON.parse(event.data), send);
       return;
@@ -134,11 +137,11 @@ function connect() {
     next = event.data;
     drawNewest();
   };
-  socket.onclose = () => {
+  own.onclose = () => {
+    if (socket !== own) return; // stopped
     socket = null;
-    if (!isStarted) return;
     show("The connection is lost. Trying again …", true);
-    setTimeout(() => isStarted && connect(), 1000);
+    retry = setTimeout(connect, 1000);
   };
 }
 
@@ -151,7 +154,10 @@ function start(name) {
 
 function stop(name) {
   byId("live-record").setAttribute("aria-pressed", "false");
-  socket?.close();
+  clearTimeout(retry);
+  const old = socket;
+  socket = next = null;
+  old?.close();
   byId("stack").classList.remove("live");
   byId("view").hidden = !byId("scene").src;
   byId("state").textContent = "";

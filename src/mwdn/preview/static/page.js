@@ -16,7 +16,9 @@ const chosen = { psf: null, capture: null, ambient: null, job: null };
 let methods = [];
 let sampleCamera = null;
 let running = null;
-let due = 0;
+let comparing = null;
+let latest = 0; // call of `showPictures`
+const due = new Map(); // timers by their work
 let isTouched = false;
 
 function say(text, wrong = false) {
@@ -115,20 +117,21 @@ async function reconstruct() {
   }
 }
 
-// Sliders move faster than methods reconstruct: only the last value counts.
+// Sliders move faster than methods reconstruct: of each kind of work only the last call counts.
 function soon(work = reconstruct, wait = 150) {
   isTouched = true;
-  clearTimeout(due);
-  due = setTimeout(() => guarded(work), wait);
+  clearTimeout(due.get(work));
+  due.set(work, setTimeout(() => guarded(work), wait));
 }
 
 async function showPictures(both = false) {
   if (isLive()) wishLive();
   if (isLive() || !chosen.job) return;
-  const job = `/jobs/${chosen.job}`;
+  const call = (latest += 1), job = chosen.job;
   const [scene, measurement] = await Promise.all([
-    getBlob(`${job}/picture${look()}`), both ? getBlob(`${job}/measurement`) : null,
+    getBlob(`/jobs/${job}/picture${look()}`), both ? getBlob(`/jobs/${job}/measurement`) : null,
   ]);
+  if (job !== chosen.job || (call !== latest && !both)) return; // a newer call shows a newer picture
   await setPicture(byId("scene"), scene);
   if (measurement) await setPicture(byId("measurement"), measurement);
   byId("view").hidden = byId("psf-section").hidden = false;
@@ -138,19 +141,23 @@ const SAVED = { png: "reconstruction.png", png16: "reconstruction-16bit.png", ti
 const save = async (format) => saveBlob(await getBlob(`/jobs/${chosen.job}/picture${look(format)}`), SAVED[format]);
 
 async function compareMethods() {
+  if (!isReady()) return;
+  comparing?.abort();
+  const { signal } = (comparing = new AbortController());
   byId("grid-section").hidden = false;
   byId("grid").replaceChildren();
-  for (const { name } of methods) {
+  for (const [name, order] of methods.map(({ name }) => [name, orderFields(name, false)])) {
     const figure = document.createElement("figure");
     const picture = Object.assign(document.createElement("img"), { alt: `Reconstruction by ${name}` });
     const caption = Object.assign(document.createElement("figcaption"), { textContent: `${name} …` });
     figure.append(picture, caption);
     byId("grid").append(figure);
     try {
-      const job = await runJob(orderFields(name, false), () => {}, new AbortController().signal);
+      const job = await runJob(order, () => {}, signal);
       await setPicture(picture, await getBlob(`/jobs/${job.id}/picture${look()}`));
       caption.textContent = `${name}, ${job.report.seconds.toFixed(2)} s`;
     } catch (error) {
+      if (signal.aborted) return;
       caption.textContent = `${name}: ${error.message}`;
       caption.className = "wrong";
     }
@@ -272,9 +279,9 @@ byId("room-light").onchange = () => {
 for (const id of ["camera", "bin", "psf-bin", "bit-depth", "mosaic", "gamma", "psf-gamma", "orientation", "align", "trust"]) byId(id).onchange = () => soon(reconstruct, 0);
 byId("exposure").oninput = () => {
   byId("exposure-value").textContent = Number(byId("exposure").value).toFixed(1);
-  soon(() => showPictures());
+  soon(showPictures);
 };
-byId("balance").onchange = () => soon(() => showPictures(), 0);
+byId("balance").onchange = () => soon(showPictures, 0);
 byId("cancel").onclick = () => {
   running?.abort();
   say("Cancelled.");
