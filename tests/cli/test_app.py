@@ -456,7 +456,9 @@ def test_demo(run, tmp_path, monkeypatch, pictures, methods):
     options = [word for name in pictures for word in ("--pictures", name)]
     code, out, err = run("demo", "--out", tmp_path / "demo", *options)
     assert (code, err) == (0, "")
-    assert names(tmp_path / "demo") == ["comparison.png", "index.html", "psf.png"]
+    assert names(tmp_path / "demo") == ["captures", "comparison.png", "index.html", "pattern.png", "psf.tif"]
+    code, _, err = run(f"{out.strip().splitlines()[-1].partition('mwdn ')[2]} --method wiener --out {tmp_path}/again")
+    assert (code, err) == (0, "")
     rows = {
         words[0]: dict(zip(methods, map(float, words[1:]), strict=True))
         for words in (re.findall(r"[\w.]+", line) for line in out.splitlines() if line.startswith("│"))
@@ -469,7 +471,7 @@ def test_demo(run, tmp_path, monkeypatch, pictures, methods):
     page = (tmp_path / "demo" / "index.html").read_text(encoding="utf-8")
     assert all(f"<th>{name}</th>" in page for name in rows)
     assert all(f"<td>{value:.2f}</td>" in page for row in rows.values() for value in row.values())
-    assert 'src="psf.png"' in page
+    assert 'src="pattern.png"' in page
     assert 'src="comparison.png"' in page
     assert str(tmp_path / "demo" / "index.html") in out  # on one line, to be clicked or copied
     assert read_frame(tmp_path / "demo" / "comparison.png").shape == (

@@ -22,6 +22,7 @@ from mwdn.capture.screen import Picture, Place, Screen, place_picture, put
 from mwdn.capture.source import CameraFrame, CameraSource, check_like
 from mwdn.data.pair_writer import check_path
 from mwdn.errors import CameraError, ImageError, ParameterError
+from mwdn.io.files import check_folder
 
 SATURATED = 1e-3
 """Fraction of a white frame's pixels that may be saturated (hot pixels)."""
@@ -281,7 +282,8 @@ class Session:
             count * (self._first.array.nbytes + height * width * 6) + references * self._first.array.nbytes
         )
         folder = self.out.absolute().parent
-        free = shutil.disk_usage(folder).free
+        check_folder(folder)
+        free = shutil.disk_usage(next(each for each in (folder, *folder.parents) if each.exists())).free
         if needed > free:
             raise ParameterError(
                 f"{count:,} pairs need {needed / 1e6:,.0f} MB, but `{folder}` has {free / 1e6:,.0f} MB left. "

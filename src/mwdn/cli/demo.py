@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 import torch
 from cyclopts import Parameter
 from rich.table import Table
@@ -15,7 +16,7 @@ from mwdn.evaluation.tables import html_table
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.contact_sheets import contact_sheet, to_display
 from mwdn.io.files import refuse_foreign, write_text
-from mwdn.io.images import write_picture
+from mwdn.io.images import write_frame, write_linear, write_picture
 from mwdn.io.pictures import dark_scene
 from mwdn.optics import Camera, Contour, Setup
 from mwdn.optics.design import design_camera
@@ -26,10 +27,13 @@ SETUP = Setup(wavelengths=9)
 MASK = Contour(size_mm=(3.0, 2.5), pitch_um=4.0)
 """The open part of the paper's mask, with squares twice as large: takes a second to simulate."""
 
-FILES = ("index.html", "comparison.png", "psf.png")
-METHODS = ("universal", "pyramid", "admm", "fista", "wiener")
 Picture = Literal["astronaut", "coffee", "cat"]
 PICTURES: tuple[Picture, ...] = ("astronaut", "coffee", "cat")
+PEAK = 0.9
+"""Light of the brightest pixel over saturation, as a well exposed capture has it."""
+
+FILES = ("index.html", "comparison.png", "pattern.png", "psf.tif", *(f"captures/{name}.png" for name in PICTURES))
+METHODS = ("universal", "pyramid", "admm", "fista", "wiener")
 
 
 def demo(
@@ -41,7 +45,7 @@ def demo(
     """Simulate a small lensless camera and reconstruct its captures with every method that needs no training.
 
     Args:
-        out: folder for the comparison picture and the page.
+        out: folder for the page, its pictures, and the camera's own files: psf.tif and captures/.
         seed: of the camera's mask and of its noise.
         pictures: names of the scenes.
     """
@@ -53,19 +57,25 @@ def demo(
     table = Table("picture", title="PSNR in dB")
     for name in METHODS:
         table.add_column(name, justify="right")
-    rows = []
+    rows, captures = [], {}
     for name in pictures:
         scene = dark_scene(name, SETUP.size, side=200)
-        measurement = camera.simulate(scene, generator=generator)
-        results = [reconstruct(measurement) for reconstruct in reconstructors.values()]
+        light = camera(scene)
+        exposure = PEAK / light.max()
+        measurement = camera.sensor.expose(exposure * light, generator=generator)
+        results = [reconstruct(measurement) / exposure for reconstruct in reconstructors.values()]
         table.add_row(name, *(f"{psnr(result.clamp(0, 1), scene).item():.2f}" for result in results))
         rows.append([scene, measurement, *results])
-    page, comparison, psf = (out / name for name in FILES)
+        captures[name] = (65535 * measurement.clamp(0, 1)).round()[0].movedim(0, -1).numpy().astype(np.uint16)
+    page, comparison, pattern, psf = (out / name for name in FILES[:4])
     write_text(page, _PAGE.format(table=html_table(table)))
     write_picture(comparison, contact_sheet(rows, ["scene", "measurement", *METHODS]))
-    write_picture(psf, to_display(camera.psf))
+    write_picture(pattern, to_display(camera.psf))
+    write_linear(psf, camera.psf / camera.psf.max())
+    for name, frame in captures.items():
+        write_frame(out / "captures" / f"{name}.png", frame)
     console.print(table)
-    say(f"Look at {page}")
+    say(f"Look at {page}", f"Go on: mwdn reconstruct {out / 'captures'} --psf {psf} --background 0")
 
 
 _PAGE = """<!doctype html>
@@ -78,7 +88,7 @@ img {{ max-width: 100%; }} td, th {{ padding: .2rem 1rem; text-align: right; }} 
 <p>A camera without a lens: a thin mask in front of the sensor turns each point of the scene into the pattern
 below, the point spread function, computed here from a mask of eight levels by diffraction. The sensor records
 the scene convolved with it.</p>
-<img src="psf.png" alt="point spread function" width="320">
+<img src="pattern.png" alt="point spread function" width="320">
 <p>The methods below needed no training for this camera: <em>universal</em> is a network that comes with the
 package and was trained on thousands of random cameras; the others are classical.</p>
 <img src="comparison.png" alt="scene, measurement and reconstructions">

@@ -10,7 +10,7 @@ from cyclopts.config import Toml
 
 from mwdn.cli.terminal import say, warn
 from mwdn.errors import ParameterError, UnknownNameError
-from mwdn.io.files import refuse_overwrite
+from mwdn.io.files import check_folder, refuse_overwrite
 from mwdn.io.toml import find_recipe
 from mwdn.optics import MASKS, ArrayMask, Setup
 from mwdn.optics.masks import MaskDesign
@@ -57,6 +57,7 @@ class Output:
         from mwdn.optics.mask_files import check_stl, write_gds, write_stl
 
         check_replaced(self.out, gds=self.gds, stl=self.stl)
+        check_folder(self.out)
         designed = design_camera(name, mask, setup)
         if self.stl:
             check_stl(designed.mask, every=self.stl_every)

@@ -12,6 +12,7 @@ from mwdn.cli.method_options import MethodOptions, read_options
 from mwdn.cli.terminal import say
 from mwdn.errors import ParameterError
 from mwdn.export.exporter import Exported, Precision, required_agreement
+from mwdn.io.files import check_folder
 
 
 def export(  # noqa: PLR0913
@@ -52,6 +53,7 @@ def export(  # noqa: PLR0913
         if runtime is not None:
             raise ParameterError(f"`runtime` ({runtime}) is for pages. Add `--web CAMERA`, or leave it out.")
         out = out or Path("camera.onnx")
+        check_folder(out.parent)
         write = _writer(out)
         exported = write(
             method, camera.load(), out, precision=precision, channels=channels, least=least, **method_options

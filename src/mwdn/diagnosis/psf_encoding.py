@@ -16,7 +16,7 @@ A coded PSF above a bright background, or in a noisy capture, hardly differs fro
 """
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 from mwdn.calibration import Calibration
 from mwdn.diagnosis.encoding import as_linear_and_coded, misfits
@@ -29,6 +29,10 @@ LINEAR = -0.06
 
 CODED = 0.1
 """Score above which it is coded. Linear PSFs have 0.07 and less."""
+
+
+JUDGES = 3
+"""Largest number of captures from which the gamma of a PSF's file is detected."""
 
 
 def psf_gamma(frame: Frame, calibration: Calibration, capture: str, *, for_viewing: bool = False) -> Verdict:
@@ -58,6 +62,33 @@ def psf_gamma(frame: Frame, calibration: Calibration, capture: str, *, for_viewi
         return Verdict("psf", "psf-gamma", "doubt", f"{text}.", "srgb", "--psf-gamma srgb")
     text = "This capture cannot tell whether the PSF's file is gamma-coded."
     return Verdict("psf", "psf-gamma", "unknown", text)
+
+
+@dataclass
+class PsfGammaTest:
+    """`psf_gamma` of the first captures of a camera, a second each, until one gives a result.
+
+    Args:
+        calibration: the camera's.
+        for_viewing: as for `psf_gamma`.
+        known: verdicts so far.
+    """
+
+    calibration: Calibration
+    for_viewing: bool = False
+    known: list[Verdict] = field(default_factory=list)
+
+    def __call__(self, frame: Frame, verdicts: tuple[Verdict, ...]) -> tuple[Verdict, ...]:
+        """The verdict, if there is one.
+
+        Args:
+            frame: (H, W, C) of a capture, numbers as stored.
+            verdicts: on this capture, see `mwdn.diagnosis.captures.examine_capture`.
+        """
+        gamma = [verdict.value for verdict in verdicts if verdict.topic == "gamma"]
+        if gamma and len(self.known) < JUDGES and all(verdict.state == "unknown" for verdict in self.known):
+            self.known.append(psf_gamma(frame, self.calibration, gamma[0], for_viewing=self.for_viewing))
+        return tuple(self.known[-1:])
 
 
 def _score(frame: Frame, calibration: Calibration, capture: str) -> float:

@@ -127,6 +127,8 @@ def export(
     refuse_overwrite(out)
     name = method_name(method)
     method = as_method(method, **options)
+    if precision != "float32" and not isinstance(method, nn.Module):
+        raise ParameterError(f"`precision` ({precision}) is for networks: a solver has no convolutions. Leave it out.")
     if channels == 1 < calibration.psf.shape[1]:
         raise ParameterError("`channels` (1) must be 3, because the PSF has colours. For a grey camera: `grey`.")
     channels = channels or calibration.psf.shape[1]

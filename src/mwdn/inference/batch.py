@@ -15,7 +15,7 @@ from mwdn.data.captures import read_capture
 from mwdn.diagnosis import Verdict
 from mwdn.diagnosis.captures import examine_capture, refuse_dark
 from mwdn.diagnosis.exif import exif_turn, settle_exif
-from mwdn.diagnosis.psf_encoding import psf_gamma
+from mwdn.diagnosis.psf_encoding import PsfGammaTest
 from mwdn.diagnosis.sizes import mismatch
 from mwdn.diagnosis.trust import Trust, examine_picture
 from mwdn.errors import ImageError, MwdnError, ShapeError
@@ -33,13 +33,10 @@ from mwdn.runtime.iterations import watch_iterations
 from mwdn.runtime.streams import prefetch
 from mwdn.runtime.transfers import to_device, to_host
 from mwdn.solvers import Pose, align
-from mwdn.types import Frame, Measurement, Scene, Size
+from mwdn.types import Measurement, Scene, Size
 
 SHOWN = 12
 """Number of captures on the summary: the first ones."""
-
-JUDGES = 3
-"""Largest number of captures from which the gamma of the PSF's file is detected."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +116,6 @@ class Batch:
     resume: bool = False
     psf_file: Path | None = None
     full_size: bool = False
-    _psf_verdicts: list[Verdict] = field(default_factory=list, init=False, repr=False)
     _mismatches: dict[tuple[int, ...], ShapeError] = field(default_factory=dict, init=False, repr=False)
 
     def run(
@@ -176,19 +172,15 @@ class Batch:
         if not self.check_consistency:
             return job
         verdicts = examine_capture(frame, calibration, for_viewing=is_for_viewing(job.capture))
-        verdicts += self._examine_psf(frame, verdicts)
+        verdicts += self._psf_gamma(frame, verdicts)
         if self.psf_file is not None and calibration.psf_format.psf_orientation is None:
             verdicts += (exif_turn(orientation(job.capture), orientation(self.psf_file)),)
         return replace(job, pose=align(measurement, self.reconstruct.psf), verdicts=verdicts)
 
-    def _examine_psf(self, frame: Frame, verdicts: tuple[Verdict, ...]) -> tuple[Verdict, ...]:
-        """Whether the PSF's file is gamma-coded: tests the first captures, a second each, until one gives a result."""
-        known = self._psf_verdicts
-        gamma = [verdict.value for verdict in verdicts if verdict.topic == "gamma"]
-        if gamma and len(known) < JUDGES and all(verdict.state == "unknown" for verdict in known):
-            for_viewing = self.psf_file is not None and is_for_viewing(self.psf_file)
-            known.append(psf_gamma(frame, self.reconstruct.calibration, gamma[0], for_viewing=for_viewing))
-        return tuple(known[-1:])
+    @cached_property
+    def _psf_gamma(self) -> PsfGammaTest:
+        for_viewing = self.psf_file is not None and is_for_viewing(self.psf_file)
+        return PsfGammaTest(self.reconstruct.calibration, for_viewing)
 
     def _check_fit(self, measurement: Measurement) -> None:
         """Check the size; the first capture of each wrong size is compared with the PSF at other bins."""

@@ -148,7 +148,7 @@ class Reconstructor:
             refresh: align again after this number of frames; 0 for never.
 
         Yields:
-            Measurement and scene, as `__call__` returns it.
+            Measurement and scene of each frame, tensors (1, C, H, W) on the CPU.
 
         Raises:
             ParameterError: ``refresh`` is negative.

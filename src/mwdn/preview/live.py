@@ -141,12 +141,13 @@ class Live:
                 with self.camera, ExitStack() as recording, closing(self._results(recording)) as results:
                     self._show(results)
             except Exception as error:
-                failed, self._is_recording = True, False
+                failed = True
                 said = str(error)
                 if not isinstance(error, MwdnError):  # a defect of this package must not end the live picture for good
                     LOG.exception("live picture")
                     said = f"An error of mwdn itself: {type(error).__name__}. The server's log says more."
                 self._publish({"error": said}, b"", b"")
+            self._is_recording = False  # the next viewer starts no recording
             self._changed.clear()
             if failed and self._wake and not self._is_stopped:
                 self._changed.wait(self._retry_s)

@@ -13,8 +13,10 @@ import torch
 
 from mwdn.calibration import Calibration
 from mwdn.diagnosis.captures import examine_capture, refuse_dark
+from mwdn.diagnosis.psf_encoding import PsfGammaTest
 from mwdn.diagnosis.sizes import mismatch
 from mwdn.diagnosis.trust import check_size, examine_picture
+from mwdn.diagnosis.verdict import Verdict
 from mwdn.errors import ImageError, ShapeError
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.formats import is_for_viewing
@@ -68,10 +70,10 @@ class Reconstructions:
     def __init__(self, limits: Limits, device: str | None = None) -> None:
         self.limits, self.device = limits, device
         self._lock = threading.Lock()
-        self._prepared: OrderedDict[tuple[Any, ...], tuple[Calibration, Reconstructor]] = OrderedDict()
+        self._prepared: OrderedDict[tuple[Any, ...], tuple[Calibration, Reconstructor, PsfGammaTest]] = OrderedDict()
 
-    def prepare(self, order: Order, calibration: Calibration) -> Reconstructor:
-        """The method for the camera.
+    def prepare(self, order: Order, calibration: Calibration) -> tuple[Reconstructor, PsfGammaTest]:
+        """The method for the camera, and the test of the PSF's gamma, which needs a capture.
 
         Raises:
             MwdnError: no such method or option, or it does not fit the camera.
@@ -83,15 +85,16 @@ class Reconstructions:
         with self._lock:
             if key in self._prepared:
                 self._prepared.move_to_end(key)
-                return self._prepared[key][1]
+                return self._prepared[key][1:]
         lit = with_ambient(calibration, order.ambient, self.limits)
         how: dict[str, Any] = {"align": order.align, "room_light": order.room_light, "device": self.device}
         made = Reconstructor(order.method, lit, **how, **order.options)
         with self._lock:
-            self._prepared[key] = calibration, made  # keeps the calibration, so that its id stays its own
+            # The calibration is kept, so that its id stays its own.
+            self._prepared[key] = calibration, made, PsfGammaTest(lit)
             while len(self._prepared) > KEPT:
                 self._prepared.popitem(last=False)
-        return made
+            return self._prepared[key][1:]
 
     def run(self, job: Job, order: Order) -> None:
         """Reconstruct; the picture is in the job before it is checked.
@@ -99,7 +102,8 @@ class Reconstructions:
         Raises:
             MwdnError: what is wrong with the capture, the camera or the method.
         """
-        reconstruct, start = self.prepare(order, order.calibration()), time.perf_counter()
+        start = time.perf_counter()
+        reconstruct, gamma = self.prepare(order, order.calibration())
         calibration = reconstruct.calibration
         frame, for_viewing = read_capture(order.capture, calibration, self.limits)
         measurement = to_device(to_measurement(frame, calibration, self.limits), reconstruct.device)
@@ -119,7 +123,9 @@ class Reconstructions:
             job.advance(0.9)
             job.state = "checking"
             with torch.inference_mode():
-                found = _check(frame, measurement, reconstruct, scene, pose, for_viewing=for_viewing)
+                verdicts = examine_capture(frame, calibration, for_viewing=for_viewing)
+                verdicts += gamma(frame, verdicts)
+                found = _check(verdicts, measurement, reconstruct, scene, pose)
             job.result = replace(job.result, report=report | found)
 
 
@@ -186,18 +192,14 @@ def to_measurement(frame: Frame, calibration: Calibration, limits: Limits) -> Me
 
 
 def _check(
-    frame: Frame,
+    verdicts: tuple[Verdict, ...],
     measurement: Measurement,
     reconstruct: Reconstructor,
     scene: Scene,
     pose: Pose | None,
-    *,
-    for_viewing: bool,
 ) -> dict[str, Any]:
-    """Verdicts on the capture, the PSF and the picture, and the numbers behind them."""
-    calibration = reconstruct.calibration
-    verdicts = examine_capture(frame, calibration, for_viewing=for_viewing)
-    given = calibration.psf_format.psf_orientation
+    """The verdicts, with those on the PSF's orientation and the picture, and the numbers behind them."""
+    given = reconstruct.calibration.psf_format.psf_orientation
     trust = examine_picture(measurement, reconstruct.psf, scene, pose=pose, given=given)
     if not trust.finite:
         raise ImageError("The numbers of the capture are too large or too small to be judged. Scale it.")

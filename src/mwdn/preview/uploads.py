@@ -30,8 +30,10 @@ class Form:
         Raises:
             ParameterError: it is missing or empty.
         """
-        if not self.files.get(name):
+        if name not in self.files:
             raise ParameterError(f"`{name}` must be a file of the form: curl --form {name}=@{name}.png")
+        if not self.files[name]:
+            raise ParameterError(f"`{name}` is empty (0 bytes). Copy the file from its source again.")
         return self.files[name]
 
     def json(self, name: str) -> dict[str, Any]:
