@@ -1,5 +1,6 @@
 """Sessions on the simulated rig: every pair once, whatever stops them."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -193,6 +194,15 @@ def test_a_drift_of_the_light_is_warned_of(tmp_path):
     recipe = read_capture_recipe(write(tmp_path, rig="drift = 0.03"), display={"gamma": 2.2})
     with pytest.warns(UserWarning, match=r"display's light has changed by"):
         session(recipe, tmp_path / "pairs.h5").run()
+
+
+def test_a_name_that_is_not_utf8_is_skipped_and_an_output_folder_is_made(tmp_path, recipe):
+    """Both ended in a traceback."""
+    shutil.copy(tmp_path / "photos" / "0.png", os.fsencode(tmp_path / "photos") + b"/bad\xff.png")
+    everything, out = replace(recipe, pictures=replace(recipe.pictures, count=0)), tmp_path / "new" / "pairs.h5"
+    with pytest.warns(UserWarning, match=r"bad\\udcff\.png` is skipped, because its name is not UTF-8"):
+        assert session(everything, out).run() == 9
+    check_pairs(out, recipe, 9)
 
 
 def test_a_damaged_photograph_is_skipped_and_named(tmp_path, recipe):

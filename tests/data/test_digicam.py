@@ -96,6 +96,18 @@ def test_room_light_is_subtracted_from_linear_light(frames, tmp_path):
         torch.testing.assert_close(pairs[0][0], expected[0], rtol=0, atol=1e-6)
 
 
+def test_psf_of_cropped_captures_is_that_of_a_smaller_sensor(tmp_path):
+    """It was computed as if the whole width of the sensor were in the crop."""
+    folder = tmp_path / "set"
+    patterns(folder, (0,))
+    shard(folder / "a.parquet", labels=[0] * 4)
+    whole, crop = FrameFormat(), FrameFormat(crop=(20, 24))
+    for name, frames in (("whole", whole), ("crop", crop)):
+        import_digicam(folder, tmp_path / f"{name}.h5", CAMERA, frames=frames)
+    psfs = [PairFile(tmp_path / f"{name}.h5").psf for name in ("whole", "crop")]
+    assert likeness(psfs[0][..., 9:29, 13:37], psfs[1]) > 0.9
+
+
 def test_metadata_of_subfolders_and_an_empty_line(run, tmp_path):
     folder = tmp_path / "set"
     patterns(folder, (1, 2))

@@ -254,6 +254,26 @@ def test_floats_of_another_scale_are_refused(tmp_path):
         import_pairs("folders", tmp_path, tmp_path / "pairs.h5")
 
 
+def test_fractions_of_saturation_have_no_bit_depth(tmp_path):
+    for folder in ("captures", "scenes"):
+        write(tmp_path / folder / "a.npy", np.full((4, 5, 3), 0.5, np.float32))
+    with pytest.raises(ImageError, match=r"floats up to 0\.5, but `bit_depth` \(12\)"):
+        import_pairs("folders", tmp_path, tmp_path / "pairs.h5", frames=FrameFormat(bit_depth=12))
+
+
+def test_scenes_are_turned_upright_and_captures_stay(tmp_path):
+    """The display showed the photograph upright; the capture is as the sensor stored it."""
+    exif = Pillow.Exif()
+    exif[274] = 3
+    for folder, seed in (("captures", 100), ("scenes", 0)):
+        path = tmp_path / folder / "a.png"
+        write(path, flag(seed))
+        Pillow.open(path).save(path, exif=exif)
+    (_, measurement, scene), *_ = read_pairs("folders", tmp_path)
+    assert np.array_equal(measurement, flag(100))
+    assert np.array_equal(scene, flag()[::-1, ::-1])
+
+
 def test_nothing_to_import(tmp_path):
     with pytest.raises(ImageError, match=r"captures` is not a folder.*--captures"):
         import_pairs("folders", tmp_path, tmp_path / "pairs.h5")

@@ -42,6 +42,15 @@ def test_scale_of_a_psf_never_matters(name, psf):
     torch.testing.assert_close(result, expected, rtol=1e-3, atol=1e-4)
 
 
+def test_gradient_of_a_psf_of_unit_sum_is_that_of_its_shape(psf):
+    """Only the shape counts, so the gradient along the PSF itself is 0; the division was left out at a sum of 1."""
+    for factor in (1.0, 2.0):
+        scaled = (factor * psf).requires_grad_()
+        (Camera(scaled)(MEASUREMENT) * MEASUREMENT).sum().backward()
+        along = (scaled.grad * scaled).sum((-2, -1))
+        assert along.abs().max() < 1e-4 * (scaled.grad * scaled).abs().sum()
+
+
 def without_light(psf):
     dark = psf.clone()
     dark[:, 1] = 0

@@ -156,6 +156,7 @@ def test_recording_holds_raw_frames(live, viewer, tmp_path):
     assert frames[0].array.shape == (SIDE, SIDE, 3)
     assert frames[0].bit_depth == 12
     assert all(a.number < b.number for a, b in itertools.pairwise(frames))
+    assert not served._is_recording  # the next viewer starts no recording
 
 
 @pytest.mark.parametrize("live", [",disconnect_every=5"], indirect=True)

@@ -2,7 +2,9 @@
 
 import io
 import json
+import signal
 import socket
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from urllib.parse import urlsplit
@@ -182,6 +184,28 @@ def test_job_can_be_cancelled(client, capture):
     assert job["state"] == "cancelled"
     assert "report" not in job
     order(client, capture)  # the next one is served
+
+
+def test_a_signal_ends_requests_in_progress_at_once(serve, psf, capture):
+    """They ended after ten seconds, with a traceback and a page of plain text."""
+    server, answers = serve(StoredCameras(LIMITS, None, {"camera": Calibration(psf)})), []
+    fields = {"camera": "camera", "method": "admm", "trust": "false", "options": '{"iterations": 1000000000}'}
+
+    def post():
+        answers.append(httpx.post(f"{server.url}reconstruct", files={"capture": capture}, data=fields, timeout=60))
+
+    threads = [threading.Thread(target=post) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    metrics = f"{server.url}metrics"
+    while "mwdn_jobs_running 1" not in (text := httpx.get(metrics).text) or "mwdn_jobs_waiting 1" not in text:
+        pass
+    server._server.handle_exit(signal.SIGINT, None)
+    for thread in threads:
+        thread.join()
+    assert [(each.status_code, each.json()) for each in answers] == [
+        (503, {"error": "The server is being stopped."})
+    ] * 2
 
 
 def test_cameras_are_listed_added_and_removed(serve, tmp_path, psf_file):

@@ -174,7 +174,8 @@ def equal_parts(paths: Sequence[Path], count: int, kind: str) -> list[list[Path]
     """
     if len(paths) % count:
         raise ParameterError(
-            f"{len(paths)} {kind} frames cannot be divided into {count} equal groups. Give as many frames for each."
+            f"{kind[0].upper()}{kind[1:]} frames ({len(paths)}) cannot be divided into {count} equal groups. Give as "
+            "many frames for each."
         )
     size = len(paths) // count
     return [list(paths[start : start + size]) for start in range(0, len(paths), size)]

@@ -1,12 +1,13 @@
 """The photographs of a session: their order, and their conversion for the display."""
 
 import random
+import warnings
 from pathlib import Path
 
 import numpy as np
 
 from mwdn.capture.screen import Picture
-from mwdn.errors import ImageError, ParameterError
+from mwdn.errors import ImageError, ParameterError, one_line
 from mwdn.io.images import READABLE, read_frame
 from mwdn.io.listing import pictures_in
 
@@ -27,6 +28,9 @@ def list_photographs(folder: Path, seed: int, known: list[str] | None = None) ->
             f"`folder` (`{folder}`) of [pictures] is not a folder. Give the folder of the photographs."
         )
     names = [path.relative_to(folder).as_posix() for path in pictures_in(folder)]
+    for name in [name for name in names if not name.isascii() and name != name.encode(errors="replace").decode()]:
+        names.remove(name)  # a session stores names as UTF-8
+        warnings.warn(f"`{one_line(name)}` is skipped, because its name is not UTF-8. Rename it.", stacklevel=2)
     if not names:
         raise ParameterError(f"`{folder}` holds no photograph. Readable: {', '.join(sorted(READABLE))}.")
     left = sorted(set(names) - set(known or ()))

@@ -15,14 +15,17 @@ from mwdn.evaluation import psnr
 from mwdn.evaluation.tables import html_table
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.contact_sheets import contact_sheet, to_display
-from mwdn.io.files import refuse_foreign, write_text
+from mwdn.io.files import check_folder, refuse_foreign, write_text
 from mwdn.io.images import write_frame, write_linear, write_picture
 from mwdn.io.pictures import dark_scene
-from mwdn.optics import Camera, Contour, Setup
+from mwdn.optics import Camera, Contour, Sensor, Setup
 from mwdn.optics.design import design_camera
 
 SETUP = Setup(wavelengths=9)
 """The paper's camera at fewer wavelengths."""
+
+SENSOR = Sensor(full_well=60_000.0)
+"""Four frames of the paper's sensor, averaged."""
 
 MASK = Contour(size_mm=(3.0, 2.5), pitch_um=4.0)
 """The open part of the paper's mask, with squares twice as large: takes a second to simulate."""
@@ -50,8 +53,9 @@ def demo(
         pictures: names of the scenes.
     """
     refuse_foreign(out, FILES, b"mwdn demo")
+    check_folder(out)
     generator = torch.Generator().manual_seed(seed)
-    camera = Camera(design_camera("contour", replace(MASK, seed=seed), SETUP).psf)
+    camera = Camera(design_camera("contour", replace(MASK, seed=seed), SETUP).psf, sensor=SENSOR)
     calibration = Calibration(camera.psf)
     reconstructors = {name: Reconstructor(name, calibration, device="cpu") for name in METHODS}
     table = Table("picture", title="PSNR in dB")

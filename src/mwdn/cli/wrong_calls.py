@@ -9,7 +9,7 @@ from typing import Any, Union, get_args, get_origin
 
 from cyclopts import CoercionError, CycloptsError, MissingArgumentError, UnknownOptionError
 from cyclopts.argument import Argument
-from cyclopts.exceptions import RepeatArgumentError, UnknownCommandError, UnusedCliTokensError
+from cyclopts.exceptions import ArgumentOrderError, RepeatArgumentError, UnknownCommandError, UnusedCliTokensError
 from cyclopts.token import Token
 
 from mwdn.errors import ParameterError, UnknownNameError, type_in_words
@@ -29,6 +29,10 @@ def wrong_call(error: CycloptsError, commands: Iterable[str]) -> ParameterError:
             return ParameterError(_unknown_option(error))
         case CoercionError(argument=Argument() as argument, token=token, msg=None):
             return ParameterError(_wrong_value(argument, token))
+        case ArgumentOrderError(token=given):
+            return ParameterError(
+                f"`{given}` must come before the options, in the order of the help. {_see_help(error)}"
+            )
         case MissingArgumentError(argument=Argument() as argument):
             return ParameterError(_missing(error, argument))
         case RepeatArgumentError():

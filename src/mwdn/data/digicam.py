@@ -155,13 +155,21 @@ def import_digicam(
         if first is None:
             continue
         attributes: dict[str, Attribute] = {"source": "digicam", "mask_label": label}
-        psf = camera.psf(patterns[label], (first[1].shape[0], first[1].shape[1]))
+        psf = _cropped(camera, frames, part).psf(patterns[label], (first[1].shape[0], first[1].shape[1]))
         result.files[file] = label, write_pairs(file, chain([first], pairs), attributes, psf)
         result.psfs.append(file.with_name(f"{file.stem}-psf.tif"))
         write_linear(result.psfs[-1], psf / psf.max())
     if not result.files:
         raise ImageError(f"`{path}` has no pair to import. For the layouts: `mwdn import --help`.")
     return result
+
+
+def _cropped(camera: DigiCam, frames: FrameFormat, listing: Listing) -> DigiCam:
+    """The camera with the part of the sensor that the captures keep."""
+    if frames.crop is None:
+        return camera
+    width = listing.sources[0].load()[0].shape[1]
+    return replace(camera, sensor_mm=camera.sensor_mm * min(frames.crop[1], width) / width)
 
 
 def list_digicam(

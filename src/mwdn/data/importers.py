@@ -9,6 +9,7 @@ from typing import cast
 import numpy as np
 
 from mwdn.calibration import Calibration, FrameFormat
+from mwdn.calibration.float_scale import check_float_scale
 from mwdn.calibration.frame_format import changed_fields
 from mwdn.data.authors_file import AuthorsWriter
 from mwdn.data.kinds import KINDS, Kind, Layout
@@ -251,6 +252,8 @@ def _correct_levels(frame: Frame, frames: FrameFormat, name: str, camera: Calibr
     """Apply every step of the format but channel order and orientation; without any, the numbers stay as stored."""
     if frames.bit_depth is not None and frames.bit_depth > 8 * frame.dtype.itemsize:
         raise ImageError(f"The capture of `{name}` has {frame.dtype}, fewer than {frames.bit_depth} bits.")
+    if frames.bit_depth is not None:
+        check_float_scale(frame, frames.bit_depth)
     steps = replace(frames, bgr=False, upside_down=False)
     if camera is None:
         return frame if steps == FrameFormat() else steps.to_measurement(frame)[0].movedim(0, -1).numpy()

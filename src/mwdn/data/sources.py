@@ -191,8 +191,8 @@ def files_by_stem(folder: Path) -> dict[str, Path]:
 
 
 def read_both(capture: Path, scene: Path) -> tuple[Frame, Frame]:
-    """Read a capture and its scene."""
-    return read_frame(capture), read_frame(scene)
+    """Read a capture as the sensor stored it, and its scene as it is to be shown."""
+    return read_frame(capture), read_frame(scene, upright=True)
 
 
 def _read_row(path: Path, file: Any, names: tuple[str, str], row: int) -> tuple[Frame, Frame]:  # noqa: ANN401

@@ -44,7 +44,11 @@ def checked_psf(psf: Tensor, *, values: bool = True, scale: bool = True) -> Psf:
     total = psf.sum((-2, -1), keepdim=True, dtype=torch.promote_types(psf.dtype, torch.float32))
     if values and not torch.compiler.is_compiling() and psf.numel() > 0:  # a graph cannot depend on values
         _refuse_values(psf.detach(), total.detach())
-    return psf if not scale else psf / torch.where((total - 1).abs() <= SUM_TOLERANCE, 1.0, total)
+    if not scale:
+        return psf
+    if not psf.requires_grad:  # otherwise the gradient needs the division
+        total = torch.where((total - 1).abs() <= SUM_TOLERANCE, 1.0, total)
+    return psf / total
 
 
 def _refuse_values(psf: Tensor, total: Tensor) -> None:

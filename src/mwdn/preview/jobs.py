@@ -16,6 +16,8 @@ from mwdn.preview.result import Result
 State = Literal["waiting", "reconstructing", "checking", "done", "failed", "cancelled"]
 ENDED = ("done", "failed", "cancelled")
 
+STOPPED = "The server is being stopped."
+
 LOG = logging.getLogger("mwdn.preview")
 
 REMEMBERED = 1000
@@ -37,7 +39,7 @@ class Job:
     progress: float = 0.0
     result: Result | None = None
     error: MwdnError | None = None
-    is_cancelled: bool = False
+    cancelled: RefusedError | None = None  # why it is to end
     deadline: float = float("inf")
     size: int = 0
     _listeners: list[Callable[[], None]] = field(default_factory=list)
@@ -66,8 +68,8 @@ class Job:
         Raises:
             RefusedError: it was cancelled, or its time is over.
         """
-        if self.is_cancelled:
-            raise RefusedError(409, "The reconstruction was cancelled.")
+        if self.cancelled is not None:
+            raise self.cancelled
         if time.monotonic() > self.deadline:
             raise RefusedError(
                 504,
@@ -111,7 +113,7 @@ class Jobs:
         job = Job(self.limits.seconds, size=size)
         with self._changed:
             if self._is_closed:
-                raise RefusedError(503, "The server is being stopped.")
+                raise RefusedError(503, STOPPED)
             kept = sum(waiting.size for waiting, _ in self._queue)
             if len(self._queue) >= self.limits.waiting or kept + size > self.limits.waiting_bytes:
                 raise RefusedError(
@@ -152,7 +154,7 @@ class Jobs:
             job.advance(1.0)
             job.end("done")
         except MwdnError as error:
-            job.end("cancelled" if job.is_cancelled else "failed", error)
+            job.end("cancelled" if job.cancelled else "failed", error)
         except Exception as error:  # a defect of this package must not end the server
             LOG.exception("reconstruction")
             what = type(error).__name__
@@ -193,15 +195,15 @@ class Jobs:
             raise RefusedError(404, f"The job's result {why}.")
         return job.result
 
-    def cancel(self, id: str) -> Job:
+    def cancel(self, id: str, why: RefusedError | None = None) -> Job:
         """End a job: before its start, or after the iteration in progress."""
         job = self.get(id)
-        job.is_cancelled = True
+        job.cancelled = why = why or RefusedError(409, "The reconstruction was cancelled.")
         with self._changed:
             waiting = next((item for item in self._queue if item[0] is job), None)
             if waiting is not None:
                 self._queue.remove(waiting)
-                job.end("cancelled", RefusedError(409, "The reconstruction was cancelled."))
+                job.end("cancelled", why)
         return job
 
     @property
@@ -217,10 +219,10 @@ class Jobs:
 
     def close(self) -> None:
         """Cancel all jobs, and wait for the iterations in progress."""
-        for id in list(self._jobs):
-            self.cancel(id)
         with self._changed:
             self._is_closed = True
             self._changed.notify_all()
+        for id in list(self._jobs):
+            self.cancel(id, RefusedError(503, STOPPED))
         for thread in self._threads:
             thread.join(timeout=10)

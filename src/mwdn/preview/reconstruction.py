@@ -155,6 +155,7 @@ def _report(order: Order, reconstruct: Reconstructor, seconds: float) -> dict[st
         "options": order.options,
         "aligned": reconstruct.align,
         "psf_hash": reconstruct.calibration.psf_hash,
+        "bin": reconstruct.calibration.frames.bin,
         "height": height,
         "width": width,
         "seconds": round(seconds, 3),

@@ -52,10 +52,18 @@ class PreviewServer:
             server_header=False,
         )
         self._server = uvicorn.Server(config)
+        usual_exit = self._server.handle_exit
+
+        def exit_at_once(sig: int, frame: Any) -> None:  # noqa: ANN401
+            """Requests in progress end when their jobs are cancelled; by itself uvicorn waits for them first."""
+            threading.Thread(target=preview.jobs.close, daemon=True).start()
+            usual_exit(sig, frame)
+
+        self._server.handle_exit = exit_at_once  # type: ignore[method-assign]
         self._thread: threading.Thread | None = None
 
     def run(self) -> None:
-        """Serve until Ctrl-C or SIGTERM, which let work in progress end."""
+        """Serve until Ctrl-C or SIGTERM, which cancel reconstructions in progress."""
         self._server.run([self.socket])
 
     def start(self) -> None:

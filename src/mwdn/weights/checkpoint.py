@@ -99,7 +99,8 @@ def load_checkpoint(path: str | Path) -> nn.Module:
     except (TypeError, ParameterError) as error:  # TypeError: `name` is one of the options, too
         version, why = (shorten(str(text), n) for text, n in ((metadata.get("version", "unknown"), 20), (error, 180)))
         raise CheckpointError(
-            f"`{path}`, of mwdn {version}, has a network that cannot be built: {why} Update mwdn."
+            f"`{path}`, of mwdn {version}, has a network that cannot be built: {why} Update "
+            "mwdn, or install the package of the plugin that has it."
         ) from error
     shapes = {key: entry.shape for key, entry in header.entries.items()}
     check_shapes(network, shapes, f"`{path}` does not fit the network '{name}' it names")
