@@ -196,6 +196,12 @@ def test_narrow_spots_are_as_alike_between_pixels():
     assert displacement(spots[1], spots[0]) == pytest.approx((3.5, -1.5, 1.0), abs=2e-3)
 
 
+@pytest.mark.usefixtures("unchecked")
+def test_displacement_between_sizes_is_refused(bench):
+    with pytest.raises(ShapeError, match="must have the same height and width"):
+        displacement(bench.light, bench.light[..., 1:])
+
+
 def test_displacement_between_pixels(bench):
     image = bench.light
     for down, right in ((3, -7), (0, 0), (-12, 5)):
@@ -203,6 +209,4 @@ def test_displacement_between_pixels(bench):
         assert found[:2] == pytest.approx((down, right), abs=0.01)
     half = (image + shifted(image, 1, 0)) / 2
     assert displacement(half, image).down == pytest.approx(0.5, abs=0.01)
-    with pytest.raises(ShapeError, match="must have the same height and width"):
-        displacement(image, image[..., 1:])
     assert torch.equal(shifted(image, 200, 0), torch.zeros_like(image))

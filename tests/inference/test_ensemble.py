@@ -34,7 +34,7 @@ def test_a_mirrored_camera_sees_the_mirrored_picture(camera, name):
     axes = MIRRORS[name]
 
     def changed(**options):
-        options = {"precision": "exact", "align": False, "device": "cpu", **options}
+        options = {"precision": "exact", "align": False, "room_light": False, "device": "cpu", **options}
         picture = Reconstructor(network, Calibration(psf), **options)(measurement)
         mirrored = Reconstructor(network, Calibration(turn(psf, name)), **options)(measurement.flip(axes))
         return float((mirrored.flip(axes) - picture).norm() / picture.norm())
@@ -45,7 +45,8 @@ def test_a_mirrored_camera_sees_the_mirrored_picture(camera, name):
 def test_the_mean_is_at_least_as_near_as_the_four_on_average(camera):
     """Of even sides the PSF's centre is not the array's: a mirrored pass that ignores it is one pixel off."""
     network, psf, scene, measurement = camera(EVEN)
-    reconstruct = Reconstructor(network, Calibration(psf), ensemble=True, align=False, device="cpu", precision="exact")
+    options = {"align": False, "room_light": False, "device": "cpu", "precision": "exact"}
+    reconstruct = Reconstructor(network, Calibration(psf), ensemble=True, **options)
     ensemble = reconstruct.engine
     passes = [ensemble.engine(measurement)]
     passes += [engine(measurement.flip(axes)).flip(axes) for axes, engine in ensemble.mirrored.items()]

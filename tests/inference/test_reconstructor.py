@@ -75,9 +75,10 @@ def test_each_network_from_its_checkpoint(tmp_path, name, psf, measurement):
     batch = torch.cat([measurement, measurement / 2])
     expected = network.eval()(batch, psf).detach()
     for method in (path, network.train()):
-        result = Reconstructor(method, Calibration(psf), align=False, device="cpu")(batch)
+        options = {"align": False, "room_light": False, "device": "cpu"}
+        result = Reconstructor(method, Calibration(psf), **options)(batch)
         assert (result - expected).norm() < 0.05 * expected.norm()
-        exact = Reconstructor(method, Calibration(psf), align=False, device="cpu", precision="exact")(batch)
+        exact = Reconstructor(method, Calibration(psf), precision="exact", **options)(batch)
         torch.testing.assert_close(exact, expected, rtol=1e-4, atol=1e-4)
         assert not result.requires_grad
 
@@ -374,7 +375,8 @@ def test_what_belongs_to_each_sample_keeps_a_batch_together(generator):
     stream.pixels_per_chunk = 1
     for _ in range(2):
         torch.testing.assert_close(stream(batch), whole(batch, stream.psf))
-    network = Reconstructor(build("wiener-bank", width=4).eval(), calibration, device="cpu", precision="exact")
+    options = {"device": "cpu", "precision": "exact", "room_light": False}
+    network = Reconstructor(build("wiener-bank", width=4).eval(), calibration, **options)
     network.pixels_per_chunk = 1
     pose = solvers.Pose(torch.tensor([0.0, 2.0, -3.0]), torch.tensor([0.0, 0.01, 0.02]))
     result = network.at(pose)(batch)
@@ -395,7 +397,8 @@ def test_copies_and_pickles_give_the_same_scene(name, precision, psf, measuremen
     if name not in SOLVERS:
         options = {"width": 2} if "width" in inspect.signature(NETWORKS[name]).parameters else {}
         method = build(name, **options).eval()
-    reconstruct = Reconstructor(method, Calibration(psf), device="cpu", precision=precision, align=False)
+    options = {"device": "cpu", "precision": precision, "align": False, "room_light": False}
+    reconstruct = Reconstructor(method, Calibration(psf), **options)
     scene = reconstruct(measurement)
     for other in (pickle.loads(pickle.dumps(reconstruct)), copy.deepcopy(reconstruct), copy.copy(reconstruct)):
         assert torch.equal(other(measurement), scene)

@@ -156,7 +156,10 @@ def test_recording_holds_raw_frames(live, viewer, tmp_path):
     assert frames[0].array.shape == (SIDE, SIDE, 3)
     assert frames[0].bit_depth == 12
     assert all(a.number < b.number for a, b in itertools.pairwise(frames))
-    assert not served._is_recording  # the next viewer starts no recording
+    number = served.join(lambda: None)  # the next viewer starts no recording
+    while served.newest is None or b'"recorded": null' not in served.newest:
+        pass
+    served.leave(number)
 
 
 @pytest.mark.parametrize("live", [",disconnect_every=5"], indirect=True)

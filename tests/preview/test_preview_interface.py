@@ -2,7 +2,6 @@
 
 import io
 import json
-import signal
 import socket
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -186,7 +185,7 @@ def test_job_can_be_cancelled(client, capture):
     order(client, capture)  # the next one is served
 
 
-def test_a_signal_ends_requests_in_progress_at_once(serve, psf, capture):
+def test_stopping_ends_requests_in_progress_at_once(serve, psf, capture):
     """They ended after ten seconds, with a traceback and a page of plain text."""
     server, answers = serve(StoredCameras(LIMITS, None, {"camera": Calibration(psf)})), []
     fields = {"camera": "camera", "method": "admm", "trust": "false", "options": '{"iterations": 1000000000}'}
@@ -200,7 +199,7 @@ def test_a_signal_ends_requests_in_progress_at_once(serve, psf, capture):
     metrics = f"{server.url}metrics"
     while "mwdn_jobs_running 1" not in (text := httpx.get(metrics).text) or "mwdn_jobs_waiting 1" not in text:
         pass
-    server._server.handle_exit(signal.SIGINT, None)
+    server.stop()
     for thread in threads:
         thread.join()
     assert [(each.status_code, each.json()) for each in answers] == [

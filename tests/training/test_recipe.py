@@ -148,7 +148,7 @@ def test_mistyped_names_get_the_nearest(read, text, said):
         (NETWORK + "[loss]\nmse = 1" + "0" * 400, "The weight of `mse` ("),
         ('[network]\nname = "mwdn"\nregularisation = inf', "`regularisation` (inf) of the network 'mwdn' must be"),
         ('[network]\nname = "mwdn"\nwidth = 20000', "[network]: the network 'mwdn' has 1,684,804,740,011 parameters"),
-        ('[network]\nname = "updn"\ndepth = 10000000', "[network]: it has too many layers. Lower its depth."),
+        ('[network]\nname = "updn"\ndepth = 10000000', "[network]: the network has too many layers. Lower its depth."),
         (NETWORK + '[cameras]\nsizes = ["²x99"]', '`sizes` of [cameras] ("'),
         (NETWORK + "[schedule]\ncrop = 8", "`crop` (8) applies to cached samples: set `pool`"),
         (NETWORK + f"[schedule]\nseed = {2**63 - 1}0", "must have 63 bits at most."),

@@ -52,11 +52,12 @@ class PreviewServer:
             server_header=False,
         )
         self._server = uvicorn.Server(config)
+        self._cancel = preview.jobs.close
         usual_exit = self._server.handle_exit
 
         def exit_at_once(sig: int, frame: Any) -> None:  # noqa: ANN401
             """Requests in progress end when their jobs are cancelled; by itself uvicorn waits for them first."""
-            threading.Thread(target=preview.jobs.close, daemon=True).start()
+            threading.Thread(target=self._cancel, daemon=True).start()
             usual_exit(sig, frame)
 
         self._server.handle_exit = exit_at_once  # type: ignore[method-assign]
@@ -72,8 +73,9 @@ class PreviewServer:
         self._thread.start()
 
     def stop(self) -> None:
-        """Let work in progress end, and stop."""
+        """Cancel reconstructions in progress, and stop."""
         self._server.should_exit = True
+        self._cancel()
         if self._thread is not None:
             self._thread.join(timeout=2 * STOP_S)
         self.socket.close()

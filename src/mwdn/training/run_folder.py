@@ -108,14 +108,14 @@ class RunFolder:
         recipe = self.path / "recipe.json"
         if not any(self.weights(name).exists() for name in WEIGHTS):
             return b""
-        return read_bytes(recipe, most=TEXT_BYTES, error=CheckpointError) if recipe.exists() else b"null"
-
-    def _check(self, owner: str) -> None:
-        if owner == "null":
+        if not recipe.exists():
             raise CheckpointError(
                 f"`{self.path}` holds weights, but no recipe.json that says of which run. Choose another folder, "
                 "`--out`, or remove it."
             )
+        return read_bytes(recipe, most=TEXT_BYTES, error=CheckpointError)
+
+    def _check(self, owner: str) -> None:
         try:
             difference = _difference(_with_current_names(json.loads(owner)), json.loads(json.dumps(self.identity)))
         except (ValueError, RecursionError):
