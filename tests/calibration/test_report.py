@@ -200,7 +200,7 @@ def test_distance_and_angle(psf):
     report = inspect_psf(Calibration(psf), depth=others, angle={5.0: psf})
     assert report.depth[10.0] == pytest.approx(1, abs=1e-4)
     assert report.depth[20.0] == psf_measures.likeness(psf.flip(-1), psf)
-    assert said(report, "distance", "at 20 the camera needs another PSF")
+    assert said(report, "distance", "at 20 mm the camera needs another PSF")
     assert said(report, "every angle", "1.00")
 
 

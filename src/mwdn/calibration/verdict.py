@@ -231,16 +231,20 @@ def _colours(report: PsfReport) -> Iterator[Finding]:
 
 
 def _places(report: PsfReport) -> Iterator[Finding]:
-    places = {"distance": report.depth, "angle": report.angle, "displacement in raw pixels": report.off_axis}
-    for what, by_place in places.items():
+    places = {
+        ("distance", " mm"): report.depth,
+        ("angle", " degrees"): report.angle,
+        ("displacement", " raw pixels"): report.off_axis,
+    }
+    for (what, unit), by_place in places.items():
         if not by_place:
             continue
         valid = [place for place, correlation in by_place.items() if correlation >= 0.7]
         invalid = [place for place, correlation in by_place.items() if correlation < 0.7]
         if invalid:
-            where = f"from {min(valid):g} to {max(valid):g}" if valid else "at none of the others"
+            where = f"from {min(valid):g} to {max(valid):g}{unit}" if valid else "nowhere else"
             text = f"By {what} of the point, this PSF is valid (correlation 0.7 or more) {where}; at "
-            text += ", ".join(f"{place:g}" for place in invalid) + " the camera needs another PSF."
+            text += ", ".join(f"{place:g}" for place in invalid) + f"{unit} the camera needs another PSF."
         else:
             text = f"This PSF is valid at every {what} compared: correlation {min(by_place.values()):.2f} or more."
         yield Finding("weak" if invalid else "good", text)

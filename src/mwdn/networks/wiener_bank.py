@@ -52,6 +52,25 @@ class BankTransfers(NamedTuple):
     filters: tuple[Tensor, ...]
 
 
+def _check_at_least(least: int, **numbers: int) -> None:
+    for name, value in numbers.items():
+        if value < least:
+            raise ParameterError(f"`{name}` ({value}) must be at least {least}.")
+
+
+def _check_iterations(finest: int, rounds: int, mean_light: MeanLight, *, evidence: bool) -> None:
+    """Check `finest`, and that there are iterations for what needs them."""
+    sizes = [level.downsampling for level in LEVELS]
+    if finest not in (0, *sizes):
+        raise ParameterError(f"`finest` ({finest}) must be 0 or one of {sizes}.")
+    if rounds and finest != 1:
+        raise ParameterError(f"`rounds` ({rounds}) of plug and play need iterations at full size: `finest` 1.")
+    if not finest and (evidence or mean_light != "kept"):
+        raise ParameterError(
+            f"`mean_light` ({mean_light}) and `evidence` ({evidence}) need iterations: `finest` 1, 2, 4 or 8."
+        )
+
+
 class WienerBank(FixedFront[BankTransfers]):
     """Wiener estimates with strong to weak regularisation, corrected by a U-Net.
 
@@ -111,20 +130,9 @@ class WienerBank(FixedFront[BankTransfers]):
         super().__init__()
         if not regularisations or min(regularisations) <= 0:
             raise ParameterError(f"`regularisations` {tuple(regularisations)} must be one or more positive numbers.")
-        if finest not in (0, *(level.downsampling for level in LEVELS)):
-            raise ParameterError(f"`finest` ({finest}) must be 0 or one of {[level.downsampling for level in LEVELS]}.")
-        if rounds and finest != 1:
-            raise ParameterError(f"`rounds` ({rounds}) of plug and play need iterations at full size: `finest` 1.")
-        if not finest and (evidence or mean_light != "kept"):
-            raise ParameterError(
-                f"`mean_light` ({mean_light}) and `evidence` ({evidence}) need iterations: `finest` 1, 2, 4 or 8."
-            )
-        positive = {"width": width, "fold": fold, "block": block}
-        others = {"rounds": rounds, "distortion": distortion, "shading": shading or 0}
-        for least, numbers in ((1, positive), (0, others)):
-            for name, value in numbers.items():
-                if value < least:
-                    raise ParameterError(f"`{name}` ({value}) must be at least {least}.")
+        _check_at_least(1, width=width, fold=fold, block=block)
+        _check_at_least(0, rounds=rounds, distortion=distortion, shading=shading or 0)
+        _check_iterations(finest, rounds, mean_light, evidence=evidence)
         self.channels, self.fold, self.regularisations = channels, fold, regularisations
         self.finest, self.align, self.block = finest, align, block
         self.levels = pyramid_levels(finest)
