@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from urllib.parse import urlsplit
 
+import cv2
 import httpx2 as httpx
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ import pytest
 from mwdn import Reconstructor
 from mwdn.calibration import Calibration
 from mwdn.errors import ParameterError
+from mwdn.io.images import srgb_encode
 from mwdn.preview.cameras import StoredCameras
 from mwdn.preview.reconstruction import with_ambient
 from mwdn.preview.server import make_server
@@ -183,6 +185,14 @@ def test_job_can_be_cancelled(client, capture):
     assert job["state"] == "cancelled"
     assert "report" not in job
     order(client, capture)  # the next one is served
+
+
+def test_a_psf_for_viewing_is_doubted_as_on_the_command_line(client, psf, capture):
+    coded = srgb_encode(psf / psf.max() * 0.9)[0].movedim(0, -1).numpy()
+    file = cv2.imencode(".jpg", (255 * coded[..., ::-1]).round().astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 100])[1]
+    response = client.post("/reconstruct", files={"capture": capture, "psf": file.tobytes()}, data={"method": "wiener"})
+    verdicts = json.loads(response.headers["mwdn-report"])["verdicts"]
+    assert [each["options"] for each in verdicts if each["topic"] == "psf-gamma"] == ["--psf-gamma srgb"]
 
 
 def test_stopping_ends_requests_in_progress_at_once(serve, psf, capture):

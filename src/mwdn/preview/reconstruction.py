@@ -47,6 +47,7 @@ class Order:
         trust: check the picture, which takes a second or two.
         room_light: as for `Reconstructor`.
         ambient: the file of a frame of the room's light alone, taken as the capture; empty if there is none.
+        psf_for_viewing: the PSF's file is of a type for viewing, such as JPEG.
     """
 
     capture: bytes
@@ -57,6 +58,7 @@ class Order:
     trust: bool = True
     room_light: bool | None = None
     ambient: bytes = b""
+    psf_for_viewing: bool = False
 
 
 class Reconstructions:
@@ -91,7 +93,7 @@ class Reconstructions:
         made = Reconstructor(order.method, lit, **how, **order.options)
         with self._lock:
             # The calibration is kept, so that its id stays its own.
-            self._prepared[key] = calibration, made, PsfGammaTest(lit)
+            self._prepared[key] = calibration, made, PsfGammaTest(lit, order.psf_for_viewing)
             while len(self._prepared) > KEPT:
                 self._prepared.popitem(last=False)
             return self._prepared[key][1:]
