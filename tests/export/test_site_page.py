@@ -72,13 +72,16 @@ def files(tmp_path_factory):
     (folder / "wrong.png").write_bytes((folder / "capture.png").read_bytes()[:-1000])
     (folder / "photo.jpg").write_bytes(cv2.imencode(".jpg", np.zeros((96, 128, 3), np.uint8))[1].tobytes())
     write_frame(folder / "small.png", np.zeros((64, 64, 3), np.uint8))
+    write_site(folder / "site", folder / "psf.png", "--bit-depth", "12", "--dark", folder / "dark.png")
+    return folder, own, other
+
+
+def write_site(out, *camera):
     jaxtyping.config.update("jaxtyping_disable", True)  # torch traces with sizes that are no numbers
-    camera = [str(folder / "psf.png"), "--bit-depth", "12", "--dark", str(folder / "dark.png")]
     with pytest.raises(SystemExit) as ended:
-        main(["export", "--web", *camera, "-o", str(folder / "site")])
+        main(["export", "--web", *map(str, camera), "-o", str(out)])
     jaxtyping.config.update("jaxtyping_disable", False)
     assert ended.value.code == 0
-    return folder, own, other
 
 
 class Quiet(http.server.SimpleHTTPRequestHandler):
@@ -224,6 +227,24 @@ def test_from_a_static_host_whose_connection_is_lost(files, tmp_path):
         page.drop("#capture", folder / "capture.png")
         wait_for(page, "capture.png")
         check_scene(page, own, folder / "capture.png")
+        assert not page.errors
+
+
+@pytest.mark.usefixtures("files")
+def test_a_grey_camera(tmp_path):
+    """Its page said that WebAssembly computes another picture, and did not start."""
+    write_frame(tmp_path / "grey.png", psf_frame(0, 12)[..., 1:2])
+    grey = Calibration.from_file(tmp_path / "grey.png", bit_depth=12)
+    write_capture(tmp_path / "capture.png", grey, "coffee", maximum=4095)
+    green = read_frame(tmp_path / "capture.png")[..., 1:2]
+    write_frame(tmp_path / "capture.png", np.ascontiguousarray(green))
+    write_site(tmp_path / "site", tmp_path / "grey.png", "--bit-depth", "12")
+    with open_page((tmp_path / "site" / "index.html").as_uri(), tmp_path / "profile") as page:
+        page.wait(STATE)
+        wait_for(page, "astronaut")
+        page.drop("#capture", tmp_path / "capture.png")
+        wait_for(page, "capture.png")
+        check_scene(page, grey, tmp_path / "capture.png")
         assert not page.errors
 
 
