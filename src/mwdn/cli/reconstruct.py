@@ -70,7 +70,7 @@ def reconstruct(  # noqa: PLR0913
         align: estimate the pose of the PSF from each capture (rotation, scale, displaced aperture, haze), for a camera
             that has changed since its calibration; by default for universal, and not for solvers.
         ensemble: average a network's pictures of the capture and its three mirror images: four times the time;
-            universal-small gains 0.1 to 0.3 dB, universal nothing.
+            universal-small gains 0.1 to 0.4 dB, universal nothing.
         room_light: find even light, a slope or a spot of light of the room in each capture and subtract it; by
             default for universal without --ambient. The .json and a line say its share.
         white_balance: of the pictures: grey-world, psf (the point source is white), or gains of red, green and blue.
