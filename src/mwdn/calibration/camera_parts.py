@@ -87,7 +87,11 @@ def draft_of(path: Path) -> Iterator[Path]:
         with as_parameter_error(path.parent):
             for file, new in moved.items():
                 file.replace(new)
-        write_camera(path, content)
+        try:
+            write_camera(path, content)
+        except BaseException:
+            _remove({*moved.values()} - before)
+            raise
     _remove(before - _own_parts(path))
 
 

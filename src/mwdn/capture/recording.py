@@ -198,7 +198,7 @@ class Replay(CameraSource):
             if not self.loop:
                 raise CameraError(f"{self.name} has ended, after {len(self._data):,} frames. Play it again: `loop`.")
             self._number, self._started = 0, time.monotonic()
-        with as_damage(f"CameraFrame {self._number} of `{self.path}` cannot be read", _ADVICE):
+        with as_damage(f"Frame {self._number} of `{self.path}` cannot be read", _ADVICE):
             array = self._data[self._number]
             values = {key: column[self._number].item() for key, column in self._columns.items()}
             first = float(self._columns["timestamp"][0]) if self._columns else math.nan

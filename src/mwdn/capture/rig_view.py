@@ -1,4 +1,4 @@
-"""Homography of a flat display's light to a camera's pixels."""
+"""Projection of a flat display's light to a camera's pixels."""
 
 import math
 

@@ -138,7 +138,7 @@ class V4l2Camera(CameraSource):
         )
 
     def _unpacked(self, data: Any) -> tuple[Any, PixelFormat]:  # noqa: ANN401
-        """CameraFrame and format; raw buffers come as rows of bytes or of numbers."""
+        """Frame and format; raw buffers come as rows of bytes or of numbers."""
         import cv2
 
         if self._format is None:

@@ -18,7 +18,7 @@ Numbers = Annotated[tuple[float, ...], Parameter(consume_multiple=True, negative
 @Parameter(name="*")
 @dataclass(frozen=True)
 class PhotographOptions:
-    """CalibrationFrames that describe the camera, and how they were taken. A folder stands for the frames in it.
+    """Photographs that describe the camera, and how they were taken. A folder stands for the frames in it.
 
     Args:
         exposures: exposure of each equal part of the frames, in order: --exposures 1 8 64, in milliseconds. Two to four

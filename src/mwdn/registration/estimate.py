@@ -71,7 +71,7 @@ class Registered(NamedTuple):
 
 
 def estimate(views: Views, *, corners: Points | None = None) -> Registered:
-    """Registered the projection from displayed pictures to reconstructions.
+    """Estimate the projection from displayed pictures to reconstructions.
 
     Markers of a board, features (SIFT), or a search over all places, sizes, turns and mirrorings give a start. The
     correlation over all pictures then refines it (ECC), and the displacements of the picture's parts correct what
