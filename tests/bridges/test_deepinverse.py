@@ -40,6 +40,15 @@ def test_the_norm_is_at_most_one(camera):
     assert 0.5 < physics.compute_sqnorm(torch.randn(1, 3, *SENSOR), verbose=False) <= 1.0 + 1e-5
 
 
+def test_another_psf_is_scaled_to_unit_sum(camera):
+    """Of any brightness; the norm of the operator was a million."""
+    physics, scene = LenslessPhysics(camera), torch.rand(1, *LenslessPhysics(camera).psf.shape[1:])
+    for change in (lambda psf: physics.update(psf=psf), lambda psf: physics(scene, psf=psf)):
+        change(1000 * camera.psf.flip(-1))
+        torch.testing.assert_close(physics.psf, camera.psf.flip(-1))
+        change(camera.psf)
+
+
 def test_the_pseudo_inverse_is_that_of_the_matrix(camera, generator):
     small = Camera(camera.psf[:, :1], size=(8, 9))
     physics = LenslessPhysics(small, scene_size=(10, 11), max_iter=200, tol=1e-6)
