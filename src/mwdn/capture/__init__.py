@@ -3,4 +3,4 @@
 from mwdn.capture.source import CameraFrame, CameraSource
 from mwdn.capture.sources import SOURCES, Kind, open_source
 
-__all__ = ["SOURCES", "CameraSource", "CameraFrame", "Kind", "open_source"]
+__all__ = ["SOURCES", "CameraFrame", "CameraSource", "Kind", "open_source"]

@@ -28,7 +28,7 @@ def list_photographs(folder: Path, seed: int, known: list[str] | None = None) ->
             f"`folder` (`{folder}`) of [pictures] is not a folder. Give the folder of the photographs."
         )
     names = [path.relative_to(folder).as_posix() for path in pictures_in(folder)]
-    for name in [name for name in names if not name.isascii() and name != name.encode(errors="replace").decode()]:
+    for name in [name for name in names if name != name.encode(errors="replace").decode()]:
         names.remove(name)  # a session stores names as UTF-8
         warnings.warn(f"`{one_line(name)}` is skipped, because its name is not UTF-8. Rename it.", stacklevel=2)
     if not names:

@@ -22,7 +22,7 @@ from mwdn.capture.screen import Picture, Place, Screen, place_picture, put
 from mwdn.capture.source import CameraFrame, CameraSource, check_like
 from mwdn.data.pair_writer import check_path
 from mwdn.errors import CameraError, ImageError, ParameterError
-from mwdn.io.files import check_folder
+from mwdn.io.files import check_folder, existing_folder
 
 SATURATED = 1e-3
 """Fraction of a white frame's pixels that may be saturated (hot pixels)."""
@@ -283,7 +283,7 @@ class Session:
         )
         folder = self.out.absolute().parent
         check_folder(folder)
-        free = shutil.disk_usage(next(each for each in (folder, *folder.parents) if each.exists())).free
+        free = shutil.disk_usage(existing_folder(folder)).free
         if needed > free:
             raise ParameterError(
                 f"{count:,} pairs need {needed / 1e6:,.0f} MB, but `{folder}` has {free / 1e6:,.0f} MB left. "

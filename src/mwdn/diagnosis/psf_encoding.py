@@ -30,7 +30,6 @@ LINEAR = -0.06
 CODED = 0.1
 """Score above which it is coded. Linear PSFs have 0.07 and less."""
 
-
 JUDGES = 3
 """Largest number of captures from which the gamma of a PSF's file is detected."""
 

@@ -1,6 +1,5 @@
 """Reconstruct a folder of captures: read, reconstruct, check and write in parallel, in one process or several."""
 
-import copy
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
@@ -196,17 +195,7 @@ class Batch:
     def _reconstruct(self, job: Job) -> Job:
         if job.measurement is None:
             return job
-        reconstruct = self._without_room_light
-        if job.pose:
-            reconstruct = reconstruct.at(job.pose)
-        return replace(job, scene=reconstruct.on_device(job.measurement))
-
-    @cached_property
-    def _without_room_light(self) -> Reconstructor:
-        """For measurements whose room light is subtracted."""
-        reconstruct = copy.copy(self.reconstruct)
-        reconstruct.room_light = False
-        return reconstruct
+        return replace(job, scene=self.reconstruct.without_search(job.pose).on_device(job.measurement))
 
     @_step
     def _finish(self, job: Job) -> Job:

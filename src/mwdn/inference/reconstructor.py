@@ -133,6 +133,12 @@ class Reconstructor:
         fixed.engine = self.engine and self.engine.with_psf(fixed.psf)
         return fixed
 
+    def without_search(self, pose: solvers.Pose | None) -> "Reconstructor":
+        """A `Reconstructor` for results of `without_room_light`, at a pose unless it is ``None``."""
+        ready = copy.copy(self)
+        ready.room_light = False
+        return ready if pose is None else ready.at(pose)
+
     @checked
     def stream(self, frames: Iterable[Frame], *, refresh: int = 100) -> Iterator[tuple[Measurement, Scene]]:
         """Reconstruct the frames of a video, faster than one by one because successive frames are similar.

@@ -179,10 +179,13 @@ def check_folder(folder: Path) -> None:
     Raises:
         ParameterError: it cannot be created or written to.
     """
-    with as_parameter_error(folder):
-        existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-        with tempfile.TemporaryFile(dir=existing):
-            pass
+    with as_parameter_error(folder), tempfile.TemporaryFile(dir=existing_folder(folder)):
+        pass
+
+
+def existing_folder(folder: Path) -> Path:
+    """The folder, or the nearest one above it that exists."""
+    return next(path for path in (folder, *folder.absolute().parents) if path.exists())
 
 
 def refuse_overwrite(output: Path, *inputs: Path | None) -> None:

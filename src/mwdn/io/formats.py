@@ -33,9 +33,7 @@ _SIGNATURES |= dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "TIFF")  
 _SIGNATURES |= dict.fromkeys((b"P5\n", b"P6\n", b"P5 ", b"P6 "), "PGM")
 _PGM_HEADER = re.compile(rb"P([56])" + 3 * rb"\s+(?:#[^\n]*\n\s*)*(\d{1,9})" + rb"\s")
 _PNG_DAMAGE = re.compile("libpng error|IDAT|image data")
-
 _PIL_MODES = ("L", "RGB", "F", "I;16", "I;16L", "I;16B")
-
 # tifffile logs unusual tags. Without a handler these lines would reach the terminal.
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
@@ -105,10 +103,12 @@ def kind_of(start: bytes) -> str | None:
     return next((kind for signature, kind in _SIGNATURES.items() if start.startswith(signature)), None)
 
 
-def is_for_viewing(path: str | Path) -> bool:
-    """Whether a file is a JPEG or WebP, which cameras and programs write gamma-coded."""
-    with suppress(OSError, ImageError), open_regular(path) as file:  # reading the pixels reports the error
-        return kind_of(file.read(12)) in ("JPEG", "WebP")
+def is_for_viewing(file: str | Path | bytes) -> bool:
+    """Whether a file, or its content, is a JPEG or WebP, which cameras and programs write gamma-coded."""
+    if isinstance(file, bytes):
+        return kind_of(file[:12]) in ("JPEG", "WebP")
+    with suppress(OSError, ImageError), open_regular(file) as opened:  # reading the pixels reports the error
+        return is_for_viewing(opened.read(12))
     return False
 
 

@@ -4,4 +4,4 @@ from mwdn.preview.cameras import StoredCameras
 from mwdn.preview.limits import Limits
 from mwdn.preview.server import PreviewServer, make_server
 
-__all__ = ["StoredCameras", "Limits", "PreviewServer", "make_server"]
+__all__ = ["Limits", "PreviewServer", "StoredCameras", "make_server"]

@@ -1,6 +1,5 @@
 """One reconstruction for a client: from an uploaded capture to a picture and a report."""
 
-import copy
 import hashlib
 import threading
 import time
@@ -114,7 +113,7 @@ class Reconstructions:
             measurement, share = reconstruct.without_room_light(measurement)
             pose = align(measurement, reconstruct.psf) if reconstruct.align else None
         with watch_iterations(lambda part: job.advance(0.9 * part)):
-            scene = _prepared(reconstruct, pose).on_device(measurement)
+            scene = reconstruct.without_search(pose).on_device(measurement)
         if not scene.isfinite().all():
             raise ImageError("The reconstruction holds NaN or infinity. Scale the capture, or use another method.")
         report = _report(order, reconstruct, time.perf_counter() - start)
@@ -129,13 +128,6 @@ class Reconstructions:
                 verdicts += gamma(frame, verdicts)
                 found = _check(verdicts, measurement, reconstruct, scene, pose)
             job.result = replace(job.result, report=report | found)
-
-
-def _prepared(reconstruct: Reconstructor, pose: Pose | None) -> Reconstructor:
-    """For a measurement whose room light is subtracted, and whose pose is known."""
-    prepared = copy.copy(reconstruct)
-    prepared.room_light = False
-    return prepared if pose is None else prepared.at(pose)
 
 
 def with_ambient(calibration: Calibration, ambient: bytes, limits: Limits) -> Calibration:

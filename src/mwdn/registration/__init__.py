@@ -9,10 +9,10 @@ from mwdn.registration.views import Views
 from mwdn.registration.warp import warp_pictures
 
 __all__ = [
-    "SessionPairs",
-    "Registered",
     "Place",
     "Projection",
+    "Registered",
+    "SessionPairs",
     "Views",
     "estimate",
     "find_outline",
