@@ -1,10 +1,14 @@
 """Verdicts with right and wrong PSFs, on real captures of two cameras.
 
     python benchmarks/trust.py ../shared/data [--method universal] [--count 2]
+    python benchmarks/trust.py ../shared/data --count 3 --saturated 0 0.2 0.4
 
 Wrong PSFs: mirrored, rotated by 180, 90 and 3 degrees, displaced, and that of another camera. Prints one line each: the
 fraction of the capture's detail that is reproduced, over the fraction that is not noise; the contrast with mirrored and
 rotated PSFs; the verdict on the PSF: its state, and the turn that rights it. Then the ranges for each kind of PSF.
+
+Second form: the right PSF only, and captures whose brightest parts are cut off. Which orientation fits best, and by how
+much, without the limit `mwdn.diagnosis.orientation.MOST_SATURATED`.
 """
 
 import argparse
@@ -15,6 +19,7 @@ from pathlib import Path
 import torch
 
 from mwdn import Calibration, Reconstructor
+from mwdn.diagnosis.orientation import fit_orientations
 from mwdn.diagnosis.trust import examine_picture
 from mwdn.io.files import atomic
 from mwdn.optics import sample_camera
@@ -53,11 +58,24 @@ def ranges(rows):
         yield f"| {name} | {len(those)} | {counts} | {named} | {' | '.join(numbers)} |"
 
 
+def clipped(sets, count, parts):
+    """Lines of a table: the lead of the orientation that fits best, for each capture and saturated part."""
+    yield f"| capture | {' | '.join(f'{part:.0%}' for part in parts)} |"
+    yield "| --- " * (1 + len(parts)) + "|"
+    for calibration, captures in sets:
+        for capture in captures[:count]:
+            measurement = calibration.correct(calibration.frames.read(capture))
+            limits = (float(measurement.flatten().quantile(1 - part)) for part in parts)
+            fits = [fit_orientations(measurement.clamp(max=limit), calibration.psf) for limit in limits]
+            yield f"| {capture.stem} | {' | '.join(f'{fit.lead:.2f} {fit.best}'.strip() for fit in fits)} |"
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path)
     parser.add_argument("--method", default="universal")
     parser.add_argument("--count", type=int, default=2)
+    parser.add_argument("--saturated", type=float, nargs="+", help="parts of the pixels that are cut off")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/trust.json"))
     arguments = parser.parse_args()
     camera, diffusercam = arguments.data / "mwdn-camera", arguments.data / "diffusercam"
@@ -69,6 +87,10 @@ def main():
         (Calibration.from_file(camera / "psf_480.tif"), sorted((camera / "real-objects").glob("scene*"))),
         (recovered, sorted((diffusercam / "diffuser_images").glob("*.npy"))),
     ]
+    if arguments.saturated:
+        for line in clipped(sets, arguments.count, arguments.saturated):
+            print(line, flush=True)
+        return
     rows = []
     print("| capture | PSF | explained / possible | contrast | PSF |\n| --- | --- | --- | --- | --- |")
     for calibration, captures in sets:
