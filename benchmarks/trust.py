@@ -8,7 +8,7 @@ fraction of the capture's detail that is reproduced, over the fraction that is n
 rotated PSFs; the verdict on the PSF: its state, and the turn that rights it. Then the ranges for each kind of PSF.
 
 Second form: the right PSF only, and captures whose brightest parts are cut off. Which orientation fits best, and by how
-much, without the limit `mwdn.diagnosis.orientation.MOST_SATURATED`.
+much, without the limit `mwdn.diagnosis.orientation.MAX_SATURATED`.
 """
 
 import argparse

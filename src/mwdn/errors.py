@@ -31,8 +31,8 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-SMALLEST_LIGHT = 1e-12
-LARGEST_LIGHT = 1e15
+MIN_LIGHT = 1e-12
+MAX_LIGHT = 1e15
 """Range of the largest number of a measurement, whose squares and their sums over 1e8 pixels float32 must hold."""
 
 _WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text", Path: "a path"}
@@ -226,7 +226,7 @@ def check_batch(image: Any, name: str) -> None:  # noqa: ANN401
 def check_light(image: Any, name: str) -> None:  # noqa: ANN401
     """Check that the numbers of the image (B, C, H, W) called ``name`` can be a measurement.
 
-    One NaN or infinity becomes a picture of NaN. From `SMALLEST_LIGHT` to `LARGEST_LIGHT`, no square or sum of a
+    One NaN or infinity becomes a picture of NaN. From `MIN_LIGHT` to `MAX_LIGHT`, no square or sum of a
     method leaves the range of float32. Darkness, all zeros, is a measurement. Waits for a GPU.
 
     Raises:
@@ -245,10 +245,10 @@ def check_light(image: Any, name: str) -> None:  # noqa: ANN401
                 f"`{name}` ({low:.3g} to {high:.3g}) holds no light: no number is positive. Check the frame that was "
                 "subtracted, `dark` or `ambient`."
             )
-        if largest and not SMALLEST_LIGHT <= largest <= LARGEST_LIGHT:
+        if largest and not MIN_LIGHT <= largest <= MAX_LIGHT:
             raise ParameterError(
                 f"`{name}` (up to {largest:.3g}) must be linear light, 1 for saturation, with a largest number from "
-                f"{SMALLEST_LIGHT:g} to {LARGEST_LIGHT:g}. Scale it: `{name} / {name}.max()`."
+                f"{MIN_LIGHT:g} to {MAX_LIGHT:g}. Scale it: `{name} / {name}.max()`."
             )
 
 

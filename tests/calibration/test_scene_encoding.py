@@ -5,7 +5,7 @@ import torch
 
 from cameras import contour_psf
 from mwdn import convolve
-from mwdn.calibration.scene_encoding import GAMMAS, MOST_PAIRS, scene_gamma, unexplained_by_gamma
+from mwdn.calibration.scene_encoding import GAMMAS, MAX_PAIRS, scene_gamma, unexplained_by_gamma
 from mwdn.optics.polynomials import polynomials
 
 SIZE = 64, 80
@@ -61,5 +61,5 @@ def test_a_single_pair_does_not_decide():
 
 
 def test_at_most_ten_pairs_are_examined(psf, generator):
-    made = list(recorded(psf, lambda scene: scene, generator, count=MOST_PAIRS + 2))
-    assert {len(part) for part in unexplained_by_gamma(psf, lambda: made).values()} == {MOST_PAIRS}
+    made = list(recorded(psf, lambda scene: scene, generator, count=MAX_PAIRS + 2))
+    assert {len(part) for part in unexplained_by_gamma(psf, lambda: made).values()} == {MAX_PAIRS}

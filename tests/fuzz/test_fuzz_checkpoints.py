@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mwdn.networks import NETWORKS
-from mwdn.networks.empty import MOST_TENSORS, _Counted, build_empty
+from mwdn.networks.empty import MAX_TENSORS, _Counted, build_empty
 from mwdn.weights import load_checkpoint
 
 pytestmark = pytest.mark.usefixtures("unchecked")
@@ -57,4 +57,4 @@ def test_every_network_is_far_from_the_limit_of_layers(name):
     """A limit that is too low would refuse checkpoints that were trained."""
     with _Counted() as counted:
         build_empty(name, **({"rounds": 1} if name == "wiener-bank" else {}))
-    assert 0 < counted.count < MOST_TENSORS / 10
+    assert 0 < counted.count < MAX_TENSORS / 10

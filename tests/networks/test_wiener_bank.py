@@ -6,7 +6,7 @@ import torch
 from made import trained
 from mwdn.errors import ParameterError
 from mwdn.networks import build
-from mwdn.networks.evidence import BENIGN_DOUBT, DOUBT_BLOCKS, LARGEST_DOUBT, against_psf, doubt_of_psf
+from mwdn.networks.evidence import BENIGN_DOUBT, DOUBT_BLOCKS, MAX_DOUBT, against_psf, doubt_of_psf
 from mwdn.networks.wiener_bank import CLOSED, WienerBank
 from mwdn.optics import Camera
 from mwdn.solvers.levels import relative_noise
@@ -145,7 +145,7 @@ def test_the_denoiser_is_told_a_clear_doubt_alone():
     none, whole = BENIGN_DOUBT
     told = doubt_of_psf(Doubted(0.5, none, (none + whole) / 2, whole, 1e6)).flatten()
     middle, large = torch.tensor([(none + whole) / 2, whole]).log()
-    torch.testing.assert_close(told, torch.tensor([0.0, 0.0, middle / 2, large, torch.tensor(LARGEST_DOUBT).log()]))
+    torch.testing.assert_close(told, torch.tensor([0.0, 0.0, middle / 2, large, torch.tensor(MAX_DOUBT).log()]))
 
 
 def test_the_denoiser_is_told_the_doubt_times_its_level(generator):

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from mwdn.bridges.forward_model import ForwardModel
-from mwdn.errors import SMALLEST_LIGHT, check_options
+from mwdn.errors import MIN_LIGHT, check_options
 from mwdn.fourier import convolve, correlate
 from mwdn.optics import Camera, Sensor
 from mwdn.optics.psf import checked_psf
@@ -89,7 +89,7 @@ class DeepInverseSolver:
             ShapeError: there is one PSF for each sample.
         """
         physics = LenslessPhysics(Camera(psf, sensor=self.sensor), channels=measurement.shape[1])
-        peak = measurement.amax((1, 2, 3), keepdim=True).clamp(min=SMALLEST_LIGHT)
+        peak = measurement.amax((1, 2, 3), keepdim=True).clamp(min=MIN_LIGHT)
         return self.reconstruct(measurement / peak, physics) * peak
 
 

@@ -75,7 +75,7 @@ KEYS: dict[str, tuple[str, Any]] = {
 }
 """Meaning and an example of each key, in the order of the file."""
 
-LONGEST_LENGTH = 1e9
+MAX_LENGTH = 1e9
 """Largest `pitch_um` and `distance_mm`: 1 km and 1,000 km, beyond any lensless camera."""
 
 _FILES = ("psf", "dark", "ambient", "flat_field", "hot_pixels")
@@ -153,9 +153,9 @@ def with_changes(camera: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[
 
 
 def check_length(name: str, length: float | None) -> None:
-    """Raise a `ParameterError` unless `pitch_um` or `distance_mm` is positive, and no longer than `LONGEST_LENGTH`."""
-    if length is not None and not 0 < length <= LONGEST_LENGTH:
-        raise ParameterError(f"`{name}` ({shown(length)}) must be above 0 and at most {LONGEST_LENGTH:g}.")
+    """Raise a `ParameterError` unless `pitch_um` or `distance_mm` is positive, and no longer than `MAX_LENGTH`."""
+    if length is not None and not 0 < length <= MAX_LENGTH:
+        raise ParameterError(f"`{name}` ({shown(length)}) must be above 0 and at most {MAX_LENGTH:g}.")
 
 
 def _as_tuple(value: Any) -> Any:  # noqa: ANN401

@@ -11,7 +11,7 @@ from mwdn.calibration.noise_model import TYPICAL, NoiseModel
 from mwdn.errors import ParameterError
 from mwdn.types import Image
 
-MOST = 8
+MAX_EXPOSURES = 8
 """Largest number of exposures."""
 
 CEILING = 0.92
@@ -53,8 +53,10 @@ def merge_exposures(averages: Sequence[FrameAverage], exposures: Sequence[float]
         ParameterError: the numbers of exposures and averages differ, an exposure is repeated or not positive, or frames
             do not have the light of their exposure.
     """
-    if len(averages) != len(exposures) or not 1 <= len(exposures) <= MOST:
-        raise ParameterError(f"`exposures` ({len(exposures)}) must be 1 to {MOST}, one for each of {len(averages)}.")
+    if len(averages) != len(exposures) or not 1 <= len(exposures) <= MAX_EXPOSURES:
+        raise ParameterError(
+            f"`exposures` ({len(exposures)}) must be 1 to {MAX_EXPOSURES}, one for each of {len(averages)}."
+        )
     if min(exposures) <= 0 or len(set(exposures)) < len(exposures):
         raise ParameterError(f"`exposures` ({', '.join(f'{t:g}' for t in exposures)}) must be positive and differ.")
     order = sorted(range(len(exposures)), key=lambda number: exposures[number])

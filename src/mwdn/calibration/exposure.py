@@ -18,7 +18,7 @@ BRIGHTEST = 1e-4
 WELL_EXPOSED = (0.5, 0.95)
 """Peaks, as fractions of saturation, for which no other exposure is advised."""
 
-LARGEST_STEP = 16.0
+MAX_STEP = 16.0
 """Largest advised change of the exposure, as a factor: an estimate from a black or white frame is coarse."""
 
 
@@ -73,14 +73,14 @@ def measure_exposure(frame: Frame, frames: FrameFormat = FrameFormat(), *, black
     peak = float(levels[place])
     true_peak = _extrapolated(levels, saturated) if saturated > place else peak
     factor = (TARGET - black) / max(true_peak - black, 1e-6)
-    return Exposure(peak, saturated, levels.size, float(np.clip(factor, 1 / LARGEST_STEP, LARGEST_STEP)))
+    return Exposure(peak, saturated, levels.size, float(np.clip(factor, 1 / MAX_STEP, MAX_STEP)))
 
 
 def _extrapolated(levels: np.ndarray, saturated: int) -> float:
     """Peak that the brightest pixels would reach without saturation, from the slope of the levels below."""
     count, pixels = saturated, levels.size
     if 4 * count >= pixels:
-        return LARGEST_STEP
+        return MAX_STEP
     # n(level) = n0 exp(-level / width): between the n-th and the 4 n-th pixel lies width * log(4).
     width = (1.0 - float(levels[4 * count])) / math.log(4)
     return 1.0 + width * math.log(count / max(BRIGHTEST * pixels, 1.0))

@@ -11,7 +11,7 @@ from mwdn.types import Image
 ISOLATED = 4.0, 8.0
 """Standard deviations of a capture's noise by which a pixel exceeds its neighbours: suspected of being hot, and hot."""
 
-MOST_ISOLATED = 2e-3
+MAX_ISOLATED = 2e-3
 """Largest fraction of hot pixels in a capture; more than that is light. Sensors have up to 5e-4."""
 
 
@@ -47,6 +47,6 @@ def find_isolated_pixels(capture: Image, *, cell: int = 1) -> Tensor:
     hot = excess > ISOLATED[1]
     count, suspected = int(hot.sum()), int((excess > ISOLATED[0]).sum())
     found = torch.zeros_like(planes)
-    if count >= suspected / 2 and count <= MOST_ISOLATED * planes.numel():
+    if count >= suspected / 2 and count <= MAX_ISOLATED * planes.numel():
         found[channel[hot], y[hot], x[hot]] = 1.0
     return F.pixel_shuffle(found[None], cell).amax(1, keepdim=True) > 0

@@ -6,14 +6,14 @@ from torch import Tensor
 from mwdn.errors import ShapeError
 from mwdn.types import Image
 
-MOST_RINGS = 8
+MAX_RINGS = 8
 """Distance, in pixels of the same colour, to which a good pixel is searched: the rings of defects that are 16 wide."""
 
 
 class PixelRepair:
     """Replaces defective pixels by the mean of the nearest good ones of the same colour.
 
-    A pixel without a good one within `MOST_RINGS` stays as it is.
+    A pixel without a good one within `MAX_RINGS` stays as it is.
 
     Args:
         defects: (H, W), true at a defective pixel.
@@ -27,7 +27,7 @@ class PixelRepair:
         good = ~defects
         neighbours, weights, alone = [], [], torch.ones(len(rows))
         # Rings of growing size, until each defective pixel has a good neighbour.
-        for ring in range(1, MOST_RINGS + 1):
+        for ring in range(1, MAX_RINGS + 1):
             found = torch.zeros(len(rows))
             for down, right in _ring(ring):
                 y, x = rows + down * cell, columns + right * cell

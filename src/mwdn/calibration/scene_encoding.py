@@ -10,10 +10,10 @@ from mwdn.types import Measurement, Psf, Scene
 GAMMAS = (1.0, 1.4, 1.8, 2.2)
 """Powers that are tried; 1 is linear, 2.2 about sRGB."""
 
-MOST_PAIRS = 10
+MAX_PAIRS = 10
 """Pairs that are examined, the first ones."""
 
-LEAST = 0.1
+MIN_GAIN = 0.1
 """Relative decrease of the unexplained part from which a gamma is accepted."""
 
 CLIPPED = 0.02
@@ -32,7 +32,7 @@ def unexplained_by_gamma(
         psf: (1, C, H, W), of the calibration.
         pairs: reads the pairs, (1, C, H, W) each; called once for each gamma. Pairs with clipped scenes are left out.
     """
-    chosen = [number for number, (_, v) in enumerate(islice(pairs(), MOST_PAIRS)) if not _is_clipped(v)]
+    chosen = [number for number, (_, v) in enumerate(islice(pairs(), MAX_PAIRS)) if not _is_clipped(v)]
     if not chosen:
         return dict.fromkeys(GAMMAS, ())
     return {gamma: _unexplained(psf, pairs(), chosen, gamma) for gamma in GAMMAS}
@@ -45,7 +45,7 @@ def scene_gamma(unexplained: dict[float, tuple[float, ...]]) -> float | None:
         return None
     best = min(unexplained, key=lambda gamma: fmean(unexplained[gamma]))
     wins = sum(decoded < plain for decoded, plain in zip(unexplained[best], linear, strict=True))
-    return best if fmean(unexplained[best]) < (1 - LEAST) * fmean(linear) and wins > len(linear) / 2 else None
+    return best if fmean(unexplained[best]) < (1 - MIN_GAIN) * fmean(linear) and wins > len(linear) / 2 else None
 
 
 def _is_clipped(scene: Scene) -> bool:

@@ -18,7 +18,7 @@ from mwdn.calibration.photon_transfer import SAME_LIGHT, PhotonTransfer, photon_
 from mwdn.errors import ParameterError, ShapeError
 from mwdn.types import Frame, Image, Size
 
-LEAST_RESPONSE = 0.1
+MIN_RESPONSE = 0.1
 """Smallest value of a flat field: a pixel with less light is replaced, not amplified."""
 
 
@@ -260,10 +260,10 @@ def _runs(levels: Sequence[float]) -> list[tuple[int, int]]:
 
 
 def relative_response(flat: Image, cell: int) -> Tensor:
-    """A flat frame over its mean, for each channel and each kind of pixel of a mosaic; at least `LEAST_RESPONSE`."""
+    """A flat frame over its mean, for each channel and each kind of pixel of a mosaic; at least `MIN_RESPONSE`."""
     response = torch.empty_like(flat)
     for row in range(cell):
         for column in range(cell):
             part = flat[..., row::cell, column::cell]
             response[..., row::cell, column::cell] = part / part.mean((-2, -1), keepdim=True).clamp(min=1e-12)
-    return response.clamp(min=LEAST_RESPONSE)
+    return response.clamp(min=MIN_RESPONSE)

@@ -3,7 +3,7 @@
 In each round, each term is tried at each order beyond the one it has, on top of the terms taken so far. A term is
 measured on pairs that it was not fitted to: each part of them (`left_out`) in turn is left out, and only the gain and
 offset of its pairs are fitted.
-The best term is taken if it lowers the mean unexplained part by `LEAST` and that of more than half of the pairs. The
+The best term is taken if it lowers the mean unexplained part by `MIN_GAIN` and that of more than half of the pairs. The
 field dependence, which no solver uses, comes last: fitted together with the other terms, it would absorb what they can
 explain.
 """
@@ -16,7 +16,7 @@ from mwdn.calibration.pair_model import Fit, PairModel, Terms
 from mwdn.errors import ParameterError
 from mwdn.types import Measurement, Psf, Scene
 
-LEAST = 0.02
+MIN_GAIN = 0.02
 """Relative decrease of the unexplained part that makes a term worth taking."""
 
 HIGHEST = {"envelope": 1, "psf_gain": 3, "sensor_field": 2, "stray_light": 2, "field_dependence": 2}
@@ -27,7 +27,7 @@ LAST = "field_dependence"
 
 KERNELS = Terms(psf_gain=3, field_dependence=2).kernels
 
-LEAST_PAIRS = 2
+MIN_PAIRS = 2
 
 PARTS = 10
 """Most parts of the pairs that are left out in turn; the time is in proportion to parts times pairs."""
@@ -112,8 +112,8 @@ def select_terms(
     """
     plain = model = PairModel(psf, pairs(), kernels=KERNELS)
     displaced = None
-    if len(model) < LEAST_PAIRS:
-        raise ParameterError(f"`pairs` ({len(model)}) must be {LEAST_PAIRS} or more: each in turn is left out.")
+    if len(model) < MIN_PAIRS:
+        raise ParameterError(f"`pairs` ({len(model)}) must be {MIN_PAIRS} or more: each in turn is left out.")
     steps = [_tried(model, "", 0, Terms())]
     report(steps[0])
     for names in ([name for name in HIGHEST if name != LAST], [name for name in HIGHEST if name == LAST]):
@@ -160,4 +160,4 @@ def _tried(model: PairModel, term: str, order: int, terms: Terms) -> Step:
 def _is_better(step: Step, before: Step) -> bool:
     pairs = zip(step.unexplained, before.unexplained, strict=True)
     wins = sum(new < old for new, old in pairs)
-    return step.mean < (1 - LEAST) * before.mean and wins > len(before.unexplained) / 2
+    return step.mean < (1 - MIN_GAIN) * before.mean and wins > len(before.unexplained) / 2

@@ -12,7 +12,7 @@ WhiteBalance = Literal["grey-world", "psf"] | tuple[float, float, float]
 """``"grey-world"``: the picture's mean becomes grey. ``"psf"``: the point source of the PSF becomes white. Three
 numbers: gains of red, green and blue; ``(1, 1, 1)`` for none."""
 
-LARGEST_GAIN = 1000
+MAX_GAIN = 1000
 """Largest gain, and inverse of the smallest: their ratios stay far within float32."""
 
 
@@ -36,11 +36,11 @@ def check_white_balance(balance: WhiteBalance | None, light: tuple[float, ...]) 
                 "`white_balance=(1.8, 1, 1.5)`."
             )
         return
-    possible = (1 / LARGEST_GAIN <= gain <= LARGEST_GAIN for gain in balance if not isinstance(gain, str))
+    possible = (1 / MAX_GAIN <= gain <= MAX_GAIN for gain in balance if not isinstance(gain, str))
     if len(balance) != 3 or not all(possible):
         raise ParameterError(
             f"`white_balance` ({shown(balance)}) must be 'grey-world', 'psf', or three positive gains of red, green "
-            f"and blue, {LARGEST_GAIN:g} at most: `white_balance=(1.8, 1, 1.5)`."
+            f"and blue, {MAX_GAIN:g} at most: `white_balance=(1.8, 1, 1.5)`."
         )
 
 

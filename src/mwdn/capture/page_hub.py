@@ -26,7 +26,7 @@ HEADERS = {
 MESSAGE_BYTES = 4096
 """Most bytes of a message from a page."""
 
-LARGEST_PX = 16384
+MAX_PX = 16384
 """Most pixels of a display along each side."""
 
 REPLACED = 4000
@@ -125,7 +125,7 @@ class Hub:
     async def _take(self, message: dict[str, Any]) -> None:
         """A message of the page: its size, or an answer to a picture."""
         size = int(message["height"]), int(message["width"])
-        if not all(1 <= side <= LARGEST_PX for side in size):
+        if not all(1 <= side <= MAX_PX for side in size):
             raise ValueError("size")
         resend = "id" not in message and self.size is None
         with self.changed:

@@ -10,7 +10,7 @@ from mwdn.errors import ParameterError, UnknownNameError
 SQUARES = 7
 """Squares along each side of the ChArUco board, of the dictionary DICT_4X4_50; markers have 3/4 of a square."""
 
-LEAST_SIDE = 12 * SQUARES
+MIN_SIDE = 12 * SQUARES
 """Least side of a picture for the board: 12 pixels a square give a marker 9 pixels, 1.5 for each of its 6 x 6 cells."""
 
 DOTS = 7
@@ -103,9 +103,9 @@ PATTERNS: Mapping[str, Callable[[tuple[int, int]], Picture]] = {
 
 def check_size(name: str, size: tuple[int, int]) -> None:
     """Raise a `ParameterError` if a picture of this height and width is too small for a pattern."""
-    if name == "charuco" and min(size) < LEAST_SIDE:
+    if name == "charuco" and min(size) < MIN_SIDE:
         raise ParameterError(
-            f"`size` ({size[0]} x {size[1]}) of [pictures] must be at least {LEAST_SIDE} x {LEAST_SIDE} pixels for a "
+            f"`size` ({size[0]} x {size[1]}) of [pictures] must be at least {MIN_SIDE} x {MIN_SIDE} pixels for a "
             'ChArUco board. Enlarge it, or leave the board out: `patterns = ["dots"]` in [session].'
         )
 

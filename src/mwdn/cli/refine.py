@@ -12,7 +12,7 @@ from mwdn.calibration.camera_file import read_camera, write_camera
 from mwdn.calibration.pair_model import Terms
 from mwdn.calibration.refinement import TERMS
 from mwdn.calibration.scene_encoding import scene_gamma, unexplained_by_gamma
-from mwdn.calibration.term_selection import LEAST_PAIRS, Selection, Step, left_out, select_terms
+from mwdn.calibration.term_selection import MIN_PAIRS, Selection, Step, left_out, select_terms
 from mwdn.cli.progress import show_progress
 from mwdn.cli.terminal import counted, say, warn
 from mwdn.errors import ParameterError
@@ -58,8 +58,8 @@ def check_pair_file(pairs: Path) -> None:
 
     with PairFile(pairs) as file:
         refuse_raw(file)
-        if len(file) < LEAST_PAIRS:
-            raise ParameterError(f"`pairs` ({len(file)}) must be {LEAST_PAIRS} or more: each in turn is left out.")
+        if len(file) < MIN_PAIRS:
+            raise ParameterError(f"`pairs` ({len(file)}) must be {MIN_PAIRS} or more: each in turn is left out.")
         for number in range(len(file)):
             pair = file[number]
             refuse_non_finite(pair, number)

@@ -37,7 +37,7 @@ IDENTITY = "session"
 one."""
 
 _HEAD = 2**16  # bytes at the start of a file, where HDF5 keeps the first attribute of the root group
-_MOST = 2**30  # bytes of a journal: far more than HDF5's tables of a million rows
+_MAX_BYTES = 2**30  # bytes of a journal: far more than HDF5's tables of a million rows
 _MAGIC = b"mwdnjrn1"
 _START = struct.Struct("<8s32sQI")  # magic, identity, length of the file, number of changes
 _CHANGE = struct.Struct("<QI")  # place in the file, number of bytes
@@ -239,7 +239,7 @@ def _read_journal(journal: Path) -> tuple[bytes, int, Changes] | None:
     """Identity, length of the file and changes; ``None`` without a complete journal."""
     if not journal.exists():
         return None
-    content = read_bytes(journal, most=_MOST)
+    content = read_bytes(journal, most=_MAX_BYTES)
     body, digest = content[:-_DIGEST], content[-_DIGEST:]
     if hashlib.blake2b(body, digest_size=_DIGEST).digest() != digest or body[:8] != _MAGIC:
         return None

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mwdn.calibration.sensor_frames import LEAST_RESPONSE
+from mwdn.calibration.sensor_frames import MIN_RESPONSE
 from mwdn.data.hdf5 import PICTURE_BYTES, CheckedFile, add_rows, create_hdf5, write_row
 from mwdn.errors import ImageError, ParameterError, ShapeError
 from mwdn.io.files import as_image_error, atomic
@@ -182,7 +182,7 @@ def quantise(pixels: Frame, dtype: np.dtype[Any], name: str = "pixels", *, has_f
     elif pixels.dtype.kind != "f":
         raise ParameterError(f"`{name}` ({pixels.dtype}) must be floats, uint8 or uint16. Convert it with `astype`.")
     low, high = (float(pixels.min()), float(pixels.max())) if pixels.size else (0.0, 0.0)
-    if not (low >= _LOWEST and high <= (_HIGHEST / LEAST_RESPONSE if has_flat else _HIGHEST)):  # NaN fails this too
+    if not (low >= _LOWEST and high <= (_HIGHEST / MIN_RESPONSE if has_flat else _HIGHEST)):  # NaN fails this too
         raise ParameterError(f"`{name}` ({low:.4g} to {high:.4g}) must be in [0, 1]. Divide it by its full scale.")
     if dtype.kind == "f":
         return pixels.astype(dtype)

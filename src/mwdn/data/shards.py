@@ -15,7 +15,7 @@ from mwdn.io.reading import open_regular
 from mwdn.runtime.requirement import require
 from mwdn.types import Frame
 
-SMALLEST_PICTURE = 67
+MIN_PICTURE = 67
 """Bytes of the smallest PNG: a file cannot hold more pictures than this allows."""
 
 UNPACKED_BYTES, PACKED_PART = 2**28, 20
@@ -76,7 +76,7 @@ class Shard:
             advice = "Name two of them: `--captures lensless --scenes lensed`."
             raise ImageError(f"`{path}` must have the columns {self.columns}, but has {str(names)[:80]}. {advice}")
         size = path.stat().st_size
-        if min(rows, default=0) < 0 or self.count * SMALLEST_PICTURE > size:
+        if min(rows, default=0) < 0 or self.count * MIN_PICTURE > size:
             raise ImageError(f"`{path}` claims {self.count:,} rows, but has {size:,} bytes for them. {COPY_AGAIN}")
         if largest > max(PACKED_PART * size, UNPACKED_BYTES):
             raise ImageError(f"`{path}` would take {largest:,} bytes unpacked, but has {size:,}. {COPY_AGAIN}")

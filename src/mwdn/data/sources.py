@@ -18,7 +18,7 @@ from mwdn.io.images import read_frame
 from mwdn.io.listing import pictures_in
 from mwdn.types import Frame
 
-MOST_ROWS = 2**21
+MAX_ROWS = 2**21
 """Most pairs of one file: listing them takes 0.7 GB."""
 
 # The ten ImageNet classes on which FlatNet's authors tested. The data set has ten pictures of each class, so these are
@@ -109,8 +109,8 @@ def list_hdf5(path: Path, captures: str, scenes: str) -> Listing:
             )
     counts = [len(file[name]) for name in (captures, scenes)]
     complete = min(counts)
-    if max(counts) > MOST_ROWS:
-        raise ImageError(f"`{path}` claims {max(counts):,} pairs; at most {MOST_ROWS:,} are imported. Divide it.")
+    if max(counts) > MAX_ROWS:
+        raise ImageError(f"`{path}` claims {max(counts):,} pairs; at most {MAX_ROWS:,} are imported. Divide it.")
     refused = {
         f"row {row}": f"Row {row} of `{path}` is in one of `{captures}` ({counts[0]:,}) and `{scenes}` ({counts[1]:,})"
         f" only. {COPY_AGAIN}"

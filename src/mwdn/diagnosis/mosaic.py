@@ -29,15 +29,15 @@ PEAK = 0.03
 RING = 0.12
 """Outer radius of the ring around a peak that shows fine detail and noise."""
 
-LEAST_CONTRAST = 5.0
+MIN_CONTRAST = 5.0
 """Smallest density of a mosaic's peak over that of its ring, which holds fine detail, noise and sharp colours. Raw
 frames have 6 to 300,000, grey, colour and binned ones 0.5 to 4.4; those interpolated from a mosaic keep up to 51."""
 
-LEAST_AMPLITUDE = 0.005
+MIN_AMPLITUDE = 0.005
 """Smallest amplitude of a mosaic over the mean brightness. Raw frames have 0.0086 and more, those interpolated from a
 mosaic 0.0025 and less."""
 
-LEAST_COHERENCE = 0.5
+MIN_COHERENCE = 0.5
 """Smallest coherence of the peaks at (1/2, 0) and (0, 1/2) that shows the diagonal of green; 1 without noise."""
 
 LARGEST = 1024
@@ -65,12 +65,12 @@ class Peaks(NamedTuple):
     @property
     def found(self) -> bool:
         """Whether they are those of a mosaic."""
-        return self.contrast > LEAST_CONTRAST and self.amplitude > LEAST_AMPLITUDE
+        return self.contrast > MIN_CONTRAST and self.amplitude > MIN_AMPLITUDE
 
     @property
     def orders(self) -> tuple[str, str]:
         """The two orders that fit. Filters of equal red and blue light: green lets most light through."""
-        is_coherent = abs(self.coherence) > LEAST_COHERENCE
+        is_coherent = abs(self.coherence) > MIN_COHERENCE
         green_is_off_diagonal = self.coherence > 0 if is_coherent else self.checkerboard < 0
         return ("rggb", "bggr") if green_is_off_diagonal else ("grbg", "gbrg")
 

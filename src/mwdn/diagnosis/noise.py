@@ -14,7 +14,7 @@ from mwdn.types import Frame, Image, Measurement
 JPEG_EDGES = 1.1
 """`block_edges` of JPEG files is above: 1.2 and more at qualities 85 to 95, 1.06 and less without."""
 
-LEAST_LEVELS = 16
+MIN_LEVELS = 16
 """Different numbers in a frame below which rounding hides its detail and its noise."""
 
 
@@ -43,7 +43,7 @@ def noise_bounds(measurement: Measurement) -> NoiseBounds:
     pairs = 4 * float(noise_level(F.avg_pool2d(b, 2)).square().sum()) if min(b.shape[-2:]) > 1 else single
     low, high = (min(1.0, variance / energy) for variance in sorted((single, pairs)))
     some = b.flatten()[:: max(1, b.numel() // 100_000)]
-    is_unbounded = len(set(some.tolist())) < LEAST_LEVELS or block_edges(b) > JPEG_EDGES
+    is_unbounded = len(set(some.tolist())) < MIN_LEVELS or block_edges(b) > JPEG_EDGES
     return NoiseBounds(low, 1.0 if is_unbounded else high)
 
 

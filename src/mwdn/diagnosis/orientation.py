@@ -30,13 +30,13 @@ CLEAR = 1.17
 ALIKE = 1.12
 """Contrast below which the PSF is another camera's."""
 
-MOST_NOISE = 0.6
+MAX_NOISE = 0.6
 """`OrientationFit.noise` above which orientations fit alike even if one of them is right."""
 
-LEAST_SIDE = 96
+MIN_SIDE = 96
 """Height and width in pixels of a capture below which that is so, too."""
 
-MOST_SATURATED = 0.1
+MAX_SATURATED = 0.1
 """Fraction of saturated pixels above which only a PSF that fits is judged. Of nine real captures through the right PSF,
 clipped at 20 %, one seems turned, and three fit all orientations alike (`benchmarks/trust.py --saturated`)."""
 
@@ -82,7 +82,7 @@ class OrientationFit:
         if self.lead >= CLEAR and not self.best:
             text = f"The PSF fits: any other orientation leaves {self.lead - 1:.0%} more unexplained."
             return Verdict("psf", "orientation", "good", text)
-        if self.saturated > MOST_SATURATED:
+        if self.saturated > MAX_SATURATED:
             text = f"The PSF cannot be judged: {self.saturated:.0%} of the capture's pixels are saturated."
             return Verdict("psf", "orientation", "unknown", text)
         if self.lead >= CLEAR:
@@ -90,7 +90,7 @@ class OrientationFit:
             text = f"The PSF is mirrored or turned: as it is, it leaves {self.contrast**-1 - 1:.0%} more unexplained."
             return Verdict("psf", "orientation", "doubt", text, right, f"--psf-orientation {right}")
         alike = f"The PSF's mirror images and turns fit the capture alike (to {self.lead - 1:.0%})"
-        if self.lead >= ALIKE or self.noise > MOST_NOISE or self.side < LEAST_SIDE:
+        if self.lead >= ALIKE or self.noise > MAX_NOISE or self.side < MIN_SIDE:
             return Verdict("psf", "orientation", "unknown", f"{alike}: the PSF cannot be judged by this capture.")
         text = f"{alike}: it is another camera's, or at another resolution."
         return Verdict("psf", "another-camera", "doubt", text, "another-camera")

@@ -26,7 +26,7 @@ from mwdn.types import Measurement, Psf, Size
 BINS = range(1, 9)
 """Bins of the PSF or the capture that are tried."""
 
-SMALLEST_SIDE = 64
+MIN_SIDE = 64
 """Pixels of the shorter side that PSF and capture must have in common."""
 
 LARGEST = 60_000
@@ -55,7 +55,7 @@ def fit_sizes(measurement: Measurement, psf: Psf) -> list[Fit]:
     fits = []
     for psf_bin, bin in bins:
         sides = [min(a // bin, b // psf_bin) for a, b in zip(capture.shape[-2:], grey.shape[-2:], strict=True)]
-        if min(sides) >= SMALLEST_SIDE:
+        if min(sides) >= MIN_SIDE:
             size = sides[0], sides[1]
             both = (crop_centre(bin_pixels(image, by), size) for image, by in ((capture, bin), (grey, psf_bin)))
             fits.append(Fit(psf_bin, bin, size, _lead(*both)))

@@ -19,10 +19,10 @@ SMALLEST = 15
 """Minimum height and width of a PSF in pixels. The check accepts the right PSF of 12 pixels for 1 or 2 captures in 10,
 of 15 pixels for 7 or 8."""
 
-LEAST_EXPLAINED = 0.25
+MIN_EXPLAINED = 0.25
 """Smallest trusted ``explained / possible``. On real captures the right PSF reaches 0.32 and more."""
 
-LEAST_POSSIBLE = 0.03
+MIN_POSSIBLE = 0.03
 """Smallest `Consistency.possible` at which a picture can be judged."""
 
 
@@ -78,11 +78,11 @@ class Trust:
     @property
     def _picture(self) -> Verdict:
         explained, possible = self.consistency.explained, self.consistency.possible
-        if possible < LEAST_POSSIBLE:
+        if possible < MIN_POSSIBLE:
             text = f"The picture cannot be judged: only {possible:.1%} of the capture's detail is not noise."
             return Verdict("picture", "noise", "unknown", text)
         share = f"{explained / possible:.0%} of what is not noise in the capture's detail"
-        if explained < LEAST_EXPLAINED * possible:
+        if explained < MIN_EXPLAINED * possible:
             return Verdict("picture", "little-explained", "doubt", f"The picture reproduces only {share}.")
         return Verdict("picture", "little-explained", "good", f"The picture reproduces {share}.")
 

@@ -242,7 +242,7 @@ class Reconstructor:
             ShapeError: the measurement is not a batch, or its size or channels do not fit the PSF or the network.
             ImageError: the array or picture is not a frame.
             ParameterError: the measurement is a tensor of integers or holds NaN, infinity, no light or a scale beyond
-                `mwdn.errors.LARGEST_LIGHT`; floats of an array exceed 1 by far; or the device does not have enough
+                `mwdn.errors.MAX_LIGHT`; floats of an array exceed 1 by far; or the device does not have enough
                 memory for pictures of this size.
         """
         if isinstance(measurement, Tensor):

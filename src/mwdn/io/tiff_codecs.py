@@ -14,11 +14,11 @@ Codec = Callable[[bytes, int], bytes]
 Numbers = Shaped[np.ndarray, "..."]
 
 _CLEAR, _END, _FIRST = 256, 257, 258
-_MOST_CODES = 4096 - _FIRST + 1
+_MAX_CODES = 4096 - _FIRST + 1
 """Codes between two clear codes: the first one adds no entry to the table of 4,096."""
 
 # Code k is 9 bits wide until the table has 511 entries: it has 258, and each code but the first adds one; and so on.
-_WIDTHS = np.select([np.arange(_MOST_CODES + 1) <= 2**bits - _FIRST - 1 for bits in (9, 10, 11)], [9, 10, 11], 12)
+_WIDTHS = np.select([np.arange(_MAX_CODES + 1) <= 2**bits - _FIRST - 1 for bits in (9, 10, 11)], [9, 10, 11], 12)
 _STARTS = np.concatenate([[0], np.cumsum(_WIDTHS)[:-1]])
 
 
@@ -67,7 +67,7 @@ def lzw_size(data: bytes, most: int) -> int:
 
 def _tables(data: bytes, most: int) -> Iterator[tuple[Numbers, Numbers]]:
     """The codes between each two clear codes, and the lengths of their strings."""
-    padded = np.frombuffer(data + bytes(2 * _MOST_CODES), np.uint8)
+    padded = np.frombuffer(data + bytes(2 * _MAX_CODES), np.uint8)
     if int.from_bytes(data[:2]) >> 7 != _CLEAR:
         raise ImageError("is damaged: LZW data does not begin with a clear code, or is of a kind before 1992.")
     size, bit, end = 0, 9, _CLEAR

@@ -10,22 +10,22 @@ from torch.overrides import TorchFunctionMode
 from mwdn.errors import MwdnError, ParameterError, reason
 from mwdn.networks import build
 
-MOST_PARAMETERS = 2**28
+MAX_PARAMETERS = 2**28
 """Largest number of parameters: 1 GiB in float32, twelve times the largest network of the paper."""
 
-MOST_TENSORS = 8_000
+MAX_TENSORS = 8_000
 """Limit of the tensors made while a network is built, about a second; the networks of the package make up to 540."""
 
 
 class _Counted(TorchFunctionMode):
-    """Counts the tensors that this thread makes, and stops at `MOST_TENSORS`."""
+    """Counts the tensors that this thread makes, and stops at `MAX_TENSORS`."""
 
     count = 0
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:  # noqa: ANN401
         result = func(*args, **(kwargs or {}))
         self.count += isinstance(result, Tensor)
-        if self.count > MOST_TENSORS:
+        if self.count > MAX_TENSORS:
             raise ParameterError("the network has too many layers. Lower its depth.")
         return result
 
@@ -52,8 +52,8 @@ def build_empty(name: str, **options: Any) -> nn.Module:  # noqa: ANN401
     if empty:
         raise ParameterError(f"`{empty[0]}` of the network '{name}' has no channels. Choose positive sizes.")
     count = sum(parameter.numel() for parameter in network.parameters())
-    if count > MOST_PARAMETERS:
+    if count > MAX_PARAMETERS:
         raise ParameterError(
-            f"the network '{name}' has {count:,} parameters; at most {MOST_PARAMETERS:,} are allowed. Lower `width`."
+            f"the network '{name}' has {count:,} parameters; at most {MAX_PARAMETERS:,} are allowed. Lower `width`."
         )
     return network

@@ -14,7 +14,7 @@ DOUBT_BLOCKS = 4, 16
 MAPS = 2 + len(DOUBT_BLOCKS)
 """Maps of `against_psf` beside the light: the place, the noise, and a doubt for each of `DOUBT_BLOCKS`."""
 
-LARGEST_DOUBT = 20.0
+MAX_DOUBT = 20.0
 """Ten real captures of two cameras have 3 to 21 at a side of 16."""
 
 BENIGN_DOUBT = 2.0, 5.0
@@ -30,7 +30,7 @@ def doubt_of_psf(estimate: Estimate) -> Tensor:
     `BENIGN_DOUBT`.
     """
     none, whole = BENIGN_DOUBT
-    doubt = estimate.doubt(DOUBT_BLOCKS[-1]).clamp(1, LARGEST_DOUBT)
+    doubt = estimate.doubt(DOUBT_BLOCKS[-1]).clamp(1, MAX_DOUBT)
     return doubt.log() * ((doubt - none) / (whole - none)).clamp(0, 1)
 
 
@@ -48,7 +48,7 @@ def against_psf(estimate: Estimate, detail: Scene, block: int) -> Tensor:
         block: side of the blocks in pixels.
     """
     noise = estimate.noise.clamp(min=REFERENCE_NOISE / 10)
-    doubts = [estimate.doubt(side).clamp(max=LARGEST_DOUBT) for side in DOUBT_BLOCKS]
+    doubts = [estimate.doubt(side).clamp(max=MAX_DOUBT) for side in DOUBT_BLOCKS]
     numbers = [(value + 1e-3).log() for value in (noise / REFERENCE_NOISE, *doubts)]
     size = detail.shape[-2:]
     y, x = (torch.linspace(-1, 1, length, device=detail.device, dtype=detail.dtype).square() / 2 for length in size)

@@ -16,10 +16,10 @@ from mwdn.types import Psf, Size
 LOSSLESS_WIDTH = 6.0
 """Full width of the autocorrelation, in binned pixels, down to which binning loses little; see `coarsest_bin`."""
 
-LEAST_BOX = 5
+MIN_BOX = 5
 """Pixels along each side of the lit part of a PSF, below which it is a spot without lines and gaps."""
 
-SMALLEST_SIDE = 100
+MIN_SIDE = 100
 """Fewest pixels of the shorter side of a frame that is binned automatically."""
 
 
@@ -87,12 +87,12 @@ def coarsest_bin(psf: Psf) -> int:
     `pyramid` gains 0.3 dB on average and is 29 times as fast, `universal-small` loses 0.2 dB; with 3 % noise they gain
     0.8 and 0.2 dB. Binned by w / 4, they lose up to 2 dB.
 
-    The shorter side of the binned frame keeps `SMALLEST_SIDE` pixels at least.
+    The shorter side of the binned frame keeps `MIN_SIDE` pixels at least.
 
     Args:
         psf: (1, C, H, W), at the resolution of the captures.
     """
-    return max(1, min(round(autocorrelation(psf).width / LOSSLESS_WIDTH), min(psf.shape[-2:]) // SMALLEST_SIDE))
+    return max(1, min(round(autocorrelation(psf).width / LOSSLESS_WIDTH), min(psf.shape[-2:]) // MIN_SIDE))
 
 
 def _detail(plane: Tensor, grid: Size) -> Tensor:
@@ -184,9 +184,9 @@ def support_box(psf: Psf) -> tuple[slice, slice]:
 def level_between_lines(box: Tensor) -> float:
     """Brightness between the lines of a PSF: 10th percentile of the middle half (h/2, w/2) of its support box.
 
-    0 for a box below `LEAST_BOX`, which holds a single spot.
+    0 for a box below `MIN_BOX`, which holds a single spot.
     """
-    if min(box.shape) < LEAST_BOX:
+    if min(box.shape) < MIN_BOX:
         return 0.0
     rows, columns = (slice(n // 4, max(3 * n // 4, n // 4 + 1)) for n in box.shape)
     ordered = box[rows, columns].flatten().sort().values

@@ -10,7 +10,7 @@ PLATEAU = 0.98, 0.995
 """Fractions of a colour's maximum. A saturated capture has more pixels above the second than between the two; other
 captures have many times fewer, because the brightest light is rare."""
 
-LEAST_SATURATED = 5e-4
+MIN_SATURATED = 5e-4
 """Smallest fraction of saturated pixels: fewer are bright peaks or hot pixels."""
 
 
@@ -24,7 +24,7 @@ def saturated_pixels(measurement: Measurement) -> Tensor:
     sample = measurement[..., ::2]
     above, at = ((sample >= part * most).float().mean((-2, -1), keepdim=True) for part in PLATEAU)
     below = above - at
-    is_plateau = (at > below) & (below > 0) & (at >= LEAST_SATURATED)
+    is_plateau = (at > below) & (below > 0) & (at >= MIN_SATURATED)
     return measurement >= torch.where(is_plateau, PLATEAU[1] * most, torch.inf)
 
 

@@ -27,7 +27,7 @@ WORST = 0.6
 WORST_PX = 1.5
 """Largest residual that is accepted; for large pictures 2 % of their side."""
 
-MOST_OUTSIDE = 0.5
+MAX_OUTSIDE = 0.5
 """Largest share of the picture outside of the camera's frame that is accepted."""
 
 _CLOSE = 0.04
@@ -37,7 +37,7 @@ _AMBIGUOUS = 0.05
 """Part by which the unexplained ``1 - correlation`` of the best start must be lower than that of the next."""
 
 _FEW = 4
-_FEWEST_PARTS = 4
+_MIN_PARTS = 4
 _ENOUGH_PARTS = 12
 """Fewest parts that separate shading from a displacement of the whole: 24 numbers for the 8 of a homography."""
 
@@ -167,15 +167,15 @@ def _check(result: Refined, residuals: Residuals) -> None:
             f"The displayed picture was not found in the reconstruction: their correlation is {result.correlation:.2f} "
             f"and must be {WORST:g} at least. {way_out}"
         )
-    if len(residuals.points) < _FEWEST_PARTS:
+    if len(residuals.points) < _MIN_PARTS:
         raise AlignmentError(
-            f"Parts of the picture that can be placed: {len(residuals.points)}, and {_FEWEST_PARTS} are needed. "
+            f"Parts of the picture that can be placed: {len(residuals.points)}, and {_MIN_PARTS} are needed. "
             f"Use more pictures, or one with more detail. {way_out}"
         )
-    if result.projection.outside > MOST_OUTSIDE:
+    if result.projection.outside > MAX_OUTSIDE:
         raise AlignmentError(
             f"{result.projection.outside:.0%} of the picture lies outside of the camera's frame, and at most "
-            f"{MOST_OUTSIDE:.0%} may. Show a smaller one, or turn the camera to it. {way_out}"
+            f"{MAX_OUTSIDE:.0%} may. Show a smaller one, or turn the camera to it. {way_out}"
         )
     corners = result.projection.corners()
     most = max(WORST_PX, 0.02 * float(np.ptp(corners, axis=0).max()))

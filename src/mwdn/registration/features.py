@@ -19,7 +19,7 @@ _FEWEST = 10
 _ENLARGED = 400
 """Pictures below this many pixels a side are enlarged: SIFT finds few features of less than 4 pixels."""
 
-_MOST_VIEWS = 40
+_MAX_VIEWS = 40
 
 Bytes = npt.NDArray[np.uint8]
 
@@ -33,7 +33,7 @@ def match_features(views: Views) -> list[Projection]:
     found = []
     pictures, reconstructions = views.bytes
     for mirrored in (False, True):
-        turned = [picture[:, ::-1] if mirrored else picture for picture in pictures[:_MOST_VIEWS]]
+        turned = [picture[:, ::-1] if mirrored else picture for picture in pictures[:_MAX_VIEWS]]
         pairs = [_matches(picture, seen) for picture, seen in zip(turned, reconstructions, strict=False)]
         displayed, seen = (np.concatenate(part) for part in zip(*pairs, strict=True))
         if mirrored and len(displayed):

@@ -25,7 +25,7 @@ _SMALLEST = 0.01
 """Smallest display, as a fraction of the frame."""
 
 _PROFILES = 48
-_LEAST_PROFILES = 4
+_MIN_PROFILES = 4
 _REACH = 0.12
 """Length of a profile on each side of the line, as a fraction of the display's size."""
 
@@ -129,7 +129,7 @@ def _side(image: FloatFrame, start: Points, end: Points, reach: float) -> tuple[
     strength = fall[np.arange(_PROFILES), where]
     edges = places + _peak(fall, where, offsets)[:, None] * outwards
     strong = strength > 0.25 * np.quantile(strength, 0.9)
-    if strong.sum() < _LEAST_PROFILES:  # nothing falls outwards here: there is no side
+    if strong.sum() < _MIN_PROFILES:  # nothing falls outwards here: there is no side
         return np.array([0.0, 0.0, 1.0]), 0.0
     vx, vy, x0, y0 = _robust_line(edges[strong])
     normal = np.array([-vy, vx])

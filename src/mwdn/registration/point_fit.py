@@ -13,10 +13,10 @@ _ITERATIONS = 20
 _STRONG = 10.0
 """Difference of the Bayesian information criterion that is strong evidence (Kass and Raftery, 1995)."""
 
-_MOST = 0.3
+_MAX_RADIAL = 0.3
 """Largest radial term: `Projection.to_picture` converges below 1/3."""
 
-_LEAST_PX = 0.03
+_MIN_PX = 0.03
 """Error of a part that its standard error does not include."""
 
 _PREDICTS = 0.8
@@ -47,7 +47,7 @@ class _Seen(NamedTuple):
 
     @classmethod
     def of(cls, picture: Points, camera: Points, errors: npt.NDArray[np.float64] | None) -> "_Seen":
-        return cls(picture, camera, np.ones(len(picture)) if errors is None else 1 / np.hypot(errors, _LEAST_PX))
+        return cls(picture, camera, np.ones(len(picture)) if errors is None else 1 / np.hypot(errors, _MIN_PX))
 
     def part(self, chosen: npt.NDArray[np.bool_]) -> "_Seen":
         return _Seen(self.picture[chosen], self.camera[chosen], self.weights[chosen])
@@ -159,7 +159,7 @@ def _descend(projection: Projection, seen: _Seen, *, radial: bool) -> Projection
 def _bent(flat: Projection, seen: _Seen) -> Projection:
     """The fit with a radial term if the points show one, otherwise the one without."""
     bent = _descend(flat, seen, radial=True)
-    is_shown = abs(bent.radial) < _MOST and _evidence(flat, bent, seen, 1) > _STRONG
+    is_shown = abs(bent.radial) < _MAX_RADIAL and _evidence(flat, bent, seen, 1) > _STRONG
     return bent if is_shown and _prediction(flat, seen) < _PREDICTS else flat
 
 

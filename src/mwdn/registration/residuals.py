@@ -10,7 +10,7 @@ from mwdn.registration.projection import Points, Projection
 from mwdn.registration.views import Views
 
 _BLUR = 1.0
-_MOST_PARTS, _FEWEST_PARTS, _PART_PX = 6, 3, 14
+_MAX_PARTS, _MIN_PARTS, _PART_PX = 6, 3, 14
 """The picture is divided into rows and columns of parts of this many pixels of the camera at least, each with a
 displacement of its own."""
 
@@ -51,7 +51,7 @@ def measure_residuals(projection: Projection, views: Views) -> Residuals:
     images = smooth_images(views.reconstructions, _BLUR)
     samples = matched_samples(projection, views, images, _BLUR)
     points = projection.to_camera(samples.points)
-    count = int(np.clip(min(samples.shape) // _PART_PX, _FEWEST_PARTS, _MOST_PARTS))
+    count = int(np.clip(min(samples.shape) // _PART_PX, _MIN_PARTS, _MAX_PARTS))
     height, width = views.picture_size
     columns, rows = np.floor((samples.points + 0.5) / [width, height] * count).astype(int).T
     parts = np.where((np.minimum(rows, columns) >= 0) & (np.maximum(rows, columns) < count), rows * count + columns, -1)

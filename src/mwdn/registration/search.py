@@ -18,7 +18,7 @@ _SCALES = 0.12 * 1.15 ** np.arange(18)
 
 _TURNS = range(0, 360, 15)
 _BLUR = 1.2
-_MOST_VIEWS = 4
+_MAX_VIEWS = 4
 
 Matrix = npt.NDArray[np.float64]
 
@@ -33,7 +33,7 @@ def search(views: Views) -> list[Projection]:
     """
     import cv2
 
-    views = views.first(_MOST_VIEWS)
+    views = views.first(_MAX_VIEWS)
     height, width = views.camera_size
     size = max(8, round(height * _SIDE / max(height, width))), max(8, round(width * _SIDE / max(height, width)))
     frames = [cv2.resize(each, size[::-1], interpolation=cv2.INTER_AREA) for each in views.reconstructions]

@@ -54,15 +54,15 @@ SMOOTH_LEVELS = (
     Level(1, 8, Penalties(0.1, 1.5, 1.5), 0.02, min_smoothing=0.2),
 )
 _HIGH_PASS = 0.03  # cycles per pixel: below, most of the residual is ambient light and unconverged iterations
-_MOST_FALL_OFF = 0.5  # coefficient of any polynomial: that of x^2 + y^2 then loses all light in the corners
+_MAX_FALL_OFF = 0.5  # coefficient of any polynomial: that of x^2 + y^2 then loses all light in the corners
 _REACH = 16  # pixels, three standard deviations of the Gaussian of `_HIGH_PASS`
 _PRIOR = (0.5, 0.01)  # standard deviations S of a calibration's errors: degrees and relative magnification
 _DELTA = (0.1, 0.002)  # finite differences
 _ENVELOPE_PRIOR = (0.015, 0.015)  # of the envelope: down and right, over the shorter side
 _ENVELOPE_DELTA = (0.004, 0.004)
 _ENVELOPE_PARTS = (1.5, 1.0, 0.5, 0.25)  # of its step, tried in turn: it is often too long in real captures
-_LEAST_SIDE = 200  # pixels: at half of 160, the paper's PSF is so coarse that exact captures seem displaced: -1 dB each
-_MOST_SCALE = 0.02  # relative magnification of an object that is about as far away as the calibration's source
+_MIN_SIDE = 200  # pixels: at half of 160, the paper's PSF is so coarse that exact captures seem displaced: -1 dB each
+_MAX_SCALE = 0.02  # relative magnification of an object that is about as far away as the calibration's source
 _CORRELATED = 20.0  # pixels of the residual that count as one independent sample
 MIN_GAIN = 1e-3
 """Part of the residual's energy that a pose must explain; otherwise the calibrated PSF is kept. With an exact PSF a
@@ -85,7 +85,7 @@ _HAZE_LEVELS = (
     Level(2, 80, Penalties(0.015, 0.4, 0.06), 0.04),
     Level(1, 40, Penalties(0.05, 1.3, 0.2), 0.04),
 )
-_LEAST_HAZE = 0.001  # less is none: E rises by 5 % shortly after its minimum at no haze
+_MIN_HAZE = 0.001  # less is none: E rises by 5 % shortly after its minimum at no haze
 _HAZE_RISE = 1.05
 """E over its minimum at which the flat part ends: the best from 1.03 to 1.15. 40 captures through three measured PSFs,
 exact and under 10 % of haze, come within 0.05 dB of their best haze, and 24 that fill the frame within 0.25 dB."""
@@ -95,7 +95,7 @@ MIN_DETAIL = 1.7
 """Detail of a capture over its noise, both at a quarter of the size, below which it shows nothing to align by. Dark and
 even frames have 1.3 to 1.4, simulated captures of 100 electrons 2.2, of 2,000 electrons 9, real ones 20 and more."""
 
-_LEAST_DETAIL = 1e-3  # over the root mean square: without noise, rounding is detail; real captures have 0.04 to 0.07
+_ROUNDING_DETAIL = 1e-3  # over the root mean square: without noise, rounding is detail; real captures have 0.04 to 0.07
 _QUARTER_NOISE = 0.11  # standard deviation of white noise after `halve` twice
 
 
@@ -132,11 +132,11 @@ def align(measurement: Measurement, psf: Psf, *, steps: int = 2, min_gain: float
     half = half / half.abs().amax((1, 2, 3), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
     psf = checked_psf(psf).expand(len(half), -1, -1, -1)
     pose = _estimate_pose(half, psf, steps, min_gain)
-    if min(measurement.shape[-2:]) >= _LEAST_SIDE:
+    if min(measurement.shape[-2:]) >= _MIN_SIDE:
         least_gain = MIN_ENVELOPE_GAIN * (_GOOD_LIGHT / relative_noise(measurement)).clamp(max=1).flatten()
         least_gain = least_gain + saturated_pixels(measurement).float().mean((1, 2, 3)) / 3
         envelope = _estimate_envelope(half, halve_psf(pose.move(psf)), least_gain)
-        pose = pose._replace(envelope=torch.where((pose.scale.abs() <= _MOST_SCALE)[:, None], envelope, 0.0))
+        pose = pose._replace(envelope=torch.where((pose.scale.abs() <= _MAX_SCALE)[:, None], envelope, 0.0))
     haze = _estimate_haze(halve(half), halve_psf(halve_psf(pose.move(psf))))
     turn_degrees, scale, haze = (torch.where(seen, value, 0.0) for value in (pose.turn_degrees, pose.scale, haze))
     shift = None if pose.envelope is None else torch.where(seen[:, None], pose.envelope, 0.0)
@@ -147,7 +147,7 @@ def has_detail(measurement: Measurement) -> Tensor:
     """Whether each capture shows more than noise and even light, (B,); false for one with NaN or infinity."""
     unit, noise = root_mean_square(measurement), relative_noise(measurement)
     detail = root_mean_square(fine_detail(halve(halve(measurement.float() / unit))))
-    return (detail > (MIN_DETAIL * _QUARTER_NOISE * noise).clamp(min=_LEAST_DETAIL)).flatten()
+    return (detail > (MIN_DETAIL * _QUARTER_NOISE * noise).clamp(min=_ROUNDING_DETAIL)).flatten()
 
 
 def _estimate_pose(half: Measurement, psf: Psf, steps: int, min_gain: float) -> Pose:
@@ -223,7 +223,7 @@ def _estimate_haze(measurement: Measurement, psf: Psf) -> Tensor:
     below, above = energy.gather(1, last), energy.gather(1, after)
     part = (limit - below) / (above - below).clamp(min=torch.finfo(energy.dtype).tiny)
     haze = torch.lerp(hazes[last], hazes[after], part.clamp(max=1))[:, 0].nan_to_num()
-    return F.threshold(haze, _LEAST_HAZE, 0.0)
+    return F.threshold(haze, _MIN_HAZE, 0.0)
 
 
 def fine_detail(image: Image) -> Image:
@@ -253,7 +253,7 @@ def _without_fall_off(whole: Tensor, prediction: Tensor, size: Size, count: int)
 
     The residual and the high-passed prediction are given on a grid (N, C, rows, columns) that begins with the sensor.
     The polynomials q are smooth, so that the high-passed product with a prediction is q times the high-passed
-    prediction p. A fall-off of more than `_MOST_FALL_OFF` cannot be the sensor's: if one of a capture's ``count`` poses
+    prediction p. A fall-off of more than `_MAX_FALL_OFF` cannot be the sensor's: if one of a capture's ``count`` poses
     has it, all residuals of this capture stay unchanged, including what the high pass spreads beyond the sensor. All
     poses are treated alike, so that differences between residuals come from the poses only.
     """
@@ -266,7 +266,7 @@ def _without_fall_off(whole: Tensor, prediction: Tensor, size: Size, count: int)
     normal = A @ A.mT
     ridge = (1e-6 * normal.diagonal(dim1=-2, dim2=-1).mean(-1)).clamp(min=1e-30)[:, None, None]
     a = torch.linalg.solve(normal + ridge * torch.eye(len(q)).to(r), A @ r.flatten(1)[..., None])
-    is_sensor = (a.abs().amax((1, 2)) < _MOST_FALL_OFF).reshape(-1, count).all(1)
+    is_sensor = (a.abs().amax((1, 2)) < _MAX_FALL_OFF).reshape(-1, count).all(1)
     unexplained = F.pad(
         r - (a.mT @ A)[:, 0].reshape(r.shape), (0, whole.shape[-1] - width, 0, whole.shape[-2] - height)
     )

@@ -19,7 +19,7 @@ from mwdn.io.reading import open_regular, parse_json
 HEADER_BYTES = 2**22
 """Most bytes of a header: 4 MiB. That of the largest network has 50 kB, with its recipe."""
 
-MOST_AXES = 8
+MAX_AXES = 8
 _DTYPES = {
     **{"F64": torch.float64, "F32": torch.float32, "F16": torch.float16, "BF16": torch.bfloat16},
     **{"I64": torch.int64, "I32": torch.int32, "I16": torch.int16, "I8": torch.int8, "U8": torch.uint8},
@@ -82,7 +82,7 @@ def _entry(path: Path, key: str, value: Any, *, first: int, size: int) -> Entry:
     value = value if isinstance(value, dict) else {}
     dtype, shape, offsets = (value.get(name) for name in ("dtype", "shape", "data_offsets"))
     known = isinstance(dtype, str) and dtype in _DTYPES
-    if known and _whole(shape, size) and _whole(offsets, size) and len(offsets) == 2 and len(shape) <= MOST_AXES:
+    if known and _whole(shape, size) and _whole(offsets, size) and len(offsets) == 2 and len(shape) <= MAX_AXES:
         start, end = offsets
         if first + end <= size and math.prod(shape) * _DTYPES[dtype].itemsize == end - start:
             return Entry(_DTYPES[dtype], tuple(shape), first + start, end - start)
@@ -136,7 +136,7 @@ def check_shapes(network: nn.Module, shapes: Mapping[str, tuple[int, ...]], what
         raise CheckpointError(f"{what}: Unexpected key `{min(unexpected)[:80]}`, one of {len(unexpected):,}.")
     for key, shape in expected.items():
         if shape != tuple(shapes[key]):
-            found = list(shapes[key])[:MOST_AXES]
+            found = list(shapes[key])[:MAX_AXES]
             raise CheckpointError(f"{what}: size mismatch for {key}: {found} instead of {list(shape)}. Copy it again.")
 
 

@@ -4,10 +4,10 @@ import { findHotPixels } from "./hot_pixels.js";
 import { decodeNpy, isNpy } from "./npy.js";
 import { decodePng, FileError, isPng } from "./png.js";
 
-const MOST_BYTES = 2 ** 29;
+const MAX_BYTES = 2 ** 29;
 
 export async function readFrame(file) {
-  if (file.size > MOST_BYTES) throw new FileError(`has ${Math.round(file.size / 1e6)} MB, more than ${Math.round(MOST_BYTES / 1e6)}.`);
+  if (file.size > MAX_BYTES) throw new FileError(`has ${Math.round(file.size / 1e6)} MB, more than ${Math.round(MAX_BYTES / 1e6)}.`);
   const bytes = new Uint8Array(await file.arrayBuffer());
   if (isPng(bytes)) return decodePng(bytes);
   if (isNpy(bytes)) return decodeNpy(bytes);

@@ -1,6 +1,6 @@
 // Hot pixels of a capture, from the capture alone, as `mwdn.calibration.isolated_pixels`.
 const ISOLATED = [4, 8];
-const MOST_ISOLATED = 2e-3;
+const MAX_ISOLATED = 2e-3;
 const SAMPLED = 2 ** 15;
 
 // The pixels of one colour, and of one place in the cell of a mosaic: {at(y, x), place(y, x), width, height}.
@@ -69,7 +69,7 @@ export function findHotPixels(image, cell) {
       }
     }
   }
-  if (count < suspected / 2 || count > MOST_ISOLATED * image.data.length) return [];
+  if (count < suspected / 2 || count > MAX_ISOLATED * image.data.length) return [];
   return [...hot].map((pixel) => [pixel, goodNeighbours(pixel, hot, image, cell)]);
 }
 

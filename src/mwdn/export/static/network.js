@@ -6,7 +6,7 @@ export class PageError extends Error {}
 
 const NAMES = { webgpu: "WebGPU", wasm: "WebAssembly" };
 const LIBRARIES = { webgpu: "ort.webgpu.min.js", wasm: "ort.wasm.min.js" };
-const LEAST_AGREEMENT = 50;
+const MIN_AGREEMENT = 50;
 globalThis.mwdnFiles ??= {};
 
 function loadScript(name) {
@@ -104,7 +104,7 @@ export async function openNetwork(check, say) {
       const network = await open(kind, models, say);
       say(`Checking the network on ${NAMES[kind]} …`);
       network.agreement = await check(network);
-      if (!(network.agreement >= LEAST_AGREEMENT)) throw new PageError(`${NAMES[kind]} computes another picture than mwdn (${network.agreement.toFixed(0)} dB).`);
+      if (!(network.agreement >= MIN_AGREEMENT)) throw new PageError(`${NAMES[kind]} computes another picture than mwdn (${network.agreement.toFixed(0)} dB).`);
       return network;
     } catch (error) {
       if (kind === kinds.at(-1)) throw error;

@@ -3,7 +3,7 @@ import { getBlob, post, RequestError } from "./requests.js";
 import { saveBlob } from "./saving.js";
 
 const byId = (id) => document.getElementById(id);
-const MOST = 8; // of them are listed
+const MAX_LISTED = 8; // of them are listed
 
 function button(text, work) {
   const made = Object.assign(document.createElement("button"), { type: "button", textContent: text });
@@ -35,7 +35,7 @@ async function take(use) {
   );
   figure.append(picture, caption, row);
   byId("snapshots").prepend(figure);
-  for (const old of [...byId("snapshots").children].slice(MOST)) {
+  for (const old of [...byId("snapshots").children].slice(MAX_LISTED)) {
     URL.revokeObjectURL(old.querySelector("img").src);
     old.remove();
   }
