@@ -320,6 +320,7 @@ def test_alignment_is_off_in_the_file_alone(tmp_path):
     assert agreement(run_file(done.path, seen), expected) >= 100
 
 
+@pytest.mark.acceptance
 def test_over_relaxed_iterations_and_recorded_scenes(tmp_path, generator):
     """As in `universal-small` and in a network of `few-pairs`, with two iterations of one level."""
     options = {"align": False, "distortion": 2, "shading": 2, "evidence": True, "mean_light": "gated"}

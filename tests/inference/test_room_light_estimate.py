@@ -56,8 +56,8 @@ def test_a_scene_that_fills_the_frame_keeps_it(camera):
 
 def test_a_batch_has_the_light_of_its_captures(camera, capture):
     found = find_room_light(torch.cat([capture + 0.3, capture]), camera[0])
-    alone = [find_room_light(each, camera[0]) for each in (capture + 0.3, capture)]
-    torch.testing.assert_close(found.background, torch.cat([each.background for each in alone]), rtol=1e-4, atol=1e-5)
+    alone = find_room_light(capture + 0.3, camera[0]).background  # the other has none: the test above
+    torch.testing.assert_close(found.background, torch.cat([alone, 0 * alone]), rtol=1e-4, atol=1e-5)
 
 
 def test_only_networks_that_align_look_for_it_unasked(camera, capture):
