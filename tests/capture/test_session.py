@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from dataclasses import replace
 
 import cv2
@@ -76,6 +77,29 @@ def session(recipe, out, camera=None, **options):
 @pytest.fixture
 def recipe(tmp_path):
     return read_capture_recipe(write(tmp_path))
+
+
+def test_a_clock_that_is_set_back_does_not_stop_it(recipe, tmp_path, monkeypatch):
+    """No frame would ever begin after a picture that was shown in the future."""
+    clock, calls = time.time, 0
+
+    def set_back():
+        nonlocal calls
+        calls += 1
+        return clock() - (3600 if calls > 30 else 0)
+
+    monkeypatch.setattr(time, "time", set_back)
+    assert session(recipe, tmp_path / "pairs.h5").run() == 7
+    assert calls > 60
+
+
+def test_fewer_photographs_than_wanted_are_said(tmp_path):
+    with pytest.warns(UserWarning, match=r"`count` \(7\) .* is more than the photographs of .* \(3\)"):
+        assert session(read_capture_recipe(write(tmp_path, pictures=3)), tmp_path / "pairs.h5").run() == 3
+
+
+def test_a_display_of_less_than_a_pixel_is_seen(tmp_path):
+    assert session(read_capture_recipe(write(tmp_path, rig="fill = 0.0001")), tmp_path / "pairs.h5").run() == 7
 
 
 def check_pairs(path, recipe, count):

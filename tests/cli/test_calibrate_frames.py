@@ -101,6 +101,8 @@ def test_the_bits_of_a_camera_file_stay_if_it_is_changed(run, folder):
     assert run("calibrate --camera camera.toml --pitch-um 4.8 --white-balance 1 1 1")[0] == 0
     after = read_camera("camera.toml")
     assert after == {**before, "pitch_um": 4.8, "white_balance": (1.0, 1.0, 1.0)}
+    code, _, err = run("calibrate --camera camera.toml --bit-depth 14")  # levels are fractions of the full scale
+    assert (code, "`--bit-depth` (14) must be 12" in err) == (2, True)
     first = {path.name for path in folder.glob("camera-*")}
     # New frames of the point source keep what is known of the sensor; the replaced PSF's file is removed.
     assert run("calibrate psf_1 --camera camera.toml")[0] == 0
@@ -173,9 +175,27 @@ def test_outlying_frames_are_named(run, folder, photographs):
     assert "`frame_3.png` is displaced by (0.0, 4.0) px" in err.replace("-0.0", "0.0")
 
 
+def test_frames_of_another_pattern_are_named(run, folder, photographs):
+    """A scene of the same light: its pattern is the PSF's convolved with it."""
+    bench, _ = photographs
+    capture = Camera(bench.light).forward(square())
+    above = [float((light - light.quantile(0.05)).mean()) for light in (bench.light, capture)]
+    save("scene", [bench.frame(capture * above[0] / above[1])])
+    code, _, err = run("calibrate psf_1/frame_1.png scene/frame_1.png --dark dark --bit-depth 12")
+    assert (code, "disagree" in err, "another pattern" in err) == (2, True, True)
+    code, _, err = run("calibrate psf_1 scene --dark dark --bit-depth 12")
+    assert (code, err.count("another pattern")) == (0, 1)
+
+
 @pytest.mark.parametrize(
     ("line", "message"),
     [
+        ("psf_1 psf_1/frame_2.png --dark dark", "`frame_2.png` is named twice"),
+        ("psf_1 --field psf_1/frame_2.png --dark dark", "`frame_2.png` is named twice"),
+        ("psf_1 --dark psf_1", "named twice"),
+        ("psf_8 --dark dark --flat psf_1 --bit-depth 12", "pixels of the flat frames are unlike their neighbours"),
+        ("dark --dark psf_1 --bit-depth 12", "pixels of the dark frames are unlike their neighbours"),
+        ("psf_1 --psf psf_8/frame_1.png", "`--psf` (`psf_8/frame_1.png`) is instead of FILES"),
         ("psf_1 psf_8 --exposures 1 8 64", "cannot be divided into 3"),
         ("psf_1 psf_8 --exposures 8 8", "`--exposures` (8, 8) must be positive and differ"),
         ("psf_8 psf_1 --exposures 1 8 --dark dark --bit-depth 12", "saturated"),
@@ -327,6 +347,8 @@ def test_several_distances(run, folder):
     assert "magnified by" in sentence
     assert at_distance(calibration, 400.0)[0].psf_hash != calibration.psf_hash
     assert "the nearest one" in at_distance(calibration, 50.0)[1]
+    wrong = run(line.replace("100 400", "400 100").replace("camera.toml", "wrong.toml") + " -o wrong.toml")
+    assert (wrong[0], "Give `--distances` in the order of the frames" in wrong[2]) == (0, True)
     save("scene", [bench.point()])
     code, _, err = run("reconstruct scene --psf camera.toml --distance 160 --method wiener --no-trust --device cpu")
     assert (code, "magnified by" in err) == (0, True)

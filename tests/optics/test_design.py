@@ -94,7 +94,7 @@ def test_fabrication_files(run, tmp_path):
     pytest.importorskip("gdstk")
     assert run("contour", "--size-mm", "0.4", "0.4", *SMALL, "--gds", "--stl", "--stl-every", "2")[0] == 0
     assert (tmp_path / "cam/mask.gds").stat().st_size > 1000
-    assert (tmp_path / "cam/mask.stl").stat().st_size == 84 + 50 * (2 * 99 * 99 + 3 * 4 * 99)
+    assert (tmp_path / "cam/mask.stl").stat().st_size == 84 + 50 * (2 * 100 * 100 + 3 * 4 * 100)
 
 
 def test_recipe_stands_behind_the_command_line(run, tmp_path):

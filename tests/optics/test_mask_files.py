@@ -116,11 +116,23 @@ def test_stl_is_a_closed_body_of_the_right_volume(generator, tmp_path):
     volume = np.einsum("ni,ni->n", wide[:, 0], np.cross(wide[:, 1], wide[:, 2])).sum() / 6
     h = mask.values.double().numpy() + 30.0
     cells = (h[:-1, :-1] + h[1:, 1:]) / 3 + (h[1:, :-1] + h[:-1, 1:]) / 6  # two triangles with a shared diagonal
-    assert volume == pytest.approx(cells.sum() * 4.0, rel=1e-5)
+    sides = [2.0 * np.array([1.5, *[1.0] * (count - 3), 1.5]) for count in h.shape]  # the outermost are at the edges
+    assert volume == pytest.approx((cells * np.outer(*sides)).sum(), rel=1e-5)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
     assert (normals[: 2 * 5 * 8, 2] > 0).all()
-    assert corners[..., 0].max() == 16.0
-    assert corners[..., 1].min() == -10.0
+
+
+@pytest.mark.parametrize("every", [1, 3, 4, 50])
+def test_stl_and_gds_have_the_masks_size_and_origin(tmp_path, every):
+    gdstk = pytest.importorskip("gdstk")
+    mask = Mask("phase", torch.ones(40, 50), 2.0, 1.5, step_um=1.0)
+    write_stl(tmp_path / "a.stl", mask, every=every)
+    write_gds(tmp_path / "a.gds", mask)
+    (left, low), (right, high) = gdstk.read_gds(tmp_path / "a.gds").top_level()[0].bounding_box()
+    assert (right - left, high - low) == pytest.approx((100, 80))
+    corners = read_stl(tmp_path / "a.stl")[1].reshape(-1, 3)
+    np.testing.assert_allclose(corners.min(0), [left, low, 0])
+    np.testing.assert_allclose(corners.max(0), [right, high, 101])
 
 
 def test_stl_refuses_what_it_cannot_show(levels, tmp_path):
@@ -131,4 +143,4 @@ def test_stl_refuses_what_it_cannot_show(levels, tmp_path):
     with pytest.raises(ParameterError, match=r"`base_um` \(0\) must be positive"):
         write_stl(tmp_path / "a.stl", levels, base_um=0.0)
     write_stl(tmp_path / "a.stl", levels, every=2)
-    assert len(read_stl(tmp_path / "a.stl")[1]) == 2 * 4 * 5 + 3 * 2 * (4 + 5)
+    assert len(read_stl(tmp_path / "a.stl")[1]) == 2 * 4 * 6 + 3 * 2 * (4 + 6)

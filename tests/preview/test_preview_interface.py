@@ -235,6 +235,21 @@ def test_cameras_are_listed_added_and_removed(serve, tmp_path, psf_file):
         assert not list(tmp_path.iterdir())
 
 
+def test_a_camera_that_cannot_be_stored_is_the_servers_fault(serve, tmp_path, psf_file):
+    (tmp_path / "file").touch()
+    server = serve(StoredCameras(LIMITS, tmp_path / "file"))  # a file in the place of its folder
+    answer = httpx.post(f"{server.url}cameras", files={"psf": psf_file}, data={"name": "mine"}, timeout=120)
+    assert answer.status_code == 507
+    assert "cannot store" in answer.text
+    assert str(tmp_path) not in answer.text
+
+
+def test_a_field_that_is_given_twice_is_refused(client, psf_file, capture):
+    files = [("psf", psf_file), ("capture", capture), ("capture", capture)]
+    answer = client.post("/reconstruct", files=files)
+    assert (answer.status_code, "`capture` is given twice" in answer.text) == (422, True)
+
+
 def test_inspect(client):
     report = client.post("/inspect", files={"camera": (None, "camera")}).json()
     assert report["headline"]

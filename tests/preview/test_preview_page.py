@@ -44,6 +44,7 @@ def test_dropped_files_become_a_picture(serve, psf, psf_file, capture, tmp_path)
         page.drop("#capture", tmp_path / "wrong.png")
         page.wait("document.getElementById('state').classList.contains('wrong')")
         assert "capture" in page.run("document.getElementById('state').textContent")
+        assert page.run("document.getElementById('view').hidden")  # the picture was another file's
         page.drop("#capture", tmp_path / "capture.npy")
         page.wait("document.getElementById('state').textContent.startsWith('admm: 48')")
 
@@ -83,11 +84,26 @@ def test_a_capture_is_not_reconstructed_through_the_camera_of_the_samples(serve,
     with open_page(server.url, tmp_path / "profile") as page:
         page.wait("document.querySelectorAll('#samples button').length === 3")
         assert page.run("document.getElementById('camera').value") == "sample"
+        assert page.run("document.getElementById('format').disabled")  # it has its own
+        assert page.run("document.getElementById('bin').matches(':disabled')")
         page.run("document.getElementById('trust').checked = false")
         page.drop("#capture", tmp_path / "capture.npy")
         page.wait("document.getElementById('state').textContent.startsWith('Drop a PSF')")
         page.drop("#psf", tmp_path / "psf.npy")
         page.wait("document.getElementById('state').textContent.startsWith('universal-small: 48')")
+        assert not page.run("document.getElementById('bin').matches(':disabled')")
+        page.run("document.getElementById('compare').click()")
+        page.wait("document.querySelectorAll('#grid figure').length > 0")
+        page.drop("#capture", (tmp_path / "capture.npy").rename(tmp_path / "another.npy"))
+        page.wait("document.getElementById('grid-section').hidden")
+        page.wait("document.getElementById('state').textContent.startsWith('universal-small: 48')")
+        page.wait("document.getElementById('cancel').hidden")
+        page.run(
+            "(files => { for (const name of 'ab') files.items.add(new File([name], name)); document.getElementById("
+            "'capture').parentElement.dispatchEvent(new DragEvent('drop', { dataTransfer: files })); })"
+            "(new DataTransfer())"
+        )
+        page.wait("document.getElementById('state').textContent.startsWith('2 files')")
         assert not page.errors
 
 

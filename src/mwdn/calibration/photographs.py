@@ -1,7 +1,10 @@
 """From all photographs of a camera to the content of its camera file."""
 
-from collections.abc import Sequence
+import os
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -9,14 +12,18 @@ import numpy as np
 
 from mwdn.calibration.camera_parts import picture_of
 from mwdn.calibration.corrections import Corrections
-from mwdn.calibration.frame_average import Kind
+from mwdn.calibration.frame_average import MIN_LIKENESS, Kind
 from mwdn.calibration.frame_format import FrameFormat
+from mwdn.calibration.places import relative_magnification
 from mwdn.calibration.point_source import PointSource, average_point, centring_shift
 from mwdn.calibration.sensor_frames import SensorFiles, SensorFrames, equal_parts, measure_sensor
 from mwdn.errors import ParameterError
 from mwdn.io.listing import list_folder
 from mwdn.optics.displacement import displacement, shifted
 from mwdn.types import Frame, Image
+
+MAGNIFICATION_ERROR = 0.003
+"""Of a PSF over that of another distance, as `relative_magnification` finds it."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +39,8 @@ class CalibrationFrames:
         centre: move each PSF's centroid to the centre of the frame.
 
     Raises:
-        ParameterError: exposures or distances do not divide the groups, or are not positive and different.
+        ParameterError: exposures or distances do not divide the groups, or are not positive and different; or a file is
+            named twice.
     """
 
     groups: tuple[tuple[Path, ...], ...]
@@ -54,6 +62,12 @@ class CalibrationFrames:
         needed = max(1, len(self.exposures)) * max(1, len(self.distances_mm))
         if len(self.groups) != needed:
             raise ParameterError(f"`groups` ({len(self.groups)}) must be {needed}, one for each exposure and distance.")
+        files = [*chain(*self.groups, *self.field), *{*chain(*self.sensor.dark)}, *self.sensor.flat]
+        twice = [file for file, count in Counter(map(os.path.realpath, files)).items() if count > 1]
+        if twice:
+            raise ParameterError(
+                f"`{Path(twice[0]).name}` is named twice. Each frame shows one thing, and counts once: leave it out."
+            )
 
 
 def expanded(paths: Sequence[Path]) -> list[Path]:
@@ -114,6 +128,7 @@ def calibrate_frames(
     parts: dict[str, Frame | list[Frame]] = {"psf": psf_frame(shifted(reference, *shift), frames)}
     content: dict[str, Any] = {"mosaic": frames.mosaic, "psf_corrected": True}
     notes = [*sensor.notes, *(note for point in points for note in point.notes)]
+    notes += _wrong_order(dict(zip(distances, points, strict=bool(distances))), photographs, frames)
     if len(distances) > 1:
         content |= {"distance_mm": distances[0], "distances_mm": tuple(distances[1:])}
         parts["distance_psfs"] = [psf_frame(_centred(point, photographs, frames), frames) for point in points[1:]]
@@ -141,6 +156,20 @@ def _within_full_scale(*images: Image) -> list[Image]:
 def _centred(point: PointSource, photographs: CalibrationFrames, frames: FrameFormat) -> Image:
     (image,) = _within_full_scale(point.image)
     return shifted(image, *centring_shift(image, frames.cell)) if photographs.centre else image
+
+
+def _wrong_order(
+    points: dict[float, PointSource], photographs: CalibrationFrames, frames: FrameFormat
+) -> Iterator[str]:
+    """A sentence for each neighbouring distance whose PSF is larger than that of the nearer one: it must be smaller."""
+    images = {distance: _centred(points[distance], photographs, frames) for distance in sorted(points)}
+    for near, far in pairwise(images):
+        magnification, alike = relative_magnification(images[far], images[near])
+        if magnification > 1 + MAGNIFICATION_ERROR and alike > MIN_LIKENESS:
+            yield (
+                f"The PSF at {far:g} mm is {magnification:.3f} times as large as at {near:g} mm, but a nearer point "
+                "casts a larger shadow. Give `--distances` in the order of the frames."
+            )
 
 
 def _field(

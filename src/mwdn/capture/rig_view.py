@@ -27,7 +27,7 @@ def view(light: FloatFrame, homography: Homography, size: Size) -> Scene:
 
     # Display pixels per sample, at the display's middle: if there are several, the display is downsampled first, so
     # that none is skipped.
-    shrink = max(int(1 / (_magnification(homography, light.shape[:2]) * SAMPLES)), 1)
+    shrink = max(min(int(1 / (_magnification(homography, light.shape[:2]) * SAMPLES)), *light.shape[:2]), 1)
     if shrink > 1:
         height, width = (length // shrink * shrink for length in light.shape[:2])
         cells = light[:height, :width].reshape(height // shrink, shrink, width // shrink, shrink, -1)

@@ -101,8 +101,14 @@ class Session:
         new = self._names(planned)
         pairs.plan(new)
         planned += new
-        if self.recipe.pictures.count:
-            planned = planned[: self.recipe.pictures.count]
+        if count := self.recipe.pictures.count:
+            planned = planned[:count]
+            if len(planned) < count:
+                warnings.warn(
+                    f"`count` ({count}) of [pictures] is more than the photographs of `{self.recipe.photographs}` "
+                    f"({len(planned)}).",
+                    stacklevel=2,
+                )
         start = planned.index(taken[-1]) + 1 if taken and taken[-1] in planned else len(taken)
         self._check_room(len(planned) - start)
         self._calibrate(pairs)
@@ -171,6 +177,7 @@ class Session:
                 while True:
                     frame = self.camera.read()
                     exposure_s = 0.0 if math.isnan(frame.exposure_s) else frame.exposure_s
+                    shown = min(shown, time.time())  # later than now if the clock was set back
                     if not self.camera.live or frame.timestamp - exposure_s >= shown:
                         return frame
             except CameraError as error:

@@ -26,7 +26,7 @@ from mwdn.cli.inspect import load_at_psf_resolution
 from mwdn.cli.photographs import PhotographOptions
 from mwdn.cli.refine import check_pair_file, refine
 from mwdn.cli.session_frames import BenchFrames, bench_frames
-from mwdn.cli.terminal import counted, if_interrupted, note, say
+from mwdn.cli.terminal import counted, if_interrupted, note, quoted, say
 from mwdn.errors import ParameterError
 from mwdn.io.files import file_sha256, refuse_overwrite
 
@@ -88,6 +88,8 @@ def calibrate(  # noqa: PLR0913
         check_pair_file(pairs)
         refuse_overwrite(out, pairs)
     kept = _kept(camera)
+    if files and psf not in (None, kept.get("psf")):
+        raise ParameterError(f"`psf` (`{psf}`) is instead of FILES (`{files[0]}` ...). Give one of them.")
     own_dark = kept.pop("dark", None)  # an option has it
     pictures = _by_kept_path(pictures, kept.get("psf"))
     photographs = replace(photographs, dark=tuple(_by_kept_path(photographs.dark, own_dark)))
@@ -180,6 +182,12 @@ def _write_one_picture(
     if options.psf != kept.get("psf"):
         of_a_psf = {"psf_corrected", "psf_gain", "envelope_shift", *chain.from_iterable(_ELSEWHERE)}
         kept = {key: value for key, value in kept.items() if key not in of_a_psf}
+    bits, before = own.get("bit_depth"), kept.get("bit_depth")
+    if bits not in (None, before) and kept.get("black_level") is not None:
+        raise ParameterError(
+            f"`bit_depth` ({bits}) must be {before or 'left out'}, as the sensor was measured. To change it, name the "
+            "photographs again, with dark and flat frames."
+        )
     psf_done = kept.get("psf_corrected", False)
     corrections = Corrections.read(kept.get("flat_field"), kept.get("hot_pixels"), psf_done=psf_done)
     calibration = options.load(corrections)
@@ -254,8 +262,8 @@ def _finish(verdict: str, calibration: Calibration, out: Path) -> None:
     height, width = calibration.size
     say(
         verdict,
-        f"PSF {calibration.psf_hash}, {height} x {width} pixels. More about it: mwdn inspect --camera {out}",
-        f"Use it: mwdn reconstruct CAPTURES --camera {out}",
+        f"PSF {calibration.psf_hash}, {height} x {width} pixels. More about it: mwdn inspect --camera {quoted(out)}",
+        f"Use it: mwdn reconstruct CAPTURES --camera {quoted(out)}",
     )
 
 

@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from mwdn.cli.progress import show_progress
 from mwdn.cli.recipe_keys import RecipeKeys, recipe_changes
-from mwdn.cli.terminal import counted, if_interrupted, note, say
+from mwdn.cli.terminal import counted, if_interrupted, note, quoted, say
 from mwdn.errors import ParameterError
 
 
@@ -34,9 +34,8 @@ def capture(
     from mwdn.capture.set_up import open_camera, open_display, open_lamp
 
     contents = read_capture_recipe(recipe, **recipe_changes(changes))
-    kept = f"All pairs so far are in {out}. The same command continues."
     with ExitStack() as stack:
-        stack.enter_context(if_interrupted(lambda: f"Interrupted. {kept}"))
+        stack.enter_context(if_interrupted(lambda: _interrupted(out)))
         camera = stack.enter_context(open_camera(contents))
         display = stack.enter_context(open_display(contents, camera, note))
         progress = stack.enter_context(show_progress())
@@ -44,8 +43,13 @@ def capture(
         session = Session(contents, camera, display, out, progress=_shown_in(progress), lamp=lamp)
         count = session.run()
     if contents.point.frames:
-        say(f"Point, dark and white frames are there, too: mwdn calibrate {out} -o camera.toml")
-    say(f"{counted(count, 'pair')} in {out}", f"Next: mwdn align {out} --camera camera.toml")
+        say(f"Point, dark and white frames are there, too: mwdn calibrate {quoted(out)} -o camera.toml")
+    say(f"{counted(count, 'pair')} in {out}", f"Next: mwdn align {quoted(out)} --camera camera.toml")
+
+
+def _interrupted(out: Path) -> str:
+    kept = f"All pairs so far are in {out}" if out.exists() else "Nothing is recorded yet"
+    return f"Interrupted. {kept}. The same command continues."
 
 
 def _ask(task: str) -> None:

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from rich.table import Table
 
 from mwdn.calibration import Calibration
-from mwdn.cli.terminal import console, say
+from mwdn.cli.terminal import console, quoted, say
 from mwdn.evaluation import psnr
 from mwdn.evaluation.tables import html_table
 from mwdn.inference.reconstructor import Reconstructor
@@ -79,7 +79,7 @@ def demo(
     for name, frame in captures.items():
         write_frame(out / "captures" / f"{name}.png", frame)
     console.print(table)
-    say(f"Look at {page}", f"Go on: mwdn reconstruct {out / 'captures'} --psf {psf} --background 0")
+    say(f"Look at {page}", f"Go on: mwdn reconstruct {quoted(out / 'captures')} --psf {quoted(psf)} --background 0")
 
 
 _PAGE = """<!doctype html>

@@ -1,5 +1,6 @@
 """Output to the terminal, by what it is: set for each command by --quiet, --verbose and --json."""
 
+import shlex
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -94,6 +95,11 @@ def warn(*warnings: str | None) -> None:
 def complain(start: str, error: MwdnError) -> None:
     """Print an error on one line: brackets are not markup, and paths are not wrapped at the terminal's width."""
     errors.print(f"{start} {escape(_spell(str(error)))}", highlight=False, soft_wrap=True)
+
+
+def quoted(path: Path) -> str:
+    """A path as a shell takes it."""
+    return shlex.quote(str(path))
 
 
 def counted(count: int, noun: str) -> str:

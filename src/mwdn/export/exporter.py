@@ -142,7 +142,7 @@ def export(
         file = Path(folder) / out.name
         module = FixedPsf(method, psf_for(method, calibration), dtype=torch.float16 if precision == "float16" else None)
         # torch's own file holds one iteration after the other.
-        loops = as_loops() if file.suffix == ".onnx" and not isinstance(method, Network) else nullcontext()
+        loops = as_loops() if file.suffix == ".onnx" else nullcontext()
         with loops:
             program = _program(module.eval(), measurement)
         write_file(file, program, about)

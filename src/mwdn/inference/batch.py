@@ -23,7 +23,7 @@ from mwdn.inference.outputs import SUMMARY, Format, output_name, read_sidecar, s
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.contact_sheets import contact_sheet, thumbnail
 from mwdn.io.exif import orientation
-from mwdn.io.files import as_image_error, write_json
+from mwdn.io.files import as_image_error, is_full, write_json
 from mwdn.io.formats import is_for_viewing
 from mwdn.io.images import read_frame, read_picture, write_picture
 from mwdn.io.support_picture import support_picture
@@ -74,12 +74,14 @@ class Job:
 
 
 def _step(work: Callable[["Batch", Job], Job]) -> Callable[["Batch", Job], Job]:
-    """Make a step of a batch: an error ends this capture's job, not the batch."""
+    """Make a step of a batch: an error ends this capture's job, not the batch, unless the disk is full."""
 
     def step(batch: "Batch", job: Job) -> Job:
         try:
             return work(batch, job)
         except MwdnError as error:
+            if is_full(error.__cause__):
+                raise
             return replace(job, measurement=None, pose=None, scene=None, error=error)
 
     return step

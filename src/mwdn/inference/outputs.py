@@ -38,7 +38,7 @@ def check_outputs(
     Raises:
         ParameterError: two captures have the same output, or one the name of another's support map; an output would
             overwrite an input, a ``.json`` that is not of this package, or a picture without one in a folder of
-            captures; an output is a symbolic link, or ``out`` is a file.
+            captures or without any of this package; an output is a symbolic link, or ``out`` is a file.
     """
     if out.exists() and not out.is_dir():
         raise ParameterError(f"`{out}` must be a folder, but is a file. Choose another one: `--out`.")
@@ -54,7 +54,8 @@ def check_outputs(
     paths = list(out.iterdir()) if out.exists() else []
     existing = {path.name for path in paths}
     folders = {str(Path(capture).parent) for capture in captures}
-    holds_captures = real(str(out)) in map(real, folders)
+    holds_pictures = any(name.endswith(".json") and read_sidecar(out / name) for name in existing)
+    is_foreign = real(str(out)) in map(real, folders) or not holds_pictures
     links = {str(path): path.readlink() for path in paths if path.is_symlink()}
     check(str(out / SUMMARY))
     sources = {SUMMARY: "the summary picture"}
@@ -65,9 +66,9 @@ def check_outputs(
         check(start + name)
         check(start + sidecar)
         check(start + name.removesuffix(_SUFFIX[format]) + _SUPPORT)
-        # Elsewhere a picture without its sidecar is of a run that was killed between the two.
+        # Among other pictures of a run, one without its sidecar is of a run that was killed between the two.
         foreign = next((each for each in (sidecar, name) if each in existing), None)
-        if foreign and (foreign == sidecar or holds_captures) and not read_sidecar(out / sidecar):
+        if foreign and (foreign == sidecar or is_foreign) and not read_sidecar(out / sidecar):
             raise ParameterError(
                 f"`{start}{foreign}` was not written by mwdn and would be lost. Choose another folder: `--out`."
             )

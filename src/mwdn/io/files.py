@@ -123,15 +123,19 @@ def check_regular(path: Path) -> None:
         raise OSError(errno.EINVAL, "it is not a regular file", str(path))
 
 
+def is_full(error: BaseException | None) -> bool:
+    """Whether an error says that the disk is full."""
+    # numpy's own errors have no number, only "1000 requested and 10 written".
+    return isinstance(error, OSError) and (error.errno is None or error.errno in FULL)
+
+
 @contextmanager
 def as_image_error(path: str | Path, at: str = "") -> Iterator[None]:
     """Turn an `OSError` while writing a file into an `ImageError` that names the file, and ``at`` which item it was."""
     try:
         yield
     except OSError as error:
-        # numpy's own errors have no number, only "1000 requested and 10 written".
-        full = error.errno is None or error.errno in FULL
-        advice = "Make room, or choose another folder." if full else "Choose another folder."
+        advice = "Make room, or choose another folder." if is_full(error) else "Choose another folder."
         advice = "Choose a shorter name." if error.errno == errno.ENAMETOOLONG else advice
         why = error.strerror or f"The disk may be full ({error})"
         raise ImageError(f"`{path}` cannot be written{at}: {why}. {advice}") from error

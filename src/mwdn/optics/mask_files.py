@@ -148,7 +148,7 @@ def check_stl(mask: Mask, *, base_um: float = 100.0, every: int = 1) -> None:
         raise ParameterError("An amplitude mask has no heights for an STL. Use GDSII: `gds`.")
     if not base_um > 0 or every < 1:
         raise ParameterError(f"`base_um` ({base_um:g}) must be positive and `every` ({every}) at least 1.")
-    rows, columns = mask.values[::every, ::every].shape
+    rows, columns = (len(_chosen(length, every)) for length in mask.values.shape)
     if rows * columns > MAX_STL_SAMPLES or min(rows, columns) < 2:
         needed = int(np.ceil(np.sqrt(mask.values.numel() / MAX_STL_SAMPLES)))
         raise ParameterError(
@@ -160,19 +160,24 @@ def check_stl(mask: Mask, *, base_um: float = 100.0, every: int = 1) -> None:
 def write_stl(path: str | Path, mask: Mask, *, base_um: float = 100.0, every: int = 1) -> None:
     """Write a phase mask as a closed body in binary STL, in um: the surface, four walls and a flat bottom.
 
+    It has the mask's size, and the origin of `write_gds`: the outermost samples lie at the mask's edges.
+
     Args:
         path: the file.
         mask: a phase mask. A step from one level to the next becomes a slope as wide as the pitch.
         base_um: thickness below height 0.
-        every: use every n-th sample along each axis.
+        every: use every n-th sample along each axis, and the last one.
 
     Raises:
         ParameterError: an amplitude mask, a number that is not positive, or more than `MAX_STL_SAMPLES`.
         ImageError: the file cannot be written.
     """
     check_stl(mask, base_um=base_um, every=every)
-    heights = mask.values.numpy()[::every, ::every].astype(np.float64)
-    triangles = np.concatenate(list(_body(heights, mask.pitch_um * every, base_um)))
+    rows, columns = (_chosen(length, every) for length in mask.values.shape)
+    heights = mask.values.numpy()[np.ix_(rows, columns)].astype(np.float64)
+    height, width = mask.values.shape
+    y, x = -_places(rows, height) * mask.pitch_um, _places(columns, width) * mask.pitch_um
+    triangles = np.concatenate(list(_body(heights + base_um, y, x)))
     sides = triangles[:, 1:] - triangles[:, :1]
     normals = np.cross(sides[:, 0], sides[:, 1])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -206,14 +211,29 @@ def _rectangles(filled: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     return np.stack([row[first], row[last] + 1, left[first], right[first]], axis=1)
 
 
-def _body(heights: npt.NDArray[Any], pitch_um: float, base_um: float) -> Any:  # noqa: ANN401
+def _chosen(length: int, every: int) -> npt.NDArray[np.int64]:
+    """Every n-th sample of so many, and the last one."""
+    return np.unique(np.append(np.arange(0, length, every), length - 1))
+
+
+def _places(chosen: npt.NDArray[np.int64], length: int) -> npt.NDArray[np.float64]:
+    """Places of the chosen of so many samples, in samples from the middle; the outermost ones are at the edges."""
+    places = chosen - length // 2.0
+    return np.concatenate([[places[0] - 0.5], places[1:-1], [places[-1] + 0.5]])
+
+
+def _body(heights: npt.NDArray[Any], rows: npt.NDArray[Any], columns: npt.NDArray[Any]) -> Any:  # noqa: ANN401
     """Triangles (n, 3 corners, xyz) of top, walls and bottom, counter-clockwise seen from outside.
 
     The bottom is a fan from its middle to every point of the border, so that each edge belongs to two triangles.
+
+    Args:
+        heights: of the surface above the bottom.
+        rows: their y, descending.
+        columns: their x.
     """
-    rows, columns = heights.shape
-    y, x = np.meshgrid(-np.arange(rows) * pitch_um, np.arange(columns) * pitch_um, indexing="ij")
-    top = np.stack([x, y, heights + base_um], axis=-1)
+    y, x = np.meshgrid(rows, columns, indexing="ij")
+    top = np.stack([x, y, heights], axis=-1)
     a, b, c, d = top[:-1, :-1], top[:-1, 1:], top[1:, :-1], top[1:, 1:]
     yield np.stack([a, c, d], axis=-2).reshape(-1, 3, 3)
     yield np.stack([a, d, b], axis=-2).reshape(-1, 3, 3)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mwdn.calibration import Calibration, FrameFormat, PsfFormat
-from mwdn.errors import MwdnError, ParameterError, UnknownNameError
+from mwdn.errors import ImageError, MwdnError, ParameterError, UnknownNameError
 from mwdn.io.files import as_image_error, atomic, write_json
 from mwdn.io.formats import at_most_pixels
 from mwdn.io.reading import read_bytes, read_json, unexpected_content
@@ -110,7 +110,7 @@ class StoredCameras:
         """Store a calibration.
 
         Raises:
-            RefusedError: the name is taken, or the server's limit is reached.
+            RefusedError: the name is taken, the server's limit is reached, or its disk cannot be written.
             MwdnError: as for `calibrate`.
         """
         _checked_name(name)
@@ -123,12 +123,19 @@ class StoredCameras:
                     409, f"{len(self._stored)} cameras are stored already, the server's limit. Remove one."
                 )
             if self.folder is not None:
-                entry = self._entry(name)
-                with as_image_error("the stored camera"), atomic(entry.with_suffix(".psf")) as temporary:
-                    temporary.write_bytes(psf)
-                write_json(entry, {"name": name, "options": options})  # last: without it there is no camera
+                self._write(name, psf, options)
             self._stored[name] = calibration
         return calibration
+
+    def _write(self, name: str, psf: bytes, options: dict[str, Any]) -> None:
+        entry = self._entry(name)
+        try:
+            with as_image_error("the stored camera"), atomic(entry.with_suffix(".psf")) as temporary:
+                temporary.write_bytes(psf)
+            write_json(entry, {"name": name, "options": options})  # last: without it there is no camera
+        except ImageError as error:
+            why = getattr(error.__cause__, "strerror", "") or "its disk may be full"  # without the server's paths
+            raise RefusedError(507, f"The server cannot store the camera: {why}.") from error
 
     def remove(self, name: str) -> None:
         """Remove a stored calibration.

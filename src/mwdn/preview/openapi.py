@@ -22,6 +22,7 @@ _ERRORS = {
     "422": "A file, a name or a number is wrong; the message says which, and what to do.",
     "503": "Too many requests wait.",
     "504": "The reconstruction takes too long.",
+    "507": "The server's disk is full, or cannot be written.",
 }
 _ERROR = {"application/json": {"schema": {"$ref": "#/components/schemas/Error"}}}
 _OBJECT = {"application/json": {"schema": {"type": "object"}}}

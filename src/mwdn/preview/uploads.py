@@ -129,6 +129,7 @@ async def read_form(request: Request, limits: Limits, files: tuple[str, ...], te
     Raises:
         RefusedError: it does not arrive in time, is no form, or the client has left.
         UnknownNameError: a field has another name.
+        ParameterError: a field is given twice, or a file is a text.
     """
     kind = request.headers.get("content-type", "").partition(";")[0].strip()
     if kind != "multipart/form-data":
@@ -154,6 +155,8 @@ async def _read_fields(form: FormData, files: tuple[str, ...], texts: tuple[str,
     for name, value in form.multi_items():
         if name not in (*files, *texts):
             raise UnknownNameError("field", name, [*files, *texts])
+        if name in found.files or name in found.texts:
+            raise ParameterError(f"`{name}` is given twice. Send one request for each.")
         if isinstance(value, UploadFile) != (name in files):
             raise ParameterError(f"`{name}` must be a {'file' if name in files else 'text'}.")
         if isinstance(value, UploadFile):

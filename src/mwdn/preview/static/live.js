@@ -189,7 +189,7 @@ export function setUpLive(name, parts) {
   toggle("live-record", "record");
   toggle("live-ambient", "ambient");
   const whenGiven = (id, wanted) => { // an empty field, or one that holds no number, is no wish
-    byId(id).onchange = () => byId(id).value && wish(wanted(Number(byId(id).value)));
+    byId(id).onchange = () => byId(id).value && byId(id).reportValidity() && wish(wanted(Number(byId(id).value)));
   };
   whenGiven("live-exposure", (milliseconds) => ({ exposure_s: milliseconds / 1000 }));
   whenGiven("live-gain", (gain) => ({ gain }));

@@ -38,7 +38,7 @@ async function guarded(work) {
 
 function calibration() {
   const options = {};
-  if (Number(byId("bin").value) > 1) options.bin = Number(byId("bin").value);
+  if (byId("bin").value && byId("bin").value !== "1") options.bin = Number(byId("bin").value);
   if (byId("psf-bin").value) options.psf_bin = Number(byId("psf-bin").value);
   if (byId("bit-depth").value) options.bit_depth = Number(byId("bit-depth").value);
   if (byId("mosaic").value) options.mosaic = byId("mosaic").value;
@@ -81,11 +81,12 @@ async function reconstruct() {
     wishLive();
     return;
   }
+  running?.abort();
   if (!isReady()) {
+    hidePicture();
     say(chosen.capture ? "Drop a PSF, or choose a calibration." : "Drop a capture, or choose a sample.");
     return;
   }
-  running?.abort();
   const mine = (running = new AbortController());
   let shown = false;
   byId("cancel").hidden = byId("progress").hidden = false;
@@ -108,6 +109,7 @@ async function reconstruct() {
     showVerdicts(report);
   } catch (error) {
     if (error.name === "AbortError") return;
+    if (!shown) hidePicture();
     say(error instanceof RequestError ? error.message : `The page failed: ${error.message}`, true);
   } finally {
     if (running === mine) {
@@ -115,6 +117,13 @@ async function reconstruct() {
       byId("cancel").hidden = byId("progress").hidden = true;
     }
   }
+}
+
+// That of other files, which must not stand for those that are chosen now.
+function hidePicture() {
+  chosen.job = null;
+  for (const id of ["measurement", "scene"]) byId(id).removeAttribute("src");
+  byId("view").hidden = byId("trust-section").hidden = true;
 }
 
 // Sliders move faster than methods reconstruct: of each kind of work only the last call counts.
@@ -177,7 +186,7 @@ async function trySample(name, camera) {
   say("Loading the sample …");
   const data = await getBlob(`/samples/${name}`);
   take("capture", new File([data], `${name}.png`));
-  byId("camera").value = camera;
+  chooseCamera(camera);
   await reconstruct();
 }
 
@@ -185,18 +194,29 @@ function take(what, file) {
   chosen[what] = file;
   byId(`${what}-name`).textContent = file.name;
   byId(`${what}-name`).parentElement.classList.add("full");
-  if (what === "psf") byId("camera").value = UPLOAD;
+  if (what === "psf") chooseCamera(UPLOAD);
+  comparing?.abort();
+  byId("grid-section").hidden = true;
   byId("headline").textContent = "";
   byId("findings").replaceChildren();
 }
 
 function setUpDrop(what) {
   setUpDropZone(byId(what), (files) => {
+    if (files.length > 1) {
+      say(`${files.length} files were dropped: drop one.`, true);
+      return;
+    }
     if (files[0]) take(what, files[0]);
     // The samples' camera is simulated: a visitor's capture is of another one.
-    if (what === "capture" && byId("camera").value === sampleCamera) byId("camera").value = UPLOAD;
+    if (what === "capture" && byId("camera").value === sampleCamera) chooseCamera(UPLOAD);
     soon(reconstruct, 0);
   });
+}
+
+function chooseCamera(name) {
+  byId("camera").value = name;
+  byId("format").disabled = name !== UPLOAD; // a stored calibration has its own
 }
 
 async function listCameras(selected) {
@@ -206,7 +226,7 @@ async function listCameras(selected) {
     new Option("the PSF below", UPLOAD),
     ...cameras.map(({ name, kind, width, height }) => new Option(`${name} (${words[kind]}, ${width} × ${height})`, name)),
   );
-  byId("camera").value = selected ?? cameras[0].name;
+  chooseCamera(selected ?? cameras[0].name);
 }
 
 async function storeCamera() {
@@ -276,7 +296,11 @@ byId("room-light").onchange = () => {
   byId("ambient-zone").hidden = byId("room-light").value !== "frame";
   soon(reconstruct, 0);
 };
-for (const id of ["camera", "bin", "psf-bin", "bit-depth", "mosaic", "gamma", "psf-gamma", "orientation", "align", "trust"]) byId(id).onchange = () => soon(reconstruct, 0);
+byId("camera").onchange = () => {
+  chooseCamera(byId("camera").value);
+  soon(reconstruct, 0);
+};
+for (const id of ["bin", "psf-bin", "bit-depth", "mosaic", "gamma", "psf-gamma", "orientation", "align", "trust"]) byId(id).onchange = () => soon(reconstruct, 0);
 byId("exposure").oninput = () => {
   byId("exposure-value").textContent = Number(byId("exposure").value).toFixed(1);
   soon(showPictures);
@@ -293,4 +317,5 @@ byId("inspect").onclick = () => guarded(async () => showFindings(await post("/in
 for (const format of Object.keys(SAVED)) byId(`save-${format}`).onclick = () => guarded(() => save(format));
 // A file that misses its zone must not replace the page.
 for (const name of ["dragover", "drop"]) document.addEventListener(name, (event) => event.preventDefault());
+byId("openapi").href += location.search; // the token
 guarded(start);
