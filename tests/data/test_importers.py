@@ -274,6 +274,15 @@ def test_scenes_are_turned_upright_and_captures_stay(tmp_path):
     assert np.array_equal(scene, flag()[::-1, ::-1])
 
 
+def test_scenes_of_the_frames_size_are_binned_as_the_captures_are(tmp_path):
+    for folder, seed in (("captures", 100), ("scenes", 0)):
+        write(tmp_path / folder / "a.npy", np.random.default_rng(seed).random((8, 12, 3), np.float32))
+    (_, measurement, scene), *_ = read_pairs("folders", tmp_path, frames=FrameFormat(bin=2))
+    assert measurement.shape == scene.shape == (4, 6, 3)
+    stored = np.load(tmp_path / "scenes" / "a.npy")
+    np.testing.assert_allclose(scene, stored.reshape(4, 2, 6, 2, 3).mean((1, 3)), atol=1e-6)
+
+
 def test_nothing_to_import(tmp_path):
     with pytest.raises(ImageError, match=r"captures` is not a folder.*--captures"):
         import_pairs("folders", tmp_path, tmp_path / "pairs.h5")
@@ -287,6 +296,10 @@ def test_nothing_to_import(tmp_path):
     write(tmp_path / "captures" / "a.bmp", flag())
     with pytest.raises(ImageError, match="differ only in their suffix"):
         import_pairs("folders", tmp_path, tmp_path / "pairs.h5")
+    with pytest.raises(ImageError, match="both captures and scenes"):
+        import_pairs("folders", tmp_path, tmp_path / "pairs.h5", layout=Layout(captures="scenes"))
+    with pytest.raises(ImageError, match=r"nowhere` is not a folder. Check its path"):
+        import_pairs("folders", tmp_path / "nowhere", tmp_path / "pairs.h5")
     with pytest.raises(UnknownNameError, match="Did you mean 'folders'"):
         import_pairs("folder", tmp_path, tmp_path / "pairs.h5")
 

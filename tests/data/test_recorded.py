@@ -156,7 +156,7 @@ def test_a_split_without_validation_holds_out_training_pairs():
     [
         (Division("diffusercam"), 1010, "of 1,010 pairs leaves 10 for training and 0 for validation"),
         (Division("random", (0.0, 0.5, 0.5)), 10, "leaves 0 for training and 5 for validation"),
-        (Division("paper"), 9, "`count` (9) must be at least 10 for the split 'paper'"),
+        (Division("paper"), 9, "`count` (9 pairs) must be at least 10 for the split 'paper'"),
     ],
 )
 def test_too_few_pairs(division, count, said):

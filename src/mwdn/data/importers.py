@@ -239,10 +239,12 @@ def _convert(
 
 def _place(kind: Kind, layout: Layout, scene: Size, frame: Size, whole: Size) -> Size | None:
     """Where a scene is in the frame, the middle of the whole one; ``None`` if it is not placed."""
-    if layout.scene_place is not None or kind.place is None:
+    if layout.scene_place is not None:
         return layout.scene_place
     if scene == frame:
         return 0, 0
+    if kind.place is None:
+        return None
     fits = scene[0] <= whole[0] and scene[1] <= whole[1]
     place = kind.place(scene, whole) if fits else None
     return place and (place[0] + frame[0] // 2 - whole[0] // 2, place[1] + frame[1] // 2 - whole[1] // 2)

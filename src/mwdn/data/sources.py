@@ -71,8 +71,14 @@ def list_folders(path: Path, captures: str, scenes: str) -> Listing:
         scenes: folder of the ground truth in ``path``.
 
     Raises:
-        ImageError: a folder is missing, or two files differ only in their suffix.
+        ImageError: a folder is missing or named twice, or two files differ only in their suffix.
     """
+    if not path.is_dir():
+        raise ImageError(f"`{path}` is not a folder. Check its path.")
+    if (path / captures).resolve() == (path / scenes).resolve():
+        raise ImageError(
+            f"`{path / captures}` is the folder of both captures and scenes. Name two: `--captures A --scenes B`."
+        )
     files = {folder: files_by_stem(path / folder) for folder in (captures, scenes)}
     stems = sorted(set(files[captures]) | set(files[scenes]), key=natural_order)
     refused, sources = {}, []

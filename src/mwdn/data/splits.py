@@ -74,7 +74,9 @@ def split(
 
 def _require(count: int, least: int, kind: str) -> None:
     if count < least:
-        raise ParameterError(f"`count` ({count:,}) must be at least {least:,} for the split '{kind}'. Use 'random'.")
+        raise ParameterError(
+            f"`count` ({count:,} pairs) must be at least {least:,} for the split '{kind}'. Use 'random'."
+        )
 
 
 def _random(count: int, fractions: Sequence[float], seed: int) -> Split:

@@ -119,7 +119,7 @@ def _kind(start: bytes) -> str:
         return kind
     raise ImageError(
         f"must be PNG, JPEG, WebP, BMP, PGM, PPM, TIFF, NPY or a camera's raw file, but starts with {start[:8]!r}. "
-        "Export it as PNG."
+        "Export it as PNG; save the frames of a video as PNG, and arrays of another program as NPY."
     )
 
 
@@ -144,8 +144,8 @@ def _frame_shape(shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, ...
     """(H, W, C) of a stored array; its header is checked before memory is allocated."""
     if dtype.kind != "f" and dtype.str[1:] not in ("u1", "u2"):
         raise FrameTypeError(
-            f"holds {dtype}; a frame has uint8, uint16 or floats. Convert it: "
-            "`frame.astype('uint16')`; integers are divided by their type's maximum, floats are taken as they are."
+            f"holds {dtype}; a frame has uint8, uint16 or floats. Convert 8-bit values: `frame.astype('uint8')`, "
+            "others to uint16: integers are divided by their type's maximum, floats are taken as they are."
         )
     axes = shape
     while axes[:1] == (1,) and (len(axes) > 3 or (len(axes) == 3 and axes[2] not in (1, 3, 4))):

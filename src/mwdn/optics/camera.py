@@ -14,7 +14,7 @@ from mwdn.types import Image, Measurement, Psf, Scene, Size
 @checked
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Forward model of a lensless camera: convolution with the PSF, crop, sensor noise.
+    """Forward model of a lensless camera: convolution with the PSF, crop, sensor noise. Computed in float32.
 
     Args:
         psf: (1 or B, 1 or C, h, w), centred, not negative. Each channel is scaled to unit sum, so that the energy of

@@ -115,7 +115,7 @@ class Schedule:
         if self.learning_rate == math.inf:
             raise ParameterError("`learning_rate` (inf) must be finite.")
         if self.crop and not self.pool:
-            raise ParameterError(f"`crop` ({self.crop}) applies to cached samples: set `pool`, or leave `crop` out.")
+            raise ParameterError(f"`crop` ({self.crop}) applies to cached samples: set `pool`, or `crop = 0`.")
         for name in ("anchor", "start_share"):
             if getattr(self, name) and not self.start:
                 raise ParameterError(

@@ -55,8 +55,8 @@ class SampleCache:
         """
         if not isinstance(network, FixedFront):
             raise ParameterError(
-                f"`pool` ({self.size}) caches what a network computes before its learned part; "
-                f"{type(network).__name__} learns from its first layer on. Set `pool = 0`."
+                f"`pool` ({self.size}) caches what a network computes before its learned part; this one learns from "
+                "its first layer on. Set `pool = 0` and `crop = 0`: `--schedule.pool 0 --schedule.crop 0`."
             )
         return network
 
