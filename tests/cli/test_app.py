@@ -16,6 +16,7 @@ from PIL import Image
 
 import mwdn
 from cameras import contour_psf
+from full_disk import full_after
 from mwdn import Camera, read_frame
 from mwdn.cli.app import COMMANDS
 from mwdn.cli.demo import METHODS, PICTURES
@@ -393,6 +394,25 @@ def test_folder_of_the_captures_is_none_for_the_pictures(run, camera, out):
     code, _, err = reconstruct(run, "raw/b.npy", out=out)
     assert (code, "b.png` was not written by mwdn and would be lost" in err) == (2, True)
     assert (camera / "raw" / "b.png").read_bytes() == before
+
+
+def test_pictures_of_something_else_stay(run, camera):
+    """They may be captures that are not among the inputs."""
+    (camera / "out").mkdir()
+    (camera / "out" / "a.png").write_bytes(before := (camera / "captures" / "b.png").read_bytes())
+    code, _, err = reconstruct(run, "captures", out="out")
+    assert (code, "out/a.png` was not written by mwdn and would be lost" in err) == (2, True)
+    assert (camera / "out" / "a.png").read_bytes() == before
+    (camera / "out" / "a.png").rename(camera / "out" / "other.png")
+    assert reconstruct(run, "captures", out="out")[0] == 0
+    (camera / "out" / "a.json").unlink()  # as of a run that was killed between the two
+    assert reconstruct(run, "captures", out="out")[0] == 0
+
+
+def test_a_full_disk_ends_it_with_one_message(run, camera):
+    with full_after(100):
+        code, _, err = reconstruct(run, "captures", out="out")
+    assert (code, err.count("cannot be written")) == (2, 1)
 
 
 def test_folder_that_cannot_be_written_to_is_found_first(run, camera, monkeypatch):

@@ -47,7 +47,7 @@ class Output:
     gds: bool = False
     """Also write mask.gds: one layer per lithography mask."""
     stl: bool = False
-    """Also write mask.stl: a closed body in um."""
+    """Also write mask.stl: a closed body in um; phase masks only."""
     stl_every: int = 1
     """Use every n-th sample along each axis for the STL, which can have 4 million samples."""
 
