@@ -38,6 +38,8 @@ def read(path, about):
     full = 2 ** int(about["bit_depth"]) - 1 if "bit_depth" in about else largest
     if largest > 1 and not frame.max() <= full <= largest:
         sys.exit(f"{path} ({frame.dtype}, up to {frame.max()}) must hold numbers of {about['bit_depth']} bits.")
+    if frame.ndim == 3 and frame.shape[2] == 4 and frame[..., 3].min() < largest:
+        sys.exit(f"{path} is transparent in parts. Save it without transparency.")
     frame = frame[..., :3][..., ::-1] if frame.ndim == 3 else frame[..., None]  # OpenCV gives BGR
     # Sensors of 10, 12 or 14 bits may use the lower bits of 16.
     fills_bits = full == 65535 and "bit_depth" not in about and frame.max() in (1023, 4095, 16383)

@@ -7,6 +7,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import jaxtyping
 import numpy as np
 import pytest
@@ -271,6 +272,7 @@ def test_the_example_knows_how_colours_are_stored(option, tmp_path, monkeypatch)
         (["camera.onnx", "none.png", "scene.png", "dark.png"], r"none.png cannot be read as PNG"),
         (["camera.onnx", "nan.tif", "scene.png", "dark.png"], r"nan.tif cannot be read as PNG.* of finite numbers"),
         (["camera.onnx", "16.png", "scene.png", "dark.png"], r"16.png \(uint16, up to \d+\) must hold .* of 12 bits"),
+        (["camera.onnx", "clear.png", "scene.png", "dark.png"], r"clear.png is transparent in parts"),
         (["camera.onnx", "capture.png", "scene.png"], r"capture.png needs a dark frame"),
         (["camera.onnx", "capture.png", "scene.png", "small.png"], r"small.png \(40, 48, 3\) must have the size of"),
         (["camera.onnx", "small.png", "scene.png", "small.png"], r"small.png is \(3, 40, 48\).*takes \[3, 38, 48\]"),
@@ -289,6 +291,7 @@ def test_the_example_says_in_one_line_what_is_wrong(arguments, message, unchange
     for name, size in (("capture.png", SIZE), ("dark.png", SIZE), ("small.png", (40, 48))):
         write_frame(Path(name), np.full((*size, 3), 9, np.uint16))
     write_frame(Path("16.png"), np.full((*SIZE, 3), 5000, np.uint16))
+    assert cv2.imwrite("clear.png", np.full((*SIZE, 4), 9, np.uint16))
     write_frame(Path("nan.tif"), np.full((*SIZE, 3), np.nan, np.float32))
     with pytest.raises(SystemExit, match=message) as ended:
         example(monkeypatch, *arguments)
