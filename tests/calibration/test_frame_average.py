@@ -55,6 +55,19 @@ def test_two_frames_lose_the_higher_of_two_numbers(bench, dark):
     assert float(average.image[0, 0, 50, 50]) == pytest.approx(frames[0][50, 50, 0] / STEPS, abs=1e-6)
 
 
+@pytest.mark.parametrize("size", [(60, 80), (300, 400)])
+@pytest.mark.parametrize("count", [2, 5])
+def test_noise_is_no_other_pattern(size, count):
+    """A peak of 100 electrons on 1,000 of stray light: averaging is for such frames."""
+    bench = Bench(size, hot=0, peak=100 / 15_000)
+    frames = [bench.frame(bench.light + 1_000 / 15_000) for _ in range(count)]
+    assert not any("another pattern" in each for each in average_frames(frames, FORMAT).rejected.values())
+
+
+def test_narrow_frames_are_averaged(bench):
+    assert average_frames([bench.point()[60:68] for _ in range(2)], FORMAT).count == 2
+
+
 def test_frames_that_disagree_are_refused(bench, dark):
     with pytest.raises(ParameterError, match=r"disagree: `a` has .*; `b` has .* three or more"):
         average_frames([bench.point(), bench.point(0.5)], FORMAT, names=["a", "b"], dark=dark.image)

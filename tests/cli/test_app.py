@@ -305,7 +305,7 @@ def test_debug_shows_where_it_comes_from(run, camera):
 
 
 def test_existing_output_is_replaced(run, camera):
-    (camera / "out").mkdir()
+    assert reconstruct(run, "captures/a.png")[0] == 0
     (camera / "out" / "a.png").write_text("old")
     (camera / "out" / "keep.txt").write_text("mine")
     assert reconstruct(run, "captures/a.png")[0] == 0

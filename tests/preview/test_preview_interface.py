@@ -1,5 +1,6 @@
 """The HTTP interface on a real socket: what is right is answered, what is wrong is refused with a reason."""
 
+import errno
 import io
 import json
 import socket
@@ -15,7 +16,7 @@ import pytest
 
 from mwdn import Reconstructor
 from mwdn.calibration import Calibration
-from mwdn.errors import ParameterError
+from mwdn.errors import ImageError, ParameterError
 from mwdn.io.images import srgb_encode
 from mwdn.preview.cameras import StoredCameras
 from mwdn.preview.reconstruction import with_ambient
@@ -235,13 +236,21 @@ def test_cameras_are_listed_added_and_removed(serve, tmp_path, psf_file):
         assert not list(tmp_path.iterdir())
 
 
-def test_a_camera_that_cannot_be_stored_is_the_servers_fault(serve, tmp_path, psf_file):
+def test_a_camera_that_cannot_be_stored_is_the_servers_fault(serve, tmp_path, psf_file, monkeypatch):
     (tmp_path / "file").touch()
     server = serve(StoredCameras(LIMITS, tmp_path / "file"))  # a file in the place of its folder
     answer = httpx.post(f"{server.url}cameras", files={"psf": psf_file}, data={"name": "mine"}, timeout=120)
-    assert answer.status_code == 507
+    assert answer.status_code == 500
     assert "cannot store" in answer.text
     assert str(tmp_path) not in answer.text
+    server = serve(StoredCameras(LIMITS, tmp_path / "folder"))
+
+    def full(path, content):
+        raise ImageError("full") from OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("mwdn.preview.cameras.write_json", full)
+    answer = httpx.post(f"{server.url}cameras", files={"psf": psf_file}, data={"name": "mine"}, timeout=120)
+    assert answer.status_code == 507
 
 
 def test_a_field_that_is_given_twice_is_refused(client, psf_file, capture):

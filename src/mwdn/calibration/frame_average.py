@@ -29,16 +29,18 @@ MOVED_PX = 0.5
 """Displacement above which a frame is left out, because it would widen the lines of the PSF."""
 
 MIN_LIKENESS = 0.7
-"""Correlation with the other frames, in coarse pixels, below which a frame is left out: it shows another pattern. Real
-captures of objects have up to 0.58 with their camera's PSF; noise leaves 0.78 where the brightest pixel has 10
-electrons."""
+"""Correlation with the other frames, in coarse pixels, below which a frame shows another pattern, unless noise accounts
+for it. Real captures of objects have up to 0.58 with their camera's PSF."""
+
+NOISE_MARGIN = 10.0
+"""Energy of the difference of two frames in coarse pixels, over that of its noise, up to which it counts as noise."""
 
 CLIP = 5.0
 """Standard deviations above which a pixel of one frame is an outlier; 6e-7 of the good pixels are, too."""
 
 _ROWS = 2**22  # numbers of one frame processed at once: some tens of MB for the frames of a band
 _SIDE = 1024  # pixels of the longer side of the frames whose displacement is measured
-_COARSE_SIDE = 64  # of those whose likeness is measured, so that noise hardly counts
+_COARSE_SIDE = 64  # of those whose likeness is measured: they have less noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +143,7 @@ def _small(frame: Frame, format: FrameFormat, dark: Image | None) -> Image:
 
 
 def _binned(image: Tensor, side: int) -> Tensor:
-    return bin_pixels(image, max(1, -(-max(image.shape[-2:]) // side)))
+    return bin_pixels(image, max(1, min(-(-max(image.shape[-2:]) // side), min(image.shape[-2:]) // 2)))
 
 
 def _light(image: Image) -> float:
@@ -158,7 +160,7 @@ def _outlying(
     factor = frames[0].shape[0] // small[0].shape[-2]
     if kind == "dark":
         return _unusual_levels(small, names)
-    # The median of two is the darker one of each pixel, and like both.
+    # The median of two is the darker one of each pixel, and so like both: each is compared with the other one.
     references = small[::-1] if len(small) == 2 else [torch.cat(small).median(0, keepdim=True).values] * len(small)
     levels = [_light(image) if kind == "PSF" else float(image.mean()) for image in small]
     usual = float(np.median(levels))
@@ -168,12 +170,22 @@ def _outlying(
             rejected[name] = f"`{name}` has {level / max(usual, 1e-12):.2f} times the light of the others"
         elif kind == "PSF":
             down, right, _ = displacement(image, reference)
-            likeness = displacement(*(_binned(each, _COARSE_SIDE) for each in (image, reference))).correlation
-            if likeness < MIN_LIKENESS:
-                rejected[name] = f"`{name}` shows another pattern: its correlation with the others is {likeness:.2f}"
-            elif max(abs(down), abs(right)) * factor >= MOVED_PX:
+            if max(abs(down), abs(right)) * factor >= MOVED_PX:
                 rejected[name] = f"`{name}` is displaced by ({down * factor:.1f}, {right * factor:.1f}) px"
+            if _shows_another(image, reference):
+                or_moved = f"{rejected[name].removeprefix(f'`{name}`')}, or" if name in rejected else ""
+                rejected[name] = f"`{name}`{or_moved} shows another pattern"
     return rejected
+
+
+def _shows_another(image: Image, reference: Image) -> bool:
+    """Whether two frames differ by more than their noise, and are less alike than `MIN_LIKENESS`, in coarse pixels."""
+    difference = image - reference
+    coarse, pair = _binned(difference, _COARSE_SIDE), [_binned(each, _COARSE_SIDE) for each in (image, reference)]
+    # Noise is white: neighbours differ by twice its variance, and averages of n pixels have 1 / n of it.
+    noise = difference.diff(dim=-1).square().mean() / 2 * coarse.numel() / difference.numel()
+    is_noise = bool((coarse - coarse.mean()).square().mean() <= NOISE_MARGIN * noise)
+    return not is_noise and displacement(*pair).correlation < MIN_LIKENESS
 
 
 def _unusual_levels(small: Sequence[Image], names: Sequence[str]) -> dict[str, str]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from mwdn.calibration.camera_parts import picture_of
 from mwdn.calibration.corrections import Corrections
-from mwdn.calibration.frame_average import MIN_LIKENESS, Kind
+from mwdn.calibration.frame_average import Kind
 from mwdn.calibration.frame_format import FrameFormat
 from mwdn.calibration.places import relative_magnification
 from mwdn.calibration.point_source import PointSource, average_point, centring_shift
@@ -23,7 +23,10 @@ from mwdn.optics.displacement import displacement, shifted
 from mwdn.types import Frame, Image
 
 MAGNIFICATION_ERROR = 0.003
-"""Of a PSF over that of another distance, as `relative_magnification` finds it."""
+"""Of `relative_magnification`: a PSF that is larger by less may be smaller."""
+
+ALIKE = 0.7
+"""Correlation of PSFs at two distances below which their magnification says nothing."""
 
 
 @dataclass(frozen=True)
@@ -62,12 +65,11 @@ class CalibrationFrames:
         needed = max(1, len(self.exposures)) * max(1, len(self.distances_mm))
         if len(self.groups) != needed:
             raise ParameterError(f"`groups` ({len(self.groups)}) must be {needed}, one for each exposure and distance.")
-        files = [*chain(*self.groups, *self.field), *{*chain(*self.sensor.dark)}, *self.sensor.flat]
-        twice = [file for file, count in Counter(map(os.path.realpath, files)).items() if count > 1]
-        if twice:
-            raise ParameterError(
-                f"`{Path(twice[0]).name}` is named twice. Each frame shows one thing, and counts once: leave it out."
-            )
+        files = [*chain(*self.groups, *self.field, *self.sensor.dark), *self.sensor.flat]
+        for named in (files, self.sensor.flat_dark):  # those of the flat frames may be dark frames of the captures
+            counts = Counter(map(os.path.realpath, named))
+            if twice := [file for file in named if counts[os.path.realpath(file)] > 1]:
+                raise ParameterError(f"`{twice[-1]}` is named twice. Name each frame once, as one kind.")
 
 
 def expanded(paths: Sequence[Path]) -> list[Path]:
@@ -165,7 +167,7 @@ def _wrong_order(
     images = {distance: _centred(points[distance], photographs, frames) for distance in sorted(points)}
     for near, far in pairwise(images):
         magnification, alike = relative_magnification(images[far], images[near])
-        if magnification > 1 + MAGNIFICATION_ERROR and alike > MIN_LIKENESS:
+        if magnification > 1 + MAGNIFICATION_ERROR and alike > ALIKE:
             yield (
                 f"The PSF at {far:g} mm is {magnification:.3f} times as large as at {near:g} mm, but a nearer point "
                 "casts a larger shadow. Give `--distances` in the order of the frames."

@@ -21,8 +21,8 @@ from mwdn.types import Frame, Image, Size
 MIN_RESPONSE = 0.1
 """Smallest value of a flat field: a pixel with less light is replaced, not amplified."""
 
-MAX_DEFECTS = 0.05
-"""Largest part of the pixels that is replaced. More are a pattern, or noise."""
+MAX_DEAD = 0.2
+"""Largest part of the pixels of flat frames that may be unlike their neighbours. More are a pattern, or noise."""
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ def measure_sensor(files: SensorFiles, frames: FrameFormat, known: Corrections =
         known: flat field and hot pixels of an earlier calibration, kept where no frames of this kind are given.
 
     Raises:
-        MwdnError: a file cannot be read, frames of the same kind disagree, or dark or flat frames show a pattern.
+        MwdnError: a file cannot be read, frames of the same kind disagree, or flat frames show a pattern.
     """
     times: Sequence[float | None] = files.dark_exposures or (None,) * len(files.dark)
     darks = {time: average_files(group, frames, kind="dark") for time, group in zip(times, files.dark, strict=True)}
@@ -162,7 +162,6 @@ def measure_sensor(files: SensorFiles, frames: FrameFormat, known: Corrections =
     notes = [sentence for average in darks.values() for sentence in average.rejected.values()]
     if (longest := measured.longest_dark) is not None and longest.count > 1:
         defects = find_hot_pixels(longest, cell=frames.cell)
-        _check_defects(defects, "dark", "Take them without any light.")
         measured = replace(measured, corrections=replace(measured.corrections, defects=defects))
     elif darks and known.defects is None:
         notes.append("A single dark frame cannot tell hot pixels from noise. Take several.")
@@ -199,7 +198,11 @@ def _with_flats(sensor: SensorFrames, files: SensorFiles, frames: FrameFormat) -
     sensor.check_size(f"Flat frames, as `{names[0]}`", (flat.shape[-2], flat.shape[-1]))
     defects = (torch.zeros(1, 1, *flat.shape[-2:]) > 0) if defects is None else defects
     dead = find_dead_pixels(flat.mean((0, 1)), cell=frames.cell)
-    _check_defects(dead, "flat", "Take them of even light, a white page or the sky, and name no others.")
+    if float(dead.float().mean()) > MAX_DEAD:
+        raise ParameterError(
+            f"{dead.float().mean():.0%} of the pixels of the flat frames are unlike their neighbours: the frames show "
+            "a pattern, or are too dark. Take them of even light, a white page or the sky, at half of the full scale."
+        )
     defects = defects | dead
     colour = demosaic(flat, frames.mosaic) if frames.mosaic else flat
     tint = tuple(colour.mean((0, 2, 3)).tolist()) if colour.shape[1] == 3 else ()
@@ -211,16 +214,6 @@ def _with_flats(sensor: SensorFrames, files: SensorFiles, frames: FrameFormat) -
     response = relative_response(flat, frames.cell) if files.flat_field else sensor.corrections.flat
     corrections = Corrections(response, defects)
     return replace(sensor, corrections=corrections, transfer=transfer, flat_colour=tint, notes=tuple(notes))
-
-
-def _check_defects(defects: Tensor, kind: Kind, advice: str) -> None:
-    """Raise a `ParameterError` if too many pixels of dark or flat frames are unlike their neighbours."""
-    part = float(defects.float().mean())
-    if part > MAX_DEFECTS:
-        raise ParameterError(
-            f"{part:.0%} of the pixels of the {kind} frames are unlike their neighbours, so the frames show a pattern. "
-            f"{advice}"
-        )
 
 
 def _black(sensor: SensorFrames, defects: Tensor) -> float | None:

@@ -177,7 +177,9 @@ class Session:
                 while True:
                     frame = self.camera.read()
                     exposure_s = 0.0 if math.isnan(frame.exposure_s) else frame.exposure_s
-                    shown = min(shown, time.time())  # later than now if the clock was set back
+                    if (now := time.time()) < shown:  # the clock was set back: this frame may be of the time before
+                        shown = now
+                        continue
                     if not self.camera.live or frame.timestamp - exposure_s >= shown:
                         return frame
             except CameraError as error:

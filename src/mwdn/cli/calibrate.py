@@ -89,7 +89,7 @@ def calibrate(  # noqa: PLR0913
         refuse_overwrite(out, pairs)
     kept = _kept(camera)
     if files and psf not in (None, kept.get("psf")):
-        raise ParameterError(f"`psf` (`{psf}`) is instead of FILES (`{files[0]}` ...). Give one of them.")
+        raise ParameterError(f"`psf` (`{psf}`) is instead of FILES (`{files[0]}`). Give either of them.")
     own_dark = kept.pop("dark", None)  # an option has it
     pictures = _by_kept_path(pictures, kept.get("psf"))
     photographs = replace(photographs, dark=tuple(_by_kept_path(photographs.dark, own_dark)))
@@ -108,6 +108,7 @@ def calibrate(  # noqa: PLR0913
             "pitch_um": pitch_um,
             "distance_mm": distance_mm,
         }
+        _check_bits(kept, own.get("bit_depth"), photographs, own_dark)
         if photographs.are_one_picture(pictures):
             dark = next(iter(expanded(photographs.dark_files)), None)
             options = CameraOptions(pictures[0], frames, psf_format=psf_format, dark=dark, ambient=ambient)
@@ -150,6 +151,17 @@ def _kept(camera: Path | None) -> dict[str, Any]:
     return values
 
 
+def _check_bits(kept: dict[str, Any], bits: int | None, photographs: PhotographOptions, own_dark: Path | None) -> None:
+    """Refuse other bits than those of the sensor's measurement, whose levels are fractions of the full scale."""
+    before, is_dark_new = kept.get("bit_depth"), photographs.dark_files not in ((), (own_dark,))
+    stale = ("full_well_electrons" in kept and not photographs.flat) or ("black_level" in kept and not is_dark_new)
+    if bits not in (None, before) and stale:
+        raise ParameterError(
+            f"`bit_depth` ({bits}) must be {before or 'left out'}, as the sensor was measured. To change it, give dark "
+            "and flat frames, too, which measure it again."
+        )
+
+
 def _by_kept_path(files: Sequence[Path], kept: Path | None) -> list[Path]:
     """The files. If the only one is the camera file's own, its path as in the camera file, so that both are equal."""
     if kept is not None and [os.path.realpath(file) for file in files] == [os.path.realpath(kept)]:
@@ -182,12 +194,6 @@ def _write_one_picture(
     if options.psf != kept.get("psf"):
         of_a_psf = {"psf_corrected", "psf_gain", "envelope_shift", *chain.from_iterable(_ELSEWHERE)}
         kept = {key: value for key, value in kept.items() if key not in of_a_psf}
-    bits, before = own.get("bit_depth"), kept.get("bit_depth")
-    if bits not in (None, before) and kept.get("black_level") is not None:
-        raise ParameterError(
-            f"`bit_depth` ({bits}) must be {before or 'left out'}, as the sensor was measured. To change it, name the "
-            "photographs again, with dark and flat frames."
-        )
     psf_done = kept.get("psf_corrected", False)
     corrections = Corrections.read(kept.get("flat_field"), kept.get("hot_pixels"), psf_done=psf_done)
     calibration = options.load(corrections)

@@ -221,7 +221,11 @@ class Batch:
         write_output(job.output, scene, self.format, pitch)
         if trust and self.map:
             write_picture(support_name(job.output), support_picture(scene, trust.support.map))
-        write_json(sidecar, content)
+        try:
+            write_json(sidecar, content)
+        except ImageError:  # the disk is full: the next run would take the picture for something else
+            job.output.unlink()
+            raise
         return replace(job, measurement=None, pose=None, scene=None, trust=trust, verdicts=verdicts)
 
     def _examine(self, measurement: Measurement, scene: Scene, pose: Pose | None) -> Trust | None:

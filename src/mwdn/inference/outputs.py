@@ -38,7 +38,7 @@ def check_outputs(
     Raises:
         ParameterError: two captures have the same output, or one the name of another's support map; an output would
             overwrite an input, a ``.json`` that is not of this package, or a picture without one in a folder of
-            captures or without any of this package; an output is a symbolic link, or ``out`` is a file.
+            captures, or in one that holds none of this package; an output is a symbolic link, or ``out`` is a file.
     """
     if out.exists() and not out.is_dir():
         raise ParameterError(f"`{out}` must be a folder, but is a file. Choose another one: `--out`.")
@@ -56,22 +56,29 @@ def check_outputs(
     folders = {str(Path(capture).parent) for capture in captures}
     holds_pictures = any(name.endswith(".json") and read_sidecar(out / name) for name in existing)
     is_foreign = real(str(out)) in map(real, folders) or not holds_pictures
+
+    def refuse(foreign: str) -> None:
+        raise ParameterError(
+            f"`{start}{foreign}` was not written by mwdn and would be lost. Choose another folder: `--out`."
+        )
+
     links = {str(path): path.readlink() for path in paths if path.is_symlink()}
-    check(str(out / SUMMARY))
-    sources = {SUMMARY: "the summary picture"}
     start = str(out / "x").removesuffix("x")  # text instead of paths: there may be a million captures
+    check(str(out / SUMMARY))
+    if SUMMARY in existing and not holds_pictures:
+        refuse(SUMMARY)
+    sources = {SUMMARY: "the summary picture"}
     for capture in captures:
         name = output_name(capture, format)
         sidecar = name.removesuffix(_SUFFIX[format]) + ".json"
         check(start + name)
         check(start + sidecar)
-        check(start + name.removesuffix(_SUFFIX[format]) + _SUPPORT)
+        support = name.removesuffix(_SUFFIX[format]) + _SUPPORT
+        check(start + support)
         # Among other pictures of a run, one without its sidecar is of a run that was killed between the two.
-        foreign = next((each for each in (sidecar, name) if each in existing), None)
+        foreign = next((each for each in (sidecar, name, support) if each in existing), None)
         if foreign and (foreign == sidecar or is_foreign) and not read_sidecar(out / sidecar):
-            raise ParameterError(
-                f"`{start}{foreign}` was not written by mwdn and would be lost. Choose another folder: `--out`."
-            )
+            refuse(foreign)
         if name in sources:
             raise ParameterError(
                 f"`{capture}` and {sources[name]} would both be written to `{start}{name}`. Name one of them, "

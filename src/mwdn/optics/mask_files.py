@@ -2,6 +2,7 @@
 
 import errno
 import json
+import math
 import os
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -150,7 +151,9 @@ def check_stl(mask: Mask, *, base_um: float = 100.0, every: int = 1) -> None:
         raise ParameterError(f"`base_um` ({base_um:g}) must be positive and `every` ({every}) at least 1.")
     rows, columns = (len(_chosen(length, every)) for length in mask.values.shape)
     if rows * columns > MAX_STL_SAMPLES or min(rows, columns) < 2:
-        needed = int(np.ceil(np.sqrt(mask.values.numel() / MAX_STL_SAMPLES)))
+        needed = every
+        while math.prod(len(_chosen(length, needed)) for length in mask.values.shape) > MAX_STL_SAMPLES:
+            needed += 1
         raise ParameterError(
             f"An STL ({rows:,} x {columns:,} samples) must have at least 2 samples a side and at "
             f"most {MAX_STL_SAMPLES:,} in all: `--stl-every {needed}`, in Python `every={needed}`; or use GDSII."
@@ -164,7 +167,8 @@ def write_stl(path: str | Path, mask: Mask, *, base_um: float = 100.0, every: in
 
     Args:
         path: the file.
-        mask: a phase mask. A step from one level to the next becomes a slope as wide as the pitch.
+        mask: a phase mask. A step from one level to the next becomes a slope as wide as the pitch; at the edges
+            the slope is half a sample wider.
         base_um: thickness below height 0.
         every: use every n-th sample along each axis, and the last one.
 

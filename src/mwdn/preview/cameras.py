@@ -11,7 +11,7 @@ from typing import Any
 
 from mwdn.calibration import Calibration, FrameFormat, PsfFormat
 from mwdn.errors import ImageError, MwdnError, ParameterError, UnknownNameError
-from mwdn.io.files import as_image_error, atomic, write_json
+from mwdn.io.files import as_image_error, atomic, is_full, write_json
 from mwdn.io.formats import at_most_pixels
 from mwdn.io.reading import read_bytes, read_json, unexpected_content
 from mwdn.preview.limits import Limits, RefusedError
@@ -135,7 +135,8 @@ class StoredCameras:
             write_json(entry, {"name": name, "options": options})  # last: without it there is no camera
         except ImageError as error:
             why = getattr(error.__cause__, "strerror", "") or "its disk may be full"  # without the server's paths
-            raise RefusedError(507, f"The server cannot store the camera: {why}.") from error
+            status = 507 if is_full(error.__cause__) else 500
+            raise RefusedError(status, f"The server cannot store the camera: {why}.") from error
 
     def remove(self, name: str) -> None:
         """Remove a stored calibration.

@@ -20,9 +20,10 @@ _ERRORS = {
     "413": "Too many bytes or pixels; the message says how many are allowed.",
     "415": "Not a multipart form.",
     "422": "A file, a name or a number is wrong; the message says which, and what to do.",
+    "500": "The server cannot write to its disk.",
     "503": "Too many requests wait.",
     "504": "The reconstruction takes too long.",
-    "507": "The server's disk is full, or cannot be written.",
+    "507": "The server's disk is full.",
 }
 _ERROR = {"application/json": {"schema": {"$ref": "#/components/schemas/Error"}}}
 _OBJECT = {"application/json": {"schema": {"type": "object"}}}

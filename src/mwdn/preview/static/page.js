@@ -103,12 +103,13 @@ async function reconstruct() {
         await showPictures(true);
       }
     }, mine.signal);
+    if (mine.signal.aborted) return;
     const report = job.report;
     const lit = report.room_light ? ` ${Math.round(100 * report.room_light)} % of its light was the room’s.` : "";
     say(`${report.method}: ${report.width} × ${report.height} pixels in ${report.seconds.toFixed(2)} s.${lit}`);
     showVerdicts(report);
   } catch (error) {
-    if (error.name === "AbortError") return;
+    if (error.name === "AbortError" || mine.signal.aborted) return;
     if (!shown) hidePicture();
     say(error instanceof RequestError ? error.message : `The page failed: ${error.message}`, true);
   } finally {
@@ -122,7 +123,10 @@ async function reconstruct() {
 // That of other files, which must not stand for those that are chosen now.
 function hidePicture() {
   chosen.job = null;
-  for (const id of ["measurement", "scene"]) byId(id).removeAttribute("src");
+  for (const id of ["measurement", "scene"]) {
+    URL.revokeObjectURL(byId(id).src);
+    byId(id).removeAttribute("src");
+  }
   byId("view").hidden = byId("trust-section").hidden = true;
 }
 
@@ -143,6 +147,7 @@ async function showPictures(both = false) {
   if (job !== chosen.job || (call !== latest && !both)) return; // a newer call shows a newer picture
   await setPicture(byId("scene"), scene);
   if (measurement) await setPicture(byId("measurement"), measurement);
+  if (job !== chosen.job) return;
   byId("view").hidden = byId("psf-section").hidden = false;
 }
 
@@ -204,6 +209,7 @@ function take(what, file) {
 function setUpDrop(what) {
   setUpDropZone(byId(what), (files) => {
     if (files.length > 1) {
+      running?.abort();
       say(`${files.length} files were dropped: drop one.`, true);
       return;
     }
@@ -216,7 +222,7 @@ function setUpDrop(what) {
 
 function chooseCamera(name) {
   byId("camera").value = name;
-  byId("format").disabled = name !== UPLOAD; // a stored calibration has its own
+  byId("format").disabled = byId("camera").value !== UPLOAD; // a stored calibration has its own
 }
 
 async function listCameras(selected) {
