@@ -94,8 +94,9 @@ def measured(method, calibration, captures, arguments, clock):
             runs[suffix, precision] = opened(file, arguments.threads)
         for precision in ("exact", "fast"):
             rows.append({"method": method, "file": "mwdn", "precision": precision})
-            # Not aligned, as in the files.
-            runs["mwdn", precision] = Reconstructor(method, calibration, align=False, device="cpu", precision=precision)
+            # Neither aligned nor without the light of the room, as in the files.
+            same = {"align": False, "room_light": False, "device": "cpu"}
+            runs["mwdn", precision] = Reconstructor(method, calibration, **same, precision=precision)
         batch = torch.rand(1, 3, *calibration.size) if captures is None else captures[:1]
         best = shortest(runs, batch, arguments.repeats, clock)
         for row in rows:

@@ -136,7 +136,7 @@ def export(
     if isinstance(method, Network) and method.align:
         about["alignment"] = "off: the PSF is taken as it is"
     measurement = simulate_captures(calibration, ("astronaut",), channels)
-    exact = Reconstructor(method, calibration, align=False, device="cpu", precision="exact")
+    exact = Reconstructor(method, calibration, align=False, room_light=False, device="cpu", precision="exact")
     expected = exact.as_recorded(exact.on_device(measurement))
     with torch.no_grad(), tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / out.name

@@ -84,7 +84,7 @@ def export_site(
     channels = network.channels or calibration.psf.shape[1]
     models = network_models(network, calibration.size, channels)
     captures = _sample_captures(calibration)
-    exact = Reconstructor(network, calibration, align=False, device="cpu", precision="exact")
+    exact = Reconstructor(network, calibration, align=False, room_light=False, device="cpu", precision="exact")
     scenes = exact.as_recorded(exact.on_device(captures.float() / 65535))
     reached = _compare(models, calibration, captures, scenes, channels)
     check_agreement(reached, "The page", _title(method), least=least)
