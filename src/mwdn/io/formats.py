@@ -119,7 +119,7 @@ def _kind(start: bytes) -> str:
         return kind
     raise ImageError(
         f"must be PNG, JPEG, WebP, BMP, PGM, PPM, TIFF, NPY or a camera's raw file, but starts with {start[:8]!r}. "
-        "Export it as PNG; save the frames of a video as PNG, and arrays of another program as NPY."
+        "Export it, or the frames of a video, as PNG."
     )
 
 
