@@ -170,11 +170,13 @@ def _outlying(
             rejected[name] = f"`{name}` has {level / max(usual, 1e-12):.2f} times the light of the others"
         elif kind == "PSF":
             down, right, _ = displacement(image, reference)
+            reasons = []
             if max(abs(down), abs(right)) * factor >= MOVED_PX:
-                rejected[name] = f"`{name}` is displaced by ({down * factor:.1f}, {right * factor:.1f}) px"
+                reasons.append(f"is displaced by ({down * factor:.1f}, {right * factor:.1f}) px")
             if _shows_another(image, reference):
-                or_moved = f"{rejected[name].removeprefix(f'`{name}`')}, or" if name in rejected else ""
-                rejected[name] = f"`{name}`{or_moved} shows another pattern"
+                reasons.append("shows another pattern")
+            if reasons:
+                rejected[name] = f"`{name}` {', or '.join(reasons)}"
     return rejected
 
 

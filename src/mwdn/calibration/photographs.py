@@ -130,10 +130,11 @@ def calibrate_frames(
     parts: dict[str, Frame | list[Frame]] = {"psf": psf_frame(shifted(reference, *shift), frames)}
     content: dict[str, Any] = {"mosaic": frames.mosaic, "psf_corrected": True}
     notes = [*sensor.notes, *(note for point in points for note in point.notes)]
-    notes += _wrong_order(dict(zip(distances, points, strict=bool(distances))), photographs, frames)
     if len(distances) > 1:
         content |= {"distance_mm": distances[0], "distances_mm": tuple(distances[1:])}
-        parts["distance_psfs"] = [psf_frame(_centred(point, photographs, frames), frames) for point in points[1:]]
+        images = [_centred(point, photographs, frames) for point in points]
+        notes += _wrong_order(dict(zip(distances, images, strict=True)))
+        parts["distance_psfs"] = [psf_frame(image, frames) for image in images[1:]]
     elif distances:
         content["distance_mm"] = distances[0]
     if photographs.field:
@@ -160,12 +161,9 @@ def _centred(point: PointSource, photographs: CalibrationFrames, frames: FrameFo
     return shifted(image, *centring_shift(image, frames.cell)) if photographs.centre else image
 
 
-def _wrong_order(
-    points: dict[float, PointSource], photographs: CalibrationFrames, frames: FrameFormat
-) -> Iterator[str]:
-    """A sentence for each neighbouring distance whose PSF is larger than that of the nearer one: it must be smaller."""
-    images = {distance: _centred(points[distance], photographs, frames) for distance in sorted(points)}
-    for near, far in pairwise(images):
+def _wrong_order(images: dict[float, Image]) -> Iterator[str]:
+    """A sentence for each distance whose PSF is larger than that of the next nearer one: it must be smaller."""
+    for near, far in pairwise(sorted(images)):
         magnification, alike = relative_magnification(images[far], images[near])
         if magnification > 1 + MAGNIFICATION_ERROR and alike > ALIKE:
             yield (

@@ -11,7 +11,7 @@ from typing import Any
 
 from mwdn.calibration import Calibration, FrameFormat, PsfFormat
 from mwdn.errors import ImageError, MwdnError, ParameterError, UnknownNameError
-from mwdn.io.files import as_image_error, atomic, is_full, write_json
+from mwdn.io.files import atomic_write, is_full, write_json
 from mwdn.io.formats import at_most_pixels
 from mwdn.io.reading import read_bytes, read_json, unexpected_content
 from mwdn.preview.limits import Limits, RefusedError
@@ -130,7 +130,7 @@ class StoredCameras:
     def _write(self, name: str, psf: bytes, options: dict[str, Any]) -> None:
         entry = self._entry(name)
         try:
-            with as_image_error("the stored camera"), atomic(entry.with_suffix(".psf")) as temporary:
+            with atomic_write(entry.with_suffix(".psf")) as temporary:
                 temporary.write_bytes(psf)
             write_json(entry, {"name": name, "options": options})  # last: without it there is no camera
         except ImageError as error:
