@@ -5,7 +5,7 @@ import torch
 
 from cameras import gaussian_psf
 from mwdn import Camera
-from mwdn.calibration.frame_operations import bin_pixels, crop_centre, demosaic, enlarge
+from mwdn.calibration.frame_operations import bin_pixels, crop_centre, demosaic, enlarge_binned
 from mwdn.errors import ParameterError, ShapeError
 from mwdn.solvers import Wiener
 
@@ -89,7 +89,7 @@ def test_reconstruction_of_binned_frames_enlarges_to_its_place(size, factor):
     psf, scene = gaussian_psf(size, 1.5 * factor), gaussian_psf(size, 2.5 * factor, spot)
     binned_psf, measurement = bin_pixels(psf, factor), bin_pixels(Camera(psf).forward(scene), factor)
     small = Wiener(regularisation=1e-3)(measurement, binned_psf / binned_psf.sum())
-    full = enlarge(small, factor, size)
+    full = enlarge_binned(small, factor, size)
     assert full.shape[-2:] == size
     assert centroid(full) == pytest.approx(spot, abs=0.1)
     assert small.amin() <= full.amin() <= full.amax() <= small.amax()

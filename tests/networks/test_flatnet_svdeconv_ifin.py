@@ -54,7 +54,7 @@ def test_flatnet_begins_as_wiener_and_learns_taps(generator):
 @torch.no_grad()
 def test_flatnet_filter_is_stretched_to_other_sizes(generator):
     """A filter that is even light adds the same brightness at any size."""
-    network = build("flatnet", width=2, size=(16, 20))
+    network = build("flatnet", width=2, size=(16, 20), channels=1)
     network.correction.fill_(1)
     h = torch.zeros(1, 1, 32, 40)
     h[..., 16, 20] = 1

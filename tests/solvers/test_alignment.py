@@ -14,7 +14,7 @@ from mwdn.optics.drawing import contour_lines
 from mwdn.optics.warp import hazed
 from mwdn.solvers import alignment
 from mwdn.solvers.alignment import align, has_detail
-from mwdn.solvers.pose import ENVELOPE_BLUR, Pose
+from mwdn.solvers.pose import POSE_BLUR, Pose
 from mwdn.solvers.pyramid import Pyramid
 
 SIZE = (144, 160)
@@ -184,7 +184,7 @@ def test_overexposure_is_not_taken_for_a_displaced_aperture(down, saturated, fou
 def test_envelope_moves_before_haze_and_keeps_the_sum(psf):
     shift = torch.tensor([[0.05, -0.02]])
     moved = Pose(torch.zeros(1), torch.zeros(1), 0.1, shift).move(psf)
-    expected = displaced_envelope(psf, shift * SIZE[0], blur=ENVELOPE_BLUR)
+    expected = displaced_envelope(psf, shift * SIZE[0], blur=POSE_BLUR)
     torch.testing.assert_close(moved, hazed(expected / expected.sum(), 0.1))
 
 

@@ -93,7 +93,7 @@ def average_frames(
     if dark is not None and tuple(dark.shape[-2:]) != frames[0].shape[:2]:
         got, wanted = (" x ".join(map(str, size)) for size in (frames[0].shape[:2], dark.shape[-2:]))
         raise ImageError(f"`{names[0]}` ({got}) must be like the dark frames ({wanted}). Use the same camera settings.")
-    format = FrameFormat(bit_depth=format.bit_depth, gamma=format.gamma)
+    format = format.encoding
     rejected = _outlying(frames, format, names, kind, dark) if len(frames) > 1 else {}
     kept = [number for number, name in enumerate(names) if name not in rejected]
     if 2 * len(kept) < len(frames) or (len(frames) == 2 and rejected):

@@ -76,6 +76,11 @@ class FrameFormat:
         return f"FrameFormat({', '.join(f'{name}={value!r}' for name, value in changed_fields(self).items())})"
 
     @property
+    def encoding(self) -> "FrameFormat":
+        """Bit depth and gamma alone."""
+        return FrameFormat(bit_depth=self.bit_depth, gamma=self.gamma)
+
+    @property
     def cell(self) -> int:
         """Raw pixels of the frame, along each axis, that make one pixel before binning: 2 with a mosaic, else 1."""
         return 1 if self.mosaic is None else 2

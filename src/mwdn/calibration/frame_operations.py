@@ -90,7 +90,7 @@ def bin_pixels(image: Tensor, factor: int) -> Tensor:
     return F.avg_pool2d(image, factor)
 
 
-def enlarge(image: Tensor, factor: int, size: Size) -> Tensor:
+def enlarge_binned(image: Tensor, factor: int, size: Size) -> Tensor:
     """Interpolate a reconstruction of binned frames at the pixels before binning, bicubic and without overshoot.
 
     The centre ``(H // 2, W // 2)`` stays the centre, for the PSF's displacements count from there. At the border, where

@@ -87,7 +87,7 @@ def _check_exposure(
     if (defects := sensor.corrections.defects) is not None:
         frame = np.where(defects[0, 0, :, :, None].numpy(), 0, frame).astype(frame.dtype)
     dark = sensor.dark(time)
-    format = FrameFormat(bit_depth=frames.bit_depth, gamma=frames.gamma)
+    format = frames.encoding
     exposure = measure_exposure(frame, format, black=0.0 if dark is None else float(dark.mean()))
     saturated = average.saturated if defects is None else average.saturated & ~defects
     count = int(saturated.sum())

@@ -77,7 +77,7 @@ def guide_exposure(
     Yields:
         A sentence and the measurement; ``None`` for a frame that cannot be measured.
     """
-    format = FrameFormat(bit_depth=format.bit_depth, gamma=format.gamma)
+    format = format.encoding
     for name, frame in frames:
         exposure = None
         try:

@@ -66,7 +66,13 @@ def export(  # noqa: PLR0913
 
 
 def _writer(out: Path) -> Callable[..., Exported]:
-    """The function that writes a file of this suffix."""
+    """The function that writes a file of this suffix.
+
+    Raises:
+        ParameterError: none does.
+    """
+    if out.suffix not in (".onnx", ".pt2", ".zip"):
+        raise ParameterError(f"`{out}` must end in .onnx, .pt2 or .zip, not '{out.suffix}'.")
     if out.suffix == ".zip":
         from mwdn.bridges.bioimage import export_bioimage
 

@@ -129,7 +129,7 @@ def import_digicam(
     check_path(output)
     refuse_overwrite(output, path)
     names = layout.captures or CAPTURES, layout.scenes or SCENES
-    levels = FrameFormat(bit_depth=frames.bit_depth, gamma=frames.gamma)
+    levels = frames.encoding
     listing, folder, is_subtracted = list_digicam(path, *names, background=camera.background, levels=levels)
     if is_subtracted:  # the captures are linear floats then
         frames = replace(frames, bit_depth=None, gamma=None)

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from mwdn.calibration.frame_operations import enlarge
+from mwdn.calibration.frame_operations import enlarge_binned
 from mwdn.data.captures import read_capture
 from mwdn.diagnosis import Verdict
 from mwdn.diagnosis.captures import examine_capture, refuse_dark
@@ -213,7 +213,7 @@ class Batch:
             content |= {**trust.content, "verdicts": [asdict(verdict) for verdict in verdicts]}
         scene, sidecar = to_host(self.reconstruct.finish(job.scene)), job.output.with_suffix(".json")
         if job.full_size:
-            scene = enlarge(scene, calibration.frames.bin, job.full_size)
+            scene = enlarge_binned(scene, calibration.frames.bin, job.full_size)
             pitch = pitch and pitch / calibration.frames.bin
         with as_image_error(sidecar):  # the new picture must not have an old sidecar or map
             sidecar.unlink(missing_ok=True)

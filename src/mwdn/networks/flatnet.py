@@ -6,9 +6,10 @@ import torch
 from torch import Tensor, nn
 
 from mwdn.errors import ParameterError
-from mwdn.fourier.padding import Boundary, pad
-from mwdn.fourier.transforms import inverse_spectrum, spectrum, transfer_function
-from mwdn.fourier.wiener import deconvolution_grid
+from mwdn.fourier.filtering import filter_image
+from mwdn.fourier.padding import Boundary
+from mwdn.fourier.transforms import transfer_function
+from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
 from mwdn.networks.blocks import check_channels, normalise_psf, resize
 from mwdn.networks.flatnet_unet import FlatNetUNet
 from mwdn.networks.network import Network
@@ -65,8 +66,7 @@ class FlatNet(Network[Tensor]):
         """Transfer function of the learned filter."""
         psf = normalise_psf(psf, size, self.channels)
         grid = deconvolution_grid(size, self.boundary)
-        H = transfer_function(unit_sum(psf), grid)
-        W = H.conj() / (H.abs().square() + self.regularisation)
+        W = wiener_transfer(unit_sum(psf), self.regularisation, grid)
         if self.correction is not None:
             # A step of 3e-4 in all N = 129,600 taps changes W by at most 3e-4 sqrt(N) = 0.1 at frequency 0, where W is
             # about 1. Without the unit 1 / sqrt(N) it would be 3e-4 N = 39. (The source's learning rate for the filter
@@ -78,9 +78,7 @@ class FlatNet(Network[Tensor]):
     def inverse(self, measurement: Measurement, prepared: Transfer) -> Tensor:
         """Measurement (B, C, H, W) deconvolved with the learned filter."""
         size = measurement.shape[-2], measurement.shape[-1]
-        grid = deconvolution_grid(size, self.boundary)
-        B = spectrum(pad(measurement.float(), grid, self.boundary), grid)
-        return inverse_spectrum(prepared * B, grid, size)
+        return filter_image(measurement.float(), prepared, deconvolution_grid(size, self.boundary), self.boundary)
 
     def reconstruct(self, measurement: Measurement, prepared: Transfer) -> Scene:
         """Scene (B, C, H, W), between 0 and 1."""

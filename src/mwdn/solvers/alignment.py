@@ -33,13 +33,13 @@ from torch.nn import functional as F
 
 from mwdn.errors import ParameterError, checked
 from mwdn.fourier.convolution import check_fit
-from mwdn.fourier.transforms import frequency_grid, inverse_spectrum, spectrum
+from mwdn.fourier.transforms import gaussian_transfer, inverse_spectrum, spectrum
 from mwdn.optics.aperture import displaced_envelope
 from mwdn.optics.psf import checked_psf
 from mwdn.optics.saturation import saturated_pixels
 from mwdn.optics.warp import hazed
 from mwdn.solvers.levels import Level, relative_noise, root_mean_square
-from mwdn.solvers.pose import ENVELOPE_BLUR, Pose
+from mwdn.solvers.pose import POSE_BLUR, Pose
 from mwdn.solvers.pyramid import halve, solve
 from mwdn.solvers.splitting import Penalties
 from mwdn.types import Image, Measurement, Psf, Size
@@ -53,9 +53,9 @@ SMOOTH_LEVELS = (
     Level(2, 20, _NO_VARIATION),
     Level(1, 8, Penalties(0.1, 1.5, 1.5), 0.02, min_smoothing=0.2),
 )
-_HIGH_PASS = 0.03  # cycles per pixel: below, most of the residual is ambient light and unconverged iterations
+_BLUR = 5.305  # pixels, 0.03 cycles per pixel: below, most of the residual is ambient light and unconverged iterations
 _MAX_FALL_OFF = 0.5  # coefficient of any polynomial: that of x^2 + y^2 then loses all light in the corners
-_REACH = 16  # pixels, three standard deviations of the Gaussian of `_HIGH_PASS`
+_REACH = 16  # pixels, three standard deviations of the Gaussian of `_BLUR`
 _PRIOR = (0.5, 0.01)  # standard deviations S of a calibration's errors: degrees and relative magnification
 _DELTA = (0.1, 0.002)  # finite differences
 _ENVELOPE_PRIOR = (0.015, 0.015)  # of the envelope: down and right, over the shorter side
@@ -183,7 +183,7 @@ def _estimate_envelope(half: Measurement, psf: Psf, least_gain: Tensor) -> Tenso
 
     def residual(shifts: Tensor) -> Tensor:
         psfs, pixels = psf.repeat_interleave(shifts.shape[1], 0), shifts.flatten(0, 1) * min(psf.shape[-2:])
-        return _residual(half, displaced_envelope(psfs, pixels, blur=ENVELOPE_BLUR))
+        return _residual(half, displaced_envelope(psfs, pixels, blur=POSE_BLUR))
 
     none = delta.new_zeros(len(half), 2)
     r = residual(none[:, None] + torch.cat([none[:1], delta.diag()]))
@@ -214,7 +214,7 @@ def _estimate_haze(measurement: Measurement, psf: Psf) -> Tensor:
     psfs = hazed(psf.repeat_interleave(len(hazes), 0), hazes.repeat(len(psf))[:, None, None, None])
     estimate = solve(measurement.repeat_interleave(len(hazes), 0), psfs, _HAZE_LEVELS)
     grid = estimate.psf.bands[-1].grid
-    low = _low_pass(grid, 4 * _HIGH_PASS, measurement.device)
+    low = gaussian_transfer(grid, _BLUR / 4, device=measurement.device)
     residual = inverse_spectrum(estimate.residual_spectrum * low, grid, grid)
     energy = residual.square().sum((1, 2, 3)).reshape(-1, len(hazes))
     limit = _HAZE_RISE * energy.amin(1, keepdim=True)
@@ -232,7 +232,7 @@ def fine_detail(image: Image) -> Image:
     down, right = min(_REACH, height - 1), min(_REACH, width - 1)
     wide = F.pad(image.float(), (right, right, down, down), mode="reflect")
     grid = wide.shape[-2], wide.shape[-1] + wide.shape[-1] % 2
-    smooth = inverse_spectrum(spectrum(wide, grid) * _low_pass(grid, _HIGH_PASS, image.device), grid, grid)
+    smooth = inverse_spectrum(spectrum(wide, grid) * gaussian_transfer(grid, _BLUR, device=image.device), grid, grid)
     return image - smooth[..., down : down + height, right : right + width]
 
 
@@ -241,7 +241,7 @@ def _residual(measurement: Tensor, psfs: Psf) -> Tensor:
     count = len(psfs) // len(measurement)
     estimate = solve(measurement.repeat_interleave(count, 0), psfs, SMOOTH_LEVELS)
     grid = estimate.psf.bands[-1].grid
-    high = 1 - _low_pass(grid, _HIGH_PASS, measurement.device)
+    high = 1 - gaussian_transfer(grid, _BLUR, device=measurement.device)
     r = inverse_spectrum(estimate.residual_spectrum * high, grid, grid)
     b = inverse_spectrum(spectrum(measurement, grid) * high, grid, grid)  # the prediction is b - r, high-passed
     size = measurement.shape[-2], measurement.shape[-1]
@@ -276,9 +276,3 @@ def _without_fall_off(whole: Tensor, prediction: Tensor, size: Size, count: int)
 def halve_psf(psf: Psf) -> Tensor:
     """Bin a PSF by 2. Its centre may move by one of the new pixels, which shifts the scene and does not change E."""
     return F.avg_pool2d(F.pad(psf, (0, psf.shape[-1] % 2, 0, psf.shape[-2] % 2)), 2)
-
-
-def _low_pass(grid: Size, limit: float, device: torch.device) -> Tensor:
-    """Gaussian transfer function of standard deviation ``limit`` in cycles per pixel."""
-    rows, columns = frequency_grid(grid, device=device)
-    return torch.exp(-(rows.square() + columns.square()) / (2 * limit**2))

@@ -9,7 +9,7 @@ from mwdn.optics.aperture import displaced_envelope
 from mwdn.optics.warp import hazed, warp
 from mwdn.types import Psf
 
-ENVELOPE_BLUR = 0.06
+POSE_BLUR = 0.06
 """See `displaced_envelope`: wider than in [mismatch], which most real captures fit better."""
 
 
@@ -49,6 +49,6 @@ class Pose(NamedTuple):
         c, s = size * angle.cos(), size * angle.sin()
         moved = warp(psf, torch.stack([torch.stack([c, s], -1), torch.stack([-s, c], -1)], 1))
         if self.envelope is not None and self.envelope.any():
-            moved = displaced_envelope(moved, self.envelope * min(psf.shape[-2:]), blur=ENVELOPE_BLUR)
+            moved = displaced_envelope(moved, self.envelope * min(psf.shape[-2:]), blur=POSE_BLUR)
         moved = moved / moved.sum((-2, -1), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
         return hazed(moved, torch.as_tensor(self.haze, device=moved.device).reshape(-1, 1, 1, 1))
