@@ -38,7 +38,7 @@ COMMANDS = {
 RECIPE = 'network = { name = "wiener" }\nschedule = { steps = 2, batch = 1, validate_every = 1, validation = 1 }\n'
 BENCHMARK = """
 solvers = { wiener = {} }
-shared.data = { photos = "photos", test_photos = "photos", background = 0.0 }
+shared.data = { photos = "photos", test_photos = "test", background = 0.0 }
 [data]
 a = { psf = "psf.npy", train = 1, validation = 1, test = 1 }
 """
@@ -70,9 +70,9 @@ def here(tmp_path):
     noise = np.random.default_rng(34)
     np.save(tmp_path / "psf.npy", noise.random((32, 40, 3), np.float32) ** 9)
     np.save(tmp_path / "capture.npy", noise.random((32, 40, 3), np.float32))
-    (tmp_path / "photos").mkdir()
-    for number in range(4):
-        cv2.imwrite(str(tmp_path / "photos" / f"{number}.png"), noise.integers(0, 256, (32, 32, 3), np.uint8))
+    for number, folder in enumerate(("photos", "photos", "photos", "test")):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / folder / f"{number}.png"), noise.integers(0, 256, (32, 32, 3), np.uint8))
     (tmp_path / "r.toml").write_text(RECIPE)
     (tmp_path / "b.toml").write_text(BENCHMARK)
     (tmp_path / "out").mkdir()

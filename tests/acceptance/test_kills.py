@@ -33,7 +33,7 @@ networks = { wiener = {}, mwdn = {} }
 solvers = { quick = { name = "admm", iterations = 3 } }
 shared.network = { width = 2 }
 schedule = { steps = 6, batch = 2, validate_every = 2, warmup = 0, bfloat16 = false }
-shared.data = { photos = "DATA/photos/test", test_photos = "DATA/photos/test" }
+shared.data = { photos = "DATA/photos/train", test_photos = "DATA/photos/test" }
 [data]
 camera = { psf = "DATA/mwdn-camera/psf_320.png", bin = 5, train = 8, validation = 2, test = 3 }
 """

@@ -1,7 +1,9 @@
 """Several processes at one benchmark."""
 
 import multiprocessing
+import shutil
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -65,5 +67,20 @@ def test_a_part_of_a_killed_process_is_another_ones(start, tmp_path):
 
 def test_a_folder_that_cannot_be_is_refused(tmp_path):
     (tmp_path / "out").write_text("")
-    with pytest.raises(ParameterError, match="must be a folder"):
-        lock(tmp_path / "out", "data")
+    with pytest.raises(ParameterError, match="must be a folder"), lock(tmp_path / "out", "data"):
+        pass
+
+
+def test_a_folder_that_another_process_removes_is_made_again(tmp_path):
+    """A command that fails early removes its empty folders, while another one waits for a lock in them."""
+    out = tmp_path / "out"
+    with ThreadPoolExecutor() as pool, lock(out, "data"):
+
+        def work():
+            with lock(out, "data"):
+                return (out / "locks").is_dir()
+
+        waiting = pool.submit(work)
+        time.sleep(0.2)
+        shutil.rmtree(out)
+        assert waiting.result(60)

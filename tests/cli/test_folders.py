@@ -49,7 +49,8 @@ def test_no_empty_folder_is_left(here, line, capsys):
 def test_what_is_written_or_was_there_stays(tmp_path):
     @no_empty_folder
     def command(*, out=tmp_path / "default", name=None):
-        out.mkdir(parents=True, exist_ok=True)
+        (out / "locks").mkdir(parents=True, exist_ok=True)
+        (out / "locks" / "data.lock").touch()
         if name:
             (out / name).touch()
         raise KeyboardInterrupt

@@ -14,6 +14,7 @@ import torch
 
 from cameras import contour_psf
 from mwdn import read_frame
+from mwdn.bridges import save_pretrained
 from mwdn.calibration import Calibration
 from mwdn.data.pairs import PairFile
 from mwdn.data.recorded import Division
@@ -77,7 +78,7 @@ def test_any_key_of_the_recipe_by_its_name(run, camera):
     for wrong, said in (
         ("--learnin-rate 1", "No key of [schedule] named 'learnin_rate'. Did you mean 'learning_rate'?"),
         ("--sensor.iso 100", "No key of [sensor] named 'iso'"),
-        ("--steps many", "`steps` of [schedule] ('many') must be of the same kind as its default, 2000."),
+        ("--steps many", "`steps` of [schedule] ('many') must be a whole number; the default is 2000."),
         ("--seed", "`--seed` must be followed by"),
     ):
         code, _, err = run(f"train r.toml --psf psf.npy --photos photos --out runs/y {wrong}")
@@ -123,10 +124,11 @@ def test_warning_of_a_reconstructor(camera):
     [
         (TRAIN.replace("runs/x", "r.toml"), "`r.toml` must be a folder that can be written to"),
         (TRAIN.replace("--photos photos", "--photos runs"), "`runs` is not a folder"),
-        (TRAIN.replace("--photos photos", ""), "`--photos FOLDER`"),
+        (TRAIN.replace("runs/x", "photos/x"), "`photos/x` lies in the folder of photographs `photos`"),
+        (TRAIN.replace("--photos photos", ""), "`--photos`, or recorded pairs, `--pairs`"),
         (
             TRAIN + " --pairs p.h5",
-            "`--photos` (photos) and `--pairs` (p.h5) exclude each other.",
+            "Photographs (`photos`) and pairs (`p.h5`) exclude each other.",
         ),
         (TRAIN.replace("--photos photos", "--pairs p.h5"), "`p.h5` does not exist"),
         (TRAIN + " --captures runs", "`runs`"),
@@ -262,6 +264,8 @@ def test_a_checkpoint_is_evaluated_on_the_pairs_that_its_training_left_out(run, 
     for options in ("", " --first 4", " --split folds --part validation", " --split paper"):
         said += [re.findall(r"was trained on (\d+) of these (\d+)", flat(run(evaluate + options)[2]))]
     assert said == [[("15", "20")], [("4", "4")], [], [("2", "2")]]
+    save_pretrained("runs/x/best.safetensors", "hub")
+    assert "was trained on 15 of these 20" in flat(run(evaluate.replace("runs/x/best.safetensors", "hub"))[2])
     assert psnr(" --split folds --part validation") == pytest.approx([every[n] for n in held_out], abs=1e-3)
     assert run(line.replace("runs/x", "runs/y") + network)[0] == 0
     code, _, err = run(

@@ -144,6 +144,12 @@ def test_what_cannot_be_written(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.usefixtures("unchecked")
+def test_integers_are_no_linear_light(tmp_path: Path) -> None:
+    with pytest.raises(ImageError, match=r"\(4 x 6 x 3, uint8\) must be .*floats.*`mwdn\.io\.images\.srgb_decode`"):
+        write_picture(tmp_path / "a.png", np.ones((4, 6, 3), np.uint8))
+
+
 def test_png_has_8_or_16_bits(tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match=r"`bits` \(12\)"):
         write_picture(tmp_path / "a.png", torch.rand(3, 4, 4), bits=12)

@@ -835,5 +835,5 @@ def test_a_denoiser_is_trained_alone_and_then_frozen(trainer, tmp_path):
 
 def test_a_denoiser_does_not_learn_from_recorded_pairs(calibration, tmp_path):
     recipe = replace(few(), network=DRUNET, denoising=Denoising((0.05, 0.1)))
-    with pytest.raises(ParameterError, match="makes its own pairs from photographs: give `--photos`"):
+    with pytest.raises(ParameterError, match="makes its own pairs from photographs: give `photos`"):
         prepare(recipe, calibration, pairs=tmp_path / "none.h5", out=tmp_path / "run", device="cpu")

@@ -6,6 +6,7 @@ another process continues the part of a killed one.
 """
 
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -13,20 +14,30 @@ from filelock import FileLock, Timeout
 from mwdn.io.files import as_parameter_error
 
 
-def lock(folder: Path, part: str) -> FileLock:
-    """Lock of a part, as a context manager: only one process at a time works on the part.
+@contextmanager
+def lock(folder: Path, part: str, *, wait: bool = True) -> Iterator[None]:
+    """Lock of a part: only one process at a time works on the part.
 
     Args:
         folder: of the benchmark.
         part: name of the part; may be a relative path.
+        wait: for another process that holds it.
 
     Raises:
         ParameterError: the folder cannot be written to.
+        filelock.Timeout: another process holds it.
     """
     path = folder / "locks" / f"{part}.lock"
-    with as_parameter_error(folder):
-        path.parent.mkdir(parents=True, exist_ok=True)
-    return FileLock(path)
+    held = FileLock(path, blocking=wait)
+    while not held.is_locked:
+        with as_parameter_error(folder):
+            path.parent.mkdir(parents=True, exist_ok=True)
+        with suppress(FileNotFoundError):  # a process that failed has removed its folders, which were empty
+            held.acquire()
+    try:
+        yield
+    finally:
+        held.release()
 
 
 def claim_parts(folder: Path, parts: Sequence[str]) -> Iterator[str]:
@@ -37,12 +48,12 @@ def claim_parts(folder: Path, parts: Sequence[str]) -> Iterator[str]:
     """
     busy = []
     for part in parts:
-        try:
-            acquired = lock(folder, part).acquire(blocking=False)
-        except Timeout:
-            busy.append(part)
-            continue
-        with acquired:
+        with ExitStack() as stack:
+            try:
+                stack.enter_context(lock(folder, part, wait=False))
+            except Timeout:
+                busy.append(part)
+                continue
             yield part
     for part in busy:
         with lock(folder, part):

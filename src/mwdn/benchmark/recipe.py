@@ -4,6 +4,7 @@ import json
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from mwdn.benchmark.dataset_recipe import PRESETS, DatasetRecipe
 from mwdn.benchmark.methods import MEAN, Method, check_name, read_methods, scale_width
 from mwdn.calibration.camera_file import read_camera
 from mwdn.errors import ParameterError, UnknownNameError, shown
+from mwdn.io.listing import lies_in
 from mwdn.io.toml import find_recipe, read_toml, to_dataclass
 from mwdn.networks import NETWORKS
 from mwdn.optics import Deviation
@@ -268,6 +270,11 @@ def _check_dataset(name: str, recipe: DatasetRecipe, names: Iterable[str]) -> No
         raise ParameterError(f'`{name}` of [data] must name a PSF, `psf = "psf.png"`, or `camera = "camera.toml"`.')
     if not recipe.pairs and not (recipe.photos and recipe.test_photos):
         raise ParameterError(f"`{name}` of [data] must name `photos` and `test_photos`, or recorded `pairs`.")
+    if recipe.photos and any(lies_in(*pair) for pair in permutations((recipe.photos, recipe.test_photos))):
+        raise ParameterError(
+            f"`photos` ({recipe.photos}) and `test_photos` ({recipe.test_photos}) of [data.{name}] must be two folders "
+            "that share no photograph, and neither may lie in the other: the test must be new to the networks."
+        )
     if recipe.trained_on and recipe.trained_on not in names:
         raise UnknownNameError("data set of this recipe", recipe.trained_on, names)
     if recipe.pairs and not (recipe.trained_on or recipe.split):

@@ -24,6 +24,7 @@ from mwdn.data.photographs import Photographs
 from mwdn.evaluation import Perceptual
 from mwdn.evaluation.alexnet import SMALLEST, load_alexnet
 from mwdn.io.files import refuse_foreign, write_text
+from mwdn.io.listing import refuse_within
 from mwdn.runtime.distributed import local_device
 from mwdn.training.losses import NEED_ALEXNET
 from mwdn.training.recipe import Schedule
@@ -106,6 +107,8 @@ def run(
     refuse_foreign(out, (PAGE, "benchmark.md", "benchmark.json", "benchmark.csv"), MARK)
     if NEED_ALEXNET & benchmark.loss.keys():
         load_alexnet(benchmark.alexnet or None, download=lpips is True)  # an error now instead of after the data
+    for photos in {folder for each in benchmark.data.values() for folder in (each.photos, each.test_photos) if folder}:
+        refuse_within(photos, out)
     with lock(out, "data"):
         datasets = {
             name: open_dataset(name, recipe, out / "data", torch_device, watch.track)

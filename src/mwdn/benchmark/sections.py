@@ -48,9 +48,9 @@ def _glance(results: Results) -> list[Block]:
             escape(label), *(_bold(f"{mean[label]:.2f}", mean[label] == max(mean.values())) for mean in means)
         )
     return [
-        f"{learned} networks, each trained for {length} of {schedule.batch} on the same pairs, and "
-        f"{len(benchmark.methods) - learned} methods without training, scored under one protocol on "
-        f"{len(results.datasets)} data sets. Scores on different data sets are not comparable.",
+        f"Networks: {learned}, each trained for {length} of {schedule.batch} on the same pairs. Methods without "
+        f"training: {len(benchmark.methods) - learned}. Data sets: {len(results.datasets)}, scored under one protocol; "
+        "scores on different ones are not comparable.",
         table,
     ]
 

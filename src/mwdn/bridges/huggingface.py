@@ -10,11 +10,11 @@ from torch import nn
 from mwdn.errors import CheckpointError, checked
 from mwdn.io.files import as_parameter_error, atomic, refuse_foreign, write_json, write_text
 from mwdn.io.reading import read_json
-from mwdn.weights.bundled import find_weights, load_network
+from mwdn.weights.bundled import WEIGHTS, find_weights, load_network
 from mwdn.weights.checkpoint import load_checkpoint, read_metadata
 
-CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
-"""Files of a folder."""
+CONFIG, CARD = "config.json", "README.md"
+"""Files of a folder, beside the weights."""
 
 _LIBRARY = "mwdn"
 _TAGS = ["lensless-imaging", "computational-imaging", "deconvolution", "image-reconstruction"]

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -24,6 +24,7 @@ from mwdn.evaluation.alexnet import SMALLEST
 from mwdn.evaluation.evaluate import Pairs
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import check_folder, refuse_foreign, refuse_overwrite
+from mwdn.weights.bundled import WEIGHTS
 from mwdn.weights.checkpoint import read_metadata
 
 
@@ -129,17 +130,23 @@ def _division(split: str, methods: Iterable[str]) -> Division:
 
 def _trained_with(method: str) -> Division | None:
     """The division of the pairs that a checkpoint was trained with; ``None`` for other methods."""
-    if not (method.endswith(".safetensors") and Path(method).is_file()):
+    if (metadata := _metadata(method)) is None:
         return None
-    table = read_metadata(method).get("recipe", {}).get("pairs", {})
+    table = metadata.get("recipe", {}).get("pairs", {})
     known = {name: table[name] for name in ("split", "seed", "folds", "fold") if name in table}
     return Division(fractions=tuple(table.get("fractions", Division.fractions)), **known)
 
 
+def _metadata(method: str) -> dict[str, Any] | None:
+    """Metadata of a checkpoint, or of a folder of `mwdn.bridges.save_pretrained`; ``None`` for other methods."""
+    file = Path(method) if method.endswith(".safetensors") else Path(method) / WEIGHTS
+    return read_metadata(file) if file.is_file() else None
+
+
 def _learned(method: str, file: PairFile, rows: range | list[int]) -> str | None:
     """A warning if a checkpoint was trained on pairs that it is evaluated on, otherwise ``None``."""
-    division = _trained_with(method)
-    if division is None or not str(read_metadata(method).get("pairs", "")).endswith(f" of {len(file):,} recorded"):
+    division, metadata = _trained_with(method), _metadata(method) or {}
+    if division is None or not str(metadata.get("pairs", "")).endswith(f" of {len(file):,} recorded"):
         return None
     parts = division.parts(len(file))
     known = len({*parts["train"]} & {*rows})

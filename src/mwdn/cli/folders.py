@@ -1,9 +1,8 @@
 """Commands that fail early leave no empty folder behind."""
 
 import os
-import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import wraps
 from inspect import signature
 from pathlib import Path
@@ -35,4 +34,15 @@ def _removed_if_empty(folder: Path) -> Iterator[None]:
     finally:
         for path in made if os.environ.get("RANK", "0") == "0" else ():  # one of several processes
             if path.is_dir() and not any(file.is_file() and file.suffix != ".lock" for file in path.rglob("*")):
-                shutil.rmtree(path, ignore_errors=True)
+                _remove(path)
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder of locks and folders; no other file, which another process may have written meanwhile."""
+    with suppress(OSError):
+        for path in sorted(folder.rglob("*"), reverse=True):
+            if path.is_dir():
+                path.rmdir()
+            elif path.suffix == ".lock":
+                path.unlink()
+        folder.rmdir()

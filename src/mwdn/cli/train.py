@@ -137,7 +137,7 @@ def _train(trainer: Trainer, progress: Progressing, board: TensorBoard | None) -
         if board is not None:
             board(report)
 
-    if trainer.task.cache is None:
+    if trainer.task.cache is None and not trainer.finished:
         start_training()
     trainer.run(show_step, samples=show_samples)
 

@@ -145,6 +145,9 @@ def perturb(psf: Psf, mismatch: Mismatch, generators: list[torch.Generator]) -> 
         psf: (B, C, H, W) of unit sum.
         mismatch: largest magnitudes.
         generators: one per sample.
+
+    Raises:
+        ParameterError: ``shift_px`` is more than a quarter of the PSF's shorter side.
     """
     if mismatch == EXACT:
         return psf

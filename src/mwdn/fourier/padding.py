@@ -24,6 +24,14 @@ def pad(image: Image, grid: Size, boundary: Boundary) -> Tensor:
 
     On a periodic grid "after the last" is also "before the first": the first half of the new pixels continues the
     far border, the second half the near one.
+
+    Args:
+        image: (B, C, H, W).
+        grid: (height, width), at least (H, W).
+        boundary: values of the new pixels, see `Boundary`; ``circular`` returns the image as it is.
+
+    Raises:
+        ShapeError, ParameterError: as for `check_grid`.
     """
     size = image.shape[-2], image.shape[-1]
     check_grid(size, grid, boundary)

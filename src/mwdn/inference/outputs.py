@@ -41,13 +41,13 @@ def check_outputs(
             captures, or in one that holds none of this package; an output is a symbolic link, or ``out`` is a file.
     """
     if out.exists() and not out.is_dir():
-        raise ParameterError(f"`{out}` must be a folder, but is a file. Choose another one: `--out`.")
+        raise ParameterError(f"`{out}` must be a folder, but is a file. Choose another one: `out`.")
     real = path_resolver()
     inputs = {real(str(path)) for path in (*captures, *protected) if path is not None}
 
     def check(output: str) -> None:
         if real(output) in inputs:
-            raise ParameterError(f"`{output}` would overwrite an input. Choose another folder: `--out`.")
+            raise ParameterError(f"`{output}` would overwrite an input. Choose another folder: `out`.")
         if output in links:
             raise ParameterError(f"`{output}` is a link to `{links[output]}`. Choose another folder: `out`.")
 
@@ -59,7 +59,7 @@ def check_outputs(
 
     def refuse(foreign: str) -> None:
         raise ParameterError(
-            f"`{start}{foreign}` was not written by mwdn and would be lost. Choose another folder: `--out`."
+            f"`{start}{foreign}` was not written by mwdn and would be lost. Choose another folder: `out`."
         )
 
     links = {str(path): path.readlink() for path in paths if path.is_symlink()}
@@ -82,7 +82,7 @@ def check_outputs(
         if name in sources:
             raise ParameterError(
                 f"`{capture}` and {sources[name]} would both be written to `{start}{name}`. Name one of them, "
-                f"such as `*{Path(capture).suffix}`, or reconstruct them into two folders: `--out`."
+                f"such as `*{Path(capture).suffix}`, or reconstruct them into two folders: `out`."
             )
         sources[name] = f"`{capture}`"
     _check_maps(sources, existing, start, format)
@@ -99,7 +99,7 @@ def _check_maps(sources: Mapping[str, str], existing: Set[str], start: str, form
         if name == of + _SUPPORT and (other := sources.get(of + _SUFFIX[format])):
             raise ParameterError(
                 f"The picture of {source} and the support map of {other} would both be written to `{start}{name}`. "
-                "Rename one of them, or reconstruct them into two folders: `--out`."
+                "Rename one of them, or reconstruct them into two folders: `out`."
             )
         is_map = name == of + _SUPPORT and f"{of}.json" in existing
         has_map = {stem + _SUPPORT, f"{stem}.support.json"} <= existing  # by its sidecar it is a picture
@@ -107,7 +107,7 @@ def _check_maps(sources: Mapping[str, str], existing: Set[str], start: str, form
             kind, lost = ("picture", stem + _SUPPORT) if has_map else ("support map", name)
             raise ParameterError(
                 f"`{start}{lost}` is the {kind} of another capture, and {source} would replace or remove it. Choose "
-                "another folder: `--out`."
+                "another folder: `out`."
             )
 
 

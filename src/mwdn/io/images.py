@@ -225,14 +225,17 @@ def _float_frame(path: Path, image: Tensor | FloatFrame, *suffixes: str) -> Floa
     """(H, W, C) float32 numbers of an image, after checks of its shape and of the suffix of ``path``."""
     if path.suffix.lower() not in suffixes:
         raise ImageError(f"`{path}` must end in {' or '.join(suffixes)}, not '{path.suffix}'. Rename it.")
+    got = f"{' x '.join(map(str, image.shape))}, {image.dtype}" if hasattr(image, "shape") else type(image).__name__
     if not isinstance(image, Tensor):
         image = torch.from_numpy(as_frame(image).copy()).movedim(-1, 0)  # flipped and read-only arrays, too
     picture = image[0] if image.ndim == 4 and len(image) == 1 else image
     fits = picture.ndim == 3 and len(picture) in (1, 3) and picture.numel() > 0
     if not (fits and picture.is_floating_point()):
-        got = f"{' x '.join(map(str, image.shape))}, {image.dtype}"
         wanted = "a tensor (C, H, W) or (1, C, H, W) or an array (H, W, C), floats of 1 or 3 channels"
-        raise ImageError(f"`image` ({got}) must be {wanted} for `{path}`. Pick one of a batch; divide integers.")
+        raise ImageError(
+            f"`image` ({got}) must be {wanted} for `{path}`: linear light, 1 is white. Pick one of a batch; divide "
+            "integers by their maximum, and decode sRGB by `mwdn.io.images.srgb_decode`."
+        )
     picture = picture.detach().to("cpu", torch.float32)
     if not torch.isfinite(picture).all():
         raise ImageError(f"`image` holds NaN or infinity: `{path}` is not written. Use `torch.nan_to_num`.")

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from mwdn.errors import one_line
+from mwdn.errors import ParameterError, one_line
 from mwdn.io.images import READABLE
 from mwdn.io.raw import RAW
 
@@ -55,6 +55,24 @@ def pictures_in(folder: Path, *, subfolders: bool = True) -> list[Path]:
     """The readable pictures of a folder, in alphabetical order; hidden files are left out."""
     found = folder.rglob("*") if subfolders else folder.iterdir()
     return sorted(path for path in found if path.suffix.lower() in READABLE and path.name[0] != "." and path.is_file())
+
+
+def lies_in(path: str | Path, folder: str | Path) -> bool:
+    """Whether a path is a folder, or lies in it."""
+    return Path(path).resolve().is_relative_to(Path(folder).resolve())
+
+
+def refuse_within(photos: str | Path, out: Path) -> None:
+    """Refuse an output folder in a folder of photographs, where the pictures of the run would become photographs.
+
+    Raises:
+        ParameterError: it lies there.
+    """
+    if Path(photos).is_dir() and lies_in(out, photos):
+        raise ParameterError(
+            f"`{out}` lies in the folder of photographs `{photos}`, in which all pictures are photographs. Choose a "
+            "folder beside it: `out`."
+        )
 
 
 def unused_photographs(folder: Path) -> list[str]:

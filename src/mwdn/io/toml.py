@@ -5,10 +5,12 @@ import json
 import math
 import tomllib
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_type_hints
 
-from mwdn.errors import ParameterError, UnknownNameError, reason, shown
+from mwdn.errors import MwdnError, ParameterError, UnknownNameError, reason, shown, type_in_words
 from mwdn.io.reading import read_text
 
 T = TypeVar("T")
@@ -99,16 +101,21 @@ def to_dataclass(cls: type[T], name: str, table: dict[str, Any]) -> T:
         if key not in defaults:
             raise UnknownNameError(f"key of [{name}]", key, defaults)
         if not _same_type(_as_tuple(value), defaults[key]):
-            example = json.dumps(defaults[key])
-            is_switch = isinstance(defaults[key], bool)
-            wanted = "true or false" if is_switch else f"of the same kind as its default, {example}"
-            raise ParameterError(f"`{key}` of [{name}] ({shown(value)}) must be {wanted}.")
-    try:
+            wanted, example = type_in_words(get_type_hints(cls)[key]), json.dumps(defaults[key])
+            raise ParameterError(f"`{key}` of [{name}] ({shown(value)}) must be {wanted}; the default is {example}.")
+    with named_table(name):
         for key, value in table.items():
             check_numbers(value, key)  # whole numbers first: a float cannot hold one of 400 digits
             check_numbers(_as_float(_as_tuple(value), defaults[key]), key)
         return cls(**{key: _as_float(_as_tuple(value), defaults[key]) for key, value in table.items()})
-    except ParameterError as error:
+
+
+@contextmanager
+def named_table(name: str) -> Iterator[None]:
+    """Begin the error of a value with the table that holds it."""
+    try:
+        yield
+    except MwdnError as error:
         error.args = (f"[{name}]: {error}",)
         raise
 

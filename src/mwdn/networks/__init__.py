@@ -61,7 +61,7 @@ def build(name: str, **options: Any) -> nn.Module:  # noqa: ANN401
 
     Raises:
         UnknownNameError: no such network, or it has no such option.
-        ParameterError: ``name`` is a solver, ``width`` is below 1, or an option is of another type.
+        ParameterError: ``name`` is a solver, ``width`` or ``channels`` is below 1, or an option is of another type.
     """
     kind = DENOISERS.get(name) or NETWORKS.get(name)
     if kind is None and name in SOLVERS:
@@ -69,8 +69,9 @@ def build(name: str, **options: Any) -> nn.Module:  # noqa: ANN401
     if kind is None:
         raise UnknownNameError("network", name, NETWORKS)
     check_options(kind, f"the network '{name}'", options)
-    if options.get("width", 1) < 1:
-        raise ParameterError(f"`width` ({options['width']}) must be at least 1.")
+    for size in ("width", "channels"):
+        if options.get(size, 1) < 1:
+            raise ParameterError(f"`{size}` ({options[size]}) must be at least 1.")
     # JSON and TOML have lists, not tuples.
     network = kind(**{key: tuple(v) if isinstance(v, list) else v for key, v in options.items()})
     return network.float()  # also where `torch.set_default_dtype` says otherwise

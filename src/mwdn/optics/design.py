@@ -122,6 +122,11 @@ class Designed:
 def design_camera(name: str, design: MaskDesign, setup: Setup) -> Designed:
     """Compute a mask and its PSF.
 
+    Args:
+        name: of the mask, such as ``contour``; recorded in ``camera.json``.
+        design: parameters of this kind of mask.
+        setup: the camera: distances, pitch, wavelengths, size of the sensor.
+
     Raises:
         ParameterError: a parameter is invalid for this mask or camera.
     """

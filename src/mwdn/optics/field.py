@@ -78,7 +78,15 @@ class Aberration:
 
 
 def field_psfs(psf: Psf, grid: Size, aberration: Aberration) -> FieldPsfs:
-    """PSFs (rows, columns, C, h, w) at the points of a grid, for a camera with this PSF on its axis.
+    """PSFs at the points of a grid, for a camera with this PSF on its axis.
+
+    Args:
+        psf: (1, C, h, w), centred.
+        grid: rows and columns of points, evenly from border to border of the scene; one point lies at its middle.
+        aberration: change of the PSF off the axis.
+
+    Returns:
+        (rows, columns, C, h, w); a sum falls by the vignetting, and by the light outside the frame.
 
     Raises:
         ParameterError: the grid has no points.

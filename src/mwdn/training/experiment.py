@@ -23,6 +23,7 @@ from mwdn.data.recorded import HELD_OUT, record, recorded_pairs
 from mwdn.data.simulated import Samples, SimulatedPairs
 from mwdn.data.unpaired import UnpairedCaptures
 from mwdn.errors import CheckpointError, ParameterError, checked
+from mwdn.io.listing import refuse_within
 from mwdn.networks.empty import build_empty
 from mwdn.optics.sensor import Sensor
 from mwdn.runtime import distributed
@@ -128,6 +129,7 @@ def prepare(
     elif pairs is not None:
         data = recorded_pairs_of(recipe, pairs, psf, refinement=calibration.refinement)
     elif photos is not None:
+        refuse_within(photos, out)
         data = simulated_captures(recipe, photos, psf, is_grey=calibration.frames.grey)
     recipe = _in_steps(recipe, data)
     stored = stored_psf(recipe, calibration, place)
@@ -139,7 +141,7 @@ def prepare(
         kind = "pairs" if pairs else "photographs"
         raise CheckpointError(
             f"`{out}` holds a run of the same recipe on other {kind} than those of `{pairs or photos}`. "
-            "Choose another folder, `--out`, or remove it."
+            "Choose another folder, `out`, or remove it."
         )
     return trainer
 
@@ -169,7 +171,7 @@ def recorded_pairs_of(recipe: Recipe, pairs: Path, psf: Psf, *, refinement: Refi
     if recipe.cameras.sizes:
         raise ParameterError("Recorded pairs, `--pairs`, are of one camera: leave [cameras] out of the recipe.")
     if recipe.denoising.levels[1]:
-        raise ParameterError("[denoising] makes its own pairs from photographs: give `--photos`, not `--pairs`.")
+        raise ParameterError("[denoising] makes its own pairs from photographs: give `photos`, not `pairs`.")
     seed = recipe.schedule.seed
     training, validation = recorded_pairs(pairs, psf, recipe.pairs, seed=seed, device=psf.device, refinement=refinement)
     _check_colours(recipe, training.file.measurement_shape[2], f"`{pairs}`")
@@ -191,16 +193,16 @@ def _check_one_source(recipe: Recipe, photos: Path | None, pairs: Path | None) -
     if recipe.selfsupervised.consistency:
         if photos is not None or pairs is not None or not recipe.sheet.captures:
             raise ParameterError(
-                "A recipe with [selfsupervised] learns from captures alone: give `--captures FOLDER`, and neither "
-                "`--photos` nor `--pairs`."
+                "A recipe with [selfsupervised] learns from captures alone: give `captures` of [sheet], and neither "
+                "`photos` nor `pairs`."
             )
     elif photos is None and pairs is None:
         raise ParameterError(
-            "Give photographs to learn from, `--photos FOLDER`, or pairs, `--pairs FILE`. "
+            "Give photographs to learn from, `photos`, or recorded pairs, `pairs`. "
             "To learn from captures alone: `mwdn train selfsupervised --captures FOLDER`."
         )
     elif photos is not None and pairs is not None:
-        raise ParameterError(f"`--photos` ({photos}) and `--pairs` ({pairs}) exclude each other. Leave one out.")
+        raise ParameterError(f"Photographs (`{photos}`) and pairs (`{pairs}`) exclude each other. Leave one out.")
 
 
 def _read_captures(

@@ -86,10 +86,12 @@ class Loss(nn.Module):
 def checked_weights(weights: Mapping[str, Any]) -> dict[str, float]:
     """Check the weights of a `Loss`; raises its errors."""
     if not weights:
-        raise ParameterError(f'`weights` must name at least one of {", ".join(NAMES)}, for example {{"mse": 1.0}}.')
+        raise ParameterError(f"The loss must name at least one of {', '.join(NAMES)}, for example `mse = 1.0`.")
     for name, weight in weights.items():
         if name not in NAMES:
             raise UnknownNameError("loss", name, NAMES)
         if not (isinstance(weight, int | float) and 0 <= weight < 2**63):
             raise ParameterError(f"The weight of `{name}` ({shown(weight)}) must be finite and not negative.")
+    if not any(weights.values()):
+        raise ParameterError(f"The loss ({', '.join(weights)}) must have a weight above 0, for example `mse = 1.0`.")
     return {name: float(weight) for name, weight in weights.items()}

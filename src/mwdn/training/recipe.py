@@ -12,8 +12,8 @@ from mwdn.data.noisy import Denoising
 from mwdn.data.recorded import Division
 from mwdn.data.simulated import Placement
 from mwdn.data.unpaired import SelfSupervised
-from mwdn.errors import MwdnError, ParameterError, UnknownNameError, checked
-from mwdn.io.toml import current_names, find_recipe, read_toml, to_dataclass
+from mwdn.errors import ParameterError, UnknownNameError, checked
+from mwdn.io.toml import current_names, find_recipe, named_table, read_toml, to_dataclass
 from mwdn.networks import DENOISERS
 from mwdn.networks.empty import build_empty
 from mwdn.optics.sensor import Sensor
@@ -254,7 +254,8 @@ def read_recipe(path: str | Path | None, **changes: Any) -> Recipe:  # noqa: ANN
             raise ParameterError(f'`{path}` must name a network: [network] name = "mwdn".')
         _check_network(content["network"])
     for table in {"loss", "later_loss"} & content.keys():
-        content[table] = checked_weights(content[table])
+        with named_table(table):
+            content[table] = checked_weights(content[table])
     tables = {name: to_dataclass(TABLES[name], name, table) for name, table in content.items() if name in TABLES}
     recipe = Recipe(**(content | tables))
     folder = Path() if "captures" in replaced.get("sheet", {}) else Path(path or "").parent
@@ -287,8 +288,7 @@ def _by_table(changes: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 def _check_network(network: dict[str, Any]) -> None:
     """Build the network without memory, to find a mistake before a thousand photographs are read."""
-    try:
-        build_empty(**network)
-    except MwdnError as error:
-        error.args = (f"[network]: {error}",)
-        raise
+    with named_table("network"):
+        channels = getattr(build_empty(**network), "channels", 3)
+        if channels not in (0, 1, 3):  # 0: any, `wiener`
+            raise ParameterError(f"`channels` ({channels}) must be 1 (grey) or 3 (RGB), as captures have.")

@@ -111,7 +111,7 @@ class RunFolder:
         if not recipe.exists():
             raise CheckpointError(
                 f"`{self.path}` holds weights, but no recipe.json that says of which run. Choose another folder, "
-                "`--out`, or remove it."
+                "`out`, or remove it."
             )
         return read_bytes(recipe, most=TEXT_BYTES, error=CheckpointError)
 
@@ -123,7 +123,7 @@ class RunFolder:
         if difference:
             raise CheckpointError(
                 f"`{self.path}` holds a run of another recipe or PSF, or on other pairs: {difference}. "
-                "Choose another folder, `--out`, or remove it."
+                "Choose another folder, `out`, or remove it."
             )
 
     @contextmanager
@@ -149,7 +149,7 @@ class RunFolder:
                     fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except BlockingIOError as error:
                     raise ParameterError(
-                        f"Another run is using `{self.path}`. Wait for its end, or choose another folder: `--out`."
+                        f"Another run is using `{self.path}`. Wait for its end, or choose another folder: `out`."
                     ) from error
             yield
         finally:

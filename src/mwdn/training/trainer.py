@@ -235,7 +235,7 @@ class Trainer:
         last = self.folder.weights("last")
         kept = f' The weights of the last validation are kept: `start = "{last}"`.' if last.exists() else ""
         return DivergenceError(
-            f"The loss of {where} is not finite. Lower the learning rate and choose another folder, `--out`.{kept}"
+            f"The loss of {where} is not finite. Lower the learning rate and choose another folder, `out`.{kept}"
         )
 
     def validate(self) -> Validation:

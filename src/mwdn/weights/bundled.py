@@ -20,6 +20,9 @@ BUNDLED = {
 HUB = "hub:"
 """Prefix: ``hub:owner/name`` is model.safetensors of that repository, ``hub:owner/name/file`` another file."""
 
+WEIGHTS = "model.safetensors"
+"""Checkpoint in a folder of `mwdn.bridges.save_pretrained`, or in a repository on the hub."""
+
 _FOLDER = Path(str(files("mwdn") / "weights"))
 
 
@@ -36,7 +39,7 @@ def find_weights(name: str) -> Path | None:
     """
     if name in BUNDLED:
         return bundled_file(name)
-    if (path := Path(name) / "model.safetensors").is_file():
+    if (path := Path(name) / WEIGHTS).is_file():
         return path
     return _download(name) if name.startswith(HUB) else None
 
@@ -64,7 +67,7 @@ def _download(name: str) -> Path:
     from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
 
     try:
-        return Path(hf_hub_download(f"{owner}/{repository}", file or "model.safetensors"))
+        return Path(hf_hub_download(f"{owner}/{repository}", file or WEIGHTS))
     except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError, OSError, ValueError) as error:
         raise CheckpointError(
             f"`{name}` cannot be fetched from the hub: {reason(error)}. Check the name and the network, or "

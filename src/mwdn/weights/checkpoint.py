@@ -13,7 +13,7 @@ from mwdn.io.files import atomic
 from mwdn.networks.empty import build_empty
 from mwdn.version import __version__
 from mwdn.weights.authors import is_authors, load_authors
-from mwdn.weights.tensors import Header, check_shapes, fill, read_header, read_tensors
+from mwdn.weights.tensors import Header, check_shapes, fill, is_safetensors, read_header, read_tensors
 from mwdn.weights.torch_file import read_plain
 
 SUFFIXES = frozenset({".safetensors", ".pt", ".pth", ".tar", ".ckpt"})
@@ -80,7 +80,7 @@ def load_checkpoint(path: str | Path) -> nn.Module:
     memory than its tensors is refused before any is allocated.
 
     Args:
-        path: a checkpoint of this package (``.safetensors``), or of the MWDN authors (``.tar`` and the like, read
+        path: a checkpoint of this package, or of the MWDN authors (``.tar`` and the like, read
             without unpickling code).
 
     Raises:
@@ -89,7 +89,7 @@ def load_checkpoint(path: str | Path) -> nn.Module:
     path = Path(path)
     if not path.is_file():
         raise CheckpointError(f"No checkpoint at `{path}`. Check the name; the current folder is `{Path.cwd()}`.")
-    if path.suffix != ".safetensors":
+    if not (path.suffix == ".safetensors" or is_safetensors(path)):
         return _load_foreign(path)
     header = read_header(path)
     metadata = _metadata(path, header)

@@ -55,6 +55,17 @@ class Header:
     entries: dict[str, Entry]
 
 
+def is_safetensors(path: Path) -> bool:
+    """Whether a file begins like safetensors: with the length of a table in JSON, and the table.
+
+    Raises:
+        CheckpointError: no regular file.
+    """
+    with open_regular(path, CheckpointError) as file:
+        start = file.read(9)
+    return start[8:] == b"{" and int.from_bytes(start[:8], "little") <= HEADER_BYTES
+
+
 def read_header(path: Path) -> Header:
     """Read and check the header of a file.
 
