@@ -74,6 +74,8 @@ def test_distances_of_arrays_are_those_of_tensors(distance):
     assert isinstance(result, float)
     assert result == pytest.approx(expected, rel=1e-6)
     assert distance(Image.fromarray(eight(PICTURE)), eight(other)) == pytest.approx(expected, rel=0.02, abs=1e-3)
+    with pytest.raises(ParameterError, match=r"floats up to .* must have 1 as white"):
+        distance(Image.fromarray(eight(PICTURE)[..., 0]).convert("F"), eight(other)[..., 0])
     assert distance(PICTURE[..., 0], other[..., 0]) == pytest.approx(
         distance(PICTURE[..., :1], other[..., :1]), rel=1e-6
     )

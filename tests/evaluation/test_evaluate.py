@@ -246,6 +246,8 @@ def test_command(common, tmp_path, capsys):
     assert (content["pictures"], content["protocol"], content["variant"]) == (2, "2:38,4:40", "best-gain")
     assert run("evaluate", *common) == 2
     assert run("evaluate", "wiener", *common, "--protocol", "centre") == 2
+    assert run("evaluate", "wiener", *common, "--protocol", "0:5,0:5") == 2
+    assert "`--protocol` (0:5,0:5) must leave at least 11 x 11 pixels" in capsys.readouterr().err
     assert run("evaluate", "winer", *common) == 2
 
 

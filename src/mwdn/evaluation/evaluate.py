@@ -13,8 +13,9 @@ import torch
 from torch import nn
 
 from mwdn.data.pairs import refuse_non_finite
-from mwdn.errors import ParameterError
+from mwdn.errors import ParameterError, ShapeError
 from mwdn.evaluation.alexnet import SMALLEST
+from mwdn.evaluation.distances import WINDOW
 from mwdn.evaluation.metrics import METRICS, Perceptual, Protocol, Variant, measure
 from mwdn.evaluation.report import Report, Scores
 from mwdn.types import Measurement, Scene
@@ -82,12 +83,16 @@ def evaluate(
 
     Raises:
         ParameterError: no method, no pair, or NaN or infinity in a pair.
-        ShapeError: a reconstruction and its scene differ in shape, or the protocol's part exceeds them.
+        ShapeError: a reconstruction and its scene differ in shape, or the protocol's part exceeds them, or is too
+            small for SSIM.
     """
     if not methods:
         raise ParameterError("`methods` must not be empty. Name one: admm, wiener, universal, or a checkpoint.")
     _check_pairs(pairs)
-    if min(protocol.crop(pairs[0][1][None]).shape[-2:]) < SMALLEST:
+    side = min(protocol.crop(pairs[0][1][None]).shape[-2:])
+    if side < WINDOW:
+        raise ShapeError(f"`protocol` ({protocol.name}) must leave at least {WINDOW} x {WINDOW} pixels, for SSIM.")
+    if side < SMALLEST:
         perceptual = Perceptual.none(f"the part {protocol.name} has less than {SMALLEST} pixels a side, for AlexNet")
     perceptual = perceptual or Perceptual.load()
     first = [pairs[i] for i in range(min(shown, len(pairs)))]
