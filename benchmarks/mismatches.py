@@ -22,7 +22,7 @@ from mwdn.io.files import write_json
 from universal import PSFS, camera, captures, recipe_of
 
 LEFT_OUT = (
-    *("", "turn_degrees", "scale", "blur_px", "background", "envelope_shift", "aperture_gain", "tails", "off_axis"),
+    *("", "turn_degrees", "scale", "blur_px", "haze", "envelope_shift", "aperture_gain", "tails", "off_axis"),
     *("depth", "vignetting", "tilt", "room_light", "hot_pixels", "gamma_coded"),
 )
 

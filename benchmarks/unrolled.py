@@ -62,7 +62,7 @@ def recipes(network):
     mild, real = read_recipe(RECIPES[network]), read_recipe("real-like")
     left = replace(real.mismatch, hot_pixels=0.0, grain=0.1, exact=0.0)
     if network == "universal":
-        left = replace(left, turn_degrees=0.06, scale=0.002, envelope_shift=0.008, background=0.05, room_light=0.05)
+        left = replace(left, turn_degrees=0.06, scale=0.002, envelope_shift=0.008, haze=0.05, room_light=0.05)
     fitted = replace(mild.mismatch, exact=0.6)
     return {
         "calibrated": (replace(mild.placement, exposure=(0.04, 1.0)), fitted),

@@ -2,7 +2,7 @@
 
     mwdn benchmark benchmark-quarter --out runs/quarter --seed 3
     mwdn recipes benchmark-quarter |
-        sed 's/bin = 4/&, deviation = { turn_degrees = 0, background = 0, off_axis = 0 }/' > exact.toml
+        sed 's/bin = 4/&, deviation = { turn_degrees = 0, haze = 0, off_axis = 0 }/' > exact.toml
     mwdn benchmark exact.toml --out runs/exact --seed 3
     python docs/claims.py runs/quarter [--exact runs/exact] [--captures ../shared/data/mwdn-camera/real-objects]
                                        [--recipe benchmark-quarter] [--record FILE] [--out docs]

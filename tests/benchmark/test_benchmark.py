@@ -300,6 +300,17 @@ def test_mistakes_of_a_recipe(tmp_path, before, after, kind, message):
         read_benchmark(tmp_path / "r.toml")
 
 
+def test_a_renamed_key_still_works_and_warns(tmp_path):
+    def read(text):
+        (tmp_path / "r.toml").write_text(RECIPE.replace("off_axis = 1 }", f"off_axis = 1, {text} = 0.2 }}"))
+        return read_benchmark(tmp_path / "r.toml")
+
+    new = read("haze")
+    with pytest.warns(FutureWarning, match=r"`background` of .* is now called `haze`"):
+        assert read("background") == new
+    assert new.data["caustic"].deviation.haze == 0.2
+
+
 def test_epochs_are_steps_of_each_data_set(tmp_path):
     """Five pairs are three steps of two; a source without end has no epochs."""
     plateau = "epochs = 4, lr_schedule = 'plateau', clip = 0.0"

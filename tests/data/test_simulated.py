@@ -434,8 +434,8 @@ def test_blur_has_the_drawn_variance():
     assert seen > 3
 
 
-def test_background_is_even_and_part_of_the_sum():
-    found = perturb(delta(16, 20).expand(30, -1, -1, -1), replace(EXACT, background=0.2), generators(30))
+def test_haze_is_even_and_part_of_the_sum():
+    found = perturb(delta(16, 20).expand(30, -1, -1, -1), replace(EXACT, haze=0.2), generators(30))
     level = found[..., 0, 0] * 16 * 20
     assert (level[:, 0] == level[:, 2]).all()
     assert 0 <= level.min() < 0.03 < 0.17 < level.max() < 0.2

@@ -44,8 +44,8 @@ def test_scale_moves_points_outwards():
     assert psf.sum() == pytest.approx(1.0, abs=1e-4)
 
 
-def test_background_is_even_and_keeps_the_light():
-    camera = Deviation(background=0.25).camera(point(SIZE, 20, 24))
+def test_haze_is_even_and_keeps_the_light():
+    camera = Deviation(haze=0.25).camera(point(SIZE, 20, 24))
     psf = camera.psf_at(3, 3)[0, 0]
     assert psf.sum() == pytest.approx(1.0, abs=1e-4)
     assert psf[0, 0] == pytest.approx(0.25 / (40 * 48), rel=1e-3)
@@ -73,7 +73,7 @@ def test_plus_changes_one_number():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"background": 1.0}, {"background": -0.1}, {"scale": -1.0}, {"off_axis": -1.0}, {"off_axis": 4.0}]
+    "wrong", [{"haze": 1.0}, {"haze": -0.1}, {"scale": -1.0}, {"off_axis": -1.0}, {"off_axis": 4.0}]
 )
 def test_what_no_camera_can_have(wrong):
     with pytest.raises(ParameterError, match="must"):

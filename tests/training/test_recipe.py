@@ -180,7 +180,7 @@ def test_mistyped_names_get_the_nearest(read, text, said):
         (NETWORK + "[placement]\naspect = 0.5", "`aspect` (0.5) must be at least 1"),
         (NETWORK + "[placement]\noffset = 1.5", "`offset` (1.5) must be in [0, 1]"),
         (NETWORK + "[mismatch]\nshift_px = -1", "`shift_px` (-1.0) must not be negative"),
-        (NETWORK + "[mismatch]\nbackground = 1", "`background` (1.0) must be below 1"),
+        (NETWORK + "[mismatch]\nhaze = 1", "`haze` (1.0) must be below 1"),
         (NETWORK + "[sensor]\nbit_depth = 99", "`bit_depth` (99) must be 1 to 16."),
         (NETWORK + "[loss]\nmse = -1", "The weight of `mse` (-1) must be finite and not negative"),
         (NETWORK + '[loss]\nmse = "much"', "The weight of `mse` ('much') must be finite and not negative"),

@@ -97,7 +97,7 @@ class DatasetRecipe:
 _PAPER = DatasetRecipe(protocol="centre-128")
 _DIFFUSERCAM = DatasetRecipe(background=0.0, upside_down=True, bgr=True, protocol="60:270,60:440")
 _PHLATCAM = DatasetRecipe(background=0.0)
-_REAL = Deviation(turn_degrees=0.5, background=0.1, off_axis=1.0)
+_REAL = Deviation(turn_degrees=0.5, haze=0.1, off_axis=1.0)
 
 PRESETS: dict[str, DatasetRecipe] = {
     # The display fills 137 of 320 pixels and lies 2.5 off the centre; 91.5 are free on each side (0.027 of them).

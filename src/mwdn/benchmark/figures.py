@@ -29,7 +29,7 @@ LABELS = {
     "shift_px": "shift of the PSF / px along each axis",
     "turn_degrees": "rotation of the PSF / degrees",
     "scale": "magnification of the PSF",
-    "background": "haze / light of the PSF",
+    "haze": "haze / light of the PSF",
     "off_axis": "off-axis variation (1: in front of a display)",
 }
 

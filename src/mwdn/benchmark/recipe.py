@@ -13,7 +13,7 @@ from mwdn.benchmark.methods import MEAN, Method, check_name, read_methods, scale
 from mwdn.calibration.camera_file import read_camera
 from mwdn.errors import ParameterError, UnknownNameError, shown
 from mwdn.io.listing import lies_in
-from mwdn.io.toml import find_recipe, read_toml, to_dataclass
+from mwdn.io.toml import current_names, find_recipe, read_toml, to_dataclass
 from mwdn.networks import NETWORKS
 from mwdn.optics import Deviation
 from mwdn.solvers import SOLVERS
@@ -157,8 +157,9 @@ def _dataset_recipe(name: str, table: dict[str, Any], folder: Path) -> DatasetRe
     nested = {f.name: getattr(preset, f.name) for f in fields(DatasetRecipe) if is_dataclass(f.default)}
     changes: dict[str, Any] = {}
     for key in nested.keys() & table.keys():
-        filled = to_dataclass(type(nested[key]), f"data.{name}.{key}", table[key])
-        changes[key] = replace(nested[key], **{part: getattr(filled, part) for part in table[key]})
+        given = current_names(type(nested[key]), f"data.{name}.{key}", table[key])
+        filled = to_dataclass(type(nested[key]), f"data.{name}.{key}", given)
+        changes[key] = replace(nested[key], **{part: getattr(filled, part) for part in given})
     plain = to_dataclass(
         DatasetRecipe, f"data.{name}", {key: value for key, value in table.items() if key not in changes}
     )
@@ -194,7 +195,7 @@ def _absolute(text: str, folder: Path) -> str:
 
 
 def _robustness(table: dict[str, Any]) -> Robustness:
-    sizes = {}
+    sizes, table = {}, current_names(Deviation, "robustness", table)
     for axis in table.keys() & AXES.keys():
         values = table[axis]
         if not (isinstance(values, list) and values and all(isinstance(v, int | float) for v in values)):

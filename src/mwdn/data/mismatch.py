@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import KW_ONLY, dataclass, fields
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -13,7 +14,7 @@ from mwdn.optics.warp import affine, hazed
 from mwdn.types import Psf, Size
 
 BELOW_1 = (
-    *("scale", "background", "vignetting", "tilt"),
+    *("scale", "haze", "vignetting", "tilt"),
     *("envelope_shift", "aperture_gain", "tails", "depth", "hot_pixels", "gamma_error"),
 )
 """Options that are fractions."""
@@ -38,7 +39,7 @@ class Mismatch:
         scale: relative magnification of the PSF.
         blur_px: standard deviation of a Gaussian blur of the PSF.
         sharpen: sharpening of the PSF by unsharp masking: weight of the difference to a blur by one pixel.
-        background: uniform haze under the PSF, as a fraction of its sum.
+        haze: even light under the PSF, as a fraction of its sum.
         colour_shift_px: displacement of red and blue relative to green, in opposite directions.
         vignetting: relative loss of light in the corners of the measurement.
         tilt: relative gain or loss of light at an edge of the measurement compared with its centre, in a random
@@ -70,7 +71,7 @@ class Mismatch:
     turn_degrees: float = 0.5
     scale: float = 0.01
     blur_px: float = 0.7
-    background: float = 0.1
+    haze: float = 0.1
     colour_shift_px: float = 0.3
     vignetting: float = 0.1
     tilt: float = 0.0
@@ -89,6 +90,8 @@ class Mismatch:
     eight_bit: float = 0.0
     gamma_coded: float = 0.0
     gamma_error: float = 0.0
+
+    RENAMED: ClassVar[dict[str, str]] = {"background": "haze"}
 
     def __post_init__(self) -> None:
         for name in ("exact", "eight_bit", "gamma_coded"):
@@ -182,7 +185,7 @@ def perturb(psf: Psf, mismatch: Mismatch, generators: list[torch.Generator]) -> 
         noise = torch.stack([torch.randn(blurred.shape[1:], generator=g) for g in generators]).to(blurred)
         blurred = blurred * (1 + mismatch.grain * noise).clamp(min=0)
     blurred = blurred / blurred.sum((-2, -1), keepdim=True).clamp(min=1e-12)
-    return hazed(blurred, mismatch.size(generators, mismatch.background)[..., None, None].to(psf))
+    return hazed(blurred, mismatch.size(generators, mismatch.haze)[..., None, None].to(psf))
 
 
 def _blur(planes: Tensor, sigma: Tensor, largest: float = 1.0) -> Tensor:

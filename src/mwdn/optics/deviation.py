@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, fields, replace
+from typing import ClassVar
 
 import torch
 
@@ -44,23 +45,25 @@ class Deviation:
         shift_px: displacement of the PSF down, and the same to the right; its length is sqrt(2) times this.
         turn_degrees: rotation of the PSF, clockwise.
         scale: relative magnification of the PSF.
-        background: haze, the part of the PSF's light that is spread evenly over the frame.
+        haze: part of the PSF's light that is spread evenly over the frame.
         off_axis: change of the PSF from the axis to the corner, in units of `OFF_AXIS`; 1 is about the paper's
             camera in front of its display.
 
     Raises:
-        ParameterError: `background` outside [0, 1), `scale` of -0.9 or less, `off_axis` outside its range.
+        ParameterError: `haze` outside [0, 1), `scale` of -0.9 or less, `off_axis` outside its range.
     """
 
     shift_px: float = 0.0
     turn_degrees: float = 0.0
     scale: float = 0.0
-    background: float = 0.0
+    haze: float = 0.0
     off_axis: float = 0.0
 
+    RENAMED: ClassVar[dict[str, str]] = {"background": "haze"}
+
     def __post_init__(self) -> None:
-        if not 0 <= self.background < 1:
-            raise ParameterError(f"`background` ({self.background}) must be in [0, 1): a fraction of the light.")
+        if not 0 <= self.haze < 1:
+            raise ParameterError(f"`haze` ({self.haze}) must be in [0, 1): a fraction of the light.")
         if not self.scale > -0.9:
             raise ParameterError(f"`scale` ({self.scale}) must be above -0.9: a relative change.")
         if not 0 <= self.off_axis < 1 / OFF_AXIS.vignetting:
@@ -93,4 +96,4 @@ class Deviation:
             psf = warp(psf, (1 + self.scale) * turn, (self.shift_px, self.shift_px))
             psf = psf / psf.sum((-2, -1), keepdim=True).clamp(min=1e-12)
         psfs = field_psfs(psf, (GRID, GRID) if self.off_axis else (1, 1), off_axis_change(self.off_axis, size))
-        return FieldCamera.from_psfs(hazed(psfs, self.background), size, rank=RANK)
+        return FieldCamera.from_psfs(hazed(psfs, self.haze), size, rank=RANK)
