@@ -20,7 +20,8 @@ class CameraTable:
         exposure_s: 0 leaves it as the camera is set.
         gain: in the camera's unit; below 0 it is left as the camera is set.
         timeout_s: seconds to wait for a frame, besides its exposure.
-        attempts: how often a camera that fails is opened again before the session ends.
+        attempts: how often a camera that fails is opened again, or a damaged frame passed over, before the session
+            ends.
     """
 
     source: str = "rig"
@@ -28,6 +29,13 @@ class CameraTable:
     gain: float = -1.0
     timeout_s: float = 5.0
     attempts: int = 3
+
+    def __post_init__(self) -> None:
+        if not self.timeout_s > 0 or self.attempts < 0 or self.exposure_s < 0:
+            raise ParameterError(
+                f"`timeout_s` ({self.timeout_s:g}) of [camera] must be positive, `attempts` ({self.attempts}) and "
+                f"`exposure_s` ({self.exposure_s:g}) not negative."
+            )
 
 
 @dataclass(frozen=True)

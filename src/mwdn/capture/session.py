@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from mwdn.capture.captured_pairs import SessionFile, create_captured, displayed_light, open_captured
-from mwdn.capture.continuation import ROUNDING, check_continued, describe_place
+from mwdn.capture.continuation import check_continued, describe_place
 from mwdn.capture.display import Display
 from mwdn.capture.gamma import fit_gamma
+from mwdn.capture.grabber import Grabber
 from mwdn.capture.patterns import grey, grey_levels, pattern, point
 from mwdn.capture.photograph_list import list_photographs, read_photograph
 from mwdn.capture.point_frames import Shooting, hot_pixels, record_point
@@ -32,9 +33,6 @@ CONTRAST = 0.005
 
 GAMMA_ERROR = 0.03
 """Largest difference of a grey step from the fit without a warning."""
-
-IN_PROGRESS = 10
-"""Largest number of frames that may have a camera's old settings after it was set; a Raspberry Pi's has a few."""
 
 ROOM = 1.02
 """Bytes of a file over those of its pictures."""
@@ -70,6 +68,7 @@ class Session:
         check_path(out)
         self.recipe, self.camera, self.display, self.out = recipe, camera, display, out
         self._wait, self._progress, self._lamp = wait, progress, lamp
+        self._grabber = Grabber(camera, recipe.camera, recipe.session.skip, wait)
         self._first: CameraFrame | None = None
         self._screen: Screen = display.screen
         self._place: Place = place_picture(self._screen, recipe.pictures.size, recipe.pictures.fill)
@@ -86,8 +85,9 @@ class Session:
             ImageError: the disk.
             ParameterError: the file was begun with other settings, or there is no room on the disk.
         """
-        self._configure()
-        self._first = self._first_frame()
+        self._grabber.configure()
+        self.display.show(self._whole(0))
+        self._first = self._grabber.first()
         if self.out.exists():
             with open_captured(self.out) as pairs:
                 check_continued(pairs, self.recipe, self._first, self._screen, self._place)
@@ -141,63 +141,10 @@ class Session:
         """Show a picture, let it settle, and grab a frame of it."""
         shown = self.display.show(picture)
         self._wait(self.recipe.session.settle_s)
-        frame = self._grab(shown)
+        frame = self._grabber.after(shown, self.recipe.session.settle_s)
         if self._first is not None:
             check_like(frame, self._first, self.camera.name)
         return frame
-
-    # The camera
-
-    def _configure(self) -> None:
-        table = self.recipe.camera
-        self.camera.configure(table.exposure_s or None, table.gain if table.gain >= 0 else None)
-
-    def _first_frame(self) -> CameraFrame:
-        """A frame of a dark display; frames that were in progress when the camera was set have its old settings."""
-        self.display.show(self._whole(0))
-        frame, table = self._grab(time.time()), self.recipe.camera
-        for _ in range(IN_PROGRESS):
-            wanted = ((frame.exposure_s, table.exposure_s), (frame.gain, table.gain))
-            if not any(value > 0 and abs(now / value - 1) > ROUNDING for now, value in wanted):
-                break
-            frame = self._grab(time.time())
-        return frame
-
-    def _grab(self, shown: float) -> CameraFrame:
-        """The first frame whose exposure began after a moment; a camera that fails is opened again.
-
-        Raises:
-            CameraError: it failed `attempts` times.
-        """
-        failures = 0
-        while True:
-            try:
-                for _ in range(self.recipe.session.skip):
-                    self.camera.read()
-                while True:
-                    frame = self.camera.read()
-                    exposure_s = 0.0 if math.isnan(frame.exposure_s) else frame.exposure_s
-                    if (now := time.time()) < shown:  # the clock was set back: this frame may be of the time before
-                        shown = now
-                        continue
-                    if not self.camera.live or frame.timestamp - exposure_s >= shown:
-                        return frame
-            except CameraError as error:
-                failures += 1
-                if failures > self.recipe.camera.attempts:
-                    raise
-                warnings.warn(f"{error} Opened again, attempt {failures}.", stacklevel=2)
-                self._reopen(last=failures == self.recipe.camera.attempts)
-
-    def _reopen(self, *, last: bool) -> None:
-        self.camera.close()
-        self._wait(1.0)
-        try:
-            self.camera.open()
-            self._configure()
-        except CameraError:
-            if last:
-                raise
 
     # Calibration of camera and display
 
@@ -212,7 +159,7 @@ class Session:
             size = self.recipe.pictures.size
             pairs.add_pattern("grey", frames, [displayed_light(grey(v, size), self._gamma) for v in levels])
         self._gamma = float(pairs.attributes["display_gamma"])
-        shooting = Shooting(self.camera, self._screen, self._frame_of, self._grab, self._lamp)
+        shooting = Shooting(self.camera, self._screen, self._frame_of, self._grabber.after, self._lamp)
         usual_s = self.recipe.camera.exposure_s or (math.nan if self._first is None else self._first.exposure_s)
         record_point(pairs, self.recipe.point, shooting, usual_s=usual_s)
         for name in self.recipe.session.shown:
