@@ -493,8 +493,9 @@ def test_dark_frame_of_another_size(tmp_path, caustic):
 @pytest.mark.parametrize(
     ("psf", "binning", "capture", "way_out"),
     [
-        ((8, 6), 1, (16, 12), "The capture is 2 times as large: bin it by 2, `bin=2, psf_bin=1`."),
-        ((16, 12), 1, (4, 3), "The PSF is 4 times as large: bin it by 4, `psf_bin=4`."),
+        ((24, 16), 1, (48, 32), "The capture is 2 times as large: bin it by 2, `bin=2, psf_bin=1`."),
+        ((64, 60), 1, (16, 15), "The PSF is 4 times as large: bin it by 4, `psf_bin=4`."),
+        ((16, 12), 1, (4, 3), "Use the PSF that belongs to this camera."),  # nothing is left to be seen
         ((8, 6), 1, (9, 12), "Crop the capture around its centre: `crop=(8, 6)`."),
         ((8, 6), 2, (18, 14), "Crop the capture around its centre: `crop=(16, 12)`."),  # in raw pixels
         ((8, 6), 1, (7, 12), "Use the PSF that belongs to this camera."),

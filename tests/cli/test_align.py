@@ -105,6 +105,8 @@ def test_one_capture_prints_place_and_writes_an_overlay(session, run):
     assert content["residual_px"] < 1.5
     assert "turned by" in noted
     assert (folder / "out" / "frame0.align.png").is_file()
+    status, _, noted = run("align", *files, *METHOD, "-o", folder / "new.h5")
+    assert (status, "must be a folder for one capture" in noted) == (2, True)
     assert json.loads((folder / "out" / "frame0.align.json").read_text()) == content
 
 

@@ -106,7 +106,7 @@ def test_an_exif_turn_is_named_once_and_doubts_no_psf_that_fits(run, camera, tur
     picture.save(camera / f"{turned}.png", exif=exif)
     code, _, err = reconstruct(run, "captures/a.png", "captures/b.png", trust=True)
     assert code == 0
-    assert err.count(f"{turned.removeprefix('captures/')}.png is to be shown turned (EXIF orientation 6)") == 1
+    assert err.count(f"by EXIF orientation: {turned.removeprefix('captures/')}.png.") == 1
     assert err.count("EXIF") == 1
 
 

@@ -70,6 +70,16 @@ def test_nothing_to_reconstruct(tmp_path):
         find_captures([tmp_path], exclude={"PSF": psf})
 
 
+def test_a_pattern_in_quotes_stands_for_its_files(tmp_path):
+    b, a, _, odd = touch(tmp_path, "b.png", "a.png", "c.tif", "[1].png")
+    assert find_captures([tmp_path / "[ab].png"]) == [a, b]
+    assert find_captures([odd]) == [odd]  # a file of this name
+    with pytest.raises(ParameterError, match=r"No file matches `.*\*\.jpg`"):
+        find_captures([tmp_path / "*.jpg"])
+    with pytest.raises(ParameterError, match="is an address, not a file"):
+        find_captures(["https://example.com/a.png"])
+
+
 def test_captures_are_corrected_by_the_calibration(tmp_path):
     """Twice as large, 4 bits, dark level 3, upside down, blue first: all of it must be undone."""
     stored = np.full((4, 6, 3), 3, np.uint8)

@@ -121,6 +121,20 @@ def test_metadata_of_subfolders_and_an_empty_line(run, tmp_path):
         import_digicam(folder, tmp_path / "pairs.h5", DigiCam(background="backgroud"))
 
 
+def test_pairs_without_a_pattern_are_skipped_if_wanted(tmp_path):
+    folder = tmp_path / "set"
+    patterns(folder, (0, 1))
+    shard(folder / "a.parquet", labels=[0.0, 1.0, 7.0, None])
+    with pytest.raises(ImageError, match=r"a label for each pair.*has none"):
+        import_digicam(folder, tmp_path / "pairs.h5", CAMERA)
+    done = import_digicam(folder, tmp_path / "pairs.h5", CAMERA, skip_damaged=True)
+    assert list(done.files.values()) == [("0", 1), ("1", 1)]
+    assert [why.partition("lacks ")[2] for why in done.skipped.values()] == [
+        "the pattern `masks/mask_7.npy`.",
+        "a mask_label.",
+    ]
+
+
 def test_labels_beside_a_missing_one_are_whole_numbers(tmp_path):
     folder = tmp_path / "set"
     patterns(folder, (0, 1))

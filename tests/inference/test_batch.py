@@ -107,7 +107,7 @@ def test_maps_and_pictures_of_earlier_runs_stay(tmp_path, psf, captures):
 
 def test_capture_called_summary(tmp_path):
     captures = touch(tmp_path, "summary.tif")
-    with pytest.raises(ParameterError, match=r"summary\.tif` and the summary picture would both be written"):
+    with pytest.raises(ParameterError, match=r"summary\.tif` has the name of the summary picture, `summary\.png`"):
         check_outputs(captures, tmp_path / "out", "png")
     check_outputs(captures, tmp_path / "out", "tiff")
 
@@ -120,7 +120,7 @@ def test_no_input_is_overwritten(tmp_path, taken):
     out = tmp_path / "other" / ".."  # another spelling of the same folder
     (tmp_path / "other").mkdir(exist_ok=True)
     captures = captures if taken == "a.png" else [tmp_path / "other" / "x.png", *captures[1:]]
-    with pytest.raises(ParameterError, match=rf"{taken}` would overwrite an input\. Choose another folder: `--out`"):
+    with pytest.raises(ParameterError, match=rf"{taken}` would overwrite an input\. Choose another folder: `out`"):
         check_outputs(captures, out, "png", protected=(psf, None))
 
 
@@ -162,7 +162,7 @@ def test_json_of_somebody_else_is_not_replaced(tmp_path, content):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "b.json").write_text(content)
     check_outputs([a], tmp_path / "out", "png")
-    with pytest.raises(ParameterError, match=r"`.*out/b\.json`.*: `--out`"):
+    with pytest.raises(ParameterError, match=r"`.*out/b\.json`.*: `out`"):
         check_outputs([a, b], tmp_path / "out", "png")
     (tmp_path / "out" / "b.json").write_text('{"origin": "0123456789abcdef"}')
     check_outputs([a, b], tmp_path / "out", "png")

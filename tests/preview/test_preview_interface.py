@@ -169,6 +169,7 @@ def test_job_has_progress_and_a_result(client, capture):
         pass
     assert (job["state"], job["progress"]) == ("done", 1)
     assert client.get(f"{place}/picture").content.startswith(b"\x89PNG")
+    assert client.get(f"{place}/picture?fromat=npy").status_code == 422
     assert np.load(io.BytesIO(client.get(f"{place}/measurement?format=npy").content)).shape == (SIDE, SIDE, 3)
 
 
@@ -293,6 +294,17 @@ def test_job_with_a_wrong_look_is_refused(client, capture):
     assert "exposure" in response.json()["error"]
 
 
+def test_a_job_has_the_look_that_it_was_ordered_with(client, capture):
+    fields = {"camera": "camera", "method": "wiener", "trust": "false", "format": "npy", "exposure": "1"}
+    place = client.post("/jobs", files={"capture": capture}, data=fields).headers["location"]
+    while client.get(place).json()["state"] not in ("done", "failed"):
+        pass
+    assert client.get(f"{place}/picture").content.startswith(b"\x93NUMPY")
+    brighter, plain = (client.get(f"{place}/picture?format=png{look}").content for look in ("", "&exposure=0"))
+    assert brighter.startswith(b"\x89PNG")
+    assert brighter != plain
+
+
 def test_metrics_and_health(client, capture):
     before = client.get("/metrics").text
     order(client, capture)
@@ -328,13 +340,16 @@ def test_other_sites_pages_are_refused(client, headers):
 
 
 def test_other_addresses_need_a_token(serve):
-    with pytest.raises(ParameterError, match="token"):
-        make_server(StoredCameras(LIMITS), LIMITS, host="0.0.0.0")
+    for token in ("", "schlüssel"):
+        with pytest.raises(ParameterError, match="token"):
+            make_server(StoredCameras(LIMITS), LIMITS, host="0.0.0.0", token=token)
     server = serve(host="0.0.0.0", token="secret")
     with httpx.Client(base_url=f"http://127.0.0.1:{urlsplit(server.url).port}") as client:
         assert client.get("/cameras").status_code == 401
         assert client.get("/cameras", headers={"authorization": "Bearer wrong"}).status_code == 401
         assert client.get("/cameras", headers={"authorization": "Bearer secret"}).status_code == 200
+        assert client.get("/cameras", headers={"authorization": "bearer secret"}).status_code == 200  # RFC 9110, 11.1
+        assert client.get("/cameras", headers={"authorization": "secret"}).status_code == 401
         assert client.get("/cameras?token=secret").status_code == 200
         assert client.get("/healthz").status_code == 200
 

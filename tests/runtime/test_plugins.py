@@ -174,6 +174,19 @@ class Inherits(Base):
     def __call__(self, measurement, psf):
         return measurement * self.gain
 
+class Half:
+    def __call__(self, measurement, psf):
+        return measurement[..., ::2, ::2]
+
+class Bare:
+    # Options without annotations, and one without a default.
+    def __init__(self, needed, gain=1.0, mode="fast", inverted=False):
+        assert (type(gain), mode, inverted) == (float, "slow", True)
+        self.gain = gain
+
+    def __call__(self, measurement, psf):
+        return measurement * self.gain
+
 class Numpy:
     def __call__(self, measurement, psf):
         return measurement.numpy()
@@ -188,13 +201,21 @@ class Plane:
 @pytest.mark.filterwarnings("always")
 def test_what_plugins_return_is_checked_and_inherited_options_work(install, run, files):
     """Each ended in a traceback."""
-    groups = {"mwdn.solvers": {"heir": "wrongs:Inherits", "numeric": "wrongs:Numpy"}}
+    solvers = {"heir": "Inherits", "numeric": "Numpy", "half": "Half", "bare": "Bare"}
+    groups = {"mwdn.solvers": {name: f"wrongs:{kind}" for name, kind in solvers.items()}}
     folder = install("mwdn-wrong", groups | {"mwdn.masks": {"plane": "wrongs:Plane", "lost": "no_such_module:Mask"}})
     (folder / "wrongs.py").write_text(WRONG)
     line = "reconstruct capture.npy --psf psf.npy --background 0 --bin 1 --no-trust --out out --method"
     assert run(f"{line} heir --gain 2")[0] == 0
     code, _, err = run(f"{line} numeric")
-    assert (code, "must return a tensor (B, C, H, W), not ndarray" in err) == (1, True), err
+    assert (code, "must return a tensor (1, 3, 48, 52), not ndarray" in err) == (1, True), err
+    code, _, err = run(f"{line} half")
+    assert (code, "half must return a tensor (1, 3, 48, 52), not Tensor (1, 3, 24, 26)" in err) == (1, True), err
+    assert run(f"{line} bare --needed 3 --gain 2 --mode slow --inverted true")[0] == 0
+    code, _, err = run(f"{line} bare --gain 2")
+    assert (code, "`--needed` of the solver 'bare' is missing" in err) == (2, True), err
+    code, out, _ = run("methods bare")
+    assert (code, "needed: any value, required" in " ".join(out.split())) == (0, True), out
     code, _, err = run("design plane")
     assert (code, "must return a `mwdn.optics.Mask`, not 3" in err) == (2, True), err
     code, _, err = run("design lost")

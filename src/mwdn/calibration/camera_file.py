@@ -102,6 +102,10 @@ def read_camera(path: str | Path) -> dict[str, Any]:
     path = Path(path)
     if path.suffix.lower() in FRAMES:
         raise ParameterError(f"`{path}` is a picture, but a camera file ends in .toml. Give it as the PSF: `--psf`.")
+    if path.suffix.lower() == ".json":
+        raise ParameterError(
+            f"`{path}` is no camera file, which ends in .toml. Of `mwdn design`: `--psf psf.tif --background 0`."
+        )
     table = read_toml(path, "camera file")
     for key, value in table.items():
         if key not in KEYS:

@@ -4,6 +4,9 @@ from mwdn.calibration.frame_format import FrameFormat
 from mwdn.calibration.psf_format import PsfFormat
 from mwdn.types import Size
 
+SMALLEST = 15
+"""Shorter side of a picture, in pixels, that binning to its size is advised for: a PSF has no shape below."""
+
 
 def advise_size(capture: Size, psf: Size, frames: FrameFormat, psf_format: PsfFormat) -> str:
     """The options with which a capture and a PSF of different sizes fit."""
@@ -13,7 +16,7 @@ def advise_size(capture: Size, psf: Size, frames: FrameFormat, psf_format: PsfFo
         (capture, psf, "capture", "bin={capture}, psf_bin={own}"),
     ):
         factor = larger[0] // smaller[0]
-        if factor > 1 and larger == (smaller[0] * factor, smaller[1] * factor):
+        if factor > 1 and min(smaller) >= SMALLEST and larger == (smaller[0] * factor, smaller[1] * factor):
             options = options.format(psf=own * factor, capture=frames.bin * factor, own=own)
             return f"The {name} is {factor} times as large: bin it by {factor}, `{options}`."
     if psf[0] <= capture[0] and psf[1] <= capture[1]:

@@ -92,6 +92,8 @@ def align(  # noqa: PLR0913
         out = out if out.suffix.lower() in SUFFIXES else out / "aligned.h5"
         content = _align_session(task, capture, out, count, levels=levels)
     else:
+        if out.suffix.lower() in SUFFIXES:
+            raise ParameterError(f"`{out}` must be a folder for one capture; a file of pairs is made from a session.")
         content = _align_frame(task, capture, picture, out)
     if json:
         print_json(content)

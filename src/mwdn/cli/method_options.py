@@ -80,4 +80,8 @@ def _convert(option: Option, given: Any) -> Any:  # noqa: ANN401
         if kind in (int, float):
             with suppress(ValueError):
                 return kind(text)
+        if kind is bool and text in ("true", "false"):
+            return text == "true"
+        if kind in (str, Any):
+            return text
     raise ParameterError(f"`{_flag(option.name)}` ({text}) must be {type_in_words(option.type)}.")

@@ -8,7 +8,7 @@ from rich.table import Table
 
 from mwdn.cli.terminal import results
 from mwdn.errors import UnknownNameError, type_in_words
-from mwdn.inference.method_options import Option, list_options, summary
+from mwdn.inference.method_options import REQUIRED, Option, list_options, summary
 from mwdn.networks import NETWORKS
 from mwdn.solvers import SOLVERS
 from mwdn.weights.bundled import BUNDLED, find_weights
@@ -53,7 +53,8 @@ def _overview() -> Table:
 def _print(title: str, options: list[Option]) -> None:
     results.print(title, style="bold", markup=False, highlight=False)
     for name, annotation, default, meaning in options:
-        line = f"[bold cyan]{name}[/]: {escape(type_in_words(annotation))} = {escape(_short(default))}"
+        line = f"[bold cyan]{name}[/]: {escape(type_in_words(annotation))}"
+        line += ", required" if default is REQUIRED else f" = {escape(_short(default))}"
         results.print(Padding(line, (0, 2)), highlight=False)
         results.print(Padding(escape(meaning), (0, 6)), highlight=False)
 

@@ -57,6 +57,8 @@ def preview(  # noqa: PLR0913
     given: dict[str, Calibration] = {}
     if camera.psf is not None:
         given[OWN] = camera.load()
+    if out.exists() and not out.is_dir():
+        raise ParameterError(f"`{out}` must be a folder, but is a file. Choose another one: `out`.")
     limits = Limits()
     cameras = StoredCameras(limits, out / "cameras", given)
     token = token or ("" if host in LOOPBACK else secrets.token_urlsafe(16))

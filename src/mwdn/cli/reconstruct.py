@@ -27,6 +27,7 @@ from mwdn.inference.outputs import Format, check_outputs, output_name, read_side
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.exif import orientation
 from mwdn.io.files import check_folder
+from mwdn.io.listing import enumerate_names
 from mwdn.runtime import distributed
 
 
@@ -142,14 +143,13 @@ def _announce(batch: Batch, remark: str) -> None:
 
 
 def _name_turn(files: Iterable[str | Path]) -> None:
-    """Name the first file with an EXIF orientation: a phone shows it turned, unlike the picture."""
-    for file in files:
-        if (number := orientation(file)) != 1:
-            note(
-                f"{Path(file).name} is to be shown turned (EXIF orientation {number}). Frames are not turned: pictures "
-                "are in the orientation of the sensor."
-            )
-            return
+    """Name the files with an EXIF orientation: a phone shows them turned, unlike the pictures."""
+    turned = [Path(file).name for file in files if orientation(file) != 1]
+    if turned:
+        note(
+            f"Shown turned elsewhere, by EXIF orientation: {enumerate_names(turned)}. Frames are not turned: pictures "
+            "are in the orientation of the sensor."
+        )
 
 
 def _list_files(captures: Iterable[Path], camera: CameraOptions, out: Path, format: Format) -> list[str]:

@@ -90,6 +90,8 @@ def long_options(arguments: Iterable[Argument]) -> list[str]:
 
 def _missing(error: MissingArgumentError, argument: Argument) -> str:
     name = error.keyword or next((token.keyword for token in argument.tokens if token.keyword), None)
+    if name == "-":
+        return "Standard input is not read. Save it as a file, then name the file."
     if name is not None and get_origin(argument.hint) is dict:  # a key of a recipe
         return f"`{name}` must be followed by its value: `{name} VALUE`; a switch takes `true` or `false`."
     if name is not None:

@@ -1,6 +1,7 @@
 """List captures, and read them as measurements."""
 
 from collections.abc import Iterable, Mapping
+from glob import glob
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,19 +30,19 @@ def list_captures(paths: Iterable[str | Path], *, exclude: Mapping[str, Path] | 
     """List files, and the frames in folders in alphabetical order, without duplicates.
 
     Args:
-        paths: files and folders.
+        paths: files, patterns of files such as ``*.png``, and folders.
         exclude: files that are no captures, by what they are: ``{"PSF": psf, "dark frame": dark}``. Hidden files in
             folders are excluded, too.
 
     Raises:
-        ParameterError: no capture is left, or a folder holds none.
+        ParameterError: no capture is left, a folder holds none, or no file matches a pattern.
     """
     real = path_resolver()  # the same file may have two names
     others = {real(str(path)): name for name, path in (exclude or {}).items()}
     files: dict[str, None] = {}
     skipped: dict[str, None] = {}
     for path in map(Path, paths):
-        listed, notes = list_folder(path) if path.is_dir() else ([str(path)], [])
+        listed, notes = list_folder(path) if path.is_dir() else (_matching(path), [])
         kinds = [others.get(real(name)) for name in listed]
         captures = [name for name, kind in zip(listed, kinds, strict=True) if not kind]
         excluded = [f"{Path(name).name} (the {kind})" for name, kind in zip(listed, kinds, strict=True) if kind]
@@ -54,6 +55,18 @@ def list_captures(paths: Iterable[str | Path], *, exclude: Mapping[str, Path] | 
     if not files:
         raise ParameterError(" ".join(["Name at least one capture, or a folder of captures.", *skipped]))
     return CaptureList(list(files), list(skipped))
+
+
+def _matching(path: Path) -> list[str]:
+    """A file; or those that a pattern such as ``*.png`` matches, which not every shell replaces by its files."""
+    if str(path).startswith(("http:/", "https:/")):
+        raise ParameterError(f"`{path}` is an address, not a file. Download the file, then name it.")
+    if not set("*?[") & set(str(path)) or path.exists():
+        return [str(path)]
+    found = sorted(glob(str(path)))  # noqa: PTH207 - hidden files are left out, as by a shell
+    if not found:
+        raise ParameterError(f"No file matches `{path}`. Check the pattern; the current folder is `{Path.cwd()}`.")
+    return found
 
 
 def find_captures(paths: Iterable[str | Path], *, exclude: Mapping[str, Path] | None = None) -> list[Path]:

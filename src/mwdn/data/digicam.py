@@ -13,7 +13,7 @@ References:
 import csv
 import io
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
@@ -134,13 +134,16 @@ def import_digicam(
     if is_subtracted:  # the captures are linear floats then
         frames = replace(frames, bit_depth=None, gamma=None)
     patterns = find_patterns(folder)
+    if skip_damaged and patterns:
+        listing = _with_patterns(listing, patterns)
     labels = sorted({source.mask for source in listing.sources}, key=lambda label: (len(label), label))
     for label in labels:
         if label not in patterns:
             if not label:
+                unlabelled = next(source.name for source in listing.sources if not source.mask)
                 raise ImageError(
                     f"`{folder}` must have one pattern, `{PATTERN}` or `masks/mask_0.npy`, or a label for each pair: "
-                    f"the column `{LABEL}`, or metadata.csv with file_name and {LABEL}."
+                    f"the column `{LABEL}`, or metadata.csv with file_name and {LABEL}. `{unlabelled}` has none."
                 )
             raise ImageError(f"`{folder}` has no pattern `masks/mask_{label}.npy`, but pairs of it. {COPY_AGAIN}")
     result = ImportedMasks()
@@ -221,6 +224,14 @@ def _label(value: object) -> str:
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     return "" if value is None else str(value)
+
+
+def _with_patterns(listing: Listing, patterns: Container[str]) -> Listing:
+    """The pairs of known patterns; the others are refused."""
+    kept = [source for source in listing.sources if source.mask in patterns]
+    others = {source.name: source.mask for source in listing.sources if source.mask not in patterns}
+    whys = {name: f"the pattern `masks/mask_{label}.npy`" if label else f"a {LABEL}" for name, label in others.items()}
+    return Listing(kept, listing.refused | {name: f"`{name}` lacks {why}." for name, why in whys.items()})
 
 
 def _read_row(shard: Shard, levels: FrameFormat, row: int) -> tuple[Frame, Frame]:

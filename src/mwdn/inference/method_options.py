@@ -5,14 +5,17 @@ import re
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+REQUIRED = inspect.Parameter.empty
+"""Default of an option that must be given."""
+
 
 class Option(NamedTuple):
     """A keyword argument of a solver or network.
 
     Args:
         name: of the argument.
-        type: as annotated.
-        default: its value unless given.
+        type: as annotated; without an annotation that of the default, or `Any`.
+        default: its value unless given; `REQUIRED` if it has none.
         meaning: its entry in the docstring.
     """
 
@@ -26,9 +29,16 @@ def list_options(method: Callable[..., Any]) -> list[Option]:
     """Keyword arguments of the class of a solver or network."""
     meanings = _docstring_arguments(inspect.getdoc(method) or "")
     return [
-        Option(name, parameter.annotation, parameter.default, meanings.get(name, ""))
+        Option(name, _type(parameter), parameter.default, meanings.get(name, ""))
         for name, parameter in inspect.signature(method).parameters.items()
+        if parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
     ]
+
+
+def _type(parameter: inspect.Parameter) -> Any:  # noqa: ANN401
+    if parameter.annotation is not parameter.empty:
+        return parameter.annotation
+    return Any if parameter.default in (REQUIRED, None) else type(parameter.default)
 
 
 def _docstring_arguments(docstring: str) -> dict[str, str]:

@@ -67,7 +67,7 @@ def check_outputs(
     check(str(out / SUMMARY))
     if SUMMARY in existing and not holds_pictures:
         refuse(SUMMARY)
-    sources = {SUMMARY: "the summary picture"}
+    sources: dict[str, str] = {}
     for capture in captures:
         name = output_name(capture, format)
         sidecar = name.removesuffix(_SUFFIX[format]) + ".json"
@@ -79,6 +79,8 @@ def check_outputs(
         foreign = next((each for each in (sidecar, name, support) if each in existing), None)
         if foreign and (foreign == sidecar or is_foreign) and not read_sidecar(out / sidecar):
             refuse(foreign)
+        if name == SUMMARY:
+            raise ParameterError(f"`{capture}` has the name of the summary picture, `{SUMMARY}`. Rename it.")
         if name in sources:
             raise ParameterError(
                 f"`{capture}` and {sources[name]} would both be written to `{start}{name}`. Name one of them, "

@@ -107,9 +107,7 @@ class Reconstructor:
             engine = Engine(as_network(method), self.psf, precision=precision)
             self.engine = Ensemble(engine) if ensemble else engine
         elif ensemble:
-            raise ParameterError(
-                f"`ensemble` is for networks: {self.name} gives mirrored captures the same picture, mirrored."
-            )
+            raise ParameterError(f"`ensemble` is for networks: {self.name} gives mirrored captures mirrored pictures.")
 
     def __repr__(self) -> str:
         height, width = self.calibration.size
@@ -191,12 +189,13 @@ class Reconstructor:
     def _reconstruct(self, measurement: Measurement) -> Scene:
         if self.align:
             return self.at(solvers.align(measurement, self.psf))._reconstruct(measurement)
-        return self.engine(measurement) if self.engine else self._checked(self.method(measurement, self.psf))
+        return self.engine(measurement) if self.engine else self._by_method(measurement)
 
-    def _checked(self, scene: object) -> Scene:
-        """The result of a method, which may be a plugin's or the caller's own."""
-        if not isinstance(scene, Tensor) or scene.ndim != 4:
-            raise ParameterError(f"The method {self.name} must return a tensor (B, C, H, W), not {shown(scene)}.")
+    def _by_method(self, measurement: Measurement) -> Scene:
+        """The result of a method that may be a plugin's or the caller's own."""
+        scene: object = self.method(measurement, self.psf)
+        if not isinstance(scene, Tensor) or scene.shape != measurement.shape:
+            raise ParameterError(f"{self.name} must return a tensor {tuple(measurement.shape)}, not {shown(scene)}.")
         return scene
 
     def _pictures_per_chunk(self, measurement: Measurement) -> int:

@@ -33,12 +33,11 @@ from mwdn.preview.reconstruction import Order, Reconstructions
 from mwdn.preview.result import MEDIA, Look, encode
 from mwdn.preview.routing import route
 from mwdn.preview.samples import CAMERA, NAMES, sample_png
-from mwdn.preview.uploads import Form, parse_look, read_form
+from mwdn.preview.uploads import LOOKS, Form, look_query, parse_look, read_form
 from mwdn.version import __version__
 
 STATIC = Path(__file__).parent / "static"
 FILES = ("capture", "psf", "ambient")
-LOOKS = ("format", "exposure", "white_balance")
 TEXTS = ("camera", "calibration", "method", "options", "align", "trust", "room_light", *LOOKS)
 
 
@@ -180,7 +179,7 @@ class Preview:
     async def camera_psf(self, request: Request) -> Response:
         """A picture of the PSF."""
         calibration = await self._thread(partial(self.cameras.get, request.path_params["name"]))
-        return await self._encoded(lambda look: encode(calibration.psf, look), parse_look(request.query_params))
+        return await self._encoded(lambda look: encode(calibration.psf, look), parse_look(look_query(request)))
 
     async def reconstruct(self, request: Request) -> Response:
         """Reconstruct a capture: the picture, with the report in a header."""
@@ -194,8 +193,9 @@ class Preview:
     async def add_job(self, request: Request) -> Response:
         """Start a reconstruction, and answer at once."""
         form = await read_form(request, self.limits, FILES, TEXTS)
-        parse_look(form.texts)  # not used here: only checked, so that a mistake is reported now
+        parse_look(form.texts)  # a mistake is reported now
         job = self._submit(form)
+        job.look = {name: form.texts[name] for name in LOOKS if name in form.texts}
         return JSONResponse(job.content(), 202, {"Location": f"/jobs/{job.id}"})
 
     async def job(self, request: Request) -> Response:
@@ -208,14 +208,14 @@ class Preview:
 
     async def picture(self, request: Request) -> Response:
         """The picture of a job; there before it is checked."""
-        return await self._encoded(self.jobs.result(request.path_params["id"]).encode, parse_look(request.query_params))
+        job = self.jobs.get(request.path_params["id"])
+        look = parse_look(job.look | look_query(request))
+        return await self._encoded(self.jobs.result(job.id).encode, look)
 
     async def measurement(self, request: Request) -> Response:
         """The measurement of a job: the capture, corrected, cropped and binned."""
         measurement = self.jobs.result(request.path_params["id"]).measurement
-        return await self._encoded(
-            lambda look: encode(measurement.clamp(min=0), look), parse_look(request.query_params)
-        )
+        return await self._encoded(lambda look: encode(measurement.clamp(min=0), look), parse_look(look_query(request)))
 
     def _submit(self, form: Form) -> Job:
         """Check a form as far as that is fast, and queue its reconstruction."""

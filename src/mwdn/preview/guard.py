@@ -58,7 +58,8 @@ class Guard:
 
     def _may(self, scope: Any) -> bool:  # noqa: ANN401
         headers, path = Headers(scope=scope), scope["path"]
-        given = headers.get("authorization", "").removeprefix("Bearer ")
+        scheme, _, given = headers.get("authorization", "").partition(" ")
+        given = given if scheme.lower() == "bearer" else ""
         given = given or parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
         if path in OPEN or path.startswith("/static/"):
             given = self.token

@@ -31,6 +31,7 @@ class Job:
     Args:
         seconds: after which it is ended.
         size: bytes of its upload.
+        look: format, exposure and white balance of its picture, as texts, unless a request says otherwise.
     """
 
     seconds: float
@@ -42,6 +43,7 @@ class Job:
     cancelled: RefusedError | None = None  # why it is to end
     deadline: float = float("inf")
     size: int = 0
+    look: dict[str, str] = field(default_factory=dict)
     _listeners: list[Callable[[], None]] = field(default_factory=list)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 

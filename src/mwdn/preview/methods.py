@@ -3,7 +3,7 @@
 from typing import Any, get_args, get_origin
 
 from mwdn.errors import ParameterError, UnknownNameError, type_in_words
-from mwdn.inference.method_options import Option, list_options, summary
+from mwdn.inference.method_options import REQUIRED, Option, list_options, summary
 from mwdn.solvers import SOLVERS
 from mwdn.weights.bundled import BUNDLED
 
@@ -27,7 +27,8 @@ def _options(name: str) -> list[dict[str, Any]]:
     listed = []
     for option in _numbers(name):
         low, high = RANGES.get(option.name, (None, None))
-        entry = {"name": option.name, "type": type_in_words(option.type), "default": option.default}
+        default = None if option.default is REQUIRED else option.default
+        entry = {"name": option.name, "type": type_in_words(option.type), "default": default}
         listed.append({**entry, "about": option.meaning, "low": low, "high": high})
     return listed
 

@@ -16,6 +16,9 @@ from mwdn.preview.result import MEDIA, Look
 FIELD_BYTES = 2**14
 """Most bytes of a field that is not a file."""
 
+LOOKS = ("format", "exposure", "white_balance")
+"""Names, in a form or a query, of how a picture is wanted."""
+
 
 @dataclass(frozen=True)
 class Form:
@@ -104,6 +107,19 @@ def parse_white_balance(text: str | None) -> Any:  # noqa: ANN401
             f"`white_balance` ({text[:40]!r}) must be camera, none, grey-world, psf or gains: 1.8,1,1.5"
         )
     return gains
+
+
+def look_query(request: Request) -> dict[str, str]:
+    """Format, exposure and white balance of a picture, as texts, from the query of its address.
+
+    Raises:
+        UnknownNameError: the query has another name.
+    """
+    values = {name: value for name, value in request.query_params.items() if name != "token"}
+    for name in values:
+        if name not in LOOKS:
+            raise UnknownNameError("name of the query", name, LOOKS)
+    return values
 
 
 def parse_look(values: Any) -> Look:  # noqa: ANN401

@@ -12,11 +12,13 @@ LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
 def check_token(host: str, token: str) -> None:
-    """Check that an address which other computers can reach has a token.
+    """Check that an address which other computers can reach has a token, and that a header can hold it.
 
     Raises:
-        ParameterError: it has none.
+        ParameterError: it has none, or one of other characters than printable ASCII.
     """
+    if not (token.isascii() and token.isprintable()):
+        raise ParameterError("`token` must be of ASCII letters, digits and signs: a header holds no others.")
     if host not in LOOPBACK and not token:
         raise ParameterError(f"`host` ({host}) can be reached by other computers: it needs a `token`, a secret.")
 

@@ -9,6 +9,7 @@
 changed since its calibration.
 """
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -68,6 +69,10 @@ def build(name: str, **options: Any) -> Callable[[Measurement, Psf], Scene]:  # 
     if name not in SOLVERS:
         raise UnknownNameError("solver", name, SOLVERS)
     check_options(SOLVERS[name], f"the solver '{name}'", options)
+    for option, parameter in inspect.signature(SOLVERS[name]).parameters.items():
+        is_named = parameter.kind in (parameter.KEYWORD_ONLY, parameter.POSITIONAL_OR_KEYWORD)
+        if is_named and parameter.default is parameter.empty and option not in options:
+            raise ParameterError(f"`{option}` of the solver '{name}' is missing: it has no default.")
     return SOLVERS[name](**options)
 
 
