@@ -36,7 +36,7 @@ MAX_LIGHT = 1e15
 """Range of the largest number of a measurement, whose squares and their sums over 1e8 pixels float32 must hold."""
 
 _WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text", Path: "a path"}
-_WORDS[NoneType] = "none"
+_WORDS |= {NoneType: "none", Any: "any value"}
 _COUNTS = {2: "two", 3: "three"}
 _Checked = TypeVar("_Checked", bound=Callable[..., Any])
 LONGEST = 300

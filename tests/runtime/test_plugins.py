@@ -213,7 +213,7 @@ def test_what_plugins_return_is_checked_and_inherited_options_work(install, run,
     assert (code, "half must return a tensor (1, 3, 48, 52), not Tensor (1, 3, 24, 26)" in err) == (1, True), err
     assert run(f"{line} bare --needed 3 --gain 2 --mode slow --inverted true")[0] == 0
     code, _, err = run(f"{line} bare --gain 2")
-    assert (code, "`--needed` of the solver 'bare' is missing" in err) == (2, True), err
+    assert (code, "`needed` of the solver 'bare' is missing" in err) == (2, True), err
     code, out, _ = run("methods bare")
     assert (code, "needed: any value, required" in " ".join(out.split())) == (0, True), out
     code, _, err = run("design plane")
