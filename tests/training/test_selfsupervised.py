@@ -229,7 +229,7 @@ def test_a_resumed_run_ends_as_an_unbroken_one(run, calibration, tmp_path):
 
 def test_what_is_missing_or_does_not_fit(run, calibration, tmp_path):
     out = tmp_path / "run"
-    with pytest.raises(ParameterError, match="`--captures FOLDER`"):
+    with pytest.raises(ParameterError, match="give `captures`"):
         prepare(RECIPE, calibration, out=out, device="cpu")
     with pytest.raises(ParameterError, match=r"\[selfsupervised\]"):
         run(pairs=tmp_path / "pairs.h5")

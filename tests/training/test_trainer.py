@@ -688,7 +688,7 @@ def test_divergence_names_recorded_rows_and_the_way_out(pairs, calibration, tmp_
     rows = [run.task.samples.pairs.row(number) for number in range(2)]
     with torch.no_grad():
         next(run.network.parameters()).fill_(float("nan"))
-    said = rf"samples 0 to 1, rows {re.escape(str(rows))} of the file\) is not finite\. .* another folder, `--out`\.$"
+    said = rf"samples 0 to 1, rows {re.escape(str(rows))} of the file\) is not finite\. .* another folder, `out`\.$"
     with pytest.raises(DivergenceError, match=said):
         run.advance()
     run.save(Validation(0.0, 0.0))

@@ -15,7 +15,7 @@ from mwdn.cli.camera import CameraOptions
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.method_options import MethodOptions, read_options
 from mwdn.cli.progress import track
-from mwdn.cli.terminal import Json, all_or_nothing, counted, print_json, say, warn
+from mwdn.cli.terminal import Json, all_or_nothing, counted, note, print_json, say, warn
 from mwdn.data.captures import read_capture
 from mwdn.data.pair_writer import SUFFIXES, check_path
 from mwdn.errors import ParameterError
@@ -189,6 +189,8 @@ def _align_frame(task: _Task, capture: Path, picture: Path | None, out: Path) ->
     write_picture(page, sheet)
     write_json(sidecar, content)
     say(_quality(projection, content), f"Look at {page}")
+    if picture is None and task.corners is None:
+        note("It is the brightest region with four straight sides: check that this is the display.")
     return content
 
 
