@@ -6,6 +6,7 @@ MWDN_KILLS is the number of kills of each command (default 20: 100 in all, about
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -33,7 +34,7 @@ networks = { wiener = {}, mwdn = {} }
 solvers = { quick = { name = "admm", iterations = 3 } }
 shared.network = { width = 2 }
 schedule = { steps = 6, batch = 2, validate_every = 2, warmup = 0, bfloat16 = false }
-shared.data = { photos = "DATA/photos/train", test_photos = "DATA/photos/test" }
+shared.data = { photos = "DATA/photos/test", test_photos = "others" }
 [data]
 camera = { psf = "DATA/mwdn-camera/psf_320.png", bin = 5, train = 8, validation = 2, test = 3 }
 """
@@ -95,6 +96,9 @@ def test_nothing_is_lost(name: str, data: Path, tmp_path: Path) -> None:
     for file, text in (("train.toml", TRAINING), ("benchmark.toml", BENCHMARK)):
         (tmp_path / file).write_text(text.replace("DATA", str(data)))
     before = time.monotonic()
+    (tmp_path / "others").mkdir()
+    for photograph in sorted((data / "photos" / "train").iterdir())[:3]:
+        shutil.copy(photograph, tmp_path / "others")
     finish(start(COMMANDS[name], data, tmp_path, "whole"))
     duration, generator = time.monotonic() - before, random.Random(29)
     kills = runs = 0
