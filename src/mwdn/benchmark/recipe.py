@@ -195,7 +195,8 @@ def _absolute(text: str, folder: Path) -> str:
 
 
 def _robustness(table: dict[str, Any]) -> Robustness:
-    sizes, table = {}, current_names(Deviation, "robustness", table)
+    table = current_names(Deviation, "robustness", table)
+    sizes = {}
     for axis in table.keys() & AXES.keys():
         values = table[axis]
         if not (isinstance(values, list) and values and all(isinstance(v, int | float) for v in values)):

@@ -105,10 +105,10 @@ def run(
     """
     torch_device = local_device(device)
     refuse_foreign(out, (PAGE, "benchmark.md", "benchmark.json", "benchmark.csv"), MARK)
-    if NEED_ALEXNET & benchmark.loss.keys():
-        load_alexnet(benchmark.alexnet or None, download=lpips is True)  # an error now instead of after the data
     for photos in {folder for each in benchmark.data.values() for folder in (each.photos, each.test_photos) if folder}:
         refuse_within(photos, out)
+    if NEED_ALEXNET & benchmark.loss.keys():
+        load_alexnet(benchmark.alexnet or None, download=lpips is True)  # an error now instead of after the data
     with lock(out, "data"):
         datasets = {
             name: open_dataset(name, recipe, out / "data", torch_device, watch.track)

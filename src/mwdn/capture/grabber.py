@@ -17,6 +17,7 @@ AHEAD_S = 0.1
 """A frame that is later than now, by more than this, has the time of another clock."""
 
 CLOCKS = "Set its clock to this computer's; for `folder:` that of the disk to which frames are written."
+"""Advice of the messages about times."""
 
 
 class Grabber:

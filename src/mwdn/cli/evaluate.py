@@ -24,8 +24,7 @@ from mwdn.evaluation.alexnet import SMALLEST
 from mwdn.evaluation.evaluate import Pairs
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import check_folder, refuse_foreign, refuse_overwrite
-from mwdn.weights.bundled import WEIGHTS
-from mwdn.weights.checkpoint import read_metadata
+from mwdn.weights.bundled import BUNDLED, stored_metadata
 
 
 @no_empty_folder
@@ -122,32 +121,31 @@ def _division(split: str, methods: Iterable[str]) -> Division:
     Raises:
         ParameterError: they were trained with different ones: the test part of one is in the training part of another.
     """
-    trained = {division for method in methods if (division := _trained_with(method)) and division.split == split}
+    metadata = filter(None, map(_metadata, methods))
+    trained = {division for each in metadata if (division := _trained_with(each)).split == split}
     if len(trained) > 1:
         raise ParameterError(f"The checkpoints divided '{split}' in different ways. Evaluate each by itself.")
     return trained.pop() if trained else Division(split)
 
 
-def _trained_with(method: str) -> Division | None:
-    """The division of the pairs that a checkpoint was trained with; ``None`` for other methods."""
-    if (metadata := _metadata(method)) is None:
-        return None
+def _trained_with(metadata: dict[str, Any]) -> Division:
+    """The division of the pairs that a checkpoint of this metadata was trained with."""
     table = metadata.get("recipe", {}).get("pairs", {})
     known = {name: table[name] for name in ("split", "seed", "folds", "fold") if name in table}
     return Division(fractions=tuple(table.get("fractions", Division.fractions)), **known)
 
 
 def _metadata(method: str) -> dict[str, Any] | None:
-    """Metadata of a checkpoint, or of a folder of `mwdn.bridges.save_pretrained`; ``None`` for other methods."""
-    file = Path(method) if method.endswith(".safetensors") else Path(method) / WEIGHTS
-    return read_metadata(file) if file.is_file() else None
+    """`stored_metadata`, except for bundled networks, which were trained without recorded pairs."""
+    return None if method in BUNDLED else stored_metadata(method)
 
 
 def _learned(method: str, file: PairFile, rows: range | list[int]) -> str | None:
     """A warning if a checkpoint was trained on pairs that it is evaluated on, otherwise ``None``."""
-    division, metadata = _trained_with(method), _metadata(method) or {}
-    if division is None or not str(metadata.get("pairs", "")).endswith(f" of {len(file):,} recorded"):
+    metadata = _metadata(method)
+    if metadata is None or not str(metadata.get("pairs", "")).endswith(f" of {len(file):,} recorded"):
         return None
+    division = _trained_with(metadata)
     parts = division.parts(len(file))
     known = len({*parts["train"]} & {*rows})
     if not known:

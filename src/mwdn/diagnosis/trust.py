@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass
 
 import torch
 
+from mwdn.calibration.size_advice import SMALLEST
 from mwdn.diagnosis.orientation import OrientationFit, fit_orientations
 from mwdn.diagnosis.support_map import Support, support_map
 from mwdn.diagnosis.verdict import Verdict
@@ -14,10 +15,6 @@ from mwdn.optics.orientation import Orientation
 from mwdn.solvers.alignment import align
 from mwdn.solvers.pose import Pose
 from mwdn.types import Measurement, Psf, Scene
-
-SMALLEST = 15
-"""Minimum height and width of a PSF in pixels. The check accepts the right PSF of 12 pixels for 1 or 2 captures in 10,
-of 15 pixels for 7 or 8."""
 
 MIN_EXPLAINED = 0.25
 """Smallest trusted ``explained / possible``. On real captures the right PSF reaches 0.32 and more."""

@@ -45,7 +45,8 @@ def comparing(distance: Callable[..., Tensor]) -> Distance:
     """Decorate a distance: check that the shapes agree, and compute in float32 outside autocast.
 
     Two numpy arrays or PIL pictures, (H, W) or (H, W, 1 or 3), are compared as tensors (1, C, H, W) of their numbers:
-    uint8 and uint16 divided by their type's maximum, floats as they are, up to `MAX_FLOAT`. The result is then a float.
+    uint8 and uint16 divided by their type's maximum, floats as they are, `MAX_WHITES` at most. The result is then a
+    float.
     """
 
     @wraps(distance)
@@ -70,8 +71,8 @@ def comparing(distance: Callable[..., Tensor]) -> Distance:
     return cast(Distance, wrapped)
 
 
-MAX_FLOAT = 16.0
-"""Largest number in an array of floats, where 1 is white; numbers of 8 bits exceed it."""
+MAX_WHITES = 16.0
+"""Largest number in a picture of floats, in units of white; numbers of 8 bits exceed it."""
 
 
 def _as_batch(picture: ArrayPicture) -> Image:
@@ -79,7 +80,7 @@ def _as_batch(picture: ArrayPicture) -> Image:
     image = torch.from_numpy(frame.astype(np.float32)).movedim(-1, 0)[None]
     if frame.dtype.kind != "f":
         return image / np.iinfo(frame.dtype).max
-    if (largest := float(image.max())) > MAX_FLOAT:
+    if (largest := float(image.max())) > MAX_WHITES:
         raise ParameterError(f"A picture of floats up to {largest:g} must have 1 as white: divide it, 8 bits by 255.")
     return image
 

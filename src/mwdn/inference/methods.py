@@ -10,8 +10,8 @@ from mwdn.calibration.psf_identity import other_psf
 from mwdn.errors import CheckpointError, ParameterError, UnknownNameError
 from mwdn.networks import DENOISERS, NETWORKS, Network
 from mwdn.types import Measurement, Psf, Scene
-from mwdn.weights.bundled import BUNDLED, find_weights
-from mwdn.weights.checkpoint import SUFFIXES, load_checkpoint, read_metadata
+from mwdn.weights.bundled import BUNDLED, find_weights, stored_metadata
+from mwdn.weights.checkpoint import SUFFIXES, load_checkpoint
 
 Method = Callable[[Measurement, Psf], Scene]
 """A solver or a network, called as ``method(measurement, psf)``."""
@@ -103,10 +103,8 @@ def background_warning(name: str, method: object, calibration: Calibration) -> s
 
 def psf_warning(method: str | Path, calibration: Calibration) -> str | None:
     """Warning if the network was trained for another PSF than the calibration's."""
-    path = find_weights(str(method)) or Path(method)
-    if path.suffix != ".safetensors":
-        return None
-    trained = other_psf(calibration, read_metadata(path))
+    metadata = stored_metadata(method)
+    trained = other_psf(calibration, metadata) if metadata else None
     return trained and (
         f"`{method}` was trained for PSF {trained}, but the calibration has PSF {calibration.psf_hash}. "
         "Expect blur, ghosts and invented detail, unless both are from the same camera: another crop, bin or "

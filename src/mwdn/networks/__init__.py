@@ -20,7 +20,7 @@ from mwdn.networks.updn import Updn
 from mwdn.networks.wiener import WienerNetwork
 from mwdn.networks.wiener_bank import WienerBank
 from mwdn.networks.wiener_unet import WienerUNet
-from mwdn.runtime.plugins import Registry
+from mwdn.runtime.plugins import Registry, check_complete
 from mwdn.solvers import BUNDLED_NAMES, SOLVERS
 
 _OWN: dict[str, type[Network[Any]]] = {
@@ -69,6 +69,7 @@ def build(name: str, **options: Any) -> nn.Module:  # noqa: ANN401
     if kind is None:
         raise UnknownNameError("network", name, NETWORKS)
     check_options(kind, f"the network '{name}'", options)
+    check_complete(kind, f"the network '{name}'", options)
     for size in ("width", "channels"):
         if options.get(size, 1) < 1:
             raise ParameterError(f"`{size}` ({options[size]}) must be at least 1.")

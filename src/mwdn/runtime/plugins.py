@@ -1,5 +1,6 @@
 """Names that other packages add: networks, solvers, masks and cameras, through entry points (docs/plugins.md)."""
 
+import inspect
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
@@ -105,6 +106,18 @@ class Registry(Mapping[str, Entry]):
         if not self._accepts(entry):
             raise ParameterError(f"{start} `{point.value}` must be {self._must_be}. {end}")
         return entry
+
+
+def check_complete(entry: Callable[..., Any], what: str, options: Mapping[str, Any]) -> None:
+    """Check that the options of a class or a function hold all its arguments without a default, as plugins may have.
+
+    Raises:
+        ParameterError: one is missing.
+    """
+    for name, argument in inspect.signature(entry).parameters.items():
+        can_be_named = argument.kind in (argument.KEYWORD_ONLY, argument.POSITIONAL_OR_KEYWORD)
+        if can_be_named and argument.default is argument.empty and name not in options:
+            raise ParameterError(f"`{name}` of {what} is missing: it has no default.")
 
 
 def _package(point: EntryPoint | None) -> str:

@@ -9,14 +9,13 @@
 changed since its calibration.
 """
 
-import inspect
 from collections.abc import Callable
 from typing import Any
 
 from mwdn.errors import ParameterError, UnknownNameError, check_options
 from mwdn.optics.noise import noise_level
 from mwdn.runtime.forks import survive_forks
-from mwdn.runtime.plugins import Registry
+from mwdn.runtime.plugins import Registry, check_complete
 from mwdn.solvers.admm import Admm
 from mwdn.solvers.alignment import align
 from mwdn.solvers.fista import Fista
@@ -69,10 +68,7 @@ def build(name: str, **options: Any) -> Callable[[Measurement, Psf], Scene]:  # 
     if name not in SOLVERS:
         raise UnknownNameError("solver", name, SOLVERS)
     check_options(SOLVERS[name], f"the solver '{name}'", options)
-    for option, parameter in inspect.signature(SOLVERS[name]).parameters.items():
-        is_named = parameter.kind in (parameter.KEYWORD_ONLY, parameter.POSITIONAL_OR_KEYWORD)
-        if is_named and parameter.default is parameter.empty and option not in options:
-            raise ParameterError(f"`{option}` of the solver '{name}' is missing: it has no default.")
+    check_complete(SOLVERS[name], f"the solver '{name}'", options)
     return SOLVERS[name](**options)
 
 

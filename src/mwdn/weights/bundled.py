@@ -2,6 +2,7 @@
 
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import nn
@@ -10,6 +11,7 @@ from mwdn.errors import CheckpointError, checked, reason
 from mwdn.runtime.requirement import require
 from mwdn.weights.checkpoint import load_checkpoint, read_metadata, save_network
 from mwdn.weights.growth import grown
+from mwdn.weights.tensors import is_safetensors
 
 BUNDLED = {
     "universal": "Any camera, no training, the best pictures: alignment, plug-and-play ADMM, U-Net.",
@@ -42,6 +44,16 @@ def find_weights(name: str) -> Path | None:
     if (path := Path(name) / WEIGHTS).is_file():
         return path
     return _download(name) if name.startswith(HUB) else None
+
+
+def stored_metadata(method: str | Path) -> dict[str, Any] | None:
+    """Metadata of the checkpoint that a path or a name of `find_weights` means; ``None`` for other methods.
+
+    Raises:
+        CheckpointError: as for `find_weights` and `read_metadata`.
+    """
+    path = find_weights(str(method)) or Path(method)
+    return read_metadata(path) if path.is_file() and is_safetensors(path) else None
 
 
 @checked
