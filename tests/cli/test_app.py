@@ -567,3 +567,9 @@ def test_as_a_process(camera):
     assert wrong.returncode == 2
     assert wrong.stderr.startswith("Error: No recipe named 'quick-cpi'. Did you mean 'quick-cpu'?")
     assert len(wrong.stderr.splitlines()) == 1
+
+
+def test_design_alone_prints_its_help(run):
+    code, out, _ = run("design")
+    assert code == 0
+    assert out.startswith("Usage: mwdn design COMMAND")

@@ -123,7 +123,7 @@ def _run(arguments: list[str], received: Sequence[int]) -> int:
     chosen = {name: not {name, short}.isdisjoint(arguments) for name, short in GLOBAL.items()}
     arguments = [argument for argument in arguments if argument not in {*GLOBAL, *GLOBAL.values()}]
     command = next((argument for argument in arguments if argument in COMMANDS), None)
-    arguments = _own_mask(arguments) if command == "design" else arguments
+    arguments = _complete_design(arguments) if command == "design" else arguments
     keep_memory()
     app = make_app(command)
     terminal.set_up(
@@ -150,9 +150,11 @@ def _run(arguments: list[str], received: Sequence[int]) -> int:
     return result if isinstance(result, int) else 0
 
 
-def _own_mask(arguments: list[str]) -> list[str]:
-    """`mwdn design --mask FILE` is short for `mwdn design array --mask FILE`."""
+def _complete_design(arguments: list[str]) -> list[str]:
+    """`mwdn design` alone prints its help; `mwdn design --mask FILE` is short for `mwdn design array --mask FILE`."""
     first = arguments.index("design") + 1
+    if first == len(arguments):
+        return [*arguments, "--help"]
     has_mask = any(argument.partition("=")[0] == "--mask" for argument in arguments)
     is_short = has_mask and arguments[first].startswith("-")
     return [*arguments[:first], "array", *arguments[first:]] if is_short else arguments
