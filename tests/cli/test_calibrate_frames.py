@@ -124,6 +124,35 @@ def test_the_bits_of_a_camera_file_stay_if_it_is_changed(run, folder):
     assert {path.name for path in folder.glob("camera-*")} == second
 
 
+def test_a_copy_of_a_camera_file_keeps_its_pictures(folder):
+    psf = np.ones((4, 5, 1), np.float32)
+    first = write_camera_with_parts(Path("camera.toml"), {}, {"psf": psf})["psf"]
+    Path("backup.toml").write_bytes(Path("camera.toml").read_bytes())
+    second = write_camera_with_parts(Path("camera.toml"), {}, {"psf": 2 * psf})["psf"]
+    assert (first.exists(), second.exists()) == (True, True)
+    Path("backup.toml").unlink()
+    write_camera_with_parts(Path("camera.toml"), {}, {"psf": 3 * psf})
+    assert (first.exists(), second.exists()) == (True, False)  # only what the replaced file names is looked at
+
+
+def test_a_background_that_is_given_is_kept(run, folder):
+    for options, background in (
+        ("", None),
+        ("--background 0", 0.0),
+        ("--dark dark", 0.0),
+        ("--dark dark --background estimate", "estimate"),
+        ("--camera camera.toml", "estimate"),
+    ):
+        assert run(f"calibrate psf_1 --bit-depth 12 {options}")[0] == 0
+        assert read_camera("camera.toml").get("background") == background
+
+
+def test_new_distances_replace_those_of_the_camera_file(run, folder):
+    assert run("calibrate psf_1 --bit-depth 12 --distance-mm 50")[0] == 0
+    assert run("calibrate psf_1 --camera camera.toml --distances 100")[0] == 0
+    assert read_camera("camera.toml")["distance_mm"] == 100
+
+
 def test_a_camera_file_appears_with_all_its_pictures_or_not_at_all(folder, monkeypatch):
     parts = {"psf": np.ones((4, 5, 1), np.float32), "dark": np.zeros((4, 5, 1), np.float32)}
     write_camera_with_parts(Path("camera.toml"), {}, parts)
@@ -212,6 +241,11 @@ def test_frames_of_another_pattern_are_named(run, folder, photographs):
         ("psf_1 --flat-through-mask --bit-depth 12", "`--flat-through-mask` needs flat frames: `--flat`"),
         ("psf_1 --flat small --bit-depth 12", "Frames of the point source, as `frame_"),
         ("empty --dark dark", "holds no frame"),
+        ("psf_1 --dark dark --psf-gamma srgb", "`--psf-gamma` is for one picture"),
+        ("psf_1 --dark dark --distances 100 --distance-mm 50", "`--distance-mm` (50) must be the first"),
+        ("psf_1 --watch dark", "leave out `psf_1`"),
+        ("--watch dark --pairs pairs.h5", "leave out `--pairs`"),
+        ("old.toml --pitch-um 2", "`old.toml` is a camera file, not a picture. To change it, give it as `--camera`"),
     ],
 )
 def test_photographs_that_do_not_fit(run, folder, line, message):

@@ -32,8 +32,9 @@ def write_camera_with_parts(
     """Write a camera file and its pictures.
 
     A picture's name ends in a hash of its numbers: ``camera-psf-1a2b3c4d.tif``. So the pictures of an existing camera
-    file stay until the new file has replaced it atomically; then those that the new file does not name are removed.
-    Of pictures that were written for another camera file, which removes them in the same way, the new one gets copies.
+    file stay until the new file has replaced it atomically; then those that no camera file of the folder names are
+    removed: a copy of the camera file keeps its pictures. Of pictures that were written for another camera file, which
+    removes them in the same way, the new one gets copies.
 
     Args:
         path: the camera file.
@@ -61,7 +62,7 @@ def write_camera_with_parts(
         for file in written:
             file.unlink(missing_ok=True)
         raise
-    _remove(before - _own_parts(path))
+    _remove_unnamed(before, path.parent)
     return dict(content)
 
 
@@ -92,13 +93,19 @@ def draft_of(path: Path) -> Iterator[Path]:
         except BaseException:
             _remove({*moved.values()} - before)
             raise
-    _remove(before - _own_parts(path))
+    _remove_unnamed(before, path.parent)
 
 
 def _renamed(value: Any, moved: Mapping[Path, Path]) -> Any:  # noqa: ANN401
     if isinstance(value, tuple):
         return tuple(_renamed(each, moved) for each in value)
     return moved.get(value, value) if isinstance(value, Path) else value
+
+
+def _remove_unnamed(files: set[Path], folder: Path) -> None:
+    """Remove files that no camera file of the folder names."""
+    if files:
+        _remove(files.difference(*map(_named_parts, folder.glob("*.toml"))))
 
 
 def _remove(files: set[Path]) -> None:
@@ -133,8 +140,8 @@ def _copied(path: Path, value: Any, written: list[Path]) -> Any:  # noqa: ANN401
     return copy
 
 
-def _own_parts(path: Path) -> set[Path]:
-    """Files that a camera file names, and that this module has written for it."""
+def _named_parts(path: Path) -> set[Path]:
+    """Files that a camera file names; none if it is no TOML file."""
     try:
         table = read_toml(path, "camera file") if path.is_file() else {}
     except ParameterError:
@@ -142,9 +149,14 @@ def _own_parts(path: Path) -> set[Path]:
     names: list[Any] = []
     for key in PARTS:
         value = table.get(key, ())
-        names += [value] if isinstance(value, str) else value
+        names += value if isinstance(value, list) else [value]
+    return {path.parent / name for name in names if isinstance(name, str)}
+
+
+def _own_parts(path: Path) -> set[Path]:
+    """Files that a camera file names, and that this module has written for it."""
     pattern = re.compile(re.escape(path.stem) + _NAME)
-    return {path.with_name(name) for name in names if isinstance(name, str) and pattern.fullmatch(name)}
+    return {file for file in _named_parts(path) if file.parent == path.parent and pattern.fullmatch(file.name)}
 
 
 def picture_of(defects: torch.Tensor) -> Frame:

@@ -14,7 +14,7 @@ from cyclopts import App, Parameter
 from mwdn.cli import terminal
 from mwdn.cli.as_typed import as_typed
 from mwdn.cli.camera_values import from_camera_file
-from mwdn.cli.given_options import note_given_bin
+from mwdn.cli.given_options import note_given
 from mwdn.cli.global_options import GLOBAL, add_global_options
 from mwdn.cli.help_texts import HelpTexts
 from mwdn.cli.signals import ended_by_signals
@@ -88,7 +88,7 @@ def make_app(command: str | None = None) -> App:
     app = App(
         name="mwdn",
         version=__version__,
-        config=(from_camera_file, note_given_bin),
+        config=(from_camera_file, note_given),
         help="Lensless imaging: reconstruct the scene from the pattern that a thin mask casts on a sensor.",
         help_formatter=HelpTexts(command) if command else None,
         help_format=None if command else "plaintext",  # Markdown takes 0.1 s to import

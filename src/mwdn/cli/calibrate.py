@@ -21,6 +21,15 @@ from mwdn.calibration.report import inspect_psf
 from mwdn.calibration.verdict import headline
 from mwdn.calibration.watching import guide_exposure, watch_folder
 from mwdn.calibration.white_balance import WhiteBalance, check_white_balance
+from mwdn.cli.calibrate_checks import (
+    OF_OTHER_FRAMES,
+    check_bits,
+    refuse_camera_files,
+    refuse_corrected,
+    refuse_psf_format,
+    refuse_two_distances,
+    refuse_with_watch,
+)
 from mwdn.cli.camera import CameraOptions
 from mwdn.cli.inspect import load_at_psf_resolution
 from mwdn.cli.photographs import PhotographOptions
@@ -52,6 +61,7 @@ def calibrate(  # noqa: PLR0913
     pairs: Path | None = None,
     out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("camera.toml"),
     auto_bin: Annotated[bool, Parameter(show=False)] = True,
+    auto_background: Annotated[bool, Parameter(show=False)] = True,
 ) -> None:
     """Write a camera file: the PSF, and everything else that other commands need to know about the camera.
 
@@ -78,11 +88,14 @@ def calibrate(  # noqa: PLR0913
             PSF, the displacement of the aperture's shadow, the sensor's field and stray light.
         out: the camera file, ending in .toml.
         auto_bin: whether --bin is not given: then every reconstruction chooses.
+        auto_background: whether --background is not given.
     """
     if watch is not None:
+        refuse_with_watch(files, pairs)
         _watch(watch, frames, photographs.exposures)
         return
     check_camera_path(out)
+    refuse_camera_files(files)
     pictures = [*files] or [CameraOptions(psf).psf_file]
     if pairs is not None:
         check_pair_file(pairs)
@@ -103,20 +116,22 @@ def calibrate(  # noqa: PLR0913
             "ambient": ambient,
             **changed_fields(psf_format),
             **changed_fields(frames),
+            "background": None if auto_background else psf_format.background,
             "bin": None if auto_bin else frames.bin,
             "white_balance": white_balance,
             "pitch_um": pitch_um,
             "distance_mm": distance_mm,
         }
-        _check_bits(kept, own.get("bit_depth"), photographs, own_dark)
+        check_bits(kept, own.get("bit_depth"), photographs, own_dark)
         if photographs.are_one_picture(pictures):
             dark = next(iter(expanded(photographs.dark_files)), None)
             options = CameraOptions(pictures[0], frames, psf_format=psf_format, dark=dark, ambient=ambient)
             refuse_overwrite(out, options.psf, dark, ambient)
             write = partial(_write_one_picture, options, kept, own)
         else:
-            _refuse_psf_format(psf_format)
-            _refuse_corrected(camera, kept, pictures)
+            refuse_psf_format(psf_format, kept)
+            refuse_two_distances(distance_mm, photographs.distances, kept)
+            refuse_corrected(camera, kept, pictures)
             known = Corrections.read(kept.get("flat_field"), kept.get("hot_pixels"))
             refuse_overwrite(out, *expanded((*pictures, *photographs.dark_files, *photographs.flat)))
             done = calibrate_frames(photographs.of(pictures), frames, known)
@@ -136,10 +151,8 @@ def _write_and_refine(out: Path, pairs: Path | None, write: Callable[[Path], tup
     with if_interrupted(lambda: interrupted), draft_of(out) as draft:
         verdict, calibration = write(draft)
         if pairs is not None:
-            _finish(verdict, calibration, out)
             refine(draft, pairs, out.with_name(f"{out.stem}-refinement.json"))
-    if pairs is None:
-        _finish(verdict, calibration, out)
+    _finish(verdict, calibration, out)
 
 
 def _kept(camera: Path | None) -> dict[str, Any]:
@@ -149,17 +162,6 @@ def _kept(camera: Path | None) -> dict[str, Any]:
     if psf is not None and sha256 and psf.is_file() and file_sha256(psf) != sha256:
         values.pop("psf_corrected", None)  # the PSF has been replaced by another picture
     return values
-
-
-def _check_bits(kept: dict[str, Any], bits: int | None, photographs: PhotographOptions, own_dark: Path | None) -> None:
-    """Refuse other bits than those of the sensor's measurement, whose levels are fractions of the full scale."""
-    before, is_dark_new = kept.get("bit_depth"), photographs.dark_files not in ((), (own_dark,))
-    stale = ("full_well_electrons" in kept and not photographs.flat) or ("black_level" in kept and not is_dark_new)
-    if bits not in (None, before) and stale:
-        raise ParameterError(
-            f"`bit_depth` ({bits}) must be {before or 'left out'}, as the sensor was measured. To change it, give dark "
-            "and flat frames, too, which measure it again."
-        )
 
 
 def _by_kept_path(files: Sequence[Path], kept: Path | None) -> list[Path]:
@@ -214,18 +216,11 @@ def _write_photographs(
     content = {key: value for key, value in content.items() if value is not None or key not in done.content}
     if content.get("white_balance") == "flat":
         content["white_balance"] = _flat_balance(done.flat_colour)
-    # A dark frame with the room's light has no background left; tails below the lines are then the PSF's own.
-    background = content.get("background") or (0.0 if has_dark else None)
-    own_distance = {"distance_mm": content["distance_mm"]} if content.get("distance_mm") else {}
-    content |= {"psf_gain": None, "envelope_shift": None}  # of an earlier PSF
-    content = {
-        **content,
-        "background": background,
-        **done.content,
-        **own_distance,
-        "psf_gamma": None,
-        "psf_bit_depth": None,
-    }
+    if content.get("background") is None and has_dark:
+        # A dark frame with the room's light has no background left; tails below the lines are then the PSF's own.
+        content["background"] = 0.0
+    content |= dict.fromkeys((*OF_OTHER_FRAMES, "psf_gain", "envelope_shift"))  # of an earlier PSF
+    content |= done.content
     for psfs, places in _ELSEWHERE:  # those of an earlier PSF do not fit this one
         if psfs not in done.parts:
             content |= {psfs: None, places: None}
@@ -246,22 +241,6 @@ def _flat_balance(colour: tuple[float, ...]) -> tuple[float, float, float]:
         )
     red, green, blue = colour
     return round(green / red, 4), 1.0, round(green / blue, 4)
-
-
-def _refuse_psf_format(psf_format: PsfFormat) -> None:
-    if any(value is not None for value in (psf_format.psf_bin, psf_format.psf_bit_depth, psf_format.psf_orientation)):
-        raise ParameterError(
-            "`psf_bin`, `psf_bit_depth` and `psf_orientation` are for one picture from another source. Frames of the "
-            "camera itself have the captures' pixels: leave them out."
-        )
-
-
-def _refuse_corrected(camera: Path | None, kept: dict[str, Any], pictures: Sequence[Path]) -> None:
-    if kept.get("psf_corrected") and [*pictures] == [kept["psf"]]:
-        raise ParameterError(
-            f"The PSF of `{camera}` is corrected already. To correct it by other frames, name the photographs of the "
-            "point source again, with all that belong to them: `mwdn calibrate POINT --dark DARK ...`."
-        )
 
 
 def _finish(verdict: str, calibration: Calibration, out: Path) -> None:
