@@ -91,9 +91,19 @@ def test_a_session_becomes_aligned_pairs_that_the_psf_explains(session, run):
     again = folder / "again.h5"
     line = ("align", folder / "session.h5", "--psf", folder / "psf.npy", "--method", "wiener", "-o", again)
     for source in (out, out.with_suffix(".json")):
-        assert run(*line, "--homography", source)[0] == 0
+        status, said, noted = run(*line, "--homography", source)
+        assert (status, noted) == (0, "")
+        assert "Picture placed as given" in said
         with PairFile(out) as first, PairFile(again) as second:
             torch.testing.assert_close(first[1][1], second[1][1], atol=1e-4, rtol=0)
+    status, _, said = run(*line, "--homography", out, "--crop", 64, 64)
+    sizes = f"The measurements (64 x 64) must have the size that was aligned ({SIZE} x {SIZE})"
+    assert (status, sizes in said) == (2, True)
+    moved = json.loads(out.with_suffix(".json").read_text())
+    moved["homography"] = (np.array([[1, 0, 40], [0, 1, -20], [0, 0, 1.0]]) @ np.array(moved["homography"])).tolist()
+    (folder / "moved.json").write_text(json.dumps(moved))
+    status, _, said = run(*line, "--homography", folder / "moved.json")
+    assert (status, "The picture fits badly where `--homography` puts it" in said) == (0, True)
 
 
 def test_one_capture_prints_place_and_writes_an_overlay(session, run):
@@ -115,6 +125,7 @@ def test_one_capture_prints_place_and_writes_an_overlay(session, run):
     [
         (("frame0.png", "picture0.png", "--points", "1,2,3"), "four points"),
         (("frame0.png", "picture0.png", "--homography", "psf.npy"), "psf.npy"),
+        (("frame0.png", "picture0.png", "--points", "1,2,3,4,5,6,7,8", "--homography", "a.json"), "Give either"),
         (("frame0.png", "picture0.png", "--display-gamma", "9"), "(9)"),
         (("session.h5", "picture0.png"), "has its own pictures"),
         (("session.h5", "--count", "0"), "(0)"),

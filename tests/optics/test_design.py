@@ -133,9 +133,13 @@ def test_recipe_of_the_paper_is_the_default(run, monkeypatch):
         ("--mask a.npy --levls 3", "Did you mean --levels?"),
         ("pinholes --stl --size-mm 0.4 0.4 --count 2", "no heights for an STL"),
         ("diffuser --stl --size-mm 0.4 0.4 --stl-every 0", "`every` (0) at least 1"),
+        ("diffuser --size-mm 0.4 0.4 --stl-every 2", "`--stl-every` needs `--stl`"),
+        ("--mask a.npy --values amplitude --pitch-um 2 --levels 4 --index 2", "leave out `--index`, `--levels`"),
+        ("--mask a.npy --values height --pitch-um 2 --phase-nm 532", "leave out `--phase-nm`"),
     ],
 )
 def test_wrong_call_is_one_message_and_exit_2(run, tmp_path, line, message):
+    np.save(tmp_path / "a.npy", np.ones((8, 8)))
     code, out, err = run(*line.split(), *SMALL)
     assert code == 2
     assert message in " ".join(err.split())
@@ -158,6 +162,19 @@ def test_a_mask_from_a_file(run, tmp_path):
     for line in (["array", "--mask", "heights.npy"], ["--mask", "heights.npy"]):
         assert "`--values height --pitch-um 2`" in run(*line, *SMALL)[2]
     assert "--values" in run("--mask", "heights.npy", "--help")[1]
+
+
+def test_an_opaque_mask_leaves_the_design_before_it(run, tmp_path):
+    """mask.tif was replaced, and psf.tif stayed that of the earlier mask."""
+    np.save(tmp_path / "open.npy", np.ones((100, 100), np.float32))
+    np.save(tmp_path / "closed.npy", np.zeros((100, 100), np.float32))
+    line = ["--values", "amplitude", "--pitch-um", "4", *SMALL]
+    assert run("--mask", "open.npy", *line)[0] == 0
+    before = {path.name: path.read_bytes() for path in (tmp_path / "cam").iterdir()}
+    assert len(before) == 4
+    code, _, err = run("--mask", "closed.npy", *line)
+    assert (code, "No light passes the mask within the aperture" in err) == (2, True)
+    assert {path.name: path.read_bytes() for path in (tmp_path / "cam").iterdir()} == before
 
 
 def test_designed_camera_keeps_its_light():

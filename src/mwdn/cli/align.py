@@ -24,7 +24,8 @@ from mwdn.io.contact_sheets import contact_sheet
 from mwdn.io.files import check_folder, refuse_overwrite, write_json
 from mwdn.io.images import read_frame, write_picture
 from mwdn.registration.captured import SRGB, SessionPairs, as_gamma, as_light
-from mwdn.registration.estimate import estimate, through_corners
+from mwdn.registration.correlation import correlation_at
+from mwdn.registration.estimate import WORST, estimate, through_corners
 from mwdn.registration.outline import find_outline
 from mwdn.registration.overlay import draw_outline, overlay
 from mwdn.registration.pairs import chosen, fit_levels, reconstruct_views, write_aligned
@@ -77,6 +78,8 @@ def align(  # noqa: PLR0913
     """
     if count < 1:
         raise ParameterError(f"`count` ({count}) must be at least 1.")
+    if points is not None and homography is not None:
+        raise ParameterError("`points` are where to start a search, and `homography` replaces it. Give either of them.")
     own = read_options([method], options, align)[method]
     task = _Task(
         calibration=camera.load(),
@@ -125,15 +128,24 @@ class _Task:
         warn(reconstructor.warning)
         return reconstructor
 
-    def register(
-        self, picture_size: Size, views: Callable[[], Views]
-    ) -> tuple[Projection, dict[str, Any], Residuals | None]:
-        """The given projection for pictures of a size, or the estimate from views; its content, and its residuals."""
+    def register(self, views: Views) -> tuple[Projection, dict[str, Any], Residuals | None]:
+        """The given projection, or the estimate from views; its content with its quality, and its residuals."""
+        if self.given is None:
+            result = estimate(views, corners=self.corners)
+            return result.projection, result.content(), result.residuals
+        projection = self.given.for_picture(views.picture_size)
+        correlation = correlation_at(projection, views, 1.0, robust=True)
+        if correlation < WORST:
+            warn(
+                f"The picture fits badly where `homography` puts it: their correlation is {correlation:.2f}, below "
+                f"{WORST:g}. Leave it out to align again."
+            )
+        return projection, {**projection.to_dict(), "correlation": round(correlation, 4)}, None
+
+    def check_camera(self, size: Size) -> None:
+        """Check that a given projection leads to frames of this size."""
         if self.given is not None:
-            projection = self.given.for_picture(picture_size)
-            return projection, projection.to_dict(), None
-        result = estimate(views(), corners=self.corners)
-        return result.projection, result.content(), result.residuals
+            self.given.check_camera(size)
 
     def check_outputs(self, *outputs: Path) -> None:
         """Check that files can be written, before any work starts."""
@@ -151,13 +163,12 @@ def _align_session(task: _Task, capture: Path, out: Path, count: int, *, levels:
         SessionPairs(capture, task.calibration, display_gamma=task.gamma or 1.0) as pairs,
         all_or_nothing(out),
     ):
-        rows = chosen(len(pairs), count)
+        rows, psf = chosen(len(pairs), count), pairs.calibration.psf
+        task.check_camera((psf.shape[-2], psf.shape[-1]))
         reconstructor = task.prepare(pairs.calibration)
-        progress = partial(track, title="Reconstructing")
-        projection, content, residuals = task.register(
-            pairs.picture_size, lambda: reconstruct_views(pairs, reconstructor, rows, progress)
-        )
-        psf = pairs.calibration.psf
+        judged = rows if task.given is None else rows[:1]
+        views = reconstruct_views(pairs, reconstructor, judged, partial(track, title="Reconstructing"))
+        projection, content, residuals = task.register(views)
         white = fit_levels(pairs, projection, psf, rows) if levels else None
         write_aligned(out, pairs, projection, content, levels=white, track=partial(track, title="Writing pairs"))
         sheet = overlay(
@@ -178,6 +189,7 @@ def _align_frame(task: _Task, capture: Path, picture: Path | None, out: Path) ->
     page, sidecar = out / f"{capture.stem}.align.png", out / f"{capture.stem}.align.json"
     task.check_outputs(page, sidecar)
     measurement = read_capture(capture, task.calibration)
+    task.check_camera((measurement.shape[-2], measurement.shape[-1]))
     reconstructor = task.prepare(task.calibration)
     scene = reconstructor(measurement)
     if picture is None:
@@ -218,8 +230,7 @@ def _outline(scene: Scene, linear: Scene, corners: Points | None) -> _Placed:
 
 def _known_picture(task: _Task, shown: Image, scene: Scene) -> _Placed:
     """The displayed picture in the reconstruction, unless its homography is given."""
-    size = shown.shape[-2], shown.shape[-1]
-    projection, content, residuals = task.register(size, lambda: Views.of(list(shown), list(scene)))
+    projection, content, residuals = task.register(Views.of(list(shown), list(scene)))
     sheet = overlay(scene, warp_pictures(shown, projection), projection.corners(), residuals)
     return _Placed(projection, content, sheet)
 
@@ -227,11 +238,13 @@ def _known_picture(task: _Task, shown: Image, scene: Scene) -> _Placed:
 def _quality(projection: Projection, content: Mapping[str, Any]) -> str:
     """Place of the picture, and how well it fits, in a sentence."""
     radial = f", radial term {projection.radial:.3f}" if projection.radial else ""
-    fit = ""
+    fit, how = "", "found"
     if "residual_px" in content:
         fit = f"; residual {content['residual_px']:.2f} px, correlation {content['correlation']:.3f}{radial}"
+    elif "correlation" in content:
+        fit, how = f"; correlation {content['correlation']:.3f}{radial}", "placed as given"
     cut = f" {projection.outside:.0%} of it lies outside of the frame." if projection.outside > 0.01 else ""
-    return f"Picture found: {Place.of(projection.corners())}{fit}.{cut}"
+    return f"Picture {how}: {Place.of(projection.corners())}{fit}.{cut}"
 
 
 def _corners(points: str) -> Points:

@@ -86,6 +86,11 @@ def refine(camera: Path, pairs: Path, report: Path) -> None:
     calibration = Calibration.load(camera, **NO_TERMS, white_balance=None)
     with PairFile(pairs) as file:
         check_pairs(file, calibration.psf)
+        if file.measurement_shape[2] != calibration.psf.shape[1]:
+            raise ParameterError(
+                f"The pairs of `{pairs}` are in colour, but the PSF is grey. Make grey pairs, with `grey`, or take a "
+                "picture of the PSF in colour."
+            )
         warn(other_camera(file, calibration))
         white = display_white(file)
         if file.attributes.get(REFINED) == "align":

@@ -1,6 +1,7 @@
 """A mask from an array of numbers that another program computed or a microscope measured."""
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -21,6 +22,16 @@ from mwdn.types import Plane
 
 Numbers = npt.NDArray[Any]
 Quantity = Literal["height", "phase", "amplitude", "transmission"]
+
+_MEANINGLESS: dict[Quantity, tuple[str, ...]] = {
+    "height": ("phase_nm",),
+    "phase": (),
+    "amplitude": ("phase_nm", "index", "levels"),
+    "transmission": ("phase_nm", "index", "levels"),
+}
+"""Options of `ArrayMask` that other numbers need."""
+
+_PLURAL = dict(zip(get_args(Quantity), ("heights", "phases", "amplitudes", "transmissions"), strict=True))
 
 MAX_RELIEF_UM = 1000.0
 """Largest height of a mask above its lowest point. A larger one is not a thin mask; its numbers are probably in nm."""
@@ -67,12 +78,9 @@ class ArrayMask:
             ParameterError: an option is missing or out of its range, or the numbers cannot be what `values` says.
         """
         if designed := _read_design(self.mask):
-            given = [field.name for field in fields(self)[1:] if getattr(self, field.name) != field.default]
-            if given:
-                raise ParameterError(
-                    f"`{self.mask}` is a design and says its own pitch, heights and index: leave out "
-                    f"{', '.join(f'`{name}`' for name in given)}."
-                )
+            self._refuse(
+                {field.name for field in fields(self)[1:]}, "is a design and says its own pitch, heights and index"
+            )
             needed, _ = needed_pitch(designed, setup)
             if designed.pitch_um > needed:
                 raise ParameterError(
@@ -86,6 +94,7 @@ class ArrayMask:
                 f"`{self.mask}` holds numbers without units: say what they are, "
                 f"{', '.join(get_args(Quantity))}, and how many um apart: `values='height', pitch_um=2`."
             )
+        self._refuse(_MEANINGLESS[self.values], f"holds {_PLURAL[self.values]}, which have none of these")
         mask = make_mask(
             _scaled(frame, self.values, self.full_scale),
             self.values,
@@ -97,6 +106,13 @@ class ArrayMask:
         )
         _check_slope(mask, setup, self.subdivide)
         return mask
+
+
+    def _refuse(self, names: Collection[str], why: str) -> None:
+        """Refuse options that would be ignored."""
+        changed = [field.name for field in fields(self) if getattr(self, field.name) != field.default]
+        if given := [name for name in changed if name in names]:
+            raise ParameterError(f"`{self.mask}` {why}: leave out {', '.join(f'`{name}`' for name in given)}.")
 
 
 def _check_slope(mask: Mask, setup: Setup, subdivide: int) -> None:

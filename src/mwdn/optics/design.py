@@ -4,13 +4,14 @@ import dataclasses
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from torch import Tensor
 
 from mwdn.errors import ParameterError, shown
 from mwdn.io.contact_sheets import contact_sheet, thumbnail
-from mwdn.io.files import write_json
+from mwdn.io.files import as_image_error, write_json
 from mwdn.io.images import write_linear, write_picture
 from mwdn.io.reading import read_json
 from mwdn.optics.mask_files import write_mask
@@ -98,7 +99,7 @@ class Designed:
         return {"source_mm": by_distance, "angle_degrees": by_angle}
 
     def write(self, out: Path, *, sensitive: bool = False) -> None:
-        """Write mask.tif, psf.tif, camera.json and preview.png, replacing files of the same names.
+        """Write mask.tif, psf.tif, camera.json and preview.png, replacing files of the same names together.
 
         Args:
             out: a folder; created if missing.
@@ -108,10 +109,17 @@ class Designed:
             ImageError: a file cannot be written.
         """
         report = self.report() | ({"likeness": self.sensitivity()} if sensitive else {})
-        write_mask(out / "mask.tif", self.mask)
-        write_linear(out / "psf.tif", self.stored)
-        write_picture(out / "preview.png", contact_sheet([self.pictures()], ["mask (middle)", "PSF", "spectrum"]))
-        write_json(out / "camera.json", report)
+        with as_image_error(out):
+            out.mkdir(parents=True, exist_ok=True)
+            folder = TemporaryDirectory(prefix=".design-", dir=out)
+        with folder as name:
+            draft = Path(name)
+            write_mask(draft / "mask.tif", self.mask)
+            write_linear(draft / "psf.tif", self.stored)
+            write_picture(draft / "preview.png", contact_sheet([self.pictures()], ["mask (middle)", "PSF", "spectrum"]))
+            write_json(draft / "camera.json", report)
+            for file in draft.iterdir():
+                file.replace(out / file.name)
 
     def pictures(self) -> list[Tensor]:
         """The middle of the mask, the PSF and its spectrum, for `contact_sheet`."""

@@ -138,8 +138,9 @@ def _single(tried: list[tuple[Refined, str]], few: Views) -> tuple[Refined, str]
         is_other = np.abs(other.projection.corners() - corners).max() > 0.2 * size
         if is_other and result.correlation - other.correlation < _AMBIGUOUS * (1 - other.correlation):
             raise AlignmentError(
-                "The displayed picture fits the reconstruction in several ways: it looks the same turned or mirrored. "
-                "Show one without symmetry, or give its corners: `--points`."
+                "The displayed picture fits the reconstruction in several ways: it was not on the display, or it looks "
+                "the same turned or mirrored. Check that picture and capture belong together, show a picture without "
+                "symmetry, or give its corners: `--points`."
             )
     return result, name
 

@@ -11,7 +11,7 @@ from mwdn.calibration.psf_identity import psf_identity
 from mwdn.data.pair_checks import REFINED, WHITE
 from mwdn.data.pair_writer import Attribute
 from mwdn.data.pairs import PairFile
-from mwdn.errors import AlignmentError, ShapeError
+from mwdn.errors import AlignmentError
 from mwdn.fourier.convolution import convolve
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.registration.captured import SessionPairs
@@ -95,12 +95,7 @@ def write_aligned(
         MwdnError: a pair is damaged, does not fit the camera, or the file cannot be written.
     """
     first = pairs.measurement(0)
-    if tuple(first.shape[-2:]) != tuple(projection.camera_size):
-        (h, w), (H, W) = first.shape[-2:], projection.camera_size
-        raise ShapeError(
-            f"The measurements ({h} x {w}) must have the size that was aligned ({H} x {W}). Use the same crop and bin, "
-            "or align again without `--homography`."
-        )
+    projection.check_camera((first.shape[-2], first.shape[-1]))
     brightest = 1.0 if levels is None else float(levels.max())
     colours = torch.ones(first.shape[1]) if levels is None else levels / brightest
     shape = (*first.shape[-2:], first.shape[1])

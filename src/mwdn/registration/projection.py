@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from mwdn.errors import AlignmentError, ParameterError
+from mwdn.errors import AlignmentError, ParameterError, ShapeError
 from mwdn.types import Size
 
 Points = npt.NDArray[np.float64]
@@ -137,6 +137,15 @@ class Projection:
                 "Align again with pictures of this size."
             )
         return replace(self, picture_size=size)
+
+    def check_camera(self, size: Size) -> None:
+        """Raise a `ShapeError` unless the camera's frames have this size."""
+        if tuple(size) != tuple(self.camera_size):
+            (h, w), (H, W) = size, self.camera_size
+            raise ShapeError(
+                f"The measurements ({h} x {w}) must have the size that was aligned ({H} x {W}). Use the same crop and "
+                "bin, or align again without `--homography`."
+            )
 
     def corners(self) -> Points:
         """Pixels of the camera (4, 2) of the picture's outer corners, clockwise from its own top left."""
