@@ -87,6 +87,14 @@ def test_background_is_reported(tmp_path, psf):
     assert kept.support.glow > report.support.glow + 0.3
 
 
+def test_a_psf_from_which_too_much_was_subtracted(tmp_path, psf):
+    frame = (psf / psf.max())[0].movedim(0, -1).numpy()
+    noise = 0.002 * np.random.default_rng(0).standard_normal(frame.shape)
+    for level, weights in ((0.0, []), (0.3, ["bad"])):
+        report = report_of(tmp_path, (frame + noise - level).astype("f4"))
+        assert [finding.weight for finding in said(report, "below 0", "more was subtracted")] == weights
+
+
 def test_light_between_the_lines_that_the_estimate_leaves(tmp_path, psf):
     """The level lies only where the mask is lit, so the darkest 5 % of the frame do not show it."""
     lit = torch.zeros(SIZE)

@@ -412,6 +412,10 @@ def test_several_positions_make_a_field_of_psfs(run, folder):
     assert float(right.sum() / centre.sum()) == pytest.approx(0.8, abs=0.05)
     assert math.isclose(float(field.weights.sum(0).mean()), 1, rel_tol=1e-3)
     assert STEPS == 4095
+    # The point to the right of a PSF that is mirrored lies to the left.
+    mirrored = field_camera(Calibration.load("camera.toml", psf_orientation="flip-left-right"))
+    sums = [float(mirrored.psf_at(64, column).sum()) for column in (0, 80)]
+    assert sums[0] / sums[1] == pytest.approx(0.8, abs=0.05)
 
 
 def test_points_of_the_field_keep_their_light_behind_a_weak_sensor(run, folder):

@@ -12,6 +12,7 @@ from mwdn.calibration.frame_operations import bin_pixels
 from mwdn.calibration.psf import Calibration
 from mwdn.errors import ParameterError
 from mwdn.optics.field import FieldCamera
+from mwdn.optics.orientation import turn_displacement
 from mwdn.optics.psf import unit_sum
 from mwdn.optics.psf_measures import likeness
 from mwdn.optics.sensor import Sensor
@@ -135,15 +136,23 @@ def field_camera(calibration: Calibration) -> FieldCamera:
         raise ParameterError(
             "`field_psfs` of the camera must name PSFs off the axis: `mwdn calibrate psf/ --field ...`."
         )
-    raw = calibration.frames.cell * calibration.frames.bin
-    sign = -1.0 if calibration.frames.upside_down else 1.0
-    points = [(0.0, 0.0), *((sign * down / raw, right / raw) for down, right in places.field_positions)]
+    points = [(0.0, 0.0), *(_in_measurement(calibration, position) for position in places.field_positions)]
     others = [_read(calibration, file) for file in places.field_psfs]
     light = [sum(one.light) / max(sum(calibration.light), 1e-30) for one in others]
     psfs = torch.cat([calibration.psf, *(level * one.psf for level, one in zip(light, others, strict=True))])
     weights = _shepard(torch.tensor(points), calibration.size)
     maps = F.interpolate(weights, calibration.size, mode="bilinear", align_corners=True)
     return FieldCamera(psfs, maps, sensor=calibration.binned_sensor or Sensor())
+
+
+def _in_measurement(calibration: Calibration, position: tuple[float, float]) -> tuple[float, float]:
+    """Displacement (down, right) in raw pixels of the PSF's frames as one in pixels of a measurement."""
+    frames, psf_format = calibration.frames, calibration.psf_format
+    raw = frames.cell * (psf_format.psf_bin or frames.bin)
+    down, right = position[0] / raw, position[1] / raw
+    down = -down if frames.upside_down else down
+    orientation = psf_format.psf_orientation
+    return (down, right) if orientation is None else turn_displacement(down, right, orientation)
 
 
 def _shepard(points: Tensor, size: tuple[int, int]) -> Tensor:

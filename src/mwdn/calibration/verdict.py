@@ -74,6 +74,13 @@ def _levels(report: PsfReport) -> Iterator[Finding]:
             "Save 16 bits, or average frames."
         )
         yield Finding("weak", text)
+    if levels.below_zero > 0.01:
+        text = (
+            f"{_percent(levels.below_zero)} of its pixels are far below 0 and count as 0: more was subtracted from the "
+            "picture than light of the surroundings, so the PSF has lost its faint parts. Use the picture as it was "
+            "before."
+        )
+        yield Finding("bad" if levels.below_zero > 0.2 else "weak", text)
     yield from _background(levels)
 
 

@@ -44,6 +44,13 @@ def turn(psf: Tensor, orientation: Orientation) -> Tensor:
     return psf.contiguous()
 
 
+def turn_displacement(down: float, right: float, orientation: Orientation) -> tuple[float, float]:
+    """Displacement (down, right) of a point after `turn`."""
+    swap, rows, columns = _STEPS[check_orientation(orientation)]
+    down, right = (right, down) if swap else (down, right)
+    return -down if rows else down, -right if columns else right
+
+
 def compose(first: Orientation | None, second: Orientation | None) -> Orientation | None:
     """Single turn that equals ``first`` followed by ``second``; None for no turn."""
     if first is None or second is None:
