@@ -136,6 +136,7 @@ def test_warning_of_a_reconstructor(camera):
         (TRAIN.replace("--steps 4", "--steps 0"), "[schedule]: `--steps` (0) must be positive"),
         (TRAIN.replace("--device cpu", "--device gpu"), "`--device` (gpu) must be one that torch can use here"),
         (TRAIN.replace("--device cpu", "--device cuda:99"), "`--device` (cuda:99) must be one that torch can use here"),
+        ("simulate photos --psf psf.npy --exact --mismatch.haze 0.1", "leave out `--exact`"),
         ("simulate photos --psf psf.npy --count 0", "`--count` (0) must be at least 1"),
         ("simulate photos --psf psf.npy -o photos", "`photos` cannot be written: Is a directory"),
         ("simulate photos --psf psf.npy -o photos/0.png", "`0.png` must end in .h5 or .hdf5"),

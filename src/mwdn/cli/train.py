@@ -18,6 +18,7 @@ from mwdn.cli.terminal import all_or_nothing, counted, note, notes, say, warn
 from mwdn.data.captures import list_captures
 from mwdn.data.pair_checks import other_camera
 from mwdn.data.pairs import PairFile
+from mwdn.errors import ParameterError
 from mwdn.io.files import refuse_overwrite
 from mwdn.io.listing import unused_photographs
 from mwdn.optics.distortion import displacement_px
@@ -185,10 +186,12 @@ def simulate(
         out: file of pairs, ending in .h5 or .hdf5; an existing one is replaced on success.
         count: number of pairs.
         recipe: placement, mismatch, sensor and seed, as for `mwdn train`; by default their default values.
-        exact: simulate the calibrated camera itself, without mismatch.
+        exact: simulate the calibrated camera itself, without mismatch; noise and even light (--placement.ambient) stay.
         **changes: any key of the recipe.
     """
     refuse_overwrite(out, *camera.files, recipe)
+    if exact and "mismatch" in changes:
+        raise ParameterError("`exact` leaves out all mismatch: leave out `exact`, or the keys of `mismatch`.")
     simulation = read_recipe(recipe, **recipe_changes(changes))
     progress = partial(track, title="Simulating")
     note(*unused_photographs(photos))
