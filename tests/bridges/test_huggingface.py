@@ -59,8 +59,16 @@ def test_the_hub_reads_the_card(checkpoint, tmp_path):
 def test_an_edited_card_stays(checkpoint, tmp_path):
     folder = save_pretrained(checkpoint, tmp_path / "lensless")
     (folder / "README.md").write_text("mine")
-    save_pretrained(checkpoint, folder)
+    with pytest.warns(UserWarning, match="was edited and stays"):
+        save_pretrained(checkpoint, folder)
     assert (folder / "README.md").read_text() == "mine"
+
+
+def test_a_card_that_was_not_edited_is_that_of_the_new_weights(checkpoint, tmp_path):
+    folder = save_pretrained("universal-small", tmp_path / "lensless", license="mit")
+    save_pretrained(checkpoint, folder, license="apache-2.0")
+    text = (folder / "README.md").read_text()
+    assert ("24.50 dB" in text, 'license: "apache-2.0"' in text, "universal" in text) == (True, True, False)
 
 
 def test_files_of_others_stay(checkpoint, tmp_path):
@@ -83,5 +91,5 @@ def test_a_config_of_another_network_is_refused(checkpoint, tmp_path):
 
 
 def test_what_is_no_folder_is_a_name_on_the_hub(tmp_path):
-    with pytest.raises(CheckpointError, match="hub:nothing"):
+    with pytest.raises(CheckpointError, match="`nothing` is no folder, and no `owner/name`"):
         from_pretrained("nothing")

@@ -460,7 +460,13 @@ def test_without_trust(run, camera):
     assert (code, err) == (0, "")
     assert "reproduces" not in out
     assert names(camera / "out") == ["a.json", "a.png", "summary.png"]
-    assert set(json.loads((camera / "out" / "a.json").read_text())) == {"method", "psf_hash", "origin", "bin"}
+    assert set(json.loads((camera / "out" / "a.json").read_text())) == {
+        "method",
+        "psf_hash",
+        "origin",
+        "picture",
+        "bin",
+    }
 
 
 # --- The others ---------------------------------------------------------------------------------------
@@ -473,8 +479,7 @@ def test_without_trust(run, camera):
 def test_demo(run, tmp_path, monkeypatch, pictures, methods):
     """With one picture and the two fastest methods here; a picture by all of them takes ten seconds."""
     monkeypatch.setattr("mwdn.cli.demo.METHODS", methods)
-    options = [word for name in pictures for word in ("--pictures", name)]
-    code, out, err = run("demo", "--out", tmp_path / "demo", *options)
+    code, out, err = run("demo", "--out", tmp_path / "demo", "--pictures", *pictures)
     assert (code, err) == (0, "")
     assert names(tmp_path / "demo") == ["captures", "comparison.png", "index.html", "pattern.png", "psf.tif"]
     code, _, err = run(f"{out.strip().splitlines()[-1].partition('mwdn ')[2]} --method wiener --out {tmp_path}/again")

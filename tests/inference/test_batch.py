@@ -185,7 +185,7 @@ def test_linear_formats_hold_what_the_reconstructor_returns(tmp_path, format, su
         assert np.array_equal(found, scene[0].movedim(0, -1).numpy())
         assert job.measurement is job.scene is job.trust is job.error is None  # a million jobs may be kept
         beside = json.loads(job.output.with_suffix(".json").read_text())
-        assert beside.keys() == {"method", "psf_hash", "origin", "bin"}
+        assert beside.keys() == {"method", "psf_hash", "origin", "picture", "bin"}
         assert beside["method"] == "name"
         assert beside["psf_hash"] == batch.reconstruct.calibration.psf_hash
 
@@ -460,6 +460,15 @@ def test_old_map_never_stands_beside_a_new_picture(tmp_path, psf, captures):
     assert (out / "0.support.png").exists()
     list(make_batch(psf, out, Wiener(regularisation=1.0)).run(captures[:1]))
     assert not (out / "0.support.png").exists()
+
+
+def test_a_picture_of_another_format_does_not_stay_beside_the_new_sidecar(tmp_path, psf, captures):
+    out = tmp_path / "out"
+    list(make_batch(psf, out).run(captures[:1]))
+    assert (out / "0.png").exists()
+    (out / "0.tif").write_bytes(b"of the user")
+    list(make_batch(psf, out, Wiener(regularisation=1.0), format="npy").run(captures[:1]))
+    assert sorted(path.name for path in out.iterdir()) == ["0.json", "0.npy", "0.tif"]
 
 
 # --- Several processes --------------------------------------------------------------------------------

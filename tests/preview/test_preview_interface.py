@@ -117,6 +117,7 @@ def test_hostile_captures_are_refused(client, capture, kind):
         ({"format": "exe"}, 422, "format"),
         ({"exposure": "nan"}, 422, "exposure"),
         ({"white_balance": "1,2"}, 422, "white_balance"),
+        ({"white_balance": "0,1,1"}, 422, "white_balance"),
         ({"calibration": '{"bin": 2}'}, 422, "calibration"),
         ({"unknown": "1"}, 422, "unknown"),
         ({"camera": None}, 422, "psf"),

@@ -2,12 +2,13 @@
 
 import json
 import shutil
+import warnings
 from pathlib import Path
 from typing import Any
 
 from torch import nn
 
-from mwdn.errors import CheckpointError, checked
+from mwdn.errors import CheckpointError, MwdnError, checked
 from mwdn.io.files import as_parameter_error, atomic, refuse_foreign, write_json, write_text
 from mwdn.io.reading import read_json
 from mwdn.weights.bundled import WEIGHTS, find_weights, load_network
@@ -25,7 +26,7 @@ def save_pretrained(method: str | Path, folder: str | Path, *, license: str | No
     """Write a trained network as a folder that can be uploaded to the Hugging Face hub.
 
     ``config.json`` names the network and its options, ``model.safetensors`` is the checkpoint, ``README.md`` the model
-    card with metadata. A card that is already there stays: it may have been edited.
+    card with metadata. A card that was edited stays, with a warning.
 
     Args:
         method: path of a checkpoint of this package, or ``universal`` or ``universal-small``.
@@ -43,13 +44,27 @@ def save_pretrained(method: str | Path, folder: str | Path, *, license: str | No
     network, metadata = load_checkpoint(source), read_metadata(source)
     refuse_foreign(folder, (CONFIG, WEIGHTS), b'"library_name": "mwdn"')
     config = {"library_name": _LIBRARY, "model_type": metadata["name"], **metadata}
+    card, title, is_own = folder / CARD, folder.resolve().name, _is_generated(folder)
     with as_parameter_error(folder, "Choose another one: `folder`."):
         write_json(folder / CONFIG, config)
         with atomic(folder / WEIGHTS) as temporary:
             shutil.copyfile(source, temporary)
-        if not (folder / CARD).exists():
-            write_text(folder / CARD, _card(folder.resolve().name, network, metadata, license))
+        if is_own or not card.exists():
+            write_text(card, _card(title, network, metadata, license))
+        else:
+            warnings.warn(f"`{card}` was edited and stays: check that it describes these weights.", stacklevel=3)
     return folder
+
+
+def _is_generated(folder: Path) -> bool:
+    """Whether the card of a folder is as `save_pretrained` wrote it for the weights there."""
+    try:
+        written = (folder / CARD).read_text(encoding="utf-8")
+        network, metadata = load_checkpoint(folder / WEIGHTS), read_metadata(folder / WEIGHTS)
+    except (OSError, UnicodeDecodeError, MwdnError):
+        return False
+    without_license = "".join(line for line in written.splitlines(True) if not line.startswith("license: "))
+    return without_license == _card(folder.resolve().name, network, metadata, None)
 
 
 @checked
@@ -66,7 +81,13 @@ def from_pretrained(name: str | Path) -> nn.Module:
     """
     folder = Path(name)
     if not folder.is_dir():
-        return load_network(f"hub:{name}")
+        of_hub = str(name).removeprefix("hub:")
+        if of_hub.count("/") != 1:
+            raise CheckpointError(f"`{name}` is no folder, and no `owner/name` of the Hugging Face hub.")
+        try:
+            return load_network(f"hub:{of_hub}")
+        except MwdnError as error:
+            raise CheckpointError(f"There is no folder `{name}`, and on the hub: {error}") from error
     config, metadata = read_json(folder / CONFIG), read_metadata(folder / WEIGHTS)
     for key in ("name", "options"):
         if not isinstance(config, dict) or config.get(key) != metadata[key]:

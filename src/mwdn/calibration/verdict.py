@@ -144,7 +144,7 @@ def _light(report: PsfReport) -> Iterator[Finding]:
     if support.border > 0.1:
         text = (
             f"{extent}, but the border of the frame is still {_percent(support.border)} as bright as the mean: the PSF "
-            "is cut off, or has a background. Use a larger `--crop` if the frame is larger."
+            "is cut off, or has a background. If the frame is larger, take more of it: `--crop`."
         )
         yield Finding("bad" if support.border > 0.5 else "weak", text)
     else:

@@ -43,7 +43,7 @@ def demo(
     *,
     out: Annotated[Path, Parameter(name=["--out", "-o"])] = Path("results/demo"),
     seed: int = 0,
-    pictures: tuple[Picture, ...] = PICTURES,
+    pictures: Annotated[tuple[Picture, ...], Parameter(consume_multiple=True, negative=())] = PICTURES,
 ) -> None:
     """Simulate a small lensless camera and reconstruct its captures with every method that needs no training.
 

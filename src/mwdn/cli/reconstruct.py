@@ -22,7 +22,7 @@ from mwdn.cli.terminal import Json, complain, counted, detail, if_interrupted, n
 from mwdn.data.captures import list_captures
 from mwdn.diagnosis.trust import check_size
 from mwdn.errors import ParameterError, one_line
-from mwdn.inference.batch import SHOWN, Batch, Job
+from mwdn.inference.batch import Batch, Job
 from mwdn.inference.outputs import Format, check_outputs, output_name, read_sidecar
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.exif import orientation
@@ -118,7 +118,7 @@ def reconstruct(  # noqa: PLR0913
         is_first = distributed.rank() == 0
         if is_first:
             _announce(batch, remark)
-            _name_turn((camera.psf_file, *files[:SHOWN]))
+            _name_turn((camera.psf_file, *files))
         failed, existing = _run(batch, files)
         if is_first:
             batch.summarise(files)

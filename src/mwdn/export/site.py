@@ -169,7 +169,8 @@ def _in_words(calibration: Calibration) -> str:
     words += [] if frames.crop is None else [f"cropped to {frames.crop[0]} x {frames.crop[1]}"]
     words += [] if frames.bin == 1 else [f"binned by {frames.bin}"]
     words += [] if frames.gamma is None else [f"gamma {frames.gamma}"]
-    words += [] if calibration.dark is None and calibration.ambient is None else ["dark frame subtracted"]
+    words += [] if calibration.dark is None else ["dark frame subtracted"]
+    words += [] if calibration.ambient is None else ["light of the room subtracted"]
     return ", ".join(words)
 
 

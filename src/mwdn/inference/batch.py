@@ -19,11 +19,19 @@ from mwdn.diagnosis.sizes import mismatch
 from mwdn.diagnosis.trust import Trust, examine_picture
 from mwdn.errors import ImageError, MwdnError, ShapeError
 from mwdn.inference.origin import origin, settings_hash
-from mwdn.inference.outputs import SUMMARY, Format, output_name, read_sidecar, support_name, write_output
+from mwdn.inference.outputs import (
+    SUMMARY,
+    Format,
+    output_name,
+    read_sidecar,
+    remove_earlier,
+    support_name,
+    write_output,
+)
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.contact_sheets import contact_sheet, thumbnail
 from mwdn.io.exif import orientation
-from mwdn.io.files import as_image_error, is_full, write_json
+from mwdn.io.files import is_full, write_json
 from mwdn.io.formats import is_for_viewing
 from mwdn.io.images import read_frame, read_picture, write_picture
 from mwdn.io.support_picture import support_picture
@@ -207,7 +215,7 @@ class Batch:
         verdicts = settle_exif((*job.verdicts, *trust.verdicts)) if trust else ()
         calibration, pitch = self.reconstruct.calibration, self.reconstruct.calibration.pitch_um
         content: dict[str, object] = {"method": self.method, "psf_hash": calibration.psf_hash, "origin": job.origin}
-        content["bin"] = calibration.frames.bin
+        content |= {"picture": job.output.name, "bin": calibration.frames.bin}
         content |= {} if job.room_light is None else {"room_light": round(job.room_light, 4)}
         if trust:
             content |= {**trust.content, "verdicts": [asdict(verdict) for verdict in verdicts]}
@@ -215,9 +223,7 @@ class Batch:
         if job.full_size:
             scene = enlarge_binned(scene, calibration.frames.bin, job.full_size)
             pitch = pitch and pitch / calibration.frames.bin
-        with as_image_error(sidecar):  # the new picture must not have an old sidecar or map
-            sidecar.unlink(missing_ok=True)
-            support_name(job.output).unlink(missing_ok=True)
+        remove_earlier(job.output, job.capture)  # the new picture must not have an old sidecar or map
         write_output(job.output, scene, self.format, pitch)
         if trust and self.map:
             write_picture(support_name(job.output), support_picture(scene, trust.support.map))

@@ -6,7 +6,7 @@ from typing import Literal
 
 from mwdn.errors import ParameterError
 from mwdn.io.contact_sheets import to_display
-from mwdn.io.files import path_resolver
+from mwdn.io.files import as_image_error, path_resolver
 from mwdn.io.images import write_imagej, write_linear, write_picture
 from mwdn.io.reading import read_json
 from mwdn.types import Scene
@@ -111,6 +111,23 @@ def _check_maps(sources: Mapping[str, str], existing: Set[str], start: str, form
                 f"`{start}{lost}` is the {kind} of another capture, and {source} would replace or remove it. Choose "
                 "another folder: `out`."
             )
+
+
+def remove_earlier(output: Path, capture: Path) -> None:
+    """Remove what an earlier run made of a capture: sidecar, support map, and the picture if it has another format.
+
+    Raises:
+        ImageError: a file cannot be removed.
+    """
+    sidecar = output.with_suffix(".json")
+    earlier = read_sidecar(sidecar).get("picture")
+    with as_image_error(sidecar):
+        sidecar.unlink(missing_ok=True)
+        support_name(output).unlink(missing_ok=True)
+        if earlier in {output.stem + suffix for suffix in _SUFFIX.values()} - {output.name}:
+            picture = output.with_name(str(earlier))
+            if picture.resolve() != capture.resolve():
+                picture.unlink(missing_ok=True)
 
 
 def write_output(path: Path, scene: Scene, format: Format, pixel_um: float | None) -> None:

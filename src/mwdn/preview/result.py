@@ -47,6 +47,8 @@ class Look:
     def __post_init__(self) -> None:
         if not -STOPS <= self.exposure <= STOPS:
             raise ParameterError(f"`exposure` ({self.exposure}) must be from -{STOPS:g} to {STOPS:g} stops.")
+        if isinstance(self.white_balance, tuple):
+            check_white_balance(self.white_balance, (1.0,) * 3)  # gains; for the camera see `balance`
 
     def balance(self, scene: Scene, light: tuple[float, ...], own: WhiteBalance | None) -> Scene:
         """Apply the white balance to a scene, of a camera with this light of the point source and this own balance.
