@@ -3,6 +3,7 @@
 import io
 import itertools
 import json
+import time
 
 import httpx2 as httpx
 import numpy as np
@@ -11,7 +12,9 @@ from websockets.sync.client import connect
 
 from mwdn.calibration import Calibration
 from mwdn.capture import open_source
+from mwdn.capture.folder import WatchedFolder
 from mwdn.io.formats import as_frame
+from mwdn.io.images import write_frame
 from mwdn.preview.cameras import StoredCameras
 from mwdn.preview.live import Live
 from mwdn.preview.live_pictures import LivePictures
@@ -217,3 +220,38 @@ def test_wish_made_while_another_is_refused_stays(monkeypatch):
         patch.setattr(LiveSettings, "prepare", prepare_slowly)
         assert pictures.begin(frame)().settings.method == "wiener"
     assert pictures.begin(frame)().settings.method == "fista"
+
+
+def test_a_folder_goes_on_after_frames_of_all_kinds_and_pauses(tmp_path):
+    """An 8-bit frame, one of another size and a damaged one lost the good frames after them, and ended a recording."""
+    with open_source(f"rig,height={SIDE},width={SIDE}") as rig:
+        array, psf = (rig.read().array << 4).astype(np.uint16), rig.psf
+    folder, said = tmp_path / "frames", []
+    folder.mkdir()
+    camera = WatchedFolder(folder, timeout_s=1.2)
+    live = Live(camera, Calibration(psf), method="wiener", folder=tmp_path, device="cpu", retry_s=0.01)
+    viewer = live.join(lambda: said.append(parts(live.newest)[0]))
+
+    def shown(condition):
+        end = time.monotonic() + 20
+        while not any(map(condition, said)):
+            assert time.monotonic() < end, [each.get("refused", each) for each in said]
+            time.sleep(0.02)
+        said.clear()
+
+    shown(lambda message: "no new frame yet" in message.get("error", ""))
+    live.control({"record": True})
+    write_frame(folder / "0.png", array)
+    shown(lambda message: message.get("recorded") == 1)
+    time.sleep(1.5)  # longer than the time-out
+    write_frame(folder / "1.png", (array >> 8).astype(np.uint8))
+    shown(lambda message: message.get("number") == 1 and "delivers other frames" in message["refused"])
+    live.control({"record": False})
+    write_frame(folder / "2.png", array[:-8])
+    shown(lambda message: message.get("number") == 2 and "(40 x 48)" in message["refused"])
+    (folder / "3.png").write_bytes((folder / "0.png").read_bytes()[:999])
+    shown(lambda message: "3.png" in message.get("error", ""))
+    write_frame(folder / "4.png", array)
+    shown(lambda message: message.get("number") == 4 and not message["refused"])
+    live.leave(viewer)
+    live.close()

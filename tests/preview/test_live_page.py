@@ -42,6 +42,7 @@ def test_live_picture_is_started_used_and_stopped(serve, tmp_path):
         assert 0 <= page.run("Number(document.getElementById('live-state').dataset.latency)") < 60_000
         # The page shows the method of the server, not that of its own list.
         page.wait("document.getElementById('method').value === 'wiener'")
+        assert page.run("document.getElementById('room-light').value") == ""  # as the method does by default
 
         choose(page, "method", "admm")
         page.wait("document.getElementById('option-iterations')")

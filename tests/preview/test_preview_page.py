@@ -32,7 +32,8 @@ def test_dropped_files_become_a_picture(serve, psf, psf_file, capture, tmp_path)
         page.press("ArrowRight", 39)
         assert page.run("document.getElementById('stack').style.getPropertyValue('--split')") == "51%"
 
-        # A slider makes another picture.
+        # A slider makes another picture, of the capture that was chosen, whatever has been written over it.
+        (tmp_path / "capture.npy").write_bytes(b"the next frame, not yet whole")
         before = page.run("document.getElementById('scene').src")
         page.run(
             "(slider => { slider.value = slider.max; slider.oninput(); })"
@@ -45,8 +46,16 @@ def test_dropped_files_become_a_picture(serve, psf, psf_file, capture, tmp_path)
         page.wait("document.getElementById('state').classList.contains('wrong')")
         assert "capture" in page.run("document.getElementById('state').textContent")
         assert page.run("document.getElementById('view').hidden")  # the picture was another file's
+        (tmp_path / "capture.npy").write_bytes(capture)
         page.drop("#capture", tmp_path / "capture.npy")
         page.wait("document.getElementById('state').textContent.startsWith('admm: 48')")
+
+        # The verdict on a PSF is not that of another one.
+        page.run("document.getElementById('inspect').click()")
+        page.wait("document.getElementById('headline').textContent")
+        page.run("document.getElementById('orientation').value = 'rotate-180'")
+        page.run("document.getElementById('orientation').onchange()")
+        assert not page.run("document.getElementById('headline').textContent")
 
         page.size(390, 800)  # a phone's width: nothing is cut off
         assert page.run("document.documentElement.scrollWidth") <= 390

@@ -37,6 +37,8 @@ class WatchedFolder(CameraSource):
         ParameterError: a wrong bit depth.
     """
 
+    waits = True
+
     def __init__(
         self,
         folder: str | Path,

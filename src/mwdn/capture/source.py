@@ -52,6 +52,10 @@ class CameraFrame:
         return self.array.shape, self.array.dtype.name, self.bit_depth, self.mosaic
 
 
+class SilentCameraError(CameraError):
+    """No frame has come in time."""
+
+
 class CameraSource(ABC):
     """A camera. Use it in a ``with`` statement, which opens and closes it.
 
@@ -64,6 +68,9 @@ class CameraSource(ABC):
 
     live = True
     """Whether timestamps are of now: not those of a recording."""
+
+    waits = False
+    """Whether a pause is no failure: somebody takes frames one by one."""
 
     def __init__(self, name: str, timeout_s: float = TIMEOUT_S) -> None:
         self.name, self.timeout_s = name, timeout_s
@@ -117,9 +124,9 @@ class CameraSource(ABC):
         """The error of a camera that is read before it is opened."""
         return CameraError(f"{self.name} is not open. Read inside `with {type(self).__name__}(...) as camera:`.")
 
-    def silent(self) -> CameraError:
+    def silent(self) -> SilentCameraError:
         """The error of a camera that delivers no frame in time."""
-        return CameraError(
+        return SilentCameraError(
             f"{self.name} has delivered no frame for {self.timeout_s:g} s. Check its cable, power and trigger, or wait "
             "longer: `timeout_s`."
         )

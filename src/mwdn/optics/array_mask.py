@@ -107,7 +107,6 @@ class ArrayMask:
         _check_slope(mask, setup, self.subdivide)
         return mask
 
-
     def _refuse(self, names: Collection[str], why: str) -> None:
         """Refuse options that would be ignored."""
         changed = [field.name for field in fields(self) if getattr(self, field.name) != field.default]

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 from mwdn.calibration import Calibration
 from mwdn.capture.recording import Recorder, record
-from mwdn.capture.source import CameraFrame, CameraSource
-from mwdn.errors import MwdnError
+from mwdn.capture.source import CameraFrame, CameraSource, SilentCameraError
+from mwdn.errors import CameraError, ImageError, MwdnError
 from mwdn.preview.limits import RefusedError
 from mwdn.preview.live_pictures import LivePicture, LivePictures, finite
 from mwdn.preview.live_settings import CAMERA, LiveSettings
@@ -69,7 +69,7 @@ class Live:
         self._pending: dict[str, float] = {}
         self._is_recording = self._is_stopped = False
         self._recorded: int | None = None  # frames of the recording that runs
-        self._recording = self._refused = ""
+        self._recording = self._refused = self._unrecorded = ""
         self._newest: bytes | None = None
         self._picture: LivePicture | None = None
 
@@ -136,20 +136,21 @@ class Live:
 
     def _run(self) -> None:
         while True:
-            failed = False
+            failure: Exception | None = None
             try:
                 with self.camera, ExitStack() as recording, closing(self._results(recording)) as results:
                     self._show(results)
             except Exception as error:
-                failed = True
+                failure = error
                 said = str(error)
                 if not isinstance(error, MwdnError):  # a defect of this package must not end the live picture for good
                     LOG.exception("live picture")
                     said = f"An error of mwdn itself: {type(error).__name__}. The server's log says more."
                 self._publish({"error": said}, b"", b"")
-            self._is_recording = False  # the next viewer starts no recording
+            # The next viewer starts no recording; one that runs goes on, in another file, when the camera is back.
+            self._is_recording &= bool(self._wake) and isinstance(failure, CameraError)
             self._changed.clear()
-            if failed and self._wake and not self._is_stopped:
+            if failure and self._wake and not self._is_stopped:
                 self._changed.wait(self._retry_s)
             with self._lock:  # somebody may have come since the last one left
                 if self._is_stopped or not self._wake:
@@ -159,21 +160,44 @@ class Live:
     def _frames(self, recording: ExitStack) -> Iterator[CameraFrame]:
         """All frames; settings change between them, and each is recorded if that is wanted."""
         recorder: Recorder | None = None
-        self._recorded = None
+        self._recorded, self._unrecorded = None, ""
         while self._wake and not self._is_stopped:
             self._configure()
-            frame = self.camera.read()
+            frame = self._read()
+            if frame is None:
+                continue
             if self._is_recording and recorder is None:
                 self._recording = time.strftime("recording-%Y%m%d-%H%M%S.h5", time.gmtime())
                 recorder = recording.enter_context(record(self.folder / self._recording, camera=self.camera.name))
             if not self._is_recording and recorder is not None:
-                recorder = self._recorded = None
+                recorder, self._recorded, self._unrecorded = None, None, ""
                 recording.close()
             if recorder is not None:
-                recorder.append(frame)
-                self._recorded = len(recorder)
+                self._append(recorder, frame)
             yield frame
         recording.close()
+
+    def _append(self, recorder: Recorder, frame: CameraFrame) -> None:
+        """Record a frame; one of another format is only shown."""
+        self._unrecorded = ""
+        try:
+            recorder.append(frame)
+        except CameraError as error:
+            self._unrecorded = str(error)
+        self._recorded = len(recorder)
+
+    def _read(self) -> CameraFrame | None:
+        """The next frame; ``None`` if it is damaged, or if nobody has taken one."""
+        try:
+            return self.camera.read()
+        except ImageError as error:
+            self._publish({"error": str(error)}, b"", b"")
+        except SilentCameraError:
+            if not self.camera.waits:
+                raise
+            if self._picture is None:
+                self._publish({"error": f"{self.camera.name} has no new frame yet."}, b"", b"")
+        return None
 
     def _configure(self) -> None:
         """Set what viewers want of the camera; a value that it refuses must not end the picture."""
@@ -226,11 +250,12 @@ class Live:
     def _about(self, picture: LivePicture) -> dict[str, Any]:
         """For JSON: the frame, and the settings of its picture, which all viewers share."""
         frame, settings = picture.frame, picture.settings
+        reasons = (self._refused, self._unrecorded, self.pictures.refused, picture.wrong)
         return {
             "number": frame.number,
             "exposure_s": finite(frame.exposure_s),
             "gain": finite(frame.gain),
-            "refused": " ".join(filter(None, (self._refused, self.pictures.refused, picture.wrong))),
+            "refused": " ".join(filter(None, reasons)),
             "recorded": self._recorded,
             "recording": self._recording,
             "method": settings.method,

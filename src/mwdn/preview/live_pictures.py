@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from threading import Lock
@@ -12,7 +13,7 @@ import torch
 
 from mwdn.calibration import Calibration
 from mwdn.capture.source import CameraFrame
-from mwdn.errors import MwdnError, ParameterError
+from mwdn.errors import MwdnError
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.preview.live_encoding import brightest, encode_jpeg
 from mwdn.preview.live_settings import LiveSettings
@@ -104,6 +105,7 @@ class LivePictures:
         self._reconstruct: Reconstructor | None = None
         self._used = settings
         self._ambient: CameraFrame | None = None
+        self._numbers: tuple[int, str | None] = 0, None  # bit depth and mosaic of the frames that `_reconstruct` takes
 
     def change(self, message: dict[str, Any]) -> None:
         """Take over the settings of a message, from any thread; why one is not possible becomes `refused`."""
@@ -119,14 +121,14 @@ class LivePictures:
         """Prepare the reconstruction of a frame with the present settings, for one frame at a time.
 
         Returns:
-            A function that makes the picture, at the same time as those of other frames; it may raise a `MwdnError`.
+            A function that makes the picture, at the same time as those of other frames.
 
         Raises:
-            MwdnError: the frame does not fit the camera, or the method does not.
+            MwdnError: the method does not fit the camera.
         """
         reconstruct = self._prepared(frame)
         if reconstruct.align:  # the pose of the first frame that shows something holds for those that follow
-            with torch.inference_mode():
+            with torch.inference_mode(), suppress(MwdnError):  # `_finish` says what is wrong with a frame
                 measurement = reconstruct.calibration.correct(frame.array).to(reconstruct.device)
                 measurement, _ = reconstruct.without_room_light(measurement)
                 if has_detail(measurement).all():
@@ -140,16 +142,17 @@ class LivePictures:
     def _finish(
         self, frame: CameraFrame, reconstruct: Reconstructor, settings: LiveSettings, *, has_ambient: bool
     ) -> LivePicture:
-        start = time.perf_counter()
-        measurement = reconstruct.calibration.correct(frame.array)
-        self.count("correct", time.perf_counter() - start)
-        start, wrong = time.perf_counter(), ""
-        try:
+        start, wrong, calibration = time.perf_counter(), "", reconstruct.calibration
+        measurement = scene = torch.zeros(1, calibration.psf.shape[1], *calibration.size)
+        try:  # a dark frame, or one of another size, must not end the live picture
+            measurement = calibration.correct(frame.array)
+            self.count("correct", time.perf_counter() - start)
+            start, scene = time.perf_counter(), torch.zeros_like(measurement)
             scene = torch.nan_to_num(reconstruct.as_recorded(reconstruct.on_device(measurement)).cpu())
-        except ParameterError as error:  # a dark frame must not end the live picture
-            wrong, scene = str(error), torch.zeros_like(measurement)
+        except MwdnError as error:
+            wrong = str(error)
         self.count("reconstruct", time.perf_counter() - start)
-        shown, calibration = measurement.clamp(min=0), reconstruct.calibration
+        shown = measurement.clamp(min=0)
         return LivePicture(frame, shown, scene, settings, calibration, has_ambient=has_ambient, wrong=wrong)
 
     def _prepared(self, frame: CameraFrame) -> Reconstructor:
@@ -160,10 +163,12 @@ class LivePictures:
             self._ambient, self._reconstruct = frame if takes_ambient else None, None
         elif self._ambient is not None and not _is_alike(self._ambient, frame):
             self._ambient = self._reconstruct = None
-            self.refused = "The exposure has changed: take the frame of the room's light again."
-        if self._reconstruct is None or not settings.is_same_method(self._used):
+            self.refused = "The exposure or the format has changed: take the frame of the room's light again."
+        numbers = frame.bit_depth, frame.mosaic
+        if self._reconstruct is None or numbers != self._numbers or not settings.is_same_method(self._used):
             try:
                 self._reconstruct = settings.prepare(self._calibration(frame), self.device)
+                self._numbers = numbers
             except MwdnError as error:
                 if self._reconstruct is None:
                     raise
@@ -182,8 +187,8 @@ class LivePictures:
 
 
 def _is_alike(a: CameraFrame, b: CameraFrame) -> bool:
-    """Whether two frames have the same exposure and gain, or the camera does not say."""
-    return all(
+    """Whether two frames have the same format, exposure and gain, or the camera does not say."""
+    return a.kind == b.kind and all(
         not math.isfinite(x - y) or math.isclose(x, y, rel_tol=0.01)
         for x, y in ((a.exposure_s, b.exposure_s), (a.gain, b.gain))
     )

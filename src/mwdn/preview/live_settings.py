@@ -1,6 +1,7 @@
 """What viewers of the live picture may change, and the messages that change it."""
 
 from dataclasses import dataclass, field, fields, replace
+from types import NoneType
 from typing import Any
 
 from mwdn.calibration import Calibration
@@ -16,20 +17,19 @@ from mwdn.solvers import Admm, Fista, WarmStart
 CAMERA = ("exposure_s", "gain")
 """Settings of the camera itself."""
 
-KINDS: dict[str, type | tuple[type, ...]] = {
+KINDS: dict[str, tuple[type, ...]] = {
     "exposure_s": (int, float),
     "gain": (int, float),
-    "record": bool,
-    "ambient": bool,
-    "method": str,
-    "options": dict,
-    "align": bool,
-    "room_light": bool,
+    "record": (bool,),
+    "ambient": (bool,),
+    "method": (str,),
+    "options": (dict,),
+    "align": (bool, NoneType),
+    "room_light": (bool, NoneType),
     "stops": (int, float),
-    "white_balance": str,
+    "white_balance": (str,),
 }
 """What a message may hold, and the types of JSON; ``ambient`` takes the next frame as that of the room's light."""
-
 
 FOLLOWING = 10
 """Iterations of ADMM and FISTA for each frame but the first."""
@@ -42,15 +42,15 @@ class LiveSettings:
     Args:
         method: see `mwdn.preview.methods`.
         options: of the method.
-        align: fit the pose of the PSF to the first frame.
-        room_light: find the room's light in each frame, see `mwdn.Reconstructor`.
+        align: fit the pose of the PSF to the first frame; ``None`` does as the method does by default.
+        room_light: find the room's light in each frame, see `mwdn.Reconstructor`; ``None`` likewise.
         look: exposure and white balance of the pictures.
     """
 
     method: str = "universal-small"
     options: dict[str, Any] = field(default_factory=dict)
-    align: bool = False
-    room_light: bool = False
+    align: bool | None = None
+    room_light: bool | None = None
     look: Look = field(default_factory=Look)
 
     def changed(self, message: dict[str, Any], light: tuple[float, ...]) -> "LiveSettings":
@@ -103,8 +103,6 @@ def check_message(message: Any) -> dict[str, Any]:  # noqa: ANN401
     if not isinstance(message, dict):
         raise ParameterError("A message must be a JSON object.")
     for name, value in message.items():
-        kind = KINDS.get(name)
-        is_wrong = kind is None or not isinstance(value, kind)
-        if is_wrong or (isinstance(value, bool) and kind is not bool):
+        if type(value) not in KINDS.get(name, ()):
             raise ParameterError(f"`{name[:40]}` must be one of {', '.join(KINDS)}, of the right type.")
     return message

@@ -216,10 +216,7 @@ function setUpFiles(id, take) {
       say(error instanceof FileError ? error.message : `The page failed: ${error.message}`, true);
     }
   };
-  setUpDropZone(input, async (files) => {
-    await accept(files);
-    input.value = ""; // the same file again is a change, too
-  });
+  setUpDropZone(input, accept);
 }
 
 async function planes(name) {

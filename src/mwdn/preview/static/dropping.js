@@ -1,7 +1,10 @@
 /** A file input in a label onto which files can be dropped: `take` gets the files of either way. */
 export function setUpDropZone(input, take) {
   const zone = input.parentElement;
-  input.onchange = () => take(input.files);
+  input.onchange = async () => {
+    await take(input.files);
+    input.value = ""; // else the same file cannot be chosen again
+  };
   zone.ondragover = (event) => {
     event.preventDefault();
     zone.classList.add("target");

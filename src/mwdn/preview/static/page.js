@@ -11,6 +11,7 @@ import { showFindings, showVerdicts } from "./verdicts.js";
 const byId = (id) => document.getElementById(id);
 const ORIENTATIONS = ["rotate-180", "rotate-90", "rotate-270", "flip-left-right", "flip-top-bottom", "transpose", "transverse"];
 const UPLOAD = "";
+const ROOM_LIGHT = { "": null, true: true, false: false, frame: false }; // of the live picture, by the choice
 
 const chosen = { psf: null, capture: null, ambient: null, job: null };
 let methods = [];
@@ -53,8 +54,11 @@ function cameraFields() {
   return name === UPLOAD ? { psf: chosen.psf, calibration: calibration() } : { camera: name };
 }
 
-function isReady() {
-  return chosen.capture && (byId("camera").value !== UPLOAD || chosen.psf);
+function whatIsMissing() {
+  if (!chosen.capture) return "Drop a capture, or choose a sample.";
+  if (byId("camera").value === UPLOAD && !chosen.psf) return "Drop a PSF, or choose a calibration.";
+  if (byId("room-light").value === "frame" && !chosen.ambient) return "Drop a frame of the room’s light alone.";
+  return "";
 }
 
 function orderFields(method = byId("method").value, trust = byId("trust").checked) {
@@ -71,7 +75,7 @@ const look = (format = "png") =>
 // What all viewers of the live picture share.
 function wishLive() {
   wish({
-    method: byId("method").value, options: readSliders(), align: byId("align").checked, room_light: byId("room-light").value === "true",
+    method: byId("method").value, options: readSliders(), align: byId("align").checked || null, room_light: ROOM_LIGHT[byId("room-light").value],
     stops: Number(byId("exposure").value), white_balance: byId("balance").value,
   });
 }
@@ -82,9 +86,9 @@ async function reconstruct() {
     return;
   }
   running?.abort();
-  if (!isReady()) {
+  if (whatIsMissing()) {
     hidePicture();
-    say(chosen.capture ? "Drop a PSF, or choose a calibration." : "Drop a capture, or choose a sample.");
+    say(whatIsMissing());
     return;
   }
   const mine = (running = new AbortController());
@@ -155,7 +159,7 @@ const SAVED = { png: "reconstruction.png", png16: "reconstruction-16bit.png", ti
 const save = async (format) => saveBlob(await getBlob(`/jobs/${chosen.job}/picture${look(format)}`), SAVED[format]);
 
 async function compareMethods() {
-  if (!isReady()) return;
+  if (whatIsMissing()) return;
   comparing?.abort();
   const { signal } = (comparing = new AbortController());
   byId("grid-section").hidden = false;
@@ -181,7 +185,7 @@ async function compareMethods() {
 // A snapshot of the live camera as a capture, to check it, compare methods and save the picture.
 async function useSnapshot(frame, job) {
   stopLive();
-  take("capture", new File([frame], `frame-${job.report.number}.png`, { type: "image/png" }));
+  await take("capture", new File([frame], `frame-${job.report.number}.png`, { type: "image/png" }));
   await listCameras(job.camera);
   await reconstruct();
 }
@@ -190,16 +194,22 @@ async function trySample(name, camera) {
   stopLive();
   say("Loading the sample …");
   const data = await getBlob(`/samples/${name}`);
-  take("capture", new File([data], `${name}.png`));
+  await take("capture", new File([data], `${name}.png`));
   chooseCamera(camera);
   await reconstruct();
 }
 
-function take(what, file) {
-  chosen[what] = file;
+// The file is read at once: a program that captures may write the next frame into it.
+async function take(what, file) {
+  chosen[what] = new File([await file.arrayBuffer()], file.name, { type: file.type });
   byId(`${what}-name`).textContent = file.name;
   byId(`${what}-name`).parentElement.classList.add("full");
   if (what === "psf") chooseCamera(UPLOAD);
+  hideComparison();
+}
+
+// Pictures of other methods, and the verdict on a PSF, of what was chosen before.
+function hideComparison() {
   comparing?.abort();
   byId("grid-section").hidden = true;
   byId("headline").textContent = "";
@@ -207,13 +217,13 @@ function take(what, file) {
 }
 
 function setUpDrop(what) {
-  setUpDropZone(byId(what), (files) => {
+  setUpDropZone(byId(what), async (files) => {
     if (files.length > 1) {
       running?.abort();
       say(`${files.length} files were dropped: drop one.`, true);
       return;
     }
-    if (files[0]) take(what, files[0]);
+    if (files[0]) await guarded(() => take(what, files[0]));
     // The samples' camera is simulated: a visitor's capture is of another one.
     if (what === "capture" && byId("camera").value === sampleCamera) chooseCamera(UPLOAD);
     soon(reconstruct, 0);
@@ -254,8 +264,8 @@ async function removeCamera() {
 // The settings of the live picture, which another page has changed.
 function followLive({ method, options, align, room_light }) {
   byId("method").value = method;
-  byId("align").checked = align;
-  byId("room-light").value = String(room_light);
+  byId("align").checked = align === true;
+  byId("room-light").value = room_light === null ? "" : String(room_light);
   byId("ambient-zone").hidden = true;
   chooseMethod(options);
 }
@@ -304,9 +314,16 @@ byId("room-light").onchange = () => {
 };
 byId("camera").onchange = () => {
   chooseCamera(byId("camera").value);
+  hideComparison();
   soon(reconstruct, 0);
 };
-for (const id of ["bin", "psf-bin", "bit-depth", "mosaic", "gamma", "psf-gamma", "orientation", "align", "trust"]) byId(id).onchange = () => soon(reconstruct, 0);
+for (const id of ["bin", "psf-bin", "bit-depth", "mosaic", "gamma", "psf-gamma", "orientation"]) {
+  byId(id).onchange = () => {
+    hideComparison();
+    soon(reconstruct, 0);
+  };
+}
+for (const id of ["align", "trust"]) byId(id).onchange = () => soon(reconstruct, 0);
 byId("exposure").oninput = () => {
   byId("exposure-value").textContent = Number(byId("exposure").value).toFixed(1);
   soon(showPictures);
