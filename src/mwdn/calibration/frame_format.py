@@ -39,7 +39,7 @@ class FrameFormat:
             file has its own: ``psf_gamma``.
         crop: height and width of the central part to use, in raw pixels of the frame; even with a mosaic.
         mosaic: raw frames of a colour filter array with this order: each 2 x 2 cell becomes one pixel. A camera's raw
-            file (.dng, .nef ...) says its own order: `mwdn.Calibration.from_file` takes that of the PSF's.
+            file (.dng, .nef ...) says its own order, and that of the PSF's file holds for the captures.
         grey: average the colours.
         bin: average blocks of this many pixels along each axis.
         upside_down: the file's first row is the bottom of the picture (DiffuserCam's .npy).

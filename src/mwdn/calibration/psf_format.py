@@ -21,7 +21,7 @@ class PsfFormat:
 
     Args:
         background: uniform light under the PSF in addition to the dark frame: a fraction of the full scale, or
-            ``"estimate"`` (see `mwdn.calibration.psf_levels.estimate_background`). 0 for a PSF without background.
+            ``"estimate"``, which takes it from the darkest pixels. 0 for a PSF without background.
         psf_bin: ``bin`` of the PSF, if it was taken at another resolution than the captures. ``crop`` is scaled to
             cover the same part of the view, and the dark frame is not subtracted from the PSF.
         psf_bit_depth: bits of the PSF's numbers, if it was taken with others than the captures.

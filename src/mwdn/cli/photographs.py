@@ -21,8 +21,8 @@ class PhotographOptions:
     """Photographs that describe the camera, and how they were taken. A folder stands for the frames in it.
 
     Args:
-        exposures: exposure of each equal part of the frames, in order: --exposures 1 8 64, in milliseconds. Two to four
-            are merged to high dynamic range.
+        exposures: exposure of each equal part of the frames, in order: --exposures 1 8 64, in milliseconds. Several,
+            up to eight, are merged to high dynamic range.
         dark: frames taken without light, or with the source switched off, several; subtracted from the PSF and the
             captures.
         dark_exposures: exposure of each folder of dark frames, or of each equal part of the files, if they differ.

@@ -100,7 +100,8 @@ def fitting_size(measurement: Measurement, calibration: Calibration) -> Verdict:
     what, bin, value = ("PSF", best.psf_bin, str(best.psf_bin))
     if best.bin > 1:
         what, bin, value = ("capture", best.bin, f"1/{best.bin}")
-    text = f"They fit with the {what} binned by {bin}, and at no other bin tried."
+    text = f"They fit with the {what} binned by {bin}" if bin != 1 else "They fit without binning"
+    text += ", and at no other bin tried."
     sizes = (measurement.shape[-2:], best.bin), (calibration.psf.shape[-2:], best.psf_bin)
     cropped = any(best.size != tuple(length // by for length in size) for size, by in sizes)
     return Verdict("psf", "size", "doubt", text, value, _options(best, calibration, cropped=cropped))
