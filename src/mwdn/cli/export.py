@@ -9,6 +9,7 @@ from cyclopts import Parameter
 from mwdn.cli.camera import CameraOptions
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.method_options import MethodOptions, read_options
+from mwdn.cli.progress import show_progress
 from mwdn.cli.terminal import say
 from mwdn.errors import ParameterError
 from mwdn.export.exporter import Exported, Precision, required_agreement
@@ -54,10 +55,12 @@ def export(  # noqa: PLR0913
             raise ParameterError(f"`runtime` ({runtime}) is for pages. Add `--web CAMERA`, or leave it out.")
         out = out or Path("camera.onnx")
         check_folder(out.parent)
-        write = _writer(out)
-        exported = write(
-            method, camera.load(), out, precision=precision, channels=channels, least=least, **method_options
-        )
+        write, calibration = _writer(out), camera.load()
+        with show_progress() as progress:
+            progress.start("Exporting, and comparing with mwdn", None)
+            exported = write(
+                method, calibration, out, precision=precision, channels=channels, least=least, **method_options
+            )
         _report(exported, out.stat().st_size, required_agreement(least, precision))
         return
     if precision != "float32" or channels is not None:
@@ -88,7 +91,10 @@ def _export_page(
 ) -> None:
     from mwdn.export.site import FILES, export_site
 
-    exported = export_site(method, camera.load(), out, runtime=runtime, name=web.name, least=least)
+    calibration = camera.load()
+    with show_progress() as progress:
+        progress.start("Exporting, and comparing with mwdn", None)
+        exported = export_site(method, calibration, out, runtime=runtime, name=web.name, least=least)
     size = sum((out / name).stat().st_size for name in FILES)
     _report(exported, size, required_agreement(least))
     say(f"Open {out / FILES[0]}, or copy the folder to a static host.")
