@@ -126,13 +126,19 @@ def test_the_bits_of_a_camera_file_stay_if_it_is_changed(run, folder):
 
 def test_a_copy_of_a_camera_file_keeps_its_pictures(folder):
     psf = np.ones((4, 5, 1), np.float32)
-    first = write_camera_with_parts(Path("camera.toml"), {}, {"psf": psf})["psf"]
-    Path("backup.toml").write_bytes(Path("camera.toml").read_bytes())
-    second = write_camera_with_parts(Path("camera.toml"), {}, {"psf": 2 * psf})["psf"]
-    assert (first.exists(), second.exists()) == (True, True)
-    Path("backup.toml").unlink()
-    write_camera_with_parts(Path("camera.toml"), {}, {"psf": 3 * psf})
-    assert (first.exists(), second.exists()) == (True, False)  # only what the replaced file names is looked at
+    for name in ("camera.toml", "camera.TOML"):
+        first = write_camera_with_parts(Path(name), {}, {"psf": psf})["psf"]
+        Path("backup.toml").write_bytes(Path(name).read_bytes())
+        second = write_camera_with_parts(Path(name), {}, {"psf": 2 * psf})["psf"]
+        assert (first.exists(), second.exists()) == (True, True)
+        Path("backup.toml").write_text("pitch_um = \n")  # being edited: it may name any of them
+        third = write_camera_with_parts(Path(name), {}, {"psf": 3 * psf})["psf"]
+        assert (first.exists(), second.exists(), third.exists()) == (True, True, True)
+        Path("backup.toml").unlink()
+        write_camera_with_parts(Path(name), {"pitch_um": 2.0}, {"psf": 3 * psf})
+        assert third.exists()
+        write_camera_with_parts(Path(name), {}, {"psf": 4 * psf})
+        assert not third.exists()
 
 
 def test_a_background_that_is_given_is_kept(run, folder):
@@ -142,6 +148,10 @@ def test_a_background_that_is_given_is_kept(run, folder):
         ("--dark dark", 0.0),
         ("--dark dark --background estimate", "estimate"),
         ("--camera camera.toml", "estimate"),
+        ("--dark dark", 0.0),
+        ("--camera camera.toml --dark none", None),  # 0 was for the dark frame
+        ("--camera camera.toml --background 0", 0.0),
+        ("--camera camera.toml", 0.0),
     ):
         assert run(f"calibrate psf_1 --bit-depth 12 {options}")[0] == 0
         assert read_camera("camera.toml").get("background") == background

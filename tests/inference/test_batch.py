@@ -467,7 +467,10 @@ def test_a_picture_of_another_format_does_not_stay_beside_the_new_sidecar(tmp_pa
     list(make_batch(psf, out).run(captures[:1]))
     assert (out / "0.png").exists()
     (out / "0.tif").write_bytes(b"of the user")
-    list(make_batch(psf, out, Wiener(regularisation=1.0), format="npy").run(captures[:1]))
+    list(make_batch(psf, out, format="npy").run(captures[:1]))
+    assert sorted(path.name for path in out.iterdir()) == ["0.json", "0.npy", "0.png", "0.tif"]  # of the same method
+    list(make_batch(psf, out).run(captures[:1]))
+    list(make_batch(psf.flip(-1), out, format="npy").run(captures[:1]))
     assert sorted(path.name for path in out.iterdir()) == ["0.json", "0.npy", "0.tif"]
 
 

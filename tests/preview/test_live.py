@@ -228,7 +228,7 @@ def test_a_folder_goes_on_after_frames_of_all_kinds_and_pauses(tmp_path):
         array, psf = (rig.read().array << 4).astype(np.uint16), rig.psf
     folder, said = tmp_path / "frames", []
     folder.mkdir()
-    camera = WatchedFolder(folder, timeout_s=1.2)
+    camera = WatchedFolder(folder, timeout_s=1.2, wait=lambda seconds: time.sleep(seconds / 10))
     live = Live(camera, Calibration(psf), method="wiener", folder=tmp_path, device="cpu", retry_s=0.01)
     viewer = live.join(lambda: said.append(parts(live.newest)[0]))
 
@@ -239,18 +239,19 @@ def test_a_folder_goes_on_after_frames_of_all_kinds_and_pauses(tmp_path):
             time.sleep(0.02)
         said.clear()
 
-    shown(lambda message: "no new frame yet" in message.get("error", ""))
+    shown(lambda message: "no frame yet" in message.get("error", ""))
     live.control({"record": True})
     write_frame(folder / "0.png", array)
     shown(lambda message: message.get("recorded") == 1)
-    time.sleep(1.5)  # longer than the time-out
+    time.sleep(0.3)  # longer than the time-out
     write_frame(folder / "1.png", (array >> 8).astype(np.uint8))
     shown(lambda message: message.get("number") == 1 and "delivers other frames" in message["refused"])
     live.control({"record": False})
+    shown(lambda message: message.get("number") == 1 and message["recorded"] is None)  # though no frame comes
     write_frame(folder / "2.png", array[:-8])
     shown(lambda message: message.get("number") == 2 and "(40 x 48)" in message["refused"])
     (folder / "3.png").write_bytes((folder / "0.png").read_bytes()[:999])
-    shown(lambda message: "3.png" in message.get("error", ""))
+    shown(lambda message: message.get("number") == 2 and "3.png" in message["refused"])
     write_frame(folder / "4.png", array)
     shown(lambda message: message.get("number") == 4 and not message["refused"])
     live.leave(viewer)

@@ -33,8 +33,8 @@ def write_camera_with_parts(
 
     A picture's name ends in a hash of its numbers: ``camera-psf-1a2b3c4d.tif``. So the pictures of an existing camera
     file stay until the new file has replaced it atomically; then those that no camera file of the folder names are
-    removed: a copy of the camera file keeps its pictures. Of pictures that were written for another camera file, which
-    removes them in the same way, the new one gets copies.
+    removed: a copy of the camera file keeps its pictures. Pictures that were written for another camera file are
+    copied, because that file may remove them.
 
     Args:
         path: the camera file.
@@ -103,9 +103,13 @@ def _renamed(value: Any, moved: Mapping[Path, Path]) -> Any:  # noqa: ANN401
 
 
 def _remove_unnamed(files: set[Path], folder: Path) -> None:
-    """Remove files that no camera file of the folder names."""
-    if files:
-        _remove(files.difference(*map(_named_parts, folder.glob("*.toml"))))
+    """Remove files that no camera file of the folder names; none if one of these cannot be read."""
+    if not files:
+        return
+    cameras = [path for path in folder.iterdir() if path.suffix.lower() == ".toml"]
+    with suppress(ParameterError):
+        named = {part.resolve() for path in cameras for part in _named_parts(path)}
+        _remove({file for file in files if file.resolve() not in named})
 
 
 def _remove(files: set[Path]) -> None:
@@ -141,11 +145,12 @@ def _copied(path: Path, value: Any, written: list[Path]) -> Any:  # noqa: ANN401
 
 
 def _named_parts(path: Path) -> set[Path]:
-    """Files that a camera file names; none if it is no TOML file."""
-    try:
-        table = read_toml(path, "camera file") if path.is_file() else {}
-    except ParameterError:
-        table = {}
+    """Files that a camera file names.
+
+    Raises:
+        ParameterError: it cannot be read.
+    """
+    table = read_toml(path, "camera file") if path.is_file() else {}
     names: list[Any] = []
     for key in PARTS:
         value = table.get(key, ())
@@ -156,7 +161,10 @@ def _named_parts(path: Path) -> set[Path]:
 def _own_parts(path: Path) -> set[Path]:
     """Files that a camera file names, and that this module has written for it."""
     pattern = re.compile(re.escape(path.stem) + _NAME)
-    return {file for file in _named_parts(path) if file.parent == path.parent and pattern.fullmatch(file.name)}
+    named: set[Path] = set()
+    with suppress(ParameterError):
+        named = _named_parts(path)
+    return {file for file in named if file.parent == path.parent and pattern.fullmatch(file.name)}
 
 
 def picture_of(defects: torch.Tensor) -> Frame:

@@ -37,7 +37,7 @@ class WatchedFolder(CameraSource):
         ParameterError: a wrong bit depth.
     """
 
-    waits = True
+    may_pause = True
 
     def __init__(
         self,
@@ -99,8 +99,8 @@ class WatchedFolder(CameraSource):
                     if not entry.name.startswith(".") and Path(entry.name).suffix.lower() in FRAMES:
                         status = entry.stat()
                         states[entry.name, status.st_mtime_ns] = status.st_size
-        except OSError as error:  # an unavailable network disk, or a file that was removed meanwhile
-            if not self.folder.is_dir():
+        except OSError as error:
+            if not isinstance(error, FileNotFoundError) or not self.folder.is_dir():  # else a file has been removed
                 raise CameraError(f"`{self.folder}` cannot be read any more: {error.strerror}. Restore it.") from error
         return states
 

@@ -69,8 +69,8 @@ class CameraSource(ABC):
     live = True
     """Whether timestamps are of now: not those of a recording."""
 
-    waits = False
-    """Whether a pause is no failure: somebody takes frames one by one."""
+    may_pause = False
+    """Whether it is no failure if no frame comes for long, and `read` goes on after a damaged one."""
 
     def __init__(self, name: str, timeout_s: float = TIMEOUT_S) -> None:
         self.name, self.timeout_s = name, timeout_s

@@ -116,7 +116,7 @@ def calibrate(  # noqa: PLR0913
             "ambient": ambient,
             **changed_fields(psf_format),
             **changed_fields(frames),
-            "background": None if auto_background else psf_format.background,
+            "background": kept.get("background") if auto_background else psf_format.background,
             "bin": None if auto_bin else frames.bin,
             "white_balance": white_balance,
             "pitch_um": pitch_um,
@@ -135,6 +135,8 @@ def calibrate(  # noqa: PLR0913
             known = Corrections.read(kept.get("flat_field"), kept.get("hot_pixels"))
             refuse_overwrite(out, *expanded((*pictures, *photographs.dark_files, *photographs.flat)))
             done = calibrate_frames(photographs.of(pictures), frames, known)
+            if auto_background and own_dark is not None and not photographs.dark_files:
+                own["background"] = None  # 0 was for the dark frame
             write = partial(_write_photographs, done, {**kept, **own}, has_dark=bool(photographs.dark_files))
         _write_and_refine(out, pairs, write)
 
@@ -152,6 +154,7 @@ def _write_and_refine(out: Path, pairs: Path | None, write: Callable[[Path], tup
         verdict, calibration = write(draft)
         if pairs is not None:
             refine(draft, pairs, out.with_name(f"{out.stem}-refinement.json"))
+            calibration = Calibration.load(draft)
     _finish(verdict, calibration, out)
 
 
@@ -213,7 +216,6 @@ def _write_photographs(
     done: CameraContent, content: dict[str, Any], out: Path, *, has_dark: bool
 ) -> tuple[str, Calibration]:
     """Write a camera file with the pictures made of photographs; returns the PSF's verdict and the calibration."""
-    content = {key: value for key, value in content.items() if value is not None or key not in done.content}
     if content.get("white_balance") == "flat":
         content["white_balance"] = _flat_balance(done.flat_colour)
     if content.get("background") is None and has_dark:

@@ -5,6 +5,7 @@ from collections import ChainMap
 from collections.abc import Iterable, Mapping
 from contextlib import closing
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
@@ -118,9 +119,10 @@ def reconstruct(  # noqa: PLR0913
         is_first = distributed.rank() == 0
         if is_first:
             _announce(batch, remark)
-            _name_turn((camera.psf_file, *files))
-        failed, existing = _run(batch, files)
+            _name_turned([camera.psf_file.name] if orientation(camera.psf_file) != 1 else [])
+        failed, existing, turned = _run(batch, files)
         if is_first:
+            _name_turned(turned)
             batch.summarise(files)
             if json:
                 print_json([_entry(batch, file, failed.get(file)) for file in files])
@@ -142,9 +144,8 @@ def _announce(batch: Batch, remark: str) -> None:
     say(f"PSF {reconstructor.calibration.psf_hash}, background {background} of the full scale subtracted")
 
 
-def _name_turn(files: Iterable[str | Path]) -> None:
-    """Name the files with an EXIF orientation: a phone shows them turned, unlike the pictures."""
-    turned = [Path(file).name for file in files if orientation(file) != 1]
+def _name_turned(turned: list[str]) -> None:
+    """Name files with an EXIF orientation: a phone shows them turned, unlike the pictures."""
     if turned:
         note(
             f"Shown turned elsewhere, by EXIF orientation: {enumerate_names(turned)}. Frames are not turned: pictures "
@@ -174,9 +175,15 @@ def _entry(batch: Batch, capture: str, error: str | None) -> dict[str, object]:
     return {"capture": capture, "picture": str(picture), **read_sidecar(picture.with_suffix(".json"))}
 
 
-def _run(batch: Batch, files: list[str]) -> tuple[Mapping[str, str], int]:
-    """Reconstruct all captures; errors by capture, and the number of already existing pictures, over all processes."""
+def _run(batch: Batch, files: list[str]) -> tuple[Mapping[str, str], int, list[str]]:
+    """Reconstruct all captures.
+
+    Returns:
+        Errors by capture, the number of already existing pictures, and the names of captures with an EXIF orientation,
+        over all processes.
+    """
     failed: dict[str, str] = {}
+    turned: list[str] = []
     done = existing = 0
     doubts = Doubts()
 
@@ -189,6 +196,8 @@ def _run(batch: Batch, files: list[str]) -> tuple[Mapping[str, str], int]:
         nonlocal done, existing
         if job.error:
             failed[files[job.number]] = str(job.error)
+        elif not job.existing and orientation(job.capture) != 1:
+            turned.append(job.capture.name)
         done, existing = done + (job.error is None), existing + job.existing
         _report(job)
         doubts.add(one_line(job.capture.name), job.verdicts)
@@ -204,8 +213,9 @@ def _run(batch: Batch, files: list[str]) -> tuple[Mapping[str, str], int]:
                 pass
         progress.update(len(files))
     doubts.summarise()
-    shares = distributed.gather_json((failed, existing))
-    return ChainMap(*(share for share, _ in shares)), sum(count for _, count in shares)
+    shares = distributed.gather_json((failed, existing, turned))
+    errors, counts, names = zip(*shares, strict=True)
+    return ChainMap(*errors), sum(counts), [*chain.from_iterable(names)]
 
 
 def _report(job: Job) -> None:

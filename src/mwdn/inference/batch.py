@@ -24,14 +24,14 @@ from mwdn.inference.outputs import (
     Format,
     output_name,
     read_sidecar,
-    remove_earlier,
+    remove_other_format,
     support_name,
     write_output,
 )
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.contact_sheets import contact_sheet, thumbnail
 from mwdn.io.exif import orientation
-from mwdn.io.files import is_full, write_json
+from mwdn.io.files import as_image_error, is_full, write_json
 from mwdn.io.formats import is_for_viewing
 from mwdn.io.images import read_frame, read_picture, write_picture
 from mwdn.io.support_picture import support_picture
@@ -223,7 +223,10 @@ class Batch:
         if job.full_size:
             scene = enlarge_binned(scene, calibration.frames.bin, job.full_size)
             pitch = pitch and pitch / calibration.frames.bin
-        remove_earlier(job.output, job.capture)  # the new picture must not have an old sidecar or map
+        before = read_sidecar(sidecar)
+        with as_image_error(sidecar):  # the new picture must not have an old sidecar or map
+            sidecar.unlink(missing_ok=True)
+            support_name(job.output).unlink(missing_ok=True)
         write_output(job.output, scene, self.format, pitch)
         if trust and self.map:
             write_picture(support_name(job.output), support_picture(scene, trust.support.map))
@@ -232,6 +235,7 @@ class Batch:
         except ImageError:  # the disk is full: the next run would take the picture for something else
             job.output.unlink()
             raise
+        remove_other_format(job.output, job.capture, before=before, now=content)
         return replace(job, measurement=None, pose=None, scene=None, trust=trust, verdicts=verdicts)
 
     def _examine(self, measurement: Measurement, scene: Scene, pose: Pose | None) -> Trust | None:

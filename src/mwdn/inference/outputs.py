@@ -113,21 +113,27 @@ def _check_maps(sources: Mapping[str, str], existing: Set[str], start: str, form
             )
 
 
-def remove_earlier(output: Path, capture: Path) -> None:
-    """Remove what an earlier run made of a capture: sidecar, support map, and the picture if it has another format.
+def remove_other_format(
+    output: Path, capture: Path, *, before: Mapping[str, object], now: Mapping[str, object]
+) -> None:
+    """Remove a capture's earlier picture in another format, unless it is by the same method through the same PSF.
+
+    Args:
+        output: the new picture.
+        capture: stays, whatever its name.
+        before: content of the sidecar that has been replaced; empty for none.
+        now: content of the new one.
 
     Raises:
-        ImageError: a file cannot be removed.
+        ImageError: the picture cannot be removed.
     """
-    sidecar = output.with_suffix(".json")
-    earlier = read_sidecar(sidecar).get("picture")
-    with as_image_error(sidecar):
-        sidecar.unlink(missing_ok=True)
-        support_name(output).unlink(missing_ok=True)
-        if earlier in {output.stem + suffix for suffix in _SUFFIX.values()} - {output.name}:
-            picture = output.with_name(str(earlier))
-            if picture.resolve() != capture.resolve():
-                picture.unlink(missing_ok=True)
+    names = {output.stem + suffix for suffix in _SUFFIX.values()} - {output.name}
+    if before.get("picture") not in names or all(before.get(key) == now[key] for key in ("method", "psf_hash")):
+        return
+    picture = output.with_name(str(before["picture"]))
+    if picture.resolve() != capture.resolve():
+        with as_image_error(picture):
+            picture.unlink(missing_ok=True)
 
 
 def write_output(path: Path, scene: Scene, format: Format, pixel_um: float | None) -> None:

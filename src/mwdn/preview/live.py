@@ -6,16 +6,16 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
-from contextlib import ExitStack, closing
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from mwdn.calibration import Calibration
-from mwdn.capture.recording import Recorder, record
 from mwdn.capture.source import CameraFrame, CameraSource, SilentCameraError
 from mwdn.errors import CameraError, ImageError, MwdnError
 from mwdn.preview.limits import RefusedError
 from mwdn.preview.live_pictures import LivePicture, LivePictures, finite
+from mwdn.preview.live_recording import LiveRecording
 from mwdn.preview.live_settings import CAMERA, LiveSettings
 from mwdn.preview.metrics import Metrics
 from mwdn.runtime.devices import select_device
@@ -36,6 +36,13 @@ class _Result(NamedTuple):
     encoded: tuple[bytes, bytes]
     start: float
     """Seconds since the epoch at which the work began."""
+
+
+class _Shown(NamedTuple):
+    picture: LivePicture
+    said: dict[str, Any]
+    """About the frame, for JSON."""
+    encoded: tuple[bytes, bytes]
 
 
 class Live:
@@ -60,18 +67,18 @@ class Live:
         device: str | None = None,
         retry_s: float = RETRY_S,
     ) -> None:
-        self.camera, self.calibration, self.folder, self.metrics = camera, calibration, folder, Metrics()
+        self.camera, self.calibration, self.metrics = camera, calibration, Metrics()
+        self.recording = LiveRecording(folder, camera.name)
         self.pictures = LivePictures(calibration, LiveSettings(method), device, count=self._count)
         self._retry_s, self._device = retry_s, select_device(device)
         self._lock, self._changed = threading.Lock(), threading.Event()
         self._wake: dict[int, Callable[[], None]] = {}
         self._thread: threading.Thread | None = None
         self._pending: dict[str, float] = {}
-        self._is_recording = self._is_stopped = False
-        self._recorded: int | None = None  # frames of the recording that runs
-        self._recording = self._refused = self._unrecorded = ""
+        self._is_stopped = False
+        self._refused = self._unread = ""
         self._newest: bytes | None = None
-        self._picture: LivePicture | None = None
+        self._shown: _Shown | None = None
 
     def join(self, wake: Callable[[], None]) -> int:
         """Add a viewer, and start the camera for the first one.
@@ -86,7 +93,7 @@ class Live:
             number = max(self._wake, default=0) + 1
             self._wake[number] = wake
             if self._thread is None:
-                self._is_stopped, self._newest, self._picture = False, None, None
+                self._is_stopped, self._newest, self._shown = False, None, None
                 self._thread = threading.Thread(target=self._run, daemon=True)
                 self._thread.start()
             return number
@@ -114,15 +121,15 @@ class Live:
         Raises:
             RefusedError: there is none.
         """
-        if self._picture is None:
+        if self._shown is None:
             raise RefusedError(409, "The live camera has no picture. Start it first.")
-        return self._picture
+        return self._shown.picture
 
     def control(self, message: dict[str, Any]) -> None:
         """Follow a message, of `mwdn.preview.live_settings.check_message`."""
         message, self._refused = dict(message), ""
         self._pending |= {name: float(message.pop(name)) for name in CAMERA if name in message}
-        self._is_recording = message.pop("record", self._is_recording)
+        self.recording.is_wanted = message.pop("record", self.recording.is_wanted)
         if message:
             self.pictures.change(message)
 
@@ -138,7 +145,7 @@ class Live:
         while True:
             failure: Exception | None = None
             try:
-                with self.camera, ExitStack() as recording, closing(self._results(recording)) as results:
+                with self.camera, self.recording, closing(self._results()) as results:
                     self._show(results)
             except Exception as error:
                 failure = error
@@ -147,57 +154,45 @@ class Live:
                     LOG.exception("live picture")
                     said = f"An error of mwdn itself: {type(error).__name__}. The server's log says more."
                 self._publish({"error": said}, b"", b"")
-            # The next viewer starts no recording; one that runs goes on, in another file, when the camera is back.
-            self._is_recording &= bool(self._wake) and isinstance(failure, CameraError)
+            # When a camera is back, its recording goes on in another file. The next viewer starts none.
+            if not (isinstance(failure, CameraError) and self.camera.live):
+                self.recording.is_wanted = False
             self._changed.clear()
             if failure and self._wake and not self._is_stopped:
                 self._changed.wait(self._retry_s)
             with self._lock:  # somebody may have come since the last one left
                 if self._is_stopped or not self._wake:
+                    self.recording.is_wanted = False
                     self._thread = None
                     return
 
-    def _frames(self, recording: ExitStack) -> Iterator[CameraFrame]:
+    def _frames(self) -> Iterator[CameraFrame]:
         """All frames; settings change between them, and each is recorded if that is wanted."""
-        recorder: Recorder | None = None
-        self._recorded, self._unrecorded = None, ""
         while self._wake and not self._is_stopped:
             self._configure()
+            if self.recording.stop():
+                self._tell()
             frame = self._read()
-            if frame is None:
-                continue
-            if self._is_recording and recorder is None:
-                self._recording = time.strftime("recording-%Y%m%d-%H%M%S.h5", time.gmtime())
-                recorder = recording.enter_context(record(self.folder / self._recording, camera=self.camera.name))
-            if not self._is_recording and recorder is not None:
-                recorder, self._recorded, self._unrecorded = None, None, ""
-                recording.close()
-            if recorder is not None:
-                self._append(recorder, frame)
-            yield frame
-        recording.close()
-
-    def _append(self, recorder: Recorder, frame: CameraFrame) -> None:
-        """Record a frame; one of another format is only shown."""
-        self._unrecorded = ""
-        try:
-            recorder.append(frame)
-        except CameraError as error:
-            self._unrecorded = str(error)
-        self._recorded = len(recorder)
+            if frame is not None:
+                self.recording.add(frame)
+                yield frame
+        self.recording.close()
 
     def _read(self) -> CameraFrame | None:
-        """The next frame; ``None`` if it is damaged, or if nobody has taken one."""
+        """The next frame; ``None`` if a camera that may pause has none, or a damaged one."""
         try:
-            return self.camera.read()
-        except ImageError as error:
-            self._publish({"error": str(error)}, b"", b"")
-        except SilentCameraError:
-            if not self.camera.waits:
+            frame = self.camera.read()
+        except (ImageError, SilentCameraError) as error:
+            if not self.camera.may_pause:
                 raise
-            if self._picture is None:
-                self._publish({"error": f"{self.camera.name} has no new frame yet."}, b"", b"")
-        return None
+            if isinstance(error, ImageError):
+                self._unread = str(error)
+                self._tell()
+            elif self._shown is None:
+                self._publish({"error": f"{self.camera.name} has no frame yet."}, b"", b"")
+            return None
+        self._unread = ""
+        return frame
 
     def _configure(self) -> None:
         """Set what viewers want of the camera; a value that it refuses must not end the picture."""
@@ -208,7 +203,7 @@ class Live:
             except MwdnError as error:
                 self._refused = str(error)
 
-    def _results(self, recording: ExitStack) -> Generator["_Result", None, None]:
+    def _results(self) -> Generator["_Result", None, None]:
         """The newest picture each time.
 
         On a CPU two frames are in progress, each on half of the processors: 18 frames/s on two processors, against 12
@@ -216,7 +211,7 @@ class Live:
         """
         workers = min(2, usable_processors()) if self._device.type == "cpu" else 1
         threads = max(1, usable_processors() // workers)
-        return latest_results(self._begin, self._frames(recording), workers=workers, threads=threads)
+        return latest_results(self._begin, self._frames(), workers=workers, threads=threads)
 
     def _begin(self, frame: CameraFrame) -> Callable[[], "_Result"]:
         start, finish = time.time(), self.pictures.begin(frame)
@@ -234,7 +229,7 @@ class Live:
         before: CameraFrame | None = None
         dropped = 0
         for picture, encoded, start in results:
-            self._picture, frame = picture, picture.frame
+            frame = picture.frame
             lost = frame.dropped if before is None else max(frame.number - before.number - 1, 0)
             dropped, before = dropped + lost, frame
             self.metrics.add("mwdn_live_frames_total")
@@ -245,19 +240,28 @@ class Live:
             # No frame is exposed after it has come: the rig without a rate does not wait for its exposure.
             taken = min(frame.timestamp, start) if self.camera.live and frame.timestamp else start
             said = {"fps": round(rate, 1), "timestamp": taken, "latency_ms": round(1000 * (now - taken))}
-            self._publish(said | {"dropped": dropped} | self._about(picture), *encoded)
+            self._shown = _Shown(picture, said | {"dropped": dropped}, encoded)
+            self._tell()
+
+    def _tell(self) -> None:
+        """Publish the newest picture, and what is to say now."""
+        if self._shown is not None:
+            picture, said, encoded = self._shown
+            self._publish(said | self._about(picture), *encoded)
+        elif self._unread:
+            self._publish({"error": self._unread}, b"", b"")
 
     def _about(self, picture: LivePicture) -> dict[str, Any]:
         """For JSON: the frame, and the settings of its picture, which all viewers share."""
         frame, settings = picture.frame, picture.settings
-        reasons = (self._refused, self._unrecorded, self.pictures.refused, picture.wrong)
+        reasons = (self._refused, self._unread, self.recording.problem, self.pictures.refused, picture.wrong)
         return {
             "number": frame.number,
             "exposure_s": finite(frame.exposure_s),
             "gain": finite(frame.gain),
             "refused": " ".join(filter(None, reasons)),
-            "recorded": self._recorded,
-            "recording": self._recording,
+            "recorded": self.recording.count,
+            "recording": self.recording.name,
             "method": settings.method,
             "options": settings.options,
             "align": settings.align,

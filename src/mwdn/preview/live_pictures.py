@@ -11,9 +11,9 @@ from typing import Any
 
 import torch
 
-from mwdn.calibration import Calibration
+from mwdn.calibration import Calibration, FrameFormat
 from mwdn.capture.source import CameraFrame
-from mwdn.errors import MwdnError
+from mwdn.errors import MwdnError, ParameterError
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.preview.live_encoding import brightest, encode_jpeg
 from mwdn.preview.live_settings import LiveSettings
@@ -105,7 +105,7 @@ class LivePictures:
         self._reconstruct: Reconstructor | None = None
         self._used = settings
         self._ambient: CameraFrame | None = None
-        self._numbers: tuple[int, str | None] = 0, None  # bit depth and mosaic of the frames that `_reconstruct` takes
+        self._format: tuple[int, str | None] = 0, None  # bit depth and mosaic of the frames that `_reconstruct` takes
 
     def change(self, message: dict[str, Any]) -> None:
         """Take over the settings of a message, from any thread; why one is not possible becomes `refused`."""
@@ -124,9 +124,11 @@ class LivePictures:
             A function that makes the picture, at the same time as those of other frames.
 
         Raises:
-            MwdnError: the method does not fit the camera.
+            MwdnError: the camera's frames do not fit the calibration, or the method does not fit the camera.
         """
-        reconstruct = self._prepared(frame)
+        reconstruct, problem = self._prepared(frame)
+        if problem:
+            return partial(self._blank, frame, reconstruct.calibration, problem)
         if reconstruct.align:  # the pose of the first frame that shows something holds for those that follow
             with torch.inference_mode(), suppress(MwdnError):  # `_finish` says what is wrong with a frame
                 measurement = reconstruct.calibration.correct(frame.array).to(reconstruct.device)
@@ -139,36 +141,52 @@ class LivePictures:
             return lambda: picture
         return finish
 
+    def _blank(self, frame: CameraFrame, calibration: Calibration, problem: str) -> LivePicture:
+        """A black picture for a frame that does not fit the camera."""
+        black = torch.zeros(1, calibration.psf.shape[1], *calibration.size)
+        return LivePicture(frame, black, black, self._used, calibration, wrong=problem)
+
     def _finish(
         self, frame: CameraFrame, reconstruct: Reconstructor, settings: LiveSettings, *, has_ambient: bool
     ) -> LivePicture:
         start, wrong, calibration = time.perf_counter(), "", reconstruct.calibration
-        measurement = scene = torch.zeros(1, calibration.psf.shape[1], *calibration.size)
-        try:  # a dark frame, or one of another size, must not end the live picture
+        try:
             measurement = calibration.correct(frame.array)
-            self.count("correct", time.perf_counter() - start)
-            start, scene = time.perf_counter(), torch.zeros_like(measurement)
+        except MwdnError as error:  # a frame of another size must not end the live picture
+            return self._blank(frame, calibration, str(error))
+        self.count("correct", time.perf_counter() - start)
+        start = time.perf_counter()
+        try:
             scene = torch.nan_to_num(reconstruct.as_recorded(reconstruct.on_device(measurement)).cpu())
-        except MwdnError as error:
-            wrong = str(error)
+        except ParameterError as error:  # nor must a dark frame
+            wrong, scene = str(error), torch.zeros_like(measurement)
         self.count("reconstruct", time.perf_counter() - start)
         shown = measurement.clamp(min=0)
         return LivePicture(frame, shown, scene, settings, calibration, has_ambient=has_ambient, wrong=wrong)
 
-    def _prepared(self, frame: CameraFrame) -> Reconstructor:
-        """The method for the current settings; if it is refused, that of the settings before."""
+    def _prepared(self, frame: CameraFrame) -> tuple[Reconstructor, str]:
+        """The method for the current settings, or that of the settings before; and why the frame does not fit.
+
+        If the method for the current settings is refused, the settings before are restored.
+        """
         with self._lock:
             settings, takes_ambient, self._takes_ambient = self.settings, self._takes_ambient, None
         if takes_ambient is not None:
             self._ambient, self._reconstruct = frame if takes_ambient else None, None
         elif self._ambient is not None and not _is_alike(self._ambient, frame):
             self._ambient = self._reconstruct = None
-            self.refused = "The exposure or the format has changed: take the frame of the room's light again."
-        numbers = frame.bit_depth, frame.mosaic
-        if self._reconstruct is None or numbers != self._numbers or not settings.is_same_method(self._used):
+            self.refused = "The exposure has changed: take the frame of the room's light again."
+        frame_format = frame.bit_depth, frame.mosaic
+        if self._reconstruct is None or frame_format != self._format or not settings.is_same_method(self._used):
             try:
-                self._reconstruct = settings.prepare(self._calibration(frame), self.device)
-                self._numbers = numbers
+                calibration = self._calibration(frame)
+            except MwdnError as error:
+                if self._reconstruct is None:
+                    raise
+                return self._reconstruct, str(error)
+            try:
+                self._reconstruct = settings.prepare(calibration, self.device)
+                self._format = frame_format
             except MwdnError as error:
                 if self._reconstruct is None:
                     raise
@@ -177,18 +195,22 @@ class LivePictures:
                     if self.settings is wished:  # a newer wish is for the next frame
                         self.settings, self.refused = settings, str(error)
         self._used = settings
-        return self._reconstruct
+        return self._reconstruct, ""
 
     def _calibration(self, frame: CameraFrame) -> Calibration:
         """The calibration, with what the camera says about its frames, and the room's light."""
-        frames = self._given.frames.completed(frame.bit_depth, frame.mosaic, of="the camera")
-        ambient = self._given.ambient if self._ambient is None else frames.normalise(self._ambient.array)
+        frames, ambient = self._completed(frame), self._given.ambient
+        if self._ambient is not None:
+            ambient = self._completed(self._ambient).normalise(self._ambient.array)
         return replace(self._given, frames=frames, ambient=ambient)
+
+    def _completed(self, frame: CameraFrame) -> FrameFormat:
+        return self._given.frames.completed(frame.bit_depth, frame.mosaic, of="the camera")
 
 
 def _is_alike(a: CameraFrame, b: CameraFrame) -> bool:
-    """Whether two frames have the same format, exposure and gain, or the camera does not say."""
-    return a.kind == b.kind and all(
+    """Whether two frames have the same exposure and gain, or the camera does not say."""
+    return all(
         not math.isfinite(x - y) or math.isclose(x, y, rel_tol=0.01)
         for x, y in ((a.exposure_s, b.exposure_s), (a.gain, b.gain))
     )

@@ -1,0 +1,72 @@
+"""The recording of a live camera, which viewers switch on and off."""
+
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+
+from mwdn.capture.recording import Recorder, record
+from mwdn.capture.source import CameraFrame
+from mwdn.errors import CameraError
+
+
+class LiveRecording:
+    """Frames are appended to a file while a recording is wanted. Leaving its ``with`` block completes the file.
+
+    Args:
+        folder: of the recordings.
+        camera: name of the camera, for the file.
+
+    Attributes:
+        is_wanted: set by viewers.
+        count: frames in the file; ``None`` while nothing is recorded.
+        name: of the newest file.
+        problem: why the newest frame is not in the file.
+    """
+
+    def __init__(self, folder: Path, camera: str) -> None:
+        self.folder, self.camera = folder, camera
+        self.is_wanted = False
+        self.count: int | None = None
+        self.name = self.problem = ""
+        self._file = ExitStack()
+        self._recorder: Recorder | None = None
+
+    def stop(self) -> bool:
+        """Complete the file if it is not wanted any more; returns whether it was."""
+        if self.is_wanted or self._recorder is None:
+            return False
+        self.close()
+        return True
+
+    def add(self, frame: CameraFrame) -> None:
+        """Record a frame if that is wanted. One of another format than the first is left out, see `problem`.
+
+        Raises:
+            ImageError: the disk is full. The frames of earlier commits are kept.
+        """
+        self.problem = ""
+        if not self.is_wanted:
+            return
+        if self._recorder is None:
+            self.name = time.strftime("recording-%Y%m%d-%H%M%S.h5", time.gmtime())
+            self._recorder = self._file.enter_context(record(self.folder / self.name, camera=self.camera))
+        try:
+            self._recorder.append(frame)
+        except CameraError as error:
+            self.problem = str(error)
+        self.count = len(self._recorder)
+
+    def close(self) -> None:
+        """Complete the file."""
+        self._recorder, self.count, self.problem = None, None, ""
+        self._file.close()
+
+    def __enter__(self) -> "LiveRecording":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._recorder, self.count, self.problem = None, None, ""
+        self._file.__exit__(kind, error, trace)
