@@ -59,16 +59,17 @@ def test_the_hub_reads_the_card(checkpoint, tmp_path):
 def test_an_edited_card_stays(checkpoint, tmp_path):
     folder = save_pretrained(checkpoint, tmp_path / "lensless")
     (folder / "README.md").write_text("mine")
-    with pytest.warns(UserWarning, match="was edited and stays"):
+    with pytest.warns(UserWarning, match="differs from what mwdn wrote, and stays"):
         save_pretrained(checkpoint, folder)
     assert (folder / "README.md").read_text() == "mine"
 
 
 def test_a_card_that_was_not_edited_is_that_of_the_new_weights(checkpoint, tmp_path):
     folder = save_pretrained("universal-small", tmp_path / "lensless", license="mit")
-    save_pretrained(checkpoint, folder, license="apache-2.0")
-    text = (folder / "README.md").read_text()
-    assert ("24.50 dB" in text, 'license: "apache-2.0"' in text, "universal" in text) == (True, True, False)
+    for license, stated in ((None, "mit"), ("apache-2.0", "apache-2.0")):
+        save_pretrained(checkpoint, folder, license=license)
+        text = (folder / "README.md").read_text()
+        assert ("24.50 dB" in text, f'license: "{stated}"' in text, "universal" in text) == (True, True, False)
 
 
 def test_files_of_others_stay(checkpoint, tmp_path):

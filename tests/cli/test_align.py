@@ -103,7 +103,7 @@ def test_a_session_becomes_aligned_pairs_that_the_psf_explains(session, run):
     moved["homography"] = (np.array([[1, 0, 40], [0, 1, -20], [0, 0, 1.0]]) @ np.array(moved["homography"])).tolist()
     (folder / "moved.json").write_text(json.dumps(moved))
     status, _, said = run(*line, "--homography", folder / "moved.json")
-    assert (status, "The picture fits badly where `--homography` puts it" in said) == (0, True)
+    assert (status, "The first picture fits badly where `--homography` puts it" in said) == (0, True)
 
 
 def test_one_capture_prints_place_and_writes_an_overlay(session, run):
@@ -126,6 +126,7 @@ def test_one_capture_prints_place_and_writes_an_overlay(session, run):
         (("frame0.png", "picture0.png", "--points", "1,2,3"), "four points"),
         (("frame0.png", "picture0.png", "--homography", "psf.npy"), "psf.npy"),
         (("frame0.png", "picture0.png", "--points", "1,2,3,4,5,6,7,8", "--homography", "a.json"), "Give either"),
+        (("frame0.png", "--homography", "a.json"), "give PICTURE, too"),
         (("frame0.png", "picture0.png", "--display-gamma", "9"), "(9)"),
         (("session.h5", "picture0.png"), "has its own pictures"),
         (("session.h5", "--count", "0"), "(0)"),

@@ -1,6 +1,7 @@
 """Trained networks as folders in the layout of the Hugging Face hub: config, weights, model card."""
 
 import json
+import re
 import shutil
 import warnings
 from pathlib import Path
@@ -31,7 +32,7 @@ def save_pretrained(method: str | Path, folder: str | Path, *, license: str | No
     Args:
         method: path of a checkpoint of this package, or ``universal`` or ``universal-small``.
         folder: the folder; its name is the title of the card.
-        license: identifier of the hub, for example ``mit``; left out unless given.
+        license: identifier of the hub, for example ``mit``; that of the card before unless given.
 
     Returns:
         The folder.
@@ -44,27 +45,32 @@ def save_pretrained(method: str | Path, folder: str | Path, *, license: str | No
     network, metadata = load_checkpoint(source), read_metadata(source)
     refuse_foreign(folder, (CONFIG, WEIGHTS), b'"library_name": "mwdn"')
     config = {"library_name": _LIBRARY, "model_type": metadata["name"], **metadata}
-    card, title, is_own = folder / CARD, folder.resolve().name, _is_generated(folder)
+    card, title = folder / CARD, folder.resolve().name
+    is_own, license_before = _own_card(folder)
     with as_parameter_error(folder, "Choose another one: `folder`."):
         write_json(folder / CONFIG, config)
         with atomic(folder / WEIGHTS) as temporary:
             shutil.copyfile(source, temporary)
         if is_own or not card.exists():
-            write_text(card, _card(title, network, metadata, license))
+            write_text(card, _card(title, network, metadata, license or license_before))
         else:
-            warnings.warn(f"`{card}` was edited and stays: check that it describes these weights.", stacklevel=3)
+            warnings.warn(
+                f"`{card}` differs from what mwdn wrote, and stays: check that it describes these weights.",
+                stacklevel=3,
+            )
     return folder
 
 
-def _is_generated(folder: Path) -> bool:
-    """Whether the card of a folder is as `save_pretrained` wrote it for the weights there."""
+def _own_card(folder: Path) -> tuple[bool, str | None]:
+    """Whether the card of a folder is as `save_pretrained` wrote it for the weights there, and its license."""
     try:
         written = (folder / CARD).read_text(encoding="utf-8")
         network, metadata = load_checkpoint(folder / WEIGHTS), read_metadata(folder / WEIGHTS)
     except (OSError, UnicodeDecodeError, MwdnError):
-        return False
-    without_license = "".join(line for line in written.splitlines(True) if not line.startswith("license: "))
-    return without_license == _card(folder.resolve().name, network, metadata, None)
+        return False, None
+    stated = re.search(r'^license: "([^"]*)"$', written, re.MULTILINE)
+    license = stated[1] if stated else None
+    return written == _card(folder.resolve().name, network, metadata, license), license
 
 
 @checked
@@ -86,7 +92,7 @@ def from_pretrained(name: str | Path) -> nn.Module:
             raise CheckpointError(f"`{name}` is no folder, and no `owner/name` of the Hugging Face hub.")
         try:
             return load_network(f"hub:{of_hub}")
-        except MwdnError as error:
+        except CheckpointError as error:
             raise CheckpointError(f"There is no folder `{name}`, and on the hub: {error}") from error
     config, metadata = read_json(folder / CONFIG), read_metadata(folder / WEIGHTS)
     for key in ("name", "options"):

@@ -22,7 +22,7 @@ NOISES = (0.01, 0.003, 0.001)
 """Noise of a measurement over its mean for which resolution is reported: 10,000, 100,000 and 1,000,000 electrons."""
 
 
-FAR = 5
+BELOW_ZERO_SIGMAS = 5
 """Standard deviations of the noise below 0 that noise alone does not reach."""
 
 
@@ -38,7 +38,7 @@ class Levels:
         background: 5th percentile of each channel, as a fraction of the full scale.
         subtracted: level that was subtracted from each channel.
         pedestal: fraction of the file's light in this background.
-        below_zero: fraction of the file's pixels that are below 0 by more than `FAR` times their noise.
+        below_zero: fraction of the file's pixels that are below 0 by more than `BELOW_ZERO_SIGMAS` times their noise.
         has_dark: whether a dark frame was subtracted from the PSF.
         between: level between the lines, as a fraction of the full scale; mean of the colours.
         noise: standard deviation of a pixel's noise, as a fraction of the full scale.
@@ -227,7 +227,7 @@ def _levels(calibration: Calibration, frame: Frame) -> Levels:
         has_dark=calibration.dark is not None or calibration.corrections.psf_done,
         subtracted=calibration.background,
         pedestal=float(share.max()),
-        below_zero=float((image < -FAR * noise.clamp(min=1e-6 * image.amax())).float().mean()),
+        below_zero=float((image < -BELOW_ZERO_SIGMAS * noise.clamp(min=1e-6 * image.amax())).float().mean()),
         between=psf_measures.level_between_lines(upright[psf_measures.support_box(calibration.psf)]),
         noise=float(noise.max()),
         noise_floor=float((pixels * (noise / light).square()).max()),

@@ -80,6 +80,9 @@ def align(  # noqa: PLR0913
         raise ParameterError(f"`count` ({count}) must be at least 1.")
     if points is not None and homography is not None:
         raise ParameterError("`points` are where to start a search, and `homography` replaces it. Give either of them.")
+    is_session = capture.suffix.lower() in SUFFIXES
+    if homography is not None and picture is None and not is_session:
+        raise ParameterError("`homography` says where a known picture lies: give PICTURE, too, or leave it out.")
     own = read_options([method], options, align)[method]
     task = _Task(
         calibration=camera.load(),
@@ -89,7 +92,7 @@ def align(  # noqa: PLR0913
         gamma=None if display_gamma is None else as_gamma(display_gamma),
         inputs=(capture, *camera.files, *filter(None, (picture, homography))),
     )
-    if capture.suffix.lower() in SUFFIXES:
+    if is_session:
         if picture is not None:
             raise ParameterError(f"`{capture}` has its own pictures. Leave `{picture}` out.")
         out = out if out.suffix.lower() in SUFFIXES else out / "aligned.h5"
@@ -137,15 +140,16 @@ class _Task:
         correlation = correlation_at(projection, views, 1.0, robust=True)
         if correlation < WORST:
             warn(
-                f"The picture fits badly where `homography` puts it: their correlation is {correlation:.2f}, below "
+                f"The first picture fits badly where `homography` puts it: its correlation is {correlation:.2f}, below "
                 f"{WORST:g}. Leave it out to align again."
             )
         return projection, {**projection.to_dict(), "correlation": round(correlation, 4)}, None
 
-    def check_camera(self, size: Size) -> None:
-        """Check that a given projection leads to frames of this size."""
+    def check_given(self, camera: Size, picture: Size) -> None:
+        """Check that a given projection leads from pictures of this size to frames of this size."""
         if self.given is not None:
-            self.given.check_camera(size)
+            self.given.check_camera(camera)
+            self.given.for_picture(picture)
 
     def check_outputs(self, *outputs: Path) -> None:
         """Check that files can be written, before any work starts."""
@@ -164,15 +168,18 @@ def _align_session(task: _Task, capture: Path, out: Path, count: int, *, levels:
         all_or_nothing(out),
     ):
         rows, psf = chosen(len(pairs), count), pairs.calibration.psf
-        task.check_camera((psf.shape[-2], psf.shape[-1]))
+        task.check_given((psf.shape[-2], psf.shape[-1]), pairs.picture_size)
         reconstructor = task.prepare(pairs.calibration)
-        judged = rows if task.given is None else rows[:1]
-        views = reconstruct_views(pairs, reconstructor, judged, partial(track, title="Reconstructing"))
+        first = reconstructor(pairs.measurement(rows[0]))
+        if task.given is None:
+            views = reconstruct_views(pairs, reconstructor, rows, partial(track, title="Reconstructing"))
+        else:
+            views = Views.of(list(pairs.picture(rows[0])), list(first))
         projection, content, residuals = task.register(views)
         white = fit_levels(pairs, projection, psf, rows) if levels else None
         write_aligned(out, pairs, projection, content, levels=white, track=partial(track, title="Writing pairs"))
         sheet = overlay(
-            reconstructor(pairs.measurement(rows[0])),
+            first,
             warp_pictures(pairs.picture(rows[0]), projection),
             projection.corners(),
             residuals,
@@ -189,14 +196,15 @@ def _align_frame(task: _Task, capture: Path, picture: Path | None, out: Path) ->
     page, sidecar = out / f"{capture.stem}.align.png", out / f"{capture.stem}.align.json"
     task.check_outputs(page, sidecar)
     measurement = read_capture(capture, task.calibration)
-    task.check_camera((measurement.shape[-2], measurement.shape[-1]))
+    shown = None if picture is None else as_light(read_frame(picture, upright=True), task.gamma or SRGB)[None]
+    if shown is not None:
+        task.check_given((measurement.shape[-2], measurement.shape[-1]), (shown.shape[-2], shown.shape[-1]))
     reconstructor = task.prepare(task.calibration)
     scene = reconstructor(measurement)
-    if picture is None:
+    if shown is None:
         linear = Reconstructor("wiener", reconstructor.calibration, device=reconstructor.device)(measurement)
         projection, content, sheet = _outline(scene, linear, task.corners)
     else:
-        shown = as_light(read_frame(picture, upright=True), task.gamma or SRGB)[None]
         projection, content, sheet = _known_picture(task, shown, scene)
     write_picture(page, sheet)
     write_json(sidecar, content)

@@ -22,7 +22,7 @@ from mwdn.calibration.verdict import headline
 from mwdn.calibration.watching import guide_exposure, watch_folder
 from mwdn.calibration.white_balance import WhiteBalance, check_white_balance
 from mwdn.cli.calibrate_checks import (
-    OF_OTHER_FRAMES,
+    PSF_OWN_FORMAT,
     check_bits,
     refuse_camera_files,
     refuse_corrected,
@@ -221,7 +221,7 @@ def _write_photographs(
     if content.get("background") is None and has_dark:
         # A dark frame with the room's light has no background left; tails below the lines are then the PSF's own.
         content["background"] = 0.0
-    content |= dict.fromkeys((*OF_OTHER_FRAMES, "psf_gain", "envelope_shift"))  # of an earlier PSF
+    content |= dict.fromkeys((*PSF_OWN_FORMAT, "psf_gain", "envelope_shift"))  # of an earlier PSF
     content |= done.content
     for psfs, places in _ELSEWHERE:  # those of an earlier PSF do not fit this one
         if psfs not in done.parts:

@@ -8,7 +8,7 @@ from mwdn.calibration import PsfFormat
 from mwdn.cli.photographs import PhotographOptions
 from mwdn.errors import ParameterError
 
-OF_OTHER_FRAMES = ("psf_bin", "psf_bit_depth", "psf_gamma", "psf_orientation")
+PSF_OWN_FORMAT = ("psf_bin", "psf_bit_depth", "psf_gamma", "psf_orientation")
 """Keys of a PSF whose picture is of another format than the captures."""
 
 
@@ -39,7 +39,7 @@ def refuse_camera_files(files: Sequence[Path]) -> None:
 
 def refuse_psf_format(psf_format: PsfFormat, kept: dict[str, Any]) -> None:
     """Refuse a format of the PSF's own for several frames, unless it is that of the camera file's earlier PSF."""
-    for name in OF_OTHER_FRAMES:
+    for name in PSF_OWN_FORMAT:
         if getattr(psf_format, name) not in (None, kept.get(name)):
             raise ParameterError(
                 f"`{name}` is for one picture from another source. Frames of the camera itself have the captures' "

@@ -23,13 +23,13 @@ from mwdn.types import Plane
 Numbers = npt.NDArray[Any]
 Quantity = Literal["height", "phase", "amplitude", "transmission"]
 
-_MEANINGLESS: dict[Quantity, tuple[str, ...]] = {
+_IGNORED: dict[Quantity, tuple[str, ...]] = {
     "height": ("phase_nm",),
     "phase": (),
     "amplitude": ("phase_nm", "index", "levels"),
     "transmission": ("phase_nm", "index", "levels"),
 }
-"""Options of `ArrayMask` that other numbers need."""
+"""Options of `ArrayMask` without effect, by what the numbers are."""
 
 _PLURAL = dict(zip(get_args(Quantity), ("heights", "phases", "amplitudes", "transmissions"), strict=True))
 
@@ -79,7 +79,7 @@ class ArrayMask:
         """
         if designed := _read_design(self.mask):
             self._refuse(
-                {field.name for field in fields(self)[1:]}, "is a design and says its own pitch, heights and index"
+                {field.name for field in fields(self)[1:]}, "is a design with its own pitch, heights and index"
             )
             needed, _ = needed_pitch(designed, setup)
             if designed.pitch_um > needed:
@@ -94,7 +94,7 @@ class ArrayMask:
                 f"`{self.mask}` holds numbers without units: say what they are, "
                 f"{', '.join(get_args(Quantity))}, and how many um apart: `values='height', pitch_um=2`."
             )
-        self._refuse(_MEANINGLESS[self.values], f"holds {_PLURAL[self.values]}, which have none of these")
+        self._refuse(_IGNORED[self.values], f"holds {_PLURAL[self.values]}")
         mask = make_mask(
             _scaled(frame, self.values, self.full_scale),
             self.values,
@@ -111,7 +111,8 @@ class ArrayMask:
         """Refuse options that would be ignored."""
         changed = [field.name for field in fields(self) if getattr(self, field.name) != field.default]
         if given := [name for name in changed if name in names]:
-            raise ParameterError(f"`{self.mask}` {why}: leave out {', '.join(f'`{name}`' for name in given)}.")
+            options = ", ".join(f"`{name}`" for name in given)
+            raise ParameterError(f"`{self.mask}` {why}, for which these have no effect: leave out {options}.")
 
 
 def _check_slope(mask: Mask, setup: Setup, subdivide: int) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mwdn.errors import ParameterError, shown
 from mwdn.io.contact_sheets import contact_sheet, thumbnail
-from mwdn.io.files import as_image_error, write_json
+from mwdn.io.files import as_image_error, check_regular, write_json
 from mwdn.io.images import write_linear, write_picture
 from mwdn.io.reading import read_json
 from mwdn.optics.mask_files import write_mask
@@ -21,6 +21,9 @@ from mwdn.optics.psf_measures import autocorrelation_width, likeness
 from mwdn.optics.psf_spectrum import modulus_image
 from mwdn.optics.setup import Setup
 from mwdn.types import Psf
+
+WRITTEN = ("mask.tif", "psf.tif", "preview.png", "camera.json")
+"""Files of a design; the last says whose the others are."""
 
 ANGLES = (1.0, 2.0, 5.0, 10.0)
 """Degrees off the axis at which `Designed.sensitivity` compares PSFs."""
@@ -112,14 +115,17 @@ class Designed:
         with as_image_error(out):
             out.mkdir(parents=True, exist_ok=True)
             folder = TemporaryDirectory(prefix=".design-", dir=out)
-        with folder as name:
-            draft = Path(name)
+        with folder as hidden:
+            draft = Path(hidden)
             write_mask(draft / "mask.tif", self.mask)
             write_linear(draft / "psf.tif", self.stored)
             write_picture(draft / "preview.png", contact_sheet([self.pictures()], ["mask (middle)", "PSF", "spectrum"]))
             write_json(draft / "camera.json", report)
-            for file in draft.iterdir():
-                file.replace(out / file.name)
+            with as_image_error(out):
+                for name in WRITTEN:
+                    check_regular(out / name)
+                for name in WRITTEN:
+                    (draft / name).replace(out / name)
 
     def pictures(self) -> list[Tensor]:
         """The middle of the mask, the PSF and its spectrum, for `contact_sheet`."""
@@ -160,7 +166,7 @@ def check_replaced(out: Path, *, gds: bool = False, stl: bool = False) -> None:
             return
     except (ParameterError, LookupError, TypeError):  # missing, or not written by `Designed.write`
         pass
-    names = ["mask.tif", "psf.tif", "preview.png", *["mask.gds"] * gds, *["mask.stl"] * stl, "camera.json"]
+    names = [*WRITTEN[:-1], *["mask.gds"] * gds, *["mask.stl"] * stl, WRITTEN[-1]]
     for path in (out / name for name in names):
         if path.exists():
             raise ParameterError(

@@ -138,7 +138,7 @@ def mask_psf(mask: Mask, setup: Setup, *, angle_degrees: tuple[float, float] = (
     down, across = (overlap(1, side, n, pitch)[0] for side, n in zip(opening, mask.values.shape, strict=True))
     aperture = torch.outer(down, across).float()
     wavelengths, weights = setup.spectrum()
-    if not bool((mask.field(wavelengths[0]) * aperture).any()):
+    if mask.kind == "amplitude" and not bool((mask.values * aperture).any()):
         height, width = setup.aperture_mm
         raise ParameterError(
             f"No light passes the mask within the aperture ({height:g} x {width:g} mm): give an open mask, or another "
