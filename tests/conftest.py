@@ -12,6 +12,8 @@ from pathlib import Path
 import jaxtyping
 import pytest
 
+import shape_checks
+
 # Where other work shares the machine, threads that wait by spinning take the core from the one they wait for:
 # the small arrays of a solver then need 200 times as long. Read once, when torch starts.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -23,8 +25,8 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 # A million objects live from the imports to the end. The collector would look through all of them, again and again.
 gc.disable()
 
-# Before anything imports mwdn: from here on each call checks the shapes and types in its signature.
-jaxtyping.install_import_hook("mwdn", "beartype.beartype")
+# Before anything imports mwdn: from here on calls check the shapes and types in their signatures.
+shape_checks.install("mwdn")
 
 import torch  # noqa: E402
 
@@ -37,6 +39,12 @@ def pytest_collection_finish() -> None:
     """From here on the garbage collector runs, but not over what is there already."""
     gc.freeze()
     gc.enable()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    """In each test the first calls of each function are checked."""
+    shape_checks.start_again()
 
 
 @pytest.fixture(autouse=True)

@@ -114,7 +114,7 @@ def double():
 
 
 @pytest.mark.usefixtures("double")
-@pytest.mark.parametrize("method", ["wiener", "universal-small", "universal"])
+@pytest.mark.parametrize("method", ["wiener", "universal"])
 def test_methods_do_not_depend_on_torchs_default_type(method, psf, capture):
     """Alignment of `universal` included."""
     calibration = Calibration.from_array(psf)
@@ -178,12 +178,12 @@ def test_a_solver_is_no_network():
         mwdn.build("admm")
 
 
-@pytest.mark.parametrize("method", ["admm", "fista", "wiener"])
-def test_any_method_can_align(method, psf, capture):
+def test_a_method_that_does_not_align_can(psf, capture):
+    """All solvers are called alike, so one of them is enough."""
     calibration = Calibration.from_array(psf)
     pose = mwdn.align(torch.from_numpy(capture).movedim(-1, 0)[None], calibration.psf)
-    aligned = Reconstructor(method, calibration, align=True, device="cpu")
-    moved = Reconstructor(method, Calibration(pose.move(calibration.psf)), device="cpu")
+    aligned = Reconstructor("wiener", calibration, align=True, device="cpu")
+    moved = Reconstructor("wiener", Calibration(pose.move(calibration.psf)), device="cpu")
     np.testing.assert_allclose(aligned(capture), moved(capture), rtol=1e-4, atol=1e-5)
     np.testing.assert_array_equal(aligned.at(pose)(capture), aligned(capture))
 

@@ -482,7 +482,9 @@ def test_demo(run, tmp_path, monkeypatch, pictures, methods):
     code, out, err = run("demo", "--out", tmp_path / "demo", "--pictures", *pictures)
     assert (code, err) == (0, "")
     assert names(tmp_path / "demo") == ["captures", "comparison.png", "index.html", "pattern.png", "psf.tif"]
-    code, _, err = run(f"{out.strip().splitlines()[-1].partition('mwdn ')[2]} --method wiener --out {tmp_path}/again")
+    code, _, err = run(
+        f"{out.strip().splitlines()[-1].partition('mwdn ')[2]} --method wiener --no-trust --out {tmp_path}/again"
+    )
     assert (code, err) == (0, "")
     rows = {
         words[0]: dict(zip(methods, map(float, words[1:]), strict=True))

@@ -2,6 +2,8 @@
 
 import json
 import math
+import shutil
+from contextlib import chdir
 from pathlib import Path
 
 import cv2
@@ -14,6 +16,7 @@ from mwdn.calibration import FrameFormat
 from mwdn.calibration.camera_file import read_camera
 from mwdn.calibration.camera_parts import write_camera_with_parts
 from mwdn.calibration.watching import guide_exposure, watch_folder
+from mwdn.cli.app import main
 from mwdn.errors import ImageError, PsfError
 from mwdn.io.images import read_frame
 from mwdn.optics.displacement import displacement, shifted
@@ -41,15 +44,36 @@ def square():
     return scene
 
 
+def link(photographs, folder):
+    for path in photographs[1].iterdir():
+        (folder / path.name).symlink_to(path)
+    return folder
+
+
 @pytest.fixture
 def folder(photographs, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    for path in photographs[1].iterdir():
-        (tmp_path / path.name).symlink_to(path)
-    return tmp_path
+    return link(photographs, tmp_path)
 
 
 EVERYTHING = "calibrate psf_1 psf_8 psf_64 --exposures 1 8 64 --dark dark --flat flat --bit-depth 12"
+
+
+@pytest.fixture(scope="module")
+def calibrated(photographs, tmp_path_factory):
+    """Files of a camera that `EVERYTHING` has made."""
+    folder = link(photographs, tmp_path_factory.mktemp("calibrated"))
+    with chdir(folder), pytest.raises(SystemExit) as ended:
+        main(EVERYTHING.split())
+    assert ended.value.code == 0
+    return list(folder.glob("camera*"))
+
+
+@pytest.fixture
+def camera(calibrated, folder):
+    """The current folder has `camera.toml`."""
+    for path in calibrated:
+        shutil.copy(path, folder)
 
 
 def test_frames_become_a_camera_that_other_commands_take(run, folder, photographs):
@@ -84,9 +108,9 @@ def test_frames_become_a_camera_that_other_commands_take(run, folder, photograph
     assert np.corrcoef(picture.ravel(), truth.ravel())[0, 1] > 0.8
 
 
-def test_dark_flat_and_hot_pixels_are_corrected_in_captures(run, folder, photographs):
+@pytest.mark.usefixtures("camera")
+def test_dark_flat_and_hot_pixels_are_corrected_in_captures(photographs):
     bench, _ = photographs
-    assert run(EVERYTHING)[0] == 0
     calibration = Calibration.load("camera.toml")
     uneven = calibration.correct(bench.flat(0.5))
     # Light that falls off towards the corners by 30 % becomes even; hot pixels are gone.
@@ -95,8 +119,8 @@ def test_dark_flat_and_hot_pixels_are_corrected_in_captures(run, folder, photogr
     assert float(calibration.correct(bench.dark()).mean()) == pytest.approx(0, abs=2e-5)
 
 
+@pytest.mark.usefixtures("camera")
 def test_the_bits_of_a_camera_file_stay_if_it_is_changed(run, folder):
-    assert run(EVERYTHING)[0] == 0
     before = read_camera("camera.toml")
     assert run("calibrate --camera camera.toml --pitch-um 4.8 --white-balance 1 1 1")[0] == 0
     after = read_camera("camera.toml")
@@ -178,9 +202,9 @@ def test_a_camera_file_appears_with_all_its_pictures_or_not_at_all(folder, monke
     assert {path.name: path.read_bytes() for path in folder.glob("camera*")} == old
 
 
-def test_a_calibration_that_fails_leaves_the_camera_as_it_was(run, folder, photographs):
+@pytest.mark.usefixtures("camera")
+def test_a_calibration_that_fails_leaves_the_camera_as_it_was(run, folder):
     """The new file was written before it was checked, and no command could read it."""
-    assert run(EVERYTHING)[0] == 0
     old = {path.name: path.read_bytes() for path in folder.glob("camera*")}
     code, out, err = run(f"{EVERYTHING} --white-balance psf")
     assert (code, out, "needs a PSF in colour" in err) == (2, "", True)

@@ -16,7 +16,7 @@ import pytest
 from mwdn.training.training_state import read_state
 
 FULL = Path("/dev/full")
-COPIES = 500
+COPIES = 100
 RECIPE = """
 network = { name = "wiener-bank", width = 2, finest = 0, align = false }
 schedule = { steps = 1000000, batch = 1, validate_every = 2, validation = 1, bfloat16 = false }
@@ -25,7 +25,7 @@ schedule = { steps = 1000000, batch = 1, validate_every = 2, validation = 1, bfl
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """Current folder with a PSF, 500 captures, photographs and a recipe."""
+    """Current folder with a PSF, `COPIES` captures, photographs and a recipe."""
     monkeypatch.chdir(tmp_path)
     noise = np.random.default_rng(0)
     np.save("psf.npy", noise.random((32, 32, 3), np.float32) ** 9)
@@ -59,7 +59,7 @@ def interrupted(line, sign, number=signal.SIGINT):
 def test_reconstruct(here):
     code, lines = interrupted("reconstruct captures --method wiener -o out", " saturated")
     assert code == 130
-    done = re.fullmatch(r"Interrupted: (\d+) of 500 captures (is|are) done\. .*--resume.*\n", lines[-1])
+    done = re.fullmatch(rf"Interrupted: (\d+) of {COPIES} captures (is|are) done\. .*--resume.*\n", lines[-1])
     assert 0 < int(done[1]) <= len(list((here / "out").glob("*.json"))) < COPIES
 
 

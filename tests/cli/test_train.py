@@ -255,19 +255,17 @@ def test_a_checkpoint_is_evaluated_on_the_pairs_that_its_training_left_out(run, 
     assert run(f"{line} --pairs.fold 1{network}")[0] == 0
     evaluate = "evaluate runs/x/best.safetensors --data pairs.h5 --psf psf.npy --device cpu --no-lpips --json"
 
-    def psnr(options=""):
+    scores, said = [], []
+    for options in ("", " --first 4", " --split folds --part validation", " --split paper"):
         code, out, err = run(evaluate + options)
         assert code == 0, err
-        return json.loads(out)["methods"]["runs/x/best.safetensors"]["values"]["psnr"]
-
-    every, held_out = psnr(), Division("folds", fold=1).parts(20)["validation"]
-    said = []
-    for options in ("", " --first 4", " --split folds --part validation", " --split paper"):
-        said += [re.findall(r"was trained on (\d+) of these (\d+)", flat(run(evaluate + options)[2]))]
+        scores += [json.loads(out)["methods"]["runs/x/best.safetensors"]["values"]["psnr"]]
+        said += [re.findall(r"was trained on (\d+) of these (\d+)", flat(err))]
     assert said == [[("15", "20")], [("4", "4")], [], [("2", "2")]]
+    held_out = Division("folds", fold=1).parts(20)["validation"]
+    assert scores[2] == pytest.approx([scores[0][n] for n in held_out], abs=1e-3)
     save_pretrained("runs/x/best.safetensors", "hub")
     assert "was trained on 15 of these 20" in flat(run(evaluate.replace("runs/x/best.safetensors", "hub"))[2])
-    assert psnr(" --split folds --part validation") == pytest.approx([every[n] for n in held_out], abs=1e-3)
     assert run(line.replace("runs/x", "runs/y") + network)[0] == 0
     code, _, err = run(
         evaluate.replace("best.safetensors ", "best.safetensors runs/y/best.safetensors ") + " --split folds"

@@ -15,8 +15,8 @@ from mwdn.optics.orientation import turn
 
 @pytest.fixture(scope="module")
 def fine():
-    """A PSF of 288 x 288 pixels, whose lines are some pixels wide."""
-    psf = contour_psf((288, 288), line=3.0, cell=60, generator=torch.Generator().manual_seed(0))
+    """A PSF of 192 x 192 pixels, whose lines are some pixels wide."""
+    psf = contour_psf((192, 192), line=2.5, cell=45, generator=torch.Generator().manual_seed(0))
     return psf / psf.sum()
 
 
@@ -39,7 +39,7 @@ def capture(fine):
 
 @pytest.mark.parametrize(
     ("bin", "size", "options"),
-    [(2, (144, 144), "--psf-bin 2"), (3, (96, 96), "--psf-bin 3"), (2, (120, 96), "--psf-bin 2 --crop 120 96")],
+    [(2, (96, 96), "--psf-bin 2"), (3, (64, 64), "--psf-bin 3"), (2, (80, 64), "--psf-bin 2 --crop 80 64")],
 )
 def test_bin_of_the_psf(fine, capture, bin, size, options):
     """The last capture could be of a PSF binned by 3, by its width."""
@@ -66,7 +66,7 @@ def test_bins_that_were_given_are_factors_of_the_advice(fine, capture):
 @pytest.mark.parametrize("stored", [None, "flip-top-bottom"])
 def test_capture_of_a_camera_held_upright(fine, capture, stored):
     """The sides are exchanged. The advice is for the PSF's file, which the calibration may have turned already."""
-    psf = crop_centre(fine, (288, 216))
+    psf = crop_centre(fine, (192, 144))
     turned = psf if stored is None else turn(psf, stored)
     calibration = Calibration(turned / turned.sum(), psf_format=PsfFormat(psf_orientation=stored))
     verdict = fitting_size(capture(turn(psf, "rotate-90")), calibration)
@@ -74,16 +74,16 @@ def test_capture_of_a_camera_held_upright(fine, capture, stored):
 
 
 def test_noise_cannot_tell(fine):
-    noise = torch.rand(1, 1, 96, 96, generator=torch.Generator().manual_seed(2))
+    noise = torch.rand(1, 1, 64, 64, generator=torch.Generator().manual_seed(2))
     verdict = fitting_size(noise, Calibration(fine))
     assert (verdict.state, verdict.value, verdict.options) == ("unknown", "", "")
 
 
 def test_size_and_colours_are_checked_apart(fine):
     grey, colours = Calibration(fine), Calibration(fine.expand(-1, 3, -1, -1))
-    frame = torch.rand(96, 96, generator=torch.Generator().manual_seed(3)).numpy()
-    assert grey.to_measurement(frame).shape == (1, 1, 96, 96)
-    with pytest.raises(ShapeError, match=r"288 x 288.*96 x 96"):
+    frame = torch.rand(64, 64, generator=torch.Generator().manual_seed(3)).numpy()
+    assert grey.to_measurement(frame).shape == (1, 1, 64, 64)
+    with pytest.raises(ShapeError, match=r"192 x 192.*64 x 64"):
         grey.check_fit(grey.to_measurement(frame))
     with pytest.raises(ShapeError, match="grey"):
-        colours.check_fit(torch.rand(1, 1, 288, 288))
+        colours.check_fit(torch.rand(1, 1, 192, 192))

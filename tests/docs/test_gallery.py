@@ -25,6 +25,8 @@ LIKELY = {  # what each prints, with its numbers left out
     "wrong_psf": r"right: .*psf, good.*mirrored: .*another camera: ",
     "zero_shot": r"admm: [\d.]+ dB.*universal: [\d.]+ dB",
 }
+SLOW = ("ambient_light", "wrong_psf")
+"""They search for the room's light or align several PSFs."""
 
 
 @pytest.fixture(autouse=True)
@@ -46,7 +48,14 @@ def run_small(path, size):
     return names
 
 
-@pytest.mark.parametrize("path", [path for path in SCRIPTS if path.stem != "zero_shot"], ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(path, marks=[pytest.mark.acceptance] * (path.stem in SLOW), id=path.stem)
+        for path in SCRIPTS
+        if path.stem != "zero_shot"
+    ],
+)
 def test_a_script_runs_and_draws(path, capsys):
     figure = run_small(path, 48)["figure"]
     assert re.search(LIKELY[path.stem], capsys.readouterr().out, re.DOTALL)

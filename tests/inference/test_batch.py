@@ -34,7 +34,7 @@ from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.contact_sheets import to_display
 from mwdn.io.images import srgb_decode
 from mwdn.networks import build
-from mwdn.solvers import Admm, Wiener
+from mwdn.solvers import Admm, Fista, Wiener
 
 SIZE = 32, 40
 
@@ -226,7 +226,7 @@ def test_png_is_the_same_picture_in_srgb(tmp_path, format, steps, captures, psf)
 
 def test_check_and_network_share_the_pose(tmp_path, captures, psf):
     """It would find the same, at the same price."""
-    network = build("wiener-bank", width=2, finest=4)
+    network = build("wiener-bank", width=2, finest=0)
     pictures = []
     for check in (True, False):
         batch = make_batch(psf, tmp_path / str(check), network, format="npy", check_consistency=check)
@@ -280,7 +280,9 @@ def bright(tmp_path, captures):
     return store
 
 
-@pytest.mark.parametrize("method", ["fista", "admm", "pyramid"])
+@pytest.mark.parametrize(
+    "method", [Fista(iterations=30), Admm(iterations=30), "pyramid"], ids=["fista", "admm", "pyramid"]
+)
 def test_trust_does_not_depend_on_the_brightness(psf, captures, method):
     """Nor do squares of what a camera of many bits counts overflow."""
     reconstruct = Reconstructor(method, Calibration(psf), device="cpu")
@@ -289,8 +291,7 @@ def test_trust_does_not_depend_on_the_brightness(psf, captures, method):
     assert dataclasses.astuple(large) == pytest.approx(dataclasses.astuple(plain), rel=0.01, abs=0.01)
 
 
-@pytest.mark.parametrize("check", [True, False])
-@pytest.mark.parametrize("format", ["png", "npy"])
+@pytest.mark.parametrize(("check", "format"), [(True, "png"), (False, "npy")])
 def test_result_that_is_not_finite_changes_nothing_and_the_others_go_on(tmp_path, psf, captures, bright, check, format):
     limit = 1.1 * read_frame(captures[0]).max() / 65535
     batch = make_batch(psf, tmp_path / "out", lambda b, h: b / (b < limit), format=format, check_consistency=check)
@@ -417,8 +418,7 @@ def test_half_a_result_is_none(tmp_path, lost, how, psf, captures):
 def test_result_of_anything_else_is_none(tmp_path, what, psf, captures):
     out, method, camera, format = tmp_path / "out", Wiener(), Calibration(psf), "png"
     if what == "weights":
-        torch.manual_seed(1)
-        method = build("wiener-bank", width=2, finest=8)
+        method = build("mwdn", width=2)
     list(make_batch(camera, out, method).run(captures[:1]))
     assert resumed(camera, out, captures[:1], method) == []
     if what == "capture":
@@ -476,7 +476,7 @@ def test_a_picture_of_another_format_does_not_stay_beside_the_new_sidecar(tmp_pa
 
 # --- Several processes --------------------------------------------------------------------------------
 
-COUNT = 10
+COUNT = 6
 
 
 @pytest.fixture(scope="module")
@@ -496,7 +496,7 @@ def shop(tmp_path_factory):
     return folder
 
 
-LINE = "reconstruct in --psf psf.npy --method admm --format npy --device cpu"
+LINE = "reconstruct in --psf psf.npy --method admm --iterations 30 --format npy --device cpu"
 
 
 @contextmanager
@@ -630,7 +630,7 @@ def test_a_machine_goes_on_without_another(shop, single, free_port):
 @linux
 def test_killed_work_goes_on_where_it_was(shop, single, run, monkeypatch):
     process, folder = start(shop, "killed"), shop / "killed"
-    while len(list(folder.glob("??.json"))) < 4:
+    while len(list(folder.glob("??.json"))) < 2:
         with pytest.raises(subprocess.TimeoutExpired):
             process.wait(0.02)
     process.send_signal(signal.SIGKILL)
@@ -646,7 +646,7 @@ def test_killed_work_goes_on_where_it_was(shop, single, run, monkeypatch):
     # Nothing was done twice: what was there is still as it was, and the rest was done.
     assert {path: path.stat().st_mtime_ns for path in before} == before
     there = {path.name for path in before}
-    assert 4 <= len(there) // 2 < COUNT
+    assert 2 <= len(there) // 2 < COUNT
     assert set(told(first)) <= there
     assert sorted(told(second)) == [
         name for name in sorted(single) if re.match(r"\d\d\.npy", name) and name not in there
@@ -675,7 +675,7 @@ def test_interrupted_work_ends_quietly_and_leaves_whole_files(shop, single):
 def test_torchrun_starts_killed_workers_again(shop, single):
     (shop / "in" / "damaged.npy").rename(shop / "damaged.npy")  # or the status would start them once more
     process = two(shop, "again", restarts=1)
-    kill_one(process, shop / "again", goal=4)
+    kill_one(process, shop / "again", goal=2)
     out, err = process.communicate(timeout=300)
     (shop / "damaged.npy").rename(shop / "in" / "damaged.npy")
     assert process.returncode == 0, err

@@ -22,7 +22,7 @@ def camera(generator):
     def make(size):
         psf = contour_psf(size, cell=10, generator=generator).expand(1, 3, -1, -1).contiguous()
         scene = torch.rand(1, 3, *size, generator=generator)
-        return trained(build("wiener-bank", width=4), generator), psf, scene, Camera(psf)(scene)
+        return trained(build("wiener-bank", width=4, finest=8), generator), psf, scene, Camera(psf)(scene)
 
     return make
 

@@ -210,6 +210,7 @@ def drawn(family):
     return torch.stack([measures(sample_camera(seed, (320, 320), family=family)) for seed in range(40)])
 
 
+@pytest.mark.acceptance
 @pytest.mark.parametrize(
     ("family", "file", "options"),
     [

@@ -33,7 +33,7 @@ def test_from_a_session_to_scored_pictures(tmp_path, run, monkeypatch):
 
     monkeypatch.setattr(walk, "mwdn", mwdn)
     out = tmp_path / "walk"
-    arguments = (tmp_path / "photos", out, "--counts", "--held-out", 3, "--size", 80, "--method", "admm")
+    arguments = (tmp_path / "photos", out, "--counts", "--held-out", 3, "--size", 64, "--method", "admm")
     monkeypatch.setattr(sys, "argv", [str(SCRIPT), *map(str, arguments)])
     walk.main()
     assert done == ["capture", "calibrate", "align", "evaluate", "reconstruct"]

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
+from two_processes import double_precision, train_precisely
 
 from cameras import contour_psf
 from mwdn.calibration import Calibration
@@ -25,7 +26,7 @@ from mwdn.training.experiment import prepare
 from mwdn.training.recipe import read_recipe
 from runs import log, same
 
-STEPS = 12
+STEPS = 8
 # 3 samples for two processes: one has one, the other two. At this rate, with small first steps and without the
 # pyramid's iterations, rounding does not grow into another path: no pool takes its maximum from another pixel.
 RECIPE = f"""
@@ -159,7 +160,7 @@ def assert_alike(found, expected):
     names = [name for name, _ in start.named_parameters()]
     moved = torch.cat([(expected[f"network.{n}"] - start.state_dict()[n]).flatten() for n in names])
     apart = torch.cat([(expected[f"network.{n}"] - found[f"network.{n}"]).flatten() for n in names])
-    assert moved.abs().max() > 5e-4
+    assert moved.abs().max() > 3e-4
     assert apart.norm() < 0.01 * moved.norm()
     for key in expected:
         if "running" in key:
@@ -181,9 +182,13 @@ def test_two_processes_end_as_one(one, two):
 
 
 @pytest.mark.acceptance
-def test_two_processes_end_as_one_in_float64(worked):
+@pytest.mark.usefixtures("unchecked")
+def test_two_processes_end_as_one_in_float64(worked, monkeypatch):
     """The difference vanishes. `mwdn-cpsf` also encodes the PSF, of which each process has the whole batch."""
-    states = [load_file(worked / "double" / name / "state.safetensors") for name in ("one-0", "two")]
+    monkeypatch.chdir(worked)
+    with double_precision():
+        train_precisely("double/one").run()
+    states = [load_file(worked / "double" / name / "state.safetensors") for name in ("one", "two")]
     assert states[0].keys() == states[1].keys()
     assert states[0]["network.decoder.head.weight"].dtype == torch.float64
     for key, value in states[0].items():

@@ -77,15 +77,21 @@ def double_precision():
     torch.Tensor.float = single
 
 
+def train_precisely(folder):
+    """The training of cpsf.toml with a PSF in float64."""
+    psf = Calibration.from_file("psf.npy", background=0.0).psf.double()
+    recipe = read_recipe("cpsf.toml")
+    return prepare(recipe, Calibration(psf), photos=Path("photos"), out=Path(folder), device="cpu")
+
+
 def main():
     with suppress(SystemExit):
         cli.main(sys.argv[1:])  # `mwdn train`, in a group of its own
     os.environ["TORCHELASTIC_RESTART_COUNT"] = "again"  # the store still has the addresses of that group
     calibration = Calibration.from_file("psf.npy", background=0.0)
-    precise, recipe = Calibration(calibration.psf.double()), read_recipe("r.toml")
-    number = os.environ["RANK"]
+    recipe, number = read_recipe("r.toml"), os.environ["RANK"]
 
-    def start(folder, recipe=recipe, calibration=calibration):
+    def start(folder, recipe=recipe):
         return prepare(recipe, calibration, photos=Path("photos"), out=Path(folder), device="cpu")
 
     def attempt(action):
@@ -95,13 +101,11 @@ def main():
             except MwdnError as error:
                 file.write(f"{type(error).__name__}: {error}\n")
 
-    with double_precision():  # outside the group: each process trains alone
-        start(f"double/one-{number}", read_recipe("cpsf.toml"), precise).run()
     with distributed.process_group():
         assert distributed.gather_json([distributed.rank()]) == [[0], [1]]
         batch_norm()
         with double_precision():
-            run = start("double/two", read_recipe("cpsf.toml"), precise)
+            run = train_precisely("double/two")
             run.run()
         Path(f"lr_schedule-{number}.json").write_text(json.dumps(run.lr_schedule.state()))
         start("mixed").run()  # started by one process

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import multiprocessing
 import os
 import random
 import re
@@ -101,6 +102,12 @@ def whole(tmp_path_factory):
     return unbroken_run(RECIPE, tmp_path_factory.mktemp("whole"))
 
 
+@pytest.fixture
+def finished(whole, photos, tmp_path):
+    """The folder `run` of a run that has ended, a copy of `whole`."""
+    return shutil.copytree(whole, tmp_path / "run")
+
+
 @pytest.fixture(scope="module")
 def whole_paper(tmp_path_factory):
     return unbroken_run(PAPER, tmp_path_factory.mktemp("paper"))
@@ -142,7 +149,7 @@ class FourPairs(SimulatedPairs):
 
 
 def test_overfits_four_pairs(photos, calibration, tmp_path):
-    recipe = few(steps=40, batch=4, warmup=5, learning_rate=5e-3, validate_every=40, validation=4, bfloat16=False)
+    recipe = few(steps=25, batch=4, warmup=5, learning_rate=5e-3, validate_every=25, validation=4, bfloat16=False)
     pairs = FourPairs(Photographs(photos, side=24), calibration.psf)
     losses = []
     trainer = Trainer(recipe, SupervisedTask(pairs), out=tmp_path / "run", calibration=calibration)
@@ -347,6 +354,38 @@ def test_killed_runs_end_as_an_unbroken_one(photos, calibration, tmp_path):
     assert [line["step"] for line in log(tmp_path / "killed")] == list(range(1, 31))
 
 
+def hold(folder, held):
+    """Keep other runs out of a folder until this process is killed."""
+    with RunFolder(folder, {}).lock():
+        held.set()
+        signal.pause()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no fork")
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # of other threads: none holds the lock
+def test_a_run_does_not_start_in_the_folder_of_another(trainer, finished):
+    """Nor does it change the files; the lock of a process that was stopped holds, that of a killed one does not."""
+    before = {path.name: path.read_bytes() for path in finished.iterdir()}
+    context = multiprocessing.get_context("fork")
+    held = context.Event()
+    first = context.Process(target=hold, args=(finished, held))
+    first.start()
+    try:
+        assert held.wait(60)
+        with pytest.raises(ParameterError, match=r"Another run is using `.*run`\."):
+            trainer().run()
+        assert before == {path.name: path.read_bytes() for path in finished.iterdir()}
+        os.kill(first.pid, signal.SIGSTOP)
+        with pytest.raises(ParameterError, match="Another run is using"), RunFolder(finished, {}).lock():
+            pytest.fail("came in")
+    finally:
+        first.kill()
+        first.join(60)
+    with RunFolder(finished, {}).lock():
+        pass
+
+
+@pytest.mark.acceptance  # 6 s, most of it the start; the test above has the lock itself
 def test_two_runs_do_not_share_a_folder(photos, calibration, tmp_path, monkeypatch, capsys):
     """While one process trains, a second run may neither start nor change the files."""
     monkeypatch.chdir(tmp_path)
@@ -453,11 +492,10 @@ def test_a_run_of_an_earlier_version_goes_on(trainer, tmp_path, request, recipe,
     assert_same_end(tmp_path / "halves", unbroken)
 
 
-def test_weights_of_an_earlier_version_belong_to_the_same_run(trainer, tmp_path):
+def test_weights_of_an_earlier_version_belong_to_the_same_run(trainer, finished):
     """Without a state, recipe.json identifies the run."""
-    trainer().run()
-    as_of_an_earlier_version(tmp_path / "run")
-    (tmp_path / "run" / "state.safetensors").unlink()
+    as_of_an_earlier_version(finished)
+    (finished / "state.safetensors").unlink()
     assert trainer().step == 0
 
 
@@ -494,10 +532,9 @@ def test_epochs_of_recorded_pairs(pairs, calibration, tmp_path):
     assert [line["step"] for line in log(tmp_path / "run") if line["psnr"] is not None] == [5, 10]
 
 
-def test_run_on_photographs_is_not_resumed_with_pairs(trainer, pairs, calibration, tmp_path):
-    trainer().run()
+def test_run_on_photographs_is_not_resumed_with_pairs(finished, pairs, calibration):
     with pytest.raises(CheckpointError, match="or on other pairs"):
-        prepare(few(validation=3), calibration, pairs=pairs, out=tmp_path / "run", device="cpu")
+        prepare(few(validation=3), calibration, pairs=pairs, out=finished, device="cpu")
 
 
 def test_epochs_of_photographs(trainer):
@@ -506,11 +543,11 @@ def test_epochs_of_photographs(trainer):
 
 def test_resumed_run_on_recorded_pairs_ends_bit_identical(pairs, calibration, tmp_path):
     def make(folder):
-        return prepare(few(steps=14), calibration, pairs=pairs, out=tmp_path / folder, device="cpu")
+        return prepare(few(steps=7, batch=4), calibration, pairs=pairs, out=tmp_path / folder, device="cpu")
 
     make("whole").run()
-    stop(make("halves"), 10)
-    assert make("halves").step == 9
+    stop(make("halves"), 5)
+    assert make("halves").step == 3  # two steps before the end of the first epoch
     make("halves").run()
     assert_same_end(tmp_path / "halves", tmp_path / "whole")
 
@@ -539,9 +576,8 @@ def test_capture_that_does_not_fit_is_reported_before_training(calibration, phot
 # --- Errors -------------------------------------------------------------------------------------------
 
 
-def test_another_recipe_or_psf_in_the_same_folder(trainer, photos, calibration, tmp_path):
-    trainer().run()
-    before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
+def test_another_recipe_or_psf_in_the_same_folder(trainer, finished, photos, calibration, tmp_path):
+    before = {path.name: path.read_bytes() for path in finished.iterdir()}
     other = Calibration(calibration.psf.flip(-1))
     for again, said in (
         (lambda: trainer(few(learning_rate=1e-4)), "`schedule.learning_rate` is 0.002 there, 0.0001 here"),
@@ -551,13 +587,12 @@ def test_another_recipe_or_psf_in_the_same_folder(trainer, photos, calibration, 
             CheckpointError, match=f"holds a run of another recipe or PSF.*{said}.*Choose another folder"
         ):
             again()
-    assert before == {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
+    assert before == {path.name: path.read_bytes() for path in finished.iterdir()}
 
 
-def test_weights_of_another_run_are_not_replaced(trainer, tmp_path):
+def test_weights_of_another_run_are_not_replaced(trainer, finished):
     """Not even if its large state was removed. Without weights, nothing can be lost."""
-    trainer().run()
-    folder = tmp_path / "run"
+    folder = finished
     (folder / "state.safetensors").unlink()
     best = (folder / "best.safetensors").read_bytes()
     with pytest.raises(CheckpointError, match="holds a run of another recipe"):
@@ -600,9 +635,8 @@ def test_a_pipe_or_a_huge_file_in_place_of_the_state(trainer, tmp_path):
         trainer()
 
 
-def test_damaged_or_foreign_state(trainer, tmp_path):
-    trainer().run()
-    state = tmp_path / "run" / "state.safetensors"
+def test_damaged_or_foreign_state(trainer, finished):
+    state = finished / "state.safetensors"
     whole = state.read_bytes()
     state.write_bytes(whole[:1000])
     with pytest.raises(CheckpointError, match=r"state\.safetensors` is damaged: .* Remove it"):
@@ -615,7 +649,7 @@ def test_damaged_or_foreign_state(trainer, tmp_path):
     save_file(tensors, state, metadata=header)
     with pytest.raises(CheckpointError, match=r"state\.safetensors` is damaged: a part is missing"):
         trainer()
-    state.write_bytes((tmp_path / "run" / "last.safetensors").read_bytes())
+    state.write_bytes((finished / "last.safetensors").read_bytes())
     with pytest.raises(CheckpointError, match="another recipe or PSF"):
         trainer()
 
@@ -805,7 +839,7 @@ def test_a_denoiser_of_grey_scenes(trainer):
 
 def test_a_denoiser_is_trained_alone_and_then_frozen(trainer, tmp_path):
     """Trained on noisy scenes, then part of a network whose U-Net learns, with a cache or without."""
-    alone = few(steps=20, learning_rate=3e-3, validate_every=20)
+    alone = few(steps=12, learning_rate=3e-3, validate_every=12)
     learned = trainer(replace(alone, network=DRUNET, denoising=Denoising((0.05, 0.1))), "a")
     noisy, scene, level = learned.task.samples.batch(range(10**6, 10**6 + 8))  # not trained on
 
