@@ -2,6 +2,7 @@
 import { getBlob, getJson, post, remove, RequestError, runJob } from "./requests.js";
 import { setUpDivider, setPicture } from "./divider.js";
 import { setUpDropZone } from "./dropping.js";
+import { calibration, cameraFields, chosen, look, orderFields, UPLOAD, whatIsMissing } from "./fields.js";
 import { pageWords } from "./hints.js";
 import { isLive, setUpLive, stopLive, wish } from "./live.js";
 import { saveBlob } from "./saving.js";
@@ -9,16 +10,18 @@ import { drawSliders, readSliders } from "./sliders.js";
 import { showFindings, showVerdicts } from "./verdicts.js";
 
 const byId = (id) => document.getElementById(id);
-const ORIENTATIONS = ["rotate-180", "rotate-90", "rotate-270", "flip-left-right", "flip-top-bottom", "transpose", "transverse"];
-const UPLOAD = "";
+const ORIENTATIONS = [
+  "rotate-180", "rotate-90", "rotate-270", "flip-left-right", "flip-top-bottom", "transpose", "transverse",
+];
 const ROOM_LIGHT = { "": null, true: true, false: false, frame: false }; // of the live picture, by the choice
 
-const chosen = { psf: null, capture: null, ambient: null, job: null };
 let methods = [];
 let sampleCamera = null;
 let running = null;
 let comparing = null;
 let latest = 0; // call of `showPictures`
+let inspected = 0; // PSFs that have been chosen or inspected
+const taken = {}; // number of files taken, by what they are
 const due = new Map(); // timers by their work
 let isTouched = false;
 
@@ -37,45 +40,11 @@ async function guarded(work) {
   }
 }
 
-function calibration() {
-  const options = {};
-  if (byId("bin").value && byId("bin").value !== "1") options.bin = Number(byId("bin").value);
-  if (byId("psf-bin").value) options.psf_bin = Number(byId("psf-bin").value);
-  if (byId("bit-depth").value) options.bit_depth = Number(byId("bit-depth").value);
-  if (byId("mosaic").value) options.mosaic = byId("mosaic").value;
-  if (byId("gamma").value) options.gamma = byId("gamma").value;
-  if (byId("psf-gamma").value) options.psf_gamma = byId("psf-gamma").value;
-  if (byId("orientation").value) options.psf_orientation = byId("orientation").value;
-  return Object.keys(options).length ? JSON.stringify(options) : "";
-}
-
-function cameraFields() {
-  const name = byId("camera").value;
-  return name === UPLOAD ? { psf: chosen.psf, calibration: calibration() } : { camera: name };
-}
-
-function whatIsMissing() {
-  if (!chosen.capture) return "Drop a capture, or choose a sample.";
-  if (byId("camera").value === UPLOAD && !chosen.psf) return "Drop a PSF, or choose a calibration.";
-  if (byId("room-light").value === "frame" && !chosen.ambient) return "Drop a frame of the room’s light alone.";
-  return "";
-}
-
-function orderFields(method = byId("method").value, trust = byId("trust").checked) {
-  const options = method === byId("method").value ? readSliders() : {};
-  const align = byId("align").checked ? "true" : "";
-  const room = byId("room-light").value;
-  const light = room === "frame" ? { room_light: "false", ambient: chosen.ambient } : { room_light: room };
-  return { ...cameraFields(), ...light, capture: chosen.capture, method, align, trust: String(trust), options: JSON.stringify(options) };
-}
-
-const look = (format = "png") =>
-  `?format=${format}&exposure=${byId("exposure").value}&white_balance=${byId("balance").value}`;
-
 // What all viewers of the live picture share.
 function wishLive() {
   wish({
-    method: byId("method").value, options: readSliders(), align: byId("align").checked || null, room_light: ROOM_LIGHT[byId("room-light").value],
+    method: byId("method").value, options: readSliders(),
+    align: byId("align").checked || null, room_light: ROOM_LIGHT[byId("room-light").value],
     stops: Number(byId("exposure").value), white_balance: byId("balance").value,
   });
 }
@@ -182,6 +151,12 @@ async function compareMethods() {
   }
 }
 
+async function inspect() {
+  const call = (inspected += 1);
+  const findings = await post("/inspect", cameraFields());
+  if (call === inspected) showFindings(findings);
+}
+
 // A snapshot of the live camera as a capture, to check it, compare methods and save the picture.
 async function useSnapshot(frame, job) {
   stopLive();
@@ -193,24 +168,31 @@ async function useSnapshot(frame, job) {
 async function trySample(name, camera) {
   stopLive();
   say("Loading the sample …");
+  const call = taken.capture;
   const data = await getBlob(`/samples/${name}`);
-  await take("capture", new File([data], `${name}.png`));
+  if (call !== taken.capture || !(await take("capture", new File([data], `${name}.png`)))) return;
   chooseCamera(camera);
   await reconstruct();
 }
 
-// The file is read at once: a program that captures may write the next frame into it.
+// The file is read at once: a program that captures may write the next frame into it. Of files that are chosen while
+// another one is read, the last counts; returns whether it is this one.
 async function take(what, file) {
-  chosen[what] = new File([await file.arrayBuffer()], file.name, { type: file.type });
+  const call = (taken[what] = (taken[what] ?? 0) + 1);
+  const content = await file.arrayBuffer();
+  if (call !== taken[what]) return false;
+  chosen[what] = new File([content], file.name, { type: file.type });
   byId(`${what}-name`).textContent = file.name;
   byId(`${what}-name`).parentElement.classList.add("full");
   if (what === "psf") chooseCamera(UPLOAD);
   hideComparison();
+  return true;
 }
 
 // Pictures of other methods, and the verdict on a PSF, of what was chosen before.
 function hideComparison() {
   comparing?.abort();
+  inspected += 1;
   byId("grid-section").hidden = true;
   byId("headline").textContent = "";
   byId("findings").replaceChildren();
@@ -223,7 +205,7 @@ function setUpDrop(what) {
       say(`${files.length} files were dropped: drop one.`, true);
       return;
     }
-    if (files[0]) await guarded(() => take(what, files[0]));
+    if (files[0] && !(await guarded(() => take(what, files[0])))) return;
     // The samples' camera is simulated: a visitor's capture is of another one.
     if (what === "capture" && byId("camera").value === sampleCamera) chooseCamera(UPLOAD);
     soon(reconstruct, 0);
@@ -231,6 +213,7 @@ function setUpDrop(what) {
 }
 
 function chooseCamera(name) {
+  if (name !== byId("camera").value) hideComparison();
   byId("camera").value = name;
   byId("format").disabled = byId("camera").value !== UPLOAD; // a stored calibration has its own
 }
@@ -257,6 +240,7 @@ async function removeCamera() {
   const name = byId("camera").value;
   if (name === UPLOAD) throw new RequestError("Choose a stored calibration first.");
   await remove(`/cameras/${encodeURIComponent(name)}`);
+  hideComparison();
   await listCameras();
   say(`${name} is removed.`);
 }
@@ -336,7 +320,7 @@ byId("cancel").onclick = () => {
 byId("compare").onclick = () => guarded(compareMethods);
 byId("store").onclick = () => guarded(storeCamera);
 byId("remove").onclick = () => guarded(removeCamera);
-byId("inspect").onclick = () => guarded(async () => showFindings(await post("/inspect", cameraFields())));
+byId("inspect").onclick = () => guarded(inspect);
 for (const format of Object.keys(SAVED)) byId(`save-${format}`).onclick = () => guarded(() => save(format));
 // A file that misses its zone must not replace the page.
 for (const name of ["dragover", "drop"]) document.addEventListener(name, (event) => event.preventDefault());
