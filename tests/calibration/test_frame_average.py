@@ -8,7 +8,7 @@ from mwdn.calibration import FrameFormat
 from mwdn.calibration.dynamic_range import merge_exposures
 from mwdn.calibration.exposure import measure_exposure
 from mwdn.calibration.frame_average import average_frames
-from mwdn.calibration.hot_pixels import find_hot_pixels
+from mwdn.calibration.hot_pixels import find_dead_pixels, find_hot_pixels
 from mwdn.calibration.photon_transfer import photon_transfer
 from mwdn.calibration.pixel_repair import PixelRepair
 from mwdn.errors import ImageError, ParameterError, ShapeError
@@ -92,6 +92,20 @@ def test_hot_pixels_are_found_and_replaced(bench, dark):
     inside = torch.zeros_like(found)
     inside[..., 2:-2, 2:-2] = True
     torch.testing.assert_close(PixelRepair(found[0, 0])(broken)[inside], slope[inside], atol=0.51, rtol=0)
+
+
+@pytest.mark.parametrize("cell", [1, 2])
+def test_dark_borders_of_frames_through_the_mask_are_no_defects(generator, cell):
+    """A quarter of the pixels of a good sensor were dead: noise at the dark border, and its slope."""
+    y, x = torch.linspace(-1, 1, 96)[:, None], torch.linspace(-1, 1, 128)
+    light = torch.exp(-12 * (y.square() + x.square()))
+    if cell == 2:
+        light = light * torch.tensor([[1.0, 0.4], [0.4, 0.7]]).repeat(48, 64)
+    deviation = (0.002**2 + 1e-4 * light).sqrt()
+    flat = light + deviation * torch.randn(96, 128, generator=generator)
+    flat[48, 64], flat[40, 70], flat[3, 3] = 0.0, 1.5, 0.3
+    found = find_dead_pixels(flat, deviation, cell=cell, through_mask=True)[0, 0]
+    assert found.nonzero().tolist() == [[3, 3], [40, 70], [48, 64]]
 
 
 def test_repair_of_a_mosaic_takes_pixels_of_the_same_colour(generator):

@@ -1,5 +1,9 @@
 """Find defective pixels in dark and flat frames."""
 
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -8,7 +12,7 @@ from mwdn.calibration.frame_average import FrameAverage
 from mwdn.types import Plane
 
 HOT = 6.0
-"""Standard deviations of the averaged dark frame above which a pixel is hot: 1e-9 of the good ones."""
+"""Standard deviations of the averaged frames from which on a pixel is defective: 1e-9 of the good ones are, too."""
 
 DEAD = 0.5
 """Relative deviation from its neighbours, in a flat frame, from which on a pixel is defective."""
@@ -37,19 +41,48 @@ def find_hot_pixels(dark: FrameAverage, *, cell: int = 1) -> Tensor:
     return (excess > HOT * deviation)[None, None]
 
 
-def find_dead_pixels(flat: Plane, *, cell: int = 1) -> Tensor:
-    """Find pixels of a flat frame (H, W) that are darker or brighter than their surroundings by `DEAD`."""
-    local = _local_median(flat, cell)
-    return ((flat - local).abs() > DEAD * local.clamp(min=1e-6))[None, None]
+def find_dead_pixels(flat: Plane, deviation: Plane, *, cell: int = 1, through_mask: bool = False) -> Tensor:
+    """Find pixels that are darker or brighter than their surroundings by `DEAD`, and by more than their noise.
+
+    The surroundings are the median of 5 x 5 pixels. Frames that were taken through the mask are not even: there a pixel
+    must lie beyond all of its eight neighbours, as none does on a slope.
+
+    Args:
+        flat: average of flat frames, (H, W).
+        deviation: standard deviation of its noise, (H, W).
+        cell: 2 for a mosaic, whose four kinds of pixels are examined separately.
+        through_mask: the frames were taken through the mask.
+
+    Returns:
+        (1, 1, H, W), bool.
+    """
+    if through_mask:
+        ring = np.ones((3, 3), np.uint8)
+        ring[1, 1] = 0
+        low, high = (_filtered(flat, cell, partial(filter, kernel=ring)) for filter in (_cv2().erode, _cv2().dilate))
+    else:
+        low = high = _local_median(flat, cell)
+    low, high, noise = low.clamp(min=1e-6), high.clamp(min=1e-6), HOT * deviation
+    dark, bright = low - flat > torch.maximum(DEAD * low, noise), flat - high > torch.maximum(DEAD * high, noise)
+    return (dark | bright)[None, None]
 
 
 def _local_median(image: Plane, cell: int) -> Plane:
     """Median of 5 x 5 pixels of the same position in the cell of a mosaic."""
+    return _filtered(image, cell, partial(_cv2().medianBlur, ksize=5))
+
+
+def _cv2() -> Any:  # noqa: ANN401 - imported when it is needed: it takes a tenth of a second
     import cv2
 
+    return cv2
+
+
+def _filtered(image: Plane, cell: int, work: Callable[..., Any]) -> Plane:
+    """Filter the pixels of each position in the cell of a mosaic."""
     result = np.empty(tuple(image.shape), np.float32)
     for row in range(cell):
         for column in range(cell):
             part = np.ascontiguousarray(image[row::cell, column::cell].numpy(), np.float32)
-            result[row::cell, column::cell] = cv2.medianBlur(part, 5)
+            result[row::cell, column::cell] = work(part)
     return torch.from_numpy(result)

@@ -13,7 +13,7 @@ from mwdn.calibration.frame_average import FrameAverage, Kind, average_frames
 from mwdn.calibration.frame_format import FrameFormat
 from mwdn.calibration.frame_operations import demosaic
 from mwdn.calibration.hot_pixels import find_dead_pixels, find_hot_pixels
-from mwdn.calibration.noise_model import fit_line
+from mwdn.calibration.noise_model import TYPICAL, fit_line
 from mwdn.calibration.photon_transfer import SAME_LIGHT, PhotonTransfer, photon_transfer
 from mwdn.errors import ParameterError, ShapeError
 from mwdn.types import Frame, Image, Size
@@ -193,17 +193,18 @@ def _with_flats(sensor: SensorFrames, files: SensorFiles, frames: FrameFormat) -
         dark = average_frames(darks, frames, names=[path.name for path in dark_paths], kind="dark").image
     else:
         notes.append("Without dark frames the flat field holds the black level, too: `--dark`.")
-    flat, left_out = _mean_flat(flats, names, frames, dark)
+    flat, deviation, left_out = _mean_flat(flats, names, frames, dark)
     notes += left_out
     sensor.check_size(f"Flat frames, as `{names[0]}`", (flat.shape[-2], flat.shape[-1]))
     defects = (torch.zeros(1, 1, *flat.shape[-2:]) > 0) if defects is None else defects
-    dead = find_dead_pixels(flat.mean((0, 1)), cell=frames.cell)
-    if float(dead.float().mean()) > MAX_DEAD:
+    plane, noise = flat.mean((0, 1)), deviation.mean((0, 1))
+    unlike = find_dead_pixels(plane, torch.zeros_like(noise), cell=frames.cell).float().mean()
+    if files.flat_field and float(unlike) > MAX_DEAD:
         raise ParameterError(
-            f"{dead.float().mean():.0%} of the pixels of the flat frames are unlike their neighbours: the frames show "
+            f"{unlike:.0%} of the pixels of the flat frames are unlike their neighbours: the frames show "
             "a pattern, or are too dark. Take them of even light, a white page or the sky, at half of the full scale."
         )
-    defects = defects | dead
+    defects = defects | find_dead_pixels(plane, noise, cell=frames.cell, through_mask=not files.flat_field)
     colour = demosaic(flat, frames.mosaic) if frames.mosaic else flat
     tint = tuple(colour.mean((0, 2, 3)).tolist()) if colour.shape[1] == 3 else ()
     transfer = None
@@ -235,14 +236,14 @@ def _black(sensor: SensorFrames, defects: Tensor) -> float | None:
 
 def _mean_flat(
     flats: Sequence[Frame], names: Sequence[str], frames: FrameFormat, dark: Image | None
-) -> tuple[Image, list[str]]:
-    """Mean of flat frames over their levels, and a sentence for each that is left out.
+) -> tuple[Image, Image, list[str]]:
+    """Mean of flat frames over their levels, its standard deviation, and a sentence for each that is left out.
 
     Raises:
         ParameterError: all are saturated or dark.
     """
     levels = [float(frames.normalise(frame).mean()) - (0.0 if dark is None else float(dark.mean())) for frame in flats]
-    total, weight, notes = None, 0.0, list[str]()
+    total, variance, weight, notes = None, None, 0.0, list[str]()
     for start, stop in _runs(levels):
         average = average_frames(flats[start:stop], frames, names=names[start:stop], kind="flat", dark=dark)
         notes += average.rejected.values()
@@ -252,10 +253,12 @@ def _mean_flat(
         # Relative to the level, noise falls with the square root of the electrons.
         part = average.count * levels[start]
         total = part * average.image / levels[start] + (0.0 if total is None else total)
+        noise = (average.noise or TYPICAL).variance(average.image) / average.count
+        variance = (part / levels[start]) ** 2 * noise + (0.0 if variance is None else variance)
         weight += part
-    if total is None or weight <= 0:
+    if total is None or variance is None or weight <= 0:
         raise ParameterError("All flat frames are saturated or dark. Expose them to about half of the full scale.")
-    return total / weight, notes
+    return total / weight, variance.sqrt() / weight, notes
 
 
 def _runs(levels: Sequence[float]) -> list[tuple[int, int]]:
