@@ -142,12 +142,19 @@ def design_camera(name: str, design: MaskDesign, setup: Setup) -> Designed:
         setup: the camera: distances, pitch, wavelengths, size of the sensor.
 
     Raises:
-        ParameterError: a parameter is invalid for this mask or camera.
+        ParameterError: a parameter is invalid for this mask or camera, or no light passes the mask.
     """
     mask = design.build(setup)
     if not isinstance(mask, Mask):
         raise ParameterError(f"`build` of the mask '{name}' must return a `mwdn.optics.Mask`, not {shown(mask)}.")
-    return Designed(name, design, setup, mask, mask_psf(mask, setup))
+    light = mask_psf(mask, setup)
+    if not bool(light.any()):
+        height, width = setup.aperture_mm
+        raise ParameterError(
+            f"No light passes the mask within the aperture ({height:g} x {width:g} mm): give an open mask, or another "
+            "`aperture_mm`."
+        )
+    return Designed(name, design, setup, mask, light)
 
 
 def check_replaced(out: Path, *, gds: bool = False, stl: bool = False) -> None:

@@ -130,20 +130,13 @@ def mask_psf(mask: Mask, setup: Setup, *, angle_degrees: tuple[float, float] = (
         a `Camera`.
 
     Raises:
-        ParameterError: the mask's pitch cannot sample the light behind it, and the message says which pitch can; or no
-            light passes the mask within the aperture.
+        ParameterError: the mask's pitch cannot sample the light behind it; the message says which pitch can.
     """
     pitch, mask = mask.pitch_um, _in_aperture(mask, setup)
     opening = tuple(side * UM_PER_MM for side in setup.aperture_mm)
     down, across = (overlap(1, side, n, pitch)[0] for side, n in zip(opening, mask.values.shape, strict=True))
     aperture = torch.outer(down, across).float()
     wavelengths, weights = setup.spectrum()
-    if mask.kind == "amplitude" and not bool((mask.values * aperture).any()):
-        height, width = setup.aperture_mm
-        raise ParameterError(
-            f"No light passes the mask within the aperture ({height:g} x {width:g} mm): give an open mask, or another "
-            "`aperture_mm`."
-        )
     needed, deflection = needed_pitch(mask, setup, angle_degrees=angle_degrees)
     if pitch > needed:
         raise ParameterError(
