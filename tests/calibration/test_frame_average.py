@@ -94,6 +94,15 @@ def test_hot_pixels_are_found_and_replaced(bench, dark):
     torch.testing.assert_close(PixelRepair(found[0, 0])(broken)[inside], slope[inside], atol=0.51, rtol=0)
 
 
+def test_noise_that_is_cut_off_at_black_makes_no_hot_pixels(generator):
+    """Raw files are read from their black level on: values above 0 were outliers, and a tenth of the pixels hot."""
+    noise = 1.25 * torch.randn(6, 96, 128, 1, generator=generator)
+    noise[:, 40, 70] += 60
+    dark = average_frames([*(16 * noise.round().clamp(min=0)).numpy().astype("u2")], kind="dark")
+    assert find_hot_pixels(dark)[0, 0].nonzero().tolist() == [[40, 70]]
+    assert dark.noise.floor == pytest.approx((16 * 0.75 / 65535) ** 2, rel=0.6)  # of what is left of the noise
+
+
 @pytest.mark.parametrize("cell", [1, 2])
 def test_dark_borders_of_frames_through_the_mask_are_no_defects(generator, cell):
     """A quarter of the pixels of a good sensor were dead: noise at the dark border, and its slope."""

@@ -8,6 +8,12 @@ from torch import Tensor
 STEPS = 24
 """Levels of brightness at which the variance is measured."""
 
+CUT_OFF = 0.1
+"""Part of the pixels at the lowest signal from which on the noise is cut off there, as that of raw files at black."""
+
+DARK = 0.8
+"""Part of the pixels, the darkest, whose variance is then the least floor: groups of equal signal have none."""
+
 
 class NoiseModel(NamedTuple):
     """Variance of one frame's pixel: ``slope * signal + floor``, in units of the full scale.
@@ -51,7 +57,8 @@ def fit_noise(signal: Tensor, difference: Tensor, *, step: float = 0.0) -> Noise
     Args:
         signal: mean of the frames above black, in units of the full scale, of any shape.
         difference: of two frames, divided by sqrt(2), at the same pixels.
-        step: of the quantisation; the floor is at least its variance, step^2 / 12.
+        step: of the quantisation; the floor is at least its variance, step^2 / 12. Where the noise is cut off
+            (`CUT_OFF`), it is at least the variance of the dark pixels.
     """
     order = signal.flatten().argsort()
     mean, spread = signal.flatten()[order], difference.flatten()[order]
@@ -59,6 +66,8 @@ def fit_noise(signal: Tensor, difference: Tensor, *, step: float = 0.0) -> Noise
     levels = torch.tensor([float(mean[part].double().mean()) for part in parts], dtype=torch.float64)
     variances = torch.tensor([clipped_variance(spread[part]) for part in parts], dtype=torch.float64)
     least = max(step**2 / 12, 1e-16)
+    if len(mean) and float((mean == mean[0]).float().mean()) > CUT_OFF:
+        least = max(least, clipped_variance(spread[: int(DARK * len(spread))]))
     variances = variances.clamp(min=least)
     slope, floor = fit_line(levels, variances, 1 / variances.square())
     return NoiseModel(max(slope, 0.0), max(floor, least))

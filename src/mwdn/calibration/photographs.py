@@ -227,5 +227,8 @@ def describe_sensor(sensor: SensorFrames) -> list[str]:
             f"read noise {transfer.read_noise:.2g} electrons, full well {transfer.full_well:,.0f} electrons."
         )
         if transfer.clipped:
-            sentences.append("The black level cuts off the noise of darkness: raise the camera's offset.")
+            sentences.append(
+                "The black level cuts off the noise of darkness, so the read noise is too small: raise the camera's "
+                "offset. Reading a raw file cuts it off, too: export frames with their black level as 16-bit TIFF."
+            )
     return sentences

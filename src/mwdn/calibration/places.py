@@ -6,7 +6,6 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from mwdn.calibration.frame_operations import bin_pixels
 from mwdn.calibration.psf import Calibration
@@ -18,9 +17,6 @@ from mwdn.optics.psf_measures import likeness
 from mwdn.optics.sensor import Sensor
 from mwdn.optics.warp import warp
 from mwdn.types import Psf
-
-GRID = 5
-"""Points of the grid of PSFs along each side of the scene, bilinear in between."""
 
 MAGNIFICATIONS = (0.8, 1.25)
 """Range in which the magnification of one PSF over that of a neighbouring distance is sought."""
@@ -121,8 +117,8 @@ def psfs_elsewhere(calibration: Calibration) -> tuple[dict[float, Psf], list[tup
 def field_camera(calibration: Calibration) -> FieldCamera:
     """A camera whose PSF changes over the field as measured; it darkens off the axis as the point source did.
 
-    On a grid of `GRID` x `GRID` points the PSFs are means of the measured ones and of the one on the axis, weighted by
-    the inverse square of the distance (Shepard); at a measured point only its own PSF has a weight.
+    At each point of the scene the PSF is the mean of the measured ones and of the one on the axis, weighted by the
+    inverse square of the distance (Shepard); at a measured point only its own PSF has a weight.
 
     Args:
         calibration: with PSFs at other positions, which were taken with the exposure of the one on the axis.
@@ -141,8 +137,7 @@ def field_camera(calibration: Calibration) -> FieldCamera:
     light = [sum(one.light) / max(sum(calibration.light), 1e-30) for one in others]
     psfs = torch.cat([calibration.psf, *(level * one.psf for level, one in zip(light, others, strict=True))])
     weights = _shepard(torch.tensor(points), calibration.size)
-    maps = F.interpolate(weights, calibration.size, mode="bilinear", align_corners=True)
-    return FieldCamera(psfs, maps, sensor=calibration.binned_sensor or Sensor())
+    return FieldCamera(psfs, weights, sensor=calibration.binned_sensor or Sensor())
 
 
 def _in_measurement(calibration: Calibration, position: tuple[float, float]) -> tuple[float, float]:
@@ -156,8 +151,8 @@ def _in_measurement(calibration: Calibration, position: tuple[float, float]) -> 
 
 
 def _shepard(points: Tensor, size: tuple[int, int]) -> Tensor:
-    """Weights (points, 1, GRID, GRID) of the points (N, 2), in pixels from the centre, on a grid over the scene."""
-    rows, columns = (torch.linspace(-(n - 1) / 2, (n - 1) / 2, GRID) for n in size)
+    """Weights (points, 1, height, width) at each pixel of the scene of points (N, 2), in pixels from the centre."""
+    rows, columns = (torch.arange(n, dtype=torch.float32) - n // 2 for n in size)
     grid = torch.stack(torch.meshgrid(rows, columns, indexing="ij"), -1)
     square = (grid - points[:, None, None]).square().sum(-1).clamp(min=1e-6)
     return (1 / square / (1 / square).sum(0))[:, None]
