@@ -117,3 +117,13 @@ def test_other_cameras_are_refused(camera):
         LenslessPhysics(Camera(camera.psf.expand(2, -1, -1, -1)))
     with pytest.raises(ParameterError, match="`camera`"):
         LenslessPhysics(camera.psf)
+
+
+def test_noise_follows_gain_and_sigma(generator):
+    physics = LenslessPhysics(Camera(torch.ones(1, 1, 1, 1), size=(64, 64)), generator=generator)
+    x = torch.full((1, 1, 64, 64), 0.5)
+    for gain, sigma in ((None, None), (1e-3, 0.02), (1e-5, 0.01)):
+        y = physics(x, gain=gain, sigma=sigma) if gain else physics(x)
+        stated = physics.noise_model
+        expected = (float(stated.gain) * 0.5 + float(stated.sigma) ** 2) ** 0.5
+        assert float((y - x).std()) == pytest.approx(expected, rel=0.05)

@@ -545,3 +545,10 @@ def _with_halo(psf, other):
     terms = np.stack([psf, cv2.GaussianBlur(psf, (0, 0), 32), np.ones_like(psf)], -1).reshape(-1, 3)
     fitted = terms @ np.linalg.lstsq(terms, other.ravel(), rcond=None)[0]
     return np.corrcoef(fitted, other.ravel())[0, 1]
+
+
+def test_flat_none_does_without_the_flat_field_of_the_camera_file(run, folder):
+    assert run(EVERYTHING)[0] == 0
+    assert run("calibrate psf_1 --camera camera.toml --flat none")[0] == 0
+    camera = read_camera("camera.toml")
+    assert ("flat_field" in camera, "hot_pixels" in camera) == (False, True)

@@ -1,13 +1,14 @@
 """A camera as the physics of DeepInverse: a `deepinv.physics.LinearPhysics`."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from mwdn.bridges.forward_model import ForwardModel
-from mwdn.errors import MIN_LIGHT, check_options
+from mwdn.errors import MIN_LIGHT, ParameterError, check_options
 from mwdn.fourier import convolve, correlate
 from mwdn.optics import Camera, Sensor
 from mwdn.optics.psf import checked_psf
@@ -97,7 +98,7 @@ class SensorNoise(_physics.PoissonGaussianNoise):  # type: ignore[misc]
     """The noise of `mwdn.Sensor`: shot and read noise, black level, saturation, quantisation.
 
     Networks of DeepInverse that ask for the noise find ``gain``, the electrons of saturation inverted, and ``sigma``,
-    the standard deviation of a dark pixel.
+    the standard deviation of a dark pixel. Both can be changed, by `update_parameters` or a call.
 
     Args:
         sensor: the sensor.
@@ -106,11 +107,40 @@ class SensorNoise(_physics.PoissonGaussianNoise):  # type: ignore[misc]
 
     def __init__(self, sensor: Sensor, generator: torch.Generator | None = None) -> None:
         step = 1 / (2**sensor.bit_depth - 1) / (1 - sensor.black_level)
-        sigma = ((sensor.read_noise / sensor.full_well) ** 2 + step**2 / 12) ** 0.5
+        self.rounding = step**2 / 12  # variance
+        sigma = ((sensor.read_noise / sensor.full_well) ** 2 + self.rounding) ** 0.5
         super().__init__(gain=1 / sensor.full_well, sigma=sigma, clip_positive=True, rng=generator)
-        self.sensor = sensor
+        self.sensor, self.stated = sensor, (float(self.gain), float(self.sigma))
 
-    def forward(self, x: Image, seed: int | None = None, **_: object) -> Image:
-        """One capture of the light on the sensor."""
+    def forward(
+        self,
+        x: Image,
+        gain: float | Tensor | None = None,
+        sigma: float | Tensor | None = None,
+        seed: int | None = None,
+        **_: object,
+    ) -> Image:
+        """One capture of the light on the sensor.
+
+        Args:
+            x: the light, 1 is saturation.
+            gain: one number, in place of that of the sensor.
+            sigma: likewise.
+            seed: of the noise.
+
+        Raises:
+            ParameterError: a number for each sample.
+        """
+        self.update_parameters(gain=gain, sigma=sigma)
         self.rng_manual_seed(seed)
-        return self.sensor.expose(x, generator=self.rng)
+        return self._sensor().expose(x, generator=self.rng)
+
+    def _sensor(self) -> Sensor:
+        """The sensor with the present gain and sigma."""
+        for name in ("gain", "sigma"):
+            if getattr(self, name).numel() > 1:
+                raise ParameterError(f"`{name}` must be one number: all captures of a batch are by one sensor.")
+        gain, sigma = float(self.gain), float(self.sigma)
+        if (gain, sigma) == self.stated:
+            return self.sensor
+        return replace(self.sensor, full_well=1 / gain, read_noise=max(sigma**2 - self.rounding, 0.0) ** 0.5 / gain)

@@ -141,7 +141,7 @@ def calibrate_frames(
         content["field_positions"], parts["field_psfs"] = _field(elsewhere, reference, shift, frames)
         notes += [note for place in places for note in place.notes]
     sensor_content, sensor_parts = of_sensor(sensor, frames)
-    results = [_summary(own, shift), *describe_sensor(sensor)]
+    results = [_summary(own, shift, "px" if frames.cell == 1 else "raw px"), *describe_sensor(sensor)]
     return CameraContent(content | sensor_content, parts | sensor_parts, notes, results, sensor.flat_colour)
 
 
@@ -208,11 +208,11 @@ def of_sensor(sensor: SensorFrames, frames: FrameFormat) -> tuple[dict[str, Any]
     return content, parts
 
 
-def _summary(point: PointSource, shift: tuple[int, int]) -> str:
+def _summary(point: PointSource, shift: tuple[int, int], unit: str) -> str:
     merged = "" if len(point.exposures) == 1 else f" at {len(point.exposures)} exposures, merged"
     range_ = f"; {point.decades:.1f} decades from the noise to the peak" if point.decades else ""
     frames = "1 frame" if point.count == 1 else f"{point.count} frames"
-    return f"{frames} averaged{merged}{range_}. Moved by ({shift[0]}, {shift[1]}) px to the centre."
+    return f"{frames} averaged{merged}{range_}. Moved by ({shift[0]}, {shift[1]}) {unit} to the centre."
 
 
 def describe_sensor(sensor: SensorFrames) -> list[str]:

@@ -103,6 +103,9 @@ def calibrate(  # noqa: PLR0913
     kept = _kept(camera)
     if files and psf not in (None, kept.get("psf")):
         raise ParameterError(f"`psf` (`{psf}`) is instead of FILES (`{files[0]}`). Give either of them.")
+    if photographs.flat == (Path("none"),):
+        kept.pop("flat_field", None)
+        photographs = replace(photographs, flat=())
     own_dark = kept.pop("dark", None)  # an option has it
     pictures = _by_kept_path(pictures, kept.get("psf"))
     photographs = replace(photographs, dark=tuple(_by_kept_path(photographs.dark, own_dark)))

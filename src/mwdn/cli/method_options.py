@@ -3,8 +3,9 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from itertools import chain
-from types import NoneType
-from typing import Annotated, Any, Literal, get_args, get_origin
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from cyclopts import App, Parameter
 
@@ -72,16 +73,29 @@ def _convert(option: Option, given: Any) -> Any:  # noqa: ANN401
         known = ", ".join(parts) or "none"
         raise ParameterError(f"`{_flag(option.name)}` has the parts {known}, not {', '.join(given)}.")
     text = given[-1].value
-    for kind in [option.type] if get_origin(option.type) is Literal else get_args(option.type) or [option.type]:
-        if get_origin(kind) is Literal and text in get_args(kind):
-            return text
-        if kind is NoneType and text == "none":
-            return None
-        if kind in (int, float):
+    try:
+        return _parse(option.type, text)
+    except ValueError:
+        like = ": `1,2,3`" if get_origin(option.type) is tuple else ""
+        raise ParameterError(f"`{_flag(option.name)}` ({text}) must be {type_in_words(option.type)}{like}.") from None
+
+
+def _parse(kind: Any, text: str) -> Any:  # noqa: ANN401
+    """A value of a type; raises a `ValueError` if the text is none."""
+    if get_origin(kind) is tuple:
+        parts, kinds = text.strip("[]() ").split(","), get_args(kind)
+        kinds = kinds[:1] * len(parts) if kinds[-1] is Ellipsis else kinds
+        return tuple(_parse(each, part.strip()) for each, part in zip(kinds, parts, strict=True))
+    if get_origin(kind) in (Union, UnionType):
+        for each in sorted(get_args(kind), key=lambda each: each is not NoneType):  # `none` is no path
             with suppress(ValueError):
-                return kind(text)
-        if kind is bool and text in ("true", "false"):
-            return text == "true"
-        if kind in (str, Any):
-            return text
-    raise ParameterError(f"`{_flag(option.name)}` ({text}) must be {type_in_words(option.type)}.")
+                return _parse(each, text)
+    elif (get_origin(kind) is Literal and text in get_args(kind)) or kind in (str, Any):
+        return text
+    elif kind is NoneType and text == "none":
+        return None
+    elif kind in (int, float, Path):
+        return kind(text)
+    elif kind is bool and text in ("true", "false"):
+        return text == "true"
+    raise ValueError(text)

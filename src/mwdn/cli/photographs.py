@@ -26,7 +26,8 @@ class PhotographOptions:
         dark: frames taken without light, or with the source switched off, several; subtracted from the PSF and the
             captures.
         dark_exposures: exposure of each folder of dark frames, or of each equal part of the files, if they differ.
-        flat: frames of even light, in pairs of the same exposure: flat field, gain and read noise.
+        flat: frames of even light, in pairs of the same exposure: flat field, gain and read noise; none to do without
+            the camera file's flat field.
         flat_dark: dark frames with the exposure of the flat frames; --dark unless given, if it has one exposure.
         flat_through_mask: the flat frames were taken through the mask: no flat field, gain and read noise alone.
         capture_exposure: exposure of the captures, one of --dark-exposures, whose dark frame they have; the longest
