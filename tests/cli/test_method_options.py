@@ -9,7 +9,6 @@ from cyclopts.token import Token
 
 from mwdn.cli.method_options import read_options
 from mwdn.errors import ParameterError
-from mwdn.solvers import SOLVERS
 
 
 @dataclass(frozen=True)
@@ -41,12 +40,12 @@ def command():
     ],
 )
 def test_values_have_the_type_of_the_option(monkeypatch, name, text, value):
-    monkeypatch.setitem(SOLVERS, "many", Many)
+    monkeypatch.setattr("mwdn.cli.method_options.SOLVERS", {"many": Many})
     assert read_options(["many"], {name: [Token(value=text)]}, command) == {"many": {name: value}}
 
 
 @pytest.mark.parametrize(("name", "text"), [("weights", "1,2"), ("steps", "x"), ("kind", "c"), ("fast", "1")])
 def test_another_value_is_named(monkeypatch, name, text):
-    monkeypatch.setitem(SOLVERS, "many", Many)
+    monkeypatch.setattr("mwdn.cli.method_options.SOLVERS", {"many": Many})
     with pytest.raises(ParameterError, match=f"`--{name}` \\({text}\\) must be"):
         read_options(["many"], {name: [Token(value=text)]}, command)
