@@ -290,6 +290,7 @@ def test_json_of_reconstruct(run, camera):
     assert "1 of 2 captures" in err
     first, last = json.loads(out)
     assert first == {"capture": "captures/a.png", "picture": "out/a.png", **json.loads(Path("out/a.json").read_text())}
+    assert first["picture"] == "out/a.png"
     assert last["capture"] == "d.png"
     assert last["picture"] is None
     assert "`d.png`" in last["error"]
@@ -464,7 +465,7 @@ def test_without_trust(run, camera):
         "method",
         "psf_hash",
         "origin",
-        "picture",
+        "file",
         "bin",
     }
 

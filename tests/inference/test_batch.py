@@ -185,7 +185,7 @@ def test_linear_formats_hold_what_the_reconstructor_returns(tmp_path, format, su
         assert np.array_equal(found, scene[0].movedim(0, -1).numpy())
         assert job.measurement is job.scene is job.trust is job.error is None  # a million jobs may be kept
         beside = json.loads(job.output.with_suffix(".json").read_text())
-        assert beside.keys() == {"method", "psf_hash", "origin", "picture", "bin"}
+        assert beside.keys() == {"method", "psf_hash", "origin", "file", "bin"}
         assert beside["method"] == "name"
         assert beside["psf_hash"] == batch.reconstruct.calibration.psf_hash
 

@@ -215,7 +215,7 @@ class Batch:
         verdicts = settle_exif((*job.verdicts, *trust.verdicts)) if trust else ()
         calibration, pitch = self.reconstruct.calibration, self.reconstruct.calibration.pitch_um
         content: dict[str, object] = {"method": self.method, "psf_hash": calibration.psf_hash, "origin": job.origin}
-        content |= {"picture": job.output.name, "bin": calibration.frames.bin}
+        content |= {"file": job.output.name, "bin": calibration.frames.bin}
         content |= {} if job.room_light is None else {"room_light": round(job.room_light, 4)}
         if trust:
             content |= {**trust.content, "verdicts": [asdict(verdict) for verdict in verdicts]}

@@ -128,9 +128,9 @@ def remove_other_format(
         ImageError: the picture cannot be removed.
     """
     names = {output.stem + suffix for suffix in _SUFFIX.values()} - {output.name}
-    if before.get("picture") not in names or all(before.get(key) == now[key] for key in ("method", "psf_hash")):
+    if before.get("file") not in names or all(before.get(key) == now[key] for key in ("method", "psf_hash")):
         return
-    picture = output.with_name(str(before["picture"]))
+    picture = output.with_name(str(before["file"]))
     if picture.resolve() != capture.resolve():
         with as_image_error(picture):
             picture.unlink(missing_ok=True)
