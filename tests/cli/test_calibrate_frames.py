@@ -176,6 +176,8 @@ def test_a_background_that_is_given_is_kept(run, folder):
         ("--camera camera.toml --dark none", None),  # 0 was for the dark frame
         ("--camera camera.toml --background 0", 0.0),
         ("--camera camera.toml", 0.0),
+        ("--dark dark --background 0.02", 0.02),
+        ("--camera camera.toml --dark none", 0.02),
     ):
         assert run(f"calibrate psf_1 --bit-depth 12 {options}")[0] == 0
         assert read_camera("camera.toml").get("background") == background

@@ -21,7 +21,6 @@ LAMBDAS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
 NOISES = (0.01, 0.003, 0.001)
 """Noise of a measurement over its mean for which resolution is reported: 10,000, 100,000 and 1,000,000 electrons."""
 
-
 BELOW_ZERO_SIGMAS = 5
 """Standard deviations of the noise below 0 that noise alone does not reach."""
 

@@ -16,7 +16,7 @@ from mwdn.calibration.hot_pixels import find_dead_pixels, find_hot_pixels
 from mwdn.calibration.noise_model import TYPICAL, fit_line
 from mwdn.calibration.photon_transfer import SAME_LIGHT, PhotonTransfer, photon_transfer
 from mwdn.errors import ParameterError, ShapeError
-from mwdn.types import Frame, Image, Size
+from mwdn.types import Frame, Image, Plane, Size
 
 MIN_RESPONSE = 0.1
 """Smallest value of a flat field: a pixel with less light is replaced, not amplified."""
@@ -198,12 +198,8 @@ def _with_flats(sensor: SensorFrames, files: SensorFiles, frames: FrameFormat) -
     sensor.check_size(f"Flat frames, as `{names[0]}`", (flat.shape[-2], flat.shape[-1]))
     defects = (torch.zeros(1, 1, *flat.shape[-2:]) > 0) if defects is None else defects
     plane, noise = flat.mean((0, 1)), deviation.mean((0, 1))
-    unlike = find_dead_pixels(plane, torch.zeros_like(noise), cell=frames.cell).float().mean()
-    if files.flat_field and float(unlike) > MAX_DEAD:
-        raise ParameterError(
-            f"{unlike:.0%} of the pixels of the flat frames are unlike their neighbours: the frames show "
-            "a pattern, or are too dark. Take them of even light, a white page or the sky, at half of the full scale."
-        )
+    if files.flat_field:
+        _refuse_pattern(plane, frames.cell)
     defects = defects | find_dead_pixels(plane, noise, cell=frames.cell, through_mask=not files.flat_field)
     colour = demosaic(flat, frames.mosaic) if frames.mosaic else flat
     tint = tuple(colour.mean((0, 2, 3)).tolist()) if colour.shape[1] == 3 else ()
@@ -215,6 +211,16 @@ def _with_flats(sensor: SensorFrames, files: SensorFiles, frames: FrameFormat) -
     response = relative_response(flat, frames.cell) if files.flat_field else sensor.corrections.flat
     corrections = Corrections(response, defects)
     return replace(sensor, corrections=corrections, transfer=transfer, flat_colour=tint, notes=tuple(notes))
+
+
+def _refuse_pattern(flat: Plane, cell: int) -> None:
+    """Raise a `ParameterError` if more than `MAX_DEAD` of the pixels are unlike their neighbours, noise or not."""
+    unlike = float(find_dead_pixels(flat, torch.zeros_like(flat), cell=cell).float().mean())
+    if unlike > MAX_DEAD:
+        raise ParameterError(
+            f"{unlike:.0%} of the pixels of the flat frames are unlike their neighbours: the frames show a pattern, or "
+            "are too dark. Take them of even light, a white page or the sky, at half of the full scale."
+        )
 
 
 def _black(sensor: SensorFrames, defects: Tensor) -> float | None:

@@ -76,9 +76,8 @@ def _levels(report: PsfReport) -> Iterator[Finding]:
         yield Finding("weak", text)
     if levels.below_zero > 0.01:
         text = (
-            f"{_percent(levels.below_zero)} of its pixels are far below 0 and count as 0: more was subtracted from the "
-            "picture than light of the surroundings, so the PSF has lost its faint parts. Use the picture as it was "
-            "before."
+            f"{_percent(levels.below_zero)} of its pixels are far below 0 and count as 0: more was subtracted than the "
+            "background, so the PSF has lost its faint parts. Use the picture before the subtraction."
         )
         yield Finding("bad" if levels.below_zero > 0.2 else "weak", text)
     yield from _background(levels)

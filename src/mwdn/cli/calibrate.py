@@ -32,7 +32,7 @@ from mwdn.cli.calibrate_checks import (
 )
 from mwdn.cli.camera import CameraOptions
 from mwdn.cli.inspect import load_at_psf_resolution
-from mwdn.cli.photographs import PhotographOptions
+from mwdn.cli.photographs import WITHOUT, PhotographOptions
 from mwdn.cli.refine import check_pair_file, refine
 from mwdn.cli.session_frames import BenchFrames, bench_frames
 from mwdn.cli.terminal import counted, if_interrupted, note, quoted, say
@@ -103,7 +103,7 @@ def calibrate(  # noqa: PLR0913
     kept = _kept(camera)
     if files and psf not in (None, kept.get("psf")):
         raise ParameterError(f"`psf` (`{psf}`) is instead of FILES (`{files[0]}`). Give either of them.")
-    if photographs.flat == (Path("none"),):
+    if photographs.flat == WITHOUT:
         kept.pop("flat_field", None)
         photographs = replace(photographs, flat=())
     own_dark = kept.pop("dark", None)  # an option has it
@@ -138,7 +138,7 @@ def calibrate(  # noqa: PLR0913
             known = Corrections.read(kept.get("flat_field"), kept.get("hot_pixels"))
             refuse_overwrite(out, *expanded((*pictures, *photographs.dark_files, *photographs.flat)))
             done = calibrate_frames(photographs.of(pictures), frames, known)
-            if auto_background and own_dark is not None and not photographs.dark_files:
+            if auto_background and own["background"] == 0 and own_dark is not None and not photographs.dark_files:
                 own["background"] = None  # 0 was for the dark frame
             write = partial(_write_photographs, done, {**kept, **own}, has_dark=bool(photographs.dark_files))
         _write_and_refine(out, pairs, write)

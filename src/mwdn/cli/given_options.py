@@ -12,8 +12,8 @@ def note_given(app: App, commands: tuple[str, ...], arguments: Any) -> None:  # 
     They may have their defaults. A camera file gives a bin, too; its background may have been chosen automatically.
     """
     by_name = {argument.name: argument for argument in arguments}
-    for name, sources in (("bin", None), ("background", ("cli",))):
+    for name in ("bin", "background"):
         automatic, given = by_name.get(f"--auto-{name}"), by_name.get(f"--{name}")
-        tokens = [] if given is None else [each for each in given.tokens if sources is None or each.source in sources]
-        if automatic is not None and not automatic.tokens and tokens:
+        is_given = given is not None and any(name == "bin" or token.source == "cli" for token in given.tokens)
+        if automatic is not None and not automatic.tokens and is_given:
             automatic.append(Token(keyword=f"--auto-{name}", value="false", source=f"--{name}"))

@@ -12,6 +12,9 @@ from mwdn.calibration.sensor_frames import SensorFiles
 from mwdn.errors import ParameterError
 
 Files = Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative=())]
+WITHOUT = (Path("none"),)
+"""Files that stand for doing without what the camera file says."""
+
 Numbers = Annotated[tuple[float, ...], Parameter(consume_multiple=True, negative=())]
 
 
@@ -53,7 +56,7 @@ class PhotographOptions:
     @property
     def dark_files(self) -> tuple[Path, ...]:
         """Files of --dark; --dark none does without."""
-        return () if self.dark == (Path("none"),) else self.dark
+        return () if self.dark == WITHOUT else self.dark
 
     def are_one_picture(self, files: Sequence[Path]) -> bool:
         """Whether a camera file can name these pictures as they are."""

@@ -112,7 +112,7 @@ class ArrayMask:
         changed = [field.name for field in fields(self) if getattr(self, field.name) != field.default]
         if given := [name for name in changed if name in names]:
             options = ", ".join(f"`{name}`" for name in given)
-            raise ParameterError(f"`{self.mask}` {why}, for which these have no effect: leave out {options}.")
+            raise ParameterError(f"`{self.mask}` {why}: leave out {options}, which would have no effect.")
 
 
 def _check_slope(mask: Mask, setup: Setup, subdivide: int) -> None:

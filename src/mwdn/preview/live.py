@@ -145,7 +145,7 @@ class Live:
         while True:
             failure: Exception | None = None
             try:
-                with self.camera, self.recording, closing(self._results()) as results:
+                with self.camera, closing(self.recording), closing(self._results()) as results:
                     self._show(results)
             except Exception as error:
                 failure = error

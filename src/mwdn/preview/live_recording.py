@@ -3,7 +3,6 @@
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
 
 from mwdn.capture.recording import Recorder, record
 from mwdn.capture.source import CameraFrame
@@ -11,7 +10,7 @@ from mwdn.errors import CameraError
 
 
 class LiveRecording:
-    """Frames are appended to a file while a recording is wanted. Leaving its ``with`` block completes the file.
+    """Frames are appended to a file while a recording is wanted. `close` completes the file.
 
     Args:
         folder: of the recordings.
@@ -61,12 +60,3 @@ class LiveRecording:
         """Complete the file."""
         self._recorder, self.count, self.problem = None, None, ""
         self._file.close()
-
-    def __enter__(self) -> "LiveRecording":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._recorder, self.count, self.problem = None, None, ""
-        self._file.__exit__(kind, error, trace)

@@ -259,7 +259,8 @@ byId("orientation").append(...ORIENTATIONS.map((name) => new Option(name, name))
 byId("camera-balance").hidden = !camera.white_balance;
 byId("balance").value = camera.white_balance ? "camera" : "";
 byId("psf-name").textContent = `${camera.name} of this page; drop another one, or choose it`;
-byId("about").textContent = `Pictures of ${HEIGHT} x ${WIDTH} pixels (height x width).${camera.about ? ` Captures of this camera: ${camera.about}.` : ""}`;
+const ownFrames = camera.about ? ` Captures of this camera: ${camera.about}.` : "";
+byId("about").textContent = `Pictures of ${HEIGHT} x ${WIDTH} pixels (height x width).${ownFrames}`;
 byId("controls").onsubmit = (event) => event.preventDefault();
 for (const id of ["bin", "depth", "gamma", "psf-gamma", "orientation", "crop"]) byId(id).onchange = again;
 byId("own").onclick = () => {
