@@ -34,8 +34,8 @@ def test_import_writes_pairs_and_says_so(folders, capsys):
 
 
 def test_files_that_are_not_read_are_named(folders, capsys):
-    """Captures of a camera's raw files were left out without a word."""
-    for name in ("captures/a.dng", "captures/b.txt", "scenes/c.gif"):
+    """Scenes of a camera's raw files were left out without a word."""
+    for name in ("scenes/a.dng", "captures/b.txt", "scenes/c.gif"):
         (folders / name).touch()
     (folders / "captures/[0].json").touch()
     assert run("folders", folders, "-o", folders / "pairs.h5") == 0

@@ -10,6 +10,7 @@ import pytest
 import torch
 from PIL import Image as Pillow
 
+from image_files import dng
 from mwdn.calibration import Calibration, FrameFormat
 from mwdn.calibration.corrections import Corrections
 from mwdn.data import PairFile, import_pairs, read_pairs
@@ -483,3 +484,23 @@ def test_colours_of_a_mosaic_stay_in_order(tmp_path):
     _, measurement, scene = next(read_pairs("folders", tmp_path, frames=FrameFormat(bgr=True, mosaic="rggb")))
     for picture in (measurement, scene):
         assert picture[0, 0] / np.float64(picture.max()) == pytest.approx([1, 0.5, 0.25], abs=1e-3)
+
+
+def test_captures_may_be_raw_files(tmp_path):
+    """Each file states its mosaic; they were left out."""
+    rng, frames = np.random.default_rng(0), FrameFormat(mosaic="grbg")
+    dark = frames.normalise(rng.integers(0, 2000, (24, 32, 1), np.uint16))
+    camera = Calibration(torch.rand(1, 3, 12, 16), frames, dark)
+    for name in "ab":
+        write(tmp_path / "captures" / f"{name}.DNG", dng(rng.integers(64, 1024, (24, 32), np.uint16), "grbg"))
+        write(tmp_path / "scenes" / f"{name}.png", flag(height=12, width=16))
+    raw = list(read_pairs("folders", tmp_path))
+    corrected = list(read_pairs("folders", tmp_path, frames=frames, camera=camera))
+    for (name, capture, _), (_, less_dark, scene) in zip(raw, corrected, strict=True):
+        path = tmp_path / "captures" / f"{name}.DNG"
+        assert np.abs(capture - FrameFormat().read(path).astype(np.float32)).max() <= 1
+        wanted = camera.to_measurement(frames.read(path))[0].movedim(0, -1).numpy()
+        assert less_dark == pytest.approx(wanted, abs=1e-6)
+        assert scene == pytest.approx(flag(height=12, width=16) / 255, abs=1e-4)
+    with pytest.raises(ImageError, match=r"`mosaic` \(rggb\).*`a`.*grbg"):
+        list(read_pairs("folders", tmp_path, frames=FrameFormat(mosaic="rggb")))

@@ -17,7 +17,8 @@ from mwdn.data.kinds import KINDS, Layout
 from mwdn.data.pair_checks import other_scene_size
 from mwdn.data.pairs import PairFile
 from mwdn.errors import ParameterError, UnknownNameError
-from mwdn.io.listing import unused_photographs
+from mwdn.io.images import READABLE
+from mwdn.io.listing import FRAMES, unused_files
 
 
 @no_empty_folder
@@ -96,8 +97,9 @@ def _report_masks(masks: ImportedMasks) -> None:
 def _unused(kind: str, path: Path, layout: Layout) -> list[str]:
     """One sentence for each kind of file in the folders of a data set that is not read."""
     usual = KINDS[kind].layout if kind in KINDS else layout
-    folders = (layout.captures or usual.captures, layout.scenes or usual.scenes)
-    return [line for name in folders if name and (path / name).is_dir() for line in unused_photographs(path / name)]
+    folders = (layout.captures or usual.captures, FRAMES), (layout.scenes or usual.scenes, READABLE)
+    present = [(path / name, suffixes) for name, suffixes in folders if name and (path / name).is_dir()]
+    return [line for folder, suffixes in present for line in unused_files(folder, suffixes)]
 
 
 def _name_skipped(skipped: dict[str, str]) -> None:

@@ -20,7 +20,7 @@ from mwdn.data.pair_checks import other_camera
 from mwdn.data.pairs import PairFile
 from mwdn.errors import ParameterError
 from mwdn.io.files import refuse_overwrite
-from mwdn.io.listing import unused_photographs
+from mwdn.io.listing import unused_files
 from mwdn.optics.distortion import displacement_px
 from mwdn.optics.shading import shading
 from mwdn.runtime import distributed
@@ -78,7 +78,7 @@ def train(  # noqa: PLR0913
         if is_first and experiment_recipe.sheet.captures:
             note(*list_captures(experiment_recipe.sheet.captures, exclude=camera.roles).skipped)
         if is_first and photos is not None:
-            note(*unused_photographs(photos))
+            note(*unused_files(photos))
         with notes.status("Reading photographs, pairs or captures"):
             calibration = camera.load()
             trainer = experiment.prepare(
@@ -194,7 +194,7 @@ def simulate(
         raise ParameterError("`exact` leaves out all mismatch: leave out `exact`, or the keys of `mismatch`.")
     simulation = read_recipe(recipe, **recipe_changes(changes))
     progress = partial(track, title="Simulating")
-    note(*unused_photographs(photos))
+    note(*unused_files(photos))
     calibration = camera.load()
     _note_colours(calibration, "--grey")
     with all_or_nothing(out):

@@ -27,7 +27,7 @@ from mwdn.data.importers import read_listing, write_pairs
 from mwdn.data.kinds import Kind, Layout
 from mwdn.data.pair_writer import Attribute, check_path
 from mwdn.data.shards import Shard, find_shards
-from mwdn.data.sources import Listing, Source, files_by_stem, list_folders
+from mwdn.data.sources import Listing, Source, Stored, files_by_stem, list_folders
 from mwdn.errors import ImageError, ParameterError
 from mwdn.io.files import refuse_overwrite
 from mwdn.io.headers import COPY_AGAIN
@@ -171,7 +171,7 @@ def _cropped(camera: DigiCam, frames: FrameFormat, listing: Listing) -> DigiCam:
     """The camera with the part of the sensor that the captures keep."""
     if frames.crop is None:
         return camera
-    width = listing.sources[0].load()[0].shape[1]
+    width = listing.sources[0].load().capture.shape[1]
     return replace(camera, sensor_mm=camera.sensor_mm * min(frames.crop[1], width) / width)
 
 
@@ -234,9 +234,9 @@ def _with_patterns(listing: Listing, patterns: Container[str]) -> Listing:
     return Listing(kept, listing.refused | {name: f"`{name}` lacks {why}." for name, why in whys.items()})
 
 
-def _read_row(shard: Shard, levels: FrameFormat, row: int) -> tuple[Frame, Frame]:
+def _read_row(shard: Shard, levels: FrameFormat, row: int) -> Stored:
     capture, scene, *ambient = shard.load(row)
-    return _without(capture, ambient[0], f"row {row}", levels) if ambient else capture, scene
+    return Stored(_without(capture, ambient[0], f"row {row}", levels) if ambient else capture, scene)
 
 
 def _without(capture: Frame, ambient: Frame, name: str, levels: FrameFormat) -> Frame:
@@ -268,9 +268,9 @@ def _list_pictures(
     return Listing(sources, listing.refused), bool(rooms)
 
 
-def _read_room(source: Source, room: Path, levels: FrameFormat) -> tuple[Frame, Frame]:
-    capture, scene = source.load()
-    return _without(capture, read_frame(room), source.name, levels), scene
+def _read_room(source: Source, room: Path, levels: FrameFormat) -> Stored:
+    stored = source.load()
+    return stored._replace(capture=_without(stored.capture, read_frame(room), source.name, levels))
 
 
 def _read_labels(path: Path) -> dict[str, str]:

@@ -210,12 +210,12 @@ def _convert(
 ) -> tuple[Frame, Frame]:
     """Load a pair as RGB, row 0 at the top, both with the capture's channels, in the smallest type exact for both."""
     stored = source.load()
-    capture, scene = stored
+    capture, scene = stored.capture, stored.scene
     usual = kind.raw_frames if kind.raw_frames is not None and capture.shape[2] == 1 else kind.frames
-    frames = replace(usual, **changed_fields(changes))
+    frames = replace(usual, **changed_fields(changes)).with_mosaic(stored.mosaic, of=f"`{source.name}`")
     full_size, whole = frames.full_size(capture), replace(frames, crop=None).full_size(capture)
     if frames.bgr:
-        capture, scene = (np.ascontiguousarray(frame[..., ::-1]) for frame in stored)
+        capture, scene = (np.ascontiguousarray(frame[..., ::-1]) for frame in (capture, scene))
     capture = _upright(_correct_levels(capture, frames, source.name, camera), frames)
     # The scene gets the channels of the capture: the mean of its colours, or equal colours.
     grey = capture.shape[2] == 1 < scene.shape[2]
@@ -231,7 +231,7 @@ def _convert(
 
     flat = camera is not None and camera.corrections.flat is not None
     shifted = flat or (camera is not None and camera.offset is not None)
-    floats = shifted or any(frame.dtype.kind == "f" for frame in stored)
+    floats = shifted or "f" in (stored.capture.dtype.kind, stored.scene.dtype.kind)
     dtype = np.dtype("float32" if floats else "uint8" if capture.dtype == scene.dtype == np.uint8 else "uint16")
     capture = quantise(capture, dtype, f"capture of {source.name}", has_flat=flat)
     return capture, quantise(scene, dtype, f"scene of {source.name}")

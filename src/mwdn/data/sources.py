@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,8 +14,9 @@ from mwdn.data.pairs import PairFile
 from mwdn.data.shards import Shard, find_shards, natural_order
 from mwdn.errors import ImageError
 from mwdn.io.headers import COPY_AGAIN
-from mwdn.io.images import read_frame
-from mwdn.io.listing import pictures_in
+from mwdn.io.images import READABLE, read_frame
+from mwdn.io.listing import FRAMES, pictures_in
+from mwdn.io.raw import Mosaic, is_raw, read_raw
 from mwdn.types import Frame
 
 MAX_ROWS = 2**21
@@ -39,18 +40,32 @@ PHLATCAM_TEST = frozenset(
 )
 
 
+class Stored(NamedTuple):
+    """A pair as it is stored.
+
+    Args:
+        capture: (H, W, C).
+        scene: (H, W, C).
+        mosaic: colours of the capture's 2 x 2 cells, as its raw file states them.
+    """
+
+    capture: Frame
+    scene: Frame
+    mosaic: Mosaic | None = None
+
+
 @dataclass(frozen=True)
 class Source:
     """One pair that has not been read yet.
 
     Args:
         name: a file's stem, or a row.
-        load: reads the capture and the scene as stored, (H, W, C), or raises `ImageError`.
+        load: reads the pair, or raises `ImageError`.
         mask: label of the mask, for a camera with several.
     """
 
     name: str
-    load: Callable[[], tuple[Frame, Frame]]
+    load: Callable[[], Stored]
     mask: str = ""
 
 
@@ -67,7 +82,7 @@ def list_folders(path: Path, captures: str, scenes: str) -> Listing:
 
     Args:
         path: of the data set.
-        captures: folder of the measurements in ``path``.
+        captures: folder of the measurements in ``path``; they may be a camera's raw files.
         scenes: folder of the ground truth in ``path``.
 
     Raises:
@@ -79,7 +94,7 @@ def list_folders(path: Path, captures: str, scenes: str) -> Listing:
         raise ImageError(
             f"`{path / captures}` is the folder of both captures and scenes. Name two: `--captures A --scenes B`."
         )
-    files = {folder: files_by_stem(path / folder) for folder in (captures, scenes)}
+    files = {captures: files_by_stem(path / captures, FRAMES), scenes: files_by_stem(path / scenes)}
     stems = sorted(set(files[captures]) | set(files[scenes]), key=natural_order)
     refused, sources = {}, []
     for stem in stems:
@@ -140,9 +155,9 @@ def list_pair_file(path: Path, captures: str, scenes: str) -> Listing:
     count = len(pairs)
     file = open_hdf5(path, COPY_AGAIN)
 
-    def load(row: int) -> tuple[Frame, Frame]:
+    def load(row: int) -> Stored:
         with as_damage(f"Pair {row} of `{path}` cannot be read", COPY_AGAIN):
-            return file[captures][row], file[scenes][row]
+            return Stored(file[captures][row], file[scenes][row])
 
     return Listing([Source(f"pair {row}", partial(load, row)) for row in range(count)])
 
@@ -172,13 +187,13 @@ def list_parquet(path: Path, captures: str, scenes: str) -> Listing:
     return Listing(sources, refused)
 
 
-def _read_cells(shard: Shard, row: int) -> tuple[Frame, Frame]:
+def _read_cells(shard: Shard, row: int) -> Stored:
     capture, scene = shard.load(row)
-    return capture, scene
+    return Stored(capture, scene)
 
 
-def files_by_stem(folder: Path) -> dict[str, Path]:
-    """Frames in a folder and its subfolders, by their path without suffix.
+def files_by_stem(folder: Path, suffixes: frozenset[str] = READABLE) -> dict[str, Path]:
+    """Files with these suffixes in a folder and its subfolders, by their path without suffix.
 
     Raises:
         ImageError: no such folder, or two files differ only in their suffix.
@@ -188,7 +203,7 @@ def files_by_stem(folder: Path) -> dict[str, Path]:
             f"`{folder}` is not a folder. Name the folders inside the data set: `--captures A --scenes B`."
         )
     paths: dict[str, Path] = {}
-    for file in pictures_in(folder):
+    for file in pictures_in(folder, suffixes):
         stem = file.relative_to(folder).with_suffix("").as_posix()
         if stem in paths:
             raise ImageError(f"`{paths[stem]}` and `{file}` differ only in their suffix. Remove one of them.")
@@ -196,12 +211,13 @@ def files_by_stem(folder: Path) -> dict[str, Path]:
     return paths
 
 
-def read_both(capture: Path, scene: Path) -> tuple[Frame, Frame]:
+def read_both(capture: Path, scene: Path) -> Stored:
     """Read a capture as the sensor stored it, and its scene as it is to be shown."""
-    return read_frame(capture), read_frame(scene, upright=True)
+    frame, mosaic = read_raw(capture) if is_raw(capture) else (read_frame(capture), None)
+    return Stored(frame, read_frame(scene, upright=True), mosaic)
 
 
-def _read_row(path: Path, file: Any, names: tuple[str, str], row: int) -> tuple[Frame, Frame]:  # noqa: ANN401
+def _read_row(path: Path, file: Any, names: tuple[str, str], row: int) -> Stored:  # noqa: ANN401
     with as_damage(f"Row {row} of `{path}` cannot be read", COPY_AGAIN):
         capture, scene = (np.moveaxis(file[name][row], 0, -1) for name in names)
-        return capture, scene
+        return Stored(capture, scene)

@@ -51,10 +51,10 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
     return False
 
 
-def pictures_in(folder: Path, *, subfolders: bool = True) -> list[Path]:
-    """The readable pictures of a folder, in alphabetical order; hidden files are left out."""
+def pictures_in(folder: Path, suffixes: frozenset[str] = READABLE, *, subfolders: bool = True) -> list[Path]:
+    """The files of a folder with these suffixes, in alphabetical order; hidden files are left out."""
     found = folder.rglob("*") if subfolders else folder.iterdir()
-    return sorted(path for path in found if path.suffix.lower() in READABLE and path.name[0] != "." and path.is_file())
+    return sorted(path for path in found if path.suffix.lower() in suffixes and path.name[0] != "." and path.is_file())
 
 
 def lies_in(path: str | Path, folder: str | Path) -> bool:
@@ -75,10 +75,10 @@ def refuse_within(photos: str | Path, out: Path) -> None:
         )
 
 
-def unused_photographs(folder: Path) -> list[str]:
-    """One sentence for each kind of file in a folder of photographs, or its subfolders, that is not read."""
+def unused_files(folder: Path, suffixes: frozenset[str] = READABLE) -> list[str]:
+    """One sentence for each kind of file in a folder, or its subfolders, that `pictures_in` does not list."""
     files = (path for path in folder.rglob("*") if not path.name.startswith(".") and path.is_file())
-    return _left_out(folder, sorted(path.relative_to(folder).as_posix() for path in files), READABLE)
+    return _left_out(folder, sorted(path.relative_to(folder).as_posix() for path in files), suffixes)
 
 
 def _left_out(folder: Path, names: list[str], readable: frozenset[str]) -> list[str]:
