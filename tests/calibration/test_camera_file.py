@@ -128,6 +128,8 @@ def test_pitch_follows_the_bin(folder):
     path = folder / "camera.toml"
     write_camera(path, {"psf": folder / "lab/psf.png", "bin": 2, "pitch_um": 4.0})
     pitches = [Calibration.load(path, **options).pitch_um for options in ({}, {"bin": 4}, {"bin": 4, "pitch_um": 5.0})]
+    with pytest.warns(DeprecationWarning, match="`bin`"):
+        assert Calibration.load(path, binning=4).pitch_um == 8.0
     assert pitches == [4.0, 8.0, 5.0]
 
 

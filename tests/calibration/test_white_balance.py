@@ -63,7 +63,9 @@ def test_each_picture_of_a_batch_has_its_own_grey_world(generator):
     torch.testing.assert_close(means, scenes[:, 1:2].mean((-2, -1)).expand(2, 3))
 
 
-@pytest.mark.parametrize("balance", ["gray-world", (1.0, 0.0, 1.0), (1.0, float("nan"), 1.0)])
+@pytest.mark.parametrize(
+    "balance", ["gray-world", "red", 5, ("a", "b", "c"), (1.0, 0.0, 1.0), (1.0, float("nan"), 1.0)]
+)
 @pytest.mark.usefixtures("unchecked")
 def test_wrong_gains(balance):
     with pytest.raises(ParameterError, match="`white_balance`"):

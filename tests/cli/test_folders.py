@@ -56,9 +56,31 @@ def test_what_is_written_or_was_there_stays(tmp_path):
         raise KeyboardInterrupt
 
     (tmp_path / "empty").mkdir()
-    for call in ({"out": tmp_path / "a" / "b", "name": "x.png"}, {"out": tmp_path / "empty"}, {}):
+    dotted = {"out": tmp_path / "v1.2"}
+    for call in ({"out": tmp_path / "a" / "b", "name": "x.png"}, {"out": tmp_path / "empty"}, {}, dotted):
         with pytest.raises(KeyboardInterrupt):
             command(**call)
     assert (tmp_path / "a" / "b" / "x.png").exists()
     assert (tmp_path / "empty").exists()
     assert not (tmp_path / "default").exists()
+    assert not (tmp_path / "v1.2").exists()
+
+
+@pytest.mark.parametrize("line", ["recipes {}", "benchmark {}", "reconstruct {} --psf psf.npy", "import folders {}"])
+def test_a_name_that_is_too_long_is_one_line(here, line, capsys):
+    """Python's `OSError` reached the terminal as a traceback."""
+    with pytest.raises(SystemExit) as caught:
+        main(line.format(300 * "a").split())
+    assert caught.value.code == 2
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1
+    assert said[0].startswith("Error: ")
+    assert "too long" in said[0]
+
+
+def test_a_black_capture_is_not_interpreted(here, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(["interpret", "universal-small", "black.npy", "--psf", "psf.npy", "-o", "new"])
+    assert caught.value.code == 2
+    assert "saw no light" in capsys.readouterr().err
+    assert not (here / "new").exists()

@@ -108,6 +108,21 @@ def test_psf_of_cropped_captures_is_that_of_a_smaller_sensor(tmp_path):
     assert likeness(psfs[0][..., 9:29, 13:37], psfs[1]) > 0.9
 
 
+def test_the_width_of_a_cropped_sensor_is_that_of_a_readable_capture(tmp_path):
+    """It was read from the first one, damaged or not."""
+    patterns(tmp_path, (0,))
+    for folder in ("lensless", "lensed"):
+        (tmp_path / folder).mkdir()
+        for name in ("a", "b"):
+            (tmp_path / folder / f"{name}.png").write_bytes(png(np.full((38, 50, 3), 90, np.uint8)))
+    (tmp_path / "lensless" / "a.png").write_bytes(b"damaged")
+    result = import_digicam(
+        tmp_path, tmp_path / "p.h5", CAMERA, frames=FrameFormat(crop=(20, 24)), skip_damaged=True
+    )  # fmt: skip
+    assert list(result.skipped) == ["a"]
+    assert len(PairFile(tmp_path / "p.h5")) == 1
+
+
 def test_metadata_of_subfolders_and_an_empty_line(run, tmp_path):
     folder = tmp_path / "set"
     patterns(folder, (1, 2))

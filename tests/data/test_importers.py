@@ -248,6 +248,27 @@ def test_a_binned_copy_of_refined_pairs_is_refined(tmp_path):
     assert PairFile(tmp_path / "b.h5").attributes == {"source": "pairs", REFINED: "simulate", WHITE: 0.5}
 
 
+def test_an_unchanged_copy_of_pairs_keeps_the_camera(tmp_path):
+    """It lost the PSF and its hash, so nothing warned of another camera."""
+    shape, psf = (4, 6, 3), torch.rand(3, 4, 6)
+    marks = {"psf_hash": "some", "pitch_um": 2.0}
+    with PairFile.create(
+        tmp_path / "a.h5", measurement_shape=shape, scene_shape=shape, attributes=marks, psf=psf
+    ) as file:
+        file.append(np.full(shape, 0.5, np.float32), np.full(shape, 0.5, np.float32))
+    import_pairs("pairs", tmp_path / "a.h5", tmp_path / "b.h5")
+    copy = PairFile(tmp_path / "b.h5")
+    assert copy.attributes == {"source": "pairs", **marks}
+    assert torch.equal(copy.psf[0], psf)
+
+
+def test_hidden_folders_are_left_out(tmp_path):
+    """A notebook's copies of captures ended the import."""
+    folders(tmp_path)
+    write(tmp_path / "captures" / ".ipynb_checkpoints" / "0-checkpoint.png", flag(0, 4, 5))
+    assert len(list(read_pairs("folders", tmp_path))) == 3
+
+
 def test_floats_of_another_scale_are_refused(tmp_path):
     for folder in ("captures", "scenes"):
         write(tmp_path / folder / "a.npy", np.full((4, 5, 3), 200, np.float32))

@@ -440,16 +440,17 @@ def test_result_of_anything_else_is_none(tmp_path, what, psf, captures):
     assert resumed(camera, out, captures[:1], method, format=format) == ["0.png"]
 
 
-def test_no_picture_stands_without_its_own_sidecar(tmp_path, psf, captures, monkeypatch):
-    """Even if the sidecar cannot be written: the next run would take the picture for something else."""
+@pytest.mark.parametrize("refused", ["write_json", "support_picture"])
+def test_no_picture_stands_without_its_own_sidecar(tmp_path, psf, captures, monkeypatch, refused):
+    """Even if the sidecar or the map cannot be written: the next run would take the picture for something else."""
     out = tmp_path / "out"
     list(make_batch(psf, out).run(captures[:1]))
 
-    def refuse(path, content):
+    def refuse(*_):
         raise ImageError("full")
 
-    monkeypatch.setattr("mwdn.inference.batch.write_json", refuse)
-    (job,) = make_batch(psf, out, Wiener(regularisation=1.0)).run(captures[:1])
+    monkeypatch.setattr(f"mwdn.inference.batch.{refused}", refuse)
+    (job,) = make_batch(psf, out, Wiener(regularisation=1.0), check_consistency=True, map=True).run(captures[:1])
     assert str(job.error) == "full"
     assert not list(out.iterdir())
 

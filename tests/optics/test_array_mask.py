@@ -152,6 +152,8 @@ def test_files(tmp_path):
         (np.zeros((4, 4)), {"index": 1.0}, ParameterError, r"`index` \(1\)"),
         (np.zeros((4, 4)), {"full_scale": 1.0}, ParameterError, "`full_scale`"),
         (np.zeros((4, 4), np.uint8), {}, ParameterError, "`full_scale`.* um that 255"),
+        (np.zeros((4, 4), np.uint8), {"full_scale": -1.0}, ParameterError, r"`full_scale` \(-1\)"),
+        (np.eye(4, dtype=np.uint8), {"full_scale": 0.5, "values": "amplitude"}, ParameterError, "`full_scale`"),
     ],
 )
 def test_what_cannot_be_a_mask(tmp_path, array, options, error, message):

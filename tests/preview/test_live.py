@@ -4,6 +4,7 @@ import io
 import itertools
 import json
 import time
+from contextlib import closing
 
 import httpx2 as httpx
 import numpy as np
@@ -18,6 +19,7 @@ from mwdn.io.images import write_frame
 from mwdn.preview.cameras import StoredCameras
 from mwdn.preview.live import Live
 from mwdn.preview.live_pictures import LivePictures
+from mwdn.preview.live_recording import LiveRecording
 from mwdn.preview.live_settings import LiveSettings
 from mwdn.preview.server import make_server
 from preview_server import LIMITS, SIDE
@@ -220,6 +222,21 @@ def test_wish_made_while_another_is_refused_stays(monkeypatch):
         patch.setattr(LiveSettings, "prepare", prepare_slowly)
         assert pictures.begin(frame)().settings.method == "wiener"
     assert pictures.begin(frame)().settings.method == "fista"
+
+
+def test_two_recordings_of_one_second_have_two_names(tmp_path, monkeypatch):
+    """The second ended the live picture."""
+    monkeypatch.setattr("mwdn.preview.live_recording.time.strftime", lambda *_: "recording-now")
+    recording = LiveRecording(tmp_path, "rig")
+    with open_source(f"rig,height={SIDE},width={SIDE}") as rig, closing(recording):
+        for _ in range(3):
+            recording.is_wanted = True
+            recording.add(rig.read())
+            recording.is_wanted = False
+            assert recording.stop()
+    assert sorted(path.name for path in tmp_path.glob("*.h5")) == [
+        "recording-now-2.h5", "recording-now-3.h5", "recording-now.h5"
+    ]  # fmt: skip
 
 
 def test_a_folder_goes_on_after_frames_of_all_kinds_and_pauses(tmp_path):

@@ -20,6 +20,7 @@ from mwdn.errors import ImageError, ParameterError
 from mwdn.io.images import srgb_encode
 from mwdn.preview.cameras import StoredCameras
 from mwdn.preview.reconstruction import with_ambient
+from mwdn.preview.samples import CAMERA
 from mwdn.preview.server import make_server
 from preview_server import LIMITS, SIDE, hostile, npy
 
@@ -112,6 +113,7 @@ def test_hostile_captures_are_refused(client, capture, kind):
         ({"options": "[1]"}, 422, "options"),
         ({"options": '{"iterations": 3}'}, 422, "iterations"),
         ({"options": '{"regularisation": NaN}'}, 422, "regularisation"),
+        ({"options": f'{{"regularisation": {400 * "9"}}}'}, 422, "regularisation"),
         ({"options": "[" * 5000}, 422, "options"),
         ({"trust": "perhaps"}, 422, "trust"),
         ({"format": "exe"}, 422, "format"),
@@ -232,6 +234,12 @@ def test_cameras_are_listed_added_and_removed(serve, tmp_path, psf_file):
         assert "mine" not in "".join(path.name for path in tmp_path.iterdir())
         again = StoredCameras(LIMITS, tmp_path)  # another start of the server
         assert again.get("mine").psf_hash == added.json()["psf_hash"]
+        stored = next(tmp_path.glob("*.psf"))
+        content = stored.read_bytes()
+        stored.write_bytes(content[:-9])
+        with pytest.warns(UserWarning, match=rf"`{stored.with_suffix('.json')}` is left out"):
+            assert CAMERA in [each["name"] for each in StoredCameras(LIMITS, tmp_path).list()]
+        stored.write_bytes(content)
         assert client.delete("/cameras/sample").status_code == 409
         assert client.delete("/cameras/mine").status_code == 204
         assert client.get("/cameras/mine").status_code == 404

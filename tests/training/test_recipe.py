@@ -130,7 +130,7 @@ def test_mistyped_names_get_the_nearest(read, text, said):
     ("text", "said"),
     [
         ("", "must name a network"),
-        ("network = 3", "`network` of `"),
+        ("network = 3", "`network` (3) must be a table"),
         ("[network]\nname = 3", "must name a network"),
         ("[network", "cannot be read as a recipe"),
         (NETWORK + "[schedule]\nsteps = -1", "`steps` (-1) must be positive."),

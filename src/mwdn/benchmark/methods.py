@@ -7,7 +7,7 @@ from inspect import signature
 from typing import Any
 
 from mwdn.errors import ParameterError, UnknownNameError, check_options, shown
-from mwdn.io.toml import to_dataclass
+from mwdn.io.toml import check_table, to_dataclass
 from mwdn.networks import NETWORKS
 from mwdn.training.recipe import Schedule
 
@@ -50,10 +50,10 @@ def read_methods(
         if not isinstance(line, dict):
             raise ParameterError(f"`{label}` of [{table}] ({line!r}) must be a table of options: `{label} = {{}}`.")
         name = line.get("name", label)
-        if name not in registry:
-            raise UnknownNameError(table.removesuffix("s"), name, registry)
+        if not isinstance(name, str) or name not in registry:
+            raise UnknownNameError(table.removesuffix("s"), str(name), registry)
         options = {key: value for key, value in line.items() if key not in ("name", "schedule")}
-        schedule = line.get("schedule", {}) if table == "networks" else {}
+        schedule = check_table(line.get("schedule", {}) if table == "networks" else {}, f"{table}.{label}.schedule")
         to_dataclass(Schedule, f"{table}.{label}.schedule", schedule)
         check_options(registry[name], f"'{name}'", options)
         parameters = signature(registry[name]).parameters

@@ -1,6 +1,5 @@
 """Recipes of benchmarks: methods, data sets, and one training budget."""
 
-import json
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, is_dataclass, replace
@@ -13,7 +12,7 @@ from mwdn.benchmark.methods import MEAN, Method, check_name, read_methods, scale
 from mwdn.calibration.camera_file import read_camera
 from mwdn.errors import ParameterError, UnknownNameError, shown
 from mwdn.io.listing import lies_in
-from mwdn.io.toml import current_names, find_recipe, read_toml, to_dataclass
+from mwdn.io.toml import check_numbers, check_table, current_names, find_recipe, read_toml, to_dataclass
 from mwdn.networks import NETWORKS
 from mwdn.optics import Deviation
 from mwdn.solvers import SOLVERS
@@ -32,6 +31,12 @@ def _no_options() -> None:
 
 UNTRAINED: dict[str, Any] = {**SOLVERS, **dict.fromkeys(BUNDLED, _no_options)}
 """Methods of [solvers], which are not trained here, each with a function or class that takes its options."""
+
+
+_TABLES = frozenset(
+    {"networks", "solvers", "shared", "data", "schedule", "loss", "plateau", "later_loss", "robustness"}
+)
+"""Tables of a recipe."""
 
 
 @dataclass(frozen=True)
@@ -121,15 +126,18 @@ def read_benchmark(path: str | Path) -> Benchmark:
     for key in content:
         if key not in keys:
             raise UnknownNameError("key of a benchmark's recipe", key, keys)
+        if key in _TABLES:
+            check_table(content[key], key)
     folder, shared = Path(path).parent, content.pop("shared", {})
-    for key in shared:
+    for key, table in shared.items():
         if key not in ("network", "data"):
             raise UnknownNameError("table of [shared]", key, ["network", "data"])
+        check_table(table, f"shared.{key}")
     networks = read_methods("networks", content.pop("networks", {}), NETWORKS, shared.get("network", {}))
     methods = [*read_methods("solvers", content.pop("solvers", {}), UNTRAINED, {}), *networks]
     tables: dict[str, Any] = {
         "data": {
-            name: _dataset_recipe(name, {**shared.get("data", {}), **table}, folder)
+            name: _dataset_recipe(name, {**shared.get("data", {}), **check_table(table, f"data.{name}")}, folder)
             for name, table in content.pop("data", {}).items()
         },
         "schedule": to_dataclass(Schedule, "schedule", content.pop("schedule", {})),
@@ -139,9 +147,8 @@ def read_benchmark(path: str | Path) -> Benchmark:
         "later_loss": checked_weights(content.pop("later_loss")) if "later_loss" in content else {},
         "robustness": _robustness(content.pop("robustness", {})),
     }
-    for name in ("alexnet", "heads"):
-        content[name] = _absolute(content.get(name, ""), folder)
     benchmark = to_dataclass(Benchmark, "the recipe", content)
+    tables |= {name: _absolute(getattr(benchmark, name), folder) for name in ("alexnet", "heads")}
     methods = [scale_width(method, benchmark.width_factor) for method in methods]
     methods = [Method(MEAN, MEAN, {}, learned=False), *methods] if benchmark.mean_picture else methods
     benchmark = replace(benchmark, **tables, methods=tuple(methods), path=str(path))
@@ -151,13 +158,14 @@ def read_benchmark(path: str | Path) -> Benchmark:
 
 def _dataset_recipe(name: str, table: dict[str, Any], folder: Path) -> DatasetRecipe:
     """A preset with the changes of a camera file and of a table; its nested tables change single fields, too."""
-    if table.get("preset", name) not in {*PRESETS, name}:
-        raise UnknownNameError(f"`preset` of [data] {name}", table["preset"], PRESETS)
+    if table.get("preset", name) not in [*PRESETS, name]:
+        raise UnknownNameError(f"`preset` of [data] {name}", str(table["preset"]), PRESETS)
     preset = PRESETS.get(table.pop("preset", name), DatasetRecipe())
     nested = {f.name: getattr(preset, f.name) for f in fields(DatasetRecipe) if is_dataclass(f.default)}
     changes: dict[str, Any] = {}
     for key in nested.keys() & table.keys():
-        given = current_names(type(nested[key]), f"data.{name}.{key}", table[key])
+        content = check_table(table[key], f"data.{name}.{key}")
+        given = current_names(type(nested[key]), f"data.{name}.{key}", content)
         filled = to_dataclass(type(nested[key]), f"data.{name}.{key}", given)
         changes[key] = replace(nested[key], **{part: getattr(filled, part) for part in given})
     plain = to_dataclass(
@@ -199,8 +207,9 @@ def _robustness(table: dict[str, Any]) -> Robustness:
     sizes = {}
     for axis in table.keys() & AXES.keys():
         values = table[axis]
-        if not (isinstance(values, list) and values and all(isinstance(v, int | float) for v in values)):
-            raise ParameterError(f"`{axis}` of [robustness] ({json.dumps(values)}) must be a list of numbers.")
+        if not (isinstance(values, list) and values and all(type(value) in (int, float) for value in values)):
+            raise ParameterError(f"`{axis}` of [robustness] ({shown(values)}) must be a list of numbers.")
+        check_numbers(values, axis)
         sizes[axis] = tuple(sorted(float(value) for value in {AXES[axis], *values}))
     others = {key: value for key, value in table.items() if key not in sizes}
     for key in others:

@@ -151,8 +151,9 @@ def _check_range(key: str, value: Any) -> None:  # noqa: ANN401
 def with_changes(camera: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """The keys of a camera file with some of them replaced; `pitch_um`, a distance after binning, follows `bin`."""
     changed = {**camera, **changes}
-    if "pitch_um" in camera and "pitch_um" not in changes:
-        changed["pitch_um"] = camera["pitch_um"] * changed.get("bin", 1) / (camera.get("bin") or 1)
+    bin = changed.get("bin", 1)
+    if "pitch_um" in camera and "pitch_um" not in changes and isinstance(bin, int):  # another type is refused later
+        changed["pitch_um"] = camera["pitch_um"] * bin / (camera.get("bin") or 1)
     return changed
 
 

@@ -14,7 +14,7 @@ from mwdn.calibration.corrections import Corrections
 from mwdn.calibration.float_scale import check_float_scale
 from mwdn.calibration.frame_format import FrameFormat
 from mwdn.calibration.place_files import PlaceFiles
-from mwdn.calibration.psf_format import PsfFormat, with_options
+from mwdn.calibration.psf_format import PsfFormat, current_options, with_options
 from mwdn.calibration.psf_levels import background_level, check_psf_frame, empty
 from mwdn.calibration.refinement import TERMS, Refinement
 from mwdn.calibration.size_advice import advise_size
@@ -84,7 +84,7 @@ class Calibration:
         """
         camera = read_camera(path)
         sha256, own_psf = camera.pop("psf_sha256", ""), camera["psf"]
-        camera = with_changes(camera, options)
+        camera = with_changes(camera, current_options(options))
         terms = Refinement(**{name: camera.pop(name) for name in TERMS if name in camera})
         if Path(camera["psf"]).resolve() == own_psf.resolve():
             check_psf_file(path, sha256, own_psf)

@@ -77,9 +77,7 @@ def with_options(frames: FrameFormat, psf_format: PsfFormat, options: dict[str, 
     Raises:
         UnknownNameError: neither has a field of this name.
     """
-    for old, new in (("binning", "bin"), ("psf_binning", "psf_bin")):
-        if old in options:
-            options[new] = _renamed(old, new, options.pop(old))
+    options = current_options(options)
     names, psf_names = ({field.name for field in fields(kind)} for kind in (FrameFormat, PsfFormat))
     for name in options:
         if name not in names | psf_names:
@@ -89,6 +87,10 @@ def with_options(frames: FrameFormat, psf_format: PsfFormat, options: dict[str, 
     return replace(frames, **of_frames), replace(psf_format, **of_psf)
 
 
-def _renamed(old: str, new: str, value: int | None) -> int | None:
-    warnings.warn(f"`{old}` is now called `{new}`: `{new}={value}`.", DeprecationWarning, stacklevel=4)
-    return value
+def current_options(options: dict[str, Any]) -> dict[str, Any]:
+    """The options with ``binning`` and ``psf_binning`` under their present names, with a warning."""
+    renamed = {"binning": "bin", "psf_binning": "psf_bin"}
+    for old in renamed.keys() & options.keys():
+        new, value = renamed[old], options[old]
+        warnings.warn(f"`{old}` is now called `{new}`: `{new}={value}`.", DeprecationWarning, stacklevel=4)
+    return {renamed.get(name, name): value for name, value in options.items()}

@@ -5,7 +5,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from mwdn.errors import ParameterError, shown
+from mwdn.errors import ParameterError, fits_type, shown
 from mwdn.types import Scene
 
 WhiteBalance = Literal["grey-world", "psf"] | tuple[float, float, float]
@@ -20,11 +20,12 @@ def check_white_balance(balance: WhiteBalance | None, light: tuple[float, ...]) 
     """Check that a white balance is possible for a camera.
 
     Args:
-        balance: the white balance.
+        balance: the white balance: a name, or gains by which red, green and blue are multiplied.
         light: of the point source in each channel, see `mwdn.Calibration`.
 
     Raises:
-        ParameterError: another name, gains that are not positive, or the colour of the point source is not known.
+        ParameterError: the name is unknown; there are not three gains, or one is not positive; or ``"psf"`` is asked
+            for and the colour of the point source is not known.
     """
     if balance is None or balance == "grey-world":
         return
@@ -36,8 +37,10 @@ def check_white_balance(balance: WhiteBalance | None, light: tuple[float, ...]) 
                 "`white_balance=(1.8, 1, 1.5)`."
             )
         return
-    possible = (1 / MAX_GAIN <= gain <= MAX_GAIN for gain in balance if not isinstance(gain, str))
-    if len(balance) != 3 or not all(possible):
+    is_possible = fits_type(balance, tuple[float, float, float]) and all(
+        1 / MAX_GAIN <= gain <= MAX_GAIN for gain in balance
+    )
+    if not is_possible:
         raise ParameterError(
             f"`white_balance` ({shown(balance)}) must be 'grey-world', 'psf', or three positive gains of red, green "
             f"and blue, {MAX_GAIN:g} at most: `white_balance=(1.8, 1, 1.5)`."

@@ -8,7 +8,7 @@ from typing import Any
 from mwdn.capture.patterns import PATTERNS, check_size
 from mwdn.capture.rig_options import RigOptions
 from mwdn.errors import ParameterError, UnknownNameError
-from mwdn.io.toml import find_recipe, read_toml, to_dataclass
+from mwdn.io.toml import check_table, find_recipe, read_toml, to_dataclass
 
 
 @dataclass(frozen=True)
@@ -227,10 +227,8 @@ def read_capture_recipe(path: str | Path, **changes: Any) -> CaptureRecipe:  # n
     for table in [*content, *changes]:
         if table not in TABLES:
             raise UnknownNameError("table of a capture recipe", table, TABLES)
-        for values in (content.get(table, {}), changes.get(table, {})):
-            if not isinstance(values, dict):
-                raise ParameterError(f"`{table}` ({values!r}) must be a table: [{table}].")
-        content[table] = {**content.get(table, {}), **changes.get(table, {})}
+        stored, changed = (check_table(part.get(table, {}), table) for part in (content, changes))
+        content[table] = stored | changed
     tables = {name: to_dataclass(TABLES[name], name, table) for name, table in content.items()}
     is_given = "folder" in changes.get("pictures", {})
     recipe = CaptureRecipe(**tables, folder=Path() if is_given else path.parent)

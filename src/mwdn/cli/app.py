@@ -17,9 +17,9 @@ from mwdn.cli.camera_values import from_camera_file
 from mwdn.cli.given_options import note_given
 from mwdn.cli.global_options import GLOBAL, add_global_options
 from mwdn.cli.help_texts import HelpTexts
-from mwdn.cli.signals import ended_by_signals
+from mwdn.cli.signals import ended_by_signals, is_full
 from mwdn.cli.wrong_calls import wrong_call
-from mwdn.errors import MwdnError
+from mwdn.errors import ImageError, MwdnError
 from mwdn.runtime.memory import keep_memory
 from mwdn.version import __version__
 
@@ -146,6 +146,12 @@ def _run(arguments: list[str], received: Sequence[int]) -> int:
         if isinstance(error, cyclopts.CycloptsError):
             error = wrong_call(error, COMMANDS)
         terminal.complain("[bold red]Error:[/]", error)
+        return 2
+    except OSError as error:  # such as a path that is too long, or lies in a folder that may not be searched
+        if received or chosen["--debug"] or isinstance(error, BrokenPipeError) or is_full(error):
+            raise
+        where = f"`{error.filename}`: " if error.filename else ""
+        terminal.complain("[bold red]Error:[/]", ImageError(f"{where}{error.strerror or error}."))
         return 2
     return result if isinstance(result, int) else 0
 

@@ -10,7 +10,8 @@ from torch.nn import Module
 from mwdn.cli.camera import CameraOptions
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.terminal import Json, counted, print_json, say, warn
-from mwdn.inference.interpretation import interpret as look_into
+from mwdn.diagnosis.captures import refuse_dark
+from mwdn.inference.interpretation import interpret as interpret_capture
 from mwdn.inference.interpretation_page import JSON, SHEET, write_interpretation
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import check_folder, refuse_foreign, refuse_overwrite
@@ -43,9 +44,10 @@ def interpret(
     refuse_overwrite(out / SHEET, capture, *camera.files)
     refuse_foreign(out, (JSON, SHEET), b'"parts"')
     measurement = calibration.correct(calibration.frames.read(capture)).to(reconstruct.device)
+    refuse_dark(measurement)
     measurement, share = reconstruct.without_room_light(measurement)
     network = reconstruct.method
-    result = look_into(
+    result = interpret_capture(
         network.to(reconstruct.device) if isinstance(network, Module) else network, measurement, reconstruct.psf
     )
     check_folder(out)

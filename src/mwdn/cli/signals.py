@@ -64,7 +64,7 @@ def ended_by_signals(arguments: Sequence[str]) -> Iterator[Sequence[int]]:
         sys.exit(141)  # Windows has no SIGPIPE
     except BaseException as error:
         if not (received or isinstance(error, KeyboardInterrupt)):
-            if "--debug" in arguments or not _is_full(error):
+            if "--debug" in arguments or not is_full(error):
                 raise
             with suppress(OSError):  # standard error may be on the same disk
                 print(f"Error: The output cannot be written: {error.strerror}. Make room.", file=sys.stderr)
@@ -79,7 +79,7 @@ def ended_by_signals(arguments: Sequence[str]) -> Iterator[Sequence[int]]:
             signal.signal(number, handler)
 
 
-def _is_full(error: BaseException) -> TypeGuard[OSError]:
+def is_full(error: BaseException) -> TypeGuard[OSError]:
     """Whether there is no room for standard output. Errors of other files have their names."""
     full = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     return isinstance(error, OSError) and error.errno in full and error.filename is None

@@ -158,7 +158,7 @@ def import_digicam(
         if first is None:
             continue
         attributes: dict[str, Attribute] = {"source": "digicam", "mask_label": label}
-        psf = _cropped(camera, frames, part).psf(patterns[label], (first[1].shape[0], first[1].shape[1]))
+        psf = _cropped(camera, frames, part, first[0]).psf(patterns[label], (first[1].shape[0], first[1].shape[1]))
         result.files[file] = label, write_pairs(file, chain([first], pairs), attributes, psf)
         result.psfs.append(file.with_name(f"{file.stem}-psf.tif"))
         write_linear(result.psfs[-1], psf / psf.max())
@@ -167,11 +167,11 @@ def import_digicam(
     return result
 
 
-def _cropped(camera: DigiCam, frames: FrameFormat, listing: Listing) -> DigiCam:
-    """The camera with the part of the sensor that the captures keep."""
+def _cropped(camera: DigiCam, frames: FrameFormat, listing: Listing, readable: str) -> DigiCam:
+    """The camera with the part of the sensor that the captures keep; ``readable`` is the name of one of them."""
     if frames.crop is None:
         return camera
-    width = listing.sources[0].load().capture.shape[1]
+    width = next(source for source in listing.sources if source.name == readable).load().capture.shape[1]
     return replace(camera, sensor_mm=camera.sensor_mm * min(frames.crop[1], width) / width)
 
 

@@ -72,13 +72,19 @@ def import_pairs(  # noqa: PLR0913
     result = Imported()
     skipped = result.skipped if skip_damaged else None
     pairs = read_pairs(kind, path, layout=layout, frames=frames, camera=camera, skipped=skipped, track=track)
-    marks = PairFile(path).attributes if kind == "pairs" else {}
-    attributes = {"source": kind} | {name: marks[name] for name in (REFINED, WHITE) if name in marks}
-    result.count = write_pairs(Path(output), pairs, attributes, authors=authors)
+    attributes, psf = _of_pairs(PairFile(path), frames) if kind == "pairs" else ({}, None)
+    result.count = write_pairs(Path(output), pairs, {**attributes, "source": kind}, psf, authors=authors)
     if not result.count:
         reason = f" {len(skipped):,} were skipped; {next(iter(skipped.values()))}" if skipped else ""
         raise ImageError(f"`{path}` has no pair to import.{reason} For the layouts: `mwdn import --help`.")
     return result
+
+
+def _of_pairs(file: PairFile, frames: FrameFormat) -> tuple[dict[str, Attribute], Psf | None]:
+    """Attributes and PSF of a file of pairs that hold in its copy; only the `REFINED` marks if its captures change."""
+    if frames == FrameFormat():
+        return file.attributes, file.psf
+    return {name: value for name, value in file.attributes.items() if name in (REFINED, WHITE)}, None
 
 
 def write_pairs(

@@ -228,12 +228,13 @@ class Batch:
             sidecar.unlink(missing_ok=True)
             support_name(job.output).unlink(missing_ok=True)
         write_output(job.output, scene, self.format, pitch)
-        if trust and self.map:
-            write_picture(support_name(job.output), support_picture(scene, trust.support.map))
         try:
+            if trust and self.map:
+                write_picture(support_name(job.output), support_picture(scene, trust.support.map))
             write_json(sidecar, content)
         except ImageError:  # the disk is full: the next run would take the picture for something else
             job.output.unlink()
+            support_name(job.output).unlink(missing_ok=True)
             raise
         remove_other_format(job.output, job.capture, before=before, now=content)
         return replace(job, measurement=None, pose=None, scene=None, trust=trust, verdicts=verdicts)

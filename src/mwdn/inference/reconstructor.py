@@ -80,8 +80,8 @@ class Reconstructor:
         room_light: bool | None = None,
         **options: Any,  # noqa: ANN401
     ) -> None:
-        given = {"method": method, "align": align, "device": device, "precision": precision, "ensemble": ensemble}
-        given["room_light"] = room_light
+        given: dict[str, Any] = {"method": method, "align": align, "device": device, "precision": precision}
+        given |= {"white_balance": white_balance, "ensemble": ensemble, "room_light": room_light}
         check_options(Reconstructor, "`Reconstructor`", given)
         if not isinstance(calibration, Calibration):
             raise ParameterError(

@@ -52,9 +52,18 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
 
 
 def pictures_in(folder: Path, suffixes: frozenset[str] = READABLE, *, subfolders: bool = True) -> list[Path]:
-    """The files of a folder with these suffixes, in alphabetical order; hidden files are left out."""
-    found = folder.rglob("*") if subfolders else folder.iterdir()
-    return sorted(path for path in found if path.suffix.lower() in suffixes and path.name[0] != "." and path.is_file())
+    """The files of a folder with these suffixes, in alphabetical order; hidden files and folders are left out."""
+    return [path for path in _visible_files(folder, subfolders=subfolders) if path.suffix.lower() in suffixes]
+
+
+def _visible_files(folder: Path, *, subfolders: bool = True) -> list[Path]:
+    """Files of a folder in alphabetical order, except hidden ones and those in hidden subfolders."""
+    paths = folder.rglob("*") if subfolders else folder.iterdir()
+    return sorted(path for path in paths if not _is_hidden(path.relative_to(folder)) and path.is_file())
+
+
+def _is_hidden(path: Path) -> bool:
+    return any(part.startswith(".") for part in path.parts)
 
 
 def lies_in(path: str | Path, folder: str | Path) -> bool:
@@ -77,8 +86,7 @@ def refuse_within(photos: str | Path, out: Path) -> None:
 
 def unused_files(folder: Path, suffixes: frozenset[str] = READABLE) -> list[str]:
     """One sentence for each kind of file in a folder, or its subfolders, that `pictures_in` does not list."""
-    files = (path for path in folder.rglob("*") if not path.name.startswith(".") and path.is_file())
-    return _left_out(folder, sorted(path.relative_to(folder).as_posix() for path in files), suffixes)
+    return _left_out(folder, [path.relative_to(folder).as_posix() for path in _visible_files(folder)], suffixes)
 
 
 def _left_out(folder: Path, names: list[str], readable: frozenset[str]) -> list[str]:

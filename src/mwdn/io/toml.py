@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import re
 import tomllib
 import warnings
 from collections.abc import Iterator
@@ -21,6 +22,9 @@ RECIPES = Path(__file__).parents[1] / "recipes"
 
 _PARTS = 100
 """Most parts of a dotted key."""
+
+_TEXT = re.compile(r"""\"(?:[^"\\\n]|\\.)*"|'[^'\n]*'|#[^\n]*""")
+"""Text in quotes on one line, and comments."""
 
 
 LARGEST = 1e9
@@ -65,9 +69,7 @@ def read_toml(path: str | Path, kind: str = "recipe") -> dict[str, Any]:
     """
     text = read_text(path)
     # tomllib's time grows with the square of a key's parts: 200,000 of them took minutes.
-    if any(
-        part.count(".") > _PARTS for line in text.splitlines() if line.lstrip()[:1] != "#" for part in line.split(",")
-    ):
+    if any(key.count(".") > _PARTS for key in re.split(r"[\n,=]", _TEXT.sub("", text))):
         raise ParameterError(f"`{path}` cannot be read as a {kind}: a key has more than {_PARTS} parts. Shorten it.")
     try:
         return tomllib.loads(text)
@@ -118,6 +120,13 @@ def named_table(name: str) -> Iterator[None]:
     except MwdnError as error:
         error.args = (f"[{name}]: {error}",)
         raise
+
+
+def check_table(value: Any, name: str) -> dict[str, Any]:  # noqa: ANN401
+    """Return the value called ``name``, or raise a `ParameterError` if it is not a table."""
+    if not isinstance(value, dict):
+        raise ParameterError(f"`{name}` ({shown(value)}) must be a table: [{name}].")
+    return value
 
 
 def check_numbers(value: Any, name: str) -> None:  # noqa: ANN401

@@ -26,8 +26,8 @@ Quantity = Literal["height", "phase", "amplitude", "transmission"]
 _IGNORED: dict[Quantity, tuple[str, ...]] = {
     "height": ("phase_nm",),
     "phase": (),
-    "amplitude": ("phase_nm", "index", "levels"),
-    "transmission": ("phase_nm", "index", "levels"),
+    "amplitude": ("phase_nm", "index", "levels", "full_scale"),
+    "transmission": ("phase_nm", "index", "levels", "full_scale"),
 }
 """Options of `ArrayMask` without effect, by what the numbers are."""
 
@@ -48,8 +48,8 @@ class ArrayMask:
         values: what the numbers are. height: of the surface, in um. phase: delay of the light in radians; wrapped or
             not, of any sign. amplitude or transmission: part of the light's amplitude or power that passes, 0 to 1.
         pitch_um: side of a sample.
-        full_scale: height in um or phase in radians of the largest number of a file of integers: 255 or 65,535. An
-            amplitude or transmission there is 1.
+        full_scale: height in um or phase in radians of the largest number of a file of integers, 255 or 65,535;
+            positive. Amplitudes and transmissions are 1 there.
         phase_nm: wavelength for which phases are given; the middle of the light's band unless given. Heights follow
             from it and from `index`: other colours have other phases.
         index: refractive index of a surface; 1.46 is fused silica.
@@ -223,6 +223,8 @@ def _scaled(frame: Numbers, values: Quantity, full_scale: float | None) -> Plane
             raise ParameterError("`full_scale` is for files of integers; this one holds floats. Leave it out.")
         return numbers
     largest = int(np.iinfo(frame.dtype).max)
+    if full_scale is not None and not full_scale > 0:
+        raise ParameterError(f"`full_scale` ({full_scale:g}) must be positive.")
     if full_scale is None and values in ("height", "phase"):
         unit = "um" if values == "height" else "radians"
         raise ParameterError(

@@ -4,6 +4,7 @@ import hashlib
 import re
 import tempfile
 import threading
+import warnings
 from collections import OrderedDict
 from dataclasses import fields
 from pathlib import Path
@@ -44,7 +45,10 @@ class StoredCameras:
         self._recent: OrderedDict[str, Calibration] = OrderedDict()
         if folder is not None and folder.is_dir():
             for entry in sorted(folder.glob("*.json")):
-                self._load(entry)
+                try:
+                    self._load(entry)
+                except MwdnError as error:  # the others are served
+                    warnings.warn(f"The stored camera `{entry}` is left out: {error}", stacklevel=2)
 
     def _load(self, entry: Path) -> None:
         content = read_json(entry)

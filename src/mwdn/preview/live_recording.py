@@ -2,6 +2,7 @@
 
 import time
 from contextlib import ExitStack
+from itertools import chain, count
 from pathlib import Path
 
 from mwdn.capture.recording import Recorder, record
@@ -48,13 +49,19 @@ class LiveRecording:
         if not self.is_wanted:
             return
         if self._recorder is None:
-            self.name = time.strftime("recording-%Y%m%d-%H%M%S.h5", time.gmtime())
+            self.name = self._free_name()
             self._recorder = self._file.enter_context(record(self.folder / self.name, camera=self.camera))
         try:
             self._recorder.append(frame)
         except CameraError as error:
             self.problem = str(error)
         self.count = len(self._recorder)
+
+    def _free_name(self) -> str:
+        """A name by the second, with a number if a recording of this second exists."""
+        start = time.strftime("recording-%Y%m%d-%H%M%S", time.gmtime())
+        names = chain([f"{start}.h5"], (f"{start}-{number}.h5" for number in count(2)))
+        return next(name for name in names if not (self.folder / name).exists())
 
     def close(self) -> None:
         """Complete the file."""

@@ -4,6 +4,7 @@ from typing import Any, get_args, get_origin
 
 from mwdn.errors import ParameterError, UnknownNameError, type_in_words
 from mwdn.inference.method_options import REQUIRED, Option, list_options, summary
+from mwdn.io.toml import check_numbers
 from mwdn.solvers import SOLVERS
 from mwdn.weights.bundled import BUNDLED
 
@@ -57,4 +58,5 @@ def checked_options(name: str, options: dict[str, Any]) -> dict[str, Any]:
             raise UnknownNameError(f"option of method '{name}'", option, known)
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise ParameterError(f"`{option}` ({value!r}) of the method must be a number.")
+        check_numbers(value, option)
     return {option: value if int in _kinds(known[option]) else float(value) for option, value in options.items()}

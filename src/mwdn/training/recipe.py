@@ -13,7 +13,7 @@ from mwdn.data.recorded import Division
 from mwdn.data.simulated import Placement
 from mwdn.data.unpaired import SelfSupervised
 from mwdn.errors import ParameterError, UnknownNameError, checked
-from mwdn.io.toml import current_names, find_recipe, named_table, read_toml, to_dataclass
+from mwdn.io.toml import check_table, current_names, find_recipe, named_table, read_toml, to_dataclass
 from mwdn.networks import DENOISERS
 from mwdn.networks.empty import build_empty
 from mwdn.optics.sensor import Sensor
@@ -244,8 +244,7 @@ def read_recipe(path: str | Path | None, **changes: Any) -> Recipe:  # noqa: ANN
     for table in content | replaced:
         if table not in FIELDS:
             raise UnknownNameError("table of a recipe", table, FIELDS)
-        if not isinstance(content.setdefault(table, {}), dict):
-            raise ParameterError(f"`{table}` of `{path}` ({content[table]!r}) must be a table: [{table}].")
+        check_table(content.setdefault(table, {}), table)
         if table == "network" and replaced.get(table, {}).get("name") not in (None, content[table].get("name")):
             content[table] = {}  # the options are those of another network
         content[table] = _named(table, content[table]) | _named(table, replaced.get(table, {}))
