@@ -32,7 +32,7 @@ from mwdn.cli.app import main
 from mwdn.data import recorded
 from mwdn.data.pair_checks import REFINED
 from mwdn.data.pairs import PairFile
-from mwdn.data.recorded import RecordedPairs
+from mwdn.data.recorded import Division, RecordedPairs
 from mwdn.data.simulated import Placement
 from mwdn.errors import CheckpointError, ParameterError, UnknownNameError
 from mwdn.evaluation import Perceptual, alexnet, bootstrap
@@ -224,6 +224,16 @@ def test_the_test_part_is_no_part_of_the_training(done):
     scenes = [file[i][1] for i in range(9)]
     for i in range(9):
         assert not any(scenes[i].equal(scenes[j]) for j in range(i))
+
+
+def test_checkpoints_say_which_simulated_pairs_they_were_trained_on(done):
+    """They said 8:1:1 with the test first, so `mwdn evaluate` recommended pairs of the training as a test."""
+    metadata = read_metadata(done / "runs" / "caustic" / "mwdn" / "best.safetensors")
+    division, count = Division(**metadata["recipe"]["pairs"]), len(PairFile(done / "data" / "caustic.h5"))
+    parts = division.parts(count)
+    assert [*parts["train"]] == [*range(4)]
+    assert [*parts["test"]] == [*range(count - 3, count)]
+    assert metadata["pairs"] == f"4 of {count} recorded"
 
 
 @pytest.mark.parametrize(

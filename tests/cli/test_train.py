@@ -361,6 +361,31 @@ def test_simulate_then_evaluate(run, camera):
     assert "wiener" in out
 
 
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("--pairs pairs.h5 --mismatch.blur-px 3", "`--mismatch.blur-px` is for simulated captures"),
+        ("--pairs pairs.h5 --placement.extent [0.1,0.2]", "`--placement.extent` is for simulated captures"),
+        ("--photos photos --pairs.fold 77", "`--pairs.fold` is for recorded pairs"),
+        ("--photos photos --captures photos -o photos/run", "lies in the folder of captures `photos`"),
+        ("--photos photos --schedule.start universal --network.name mwdn", "`WienerBank`, .* is a `Mwdn`"),
+    ],
+)
+def test_options_without_effect_and_wrong_places_are_refused(run, camera, line, said):
+    code, _, err = run(f"train quick-cpu --psf psf.npy --device cpu {line}")
+    assert code == 2
+    assert re.search(said, flat(err)), err
+    assert not (camera / "photos" / "run").exists()
+
+
+@pytest.mark.parametrize("option", ["--ambient psf.npy", "--gamma srgb"])
+def test_options_of_raw_captures_are_not_for_pairs(run, camera, option):
+    """They changed nothing, without a word."""
+    assert run("simulate photos --psf psf.npy -o pairs.h5 --count 1 --recipe r.toml")[0] == 0
+    code, _, err = run(f"evaluate wiener --data pairs.h5 --psf psf.npy --device cpu {option}")
+    assert (code, f"leave out `{option.split()[0]}`" in flat(err)) == (2, True)
+
+
 def test_simulate_is_reproducible_and_exact(run, camera):
     for name, options in (("a", "--seed 1"), ("b", "--seed 1"), ("c", ""), ("exact", "--seed 1 --exact")):
         assert run(f"simulate photos --psf psf.npy -o {name}.h5 --count 3 {options}")[0] == 0

@@ -235,6 +235,7 @@ def test_damaged_and_unlike_pictures(tmp_path):
     assert (done.count, list(done.skipped)) == (2, ["1", "2", "3", "4"])
     assert "scene of `2` (9 x 10 x 3, uint8) must be like that of the first pair (8 x 10 x 3" in done.skipped["2"]
     assert "capture of `3` (4 x 5 x 1" in done.skipped["3"]
+    assert "`--grey`" in done.skipped["3"]
     assert {file.name for file in tmp_path.iterdir()} == {"captures", "scenes", "pairs.h5"}
 
 

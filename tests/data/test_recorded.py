@@ -130,6 +130,15 @@ def test_a_number_is_the_same_pair_in_any_batch_and_process(pairs):
     assert [once.row(n) for n in range(5)] == [7, 27, 13, 23, 22]
 
 
+def test_each_pair_of_a_small_file_is_in_its_fingerprint(pairs):
+    """Every second of 20 pairs could be exchanged, and a run went on."""
+    path = pairs(20)
+    before = RecordedPairs(PairFile(path), [], psf()).fingerprint
+    with h5py.File(path, "a") as file:
+        file["scene"][13] = 1 - file["scene"][13]
+    assert RecordedPairs(PairFile(path), [], psf()).fingerprint != before
+
+
 def test_an_empty_file_has_a_fingerprint(pairs):
     assert RecordedPairs(PairFile(pairs(0)), [], psf()).fingerprint
 
@@ -156,7 +165,7 @@ def test_a_split_without_validation_holds_out_training_pairs():
     [
         (Division("diffusercam"), 1010, "of 1,010 pairs leaves 10 for training and 0 for validation"),
         (Division("random", (0.0, 0.5, 0.5)), 10, "leaves 0 for training and 5 for validation"),
-        (Division("paper"), 9, "`count` (9 pairs) must be at least 10 for the split 'paper'"),
+        (Division("paper"), 9, "The split 'paper' needs at least 10 pairs, but there are 9"),
     ],
 )
 def test_too_few_pairs(division, count, said):

@@ -20,7 +20,7 @@ def test_phlatcams_split_is_of_ten_thousand_only():
         split(9_999, "phlatcam")
 
 
-@pytest.mark.parametrize("kind", ["paper", "diffusercam", "random"])
+@pytest.mark.parametrize("kind", ["paper", "diffusercam", "in-order", "random"])
 @pytest.mark.parametrize("count", [1001, 1009, 5437])
 def test_every_pair_is_in_exactly_one_part(kind, count):
     parts = split(count, kind)
@@ -36,6 +36,11 @@ def test_random_follows_its_seed_and_its_fractions():
     assert split(7, "random", fractions=(1.0, 0.0, 0.0)) == {"train": list(range(7)), "validation": [], "test": []}
 
 
+def test_in_order_training_comes_first():
+    parts = split(11, "in-order", fractions=(6 / 11, 2 / 11, 3 / 11))
+    assert parts == {"train": [*range(6)], "validation": [6, 7], "test": [8, 9, 10]}
+
+
 def test_a_negative_seed_is_refused():
     with pytest.raises(ParameterError, match=r"`seed` \(-1\)"):
         split(10, "random", seed=-1)
@@ -49,7 +54,7 @@ def test_fractions_are_three_of_sum_one(fractions):
 
 @pytest.mark.parametrize(("count", "kind"), [(9, "paper"), (1000, "diffusercam"), (3, "random"), (0, "random")])
 def test_too_few_pairs(count, kind):
-    with pytest.raises(ParameterError, match="`count`"):
+    with pytest.raises(ParameterError, match=r"pairs.* 'folds'"):
         split(count, kind)
 
 

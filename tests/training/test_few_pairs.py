@@ -224,6 +224,23 @@ def test_unevenly_lit_scenes_are_learned_from_and_reconstructed(distorted):
     assert error(result) < 0.85 * error(seen)
 
 
+def test_nothing_is_measured_from_one_pair(distorted):
+    """The batch of two held it twice, so it confirmed itself: a shading and a distortion of 4.6 dB."""
+    recipe, calibration = distorted
+    with PairFile.create("two.h5", measurement_shape=(*LARGE, 3), scene_shape=(*LARGE, 3)) as file:
+        for number in range(2):
+            file.append(*PairFile(Path("pairs.h5"))[number])
+    options = {
+        "network": recipe.network | {"shading": 2},
+        "pairs": replace(recipe.pairs, split="folds", folds=2),
+        "schedule": replace(recipe.schedule, steps=1, batch=2),
+    }
+    run = prepare(replace(recipe, **options), calibration, out=Path("run"), pairs=Path("two.h5"), device="cpu")
+    run.run()
+    assert not run.network.distortion.any()
+    assert not run.network.shading.any()
+
+
 def test_a_resumed_run_keeps_what_was_measured(distorted):
     recipe, calibration = distorted
     recipe = replace(recipe, network=recipe.network | {"shading": 1})

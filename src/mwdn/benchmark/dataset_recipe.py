@@ -68,7 +68,10 @@ class DatasetRecipe:
     protocol: str = "full"
 
     def division(self) -> Division:
-        """How recorded pairs are divided; the default where there is no ``split``."""
+        """How the pairs are divided; the default where there is no ``split`` of recorded ones."""
+        if not self.pairs and self.train:
+            count = self.train + self.validation + self.test
+            return Division("in-order", (self.train / count, self.validation / count, self.test / count))
         return Division(self.split, seed=self.seed) if self.split else Division()
 
     def binned_protocol(self) -> Protocol:

@@ -92,7 +92,7 @@ class Benchmark:
     rates: tuple[float, ...] = ()
     trial: float = 0.1
     mean_picture: bool = False
-    published: bool = True
+    published: bool = False
     rate_factor: float = 1.0
     ablation: tuple[str, ...] = ()
     compared: str = ""

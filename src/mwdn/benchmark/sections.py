@@ -201,6 +201,7 @@ def _robustness(results: Results) -> list[Block]:
 def _provenance(results: Results) -> list[Block]:
     """Settings, versions, hardware, command and recipe."""
     benchmark = results.benchmark
+    own = benchmark.published or benchmark.rates
     table = Table("method", "built with", "optimiser", "rate", "decay", "settings from", title="Methods")
     for method in benchmark.methods:
         options = ", ".join([method.name, *(f"{key} = {value}" for key, value in method.options.items())])
@@ -209,7 +210,8 @@ def _provenance(results: Results) -> list[Block]:
     for key, value in environment(results.device).items():
         facts.add_row(escape(key), escape(value))
     return [
-        f"One schedule for all networks: {json.dumps(asdict(benchmark.schedule))}. Loss: {json.dumps(benchmark.loss)}"
+        f"One schedule for all networks{', but with the optimiser, rate and decay in the table' if own else ''}: "
+        f"{json.dumps(asdict(benchmark.schedule))}. Loss: {json.dumps(benchmark.loss)}"
         f"{_second_phase(benchmark)}. "
         "Weights are those of the best validation. Confidence intervals: percentile bootstrap over the pictures.",
         table,

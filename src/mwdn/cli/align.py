@@ -65,13 +65,13 @@ def align(  # noqa: PLR0913
         camera: calibration of the camera.
         out: folder for the results, or for a session the file of aligned pairs, ending in .h5.
         method: reconstructs the captures: universal, admm, or any other of `mwdn methods`.
-        count: captures of a session that are reconstructed.
+        count: captures of a session that are used to find the homography.
         points: start from the corners of the picture as seen in the reconstruction, from its own top left clockwise:
             x,y,x,y,x,y,x,y in pixels.
         homography: take the homography from this .json or file of aligned pairs instead of estimating it.
         display_gamma: light of the display is PICTURE's numbers to this power, srgb unless given. For a session that
             of its stored pictures, 1 unless given, because `mwdn capture` stores light.
-        levels: scale scenes and measurements of a session so that the PSF leads from one to the other.
+        levels: scale scenes and measurements of a session so that the scene through the PSF is the measurement.
         device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
         json: print the content of the .json to standard output, all else to standard error.
         **options: options of the method.

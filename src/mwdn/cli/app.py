@@ -67,7 +67,7 @@ COMMANDS = {
     "evaluate": ("evaluate:evaluate", "Compare methods on pairs of measurements and scenes: quality, time, memory."),
     "demo": (
         "demo:demo",
-        "Simulate a small lensless camera and reconstruct its captures with every method that needs no training.",
+        "Simulate a small lensless camera and reconstruct its captures with five methods that need no training.",
     ),
     "preview": (
         "preview:preview",

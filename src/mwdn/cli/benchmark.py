@@ -30,8 +30,8 @@ def benchmark(
     folder, started by hand or by torchrun, share the networks.
 
     Args:
-        recipe: benchmark-small, benchmark-ablation, benchmark-paper, or a TOML file like those (`mwdn recipes`).
-            A method or a data set is one line of it.
+        recipe: benchmark-small, benchmark-ablation, benchmark-quarter, benchmark-half, benchmark-paper, or a TOML file
+            like those (`mwdn recipes`). A method or a data set is one line of it.
         out: folder; index.html is the page, benchmark.md, .json and .csv hold the same results.
         device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
         lpips: LPIPS and feature MSE: download their public weights (234 MiB, once) if they are missing, or leave both

@@ -84,8 +84,8 @@ def calibrate(  # noqa: PLR0913
         distance_mm: distance from the point source to the camera, in millimetres.
         watch: guide the exposure instead: for each frame that is written to this folder, print its peak, its saturated
             pixels and the exposure to use next.
-        pairs: file of two or more pairs of this camera, from `mwdn align` or `mwdn import`, to find a gain over the
-            PSF, the displacement of the aperture's shadow, the sensor's field and stray light.
+        pairs: refine the calibration with a file of two or more pairs of this camera, from `mwdn align` or `mwdn
+            import`: gain over the PSF, displacement of the aperture's shadow, field of the sensor, stray light.
         out: the camera file, ending in .toml.
         auto_bin: whether --bin is not given: then every reconstruction chooses.
         auto_background: whether --background is not given.

@@ -21,7 +21,7 @@ def capture(
 ) -> None:
     """Show pictures on a display in front of a camera, and record a pair of each: the picture and the raw frame.
 
-    The same command continues a session that was stopped, by whatever. Options override keys of the recipe:
+    The same command continues an interrupted session. Options override keys of the recipe:
     --pictures.count 500, --camera.exposure-s 0.02, --session.settle-s 0.5.
 
     Args:

@@ -45,7 +45,7 @@ def demo(
     seed: int = 0,
     pictures: Annotated[tuple[Picture, ...], Parameter(consume_multiple=True, negative=())] = PICTURES,
 ) -> None:
-    """Simulate a small lensless camera and reconstruct its captures with every method that needs no training.
+    """Simulate a small lensless camera and reconstruct its captures with five methods that need no training.
 
     Args:
         out: folder for the page, its pictures, and the camera's own files: psf.tif and captures/.

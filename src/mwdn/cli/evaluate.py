@@ -56,7 +56,7 @@ def evaluate(  # noqa: PLR0913
         variant: raw, clipped to [0, 1], or best-gain (one gain and offset per picture). The default is raw for
             centre-128 and clipped otherwise.
         split: use one part of the pairs only, as `mwdn train` divides them: paper (8:1:1), diffusercam, phlatcam,
-            random or folds.
+            in-order, random or folds. All pairs unless given.
         part: of --split: test (the default), validation or train.
         first: use only this many pairs.
         lpips: LPIPS and feature MSE: download their public weights (234 MiB, once) if they are missing, or leave both
@@ -67,6 +67,7 @@ def evaluate(  # noqa: PLR0913
         **options: options of the methods.
     """
     method_options = read_options(methods, options, evaluate)
+    _refuse_capture_options(camera)
     region, file = evaluation.Protocol.parse(protocol), PairFile(data)
     calibration = replace(camera.load(), white_balance=None)  # scenes of pairs are in the camera's own colours
     check_pairs(file, calibration.psf)
@@ -105,6 +106,16 @@ def evaluate(  # noqa: PLR0913
     report.write(out)
     _print_report(report, json=json)
     say(f"Look at {out}")
+
+
+def _refuse_capture_options(camera: CameraOptions) -> None:
+    """Raise a `ParameterError` for options that act on raw captures alone; a camera file may have them."""
+    given = {"ambient": camera.ambient, "gamma": camera.frames.gamma}
+    if camera.camera is None and (names := [f"`{name}`" for name, value in given.items() if value is not None]):
+        raise ParameterError(
+            f"The captures of a file of pairs are corrected already: leave out {' and '.join(names)}. Corrections are "
+            "for `mwdn import` and `mwdn align`, which write the file."
+        )
 
 
 def _rows(file: PairFile, split: str, name: str, methods: Iterable[str]) -> range | list[int]:
@@ -147,6 +158,11 @@ def _learned(method: str, file: PairFile, rows: range | list[int]) -> str | None
         return None
     division = _trained_with(metadata)
     parts = division.parts(len(file))
+    if metadata["pairs"] != f"{len(parts['train']):,} of {len(file):,} recorded":
+        return (
+            f"`{method}` was trained on {metadata['pairs']} pairs. If `{file.path}` is the file of its training, they "
+            "may be among these: which ones is not known."
+        )
     known = len({*parts["train"]} & {*rows})
     if not known:
         return None

@@ -37,7 +37,8 @@ def export(  # noqa: PLR0913
     Options of a solver: --regularisation 1e-4, --iterations 50 ...; `mwdn methods admm` lists those of admm.
 
     Args:
-        method: as for `mwdn reconstruct --method`, a network for a page. Neither aligns the PSF to each capture.
+        method: as for `mwdn reconstruct --method`, a network for a page. The exported file and the page do not align
+            the PSF.
         camera: its calibration; the file is for this PSF and this picture size only, a page for any PSF of this size.
         out: ends in .onnx, .pt2, or .zip (the ONNX as a package of bioimage.io), camera.onnx unless given; an existing
             file is replaced only on success. A folder for --web, `site` unless given.

@@ -27,7 +27,11 @@ def methods(name: str | None = None, /) -> None:
     if not any(name in names for names in (BUNDLED, SOLVERS, NETWORKS)):
         raise UnknownNameError("method", name, {*SOLVERS, *BUNDLED, *NETWORKS})
     if name in SOLVERS:  # `wiener` is a solver and a network type
-        _print(f"Solver {name}. Options, as --name value:", list_options(SOLVERS[name]))
+        options = list_options(SOLVERS[name])
+        objects = [option for option in options if "`" in type_in_words(option.type)]  # `Penalties`
+        _print(f"Solver {name}. Options, as --name value:", [option for option in options if option not in objects])
+        if objects:
+            _print("In Python only:", objects)
     if name in BUNDLED:
         metadata = read_metadata(find_weights(name) or name)
         options = [

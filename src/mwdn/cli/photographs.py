@@ -24,17 +24,18 @@ class PhotographOptions:
     """Photographs that describe the camera, and how they were taken. A folder stands for the frames in it.
 
     Args:
-        exposures: exposure of each equal part of the frames, in order: --exposures 1 8 64, in milliseconds. Several,
-            up to eight, are merged to high dynamic range.
+        exposures: exposure in milliseconds of each equal part of the frames, in order: --exposures 1 8 64. Several, up
+            to eight, are merged to high dynamic range.
         dark: frames taken without light, or with the source switched off, several; subtracted from the PSF and the
             captures.
-        dark_exposures: exposure of each folder of dark frames, or of each equal part of the files, if they differ.
+        dark_exposures: exposure in milliseconds of each folder of dark frames, or of each equal part of the files, if
+            they differ.
         flat: frames of even light, in pairs of the same exposure: flat field, gain and read noise; none to do without
             the camera file's flat field.
         flat_dark: dark frames with the exposure of the flat frames; --dark unless given, if it has one exposure.
         flat_through_mask: the flat frames were taken through the mask: no flat field, gain and read noise alone.
-        capture_exposure: exposure of the captures, one of --dark-exposures, whose dark frame they have; the longest
-            unless given.
+        capture_exposure: exposure of the captures in milliseconds, one of --dark-exposures, whose dark frame they have;
+            the longest unless given.
         distances: distance of the point source in each equal part of the frames, in millimetres; the first is the
             camera's own.
         field: frames of points off the axis, each a file or a folder, with the exposure of the shortest frames.

@@ -47,7 +47,7 @@ def preview(  # noqa: PLR0913
         camera: a camera that the page offers beside the samples.
         host: address to listen on. All but 127.0.0.1 can be reached by other computers, and need a token.
         port: to listen on; 0 for a free one.
-        token: secret that requests must know; one is made up where it is needed.
+        token: secret that requests must know; generated if --host is not 127.0.0.1.
         live: a camera to watch, as for `mwdn capture`: rig, v4l2:0, folder:frames, replay:frames.h5,loop=true. Its PSF
             is the camera's, --psf or --camera; the simulated rig has its own.
         out: folder of stored calibrations and recordings.

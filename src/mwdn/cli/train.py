@@ -1,11 +1,11 @@
 """`mwdn train` and `mwdn simulate`."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
@@ -60,17 +60,19 @@ def train(  # noqa: PLR0913
         recipe: name of a recipe of the package, see `mwdn recipes`, or a TOML file.
         camera: calibration of the camera.
         photos: folder of photographs, the more the better, to simulate captures of.
-        pairs_file: HDF5 file of recorded pairs, from `mwdn import`; [pairs] of the recipe, or --pairs.split random,
-            divides it.
-        captures: files or folders of real captures: to learn from, with [selfsupervised]; otherwise to show on the
-            contact sheet instead of the recipe's.
+        pairs_file: HDF5 file of pairs, from `mwdn align`, `mwdn import` or `mwdn simulate`; [pairs] of the recipe, or
+            --pairs.split random, divides it.
+        captures: files or folders of real captures: to learn from, with [selfsupervised]; otherwise to show on
+            validation.png in place of those that the recipe names.
         out: folder of the run: best.safetensors for `mwdn reconstruct --method`, validation.png with the images of the
             latest validation.
         device: cpu, cuda, cuda:1 ...; by default a GPU if there is one.
         tensorboard: write progress to the folder tensorboard in --out, for `tensorboard --logdir`.
         **changes: any key of the recipe.
     """
-    experiment_recipe = read_recipe(recipe, **recipe_changes(changes))
+    given = recipe_changes(changes)
+    _refuse_unused(given, pairs=pairs_file is not None)
+    experiment_recipe = read_recipe(recipe, **given)
     if captures:
         experiment_recipe = replace(experiment_recipe, sheet=Sheet(tuple(map(str, captures))))
     with distributed.process_group(), ExitStack() as stack:
@@ -103,6 +105,17 @@ def train(  # noqa: PLR0913
         _train(trainer, stack.enter_context(show_progress(enabled=is_first, titles=True)), board)
     if is_first:
         say(f"Weights in {out / 'best.safetensors'}")
+
+
+def _refuse_unused(changes: Mapping[str, Any], *, pairs: bool) -> None:
+    """Raise a `ParameterError` for changes of tables that a training does not use, of pairs or of photographs."""
+    unused = {"mismatch", "placement"} if pairs else {"pairs"}
+    for table in unused & changes.keys():
+        key = next(iter(changes[table]), "") if isinstance(changes[table], dict) else ""
+        raise ParameterError(
+            f"`--{table}.{key.replace('_', '-')}` is for {'simulated captures' if pairs else 'recorded pairs'}. Leave "
+            f"it out with `{'pairs' if pairs else 'photos'}`."
+        )
 
 
 def _note_colours(calibration: Calibration, options: str) -> None:
@@ -185,7 +198,7 @@ def simulate(
         camera: calibration of the camera.
         out: file of pairs, ending in .h5 or .hdf5; an existing one is replaced on success.
         count: number of pairs.
-        recipe: placement, mismatch, sensor and seed, as for `mwdn train`; by default their default values.
+        recipe: placement, mismatch, sensor and seed, as for `mwdn train`; without it the defaults of these tables.
         exact: simulate the calibrated camera itself, without mismatch; noise and even light (--placement.ambient) stay.
         **changes: any key of the recipe.
     """

@@ -51,8 +51,8 @@ class DigiCam:
     """The optics of a camera with a display as its mask; the defaults are those of DigiCam.
 
     Args:
-        mask_distance_mm: from the display to the sensor.
-        source_mm: from the scene to the display.
+        mask_distance_mm: from the mask, a liquid-crystal display, to the sensor.
+        source_mm: from the scene to the mask.
         sensor_mm: width of the captures on the sensor; the Raspberry Pi HQ camera's 4056 pixels of 1.55 um.
         psf_turn: how the computed PSF must be turned to fit the captures; `mwdn reconstruct` says if it is.
         background: column or folder of frames of the room's light alone, subtracted from the captures, which are then

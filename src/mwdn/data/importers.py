@@ -16,7 +16,7 @@ from mwdn.data.kinds import KINDS, Kind, Layout
 from mwdn.data.pair_checks import REFINED, WHITE
 from mwdn.data.pair_writer import Attribute, PairWriter, PixelType, Shape, check_path, quantise
 from mwdn.data.pairs import PairFile
-from mwdn.data.scene_place import bin_scene, place_scene
+from mwdn.data.scene_place import bin_scene, place_scene, resize_scene
 from mwdn.data.sources import Listing, Source
 from mwdn.errors import ImageError, MwdnError, ParameterError, UnknownNameError
 from mwdn.io.files import refuse_overwrite
@@ -229,7 +229,7 @@ def _convert(
     if scene.shape[2] == 1 < capture.shape[2]:  # a few of ImageNet's photographs are grey
         scene = scene.repeat(3, axis=2)
     if layout.scene_size is not None:
-        scene = _resize(scene, layout.scene_size)
+        scene = resize_scene(scene, layout.scene_size)
     scene = _upright(scene, frames)
     place = _place(kind, layout, (scene.shape[0], scene.shape[1]), full_size, whole)
     if place is not None:
@@ -285,21 +285,16 @@ def _upright(frame: Frame, frames: FrameFormat) -> Frame:
     return frame[::-1] if frames.upside_down else frame
 
 
-def _resize(scene: Frame, size: Size) -> Frame:
-    import cv2
-
-    if scene.shape[:2] == size:
-        return scene
-    smaller = scene.shape[0] >= size[0] and scene.shape[1] >= size[1]
-    resized = cv2.resize(scene, size[::-1], interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
-    return np.asarray(resized).reshape(*size, -1)
-
-
 def _check_like_first(first: tuple[Frame, Frame], pair: tuple[Frame, Frame], name: str) -> None:
     for what, expected, got in zip(("capture", "scene"), first, pair, strict=True):
         if expected.shape != got.shape or expected.dtype != got.dtype:
             actual, wanted = (f"{' x '.join(map(str, frame.shape))}, {frame.dtype}" for frame in (got, expected))
+            if expected.shape == got.shape:
+                advice = "Captures and scenes together must have 8 bits, 16 bits or floats in all pairs: convert them."
+            elif expected.shape[:2] == got.shape[:2]:
+                advice = "All captures must be in colour, or all grey: convert them, or give `--grey`."
+            else:
+                advice = "Convert it, or for scenes of several sizes give `--scene-size 384 384`."
             raise ImageError(
-                f"The {what} of `{name}` ({actual}) must be like that of the first pair ({wanted}). Convert it, "
-                "or for scenes of several sizes give `--scene-size 384 384`."
+                f"The {what} of `{name}` ({actual}) must be like that of the first pair ({wanted}). {advice}"
             )

@@ -1,6 +1,7 @@
 """Recorded pairs as numbered samples, like the simulated ones; and samples recorded in a file."""
 
 import hashlib
+import math
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -28,8 +29,8 @@ from mwdn.types import Measurement, Psf
 HELD_OUT = 20
 """One in this many photographs is held out for validation, or training pairs of a split without a validation part."""
 
-FINGERPRINTED = 16
-"""Pairs that identify a file."""
+FINGERPRINTED = 2**26
+"""Numbers that identify a file of pairs: those of 109 pairs of 320 x 320 in colour, a second on one core."""
 
 
 @checked
@@ -39,7 +40,7 @@ class Division:
 
     Args:
         split: see `mwdn.data.splits.split`. The published ones go by position, so no pair may be missing.
-        fractions: of training, validation and test; only for "random".
+        fractions: of training, validation and test; only for "random" and "in-order".
         seed: only for "random".
         folds: number of parts; only for "folds".
         fold: the part for validation, from 0; only for "folds".
@@ -115,9 +116,10 @@ class RecordedPairs(Samples):
 
     @property
     def fingerprint(self) -> str:
-        """Hash of up to 16 pairs, evenly spaced over the file: reading all of a large one would take minutes."""
+        """Hash of up to `FINGERPRINTED` numbers: of all pairs of a small file, of 16 or more over a large one."""
         digest, count = hashlib.sha256(), len(self.file)
-        for row in range(0, count, max(1, -(-count // FINGERPRINTED))):
+        size = math.prod(self.file.measurement_shape) + math.prod(self.file.scene_shape)
+        for row in range(0, count, max(1, -(-count // max(16, FINGERPRINTED // size)))):
             for picture in self.file[row]:
                 digest.update(picture.numpy().tobytes())
         return digest.hexdigest()

@@ -50,3 +50,14 @@ def bin_scene(scene: Frame, bin: int) -> Frame:
     peak = np.float32(np.iinfo(scene.dtype).max if scene.dtype.kind == "u" else 1)
     light = torch.from_numpy(scene.astype(np.float32) / peak).movedim(-1, 0)[None]
     return bin_pixels(light, bin)[0].movedim(0, -1).numpy()
+
+
+def resize_scene(scene: Frame, size: Size) -> Frame:
+    """A scene (h, w, C) resampled to another height and width: by areas if it shrinks, else bilinear."""
+    import cv2
+
+    if scene.shape[:2] == size:
+        return scene
+    smaller = scene.shape[0] >= size[0] and scene.shape[1] >= size[1]
+    resized = cv2.resize(scene, size[::-1], interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
+    return np.asarray(resized).reshape(*size, -1)

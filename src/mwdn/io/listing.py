@@ -71,16 +71,16 @@ def lies_in(path: str | Path, folder: str | Path) -> bool:
     return Path(path).resolve().is_relative_to(Path(folder).resolve())
 
 
-def refuse_within(photos: str | Path, out: Path) -> None:
-    """Refuse an output folder in a folder of photographs, where the pictures of the run would become photographs.
+def refuse_within(inputs: str | Path, out: Path, *, of: str = "photographs") -> None:
+    """Refuse an output folder in a folder of photographs or captures, where a run's pictures would become such.
 
     Raises:
         ParameterError: it lies there.
     """
-    if Path(photos).is_dir() and lies_in(out, photos):
+    if Path(inputs).is_dir() and lies_in(out, inputs):
         raise ParameterError(
-            f"`{out}` lies in the folder of photographs `{photos}`, in which all pictures are photographs. Choose a "
-            "folder beside it: `out`."
+            f"`{out}` lies in the folder of {of} `{inputs}`, in which all pictures are {of}. Choose a folder beside "
+            "it: `out`."
         )
 
 

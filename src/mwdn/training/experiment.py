@@ -122,6 +122,8 @@ def prepare(
     recipe = _with_sensor(recipe, calibration)
     psf = calibration.psf.to(place)
     _check_one_source(recipe, photos, pairs)
+    for path in recipe.sheet.captures:
+        refuse_within(path, out, of="captures")
     captures = _read_captures(recipe, calibration, exclude, place)
     if recipe.selfsupervised.consistency and captures is not None:
         data = captures_alone(recipe, captures, psf)
@@ -193,8 +195,8 @@ def _check_one_source(recipe: Recipe, photos: Path | None, pairs: Path | None) -
     if recipe.selfsupervised.consistency:
         if photos is not None or pairs is not None or not recipe.sheet.captures:
             raise ParameterError(
-                "A recipe with [selfsupervised] learns from captures alone: give `captures` of [sheet], and neither "
-                "`photos` nor `pairs`."
+                "A recipe with [selfsupervised] learns from captures alone: give `captures` (in the recipe: [sheet]), "
+                "and neither `photos` nor `pairs`."
             )
     elif photos is None and pairs is None:
         raise ParameterError(

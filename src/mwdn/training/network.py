@@ -38,7 +38,13 @@ def build_network(recipe: Recipe) -> nn.Module:
         torch.default_generator.manual_seed(recipe.schedule.seed)
         network = build(**recipe.network)
     start, denoiser = recipe.schedule.start, recipe.schedule.denoiser
-    weights = (load_network(start) if start else network).state_dict()
+    started = load_network(start) if start else network
+    if type(started) is not type(network):
+        raise CheckpointError(
+            f"`start` ('{start}') holds the weights of a `{type(started).__name__}`, but the recipe's network is a "
+            f"`{type(network).__name__}`. Give weights of that network, or choose the other one: `network.name`."
+        )
+    weights = started.state_dict()
     if denoiser:
         weights |= {f"denoiser.{key}": value for key, value in load_checkpoint(denoiser).state_dict().items()}
     try:

@@ -103,10 +103,17 @@ class SampleCache:
 
     @torch.no_grad()
     def measured(self, measure: Measure, network: nn.Module, order: int) -> Tensor:
-        """Apply a measure to the reconstructions and scenes of the samples computed so far, `MEASURED` at most."""
-        rows = sorted(self.samples)[:: -(-len(self.samples) // MEASURED)]
-        pictures = [self.reconstruct_whole(network, [row])[0] for row in rows]
-        return measure(pictures, [self.samples[row].scene for row in rows], order)
+        """Apply a measure to the reconstructions and scenes of the samples computed so far, `MEASURED` at most.
+
+        Measures compare halves of the pairs, so a pair that is in several samples of the last batch counts once.
+        """
+        scenes: dict[int, Scene] = {}
+        for row in sorted(self.samples)[:: -(-len(self.samples) // MEASURED)]:
+            scene = self.samples[row].scene
+            if not any(torch.equal(scene, other) for other in scenes.values()):
+                scenes[row] = scene
+        pictures = [self.reconstruct_whole(network, [row])[0] for row in scenes]
+        return measure(pictures, list(scenes.values()), order)
 
     def reconstruct(self, network: nn.Module, numbers: range | list[int]) -> tuple[Image, Scene]:
         """Reconstructions of the samples of these numbers, and their scenes."""
