@@ -186,7 +186,7 @@ def reason(error: BaseException) -> str:
 
 
 def cut(text: str, most: int) -> str:
-    """Text of at most so many characters; a longer one ends in three dots."""
+    """Text of at most ``most`` characters; a longer one ends in three dots."""
     return text if len(text) <= most else text[: most - 4] + " ..."
 
 

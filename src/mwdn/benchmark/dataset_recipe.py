@@ -19,8 +19,8 @@ class DatasetRecipe:
     Args:
         camera: camera file of `mwdn calibrate`, for the settings of the camera that are not given here.
         psf: of the calibration, a file.
-        bin: average blocks of so many pixels of the PSF and of captures; the protocol shrinks with them.
-        psf_bin: of the PSF besides, where it was taken at so many times the resolution of the captures; 0 for that of
+        bin: side of the blocks of pixels of PSF and captures that are averaged; the protocol shrinks with them.
+        psf_bin: of the PSF besides, where it has a finer resolution than the captures; 0 for that of
             the camera file.
         background: even light under the PSF, as a part of the full scale; estimated if negative.
         upside_down: files have their first row at the bottom.
@@ -29,10 +29,10 @@ class DatasetRecipe:
         test_photos: folder to simulate the test from.
         train: pairs to train on that are made once; 0 makes every sample a new one.
         validation: pairs to choose the best weights by.
-        test: pairs to be scored on; of recorded ones at most so many, 0 for all.
+        test: number of pairs to score on; for recorded pairs an upper limit, 0 for all.
         seed: of all that is simulated.
         placement: how a photograph stands in the scene.
-        deviation: how the true camera differs from its calibration, which is all that methods are told.
+        deviation: of the true camera, which makes the measurements, from the calibration, which the methods get.
         mismatch: the same, drawn anew for each pair, in place of one true camera; see `mwdn.data.mismatch.Mismatch`.
         sensor: its noise; that of the camera file unless given.
         pairs: recorded ones in place of photographs: a file of ``mwdn import``, or a data set of this ``kind``.

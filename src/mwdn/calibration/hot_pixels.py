@@ -56,10 +56,12 @@ def find_dead_pixels(flat: Plane, deviation: Plane, *, cell: int = 1, through_ma
     Returns:
         (1, 1, H, W), bool.
     """
+    import cv2
+
     if through_mask:
         ring = np.ones((3, 3), np.uint8)
         ring[1, 1] = 0
-        low, high = (_filtered(flat, cell, partial(filter, kernel=ring)) for filter in (_cv2().erode, _cv2().dilate))
+        low, high = (_filtered(flat, cell, partial(work, kernel=ring)) for work in (cv2.erode, cv2.dilate))
     else:
         low = high = _local_median(flat, cell)
     low, high, noise = low.clamp(min=1e-6), high.clamp(min=1e-6), HOT * deviation
@@ -69,13 +71,9 @@ def find_dead_pixels(flat: Plane, deviation: Plane, *, cell: int = 1, through_ma
 
 def _local_median(image: Plane, cell: int) -> Plane:
     """Median of 5 x 5 pixels of the same position in the cell of a mosaic."""
-    return _filtered(image, cell, partial(_cv2().medianBlur, ksize=5))
-
-
-def _cv2() -> Any:  # noqa: ANN401 - imported when it is needed: it takes a tenth of a second
     import cv2
 
-    return cv2
+    return _filtered(image, cell, partial(cv2.medianBlur, ksize=5))
 
 
 def _filtered(image: Plane, cell: int, work: Callable[..., Any]) -> Plane:

@@ -1,11 +1,12 @@
 """Choose the terms of a `Refinement` by leaving pairs out.
 
-In each round, each term is tried at each order beyond the one it has, on top of the terms taken so far. A term is
-measured on pairs that it was not fitted to: each part of them (`left_out`) in turn is left out, and only the gain and
-offset of its pairs are fitted.
-The best term is taken if it lowers the mean unexplained part by `MIN_GAIN` and that of more than half of the pairs. The
-field dependence, which no solver uses, comes last: fitted together with the other terms, it would absorb what they can
-explain.
+In each round, each term is tried at each order beyond the one it has, on top of the terms taken so far. Terms are
+scored by cross-validation: the pairs are split into parts (`left_out`); for each part, terms are fitted to the other
+parts, and only gain and offset to its own pairs.
+
+The best term is taken if it lowers the mean unexplained part by `MIN_IMPROVEMENT`, and that of more than half of the
+pairs. The field dependence, which no solver uses, comes last: fitted together with the other terms, it would absorb
+what they can explain.
 """
 
 from collections.abc import Callable, Iterable
@@ -16,7 +17,7 @@ from mwdn.calibration.pair_model import Fit, PairModel, Terms
 from mwdn.errors import ParameterError
 from mwdn.types import Measurement, Psf, Scene
 
-MIN_GAIN = 0.02
+MIN_IMPROVEMENT = 0.02
 """Relative decrease of the unexplained part that makes a term worth taking."""
 
 HIGHEST = {"envelope": 1, "psf_gain": 3, "sensor_field": 2, "stray_light": 2, "field_dependence": 2}
@@ -160,4 +161,4 @@ def _tried(model: PairModel, term: str, order: int, terms: Terms) -> Step:
 def _is_better(step: Step, before: Step) -> bool:
     pairs = zip(step.unexplained, before.unexplained, strict=True)
     wins = sum(new < old for new, old in pairs)
-    return step.mean < (1 - MIN_GAIN) * before.mean and wins > len(before.unexplained) / 2
+    return step.mean < (1 - MIN_IMPROVEMENT) * before.mean and wins > len(before.unexplained) / 2

@@ -31,7 +31,7 @@ class WatchedFolder(CameraSource):
         mosaic: colours of a 2 x 2 cell of raw frames; a camera's raw file says its own.
         existing: also read the files that are there when the folder is opened.
         timeout_s: seconds to wait for a file.
-        wait: sleeps so many seconds.
+        wait: sleeps for a number of seconds.
 
     Raises:
         ParameterError: a wrong bit depth.

@@ -27,7 +27,7 @@ class Grabber:
         camera: open; opened again if it fails.
         table: its settings, and how often it may fail for one frame.
         skip: frames that are read and not used before each one.
-        wait: sleeps so many seconds.
+        wait: sleeps for a number of seconds.
     """
 
     def __init__(self, camera: CameraSource, table: CameraTable, skip: int, wait: Callable[[float], None]) -> None:

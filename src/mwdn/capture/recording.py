@@ -132,7 +132,7 @@ class Replay(CameraSource):
         loop: start again at the end.
         realtime: wait between frames as long as between their timestamps; otherwise each is there at once.
         timeout_s: has no effect.
-        wait: sleeps so many seconds.
+        wait: sleeps for a number of seconds.
     """
 
     live = False

@@ -46,7 +46,7 @@ class Rig(CameraSource):
         picture: on the display at first, with the display's size; a point in its middle unless given.
         playlist: what the display plays while the camera is read.
         timeout_s: has no effect.
-        wait: sleeps so many seconds.
+        wait: sleeps for a number of seconds.
 
     Raises:
         ShapeError: the PSF has another size.

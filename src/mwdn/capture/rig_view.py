@@ -27,12 +27,12 @@ def view(light: FloatFrame, homography: Homography, size: Size) -> Scene:
 
     # Display pixels per sample, at the display's middle: if there are several, the display is downsampled first, so
     # that none is skipped.
-    shrink = max(min(int(1 / (_magnification(homography, light.shape[:2]) * SAMPLES)), *light.shape[:2]), 1)
-    if shrink > 1:
-        height, width = (length // shrink * shrink for length in light.shape[:2])
-        cells = light[:height, :width].reshape(height // shrink, shrink, width // shrink, shrink, -1)
+    factor = max(min(int(1 / (_magnification(homography, light.shape[:2]) * SAMPLES)), *light.shape[:2]), 1)
+    if factor > 1:
+        height, width = (length // factor * factor for length in light.shape[:2])
+        cells = light[:height, :width].reshape(height // factor, factor, width // factor, factor, -1)
         light = np.ascontiguousarray(cells.mean((1, 3)))
-        homography = homography @ _scaled(float(shrink))
+        homography = homography @ _scaled(float(factor))
     to_fine = _scaled(float(SAMPLES)) @ homography
     large = cv2.warpPerspective(light, to_fine, (size[1] * SAMPLES, size[0] * SAMPLES), flags=cv2.INTER_LINEAR)
     seen = torch.from_numpy(np.asarray(large)).movedim(-1, 0)[None]

@@ -49,7 +49,7 @@ class Session:
         camera: open; opened again if it fails.
         display: in front of it.
         out: file of pairs, ending in .h5; an existing one of this recipe is continued.
-        wait: sleeps so many seconds.
+        wait: sleeps for a number of seconds.
         progress: see `Progress`.
         lamp: switches the point source of [point] on or off, or has a person do it.
     """

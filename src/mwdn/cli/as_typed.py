@@ -15,10 +15,9 @@ def as_typed(message: str, own: Collection[str], typed: Collection[str] = ()) ->
             words are values, such as the name of a folder, and stay.
 
     Returns:
-        The message, where a word in backticks is an option if the command has it or if it was typed, and so are keyword
-        arguments such as ``bin=4, crop=(8, 8)``. If the message
-        starts with the table of a recipe, ``[sensor]: ``, its words are keys of this table, and the command's own
-        options of the same name are not meant.
+        The message with options in place of names. A word in backticks becomes an option if the command has it or if it
+        was typed; so do keyword arguments such as ``bin=4, crop=(8, 8)``. In a message that starts with the table of a
+        recipe, ``[sensor]: ``, words are keys of this table.
     """
     table = re.match(r"\[([^]]+)\]: ", message)
     keys = {option.split("=")[0] for option in typed if option.startswith("--")} - set(own)

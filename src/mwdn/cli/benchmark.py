@@ -36,7 +36,8 @@ def benchmark(
         device: cpu, cuda, cuda:1 ...; a GPU if there is one unless given.
         lpips: LPIPS and feature MSE: download their public weights (234 MiB, once) if they are missing, or leave both
             metrics out. By default they are used if they are there; a terminal asks before a download.
-        seed: of the trainings: start weights and order of the pairs; that of the recipe unless given.
+        seed: of the initial weights; that of the recipe unless given. The pairs and their order have the seed of the
+            data set.
     """
     from mwdn.benchmark import Watch, read_benchmark, run
     from mwdn.benchmark.run import PAGE

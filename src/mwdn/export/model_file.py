@@ -82,7 +82,11 @@ def run_file(file: Path, measurement: Measurement) -> Scene:
 
 
 def read_about(file: Path) -> dict[str, str]:
-    """Description stored in an exported file: method, version, PSF, size, units."""
+    """The description that `export` stored in a file: method, version, PSF, size and units, each as text.
+
+    Args:
+        file: .pt2 or .onnx.
+    """
     if file.suffix == ".pt2":
         extra = {ABOUT: ""}
         torch.export.load(file, extra_files=extra)

@@ -57,7 +57,7 @@ def check_channels(picture: Image, channels: int) -> None:
 
 
 def check_sides(picture: Image, halvings: int) -> None:
-    """Raise a `ShapeError` unless a measurement or PSF can be pooled so many times."""
+    """Raise a `ShapeError` unless a measurement or PSF can be halved ``halvings`` times."""
     if min(picture.shape[-2:]) < 2**halvings:
         raise ShapeError(
             f"A picture or PSF {tuple(picture.shape)} must have at least {2**halvings} x {2**halvings} pixels for this "

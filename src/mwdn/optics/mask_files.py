@@ -216,12 +216,12 @@ def _rectangles(filled: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
 
 
 def _chosen(length: int, every: int) -> npt.NDArray[np.int64]:
-    """Every n-th sample of so many, and the last one."""
+    """Every ``every``-th of ``length`` samples, and the last one."""
     return np.unique(np.append(np.arange(0, length, every), length - 1))
 
 
 def _places(chosen: npt.NDArray[np.int64], length: int) -> npt.NDArray[np.float64]:
-    """Places of the chosen of so many samples, in samples from the middle; the outermost ones are at the edges."""
+    """Places of the chosen samples, in samples from the middle of ``length``; the outermost are at the edges."""
     places = chosen - length // 2.0
     return np.concatenate([[places[0] - 0.5], places[1:-1], [places[-1] + 0.5]])
 

@@ -36,6 +36,6 @@ def coefficient_count(order: int) -> int:
 
 
 def polynomial_order(count: int) -> int | None:
-    """Order of a polynomial with so many coefficients; ``None`` for another count."""
+    """Order of the polynomials with ``count`` coefficients; ``None`` if no order has as many."""
     order = (math.isqrt(8 * count + 1) - 3) // 2
     return order if coefficient_count(order) == count else None

@@ -94,7 +94,7 @@ def make_server(
     """A server with its application.
 
     Args:
-        cameras: `mwdn.preview.cameras.Cameras`.
+        cameras: `mwdn.preview.cameras.StoredCameras`.
         limits: of the server.
         host: see `PreviewServer`.
         port: likewise.

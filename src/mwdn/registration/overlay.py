@@ -16,7 +16,7 @@ _SIDE = 640
 
 _GREEN, _ORANGE = (60, 220, 90), (255, 140, 30)
 _ENLARGED = 10
-"""Displacements are drawn so many times as long."""
+"""Factor on the length of displacements in the drawing."""
 
 
 def draw_outline(reconstruction: Image, corners: Points, residuals: Residuals | None = None) -> Tensor:

@@ -25,7 +25,7 @@ Track = Callable[[list[int]], Iterable[int]]
 
 
 def chosen(count: int, most: int) -> list[int]:
-    """At most so many positions of ``count``, evenly spread."""
+    """At most ``most`` positions of ``count``, evenly spread."""
     step = max(1.0, count / most)
     return [int(step * number) for number in range(min(count, most))]
 

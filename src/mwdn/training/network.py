@@ -58,13 +58,13 @@ def build_network(recipe: Recipe) -> nn.Module:
 
 
 def takes_channels(network: nn.Module, colours: int) -> bool:
-    """Whether a network takes measurements of so many channels; a `FixedFront` takes grey as equal colours."""
+    """Whether a network takes measurements of ``colours`` channels; a `FixedFront` takes grey as equal colours."""
     channels = getattr(network, "channels", colours)
     return channels in (0, colours) or (colours == 1 and isinstance(network, FixedFront))  # 0 is any number
 
 
 def check_colours(network: Mapping[str, Any], colours: int, *, of: str, way_out: str) -> None:
-    """Check that a network takes measurements of so many channels.
+    """Check that a network takes measurements of ``colours`` channels.
 
     Args:
         network: its name and options, as in [network] of a recipe.

@@ -82,7 +82,7 @@ class SampleFiles:
             save_file({name: value.cpu() for name, value in sample._asdict().items()}, temporary)
 
     def fits(self, size: int) -> bool:
-        """Whether so many bytes are at most `FREE_PART` of the disk's free space."""
+        """Whether ``size`` bytes are at most `FREE_PART` of the disk's free space."""
         disk = next(folder for folder in (self.run, *self.run.resolve().parents) if folder.exists())
         return size <= FREE_PART * shutil.disk_usage(disk).free
 

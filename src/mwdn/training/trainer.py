@@ -292,9 +292,9 @@ class Trainer:
         state, header = saved
         try:
             restore(state, network=self.network, average=self.average, optimiser=self.optimiser)
-        except (KeyError, RuntimeError) as error:
+            self.step, self.best = int(header["step"]), float(header["best"])
+            saved_schedule = header.get("lr_schedule") or header["course"]  # the second is its former name
+            self.lr_schedule = make_lr_schedule(self.recipe, **json.loads(saved_schedule))
+        except (KeyError, ValueError, TypeError, RuntimeError) as error:
             raise damaged(self.folder.state, "a part is missing") from error
-        self.step, self.best = int(header["step"]), float(header["best"])
         self.fingerprint = header.get("samples", "")
-        saved_schedule = header.get("lr_schedule") or header["course"]  # the second is its former name
-        self.lr_schedule = make_lr_schedule(self.recipe, **json.loads(saved_schedule))
