@@ -1,4 +1,4 @@
-"""Each field of a JSON document that a command writes is in the page that describes it."""
+"""Each field of a JSON document that a command writes, and each key of a session, is in the page that describes it."""
 
 import re
 from dataclasses import fields
@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from mwdn.calibration.report import Levels, PsfReport
+from mwdn.capture.recipe import TABLES
 from mwdn.diagnosis import Verdict
 from mwdn.diagnosis.trust import examine_picture
 from mwdn.evaluation.report import Report, Scores
@@ -42,3 +43,9 @@ def test_reconstruct():
     numbers = examine_picture(scene, psf, scene).content
     assert {*numbers, "method", "psf_hash", "origin", "bin", "verdicts"} <= documented("reconstruct.md", "## Output")
     assert {field.name for field in fields(Verdict)} <= documented("troubleshooting.md")
+
+
+@pytest.mark.parametrize("table", TABLES.keys() - {"rig"})
+def test_capture(table):
+    """Keys such as `skip` and `most_s` were in no page."""
+    assert {field.name for field in fields(TABLES[table])} <= documented("capture.md", "## A session")
