@@ -1,4 +1,4 @@
-"""`mwdn demo`: a simulated camera, its captures, and every method that needs no training."""
+"""`mwdn demo`: a simulated camera, its captures, and five methods that need no training."""
 
 from dataclasses import replace
 from pathlib import Path
