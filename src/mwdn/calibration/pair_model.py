@@ -33,9 +33,6 @@ RIDGE = 1e-4
 DELTA = 0.01
 """Displacement of the envelope for finite differences, over the shorter side."""
 
-Pairs = Sequence[tuple[Measurement, Scene]]
-"""Measurements and scenes, (1, C, H, W) each."""
-
 
 @dataclass(frozen=True)
 class Terms:

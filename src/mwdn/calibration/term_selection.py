@@ -36,7 +36,7 @@ PARTS = 10
 MOVES = 3
 """Gauss-Newton steps on the envelope's displacement."""
 
-Pairs = Iterable[tuple[Measurement, Scene]]
+MeasuredPairs = Iterable[tuple[Measurement, Scene]]
 """Measurements and scenes, (1, C, H, W) each."""
 
 
@@ -97,7 +97,7 @@ def left_out(count: int) -> list[range]:
 
 def select_terms(
     psf: Psf,
-    pairs: Callable[[], Pairs],
+    pairs: Callable[[], MeasuredPairs],
     *,
     report: Callable[[Step], None] = lambda step: None,
 ) -> Selection:
@@ -137,7 +137,7 @@ def select_terms(
     return Selection(plain, displaced, tuple(steps))
 
 
-def _displaced(model: PairModel, terms: Terms, psf: Psf, pairs: Callable[[], Pairs]) -> PairModel:
+def _displaced(model: PairModel, terms: Terms, psf: Psf, pairs: Callable[[], MeasuredPairs]) -> PairModel:
     """Gauss-Newton on the displacement, which a model linearises: the other terms then apply to the displaced PSF."""
     down, right = 0.0, 0.0
     for step in range(1, MOVES + 1):

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from cyclopts import App, Parameter
 from cyclopts.config import Toml
 
-from mwdn.cli.terminal import say, warn
+from mwdn.cli.terminal import quoted, say, warn
 from mwdn.errors import ParameterError, UnknownNameError
 from mwdn.io.files import check_folder, refuse_overwrite
 from mwdn.io.toml import find_recipe
@@ -77,7 +77,7 @@ class Output:
         say(
             f"PSF {made['psf_hash']}: {light} of the aperture's light on the sensor, resolution "
             f"{made['resolution_mrad']:.1f} mrad, field {field} degrees. Use it: "
-            f"--psf {self.out / 'psf.tif'} --background 0",
+            f"--psf {quoted(self.out / 'psf.tif')} --background 0",
         )
 
 

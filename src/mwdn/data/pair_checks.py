@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from shlex import quote
 
 from mwdn.calibration.psf import Calibration
 from mwdn.calibration.psf_identity import other_psf
@@ -84,7 +85,8 @@ def refuse_raw(file: PairFile) -> None:
     if file.raw_bits is not None:
         raise ParameterError(
             f"`{file.path}` holds raw frames of {file.raw_bits} bits and the pictures as displayed, not yet pairs of "
-            f"measurement and scene. Align them first: `mwdn align {file.path} --camera camera.toml -o aligned.h5`."
+            f"measurement and scene. Align them first: `mwdn align {quote(str(file.path))} --camera camera.toml -o "
+            "aligned.h5`."
         )
 
 

@@ -5,6 +5,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Any, NamedTuple, SupportsIndex
 
 import numpy as np
@@ -210,7 +211,7 @@ def _read_header(path: Path, file: Any) -> _Header:  # noqa: ANN401
 def _read_shapes(path: Path, file: Any) -> tuple[int, Shape, Shape]:  # noqa: ANN401
     with as_incomplete(path, _MAKE_AGAIN):
         if "gt" in file and "blur" in file:
-            raise ImageError(f"`{path}` is the authors' file: `mwdn import mwdn {path} -o pairs.h5`.")
+            raise ImageError(f"`{path}` is the authors' file: `mwdn import mwdn {quote(str(path))} -o pairs.h5`.")
     shapes = []
     for name in NAMES:
         data = find_rows(path, file, name, _MAKE_AGAIN)

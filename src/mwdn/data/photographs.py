@@ -67,9 +67,10 @@ class Photographs:
         return parts[0], parts[1]
 
     def to(self, device: torch.device | str) -> "Photographs":
-        """Move the pictures to a device, on which `light` then works."""
-        self._pixels, self._light = self._pixels.to(device), self._light.to(device)
-        return self
+        """The photographs on a device, on which `light` works."""
+        moved = copy.copy(self)
+        moved._pixels, moved._light = self._pixels.to(device), self._light.to(device)
+        return moved
 
 
 def _square(path: Path, side: int) -> Frame:

@@ -19,7 +19,7 @@ from starlette.staticfiles import StaticFiles
 from mwdn.calibration import Calibration
 from mwdn.errors import MwdnError, ParameterError
 from mwdn.io.formats import is_for_viewing
-from mwdn.preview.cameras import OPTIONS, StoredCameras, checked_camera, describe
+from mwdn.preview.cameras import OPTIONS, StoredCameras, checked_camera
 from mwdn.preview.guard import Guard, failed, log
 from mwdn.preview.jobs import ENDED, Job, Jobs
 from mwdn.preview.limits import Limits, RefusedError
@@ -144,10 +144,7 @@ class Preview:
 
     async def camera(self, request: Request) -> Response:
         """One calibration."""
-        name = request.path_params["name"]
-        calibration = await self._thread(partial(self.cameras.get, name))
-        kind = next((each["kind"] for each in self.cameras.list() if each["name"] == name), "sample")
-        return JSONResponse(describe(name, kind, calibration))
+        return JSONResponse(await self._thread(partial(self.cameras.described, request.path_params["name"])))
 
     async def add_camera(self, request: Request) -> Response:
         """Store a calibration."""
@@ -158,7 +155,7 @@ class Preview:
             self.cameras.add(name, psf, options)
 
         await self._ended(request, self.jobs.submit(add, size=len(psf)))
-        return JSONResponse(describe(name, "stored", self.cameras.get(name)), 201)
+        return JSONResponse(await self._thread(partial(self.cameras.described, name)), 201)
 
     async def remove_camera(self, request: Request) -> Response:
         """Remove a stored calibration."""

@@ -65,6 +65,17 @@ class StoredCameras:
         named.append(("sample", CAMERA, sample_calibration()))
         return [describe(name, kind, calibration) for kind, name, calibration in named]
 
+    def described(self, name: str) -> dict[str, Any]:
+        """For JSON: one of the `list`.
+
+        Raises:
+            RefusedError: no such name.
+        """
+        calibration = self.get(name)
+        with self._lock:
+            kind = "given" if name in self.given else "stored" if name in self._stored else "sample"
+        return describe(name, kind, calibration)
+
     def get(self, name: str) -> Calibration:
         """A calibration by its name.
 
