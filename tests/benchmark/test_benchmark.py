@@ -278,6 +278,7 @@ def test_another_method_and_another_set_are_a_line_each(done):
         ("mwdn = {} }", "mwdn = { widht = 3 } }", UnknownNameError, "Did you mean 'width'?"),
         ("iterations = 3 } }", "iterations = 3 }, universal = { width = 3 } }", UnknownNameError, "width"),
         ("mwdn = {} }", "mwdn = 3 }", ParameterError, "must be a table of options"),
+        ("iterations = 3 } }", "iterations = -3 } }", ParameterError, r"\[solvers\..*\]: `iterations` \(-3\)"),
         (
             "mwdn = {} }",
             "'../../ESC' = { name = 'mwdn' } }",

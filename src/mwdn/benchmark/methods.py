@@ -7,7 +7,7 @@ from inspect import signature
 from typing import Any
 
 from mwdn.errors import ParameterError, UnknownNameError, check_options, shown
-from mwdn.io.toml import check_table, to_dataclass
+from mwdn.io.toml import check_table, named_table, to_dataclass
 from mwdn.networks import NETWORKS
 from mwdn.training.recipe import Schedule
 
@@ -56,6 +56,9 @@ def read_methods(
         schedule = check_table(line.get("schedule", {}) if table == "networks" else {}, f"{table}.{label}.schedule")
         to_dataclass(Schedule, f"{table}.{label}.schedule", schedule)
         check_options(registry[name], f"'{name}'", options)
+        if table == "solvers":  # a number outside its range is found before anything is trained
+            with named_table(f"{table}.{label}"):
+                registry[name](**options)
         parameters = signature(registry[name]).parameters
         common = {key: value for key, value in shared.items() if key in parameters}
         methods.append(Method(label, name, {**common, **options}, table == "networks", schedule))
