@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import NoReturn
 
 import cyclopts
-from cyclopts import App, Parameter
+from cyclopts import App, Group, Parameter
 
 from mwdn.cli import terminal
 from mwdn.cli.as_typed import as_typed
@@ -82,6 +82,15 @@ COMMANDS = {
 }
 """Module in `mwdn.cli` and function of each command, and the first line of its docstring."""
 
+GROUPS = (
+    (Group("Get pictures", sort_key=0), ("reconstruct", "methods", "explain", "export")),
+    (Group("Try it", sort_key=1), ("demo", "preview", "doctor")),
+    (Group("Describe a camera", sort_key=2), ("calibrate", "inspect", "design")),
+    (Group("Record pairs", sort_key=3), ("capture", "align", "import", "simulate")),
+    (Group("Train and compare", sort_key=4), ("train", "recipes", "evaluate", "benchmark", "interpret")),
+)
+"""Commands in the order of the help."""
+
 
 def make_app(command: str | None = None) -> App:
     """The command line. Only the one command that runs is imported: most import torch, which takes two seconds."""
@@ -91,16 +100,18 @@ def make_app(command: str | None = None) -> App:
         config=(from_camera_file, note_given),
         help="Lensless imaging: reconstruct the scene from the pattern that a thin mask casts on a sensor.",
         help_formatter=HelpTexts(command) if command else None,
+        group_commands=None if command else Group("Others", sort_key=len(GROUPS)),
         help_format=None if command else "plaintext",  # Markdown takes 0.1 s to import
         suppress_keyboard_interrupt=False,  # `main` says how to go on
         default_parameter=Parameter(negative_iterable=()),  # no `--empty-crop`
     )
+    groups = {name: group for group, names in GROUPS for name in names}
     for name, (place, summary) in COMMANDS.items():
         module, _, function = place.partition(":")
         if name == command:
             app.command(getattr(import_module(f"mwdn.cli.{module}"), function), name=name)
         else:
-            app.command(f"mwdn.cli.{place}", name=name, help=summary)
+            app.command(f"mwdn.cli.{place}", name=name, help=summary, group=groups[name])
     add_global_options(app)
     app.register_install_completion_command(
         help="Let the shell (bash, zsh, fish, PowerShell) complete commands and options."
