@@ -31,10 +31,12 @@ def test_a_network_returns_with_the_same_weights(checkpoint, tmp_path):
     assert all(torch.equal(expected[key], found[key]) for key in expected)
 
 
-def test_the_folder_is_a_method(checkpoint, tmp_path):
+@pytest.mark.parametrize("is_run", [False, True])
+def test_the_folder_is_a_method(checkpoint, tmp_path, is_run):
+    """That of `save_pretrained`, or of a training run."""
     calibration = mwdn.Calibration(sample_camera(3, (32, 32)).expand(1, 3, -1, -1))
     measurement = torch.rand(1, 3, 32, 32)
-    folder = save_pretrained(checkpoint, tmp_path / "lensless")
+    folder = checkpoint.parent if is_run else save_pretrained(checkpoint, tmp_path / "lensless")
     reconstruct = mwdn.Reconstructor(folder, calibration, device="cpu")
     assert "0123456789abcdef" in reconstruct.warning
     expected = mwdn.Reconstructor(checkpoint, calibration, device="cpu")(measurement)

@@ -25,6 +25,9 @@ HUB = "hub:"
 WEIGHTS = "model.safetensors"
 """Checkpoint in a folder of `mwdn.bridges.save_pretrained`, or in a repository on the hub."""
 
+BEST = "best.safetensors"
+"""Checkpoint in the folder of a training run."""
+
 _FOLDER = Path(str(files("mwdn") / "weights"))
 
 
@@ -34,15 +37,18 @@ def bundled_file(name: str) -> Path:
 
 
 def find_weights(name: str) -> Path | None:
-    """File of a bundled network, of a folder with one, or of one on the hub, downloaded once; ``None`` for other names.
+    """File of a bundled network, of a folder with `WEIGHTS` or `BEST`, or of one on the hub, downloaded once.
+
+    ``None`` for other names.
 
     Raises:
         CheckpointError: it is not on the hub, or the hub cannot be reached.
     """
     if name in BUNDLED:
         return bundled_file(name)
-    if (path := Path(name) / WEIGHTS).is_file():
-        return path
+    for file in (WEIGHTS, BEST):
+        if (path := Path(name) / file).is_file():
+            return path
     return _download(name) if name.startswith(HUB) else None
 
 
@@ -61,8 +67,8 @@ def load_network(name: str | Path) -> nn.Module:
     """Load a network on the CPU, in evaluation mode.
 
     Args:
-        name: ``universal`` or ``universal-small``, ``hub:owner/name``, or the path of a checkpoint or of a folder with
-            model.safetensors, as `mwdn.bridges.save_pretrained` writes it.
+        name: ``universal`` or ``universal-small``, ``hub:owner/name``, or the path of a checkpoint, of the folder of a
+            training run, or of one that `mwdn.bridges.save_pretrained` wrote.
 
     Raises:
         CheckpointError: no such file, a damaged one, or weights that do not fit their network.
