@@ -140,13 +140,15 @@ def _train(trainer: Trainer, progress: Progressing, board: TensorBoard | None) -
             start_training()
 
     def show_step(report: Report) -> None:
+        best = f"loss {-trainer.best:.4f}" if trainer.schedule.best_by == "loss" else f"{trainer.best:.2f} dB"
         if report.step == 1:
             for line in _measured(trainer):
                 progress.print(line)
+            if trainer.schedule.anchor and report.validation is None:
+                progress.print(f"start: validation {best}")
         speed = f"{report.pictures_per_s:.1f} pictures/s"
         progress.update(report.step, f"step {report.step:,}, {speed}, loss {report.loss:.4f}")
         if report.validation is not None:
-            best = f"loss {-trainer.best:.4f}" if trainer.schedule.best_by == "loss" else f"{trainer.best:.2f} dB"
             progress.print(f"step {report.step}: validation {report.validation.psnr:.2f} dB, best {best}")
         if board is not None:
             board(report)
