@@ -422,7 +422,7 @@ def test_several_distances(run, folder):
     assert (wrong[0], "Give `--distances` in the order of the frames" in wrong[2]) == (0, True)
     save("scene", [bench.point()])
     code, _, err = run("reconstruct scene --psf camera.toml --distance 160 --method wiener --no-trust --device cpu")
-    assert (code, "magnified by" in err) == (0, True)
+    assert (code, err.count("magnified by")) == (0, 1)
     for camera in ("", "--camera camera.toml"):  # the camera file's other PSFs do not belong to another one
         code, _, err = run(f"reconstruct scene {camera} --psf at_100/frame_1.png --distance 160 --method wiener")
         assert (code, "`--distance`" in err, "several distances" in err) == (2, True, True)

@@ -14,7 +14,7 @@ from mwdn.weights.bundled import BUNDLED
 
 def binned(
     calibration: Calibration, camera: CameraOptions, method: str, captures: Iterable[str]
-) -> tuple[Calibration, str]:
+) -> tuple[Calibration, list[str]] | None:
     """Bin a calibration as far as that loses little, for methods that work for any camera.
 
     Args:
@@ -26,19 +26,20 @@ def binned(
             the PSF's lines in the capture's pixels is not known.
 
     Returns:
-        The calibration, and a sentence for the user, empty if nothing is binned.
+        The calibration, and sentences about it for the user; ``None`` if nothing is binned.
     """
     if method not in BUNDLED and method not in SOLVERS:
-        return calibration, ""
+        return None
     verdict = binning(calibration)
     bin, psf_bin = int(verdict.value), camera.psf_format.psf_bin
     if bin == 1 or not _sizes_agree(calibration, captures):
-        return calibration, ""
+        return None
     psf_format = replace(camera.psf_format, psf_bin=psf_bin and psf_bin * bin)
     options = replace(camera, frames=replace(camera.frames, bin=bin), psf_format=psf_format)
     reason = verdict.text[0].lower() + verdict.text[1:].rstrip(".")
     refuse = "`--bin 1` refuses; `--full-size` gives pictures at the frame's size"
-    return options.load(), f"Binned by {bin}: {reason} ({refuse})."
+    calibration, sentence = options.read()
+    return calibration, [sentence, f"Binned by {bin}: {reason} ({refuse})."]
 
 
 def _sizes_agree(calibration: Calibration, captures: Iterable[str]) -> bool:

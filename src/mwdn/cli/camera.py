@@ -65,11 +65,24 @@ class CameraOptions:
         return self.psf
 
     def load(self, corrections: Corrections = Corrections(), *, psf_done: bool = False) -> Calibration:
+        """The calibration of `read`, whose sentence is printed."""
+        calibration, sentence = self.read(corrections, psf_done=psf_done)
+        note(*filter(None, [sentence]))
+        return calibration
+
+    def read(self, corrections: Corrections = Corrections(), *, psf_done: bool = False) -> tuple[Calibration, str]:
         """Read the calibration.
 
         Args:
             corrections: flat field and hot pixels, for a camera without a camera file.
             psf_done: no flat field and hot pixels for the PSF's file, whatever the camera file says.
+
+        Returns:
+            The calibration, and a sentence about the PSF of `distance`, empty without one.
+
+        Raises:
+            ParameterError: no PSF is given.
+            MwdnError: a file cannot be read, or does not fit.
         """
         formats = {**vars(self.frames), **vars(self.psf_format)}
         detail(f"{self.psf_file}: {', '.join(f'{name} {value}' for name, value in formats.items())}")
@@ -80,8 +93,4 @@ class CameraOptions:
         else:
             options |= {"psf_corrected": True} if psf_done else {}
             calibration = Calibration.load(self.camera, psf=self.psf_file, **options)
-        if self.distance is None:
-            return calibration
-        calibration, sentence = at_distance(calibration, self.distance)
-        note(sentence)
-        return calibration
+        return (calibration, "") if self.distance is None else at_distance(calibration, self.distance)

@@ -91,12 +91,13 @@ def reconstruct(  # noqa: PLR0913
         raise ParameterError("`map` needs the check that `--no-trust` skips. Leave out one of them.")
     method_options = read_options([method], options, reconstruct)[method]
     with distributed.process_group():
-        calibration, remark = camera.load(), ""
+        calibration, sentence = camera.read()
+        remarks = [sentence]
         check_size(calibration.psf)
         # Listed by the first process: files may be added to a folder meanwhile.
         files: list[str] = distributed.broadcast_json(lambda: _list_files(captures, camera, out, format))
-        if auto_bin:
-            calibration, remark = binned(calibration, camera, method, files)
+        if auto_bin and (coarse := binned(calibration, camera, method, files)):
+            calibration, remarks = coarse
         reconstructor = Reconstructor(
             method,
             replace(calibration, white_balance=None),  # the camera file's is `white_balance` unless `none`
@@ -120,7 +121,7 @@ def reconstruct(  # noqa: PLR0913
         )
         is_first = distributed.rank() == 0
         if is_first:
-            _announce(batch, remark)
+            _announce(batch, remarks)
             _name_turned([camera.psf_file.name] if orientation(camera.psf_file) != 1 else [])
         failed, existing, turned = _run(batch, files)
         if is_first:
@@ -136,12 +137,12 @@ def reconstruct(  # noqa: PLR0913
     return status
 
 
-def _announce(batch: Batch, remark: str) -> None:
-    """Print method, device and PSF, with the warning and the remark about them."""
+def _announce(batch: Batch, remarks: list[str]) -> None:
+    """Print method, device and PSF, with the warning and the remarks about them."""
     reconstructor = batch.reconstruct
     warn(reconstructor.warning)
     detail(f"{batch.method} on {reconstructor.device}")
-    note(*filter(None, [remark]))
+    note(*filter(None, remarks))
     background = ", ".join(f"{level:.4f}" for level in reconstructor.calibration.background)
     say(f"PSF {reconstructor.calibration.psf_hash}, background {background} of the full scale subtracted")
 
