@@ -46,7 +46,7 @@ def find_isolated_pixels(capture: Image, *, cell: int = 1) -> Tensor:
     excess = (planes[channel, y, x] - level) / deviation.clamp(min=1e-12)
     hot = excess > ISOLATED[1]
     count, suspected = int(hot.sum()), int((excess > ISOLATED[0]).sum())
-    found = torch.zeros_like(planes)
+    hot_mask = torch.zeros_like(planes)
     if count >= suspected / 2 and count <= MAX_ISOLATED * planes.numel():
-        found[channel[hot], y[hot], x[hot]] = 1.0
-    return F.pixel_shuffle(found[None], cell).amax(1, keepdim=True) > 0
+        hot_mask[channel[hot], y[hot], x[hot]] = 1.0
+    return F.pixel_shuffle(hot_mask[None], cell).amax(1, keepdim=True) > 0

@@ -60,14 +60,15 @@ class HarvestersCamera(CameraSource):
         return files
 
     def _index(self) -> int:
-        found = list(self._harvester.device_info_list)
-        names = [f"{each.display_name} {each.id_} {each.serial_number}" for each in found]
-        if self.address.isdecimal() and int(self.address) < len(found):
+        devices = list(self._harvester.device_info_list)
+        names = [f"{each.display_name} {each.id_} {each.serial_number}" for each in devices]
+        if self.address.isdecimal() and int(self.address) < len(devices):
             return int(self.address)
         matches = [number for number, name in enumerate(names) if self.address in name]
         if len(matches) != 1:
             raise CameraError(
-                f"{self.name} names {len(matches)} of {len(found)} cameras: {', '.join(names)[:150] or 'none found'}. "
+                f"{self.name} names {len(matches)} of {len(devices)} cameras: "
+                f"{', '.join(names)[:150] or 'none found'}. "
                 "Give its number."
             )
         return matches[0]

@@ -35,18 +35,19 @@ class PylonCamera(CameraSource):
         self.close()
         self._pylon = pylon
         factory = pylon.TlFactory.GetInstance()
-        found = list(factory.EnumerateDevices())
-        names = [f"{each.GetFriendlyName()} {each.GetSerialNumber()}" for each in found]
+        devices = list(factory.EnumerateDevices())
+        names = [f"{each.GetFriendlyName()} {each.GetSerialNumber()}" for each in devices]
         matches = [
             number for number, name in enumerate(names) if self.address in ("first", name) or self.address in name
         ]
         if not matches or (len(matches) > 1 and self.address != "first"):
             raise CameraError(
-                f"{self.name} names {len(matches)} of {len(found)} cameras: {', '.join(names)[:150] or 'none found'}. "
+                f"{self.name} names {len(matches)} of {len(devices)} cameras: "
+                f"{', '.join(names)[:150] or 'none found'}. "
                 "Check its cable; give its serial number."
             )
         with self.as_camera_error("cannot be opened", "Close other programs that use it."):
-            self._camera = pylon.InstantCamera(factory.CreateDevice(found[matches[0]]))
+            self._camera = pylon.InstantCamera(factory.CreateDevice(devices[matches[0]]))
             self._camera.Open()
             self._start()
 

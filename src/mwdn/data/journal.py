@@ -190,9 +190,9 @@ def recover(path: Path) -> None:
         OSError: the disk.
     """
     journal = journal_of(path)
-    found = _read_journal(journal)
-    if found is not None:
-        identity, length, changes = found
+    journalled = _read_journal(journal)
+    if journalled is not None:
+        identity, length, changes = journalled
         with path.open("rb+") as file:
             if identity not in file.read(_HEAD):
                 raise ImageError(f"`{journal}` belongs to another file than `{path}`. Move it away.")

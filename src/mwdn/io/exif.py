@@ -44,10 +44,10 @@ def orientation_in(file: BinaryIO) -> int:
     """As `orientation`, of an open file."""
     try:
         start = _find_tiff(file)
-        found = 1 if start is None else _read_tag(file, start)
+        turn = 1 if start is None else _read_tag(file, start)
     except (ImageError, struct.error):  # cut off
         return 1
-    return found if found in TURNS else 1
+    return turn if turn in TURNS else 1
 
 
 def upright(frame: Frame, orientation: int) -> Frame:

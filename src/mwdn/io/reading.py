@@ -53,8 +53,8 @@ def open_regular(path: str | Path, error: type[MwdnError] = ImageError) -> Binar
 
 def _check_regular(mode: int) -> None:
     if not stat.S_ISREG(mode):
-        found = "a folder" if stat.S_ISDIR(mode) else "a pipe" if stat.S_ISFIFO(mode) else "a device or socket"
-        raise ImageError(f"must be a file, but is {found}. Name one file inside a folder; save a pipe as a file.")
+        what = "a folder" if stat.S_ISDIR(mode) else "a pipe" if stat.S_ISFIFO(mode) else "a device or socket"
+        raise ImageError(f"must be a file, but is {what}. Name one file inside a folder; save a pipe as a file.")
 
 
 def _why(error: OSError | ValueError) -> str:

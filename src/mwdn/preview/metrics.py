@@ -38,10 +38,10 @@ class Metrics:
         lines = []
         for name, (kind, meaning) in MEANINGS.items():
             lines += [f"# HELP {name} {meaning}", f"# TYPE {name} {kind}"]
-            found = {labels: value for (other, labels), value in sorted(counts.items()) if other == name}
+            values = {labels: value for (other, labels), value in sorted(counts.items()) if other == name}
             if name in self.gauges:
-                found[()] = self.gauges[name]()
-            lines += [f"{name}{_labels(dict(labels))} {value:g}" for labels, value in (found or {(): 0}).items()]
+                values[()] = self.gauges[name]()
+            lines += [f"{name}{_labels(dict(labels))} {value:g}" for labels, value in (values or {(): 0}).items()]
         return "\n".join(lines) + "\n"
 
 

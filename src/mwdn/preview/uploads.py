@@ -167,16 +167,16 @@ async def read_form(request: Request, limits: Limits, files: tuple[str, ...], te
 
 
 async def _read_fields(form: FormData, files: tuple[str, ...], texts: tuple[str, ...]) -> Form:
-    found = Form()
+    result = Form()
     for name, value in form.multi_items():
         if name not in (*files, *texts):
             raise UnknownNameError("field", name, [*files, *texts])
-        if name in found.files or name in found.texts:
+        if name in result.files or name in result.texts:
             raise ParameterError(f"`{name}` is given twice. Send one request for each.")
         if isinstance(value, UploadFile) != (name in files):
             raise ParameterError(f"`{name}` must be a {'file' if name in files else 'text'}.")
         if isinstance(value, UploadFile):
-            found.files[name] = await value.read()
+            result.files[name] = await value.read()
         else:
-            found.texts[name] = value
-    return found
+            result.texts[name] = value
+    return result

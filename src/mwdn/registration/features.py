@@ -30,7 +30,7 @@ def match_features(views: Views) -> list[Projection]:
     References:
         D. G. Lowe, Distinctive image features from scale-invariant keypoints, IJCV 60 (2004).
     """
-    found = []
+    fits = []
     pictures, reconstructions = views.bytes
     for mirrored in (False, True):
         turned = [picture[:, ::-1] if mirrored else picture for picture in pictures[:_MAX_VIEWS]]
@@ -47,8 +47,8 @@ def match_features(views: Views) -> list[Projection]:
                 tolerance_px=_TOLERANCE_PX,
             )
             if fit.inliers.sum() >= _FEWEST:
-                found.append((int(fit.inliers.sum()), fit.projection))
-    return [projection for _, projection in sorted(found, key=lambda each: -each[0])]
+                fits.append((int(fit.inliers.sum()), fit.projection))
+    return [projection for _, projection in sorted(fits, key=lambda each: -each[0])]
 
 
 def _matches(picture: Bytes, seen: Bytes) -> tuple[Points, Points]:

@@ -27,10 +27,10 @@ def match_markers(views: Views) -> list[Projection]:
         name, markers = _board(picture)
         if len(markers) < 2:
             continue
-        found = _detect_either_way(reconstruction, name)
-        common = [number for number in markers if number in found]
+        by_number = _detect_either_way(reconstruction, name)
+        common = [number for number in markers if number in by_number]
         displayed += [markers[number] for number in common]
-        seen += [found[number] for number in common]
+        seen += [by_number[number] for number in common]
     if len(displayed) < 2:
         return []
     with suppress(AlignmentError):

@@ -58,8 +58,8 @@ def fit_levels(pairs: SessionPairs, projection: Projection, psf: Psf, rows: list
     for row in rows:
         measurement = pairs.measurement(row)
         scene = warp_pictures(pairs.picture(row), projection)
-        shown.append(_shrunk(convolve(_like(scene, measurement), psf)))
-        measured.append(_shrunk(measurement))
+        shown.append(_coarse(convolve(_like(scene, measurement), psf)))
+        measured.append(_coarse(measurement))
     x, y = (torch.cat(parts).movedim(1, 0).flatten(1).double() for parts in (shown, measured))
     x, y = x - x.mean(1, keepdim=True), y - y.mean(1, keepdim=True)
     gains = (x * y).sum(1) / x.square().sum(1).clamp(min=1e-12)
@@ -123,6 +123,6 @@ def _like(scene: Tensor, measurement: Tensor) -> Tensor:
     return scene.mean(1, keepdim=True).expand(-1, channels, -1, -1)
 
 
-def _shrunk(image: Tensor) -> Tensor:
+def _coarse(image: Tensor) -> Tensor:
     factor = max(1, min(image.shape[-2:]) // 64)
     return torch.nn.functional.avg_pool2d(image, factor)

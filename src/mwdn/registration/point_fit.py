@@ -86,10 +86,10 @@ def fit_points(
     count = len(picture)
     if count < 4:
         raise AlignmentError(f"A homography needs 4 points; {count} were found. Show a picture with more detail.")
-    matrix, found = _consensus(picture, camera, tolerance_px)
+    matrix, inlier_mask = _consensus(picture, camera, tolerance_px)
     if matrix is None or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-12:
         raise AlignmentError(f"No homography fits the {count} points. Three of them may lie on a line.")
-    inliers = found.ravel() > 0 if count > 4 else np.ones(count, bool)
+    inliers = inlier_mask.ravel() > 0 if count > 4 else np.ones(count, bool)
     _check_inliers(inliers, tolerance_px)
     start = Projection.from_homography(matrix, picture_size, camera_size)
     best = _descend(start, _Seen.of(picture, camera, errors).part(inliers), radial=False)
@@ -136,9 +136,9 @@ def _consensus(picture: Points, camera: Points, tolerance_px: float) -> tuple[Po
     for flip in (np.eye(3), np.diag([-1.0, 1.0, 1.0])):  # USAC refuses homographies that mirror
         points = picture @ flip[:2, :2]
         method = cv2.USAC_MAGSAC if len(picture) > 4 else 0
-        matrix, found = cv2.findHomography(points, camera, method, tolerance_px, maxIters=5000, confidence=0.9999)
-        if matrix is not None and (best[0] is None or found.sum() > best[1].sum()):
-            best = matrix @ flip, found.astype(np.uint8)
+        matrix, inlier_mask = cv2.findHomography(points, camera, method, tolerance_px, maxIters=5000, confidence=0.9999)
+        if matrix is not None and (best[0] is None or inlier_mask.sum() > best[1].sum()):
+            best = matrix @ flip, inlier_mask.astype(np.uint8)
     return best
 
 

@@ -55,16 +55,16 @@ def measure_residuals(projection: Projection, views: Views) -> Residuals:
     height, width = views.picture_size
     columns, rows = np.floor((samples.points + 0.5) / [width, height] * count).astype(int).T
     parts = np.where((np.minimum(rows, columns) >= 0) & (np.maximum(rows, columns) < count), rows * count + columns, -1)
-    found = []
+    measured = []
     for part in range(count**2):
         inside = parts == part
         own = Samples(samples.points[inside], samples.values[:, inside], samples.weights[inside], samples.shape)
         shift, error = _translation(points[inside], own, images)
         if error < _UNCERTAIN_PX:
-            found.append((own.points.mean(0), points[inside].mean(0), shift, error))
-    if not found:
+            measured.append((own.points.mean(0), points[inside].mean(0), shift, error))
+    if not measured:
         return Residuals(np.empty((0, 2)), np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
-    return Residuals(*(np.array(column) for column in zip(*found, strict=True)))
+    return Residuals(*(np.array(column) for column in zip(*measured, strict=True)))
 
 
 def _translation(points: Points, samples: Samples, images: Smooth) -> tuple[Points, float]:

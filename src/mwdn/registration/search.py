@@ -40,7 +40,7 @@ def search(views: Views) -> list[Projection]:
     seen = spectrum(torch.from_numpy(np.stack([_standard(frame) for frame in frames]))[None], size)[0]
     best: dict[tuple[bool, int], tuple[float, Projection]] = {}
     for scale in _SCALES:
-        pictures = [_shrunk(each, scale * size[1]) for each in views.pictures]
+        pictures = [_resized(each, scale * size[1]) for each in views.pictures]
         factor = scale * width / views.picture_size[1]
         for mirrored in (False, True):
             values, middles = _best_places(pictures, seen, size, mirrored=mirrored)
@@ -52,7 +52,7 @@ def search(views: Views) -> list[Projection]:
     return [projection for _, projection in sorted(best.values(), key=lambda each: -each[0])]
 
 
-def _shrunk(picture: FloatFrame, width: float) -> FloatFrame:
+def _resized(picture: FloatFrame, width: float) -> FloatFrame:
     import cv2
 
     h, w = picture.shape

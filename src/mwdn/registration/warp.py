@@ -38,7 +38,7 @@ def warp_pictures(pictures: Scene, projection: Projection) -> Image:
 
 def _warp(picture: Tensor, projection: Projection) -> Tensor:
     height, width = projection.camera_size
-    frame, projection = _shrunk(picture.movedim(0, -1).float().cpu().numpy(), projection)
+    frame, projection = _downsampled(picture.movedim(0, -1).float().cpu().numpy(), projection)
     warped = np.empty((height, width, frame.shape[-1]), np.float32)
     for top in range(0, height, _ROWS):
         rows = min(_ROWS, height - top)
@@ -60,7 +60,7 @@ def _sample(frame: FloatFrame, points: Points) -> FloatFrame:
     return np.asarray(looked, np.float32).reshape(*x.shape, -1) * inside[..., None]
 
 
-def _shrunk(frame: FloatFrame, projection: Projection) -> tuple[FloatFrame, Projection]:
+def _downsampled(frame: FloatFrame, projection: Projection) -> tuple[FloatFrame, Projection]:
     """The picture with about as many pixels as there are samples, so that none is skipped."""
     import cv2
 

@@ -147,8 +147,8 @@ def check_shapes(network: nn.Module, shapes: Mapping[str, tuple[int, ...]], what
         raise CheckpointError(f"{what}: Unexpected key `{min(unexpected)[:80]}`, one of {len(unexpected):,}.")
     for key, shape in expected.items():
         if shape != tuple(shapes[key]):
-            found = list(shapes[key])[:MAX_AXES]
-            raise CheckpointError(f"{what}: size mismatch for {key}: {found} instead of {list(shape)}. Copy it again.")
+            stored = list(shapes[key])[:MAX_AXES]
+            raise CheckpointError(f"{what}: size mismatch for {key}: {stored} instead of {list(shape)}. Copy it again.")
 
 
 def fill(network: nn.Module, tensors: Iterable[tuple[str, Tensor]], what: str) -> nn.Module:
