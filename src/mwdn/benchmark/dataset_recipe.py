@@ -20,7 +20,7 @@ class DatasetRecipe:
         camera: camera file of `mwdn calibrate`, for the settings of the camera that are not given here.
         psf: of the calibration, a file.
         bin: side of the blocks of pixels of PSF and captures that are averaged; the protocol shrinks with them.
-        psf_bin: of the PSF besides, where it has a finer resolution than the captures; 0 for that of
+        psf_bin: factor on ``bin`` for the PSF, whose pixels may be finer than those of the captures; 0 for the bin of
             the camera file.
         background: even light under the PSF, as a part of the full scale; estimated if negative.
         upside_down: files have their first row at the bottom.

@@ -68,8 +68,7 @@ class HarvestersCamera(CameraSource):
         if len(matches) != 1:
             raise CameraError(
                 f"{self.name} names {len(matches)} of {len(devices)} cameras: "
-                f"{', '.join(names)[:150] or 'none found'}. "
-                "Give its number."
+                f"{', '.join(names)[:150] or 'none found'}. Give its number."
             )
         return matches[0]
 

@@ -43,8 +43,7 @@ class PylonCamera(CameraSource):
         if not matches or (len(matches) > 1 and self.address != "first"):
             raise CameraError(
                 f"{self.name} names {len(matches)} of {len(devices)} cameras: "
-                f"{', '.join(names)[:150] or 'none found'}. "
-                "Check its cable; give its serial number."
+                f"{', '.join(names)[:150] or 'none found'}. Check its cable; give its serial number."
             )
         with self.as_camera_error("cannot be opened", "Close other programs that use it."):
             self._camera = pylon.InstantCamera(factory.CreateDevice(devices[matches[0]]))

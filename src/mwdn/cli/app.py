@@ -19,7 +19,7 @@ from mwdn.cli.global_options import GLOBAL, add_global_options
 from mwdn.cli.help_texts import HelpTexts
 from mwdn.cli.signals import ended_by_signals, is_full
 from mwdn.cli.wrong_calls import wrong_call
-from mwdn.errors import ImageError, MwdnError
+from mwdn.errors import MwdnError
 from mwdn.runtime.memory import keep_memory
 from mwdn.version import __version__
 
@@ -162,7 +162,7 @@ def _run(arguments: list[str], received: Sequence[int]) -> int:
         if received or chosen["--debug"] or isinstance(error, BrokenPipeError) or is_full(error):
             raise
         where = f"`{error.filename}`: " if error.filename else ""
-        terminal.complain("[bold red]Error:[/]", ImageError(f"{where}{error.strerror or error}."))
+        terminal.complain("[bold red]Error:[/]", MwdnError(f"{where}{error.strerror or error}."))
         return 2
     return result if isinstance(result, int) else 0
 

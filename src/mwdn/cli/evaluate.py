@@ -153,12 +153,12 @@ def _metadata(method: str) -> dict[str, Any] | None:
 
 def _learned(method: str, file: PairFile, rows: range | list[int]) -> str | None:
     """A warning if a checkpoint was trained on pairs that it is evaluated on, otherwise ``None``."""
-    metadata = _metadata(method)
-    if metadata is None or not str(metadata.get("pairs", "")).endswith(f" of {len(file):,} recorded"):
+    metadata, of_file = _metadata(method), f" of {len(file):,} recorded"
+    if metadata is None or not str(metadata.get("pairs", "")).endswith(of_file):
         return None
     division = _trained_with(metadata)
     parts = division.parts(len(file))
-    if metadata["pairs"] != f"{len(parts['train']):,} of {len(file):,} recorded":
+    if metadata["pairs"] != f"{len(parts['train']):,}{of_file}":
         return (
             f"`{method}` was trained on {metadata['pairs']} pairs. If `{file.path}` is the file of its training, they "
             "may be among these: which ones is not known."

@@ -70,8 +70,8 @@ def reconstruct(  # noqa: PLR0913
         full_size: interpolate the pictures of binned captures to the captures' size before binning. Without --bin,
             PSF and captures are binned as far as that loses little; --bin 1 refuses.
         align: estimate the pose of the PSF from each capture (rotation, scale, displaced aperture, haze), for a camera
-            that has changed since its calibration; the default for networks that were trained with
-            alignment (universal).
+            that has changed since its calibration; the default for networks that were trained with alignment
+            (universal).
         ensemble: average a network's pictures of the capture and its three mirror images: four times the time;
             universal-small gains 0.1 to 0.4 dB, universal nothing.
         room_light: find even light, a slope or a spot of light of the room in each capture and subtract it; on by

@@ -190,9 +190,9 @@ def recover(path: Path) -> None:
         OSError: the disk.
     """
     journal = journal_of(path)
-    journalled = _read_journal(journal)
-    if journalled is not None:
-        identity, length, changes = journalled
+    content = _read_journal(journal)
+    if content is not None:
+        identity, length, changes = content
         with path.open("rb+") as file:
             if identity not in file.read(_HEAD):
                 raise ImageError(f"`{journal}` belongs to another file than `{path}`. Move it away.")

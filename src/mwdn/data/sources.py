@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mwdn.calibration import FrameFormat
 from mwdn.data.hdf5 import as_damage, find_rows, names_in, open_hdf5
 from mwdn.data.pair_checks import refuse_raw
 from mwdn.data.pairs import PairFile
@@ -16,7 +17,7 @@ from mwdn.errors import ImageError
 from mwdn.io.headers import COPY_AGAIN
 from mwdn.io.images import READABLE, read_frame
 from mwdn.io.listing import FRAMES, pictures_in
-from mwdn.io.raw import Mosaic, is_raw, read_raw
+from mwdn.io.raw import Mosaic
 from mwdn.types import Frame
 
 MAX_ROWS = 2**21
@@ -213,8 +214,8 @@ def files_by_stem(folder: Path, suffixes: frozenset[str] = READABLE) -> dict[str
 
 def read_both(capture: Path, scene: Path) -> Stored:
     """Read a capture as the sensor stored it, and its scene as it is to be shown."""
-    frame, mosaic = read_raw(capture) if is_raw(capture) else (read_frame(capture), None)
-    return Stored(frame, read_frame(scene, upright=True), mosaic)
+    frame, stated = FrameFormat().read_stored(capture)
+    return Stored(frame, read_frame(scene, upright=True), stated.mosaic)
 
 
 def _read_row(path: Path, file: Any, names: tuple[str, str], row: int) -> Stored:  # noqa: ANN401
