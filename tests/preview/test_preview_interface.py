@@ -13,6 +13,7 @@ import cv2
 import httpx2 as httpx
 import numpy as np
 import pytest
+from PIL import Image
 
 from mwdn import Reconstructor
 from mwdn.calibration import Calibration
@@ -198,6 +199,17 @@ def test_a_psf_for_viewing_is_doubted_as_on_the_command_line(client, psf, captur
     response = client.post("/reconstruct", files={"capture": capture, "psf": file.tobytes()}, data={"method": "wiener"})
     verdicts = json.loads(response.headers["mwdn-report"])["verdicts"]
     assert [each["options"] for each in verdicts if each["topic"] == "psf-gamma"] == ["--psf-gamma srgb"]
+
+
+def test_exif_turns_that_differ_are_doubted_as_on_the_command_line(client, psf, capture):
+    """The PSF is mirrored: a right one settles the doubt."""
+    pixels, exif, file = psf[0].flip(-1).movedim(0, -1) / psf.max(), Image.Exif(), io.BytesIO()
+    exif[274] = 6
+    Image.fromarray((255 * pixels).round().byte().numpy()).save(file, "png", exif=exif)
+    files = {"capture": capture, "psf": file.getvalue()}
+    response = client.post("/reconstruct", files=files, data={"method": "wiener"})
+    verdicts = json.loads(response.headers["mwdn-report"])["verdicts"]
+    assert [each["options"] for each in verdicts if each["topic"] == "exif"] == ["--psf-orientation rotate-270"]
 
 
 def test_stopping_ends_requests_in_progress_at_once(serve, psf, capture):

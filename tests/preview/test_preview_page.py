@@ -115,12 +115,12 @@ def test_a_capture_is_not_reconstructed_through_the_camera_of_the_samples(serve,
 
 
 def test_verdicts_are_not_those_of_the_picture_before(serve, psf, capture, tmp_path, monkeypatch):
-    from mwdn.preview import reconstruction
+    from mwdn.inference.capture_pipeline import CapturePipeline
 
     (tmp_path / "capture.npy").write_bytes(capture)
-    check, may_check = reconstruction._check, threading.Event()
+    check, may_check = CapturePipeline.examine_scene, threading.Event()
     may_check.set()
-    monkeypatch.setattr(reconstruction, "_check", lambda *a, **b: may_check.wait(60) and check(*a, **b))
+    monkeypatch.setattr(CapturePipeline, "examine_scene", lambda *a, **b: may_check.wait(60) and check(*a, **b))
     server = serve(StoredCameras(LIMITS, None, {"camera": Calibration(psf)}))
     hidden = "document.getElementById('trust-section').hidden"
     with open_page(server.url, tmp_path / "profile") as page:

@@ -2,9 +2,10 @@
 
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -12,12 +13,9 @@ from torch import Tensor, nn
 from mwdn.calibration.frame_operations import enlarge_binned
 from mwdn.data.captures import read_capture
 from mwdn.diagnosis import Verdict
-from mwdn.diagnosis.captures import examine_capture, refuse_dark
-from mwdn.diagnosis.exif import exif_turn, settle_exif
-from mwdn.diagnosis.psf_encoding import PsfGammaTest
-from mwdn.diagnosis.sizes import mismatch
-from mwdn.diagnosis.trust import Trust, examine_picture
-from mwdn.errors import ImageError, MwdnError, ShapeError
+from mwdn.diagnosis.trust import Trust
+from mwdn.errors import ImageError, MwdnError
+from mwdn.inference.capture_pipeline import CapturePipeline, Prepared, refuse_infinite
 from mwdn.inference.origin import origin, settings_hash
 from mwdn.inference.outputs import (
     SUMMARY,
@@ -30,17 +28,14 @@ from mwdn.inference.outputs import (
 )
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.contact_sheets import contact_sheet, thumbnail
-from mwdn.io.exif import orientation
 from mwdn.io.files import as_image_error, is_full, write_json
-from mwdn.io.formats import is_for_viewing
 from mwdn.io.images import read_frame, read_picture, write_picture
 from mwdn.io.support_picture import support_picture
 from mwdn.runtime import distributed
 from mwdn.runtime.iterations import watch_iterations
 from mwdn.runtime.streams import prefetch
-from mwdn.runtime.transfers import to_device, to_host
-from mwdn.solvers import Pose, align
-from mwdn.types import Measurement, Scene, Size
+from mwdn.runtime.transfers import to_host
+from mwdn.types import Scene, Size
 
 SHOWN = 12
 """Number of captures on the summary: the first ones."""
@@ -48,19 +43,14 @@ SHOWN = 12
 
 @dataclass(frozen=True)
 class Job:
-    """One capture and its picture.
+    """One capture and what became of it.
 
     Args:
         capture: file of the capture.
         output: file of the picture.
         number: of the capture, from 0.
-        origin: hash of everything the picture depends on, see `mwdn.inference.origin`.
-        measurement: (1, C, H, W); like ``pose`` and ``scene`` dropped when the job is done.
-        pose: of the PSF, if the consistency is checked.
-        scene: (1, C, H, W).
-        room_light: part of the capture's light that was subtracted as the room's; `None` if it was not looked for.
         existing: whether the picture was already there and nothing was done.
-        full_size: height and width of the picture, if it is to be larger than the measurement.
+        room_light: part of the capture's light that was subtracted as the room's; `None` if it was not looked for.
         verdicts: on the capture, the PSF and the picture, if they are checked.
         trust: in the PSF and the picture, if they are checked.
         error: why there is no picture.
@@ -69,30 +59,42 @@ class Job:
     capture: Path
     output: Path
     number: int = 0
-    origin: str = ""
-    measurement: Measurement | None = None
-    pose: Pose | None = None
-    scene: Scene | None = None
-    room_light: float | None = None
     existing: bool = False
-    full_size: Size | None = None
+    room_light: float | None = None
     verdicts: tuple[Verdict, ...] = ()
     trust: Trust | None = None
     error: MwdnError | None = None
 
 
-def _step(work: Callable[["Batch", Job], Job]) -> Callable[["Batch", Job], Job]:
-    """Make a step of a batch: an error ends this capture's job, not the batch, unless the disk is full."""
+class _Read(NamedTuple):
+    """A capture that was read."""
 
-    def step(batch: "Batch", job: Job) -> Job:
-        try:
-            return work(batch, job)
-        except MwdnError as error:
-            if is_full(error.__cause__):
-                raise
-            return replace(job, measurement=None, pose=None, scene=None, error=error)
+    job: Job
+    origin: str
+    """Hash of everything the picture depends on, see `mwdn.inference.origin`."""
+    prepared: Prepared
+    full_size: Size | None
+    """Height and width of the picture, if it is to be larger than the measurement."""
 
-    return step
+
+class _Solved(NamedTuple):
+    """A capture that was reconstructed."""
+
+    read: _Read
+    scene: Scene
+
+
+_Result = TypeVar("_Result")
+
+
+def _attempt(job: Job, step: Callable[[], _Result]) -> _Result | Job:
+    """Do a step of a job: an error ends this job, not the batch, unless the disk is full."""
+    try:
+        return step()
+    except MwdnError as error:
+        if is_full(error.__cause__):
+            raise
+        return replace(job, error=error)
 
 
 @dataclass(frozen=True)
@@ -125,7 +127,6 @@ class Batch:
     resume: bool = False
     psf_file: Path | None = None
     full_size: bool = False
-    _mismatches: dict[tuple[int, ...], ShapeError] = field(default_factory=dict, init=False, repr=False)
 
     def run(
         self,
@@ -145,124 +146,96 @@ class Batch:
         """
         solves = not isinstance(self.reconstruct.method, nn.Module)  # a network iterates only at its start
 
-        def reconstruct(job: Job) -> Job:
-            with watch_iterations(lambda part: progress(job.number + part * solves)):
-                job = self._reconstruct(job)
-            progress(job.number + 1.0)
-            return job
+        def read(job: Job) -> _Read | Job:
+            return _attempt(job, lambda: self._read(job))
 
-        def finish(job: Job) -> Job:
-            job = self._finish(job)
+        def reconstruct(work: _Read | Job) -> _Solved | Job:
+            number = work.number if isinstance(work, Job) else work.job.number
+            with watch_iterations(lambda part: progress(number + part * solves)):
+                solved = work if isinstance(work, Job) else _attempt(work.job, lambda: self._solve(work))
+            progress(number + 1.0)
+            return solved
+
+        def finish(work: _Solved | Job) -> Job:
+            job = work if isinstance(work, Job) else _attempt(work.read.job, lambda: self._write(work))
             report(job)
             return job
 
         numbers = distributed.work_queue(len(captures))
         jobs = (Job(Path(captures[n]), self.out / output_name(captures[n], self.format), n) for n in numbers)
         # Alignment and the check take longer than most methods: on a CPU the three steps share its cores.
-        with prefetch(self._read, jobs) as read, prefetch(finish, map(reconstruct, read)) as finished:
+        with prefetch(read, jobs) as prepared, prefetch(finish, map(reconstruct, prepared)) as finished:
             yield from finished
 
-    @_step
-    def _read(self, job: Job) -> Job:
-        job = replace(job, origin=origin(self._settings_hash, job.capture))
-        if self.resume and self._exists(job):
+    def _read(self, job: Job) -> _Read | Job:
+        made_of = origin(self._settings_hash, job.capture)
+        if self.resume and self._exists(job, made_of):
             return replace(job, existing=True)
         calibration = self.reconstruct.calibration
         frame = calibration.frames.read(job.capture)
         measurement = calibration.to_measurement(frame)
-        self._check_fit(measurement)
-        refuse_dark(measurement)
-        measurement = to_device(measurement, self.reconstruct.device)
+        self._pipeline.check(measurement)
+        prepared = self._pipeline.prepare(measurement, pose=self.check_consistency)
+        if self.check_consistency:
+            job = replace(job, verdicts=self._pipeline.examine_frame(frame, job.capture))
         full_size = calibration.frames.full_size(frame) if self.full_size else None
-        measurement, share = self.reconstruct.without_room_light(measurement)
-        job = replace(
-            job, measurement=measurement, full_size=full_size, room_light=None if share is None else float(share)
-        )
-        if not self.check_consistency:
-            return job
-        verdicts = examine_capture(frame, calibration, for_viewing=is_for_viewing(job.capture))
-        verdicts += self._psf_gamma(frame, verdicts)
-        if self.psf_file is not None and calibration.psf_format.psf_orientation is None:
-            verdicts += (exif_turn(orientation(job.capture), orientation(self.psf_file)),)
-        return replace(job, pose=align(measurement, self.reconstruct.psf), verdicts=verdicts)
+        return _Read(replace(job, room_light=prepared.room_light), made_of, prepared, full_size)
 
-    @cached_property
-    def _psf_gamma(self) -> PsfGammaTest:
-        for_viewing = self.psf_file is not None and is_for_viewing(self.psf_file)
-        return PsfGammaTest(self.reconstruct.calibration, for_viewing)
+    def _solve(self, read: _Read) -> _Solved:
+        return _Solved(read, self._pipeline.solve(read.prepared))
 
-    def _check_fit(self, measurement: Measurement) -> None:
-        """Check the size; the first capture of each wrong size is compared with the PSF at other bins."""
-        try:
-            self.reconstruct.calibration.check_fit(measurement)
-        except ShapeError as error:
-            size = tuple(measurement.shape[-2:])
-            if size not in self._mismatches:
-                self._mismatches[size] = mismatch(error, measurement, self.reconstruct.calibration)
-            raise self._mismatches[size] from None
-
-    @_step
-    def _reconstruct(self, job: Job) -> Job:
-        if job.measurement is None:
-            return job
-        return replace(job, scene=self.reconstruct.without_search(job.pose).on_device(job.measurement))
-
-    @_step
-    def _finish(self, job: Job) -> Job:
-        if job.measurement is None or job.scene is None:
-            return job
-        trust = self._examine(job.measurement, job.scene, job.pose)
-        verdicts = settle_exif((*job.verdicts, *trust.verdicts)) if trust else ()
-        calibration, pitch = self.reconstruct.calibration, self.reconstruct.calibration.pitch_um
-        content: dict[str, object] = {"method": self.method, "psf_hash": calibration.psf_hash, "origin": job.origin}
+    def _write(self, solved: _Solved) -> Job:
+        (job, origin, prepared, _), scene = solved
+        calibration = self.reconstruct.calibration
+        content: dict[str, object] = {"method": self.method, "psf_hash": calibration.psf_hash, "origin": origin}
         content |= {"file": job.output.name, "bin": calibration.frames.bin}
         content |= {} if job.room_light is None else {"room_light": round(job.room_light, 4)}
-        if trust:
+        refuse_infinite(prepared, scene)
+        if self.check_consistency:
+            trust, verdicts = self._pipeline.examine_scene(prepared, scene, job.verdicts)
             content |= {**trust.content, "verdicts": [asdict(verdict) for verdict in verdicts]}
-        scene, sidecar = to_host(self.reconstruct.finish(job.scene)), job.output.with_suffix(".json")
-        if job.full_size:
-            scene = enlarge_binned(scene, calibration.frames.bin, job.full_size)
-            pitch = pitch and pitch / calibration.frames.bin
+            job = replace(job, trust=trust, verdicts=verdicts)
+        self._write_files(job, self._picture(solved), content)
+        return job
+
+    def _picture(self, solved: _Solved) -> Scene:
+        """The picture, on the CPU, in the size that was requested."""
+        picture, size = to_host(self.reconstruct.finish(solved.scene)), solved.read.full_size
+        return picture if size is None else enlarge_binned(picture, self.reconstruct.calibration.frames.bin, size)
+
+    def _write_files(self, job: Job, picture: Scene, content: dict[str, object]) -> None:
+        """Write the picture, the map and the sidecar, which is last: a picture with a sidecar is complete."""
+        frames, pitch = self.reconstruct.calibration.frames, self.reconstruct.calibration.pitch_um
+        sidecar, map_file = job.output.with_suffix(".json"), support_name(job.output)
         before = read_sidecar(sidecar)
         with as_image_error(sidecar):  # the new picture must not have an old sidecar or map
             sidecar.unlink(missing_ok=True)
-            support_name(job.output).unlink(missing_ok=True)
-        write_output(job.output, scene, self.format, pitch)
+            map_file.unlink(missing_ok=True)
+        write_output(job.output, picture, self.format, pitch and (pitch / frames.bin if self.full_size else pitch))
         try:
-            if trust and self.map:
-                write_picture(support_name(job.output), support_picture(scene, trust.support.map))
+            if job.trust and self.map:
+                write_picture(map_file, support_picture(picture, job.trust.support.map))
             write_json(sidecar, content)
         except ImageError:  # the disk is full: the next run would take the picture for something else
             job.output.unlink()
-            support_name(job.output).unlink(missing_ok=True)
+            map_file.unlink(missing_ok=True)
             raise
         remove_other_format(job.output, job.capture, before=before, now=content)
-        return replace(job, measurement=None, pose=None, scene=None, trust=trust, verdicts=verdicts)
 
-    def _examine(self, measurement: Measurement, scene: Scene, pose: Pose | None) -> Trust | None:
-        """Check a scene if requested; an `ImageError` unless the scene and the result are finite."""
-        trust, finite = None, bool(scene.isfinite().all())
-        if finite and self.check_consistency:
-            given = self.reconstruct.calibration.psf_format.psf_orientation
-            trust = examine_picture(measurement, self.reconstruct.psf, scene, pose=pose, given=given)
-            finite = trust.finite
-        if not finite:
-            raise ImageError(
-                "The reconstruction holds NaN, infinity or too large numbers: nothing is written. The capture's "
-                f"brightest pixel is {measurement.amax():.3g}, where 1 is saturation. Scale it, or use another method."
-            )
-        return trust
+    @cached_property
+    def _pipeline(self) -> CapturePipeline:
+        return CapturePipeline(self.reconstruct, self.psf_file)
 
     @cached_property
     def _settings_hash(self) -> str:
         return settings_hash(self.reconstruct, self.format, full_size=self.full_size)
 
-    def _exists(self, job: Job) -> bool:
-        """Whether a job's picture is complete, of the same origin, and checked if that is requested."""
+    def _exists(self, job: Job, origin: str) -> bool:
+        """Whether a job's picture is complete, of this origin, and checked if that is requested."""
         content = read_sidecar(job.output.with_suffix(".json"))
         checked = "doubtful" in content or not self.check_consistency
         checked &= not self.map or support_name(job.output).is_file()
-        return checked and content.get("origin") == job.origin != "" and job.output.is_file()
+        return checked and content.get("origin") == origin != "" and job.output.is_file()
 
     def summarise(self, captures: Iterable[str | Path]) -> None:
         """Write a contact sheet of the first captures and their pictures on the disk, unless there are none.

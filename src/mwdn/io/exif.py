@@ -1,6 +1,7 @@
 """EXIF orientation: how a picture is to be turned when it is shown. The pixels stay as the sensor stored them."""
 
 import struct
+from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
@@ -27,20 +28,25 @@ _STEPS = 100_000
 """Largest number of parts of a file that are searched: a PNG of 800 MB has as many."""
 
 
-def orientation(path: str | Path) -> int:
+def orientation(file: str | Path | bytes) -> int:
     """EXIF orientation of a JPEG, PNG, WebP, TIFF, or raw file that is a TIFF inside; reads a few hundred bytes.
+
+    Args:
+        file: the file, or its content.
 
     Returns:
         1 to 8, see `TURNS`; 1 (upright) if the file has no such tag, or cannot be read.
     """
+    if isinstance(file, bytes):
+        return orientation_in(BytesIO(file))
     try:
-        with open_regular(path) as file:
-            return orientation_in(file)
+        with open_regular(file) as opened:
+            return orientation_in(opened)
     except (OSError, ImageError):  # reading the pixels reports the error
         return 1
 
 
-def orientation_in(file: BinaryIO) -> int:
+def orientation_in(file: BinaryIO | BytesIO) -> int:
     """As `orientation`, of an open file."""
     try:
         start = _find_tiff(file)
@@ -56,7 +62,7 @@ def upright(frame: Frame, orientation: int) -> Frame:
     return frame[:: -1 if orientation in (3, 4, 7, 8) else 1, :: -1 if orientation in (2, 3, 6, 7) else 1]
 
 
-def _find_tiff(file: BinaryIO) -> int | None:
+def _find_tiff(file: BinaryIO | BytesIO) -> int | None:
     """Position of the EXIF block, which is a small TIFF."""
     head = file.read(12)
     if head[:2] in (b"II", b"MM"):
@@ -70,7 +76,7 @@ def _find_tiff(file: BinaryIO) -> int | None:
     return None
 
 
-def _in_jpeg(file: BinaryIO) -> int | None:
+def _in_jpeg(file: BinaryIO | BytesIO) -> int | None:
     position = 2
     for _ in range(_STEPS):
         marker, length = struct.unpack(">HH", _at(file, position, 4))
@@ -82,7 +88,7 @@ def _in_jpeg(file: BinaryIO) -> int | None:
     return None
 
 
-def _in_png(file: BinaryIO) -> int | None:
+def _in_png(file: BinaryIO | BytesIO) -> int | None:
     position = 8
     for _ in range(_STEPS):
         length, name = struct.unpack(">I4s", _at(file, position, 8))
@@ -92,7 +98,7 @@ def _in_png(file: BinaryIO) -> int | None:
     return None
 
 
-def _in_webp(file: BinaryIO) -> int | None:
+def _in_webp(file: BinaryIO | BytesIO) -> int | None:
     position = 12
     for _ in range(_STEPS):
         name, length = struct.unpack("<4sI", _at(file, position, 8))
@@ -102,12 +108,12 @@ def _in_webp(file: BinaryIO) -> int | None:
     return None
 
 
-def _at(file: BinaryIO, position: int, count: int) -> bytes:
+def _at(file: BinaryIO | BytesIO, position: int, count: int) -> bytes:
     file.seek(position)
     return file.read(count)
 
 
-def _read_tag(file: BinaryIO, start: int) -> int:
+def _read_tag(file: BinaryIO | BytesIO, start: int) -> int:
     """The orientation in the first directory of a TIFF."""
     order = "<" if _at(file, start, 2) == b"II" else ">"
     version, offset = struct.unpack(order + "HI", file.read(6))

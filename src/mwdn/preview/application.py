@@ -18,7 +18,6 @@ from starlette.staticfiles import StaticFiles
 
 from mwdn.calibration import Calibration
 from mwdn.errors import MwdnError, ParameterError
-from mwdn.io.formats import is_for_viewing
 from mwdn.preview.cameras import OPTIONS, StoredCameras, checked_camera
 from mwdn.preview.guard import Guard, failed, log
 from mwdn.preview.jobs import ENDED, Job, Jobs
@@ -228,7 +227,7 @@ class Preview:
             trust=trust is not False,
             room_light=form.flag("room_light"),
             ambient=form.files.get("ambient", b""),
-            psf_for_viewing=is_for_viewing(form.files.get("psf", b"")),
+            psf_file=form.files.get("psf", b""),
         )
         job = self.jobs.submit(partial(self.reconstructions.run, order=order), size=sum(map(len, form.files.values())))
         job.when_ended(lambda: self._count(job, method))

@@ -8,26 +8,16 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-import torch
-
 from mwdn.calibration import Calibration
-from mwdn.diagnosis.captures import examine_capture, refuse_dark
-from mwdn.diagnosis.psf_encoding import PsfGammaTest
-from mwdn.diagnosis.sizes import mismatch
-from mwdn.diagnosis.trust import check_size, examine_picture
+from mwdn.diagnosis.trust import Trust, check_size
 from mwdn.diagnosis.verdict import Verdict
-from mwdn.errors import ImageError, ShapeError
+from mwdn.inference.capture_pipeline import CapturePipeline, refuse_infinite
 from mwdn.inference.reconstructor import Reconstructor
-from mwdn.io.formats import is_for_viewing
 from mwdn.preview.cameras import check_pixels, read_upload
 from mwdn.preview.jobs import Job
 from mwdn.preview.limits import Limits
 from mwdn.preview.result import Result
 from mwdn.runtime.iterations import watch_iterations
-from mwdn.runtime.transfers import to_device
-from mwdn.solvers.alignment import align
-from mwdn.solvers.pose import Pose
-from mwdn.types import Frame, Measurement, Scene
 
 KEPT = 4
 """Prepared methods that are kept for the next capture; one of 1 Mpixel takes about 100 MB."""
@@ -46,7 +36,7 @@ class Order:
         trust: check the picture, which takes a second or two.
         room_light: as for `Reconstructor`.
         ambient: the file of a frame of the room's light alone, taken as the capture; empty if there is none.
-        psf_for_viewing: the PSF's file is of a type for viewing, such as JPEG.
+        psf_file: content of the PSF's file; empty if the camera is known to the server.
     """
 
     capture: bytes
@@ -57,7 +47,7 @@ class Order:
     trust: bool = True
     room_light: bool | None = None
     ambient: bytes = b""
-    psf_for_viewing: bool = False
+    psf_file: bytes = b""
 
 
 class Reconstructions:
@@ -71,10 +61,10 @@ class Reconstructions:
     def __init__(self, limits: Limits, device: str | None = None) -> None:
         self.limits, self.device = limits, device
         self._lock = threading.Lock()
-        self._prepared: OrderedDict[tuple[Any, ...], tuple[Calibration, Reconstructor, PsfGammaTest]] = OrderedDict()
+        self._prepared: OrderedDict[tuple[Any, ...], tuple[Calibration, CapturePipeline]] = OrderedDict()
 
-    def prepare(self, order: Order, calibration: Calibration) -> tuple[Reconstructor, PsfGammaTest]:
-        """The method for the camera, and the test of the PSF's gamma, which needs a capture.
+    def prepare(self, order: Order, calibration: Calibration) -> CapturePipeline:
+        """The method for the camera.
 
         Raises:
             MwdnError: no such method or option, or it does not fit the camera.
@@ -82,20 +72,20 @@ class Reconstructions:
         check_size(calibration.psf)
         ambient = hashlib.sha256(order.ambient).digest()
         options = tuple(sorted(order.options.items()))
-        key = (id(calibration), order.method, options, order.align, order.room_light, ambient)
+        key = (id(calibration), bool(order.psf_file), order.method, options, order.align, order.room_light, ambient)
         with self._lock:
             if key in self._prepared:
                 self._prepared.move_to_end(key)
-                return self._prepared[key][1:]
+                return self._prepared[key][1]
         lit = with_ambient(calibration, order.ambient, self.limits)
         how: dict[str, Any] = {"align": order.align, "room_light": order.room_light, "device": self.device}
         made = Reconstructor(order.method, lit, **how, **order.options)
         with self._lock:
             # The calibration is kept, so that its id stays its own.
-            self._prepared[key] = calibration, made, PsfGammaTest(lit, order.psf_for_viewing)
+            self._prepared[key] = calibration, CapturePipeline(made, order.psf_file or None)
             while len(self._prepared) > KEPT:
                 self._prepared.popitem(last=False)
-            return self._prepared[key][1:]
+            return self._prepared[key][1]
 
     def run(self, job: Job, order: Order) -> None:
         """Reconstruct; the picture is in the job before it is checked.
@@ -104,30 +94,28 @@ class Reconstructions:
             MwdnError: what is wrong with the capture, the camera or the method.
         """
         start = time.perf_counter()
-        reconstruct, gamma = self.prepare(order, order.calibration())
-        calibration = reconstruct.calibration
-        frame, for_viewing = read_capture(order.capture, calibration, self.limits)
-        measurement = to_device(to_measurement(frame, calibration, self.limits), reconstruct.device)
+        pipeline = self.prepare(order, order.calibration())
+        reconstruct, calibration = pipeline.reconstruct, pipeline.calibration
+        frame = read_upload(order.capture, "capture", self.limits.frame_pixels, calibration.frames.read)
+        measurement = calibration.to_measurement(frame)
+        check_pixels("capture", (measurement.shape[-2], measurement.shape[-1]), self.limits)
+        pipeline.check(measurement)
         job.advance(0.0)
         with watch_iterations(lambda _: job.advance(0.0)):  # which may cancel
-            measurement, share = reconstruct.without_room_light(measurement)
-            pose = align(measurement, reconstruct.psf) if reconstruct.align else None
+            prepared = pipeline.prepare(measurement, pose=reconstruct.align)
         with watch_iterations(lambda part: job.advance(0.9 * part)):
-            scene = reconstruct.without_search(pose).on_device(measurement)
-        if not scene.isfinite().all():
-            raise ImageError("The reconstruction holds NaN or infinity. Scale the capture, or use another method.")
+            scene = pipeline.solve(prepared)
+        refuse_infinite(prepared, scene)
         report = _report(order, reconstruct, time.perf_counter() - start)
-        report["room_light"] = None if share is None else round(float(share), 4)
+        report["room_light"] = None if prepared.room_light is None else round(prepared.room_light, 4)
         shown = reconstruct.as_recorded(scene).cpu()
-        job.result = Result(measurement.cpu(), shown, calibration.light, calibration.white_balance, report)
+        job.result = Result(prepared.measurement.cpu(), shown, calibration.light, calibration.white_balance, report)
         if order.trust:
             job.advance(0.9)
             job.state = "checking"
-            with torch.inference_mode():
-                verdicts = examine_capture(frame, calibration, for_viewing=for_viewing)
-                verdicts += gamma(frame, verdicts)
-                found = _check(verdicts, measurement, reconstruct, scene, pose)
-            job.result = replace(job.result, report=report | found)
+            verdicts = pipeline.examine_frame(frame, order.capture)
+            trust, verdicts = pipeline.examine_scene(prepared, scene, verdicts)
+            job.result = replace(job.result, report=report | _found(trust, verdicts))
 
 
 def with_ambient(calibration: Calibration, ambient: bytes, limits: Limits) -> Calibration:
@@ -157,46 +145,7 @@ def _report(order: Order, reconstruct: Reconstructor, seconds: float) -> dict[st
     }
 
 
-def read_capture(data: bytes, calibration: Calibration, limits: Limits) -> tuple[Frame, bool]:
-    """A raw frame, and whether its file is of a type for viewing.
-
-    Raises:
-        MwdnError: the file is wrong.
-    """
-
-    def read(path: Any) -> tuple[Frame, bool]:  # noqa: ANN401
-        return calibration.frames.read(path), is_for_viewing(path)
-
-    return read_upload(data, "capture", limits.frame_pixels, read)
-
-
-def to_measurement(frame: Frame, calibration: Calibration, limits: Limits) -> Measurement:
-    """A measurement that fits the camera.
-
-    Raises:
-        MwdnError: it does not fit; it has too many pixels; it is dark.
-    """
-    measurement = calibration.to_measurement(frame)
-    check_pixels("capture", (measurement.shape[-2], measurement.shape[-1]), limits)
-    try:
-        calibration.check_fit(measurement)
-    except ShapeError as error:
-        raise mismatch(error, measurement, calibration) from None
-    refuse_dark(measurement)
-    return measurement
-
-
-def _check(
-    verdicts: tuple[Verdict, ...],
-    measurement: Measurement,
-    reconstruct: Reconstructor,
-    scene: Scene,
-    pose: Pose | None,
-) -> dict[str, Any]:
-    """The verdicts, with those on the PSF's orientation and the picture, and the numbers behind them."""
-    given = reconstruct.calibration.psf_format.psf_orientation
-    trust = examine_picture(measurement, reconstruct.psf, scene, pose=pose, given=given)
-    if not trust.finite:
-        raise ImageError("The numbers of the capture are too large or too small to be judged. Scale it.")
-    listed = [{**asdict(verdict), "sentence": verdict.sentence} for verdict in (*verdicts, *trust.verdicts)]
+def _found(trust: Trust, verdicts: tuple[Verdict, ...]) -> dict[str, Any]:
+    """The verdicts, and the numbers behind them."""
+    listed = [{**asdict(verdict), "sentence": verdict.sentence} for verdict in verdicts]
     return {**trust.content, "summary": trust.sentence, "verdicts": listed}

@@ -1,0 +1,134 @@
+"""The steps from a raw frame to a scene and the verdicts on it, for batches and for the preview."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from mwdn.diagnosis.captures import examine_capture, refuse_dark
+from mwdn.diagnosis.exif import exif_turn, settle_exif
+from mwdn.diagnosis.psf_encoding import PsfGammaTest
+from mwdn.diagnosis.sizes import mismatch
+from mwdn.diagnosis.trust import Trust, examine_picture
+from mwdn.diagnosis.verdict import Verdict
+from mwdn.errors import ImageError, ShapeError
+from mwdn.inference.reconstructor import Reconstructor
+from mwdn.io.exif import orientation
+from mwdn.io.formats import is_for_viewing
+from mwdn.runtime.transfers import to_device
+from mwdn.solvers import Pose, align
+from mwdn.types import Frame, Measurement, Scene, Size
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A capture, ready for the method.
+
+    Args:
+        measurement: (1, C, H, W), on the device of the reconstruction, without the light of the room.
+        room_light: part of the capture's light that was subtracted as the room's; `None` if it was not looked for.
+        pose: of the PSF, if it was estimated.
+    """
+
+    measurement: Measurement
+    room_light: float | None = None
+    pose: Pose | None = None
+
+
+class CapturePipeline:
+    """From the captures of one camera to scenes and verdicts.
+
+    Each method is one step, so that the caller can report and overlap them. Steps may run in different threads, one
+    capture in each.
+
+    Args:
+        reconstruct: the method and the camera.
+        psf_file: file of the PSF, or its content: its type tells about its gamma, and its EXIF orientation is compared
+            with the captures'.
+
+    Attributes:
+        reconstruct: as given.
+        calibration: of the camera.
+    """
+
+    def __init__(self, reconstruct: Reconstructor, psf_file: Path | bytes | None = None) -> None:
+        self.reconstruct, self.calibration = reconstruct, reconstruct.calibration
+        for_viewing = psf_file is not None and is_for_viewing(psf_file)
+        self._psf_gamma = PsfGammaTest(self.calibration, for_viewing)
+        self._psf_turn = None if psf_file is None else orientation(psf_file)
+        self._mismatches: dict[Size, ShapeError] = {}
+
+    def check(self, measurement: Measurement) -> None:
+        """Check that a measurement fits the camera.
+
+        The first one of each wrong size is compared with the PSF at other bins.
+
+        Raises:
+            ShapeError: it does not fit.
+            ImageError: it is dark.
+        """
+        try:
+            self.calibration.check_fit(measurement)
+        except ShapeError as error:
+            size = (measurement.shape[-2], measurement.shape[-1])
+            if size not in self._mismatches:
+                self._mismatches[size] = mismatch(error, measurement, self.calibration)
+            raise self._mismatches[size] from None
+        refuse_dark(measurement)
+
+    def prepare(self, measurement: Measurement, *, pose: bool) -> Prepared:
+        """Subtract the light of the room, if the reconstruction does, and estimate the PSF's pose if requested."""
+        measurement, share = self.reconstruct.without_room_light(to_device(measurement, self.reconstruct.device))
+        found = align(measurement, self.reconstruct.psf) if pose else None
+        return Prepared(measurement, None if share is None else float(share), found)
+
+    def solve(self, prepared: Prepared) -> Scene:
+        """The scene, (1, C, H, W) on the device, as the camera sees it: without `Reconstructor.finish`."""
+        return self.reconstruct.without_search(prepared.pose).on_device(prepared.measurement)
+
+    def examine_frame(self, frame: Frame, file: Path | bytes) -> tuple[Verdict, ...]:
+        """Verdicts on a capture, and on what only the PSF's file and the capture tell about the PSF.
+
+        Args:
+            frame: (H, W, C), as `FrameFormat.read` returns it.
+            file: of the capture, or its content.
+        """
+        verdicts = examine_capture(frame, self.calibration, for_viewing=is_for_viewing(file))
+        verdicts += self._psf_gamma(frame, verdicts)
+        if self._psf_turn is not None and self.calibration.psf_format.psf_orientation is None:
+            verdicts += (exif_turn(orientation(file), self._psf_turn),)
+        return verdicts
+
+    @torch.inference_mode()
+    def examine_scene(
+        self, prepared: Prepared, scene: Scene, verdicts: tuple[Verdict, ...]
+    ) -> tuple[Trust, tuple[Verdict, ...]]:
+        """How far to trust a scene, and all verdicts.
+
+        Args:
+            prepared: the capture.
+            scene: result of `solve`.
+            verdicts: of `examine_frame`.
+
+        Raises:
+            ImageError: the scene or the result is not finite.
+        """
+        refuse_infinite(prepared, scene)
+        given = self.calibration.psf_format.psf_orientation
+        trust = examine_picture(prepared.measurement, self.reconstruct.psf, scene, pose=prepared.pose, given=given)
+        if not trust.finite:
+            raise _not_finite(prepared)
+        return trust, settle_exif((*verdicts, *trust.verdicts))
+
+
+def refuse_infinite(prepared: Prepared, scene: Scene) -> None:
+    """Raise an `ImageError` if a scene holds NaN or infinity."""
+    if not scene.isfinite().all():
+        raise _not_finite(prepared)
+
+
+def _not_finite(prepared: Prepared) -> ImageError:
+    return ImageError(
+        "The reconstruction holds NaN, infinity or too large numbers. The capture's brightest pixel is "
+        f"{prepared.measurement.amax():.3g}, where 1 is saturation. Scale it, or use another method."
+    )

@@ -1,0 +1,91 @@
+"""The steps from a raw frame to a scene and the verdicts on it, in batches and for the preview."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from cameras import contour_psf
+from mwdn import Camera, read_frame
+from mwdn.calibration import Calibration, PsfFormat
+from mwdn.diagnosis import sizes
+from mwdn.errors import ImageError, ShapeError
+from mwdn.inference import capture_pipeline
+from mwdn.inference.capture_pipeline import CapturePipeline, Prepared
+from mwdn.inference.reconstructor import Reconstructor
+
+SIZE = 32, 40
+
+
+@pytest.fixture
+def psf(generator):
+    return contour_psf(SIZE, cell=10, generator=generator).expand(1, 3, -1, -1).contiguous()
+
+
+@pytest.fixture
+def capture(psf, generator, tmp_path):
+    """File of a capture."""
+    scene = torch.zeros(1, 3, *SIZE)
+    scene[..., 10:20, 12:22] = 0.7
+    seen = Camera(psf).simulate(scene, generator=generator)[0].movedim(0, -1)
+    frame = (seen.clamp(0, 1) * 255).round().numpy().astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "capture.png"), frame[..., ::-1])
+    return tmp_path / "capture.png"
+
+
+def turned(file, orientation):
+    """The same pixels with an EXIF orientation."""
+    exif = Image.Exif()
+    exif[274] = orientation
+    to = file.with_name(f"turned-{orientation}.png")
+    Image.open(file).save(to, exif=exif)
+    return to
+
+
+def make(psf, file=None, method="wiener", **options):
+    return CapturePipeline(Reconstructor(method, Calibration(psf, **options), device="cpu"), file)
+
+
+def test_steps_give_what_the_reconstructor_returns(psf, capture):
+    pipeline = make(psf)
+    frame = read_frame(capture)
+    measurement = pipeline.calibration.to_measurement(frame)
+    pipeline.check(measurement)
+    prepared = pipeline.prepare(measurement, pose=False)
+    assert (prepared.room_light, prepared.pose) == (None, None)
+    torch.testing.assert_close(pipeline.solve(prepared), pipeline.reconstruct(measurement), rtol=0, atol=0)
+
+
+def test_verdicts_on_a_file_and_on_its_content_are_equal(psf, capture):
+    file = turned(capture, 6)
+    frame = read_frame(file)
+    of_files = make(psf, capture).examine_frame(frame, file)
+    of_contents = make(psf, capture.read_bytes()).examine_frame(frame, file.read_bytes())
+    assert of_files == of_contents
+    assert [verdict.state for verdict in of_files if verdict.topic == "exif"] == ["doubt"]
+
+
+def test_exif_of_the_psf_needs_its_file_and_no_given_orientation(psf, capture):
+    frame, given = read_frame(capture), PsfFormat(psf_orientation="rotate-90")
+    for pipeline in (make(psf), make(psf, turned(capture, 6), psf_format=given)):
+        assert "exif" not in {verdict.topic for verdict in pipeline.examine_frame(frame, capture)}
+
+
+def test_bins_are_searched_once_for_each_wrong_size(psf, monkeypatch):
+    searched = []
+    monkeypatch.setattr(
+        capture_pipeline, "mismatch", lambda error, *rest: searched.append(rest) or sizes.mismatch(error, *rest)
+    )
+    pipeline = make(psf)
+    for size in ((32, 48), (32, 48), (40, 48)):
+        with pytest.raises(ShapeError, match=f"{size[0]} x {size[1]}"):
+            pipeline.check(torch.rand(1, 3, *size))
+    assert len(searched) == 2
+
+
+@pytest.mark.parametrize("wrong", [float("nan"), float("inf")])
+def test_a_scene_that_is_not_finite_is_refused(psf, wrong):
+    prepared = Prepared(torch.full((1, 3, *SIZE), 0.25))
+    with pytest.raises(ImageError, match=r"brightest pixel is 0\.25"):
+        make(psf).examine_scene(prepared, torch.full((1, 3, *SIZE), wrong), ())
