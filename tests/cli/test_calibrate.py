@@ -119,6 +119,17 @@ def test_camera_file_is_changed_by_calibrating_again(run):
     assert run(f"{RECONSTRUCT} a --camera camera.toml")[0] == 0
 
 
+@pytest.mark.usefixtures("folder")
+def test_none_takes_keys_out_of_the_camera_file(run):
+    """They stayed, although the command was told to do without them."""
+    content = {"psf_gamma": 2.0, "psf_orientation": "rotate-180", "psf_bit_depth": 16}
+    content |= {"gamma": 2.2, "bit_depth": 14, "crop": (48, 48), "mosaic": "rggb"}
+    write_camera("camera.toml", {"psf": Path("lab/psf.png"), "grey": True, **content})
+    without = " ".join(f"--{key.replace('_', '-')} none" for key in content)
+    assert run(f"calibrate --camera camera.toml --no-grey {without}")[0] == 0
+    assert read_camera("camera.toml").keys() == {"psf", "psf_sha256"}
+
+
 def test_files_of_a_camera_file_are_known_by_any_path(run, folder):
     """The corrected PSF by its absolute path was corrected again, by the dark frame and without its gain."""
     cv2.imwrite("dark.png", np.full((*SIZE, 3), 2000, np.uint16))

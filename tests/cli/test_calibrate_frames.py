@@ -127,6 +127,8 @@ def test_the_bits_of_a_camera_file_stay_if_it_is_changed(run, folder):
     assert after == {**before, "pitch_um": 4.8, "white_balance": (1.0, 1.0, 1.0)}
     code, _, err = run("calibrate --camera camera.toml --bit-depth 14")  # levels are fractions of the full scale
     assert (code, "`--bit-depth` (14) must be 12" in err) == (2, True)
+    code, _, err = run("calibrate --camera camera.toml --bit-depth none")
+    assert (code, "`--bit-depth` (none) must be 12" in err) == (2, True)
     first = {path.name for path in folder.glob("camera-*")}
     # New frames of the point source keep what is known of the sensor; the replaced PSF's file is removed.
     assert run("calibrate psf_1 --camera camera.toml")[0] == 0

@@ -117,15 +117,15 @@ def calibrate(  # noqa: PLR0913
             photographs = _with_exposure(photographs, kept.get("dark_exposure"), camera)
         own = {
             "ambient": ambient,
-            **changed_fields(psf_format),
-            **changed_fields(frames),
+            **_values(psf_format),
+            **_values(frames),
             "background": kept.get("background") if auto_background else psf_format.background,
             "bin": None if auto_bin else frames.bin,
             "white_balance": white_balance,
             "pitch_um": pitch_um,
             "distance_mm": distance_mm,
         }
-        check_bits(kept, own.get("bit_depth"), photographs, own_dark)
+        check_bits(kept, own["bit_depth"], photographs, own_dark)
         if photographs.are_one_picture(pictures):
             dark = next(iter(expanded(photographs.dark_files)), None)
             options = CameraOptions(pictures[0], frames, psf_format=psf_format, dark=dark, ambient=ambient)
@@ -168,6 +168,11 @@ def _kept(camera: Path | None) -> dict[str, Any]:
     if psf is not None and sha256 and psf.is_file() and file_sha256(psf) != sha256:
         values.pop("psf_corrected", None)  # the PSF has been replaced by another picture
     return values
+
+
+def _values(format: PsfFormat | FrameFormat) -> dict[str, Any]:
+    """The fields of a format; ``None`` for a default, which takes the key out of the camera file."""
+    return dict.fromkeys(vars(format)) | changed_fields(format)
 
 
 def _by_kept_path(files: Sequence[Path], kept: Path | None) -> list[Path]:

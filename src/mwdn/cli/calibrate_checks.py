@@ -16,10 +16,10 @@ def check_bits(kept: dict[str, Any], bits: int | None, photographs: PhotographOp
     """Refuse other bits than those of the sensor's measurement, whose levels are fractions of the full scale."""
     before, is_dark_new = kept.get("bit_depth"), photographs.dark_files not in ((), (own_dark,))
     stale = ("full_well_electrons" in kept and not photographs.flat) or ("black_level" in kept and not is_dark_new)
-    if bits not in (None, before) and stale:
+    if bits != before and stale:
         raise ParameterError(
-            f"`bit_depth` ({bits}) must be {before or 'left out'}, as the sensor was measured. To change it, give dark "
-            "and flat frames, too, which measure it again."
+            f"`bit_depth` ({bits or 'none'}) must be {before or 'left out'}, as the sensor was measured. To change it, "
+            "give dark and flat frames, too, which measure it again."
         )
 
 
