@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -17,6 +16,7 @@ from mwdn.calibration.camera_parts import draft_of, write_camera_with_parts
 from mwdn.calibration.corrections import Corrections
 from mwdn.calibration.frame_format import changed_fields
 from mwdn.calibration.photographs import CameraContent, calibrate_frames, expanded
+from mwdn.calibration.psf_format import Background
 from mwdn.calibration.report import inspect_psf
 from mwdn.calibration.verdict import headline
 from mwdn.calibration.watching import guide_exposure, watch_folder
@@ -28,6 +28,7 @@ from mwdn.cli.calibrate_checks import (
     refuse_corrected,
     refuse_psf_format,
     refuse_two_distances,
+    refuse_two_psfs,
     refuse_with_watch,
 )
 from mwdn.cli.camera import CameraOptions
@@ -42,8 +43,12 @@ from mwdn.io.files import file_sha256, refuse_overwrite
 POLL_S = 0.3
 """Seconds between two looks at a watched folder."""
 
-_ELSEWHERE = (("distance_psfs", "distances_mm"), ("field_psfs", "field_positions"))
-"""Keys of the PSFs of points elsewhere, and of their places."""
+_PLACES = ("distance_psfs", "distances_mm", "field_psfs", "field_positions")
+_OF_A_PSF = ("psf_corrected", "psf_gain", "envelope_shift", *_PLACES)
+"""Keys of a camera file that do not hold for another PSF."""
+
+_Write = Callable[[Path], tuple[str, Calibration]]
+"""Writes a camera file to a path; returns the PSF's verdict and the calibration."""
 
 
 def calibrate(  # noqa: PLR0913
@@ -100,69 +105,40 @@ def calibrate(  # noqa: PLR0913
     if pairs is not None:
         check_pair_file(pairs)
         refuse_overwrite(out, pairs)
-    kept = _kept(camera)
-    if files and psf not in (None, kept.get("psf")):
-        raise ParameterError(f"`psf` (`{psf}`) is instead of FILES (`{files[0]}`). Give either of them.")
-    if photographs.flat == WITHOUT:
-        kept.pop("flat_field", None)
-        photographs = replace(photographs, flat=())
-    own_dark = kept.pop("dark", None)  # an option has it
-    pictures = _by_kept_path(pictures, kept.get("psf"))
-    photographs = replace(photographs, dark=tuple(_by_kept_path(photographs.dark, own_dark)))
-    with bench_frames(BenchFrames(pictures, photographs, frames), own_dark) as bench:
-        pictures, photographs, frames = bench.pictures, bench.photographs, bench.frames
-        if photographs.dark_files != (own_dark,):
-            kept.pop("dark_exposure", None)  # of another dark frame
-        elif pictures != [kept["psf"]] and psf_format.shares_pixels(frames):
-            photographs = _with_exposure(photographs, kept.get("dark_exposure"), camera)
-        own = {
-            "ambient": ambient,
+    before = _read_before(camera)
+    refuse_two_psfs(files, psf, before)
+    given = _by_own_paths(BenchFrames(pictures, photographs, frames), before)
+    with bench_frames(given, before.get("dark")) as recorded:
+        bench = _with_dark_exposure(recorded, psf_format, before, camera)
+        check_bits(before, bench.frames.bit_depth, bench.photographs)
+        content = {
+            **before,
+            "dark": None,  # `photographs` names it
+            "dark_exposure": before.get("dark_exposure") if _keeps_dark(bench, before) else None,
+            "flat_field": None if photographs.flat == WITHOUT else before.get("flat_field"),
             **_values(psf_format),
-            **_values(frames),
-            "background": kept.get("background") if auto_background else psf_format.background,
-            "bin": None if auto_bin else frames.bin,
+            **_values(bench.frames),
+            "ambient": ambient,
+            "background": before.get("background") if auto_background else psf_format.background,
+            "bin": None if auto_bin else bench.frames.bin,
             "white_balance": white_balance,
             "pitch_um": pitch_um,
             "distance_mm": distance_mm,
         }
-        check_bits(kept, own["bit_depth"], photographs, own_dark)
-        if photographs.are_one_picture(pictures):
-            dark = next(iter(expanded(photographs.dark_files)), None)
-            options = CameraOptions(pictures[0], frames, psf_format=psf_format, dark=dark, ambient=ambient)
-            refuse_overwrite(out, options.psf, dark, ambient)
-            write = partial(_write_one_picture, options, kept, own)
+        if bench.photographs.are_one_picture(bench.pictures):
+            write = _prepare_one_picture(bench, psf_format, content, out)
         else:
-            refuse_psf_format(psf_format, kept)
-            refuse_two_distances(distance_mm, photographs.distances, kept)
-            refuse_corrected(camera, kept, pictures)
-            known = Corrections.read(kept.get("flat_field"), kept.get("hot_pixels"))
-            refuse_overwrite(out, *expanded((*pictures, *photographs.dark_files, *photographs.flat)))
-            done = calibrate_frames(photographs.of(pictures), frames, known)
-            if auto_background and own["background"] == 0 and own_dark is not None and not photographs.dark_files:
-                own["background"] = None  # 0 was for the dark frame
-            write = partial(_write_photographs, done, {**kept, **own}, has_dark=bool(photographs.dark_files))
+            refuse_psf_format(psf_format, before)
+            refuse_two_distances(distance_mm, bench.photographs.distances, before)
+            refuse_corrected(camera, before, bench.pictures)
+            if auto_background:
+                content["background"] = _background(bench, before)
+            write = _prepare_averaged(bench, content, out)
         _write_and_refine(out, pairs, write)
 
 
-def _write_and_refine(out: Path, pairs: Path | None, write: Callable[[Path], tuple[str, Calibration]]) -> None:
-    """Write the camera file, refined if there are pairs: it appears when it is complete and checked.
-
-    Args:
-        out: the camera file.
-        pairs: to refine it with.
-        write: writes it to a path; returns the PSF's verdict and the calibration.
-    """
-    interrupted = f"Interrupted. {out} is written at the end: nothing has changed."
-    with if_interrupted(lambda: interrupted), draft_of(out) as draft:
-        verdict, calibration = write(draft)
-        if pairs is not None:
-            refine(draft, pairs, out.with_name(f"{out.stem}-refinement.json"))
-            calibration = Calibration.load(draft)
-    _finish(verdict, calibration, out)
-
-
-def _kept(camera: Path | None) -> dict[str, Any]:
-    """The values of the camera file to change for which this command has no option."""
+def _read_before(camera: Path | None) -> dict[str, Any]:
+    """The values of the camera file to change; none without one."""
     values = {} if camera is None else read_camera(camera)
     psf, sha256 = values.get("psf"), values.pop("psf_sha256", "")
     if psf is not None and sha256 and psf.is_file() and file_sha256(psf) != sha256:
@@ -170,26 +146,39 @@ def _kept(camera: Path | None) -> dict[str, Any]:
     return values
 
 
-def _values(format: PsfFormat | FrameFormat) -> dict[str, Any]:
-    """The fields of a format; ``None`` for a default, which takes the key out of the camera file."""
-    return dict.fromkeys(vars(format)) | changed_fields(format)
+def _by_own_paths(given: BenchFrames, before: dict[str, Any]) -> BenchFrames:
+    """The frames, named as in the camera file where they are its own; no flat frames for `WITHOUT`."""
+    dark = tuple(_by_own_path(given.photographs.dark, before.get("dark")))
+    flat = () if given.photographs.flat == WITHOUT else given.photographs.flat
+    photographs = replace(given.photographs, dark=dark, flat=flat)
+    return BenchFrames(_by_own_path(given.pictures, before.get("psf")), photographs, given.frames)
 
 
-def _by_kept_path(files: Sequence[Path], kept: Path | None) -> list[Path]:
-    """The files. If the only one is the camera file's own, its path as in the camera file, so that both are equal."""
-    if kept is not None and [os.path.realpath(file) for file in files] == [os.path.realpath(kept)]:
-        return [kept]
+def _by_own_path(files: Sequence[Path], own: Path | None) -> list[Path]:
+    """The files; if the only one is the camera file's own, its path as in the camera file."""
+    if own is not None and [os.path.realpath(file) for file in files] == [os.path.realpath(own)]:
+        return [own]
     return [*files]
 
 
-def _with_exposure(photographs: PhotographOptions, exposure: float | None, camera: Path | None) -> PhotographOptions:
-    """The photographs of a new PSF, with the exposure of the camera's dark frame; ``None`` is for any exposure.
+def _keeps_dark(bench: BenchFrames, before: dict[str, Any]) -> bool:
+    """Whether the dark frame is that of the camera file."""
+    return bench.photographs.dark_files == (before.get("dark"),)
+
+
+def _with_dark_exposure(
+    bench: BenchFrames, psf_format: PsfFormat, before: dict[str, Any], camera: Path | None
+) -> BenchFrames:
+    """The frames; those of a new PSF with the exposure of the camera file's dark frame, if that is subtracted.
 
     Raises:
-        ParameterError: the photographs have another exposure, or none is given.
+        ParameterError: they have another exposure, or none is given.
     """
-    if exposure is None or photographs.dark_exposures:
-        return photographs
+    exposure, photographs = before.get("dark_exposure"), bench.photographs
+    is_subtracted = _keeps_dark(bench, before) and psf_format.shares_pixels(bench.frames)
+    is_new = bench.pictures != [before.get("psf")]
+    if exposure is None or photographs.dark_exposures or not (is_subtracted and is_new):
+        return bench
     if photographs.exposures != (exposure,):
         given = ", ".join(f"{time:g}" for time in photographs.exposures) or "not given"
         raise ParameterError(
@@ -197,43 +186,58 @@ def _with_exposure(photographs: PhotographOptions, exposure: float | None, camer
             "is subtracted. If they differ, give dark frames for the PSF and for the captures: `dark` and "
             "`dark_exposures`."
         )
-    return replace(photographs, dark_exposures=(exposure,))
+    return replace(bench, photographs=replace(photographs, dark_exposures=(exposure,)))
 
 
-def _write_one_picture(
-    options: CameraOptions, kept: dict[str, Any], own: dict[str, Any], out: Path
-) -> tuple[str, Calibration]:
-    """Write a camera file that names the PSF's picture as it is; returns the PSF's verdict and the calibration."""
-    if options.psf != kept.get("psf"):
-        of_a_psf = {"psf_corrected", "psf_gain", "envelope_shift", *chain.from_iterable(_ELSEWHERE)}
-        kept = {key: value for key, value in kept.items() if key not in of_a_psf}
-    psf_done = kept.get("psf_corrected", False)
-    corrections = Corrections.read(kept.get("flat_field"), kept.get("hot_pixels"), psf_done=psf_done)
+def _values(format: PsfFormat | FrameFormat) -> dict[str, Any]:
+    """The fields of a format; ``None`` for a default, which takes the key out of the camera file."""
+    return dict.fromkeys(vars(format)) | changed_fields(format)
+
+
+def _background(bench: BenchFrames, before: dict[str, Any]) -> Background | None:
+    """The background of averaged frames if no option gives it: 0 comes and goes with the dark frame."""
+    background: Background | None = before.get("background")
+    if bench.photographs.dark_files:
+        # A dark frame with the room's light has no background left; tails below the lines are then the PSF's own.
+        return 0.0 if background is None else background
+    return None if background == 0 and "dark" in before else background
+
+
+def _prepare_one_picture(bench: BenchFrames, psf_format: PsfFormat, content: dict[str, Any], out: Path) -> _Write:
+    """Prepare a camera file that names the PSF's picture as it is."""
+    dark, ambient = next(iter(expanded(bench.photographs.dark_files)), None), content["ambient"]
+    options = CameraOptions(bench.pictures[0], bench.frames, psf_format=psf_format, dark=dark, ambient=ambient)
+    refuse_overwrite(out, options.psf, dark, ambient)
+    return partial(_write_one_picture, options, content)
+
+
+def _write_one_picture(options: CameraOptions, content: dict[str, Any], out: Path) -> tuple[str, Calibration]:
+    if options.psf != content.get("psf"):
+        content = {**content, **dict.fromkeys(_OF_A_PSF)}
+    psf_done = bool(content.get("psf_corrected"))
+    corrections = Corrections.read(content["flat_field"], content.get("hot_pixels"), psf_done=psf_done)
     calibration = options.load(corrections)
-    balance = own["white_balance"]
-    if balance == "flat":
+    if content["white_balance"] == "flat":
         raise ParameterError("`white_balance` 'flat' needs flat frames: `--flat`. Use 'grey-world', or gains.")
-    check_white_balance(balance, calibration.light)
+    check_white_balance(content["white_balance"], calibration.light)
     own_resolution = load_at_psf_resolution(options, corrections)
     report = inspect_psf(own_resolution, own_resolution.frames.read(options.psf_file))
-    write_camera_with_parts(out, {**kept, "psf": options.psf_file, "dark": options.dark, **own}, {})
+    write_camera_with_parts(out, {**content, "psf": options.psf_file, "dark": options.dark}, {})
     return headline(report), calibration
 
 
-def _write_photographs(
-    done: CameraContent, content: dict[str, Any], out: Path, *, has_dark: bool
-) -> tuple[str, Calibration]:
-    """Write a camera file with the pictures made of photographs; returns the PSF's verdict and the calibration."""
-    if content.get("white_balance") == "flat":
-        content["white_balance"] = _flat_balance(done.flat_colour)
-    if content.get("background") is None and has_dark:
-        # A dark frame with the room's light has no background left; tails below the lines are then the PSF's own.
-        content["background"] = 0.0
-    content |= dict.fromkeys((*PSF_OWN_FORMAT, "psf_gain", "envelope_shift"))  # of an earlier PSF
-    content |= done.content
-    for psfs, places in _ELSEWHERE:  # those of an earlier PSF do not fit this one
-        if psfs not in done.parts:
-            content |= {psfs: None, places: None}
+def _prepare_averaged(bench: BenchFrames, content: dict[str, Any], out: Path) -> _Write:
+    """Prepare a camera file with pictures that are made of the frames."""
+    photographs = bench.photographs
+    known = Corrections.read(content["flat_field"], content.get("hot_pixels"))
+    refuse_overwrite(out, *expanded((*bench.pictures, *photographs.dark_files, *photographs.flat)))
+    done = calibrate_frames(photographs.of(bench.pictures), bench.frames, known)
+    return partial(_write_averaged, done, content)
+
+
+def _write_averaged(done: CameraContent, content: dict[str, Any], out: Path) -> tuple[str, Calibration]:
+    balance = _flat_balance(done.flat_colour) if content["white_balance"] == "flat" else content["white_balance"]
+    content = {**content, "white_balance": balance, **dict.fromkeys((*PSF_OWN_FORMAT, *_OF_A_PSF)), **done.content}
     written = write_camera_with_parts(out, content, done.parts)
     calibration = Calibration.load(out)
     check_white_balance(calibration.white_balance, calibration.light)
@@ -253,7 +257,14 @@ def _flat_balance(colour: tuple[float, ...]) -> tuple[float, float, float]:
     return round(green / red, 4), 1.0, round(green / blue, 4)
 
 
-def _finish(verdict: str, calibration: Calibration, out: Path) -> None:
+def _write_and_refine(out: Path, pairs: Path | None, write: _Write) -> None:
+    """Write the camera file, refined if there are pairs: it appears when it is complete and checked."""
+    interrupted = f"Interrupted. {out} is written at the end: nothing has changed."
+    with if_interrupted(lambda: interrupted), draft_of(out) as draft:
+        verdict, calibration = write(draft)
+        if pairs is not None:
+            refine(draft, pairs, out.with_name(f"{out.stem}-refinement.json"))
+            calibration = Calibration.load(draft)
     height, width = calibration.size
     say(
         verdict,
