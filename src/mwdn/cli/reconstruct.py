@@ -7,7 +7,7 @@ from contextlib import closing
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from cyclopts import Parameter
 from rich.markup import escape
@@ -121,39 +121,13 @@ def reconstruct(  # noqa: PLR0913
         )
         is_first = distributed.rank() == 0
         if is_first:
-            _announce(batch, remarks)
-            _name_turned([camera.psf_file.name] if orientation(camera.psf_file) != 1 else [])
-        failed, existing, turned = _run(batch, files)
+            _announce(batch, camera.psf_file, remarks)
+        outcome = _run(batch, files)
         if is_first:
-            _name_turned(turned)
-            batch.summarise(files)
-            if json:
-                print_json([_entry(batch, file, failed.get(file)) for file in files])
-            before = f", {existing} of them before" if existing else ""
-            done = f"{len(files) - len(failed):,} of " if failed else ""
-            say(f"{done}{counted(len(files), 'capture')} reconstructed into {out}{before}")
-    status = 1 if failed else 0
+            _summarise(batch, files, outcome, json=json)
+    status = 1 if outcome.failed else 0
     distributed.set_exit_status(status)
     return status
-
-
-def _announce(batch: Batch, remarks: list[str]) -> None:
-    """Print method, device and PSF, with the warning and the remarks about them."""
-    reconstructor = batch.reconstruct
-    warn(reconstructor.warning)
-    detail(f"{batch.method} on {reconstructor.device}")
-    note(*filter(None, remarks))
-    background = ", ".join(f"{level:.4f}" for level in reconstructor.calibration.background)
-    say(f"PSF {reconstructor.calibration.psf_hash}, background {background} of the full scale subtracted")
-
-
-def _name_turned(turned: list[str]) -> None:
-    """Name files with an EXIF orientation: a phone shows them turned, unlike the pictures."""
-    if turned:
-        note(
-            f"Shown turned elsewhere, by EXIF orientation: {enumerate_names(turned)}. Frames are not turned: pictures "
-            "are in the orientation of the sensor."
-        )
 
 
 def _list_files(captures: Iterable[Path], camera: CameraOptions, out: Path, format: Format) -> list[str]:
@@ -170,21 +144,36 @@ def _list_files(captures: Iterable[Path], camera: CameraOptions, out: Path, form
     return files
 
 
-def _entry(batch: Batch, capture: str, error: str | None) -> dict[str, object]:
-    """Entry of --json for one capture."""
-    if error is not None:
-        return {"capture": capture, "picture": None, "error": error}
-    picture = batch.out / output_name(capture, batch.format)
-    return {"capture": capture, "picture": str(picture), **read_sidecar(picture.with_suffix(".json"))}
+def _announce(batch: Batch, psf_file: Path, remarks: list[str]) -> None:
+    """Print method, device and PSF, with the warning and the remarks about them."""
+    reconstructor = batch.reconstruct
+    warn(reconstructor.warning)
+    detail(f"{batch.method} on {reconstructor.device}")
+    note(*filter(None, remarks))
+    background = ", ".join(f"{level:.4f}" for level in reconstructor.calibration.background)
+    say(f"PSF {reconstructor.calibration.psf_hash}, background {background} of the full scale subtracted")
+    _name_turned([psf_file.name] if orientation(psf_file) != 1 else [])
 
 
-def _run(batch: Batch, files: list[str]) -> tuple[Mapping[str, str], int, list[str]]:
-    """Reconstruct all captures.
+def _name_turned(turned: list[str]) -> None:
+    """Name files with an EXIF orientation: a phone shows them turned, unlike the pictures."""
+    if turned:
+        note(
+            f"Shown turned elsewhere, by EXIF orientation: {enumerate_names(turned)}. Frames are not turned: pictures "
+            "are in the orientation of the sensor."
+        )
 
-    Returns:
-        Errors by capture, the number of already existing pictures, and the names of captures with an EXIF orientation,
-        over all processes.
-    """
+
+class _Outcome(NamedTuple):
+    """Errors by capture, number of pictures that existed before, names of captures with an EXIF orientation."""
+
+    failed: Mapping[str, str]
+    existing: int
+    turned: list[str]
+
+
+def _run(batch: Batch, files: list[str]) -> _Outcome:
+    """Reconstruct all captures; returns the outcome over all processes."""
     failed: dict[str, str] = {}
     turned: list[str] = []
     done = existing = 0
@@ -218,7 +207,7 @@ def _run(batch: Batch, files: list[str]) -> tuple[Mapping[str, str], int, list[s
     doubts.summarise()
     shares = distributed.gather_json((failed, existing, turned))
     errors, counts, names = zip(*shares, strict=True)
-    return ChainMap(*errors), sum(counts), [*chain.from_iterable(names)]
+    return _Outcome(ChainMap(*errors), sum(counts), [*chain.from_iterable(names)])
 
 
 def _report(job: Job) -> None:
@@ -229,3 +218,22 @@ def _report(job: Job) -> None:
     elif job.trust:
         lit = f"; {job.room_light:.0%} of its light was the room's" if job.room_light else ""
         say(f"{one_line(job.capture.name)}: {job.trust.sentence}{lit}")
+
+
+def _summarise(batch: Batch, files: list[str], outcome: _Outcome, *, json: bool) -> None:
+    """Write the contact sheet; print the entries of --json and how many pictures there are."""
+    _name_turned(outcome.turned)
+    batch.summarise(files)
+    if json:
+        print_json([_entry(batch, file, outcome.failed.get(file)) for file in files])
+    before = f", {outcome.existing} of them before" if outcome.existing else ""
+    done = f"{len(files) - len(outcome.failed):,} of " if outcome.failed else ""
+    say(f"{done}{counted(len(files), 'capture')} reconstructed into {batch.out}{before}")
+
+
+def _entry(batch: Batch, capture: str, error: str | None) -> dict[str, object]:
+    """Entry of --json for one capture."""
+    if error is not None:
+        return {"capture": capture, "picture": None, "error": error}
+    picture = batch.out / output_name(capture, batch.format)
+    return {"capture": capture, "picture": str(picture), **read_sidecar(picture.with_suffix(".json"))}
