@@ -21,7 +21,7 @@ import torch
 from mwdn import Calibration, Reconstructor
 from mwdn.export import export_site
 from mwdn.export.exporter import agreement
-from mwdn.export.site import FILES
+from mwdn.export.site import SITE_FILES
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 import browser
@@ -46,8 +46,8 @@ def main():
         site = arguments.site or Path(folder) / "site"
         if not arguments.site:
             export_site(METHOD, calibration, site, runtime=arguments.runtime, name=arguments.psf.name)
-        sizes = {name: (site / name).stat().st_size for name in FILES}
-        with browser.open_page((site / FILES[0]).as_uri(), Path(folder) / "profile") as page:
+        sizes = {name: (site / name).stat().st_size for name in SITE_FILES}
+        with browser.open_page((site / SITE_FILES[0]).as_uri(), Path(folder) / "profile") as page:
             page.wait(f"{STATE}?.textContent.includes('pixels in')")
             if arguments.site:
                 page.drop("#psf", arguments.psf)

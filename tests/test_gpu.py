@@ -12,7 +12,7 @@ import torch
 
 from cameras import contour_psf
 from mwdn import Calibration, Camera, Reconstructor, solvers
-from mwdn.data.mismatch import REAL, Mismatch
+from mwdn.data.mismatch import REAL_OPTIONS, Mismatch
 from mwdn.data.pairs import PairFile
 from mwdn.data.photographs import Photographs
 from mwdn.data.recorded import RecordedPairs, record
@@ -98,7 +98,7 @@ def test_reconstructions(method, precision, calibration, batches):
         assert psnr(there(batch), here(batch)) > (60 if precision == "exact" else 40)
 
 
-@pytest.mark.parametrize("mismatch", [Mismatch(), Mismatch(**dict.fromkeys(REAL, 0.02))])
+@pytest.mark.parametrize("mismatch", [Mismatch(), Mismatch(**dict.fromkeys(REAL_OPTIONS, 0.02))])
 def test_samples(calibration, photographs, mismatch):
     """The same scenes and PSFs; the noise differs, as each device has its own generator."""
     here, there = (

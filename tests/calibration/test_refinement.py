@@ -17,7 +17,7 @@ from mwdn.calibration.pair_model import PairModel, Terms
 from mwdn.calibration.places import at_distance
 from mwdn.calibration.psf_identity import psf_identity
 from mwdn.calibration.refinement import Refinement, smooth_field
-from mwdn.calibration.term_selection import PARTS, left_out, select_terms
+from mwdn.calibration.term_selection import MAX_FOLDS, left_out, select_terms
 from mwdn.data.pair_checks import other_camera
 from mwdn.data.pairs import PairFile
 from mwdn.errors import ParameterError
@@ -116,11 +116,11 @@ def test_with_a_displaced_envelope_the_calibration_as_it_was_stays(psf):
     assert selection.fit(with_it.terms).refinement().envelope_shift[0] == pytest.approx(0.05, abs=0.015)
 
 
-@pytest.mark.parametrize("count", [2, PARTS, 23])
+@pytest.mark.parametrize("count", [2, MAX_FOLDS, 23])
 def test_each_pair_is_left_out_once_and_some_are_kept(count):
     parts = left_out(count)
     assert sorted(pair for part in parts for pair in part) == list(range(count))
-    assert len(parts) == min(count, PARTS)
+    assert len(parts) == min(count, MAX_FOLDS)
     assert max(map(len, parts)) < count
 
 

@@ -19,7 +19,7 @@ from cameras import contour_psf
 from full_disk import full_after
 from mwdn import Camera, read_frame
 from mwdn.cli.app import COMMANDS
-from mwdn.cli.demo import METHODS, PICTURES
+from mwdn.cli.demo import DEMO_METHODS, PICTURES
 from mwdn.io.toml import find_recipe, packaged_recipes
 
 SIZE = 32, 40
@@ -475,11 +475,11 @@ def test_without_trust(run, camera):
 
 @pytest.mark.parametrize(
     ("pictures", "methods"),
-    [(PICTURES[-1:], ("pyramid", "wiener")), pytest.param(PICTURES, METHODS, marks=pytest.mark.acceptance)],
+    [(PICTURES[-1:], ("pyramid", "wiener")), pytest.param(PICTURES, DEMO_METHODS, marks=pytest.mark.acceptance)],
 )
 def test_demo(run, tmp_path, monkeypatch, pictures, methods):
     """With one picture and the two fastest methods here; a picture by all of them takes ten seconds."""
-    monkeypatch.setattr("mwdn.cli.demo.METHODS", methods)
+    monkeypatch.setattr("mwdn.cli.demo.DEMO_METHODS", methods)
     code, out, err = run("demo", "--out", tmp_path / "demo", "--pictures", *pictures)
     assert (code, err) == (0, "")
     assert names(tmp_path / "demo") == ["captures", "comparison.png", "index.html", "pattern.png", "psf.tif"]

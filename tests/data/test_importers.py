@@ -15,7 +15,7 @@ from mwdn.calibration import Calibration, FrameFormat
 from mwdn.calibration.corrections import Corrections
 from mwdn.data import PairFile, import_pairs, read_pairs
 from mwdn.data.kinds import Layout
-from mwdn.data.pair_checks import REFINED, WHITE
+from mwdn.data.pair_checks import DISPLAY_WHITE, REFINED
 from mwdn.errors import ImageError, MissingPackageError, ParameterError, UnknownNameError
 
 RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
@@ -242,11 +242,11 @@ def test_damaged_and_unlike_pictures(tmp_path):
 def test_a_binned_copy_of_refined_pairs_is_refined(tmp_path):
     """The camera's stray light was subtracted from it a second time."""
     shape = (4, 6, 3)
-    marks = {REFINED: "simulate", WHITE: 0.5, "psf_hash": "of larger pixels"}
+    marks = {REFINED: "simulate", DISPLAY_WHITE: 0.5, "psf_hash": "of larger pixels"}
     with PairFile.create(tmp_path / "a.h5", measurement_shape=shape, scene_shape=shape, attributes=marks) as file:
         file.append(np.full(shape, 0.5, np.float32), np.full(shape, 0.5, np.float32))
     import_pairs("pairs", tmp_path / "a.h5", tmp_path / "b.h5", frames=FrameFormat(bin=2))
-    assert PairFile(tmp_path / "b.h5").attributes == {"source": "pairs", REFINED: "simulate", WHITE: 0.5}
+    assert PairFile(tmp_path / "b.h5").attributes == {"source": "pairs", REFINED: "simulate", DISPLAY_WHITE: 0.5}
 
 
 def test_an_unchanged_copy_of_pairs_keeps_the_camera(tmp_path):

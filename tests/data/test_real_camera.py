@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from cameras import contour_psf
-from mwdn.data.mismatch import EXACT, REAL, Mismatch
+from mwdn.data.mismatch import EXACT, REAL_OPTIONS, Mismatch
 from mwdn.data.photographs import Photographs
 from mwdn.data.real_camera import RealCamera, field_camera
 from mwdn.data.simulated import Placement, SimulatedPairs
@@ -21,7 +21,7 @@ from mwdn.optics.warp import warp
 
 SIZE = 32, 40
 CLEAN = Sensor(full_well=1e9, read_noise=0.0, bit_depth=16, black_level=0.0)
-ALL = replace(EXACT, **dict.fromkeys(REAL, 0.3), full=True)
+ALL = replace(EXACT, **dict.fromkeys(REAL_OPTIONS, 0.3), full=True)
 
 
 @pytest.fixture
@@ -44,7 +44,7 @@ def drawn(count=200, **options):
 def test_each_option_changes_captures_and_no_scene(pairs):
     """An option that is read nowhere would look as if it were on."""
     plain = pairs.batch(range(4))
-    for name in REAL:
+    for name in REAL_OPTIONS:
         options = {"eight_bit": {name: 1.0}, "gamma_coded": {name: 1.0}, "gamma_error": {name: 0.3, "gamma_coded": 1.0}}
         options = options.get(name, {name: 0.3})
         other = replace(pairs, mismatch=replace(EXACT, **options, full=True)).batch(range(4))

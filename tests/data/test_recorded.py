@@ -10,7 +10,7 @@ import torch
 
 from cameras import capture_of_rectangles
 from mwdn.calibration.refinement import Refinement
-from mwdn.data.pair_checks import REFINED, WHITE
+from mwdn.data.pair_checks import DISPLAY_WHITE, REFINED
 from mwdn.data.pairs import PairFile
 from mwdn.data.recorded import Division, PrefetchedPairs, RecordedPairs, recorded_pairs
 from mwdn.data.simulated import Samples
@@ -218,7 +218,7 @@ def test_a_refinement_is_applied_once(tmp_path, refined):
 def test_stray_light_has_the_units_of_aligned_pairs(tmp_path):
     """The stray light is a fraction of the full scale; `mwdn align` has divided measurements by the display's white."""
     with PairFile.create(
-        tmp_path / "a.h5", measurement_shape=(4, 6, 3), scene_shape=(4, 6, 3), attributes={WHITE: 0.4}
+        tmp_path / "a.h5", measurement_shape=(4, 6, 3), scene_shape=(4, 6, 3), attributes={DISPLAY_WHITE: 0.4}
     ) as file:
         file.append(torch.full((10, 3, 4, 6), (0.2 + 0.04) / 0.4), torch.ones(10, 3, 4, 6))
     train, _ = recorded_pairs(tmp_path / "a.h5", psf(), Division(), refinement=Refinement(stray_light=((0.04,),)))

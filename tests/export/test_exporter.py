@@ -24,7 +24,7 @@ from mwdn.errors import ExportError, MissingPackageError, ParameterError
 from mwdn.export import export, read_about, run_file
 from mwdn.export.dft import column_matrices, inverse_row_matrix, row_matrix
 from mwdn.export.exporter import MIN_AGREEMENT, agreement, simulate_captures
-from mwdn.export.onnx_program import REAL
+from mwdn.export.onnx_program import REAL_HANDLERS
 from mwdn.fourier.filtering import filter_image
 from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
 from mwdn.io.images import srgb_encode, write_frame
@@ -455,7 +455,7 @@ def test_a_file_that_is_not_the_same_function_is_not_written(method, message, tm
 def test_a_file_that_onnxruntime_refuses_is_not_written(precision, tmp_path, monkeypatch):
     """Two types in one sum: the checker of onnx lets it pass."""
     half = {torch.ops.aten.relu.default: lambda g, node, x: g("Add", x, torch.ones(1, dtype=torch.float16))}
-    monkeypatch.setattr("mwdn.export.onnx_program.REAL", REAL | half)
+    monkeypatch.setattr("mwdn.export.onnx_program.REAL_HANDLERS", REAL_HANDLERS | half)
     with pytest.raises(ExportError, match=r"`camera.onnx` cannot be run: .*Add.* Export it again: as .onnx, as .pt2"):
         export(Rectified(), camera(), tmp_path / "camera.onnx", precision=precision)
     assert not any(tmp_path.iterdir())

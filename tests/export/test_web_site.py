@@ -24,7 +24,7 @@ from mwdn.errors import ExportError, ParameterError
 from mwdn.export import export_site, web_runtime
 from mwdn.export.exporter import agreement
 from mwdn.export.network_models import NetworkModels, run_models
-from mwdn.export.site import FILES
+from mwdn.export.site import SITE_FILES
 from mwdn.export.site_scripts import MODULES, joined_modules, read_static
 from mwdn.io.images import decode_frame
 from mwdn.networks import build
@@ -51,8 +51,10 @@ def runtime(tmp_path_factory):
     """As the npm package, with other contents."""
     folder = tmp_path_factory.mktemp("runtime")
     (folder / "dist").mkdir()
-    (folder / "package.json").write_text(json.dumps({"name": "onnxruntime-web", "version": web_runtime.VERSION}))
-    for name in web_runtime.NAMES:
+    (folder / "package.json").write_text(
+        json.dumps({"name": "onnxruntime-web", "version": web_runtime.RUNTIME_VERSION})
+    )
+    for name in web_runtime.RUNTIME_FILES:
         (folder / "dist" / name).write_bytes(name.encode())
     return folder
 
@@ -87,9 +89,9 @@ def read_camera(folder):
 
 def test_the_folder_is_complete_and_loads_nothing_else(site):
     folder = site[0].path
-    assert sorted(path.name for path in folder.iterdir()) == sorted(FILES)
+    assert sorted(path.name for path in folder.iterdir()) == sorted(SITE_FILES)
     page = (folder / "index.html").read_text()
-    assert set(re.findall(r'(?:src|href)="([^"#]+)"', page)) <= set(FILES)
+    assert set(re.findall(r'(?:src|href)="([^"#]+)"', page)) <= set(SITE_FILES)
     assert "connect-src data: blob:" in page  # the browser itself refuses to send anything
     for name in ("page.js", "page.css", "site.css", "index.html"):
         assert not re.search(r"https?://", (folder / name).read_text()), name
@@ -228,7 +230,7 @@ def test_a_site_of_a_grey_camera_replaces_an_earlier_one(site, runtime, tmp_path
     done = export_site(network(), replace(grey, psf=grey.psf[:, :1]), tmp_path, runtime=runtime)
     assert read_camera(tmp_path)["images"]["psf"]["channels"] == 1
     assert done.agreement > 100
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*FILES, "notes.txt"])
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*SITE_FILES, "notes.txt"])
 
 
 @pytest.mark.parametrize(
@@ -246,7 +248,7 @@ def test_the_runtime_is_checked(runtime, tmp_path, monkeypatch):
         web_runtime.read_runtime(tmp_path)
     other = tmp_path / "other"
     (other / "dist").mkdir(parents=True)
-    for name in web_runtime.NAMES:
+    for name in web_runtime.RUNTIME_FILES:
         (other / "dist" / name).touch()
     (other / "package.json").write_text('{"name": "onnxruntime-web", "version": "1.0.0"}')
     with pytest.raises(ExportError, match=r"must be onnxruntime-web 1\.30\.0, but is onnxruntime-web 1\.0\.0"):
@@ -256,7 +258,7 @@ def test_the_runtime_is_checked(runtime, tmp_path, monkeypatch):
     monkeypatch.setattr(web_runtime.shutil, "which", lambda name: None)
     with pytest.raises(ExportError, match=r"npm, which is not installed.*--runtime FOLDER"):
         web_runtime.read_runtime()
-    (tmp_path / f"onnxruntime-web-{web_runtime.VERSION}.tgz").write_bytes(b"something else")
+    (tmp_path / f"onnxruntime-web-{web_runtime.RUNTIME_VERSION}.tgz").write_bytes(b"something else")
     with pytest.raises(ExportError, match=r"must have the hash sha512-q0y"):
         web_runtime.read_runtime()
 

@@ -6,7 +6,7 @@ from torch.nn import functional as F
 
 from cameras import contour_psf
 from mwdn import Calibration, Reconstructor, fourier
-from mwdn.inference.room_light import FAINT, PIXELS, estimate_room_light, find_room_light, halved
+from mwdn.inference.room_light import MIN_ROOM_LIGHT, PIXELS, estimate_room_light, find_room_light, halved
 from mwdn.networks import build
 from mwdn.optics.room_light import even_light, sloping_light
 from mwdn.solvers import Pyramid
@@ -58,7 +58,7 @@ def test_a_scene_that_fills_the_frame_keeps_it(camera):
     capture = fourier.convolve(F.interpolate(scene, SIZE, mode="bicubic").clamp(min=0), camera[1])
     lit = capture + 0.2 * capture.mean()
     coarse, h, _ = halved(lit, camera[0], PIXELS)
-    assert estimate_room_light(coarse, h).mean() > FAINT * lit.mean()
+    assert estimate_room_light(coarse, h).mean() > MIN_ROOM_LIGHT * lit.mean()
     assert not find_room_light(lit, camera[0]).background.any()
 
 

@@ -51,7 +51,7 @@ def test_large_pictures_in_parts_everywhere(name, monkeypatch, generator):
     network = trained(build(name, width=16), generator)
     psf, measurement = torch.rand(1, 3, 64, 45, generator=generator), torch.rand(2, 3, 64, 45, generator=generator)
     expected = network(measurement, psf)
-    monkeypatch.setattr(memory_format, "LARGEST", 3 * 2 * 64 * 45)
+    monkeypatch.setattr(memory_format, "CHUNK_VALUES", 3 * 2 * 64 * 45)
     monkeypatch.setattr(WienerFilter, "max_grid_pixels", 8 * 96 * 70)
     engine = Engine(network, psf, precision="exact")
     heights = limit_strips(engine.network)

@@ -4,7 +4,7 @@ import torch
 
 from cameras import contour_psf
 from mwdn import fourier
-from mwdn.networks.room_light import GAINS, ORDER, RoomLightUNet, clues
+from mwdn.networks.room_light import GAINS, MAX_FREQUENCY, RoomLightUNet, clues
 from mwdn.solvers.light_spot import cosines
 
 SIZE = 38, 50
@@ -28,7 +28,7 @@ def test_light_is_smooth_in_a_frame_of_any_size(generator):
     for size in (SIZE, (34, 60), (2, 3)):
         with torch.no_grad():
             light = network(torch.rand(2, 3, len(GAINS), *size, generator=generator))
-        basis = cosines(size, light.device, ORDER)
+        basis = cosines(size, light.device, MAX_FREQUENCY)
         smooth = (basis.coefficients(light) @ basis.light.flatten(1)).view(light.shape)
         torch.testing.assert_close(light, smooth, rtol=0, atol=1e-5)
 

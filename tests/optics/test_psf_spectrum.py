@@ -82,7 +82,7 @@ def test_resolution_of_a_gaussian_is_where_it_falls_below_the_noise():
     square = rows**2 + columns**2
     square[0, 0] = np.inf
     f = np.linspace(0.01, 0.5, 100_000)
-    signal = np.exp(-4 * np.pi**2 * sigma**2 * f**2) * psf_spectrum.CONTRAST**2 / f**2 / (1 / square).mean()
+    signal = np.exp(-4 * np.pi**2 * sigma**2 * f**2) * psf_spectrum.SCENE_CONTRAST**2 / f**2 / (1 / square).mean()
     expected = f[signal >= noise**2].max()
     assert psf_spectrum.resolved_frequency(gaussian_psf((size, size), sigma), noise) == pytest.approx(
         expected, abs=1.5 / size

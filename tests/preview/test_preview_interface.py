@@ -21,7 +21,7 @@ from mwdn.errors import ImageError, ParameterError
 from mwdn.io.images import srgb_encode
 from mwdn.preview.cameras import StoredCameras
 from mwdn.preview.reconstruction import with_ambient
-from mwdn.preview.samples import CAMERA
+from mwdn.preview.samples import SAMPLE_CAMERA
 from mwdn.preview.server import make_server
 from preview_server import LIMITS, SIDE, hostile, npy
 
@@ -250,7 +250,7 @@ def test_cameras_are_listed_added_and_removed(serve, tmp_path, psf_file):
         content = stored.read_bytes()
         stored.write_bytes(content[:-9])
         with pytest.warns(UserWarning, match=rf"`{stored.with_suffix('.json')}` is left out"):
-            assert CAMERA in [each["name"] for each in StoredCameras(LIMITS, tmp_path).list()]
+            assert SAMPLE_CAMERA in [each["name"] for each in StoredCameras(LIMITS, tmp_path).list()]
         stored.write_bytes(content)
         assert client.delete("/cameras/sample").status_code == 409
         assert client.delete("/cameras/mine").status_code == 204

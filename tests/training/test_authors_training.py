@@ -14,7 +14,7 @@ from mwdn.errors import ParameterError
 from mwdn.evaluation.alexnet import AlexNet
 from mwdn.training.experiment import prepare
 from mwdn.training.recipe import Recipe, Schedule
-from mwdn.weights.authors import OPTIONS, renamed
+from mwdn.weights.authors import AUTHORS_OPTIONS, renamed
 
 STEPS, BATCH, SIZE = 4, 2, 48
 EXACT = Schedule(
@@ -57,7 +57,7 @@ def pairs(tmp_path, generator):
 
 
 def recipe(name, start="", **options):
-    network = {"name": name, "width": 4, **OPTIONS, **options}
+    network = {"name": name, "width": 4, **AUTHORS_OPTIONS, **options}
     loss = {"mse": 1.0, "feature_mse": 1.0}
     return Recipe(network, replace(EXACT, start=str(start)), loss, pairs=Division("folds", folds=9))
 

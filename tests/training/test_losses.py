@@ -6,7 +6,7 @@ import torch
 from mwdn.errors import CheckpointError, ParameterError, UnknownNameError
 from mwdn.evaluation.distances import feature_mse, lpips, mse, ssim
 from mwdn.training import losses
-from mwdn.training.losses import NAMES, Loss
+from mwdn.training.losses import LOSS_PARTS, Loss
 
 
 def test_loss_is_the_weighted_sum_of_its_parts(noisy_pair, lpips_files):
@@ -34,7 +34,7 @@ def test_loss_has_gradients_for_the_reconstruction_only(noisy_pair, lpips_files)
 
 
 def test_grey_pictures_have_all_losses(noisy_pair, lpips_files):
-    names = set(NAMES) - {"vgg_mse"}  # in test_vgg.py
+    names = set(LOSS_PARTS) - {"vgg_mse"}  # in test_vgg.py
     total, _ = Loss(dict.fromkeys(sorted(names), 1.0), **lpips_files)(noisy_pair[0][:, :1], noisy_pair[1][:, :1])
     assert total.isfinite()
 

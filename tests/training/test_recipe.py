@@ -8,7 +8,7 @@ import pytest
 
 from mwdn.benchmark.published import PUBLISHED
 from mwdn.data.cameras import Cameras
-from mwdn.data.mismatch import REAL, Mismatch
+from mwdn.data.mismatch import REAL_OPTIONS, Mismatch
 from mwdn.data.simulated import Placement
 from mwdn.errors import ParameterError, UnknownNameError
 from mwdn.io.toml import packaged_recipes
@@ -65,7 +65,7 @@ def test_tables_made_in_python_have_their_types(table):
 
 def test_options_that_are_off_leave_the_identity_of_earlier_runs(read):
     """Otherwise no run begun before them could resume, and every cached sample would be computed again."""
-    assert not set(REAL) & read(NETWORK).as_dict()["mismatch"].keys()
+    assert not set(REAL_OPTIONS) & read(NETWORK).as_dict()["mismatch"].keys()
     assert read(NETWORK + "[mismatch]\ntails = 0.1\n").as_dict()["mismatch"]["tails"] == 0.1
 
 

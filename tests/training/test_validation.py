@@ -11,7 +11,7 @@ from mwdn.io.contact_sheets import contact_sheet
 from mwdn.training.losses import Loss
 from mwdn.training.recipe import Recipe, Schedule
 from mwdn.training.tasks import SupervisedTask
-from mwdn.training.validation import START, Validator
+from mwdn.training.validation import VALIDATION_START, Validator
 
 SIZE = 12, 16
 RECIPE = Recipe({"name": "unet"}, Schedule(batch=2, validation=5), {"mse": 1.0, "l1": 0.5})
@@ -48,7 +48,7 @@ def test_means_over_the_samples_whatever_the_batch(batch):
     loss = Loss(RECIPE.loss)
     loss.weights = {"mse": 1.0, "l1": 0.0}  # of the training's current phase
     result = Validator(recipe, SupervisedTask(pairs), PSF)(Darker(), loss, "step 3")
-    assert pairs.asked == list(range(START, START + 5))
+    assert pairs.asked == list(range(VALIDATION_START, VALIDATION_START + 5))
     measurement, scene, _ = Numbered().batch(pairs.asked)
     error = 1.5 * measurement - 0.2 - scene
     clipped = (1.5 * measurement - 0.2).clamp(0, 1) - scene
@@ -63,7 +63,7 @@ def test_captures_stand_beside_the_pairs(shown):
     captures = torch.rand(shown, 3, *SIZE)
     network = Darker()
     sheet = Validator(RECIPE, SupervisedTask(Numbered()), PSF, captures)(network, Loss(RECIPE.loss), "step 3").sheet
-    measurement, scene, _ = Numbered().batch(range(START, START + 5))
+    measurement, scene, _ = Numbered().batch(range(VALIDATION_START, VALIDATION_START + 5))
     white = torch.ones(1, 1, *SIZE)
     rows = [[m[None], network(m[None], PSF), s[None]] for m, s in zip(measurement, scene, strict=True)]
     rows += [[white] * 3] * (min(shown, 6) - 5)
@@ -75,6 +75,6 @@ def test_captures_stand_beside_the_pairs(shown):
 
 def test_sheet_without_captures():
     sheet = Validator(RECIPE, SupervisedTask(Numbered()), PSF)(Darker(), Loss(RECIPE.loss), "step 3").sheet
-    measurement, scene, _ = Numbered().batch(range(START, START + 5))
+    measurement, scene, _ = Numbered().batch(range(VALIDATION_START, VALIDATION_START + 5))
     rows = [[m[None], 1.5 * m[None] - 0.2, s[None]] for m, s in zip(measurement, scene, strict=True)]
     torch.testing.assert_close(sheet, contact_sheet(rows, ["measurement", "step 3", "scene"]))

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.benchmark.pages import Picture
-from mwdn.benchmark.recipe import AXES
+from mwdn.benchmark.recipe import SWEPT
 from mwdn.benchmark.robustness import Sweep
 from mwdn.io.contact_sheets import contact_sheet
 from mwdn.io.images import srgb_encode
@@ -113,7 +113,7 @@ def robustness(label: str, sweeps: dict[str, Sweep]) -> Picture:
         panel.set_xlabel(LABELS[axis], fontsize=8)
         panel.tick_params(labelsize=8)
         panel.grid(alpha=0.3)
-        panel.axvline(AXES[axis], color="k", lw=0.5)
+        panel.axvline(SWEPT[axis], color="k", lw=0.5)
     panels[0].set_ylabel("PSNR / dB", fontsize=8)
     figure.suptitle(label, fontsize=10)
     words = f"{label}: PSNR against the size of each mismatch; other methods in grey"

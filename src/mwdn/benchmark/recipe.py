@@ -21,7 +21,7 @@ from mwdn.training.recipe import Recipe, Schedule
 from mwdn.training.tables import Plateau
 from mwdn.weights.bundled import BUNDLED
 
-AXES = {"noise": 1.0, **{part.name: 0.0 for part in fields(Deviation)}}
+SWEPT = {"noise": 1.0, **{part.name: 0.0 for part in fields(Deviation)}}
 """What a robustness sweep varies, and its value in the camera of the training; noise is a factor."""
 
 
@@ -46,7 +46,7 @@ class Robustness:
     Args:
         data: a simulated data set; empty for no test.
         count: test pictures for each size.
-        sizes: of the mismatch, for each of `AXES` to sweep.
+        sizes: of the mismatch, for each of `SWEPT` to sweep.
     """
 
     data: str = ""
@@ -205,17 +205,17 @@ def _absolute(text: str, folder: Path) -> str:
 def _robustness(table: dict[str, Any]) -> Robustness:
     table = current_names(Deviation, "robustness", table)
     sizes = {}
-    for axis in table.keys() & AXES.keys():
+    for axis in table.keys() & SWEPT.keys():
         values = table[axis]
         if not (isinstance(values, list) and values and all(type(value) in (int, float) for value in values)):
             raise ParameterError(f"`{axis}` of [robustness] ({shown(values)}) must be a list of numbers.")
         check_numbers(values, axis)
-        sizes[axis] = tuple(sorted(float(value) for value in {AXES[axis], *values}))
+        sizes[axis] = tuple(sorted(float(value) for value in {SWEPT[axis], *values}))
     others = {key: value for key, value in table.items() if key not in sizes}
     for key in others:
         if key not in ("data", "count"):
-            raise UnknownNameError("key of [robustness]", key, ["data", "count", *AXES])
-    ordered = {axis: sizes[axis] for axis in AXES if axis in sizes}
+            raise UnknownNameError("key of [robustness]", key, ["data", "count", *SWEPT])
+    ordered = {axis: sizes[axis] for axis in SWEPT if axis in sizes}
     return replace(to_dataclass(Robustness, "robustness", others), sizes=ordered)
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mwdn.benchmark.dataset_recipe import DatasetRecipe
-from mwdn.benchmark.recipe import AXES, Robustness
+from mwdn.benchmark.recipe import SWEPT, Robustness
 from mwdn.benchmark.scoring import read_record
 from mwdn.benchmark.sets import Dataset, simulated_pairs
 from mwdn.data.mismatch import EXACT
@@ -72,7 +72,7 @@ def pairs_at(dataset: Dataset, photographs: Photographs, count: int, axis: str, 
         dataset: a simulated data set.
         photographs: of the test.
         count: number of pairs.
-        axis: one of `AXES`.
+        axis: one of `SWEPT`.
         size: of the mismatch, added to what the camera had in training; for noise a factor.
 
     Returns:
@@ -131,4 +131,4 @@ def sweep(
 
 def _keys(axis: str, size: float) -> tuple[str, str]:
     """Keys in the file: the camera of the training is the start of every axis and is measured once."""
-    return ("none", "0") if size == AXES[axis] else (axis, repr(size))
+    return ("none", "0") if size == SWEPT[axis] else (axis, repr(size))

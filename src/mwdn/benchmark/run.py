@@ -22,7 +22,7 @@ from mwdn.benchmark.sets import Dataset, open_dataset
 from mwdn.benchmark.training import check_networks, schedule_on, train
 from mwdn.data.photographs import Photographs
 from mwdn.evaluation import Perceptual
-from mwdn.evaluation.alexnet import SMALLEST, load_alexnet
+from mwdn.evaluation.alexnet import ALEXNET_MIN_PX, load_alexnet
 from mwdn.io.files import refuse_foreign, write_text
 from mwdn.io.listing import refuse_within
 from mwdn.runtime.distributed import local_device
@@ -182,7 +182,7 @@ def _score_all(
 ) -> dict[str, MethodResult]:
     """Scores of all methods on a data set, by label."""
     sides = dataset.protocol.crop(dataset.calibration.psf).shape[-2:]
-    perceptual = Perceptual.none if min(sides) < SMALLEST else load_perceptual  # `evaluate` says why
+    perceptual = Perceptual.none if min(sides) < ALEXNET_MIN_PX else load_perceptual  # `evaluate` says why
     results = {}
     watch.stage(f"{dataset.name}: scoring", len(benchmark.methods))
     for number, method in enumerate(benchmark.methods):

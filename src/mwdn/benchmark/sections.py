@@ -13,7 +13,7 @@ from torch import Tensor
 from mwdn.benchmark import figures, training
 from mwdn.benchmark.methods import Method
 from mwdn.benchmark.pages import Block, Code, Picture, Section
-from mwdn.benchmark.recipe import AXES, Benchmark
+from mwdn.benchmark.recipe import SWEPT, Benchmark
 from mwdn.benchmark.results import Results, environment
 from mwdn.benchmark.scoring import MethodResult
 from mwdn.benchmark.sets import Dataset
@@ -181,12 +181,12 @@ def _ablation(results: Results) -> list[Block]:
 
 def _robustness(results: Results) -> list[Block]:
     robustness = results.benchmark.robustness
-    largest = {axis: max(sizes, key=lambda size: abs(size - AXES[axis])) for axis, sizes in robustness.sizes.items()}
+    largest = {axis: max(sizes, key=lambda size: abs(size - SWEPT[axis])) for axis, sizes in robustness.sizes.items()}
     columns = ["as trained", *(f"{axis} {size:g}" for axis, size in largest.items())]
     table = _method_table(columns, "PSNR / dB as trained, and its change at the largest mismatch")
     for label, sweep in results.sweeps.items():
         axis, values = next(iter(sweep.items()))
-        as_trained = statistics.fmean(values[AXES[axis]])
+        as_trained = statistics.fmean(values[SWEPT[axis]])
         changes = [statistics.fmean(sweep[axis][size]) - as_trained for axis, size in largest.items()]
         table.add_row(escape(label), f"{as_trained:.2f}", *(f"{change:+.2f}" for change in changes))
     return [

@@ -31,7 +31,7 @@ from mwdn.io.reading import read_json
 from mwdn.optics import Deviation, FieldCamera
 from mwdn.optics.psf import psf_hash
 from mwdn.training.experiment import FILE_START, simulated_sensor
-from mwdn.training.validation import START
+from mwdn.training.validation import VALIDATION_START
 from mwdn.types import Measurement
 
 CAPTURES = 6
@@ -220,7 +220,7 @@ def _simulate(
         (replace(source, photographs=photographs.to(device)), range(start, start + count))
         for photographs, start, count in (
             (learned, 0, recipe.train),
-            (held_out, START, recipe.validation),
+            (held_out, VALIDATION_START, recipe.validation),
             (Photographs(recipe.test_photos), FILE_START, recipe.test),
         )
     ]

@@ -12,7 +12,7 @@ from torch import nn
 from mwdn.errors import CheckpointError, MwdnError, checked
 from mwdn.io.files import as_parameter_error, atomic, refuse_foreign, write_json, write_text
 from mwdn.io.reading import read_json
-from mwdn.weights.bundled import WEIGHTS, find_weights, load_network
+from mwdn.weights.bundled import WEIGHTS_FILE, find_weights, load_network
 from mwdn.weights.checkpoint import load_checkpoint, read_metadata
 
 CONFIG, CARD = "config.json", "README.md"
@@ -43,13 +43,13 @@ def save_pretrained(method: str | Path, folder: str | Path, *, license: str | No
     """
     source, folder = find_weights(str(method)) or Path(method), Path(folder)
     network, metadata = load_checkpoint(source), read_metadata(source)
-    refuse_foreign(folder, (CONFIG, WEIGHTS), b'"library_name": "mwdn"')
+    refuse_foreign(folder, (CONFIG, WEIGHTS_FILE), b'"library_name": "mwdn"')
     config = {"library_name": _LIBRARY, "model_type": metadata["name"], **metadata}
     card, title = folder / CARD, folder.resolve().name
     is_own, license_before = _own_card(folder)
     with as_parameter_error(folder, "Choose another one: `folder`."):
         write_json(folder / CONFIG, config)
-        with atomic(folder / WEIGHTS) as temporary:
+        with atomic(folder / WEIGHTS_FILE) as temporary:
             shutil.copyfile(source, temporary)
         if is_own or not card.exists():
             write_text(card, _card(title, network, metadata, license or license_before))
@@ -65,7 +65,7 @@ def _own_card(folder: Path) -> tuple[bool, str | None]:
     """Whether the card of a folder is as `save_pretrained` wrote it for the weights there, and its license."""
     try:
         written = (folder / CARD).read_text(encoding="utf-8")
-        network, metadata = load_checkpoint(folder / WEIGHTS), read_metadata(folder / WEIGHTS)
+        network, metadata = load_checkpoint(folder / WEIGHTS_FILE), read_metadata(folder / WEIGHTS_FILE)
     except (OSError, UnicodeDecodeError, MwdnError):
         return False, None
     stated = re.search(r'^license: "([^"]*)"$', written, re.MULTILINE)
@@ -94,14 +94,14 @@ def from_pretrained(name: str | Path) -> nn.Module:
             return load_network(f"hub:{of_hub}")
         except CheckpointError as error:
             raise CheckpointError(f"There is no folder `{name}`, and on the hub: {error}") from error
-    config, metadata = read_json(folder / CONFIG), read_metadata(folder / WEIGHTS)
+    config, metadata = read_json(folder / CONFIG), read_metadata(folder / WEIGHTS_FILE)
     for key in ("name", "options"):
         if not isinstance(config, dict) or config.get(key) != metadata[key]:
             raise CheckpointError(
-                f"`{folder / CONFIG}` and `{WEIGHTS}` must have the same `{key}`. Write the folder anew: "
+                f"`{folder / CONFIG}` and `{WEIGHTS_FILE}` must have the same `{key}`. Write the folder anew: "
                 "`mwdn.bridges.save_pretrained`."
             )
-    return load_checkpoint(folder / WEIGHTS)
+    return load_checkpoint(folder / WEIGHTS_FILE)
 
 
 def _card(title: str, network: nn.Module, metadata: dict[str, Any], license: str | None) -> str:

@@ -18,10 +18,10 @@ from mwdn.runtime.requirement import require
 from mwdn.types import FloatFrame, Frame
 from mwdn.weights.bundled import BUNDLED
 
-METHODS = (*BUNDLED, "pyramid", "admm", "fista", "wiener")
+WIDGET_METHODS = (*BUNDLED, "pyramid", "admm", "fista", "wiener")
 """Choices of the widget."""
 
-SUFFIXES = frozenset({".h5", ".hdf5", ".toml", ".npy", ".png", ".tif", ".tiff"}) | RAW
+READ_SUFFIXES = frozenset({".h5", ".hdf5", ".toml", ".npy", ".png", ".tif", ".tiff"}) | RAW
 """Of the files that are read."""
 
 Layer = tuple[Any, dict[str, Any], str]
@@ -35,7 +35,7 @@ def get_reader(path: str | list[str]) -> Callable[[str | list[str]], list[Layer]
     - A camera file (``.toml``): its PSF.
     - Captures (PNG, TIFF, NPY, raw files of cameras): the numbers as stored, which the widget takes.
     """
-    return _read if all(Path(each).suffix.lower() in SUFFIXES for each in _paths(path)) else None
+    return _read if all(Path(each).suffix.lower() in READ_SUFFIXES for each in _paths(path)) else None
 
 
 def _paths(path: str | list[str]) -> list[str]:
@@ -102,7 +102,7 @@ def reconstruct_widget() -> Any:  # noqa: ANN401
     names = ("magicgui", "napari", "napari.layers", "napari.types", "napari.qt.threading")
     magicgui, napari, layers, types, threading = (require(name, "napari") for name in names)
 
-    def reconstruct(capture: Any, psf: Path, method: str = METHODS[0]) -> Any:  # noqa: ANN401
+    def reconstruct(capture: Any, psf: Path, method: str = WIDGET_METHODS[0]) -> Any:  # noqa: ANN401
         if capture is None or not psf.is_file():
             raise ParameterError("Choose the layer of a capture, and a camera file or the picture of a point source.")
         viewer, frame = napari.current_viewer(), capture.data
@@ -115,4 +115,5 @@ def reconstruct_widget() -> Any:  # noqa: ANN401
     worker = threading.FunctionWorker[types.LayerDataTuple]
     reconstruct.__annotations__ |= {"capture": layers.Image, "return": worker}
     files = "*.toml *.png *.tif *.tiff *.npy"
-    return magicgui.magicgui(reconstruct, call_button="Reconstruct", psf={"filter": files}, method={"choices": METHODS})
+    psf, methods = {"filter": files}, {"choices": WIDGET_METHODS}
+    return magicgui.magicgui(reconstruct, call_button="Reconstruct", psf=psf, method=methods)

@@ -14,7 +14,7 @@ from mwdn.calibration.refinement import Refinement
 from mwdn.calibration.white_balance import WhiteBalance
 from mwdn.errors import ParameterError, PsfError, UnknownNameError, fits_type, one_line, shown
 from mwdn.io.files import as_parameter_error, atomic, file_sha256
-from mwdn.io.headers import MAX_BYTES
+from mwdn.io.headers import MAX_DECODED_BYTES
 from mwdn.io.listing import FRAMES
 from mwdn.io.toml import check_numbers, read_toml
 from mwdn.optics.sensor import Sensor
@@ -236,7 +236,7 @@ def check_psf_file(path: str | Path, sha256: str, psf: Path) -> None:
     """Raise a `PsfError` if the PSF of the camera file ``path`` has changed since that was written."""
     # A larger file is refused when it is read; hashing it would take long.
     with suppress(OSError):  # an impossible file name; reading the file reports it
-        if not sha256 or not psf.is_file() or psf.stat().st_size > MAX_BYTES or file_sha256(psf) == sha256:
+        if not sha256 or not psf.is_file() or psf.stat().st_size > MAX_DECODED_BYTES or file_sha256(psf) == sha256:
             return
         raise PsfError(
             f"`{psf}` has changed since the camera file `{path}` was written, and may not fit its other values. "

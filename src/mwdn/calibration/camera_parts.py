@@ -19,10 +19,10 @@ from mwdn.io.images import write_frame
 from mwdn.io.toml import read_toml
 from mwdn.types import Frame
 
-PARTS = ("psf", "dark", "flat_field", "hot_pixels", "distance_psfs", "field_psfs")
+PART_KEYS = ("psf", "dark", "flat_field", "hot_pixels", "distance_psfs", "field_psfs")
 """Keys of a camera file whose files this module writes."""
 
-_NAME = rf"-(?:{'|'.join(key.removesuffix('s').replace('_', '-') for key in PARTS)})-[0-9a-f]{{8}}\.(?:tif|png)"
+_NAME = rf"-(?:{'|'.join(key.removesuffix('s').replace('_', '-') for key in PART_KEYS)})-[0-9a-f]{{8}}\.(?:tif|png)"
 """What follows the camera file's stem in the name of a picture."""
 
 
@@ -50,7 +50,7 @@ def write_camera_with_parts(
     before = _own_parts(path)
     written: list[Path] = []
     try:
-        others = {key: content[key] for key in PARTS if content.get(key) and key not in parts}
+        others = {key: content[key] for key in PART_KEYS if content.get(key) and key not in parts}
         content = {**content, **{key: _copied(path, value, written) for key, value in others.items()}}
         for key, frames in parts.items():
             if isinstance(frames, np.ndarray):
@@ -152,7 +152,7 @@ def _named_parts(path: Path) -> set[Path]:
     """
     table = read_toml(path, "camera file") if path.is_file() else {}
     names: list[Any] = []
-    for key in PARTS:
+    for key in PART_KEYS:
         value = table.get(key, ())
         names += value if isinstance(value, list) else [value]
     return {path.parent / name for name in names if isinstance(name, str)}

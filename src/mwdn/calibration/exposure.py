@@ -12,7 +12,7 @@ from mwdn.types import Frame
 TARGET = 0.8
 """Peak of a well exposed PSF, as a fraction of saturation: sensors are linear up to there, with room for drift."""
 
-BRIGHTEST = 1e-4
+ABOVE_PEAK = 1e-4
 """Fraction of the pixels above the peak level: 10 of 320 x 320. Hot pixels and cosmic hits are fewer than these."""
 
 WELL_EXPOSED = (0.5, 0.95)
@@ -26,7 +26,7 @@ class Exposure(NamedTuple):
     """How a frame of a point source is exposed.
 
     Args:
-        peak: level above which `BRIGHTEST` of the pixels lie, as a fraction of saturation.
+        peak: level above which `ABOVE_PEAK` of the pixels lie, as a fraction of saturation.
         saturated: number of saturated pixels.
         pixels: number of pixels.
         factor: by which to multiply the exposure, so that the peak reaches `TARGET`.
@@ -69,7 +69,7 @@ def measure_exposure(frame: Frame, frames: FrameFormat = FrameFormat(), *, black
     # In a gamma-coded file, the exposure scales the decoded light.
     brightest = np.sort(frames.normalise(frame).amax((0, 1)).flatten().numpy())[::-1]
     levels = brightest * np.float32(frames.full_scale(frame) / full)
-    place = min(math.ceil(BRIGHTEST * levels.size), levels.size - 1)
+    place = min(math.ceil(ABOVE_PEAK * levels.size), levels.size - 1)
     peak = float(levels[place])
     true_peak = _extrapolated(levels, saturated) if saturated > place else peak
     factor = (TARGET - black) / max(true_peak - black, 1e-6)
@@ -83,4 +83,4 @@ def _extrapolated(levels: np.ndarray, saturated: int) -> float:
         return MAX_STEP
     # n(level) = n0 exp(-level / width): between the n-th and the 4 n-th pixel lies width * log(4).
     width = (1.0 - float(levels[4 * count])) / math.log(4)
-    return 1.0 + width * math.log(count / max(BRIGHTEST * pixels, 1.0))
+    return 1.0 + width * math.log(count / max(ABOVE_PEAK * pixels, 1.0))

@@ -18,7 +18,7 @@ from mwdn.types import Frame, Image
 Kind = Literal["PSF", "dark", "flat"]
 """What the frames show: a point source, no light, or even light."""
 
-MAX_BYTES = 2**32
+MAX_TOTAL_BYTES = 2**32
 """Limit of the stored bytes of frames that are averaged at once: 4 GiB, 170 frames of 12 megapixels."""
 
 LIGHT_TOLERANCE = 0.05
@@ -85,7 +85,7 @@ def average_frames(
         dark: (1, C or 1, H, W), subtracted from each; in linear units of the full scale.
 
     Raises:
-        ImageError: no frames, frames of another size, or more than `MAX_BYTES`.
+        ImageError: no frames, frames of another size, or more than `MAX_TOTAL_BYTES`.
         ParameterError: most frames are outliers, or two disagree.
     """
     names = list(names) or [f"frame {number}" for number in range(1, len(frames) + 1)]
@@ -121,8 +121,8 @@ def _check_alike(frames: Sequence[Frame], names: Sequence[str]) -> None:
         if frame.shape != frames[0].shape or frame.dtype != frames[0].dtype:
             got, wanted = (f"{' x '.join(map(str, one.shape))}, {one.dtype}" for one in (frame, frames[0]))
             raise ImageError(f"`{name}` ({got}) must be like `{names[0]}` ({wanted}). Use the same camera settings.")
-    if (size := sum(frame.nbytes for frame in frames)) > MAX_BYTES:
-        raise ImageError(f"{len(frames)} frames ({size:,} bytes) are more than {MAX_BYTES:,}. Give fewer frames.")
+    if (size := sum(frame.nbytes for frame in frames)) > MAX_TOTAL_BYTES:
+        raise ImageError(f"{len(frames)} frames ({size:,} bytes) are more than {MAX_TOTAL_BYTES:,}. Give fewer frames.")
 
 
 def _linear(frames: Sequence[Frame], format: FrameFormat, scales: Sequence[float], dark: Image | None) -> Tensor:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-STEPS = 24
+SIGNAL_GROUPS = 24
 """Levels of brightness at which the variance is measured."""
 
 CUT_OFF = 0.1
@@ -51,7 +51,7 @@ def clipped_variance(values: Tensor) -> float:
 def fit_noise(signal: Tensor, difference: Tensor, *, step: float = 0.0) -> NoiseModel:
     """Fit the noise of one frame to the differences of frames of the same light.
 
-    The pixels are sorted by their signal into `STEPS` groups. A line through the variance of each, weighted by
+    The pixels are sorted by their signal into `SIGNAL_GROUPS` groups. A line through the variance of each, weighted by
     ``count / variance^2`` (the variance of a variance), has the two numbers of the model.
 
     Args:
@@ -62,7 +62,7 @@ def fit_noise(signal: Tensor, difference: Tensor, *, step: float = 0.0) -> Noise
     """
     order = signal.flatten().argsort()
     mean, spread = signal.flatten()[order], difference.flatten()[order]
-    parts = [part for part in torch.arange(len(order)).tensor_split(STEPS) if len(part) > 8]
+    parts = [part for part in torch.arange(len(order)).tensor_split(SIGNAL_GROUPS) if len(part) > 8]
     levels = torch.tensor([float(mean[part].double().mean()) for part in parts], dtype=torch.float64)
     variances = torch.tensor([clipped_variance(spread[part]) for part in parts], dtype=torch.float64)
     least = max(step**2 / 12, 1e-16)

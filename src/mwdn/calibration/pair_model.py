@@ -30,7 +30,7 @@ BLOCKS = 32
 RIDGE = 1e-4
 """Of the normal equations, over the mean of their diagonal."""
 
-DELTA = 0.01
+DISPLACEMENT_STEP = 0.01
 """Displacement of the envelope for finite differences, over the shorter side."""
 
 
@@ -121,10 +121,10 @@ class PairModel:
         moved = psf if shift is None else _displaced(psf, shift)
         over_frame = polynomials(3, size)[:, None].float()
         bases = [((0, 0), moved), *(((m, k), moved * over_frame[m]) for m, k in kernels)]
-        steps = {(-1, 0): (DELTA, 0.0), (-2, 0): (0.0, DELTA)} if moves else {}
+        steps = {(-1, 0): (DISPLACEMENT_STEP, 0.0), (-2, 0): (0.0, DISPLACEMENT_STEP)} if moves else {}
         for name, (down, right) in steps.items():
             ends = (_displaced(moved, (sign * down, sign * right)) for sign in (1, -1))
-            bases.append((name, next(ends) / (2 * DELTA) - next(ends) / (2 * DELTA)))
+            bases.append((name, next(ends) / (2 * DISPLACEMENT_STEP) - next(ends) / (2 * DISPLACEMENT_STEP)))
         self.kernels = [name for name, _ in bases]
         ones = torch.ones(1, psf.shape[1], *size)
         self.even = self._reduce(ones, ones, bases, over_frame)[1]

@@ -25,7 +25,7 @@ from mwdn.types import Frame, Image
 MAGNIFICATION_ERROR = 0.003
 """Of `relative_magnification`: a PSF that is larger by less may be smaller."""
 
-ALIKE = 0.7
+MIN_CORRELATION = 0.7
 """Correlation of PSFs at two distances below which their magnification says nothing."""
 
 
@@ -165,7 +165,7 @@ def _wrong_order(images: dict[float, Image]) -> Iterator[str]:
     """A sentence for each distance whose PSF is larger than that of the next nearer one: it must be smaller."""
     for near, far in pairwise(sorted(images)):
         magnification, alike = relative_magnification(images[far], images[near])
-        if magnification > 1 + MAGNIFICATION_ERROR and alike > ALIKE:
+        if magnification > 1 + MAGNIFICATION_ERROR and alike > MIN_CORRELATION:
             yield (
                 f"The PSF at {far:g} mm is {magnification:.3f} times as large as at {near:g} mm, but a nearer point "
                 "casts a larger shadow. Give `--distances` in the order of the frames."

@@ -16,7 +16,7 @@ from mwdn.calibration.sensor_frames import SensorFrames, average_files
 from mwdn.errors import PsfError
 from mwdn.types import Image
 
-DIM = 0.3
+LOW_PEAK = 0.3
 """Peak of the shortest exposure, as a fraction of the full scale, below which a longer one is advised."""
 
 
@@ -97,7 +97,7 @@ def _check_exposure(
             f"maximum, {format.saturated(frame)[1]:,}. Use {exposure.next(time)}, and capture it again."
         )
     notes = []
-    if exposure.peak < DIM and frame.dtype.kind != "f":
+    if exposure.peak < LOW_PEAK and frame.dtype.kind != "f":
         bits = format.possible_bit_depth(frame)
         unless = f", unless the sensor has {bits} bits: `--bit-depth {bits}`" if bits else ""
         notes.append(f"The peak is at {exposure.peak:.2f} of the full scale: use {exposure.next(time)}{unless}.")

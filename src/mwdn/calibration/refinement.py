@@ -26,7 +26,7 @@ Coefficients = tuple[tuple[float, ...], ...]
 TERMS = ("psf_gain", "envelope_shift", "sensor_field", "stray_light")
 """Fields of `Refinement`, which are keys of a camera file, too."""
 
-DIMMEST = 0.05
+MIN_FIELD = 0.05
 """Lower limit of gains and fields: a polynomial may fall below 0 where it was not measured."""
 
 
@@ -75,7 +75,7 @@ class Refinement:
             shift = torch.tensor([self.envelope_shift], dtype=psf.dtype) * min(psf.shape[-2:])
             psf = displaced_envelope(psf, shift.expand(len(psf), -1))
         if self.psf_gain:
-            psf = psf * self._field("psf_gain", psf).clamp(min=DIMMEST)
+            psf = psf * self._field("psf_gain", psf).clamp(min=MIN_FIELD)
         return unit_sum(psf)
 
     def measurement(self, measurement: Measurement) -> Measurement:
@@ -87,7 +87,7 @@ class Refinement:
         if self.stray_light:
             measurement = measurement - self._field("stray_light", measurement)
         if self.sensor_field:
-            measurement = measurement / self._field("sensor_field", measurement).clamp(min=DIMMEST)
+            measurement = measurement / self._field("sensor_field", measurement).clamp(min=MIN_FIELD)
         return measurement
 
     def field_map(self, size: Size) -> Tensor | None:

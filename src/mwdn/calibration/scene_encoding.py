@@ -13,7 +13,7 @@ GAMMAS = (1.0, 1.4, 1.8, 2.2)
 MAX_PAIRS = 10
 """Pairs that are examined, the first ones."""
 
-MIN_GAIN = 0.1
+MIN_DECREASE = 0.1
 """Relative decrease of the unexplained part from which a gamma is accepted."""
 
 CLIPPED = 0.02
@@ -45,7 +45,7 @@ def scene_gamma(unexplained: dict[float, tuple[float, ...]]) -> float | None:
         return None
     best = min(unexplained, key=lambda gamma: fmean(unexplained[gamma]))
     wins = sum(decoded < plain for decoded, plain in zip(unexplained[best], linear, strict=True))
-    return best if fmean(unexplained[best]) < (1 - MIN_GAIN) * fmean(linear) and wins > len(linear) / 2 else None
+    return best if fmean(unexplained[best]) < (1 - MIN_DECREASE) * fmean(linear) and wins > len(linear) / 2 else None
 
 
 def _is_clipped(scene: Scene) -> bool:

@@ -4,7 +4,7 @@ from mwdn.calibration.frame_format import FrameFormat
 from mwdn.calibration.psf_format import PsfFormat
 from mwdn.types import Size
 
-SMALLEST = 15
+MIN_PSF_PX = 15
 """Minimum height and width of a PSF in pixels. `mwdn.diagnosis.trust` accepts the right PSF of 12 pixels for 1 or 2
 captures in 10, of 15 pixels for 7 or 8."""
 
@@ -17,7 +17,7 @@ def advise_size(capture: Size, psf: Size, frames: FrameFormat, psf_format: PsfFo
         (capture, psf, "capture", "bin={capture}, psf_bin={own}"),
     ):
         factor = larger[0] // smaller[0]
-        if factor > 1 and min(smaller) >= SMALLEST and larger == (smaller[0] * factor, smaller[1] * factor):
+        if factor > 1 and min(smaller) >= MIN_PSF_PX and larger == (smaller[0] * factor, smaller[1] * factor):
             options = options.format(psf=own * factor, capture=frames.bin * factor, own=own)
             return f"The {name} is {factor} times as large: bin it by {factor}, `{options}`."
     if psf[0] <= capture[0] and psf[1] <= capture[1]:

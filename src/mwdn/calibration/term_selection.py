@@ -30,7 +30,7 @@ KERNELS = Terms(psf_gain=3, field_dependence=2).kernels
 
 MIN_PAIRS = 2
 
-PARTS = 10
+MAX_FOLDS = 10
 """Most parts of the pairs that are left out in turn; the time is in proportion to parts times pairs."""
 
 MOVES = 3
@@ -91,8 +91,8 @@ class Selection:
 
 
 def left_out(count: int) -> list[range]:
-    """The pairs that are left out in turn: each alone, or `PARTS` parts of more pairs."""
-    return [range(first, count, PARTS) for first in range(min(count, PARTS))]
+    """The pairs that are left out in turn: each alone, or `MAX_FOLDS` parts of more pairs."""
+    return [range(first, count, MAX_FOLDS) for first in range(min(count, MAX_FOLDS))]
 
 
 def select_terms(

@@ -17,7 +17,7 @@ from mwdn.capture.screen import Picture
 from mwdn.capture.source import CameraFrame
 from mwdn.data.hdf5 import add_rows, as_damage, find_rows, open_hdf5, write_row
 from mwdn.data.journal import Growing, create_growing, open_growing
-from mwdn.data.pair_writer import VERSION, VERSION_KEY
+from mwdn.data.pair_writer import FORMAT_VERSION, VERSION_KEY
 from mwdn.errors import ImageError, ParameterError
 from mwdn.io.files import as_image_error
 
@@ -216,7 +216,7 @@ def create_captured(
     """
     with as_image_error(path), create_growing(path) as growing:
         file = growing.file
-        file.attrs.update({VERSION_KEY: VERSION, **attributes})
+        file.attrs.update({VERSION_KEY: FORMAT_VERSION, **attributes})
         set_format(file.attrs, first)
         add_rows(file, "scene", (*scene_size, 3), np.dtype(np.uint16))
         for name in ("photograph", "planned"):

@@ -16,7 +16,7 @@ from mwdn.errors import DisplayError
 from mwdn.runtime.requirement import require
 from mwdn.runtime.web_access import LOOPBACK, check_token, listen, page_url
 
-LIBRARIES = ("starlette", "websockets", "uvicorn")
+PAGE_PACKAGES = ("starlette", "websockets", "uvicorn")
 
 SHOW_S = 30.0
 """Seconds in which a picture must be shown: a page that was closed meanwhile can be opened again."""
@@ -50,7 +50,7 @@ class PageDisplay(Display):
         token: str = "",
         show_s: float = SHOW_S,
     ) -> None:
-        for name in LIBRARIES:
+        for name in PAGE_PACKAGES:
             require(name, "page", purpose="The display page")
         check_token(host, token)
         self._cm = {"width_cm": width_cm, "height_cm": height_cm, "distance_cm": distance_cm}

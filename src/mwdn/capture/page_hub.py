@@ -13,7 +13,7 @@ from mwdn.errors import ShapeError
 from mwdn.runtime.web_access import is_allowed
 
 STATIC = Path(__file__).parent / "static"
-FILES = {"/": "page.html", "/page.js": "page.js", "/page.css": "page.css"}
+PAGE_FILES = {"/": "page.html", "/page.js": "page.js", "/page.css": "page.css"}
 
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
@@ -61,9 +61,9 @@ class Hub:
             yield
 
         async def file(request: Any) -> FileResponse:  # noqa: ANN401
-            return FileResponse(STATIC / FILES[request.url.path], headers=HEADERS)
+            return FileResponse(STATIC / PAGE_FILES[request.url.path], headers=HEADERS)
 
-        routes = [Route(path, file) for path in FILES]
+        routes = [Route(path, file) for path in PAGE_FILES]
         return Starlette(routes=[*routes, WebSocketRoute("/display", self._connect)], lifespan=lifespan)
 
     def send(self, picture: Picture) -> int:

@@ -10,13 +10,13 @@ from mwdn.errors import ParameterError, UnknownNameError
 SQUARES = 7
 """Squares along each side of the ChArUco board, of the dictionary DICT_4X4_50; markers have 3/4 of a square."""
 
-MIN_SIDE = 12 * SQUARES
+MIN_BOARD_PX = 12 * SQUARES
 """Least side of a picture for the board: 12 pixels a square give a marker 9 pixels, 1.5 for each of its 6 x 6 cells."""
 
 DOTS = 7
 """Dots along each side; the first two have twice the diameter of the others, so that turns and mirrors are noticed."""
 
-STEPS = 9
+GREY_STEPS = 9
 """Grey steps from black to white by which a display's gamma is measured."""
 
 
@@ -27,7 +27,7 @@ def grey(level: int, size: tuple[int, int]) -> Picture:
 
 def grey_levels() -> list[int]:
     """Levels of the grey steps, evenly from 0 to 255."""
-    return [round(255 * step / (STEPS - 1)) for step in range(STEPS)]
+    return [round(255 * step / (GREY_STEPS - 1)) for step in range(GREY_STEPS)]
 
 
 def point(screen: Screen, size_cm: float = 0.1, at_cm: tuple[float, float] = (0.0, 0.0)) -> Picture:
@@ -103,10 +103,10 @@ PATTERNS: Mapping[str, Callable[[tuple[int, int]], Picture]] = {
 
 def check_size(name: str, size: tuple[int, int]) -> None:
     """Raise a `ParameterError` if a picture of this height and width is too small for a pattern."""
-    if name == "charuco" and min(size) < MIN_SIDE:
+    if name == "charuco" and min(size) < MIN_BOARD_PX:
         raise ParameterError(
-            f"`size` ({size[0]} x {size[1]}) of [pictures] must be at least {MIN_SIDE} x {MIN_SIDE} pixels for a "
-            'ChArUco board. Enlarge it, or leave the board out: `patterns = ["dots"]` in [session].'
+            f"`size` ({size[0]} x {size[1]}) of [pictures] must be at least {MIN_BOARD_PX} x {MIN_BOARD_PX} pixels for "
+            'a ChArUco board. Enlarge it, or leave the board out: `patterns = ["dots"]` in [session].'
         )
 
 

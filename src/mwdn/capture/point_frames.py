@@ -1,6 +1,6 @@
 """Frames for `mwdn calibrate` at the start of a session: of a point on the display, a black and a white display.
 
-They are stored in the session's file, each group (K, H, W, C) of `GROUPS` with its exposure:
+They are stored in the session's file, each group (K, H, W, C) of `CALIBRATION_GROUP` with its exposure:
 
 | group | display | exposure |
 | --- | --- | --- |
@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from mwdn.calibration.exposure import BRIGHTEST, measure_exposure
+from mwdn.calibration.exposure import ABOVE_PEAK, measure_exposure
 from mwdn.calibration.frame_average import average_frames
 from mwdn.calibration.frame_format import FrameFormat
 from mwdn.calibration.hot_pixels import find_hot_pixels
@@ -33,7 +33,7 @@ from mwdn.capture.screen import Picture, Screen
 from mwdn.capture.source import CameraFrame, CameraSource
 from mwdn.errors import CameraError
 
-GROUPS = "calibration"
+CALIBRATION_GROUP = "calibration"
 """HDF5 group of a session's file that holds them."""
 
 HALF = 186
@@ -84,7 +84,7 @@ def record_point(pairs: SessionFile, table: PointTable, shooting: Shooting, *, u
         CameraError: the exposure cannot be set, or the point is too faint beside the room's light.
     """
     screen, last = shooting.screen, f"dark-{table.exposures}"
-    if not table.frames or pairs.has_group(f"{GROUPS}/{last}"):
+    if not table.frames or pairs.has_group(f"{CALIBRATION_GROUP}/{last}"):
         return
     if not math.isfinite(usual_s):
         raise CameraError(
@@ -133,7 +133,7 @@ def _add(pairs: SessionFile, name: str, frames: list[CameraFrame], exposure_s: f
                 f"A frame of {name} has an exposure of {frame.exposure_s:.4g} s instead of {exposure_s:.4g} s. The "
                 "same command tries again; for shorter exposures set `ratio` or `exposures` of [point] lower."
             )
-    pairs.add_frames(f"{GROUPS}/{name}", frames, {"exposure_s": exposure_s})
+    pairs.add_frames(f"{CALIBRATION_GROUP}/{name}", frames, {"exposure_s": exposure_s})
 
 
 def hot_pixels(dark: list[CameraFrame]) -> npt.NDArray[np.bool_]:
@@ -162,11 +162,11 @@ def _check_contrast(pairs: SessionFile, dark: CameraFrame, table: PointTable) ->
     Raises:
         CameraError: it is.
     """
-    frames = pairs.frames(f"{GROUPS}/point-1")
+    frames = pairs.frames(f"{CALIBRATION_GROUP}/point-1")
     light = np.mean(frames, axis=0, dtype=np.float64).max(-1) - dark.array.max(-1)
-    part = float(np.quantile(light, 1 - BRIGHTEST)) / (2**dark.bit_depth - 1)
+    part = float(np.quantile(light, 1 - ABOVE_PEAK)) / (2**dark.bit_depth - 1)
     if part < _CONTRAST:
-        pairs.remove(GROUPS)
+        pairs.remove(CALIBRATION_GROUP)
         level = float(dark.array.mean()) / (2**dark.bit_depth - 1)
         reason = f"other light has {level:.0%}: darken the room" if level > _CONTRAST else "it is too faint"
         way_out = "Was the lamp on, and off again?" if table.lamp else "Take a lamp behind a pinhole: `lamp = true`."

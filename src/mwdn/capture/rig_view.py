@@ -8,7 +8,7 @@ import torch
 from mwdn.capture.screen import Homography
 from mwdn.types import FloatFrame, Scene, Size
 
-SAMPLES = 3
+SUBPIXELS = 3
 """Points along each side of a camera's pixel whose light is averaged."""
 
 
@@ -27,16 +27,16 @@ def view(light: FloatFrame, homography: Homography, size: Size) -> Scene:
 
     # Display pixels per sample, at the display's middle: if there are several, the display is downsampled first, so
     # that none is skipped.
-    factor = max(min(int(1 / (_magnification(homography, light.shape[:2]) * SAMPLES)), *light.shape[:2]), 1)
+    factor = max(min(int(1 / (_magnification(homography, light.shape[:2]) * SUBPIXELS)), *light.shape[:2]), 1)
     if factor > 1:
         height, width = (length // factor * factor for length in light.shape[:2])
         cells = light[:height, :width].reshape(height // factor, factor, width // factor, factor, -1)
         light = np.ascontiguousarray(cells.mean((1, 3)))
         homography = homography @ _scaled(float(factor))
-    to_fine = _scaled(float(SAMPLES)) @ homography
-    large = cv2.warpPerspective(light, to_fine, (size[1] * SAMPLES, size[0] * SAMPLES), flags=cv2.INTER_LINEAR)
+    to_fine = _scaled(float(SUBPIXELS)) @ homography
+    large = cv2.warpPerspective(light, to_fine, (size[1] * SUBPIXELS, size[0] * SUBPIXELS), flags=cv2.INTER_LINEAR)
     seen = torch.from_numpy(np.asarray(large)).movedim(-1, 0)[None]
-    return torch.nn.functional.avg_pool2d(seen, SAMPLES)
+    return torch.nn.functional.avg_pool2d(seen, SUBPIXELS)
 
 
 def _scaled(factor: float) -> Homography:

@@ -28,7 +28,7 @@ from mwdn.io.files import check_folder, existing_folder
 SATURATED = 1e-3
 """Fraction of a white frame's pixels that may be saturated (hot pixels)."""
 
-CONTRAST = 0.005
+MIN_WHITE = 0.005
 """Smallest difference of the means of white and dark frames, over the full scale."""
 
 GAMMA_ERROR = 0.03
@@ -188,7 +188,7 @@ class Session:
                 f"({white.exposure_s:g}) of [camera], or `gain`, by half."
             )
         contrast = (float(white.array.mean()) - float(dark.array.mean())) / full
-        if contrast < CONTRAST:
+        if contrast < MIN_WHITE:
             raise CameraError(
                 f"A white display is brighter than a dark one by {contrast:.2%} of the full scale only. Turn the "
                 f"camera to the display, or raise `exposure_s` ({white.exposure_s:g}) of [camera]."

@@ -17,7 +17,7 @@ from mwdn.cli.method_options import MethodOptions, read_options
 from mwdn.cli.progress import track
 from mwdn.cli.terminal import Json, all_or_nothing, counted, note, print_json, say, warn
 from mwdn.data.captures import read_capture
-from mwdn.data.pair_writer import SUFFIXES, check_path
+from mwdn.data.pair_writer import PAIR_SUFFIXES, check_path
 from mwdn.errors import ParameterError
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.contact_sheets import contact_sheet
@@ -80,7 +80,7 @@ def align(  # noqa: PLR0913
         raise ParameterError(f"`count` ({count}) must be at least 1.")
     if points is not None and homography is not None:
         raise ParameterError("`points` are where to start a search, and `homography` replaces it. Give either of them.")
-    is_session = capture.suffix.lower() in SUFFIXES
+    is_session = capture.suffix.lower() in PAIR_SUFFIXES
     if homography is not None and picture is None and not is_session:
         raise ParameterError("`homography` says where a known picture lies: give PICTURE, too, or leave it out.")
     own = read_options([method], options, align)[method]
@@ -95,10 +95,10 @@ def align(  # noqa: PLR0913
     if is_session:
         if picture is not None:
             raise ParameterError(f"`{capture}` has its own pictures. Leave `{picture}` out.")
-        out = out if out.suffix.lower() in SUFFIXES else out / "aligned.h5"
+        out = out if out.suffix.lower() in PAIR_SUFFIXES else out / "aligned.h5"
         content = _align_session(task, capture, out, count, levels=levels)
     else:
-        if out.suffix.lower() in SUFFIXES:
+        if out.suffix.lower() in PAIR_SUFFIXES:
             raise ParameterError(f"`{out}` must be a folder for one capture; a file of pairs is made from a session.")
         content = _align_frame(task, capture, picture, out)
     if json:

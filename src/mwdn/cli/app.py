@@ -82,7 +82,7 @@ COMMANDS = {
 }
 """Module in `mwdn.cli` and function of each command, and the first line of its docstring."""
 
-GROUPS = (
+COMMAND_GROUPS = (
     (Group("Get pictures", sort_key=0), ("reconstruct", "methods", "explain", "export")),
     (Group("Try it", sort_key=1), ("demo", "preview", "doctor")),
     (Group("Describe a camera", sort_key=2), ("calibrate", "inspect", "design")),
@@ -100,12 +100,12 @@ def make_app(command: str | None = None) -> App:
         config=(from_camera_file, note_given),
         help="Lensless imaging: reconstruct the scene from the pattern that a thin mask casts on a sensor.",
         help_formatter=HelpTexts(command) if command else None,
-        group_commands=None if command else Group("Others", sort_key=len(GROUPS)),
+        group_commands=None if command else Group("Others", sort_key=len(COMMAND_GROUPS)),
         help_format=None if command else "plaintext",  # Markdown takes 0.1 s to import
         suppress_keyboard_interrupt=False,  # `main` says how to go on
         default_parameter=Parameter(negative_iterable=()),  # no `--empty-crop`
     )
-    groups = {name: group for group, names in GROUPS for name in names}
+    groups = {name: group for group, names in COMMAND_GROUPS for name in names}
     for name, (place, summary) in COMMANDS.items():
         module, _, function = place.partition(":")
         if name == command:

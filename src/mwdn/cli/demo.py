@@ -32,11 +32,11 @@ MASK = Contour(size_mm=(3.0, 2.5), pitch_um=4.0)
 
 Picture = Literal["astronaut", "coffee", "cat"]
 PICTURES: tuple[Picture, ...] = ("astronaut", "coffee", "cat")
-PEAK = 0.9
+EXPOSED_PEAK = 0.9
 """Light of the brightest pixel over saturation, as a well exposed capture has it."""
 
-FILES = ("index.html", "comparison.png", "pattern.png", "psf.tif", *(f"captures/{name}.png" for name in PICTURES))
-METHODS = ("universal", "pyramid", "admm", "fista", "wiener")
+DEMO_FILES = ("index.html", "comparison.png", "pattern.png", "psf.tif", *(f"captures/{name}.png" for name in PICTURES))
+DEMO_METHODS = ("universal", "pyramid", "admm", "fista", "wiener")
 
 
 def demo(
@@ -52,28 +52,28 @@ def demo(
         seed: of the camera's mask and of its noise.
         pictures: names of the scenes.
     """
-    refuse_foreign(out, FILES, b"mwdn demo")
+    refuse_foreign(out, DEMO_FILES, b"mwdn demo")
     check_folder(out)
     generator = torch.Generator().manual_seed(seed)
     camera = Camera(design_camera("contour", replace(MASK, seed=seed), SETUP).psf, sensor=SENSOR)
     calibration = Calibration(camera.psf)
-    reconstructors = {name: Reconstructor(name, calibration, device="cpu") for name in METHODS}
+    reconstructors = {name: Reconstructor(name, calibration, device="cpu") for name in DEMO_METHODS}
     table = Table("picture", title="PSNR in dB")
-    for name in METHODS:
+    for name in DEMO_METHODS:
         table.add_column(name, justify="right")
     rows, captures = [], {}
     for name in pictures:
         scene = dark_scene(name, SETUP.size, side=200)
         light = camera(scene)
-        exposure = PEAK / light.max()
+        exposure = EXPOSED_PEAK / light.max()
         measurement = camera.sensor.expose(exposure * light, generator=generator)
         results = [reconstruct(measurement) / exposure for reconstruct in reconstructors.values()]
         table.add_row(name, *(f"{psnr(result.clamp(0, 1), scene).item():.2f}" for result in results))
         rows.append([scene, measurement, *results])
         captures[name] = (65535 * measurement.clamp(0, 1)).round()[0].movedim(0, -1).numpy().astype(np.uint16)
-    page, comparison, pattern, psf = (out / name for name in FILES[:4])
+    page, comparison, pattern, psf = (out / name for name in DEMO_FILES[:4])
     write_text(page, _PAGE.format(table=html_table(table)))
-    write_picture(comparison, contact_sheet(rows, ["scene", "measurement", *METHODS]))
+    write_picture(comparison, contact_sheet(rows, ["scene", "measurement", *DEMO_METHODS]))
     write_picture(pattern, to_display(camera.psf))
     write_linear(psf, camera.psf / camera.psf.max())
     for name, frame in captures.items():

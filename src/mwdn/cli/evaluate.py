@@ -20,7 +20,7 @@ from mwdn.data.pairs import PairFile, Part
 from mwdn.data.recorded import Division, RefinedPairs
 from mwdn.errors import ParameterError
 from mwdn.evaluation import Perceptual, Report, Variant
-from mwdn.evaluation.alexnet import SMALLEST
+from mwdn.evaluation.alexnet import ALEXNET_MIN_PX
 from mwdn.evaluation.evaluate import Pairs
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import check_folder, refuse_foreign, refuse_overwrite
@@ -88,7 +88,7 @@ def evaluate(  # noqa: PLR0913
     warn(*(reconstruct.warning for reconstruct in reconstructors.values()), other_camera(file, calibration), *learned)
     refuse_overwrite(out / evaluation.SHEET, *camera.files)
     refuse_foreign(out, (evaluation.JSON, evaluation.SHEET), b'"protocol"')
-    if min(region.crop(calibration.psf).shape[-2:]) >= SMALLEST:
+    if min(region.crop(calibration.psf).shape[-2:]) >= ALEXNET_MIN_PX:
         lpips = ask_for_lpips(lpips)
     perceptual = Perceptual.none("--no-lpips") if lpips is False else Perceptual.load(download=lpips is True)
     check_folder(out)

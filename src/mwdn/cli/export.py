@@ -90,15 +90,15 @@ def _writer(out: Path) -> Callable[..., Exported]:
 def _export_page(
     method: str, camera: CameraOptions, *, out: Path, web: Path, runtime: Path | None, least: float | None
 ) -> None:
-    from mwdn.export.site import FILES, export_site
+    from mwdn.export.site import SITE_FILES, export_site
 
     calibration = camera.load()
     with show_progress() as progress:
         progress.start("Exporting, and comparing with mwdn", None)
         exported = export_site(method, calibration, out, runtime=runtime, name=web.name, least=least)
-    size = sum((out / name).stat().st_size for name in FILES)
+    size = sum((out / name).stat().st_size for name in SITE_FILES)
     _report(exported, size, required_agreement(least))
-    say(f"Open {out / FILES[0]}, or copy the folder to a static host.")
+    say(f"Open {out / SITE_FILES[0]}, or copy the folder to a static host.")
 
 
 def _report(exported: Exported, size: int, required: float) -> None:

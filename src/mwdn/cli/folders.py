@@ -8,7 +8,7 @@ from inspect import signature
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
-FILES = frozenset({".h5", ".hdf5", ".onnx", ".pt2", ".zip"})
+FILE_SUFFIXES = frozenset({".h5", ".hdf5", ".onnx", ".pt2", ".zip"})
 """Suffixes of an ``out`` that is a file. A folder's name may have a dot: ``results/v1.2``."""
 
 P = ParamSpec("P")
@@ -23,7 +23,7 @@ def no_empty_folder(command: Callable[P, R]) -> Callable[P, R]:
         call = signature(command).bind(*args, **named)
         call.apply_defaults()
         out: Path = call.arguments["out"]
-        with _removed_if_empty(out.parent if out.suffix.lower() in FILES else out):
+        with _removed_if_empty(out.parent if out.suffix.lower() in FILE_SUFFIXES else out):
             return command(*args, **named)
 
     return run

@@ -53,7 +53,7 @@ class Pictures:
 def check_pair_file(pairs: Path) -> None:
     """Raise an `MwdnError` unless this is a file of enough pairs, none of them black or with NaN."""
     from mwdn.data.pair_checks import refuse_raw
-    from mwdn.data.pair_writer import NAMES
+    from mwdn.data.pair_writer import PAIR_PARTS
     from mwdn.data.pairs import PairFile, refuse_non_finite
 
     with PairFile(pairs) as file:
@@ -63,7 +63,7 @@ def check_pair_file(pairs: Path) -> None:
         for number in range(len(file)):
             pair = file[number]
             refuse_non_finite(pair, number)
-            for name, picture in zip(NAMES, pair, strict=True):
+            for name, picture in zip(PAIR_PARTS, pair, strict=True):
                 if picture.amax() <= 0:
                     raise ParameterError(f"The {name} of pair {number}, counted from 0, is black. Leave this pair out.")
 

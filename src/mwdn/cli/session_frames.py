@@ -10,7 +10,7 @@ from typing import Any
 from mwdn.calibration.frame_format import FrameFormat
 from mwdn.cli.photographs import PhotographOptions
 from mwdn.data.hdf5 import as_damage, find_rows, open_hdf5, read_attributes
-from mwdn.data.pair_writer import SUFFIXES
+from mwdn.data.pair_writer import PAIR_SUFFIXES
 from mwdn.errors import ParameterError
 from mwdn.io.images import write_frame
 from mwdn.io.listing import list_folder
@@ -69,9 +69,9 @@ def _session(pictures: Sequence[Path]) -> Path | None:
         return None
     (path,) = pictures
     if path.is_dir() and not list_folder(path)[0]:
-        files = sorted(each for each in path.iterdir() if each.suffix.lower() in SUFFIXES)
+        files = sorted(each for each in path.iterdir() if each.suffix.lower() in PAIR_SUFFIXES)
         return files[0] if len(files) == 1 else None
-    return path if path.suffix.lower() in SUFFIXES else None
+    return path if path.suffix.lower() in PAIR_SUFFIXES else None
 
 
 def _extracted(path: Path, folder: Path, given: BenchFrames) -> BenchFrames:

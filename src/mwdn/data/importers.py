@@ -13,7 +13,7 @@ from mwdn.calibration.float_scale import check_float_scale
 from mwdn.calibration.frame_format import changed_fields
 from mwdn.data.authors_file import AuthorsWriter
 from mwdn.data.kinds import KINDS, Kind, Layout
-from mwdn.data.pair_checks import REFINED, WHITE
+from mwdn.data.pair_checks import DISPLAY_WHITE, REFINED
 from mwdn.data.pair_writer import Attribute, PairWriter, PixelType, Shape, check_path, quantise
 from mwdn.data.pairs import PairFile
 from mwdn.data.scene_place import bin_scene, place_scene, resize_scene
@@ -84,7 +84,7 @@ def _of_pairs(file: PairFile, frames: FrameFormat) -> tuple[dict[str, Attribute]
     """Attributes and PSF of a file of pairs that hold in its copy; only the `REFINED` marks if its captures change."""
     if frames == FrameFormat():
         return file.attributes, file.psf
-    return {name: value for name, value in file.attributes.items() if name in (REFINED, WHITE)}, None
+    return {name: value for name, value in file.attributes.items() if name in (REFINED, DISPLAY_WHITE)}, None
 
 
 def write_pairs(

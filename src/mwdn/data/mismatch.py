@@ -121,7 +121,7 @@ class Mismatch:
         return largest * (torch.where(values < 0, -1.0, 1.0) if self.full else values)
 
 
-REAL = tuple(part.name for part in fields(Mismatch) if part.kw_only)
+REAL_OPTIONS = tuple(part.name for part in fields(Mismatch) if part.kw_only)
 """Options for real captures, off by default. Only append: the position in this list is the number of a random
 stream."""
 

@@ -16,7 +16,7 @@ REFINED = "refined"
 made them without its sensor field and stray light."""
 
 
-WHITE = "display_white"
+DISPLAY_WHITE = "display_white"
 """Attribute of aligned files: the display's white as a fraction of the full scale. Measurements are divided by it."""
 
 
@@ -29,8 +29,8 @@ def missing_refinement(file: PairFile, refinement: Refinement) -> Refinement:
 
 
 def display_white(file: PairFile) -> float:
-    """`WHITE` of a file; 1 if it has none."""
-    white = file.attributes.get(WHITE)
+    """`DISPLAY_WHITE` of a file; 1 if it has none."""
+    white = file.attributes.get(DISPLAY_WHITE)
     return white if isinstance(white, float) and 0 < white < math.inf else 1.0
 
 

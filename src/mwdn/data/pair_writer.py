@@ -25,12 +25,12 @@ PixelType = Literal["uint8", "uint16", "float32"]
 Shape = tuple[int, int, int]
 """Height, width and channels of one sample, in the file's order of axes."""
 
-VERSION = 1
+FORMAT_VERSION = 1
 """Version of the format, stored as the attribute `VERSION_KEY`."""
 
 VERSION_KEY = "mwdn_pairs"
-NAMES = ("measurement", "scene")
-SUFFIXES = ".h5", ".hdf5"
+PAIR_PARTS = ("measurement", "scene")
+PAIR_SUFFIXES = ".h5", ".hdf5"
 
 # Numbers outside this range are not noise around [0, 1] but have another scale, for example 0 to 255.
 _LOWEST, _HIGHEST = -0.5, 1.5
@@ -46,7 +46,7 @@ def check_path(path: Path) -> None:
     if path.is_dir():
         raise ImageError(f"`{path}` is a folder. Name a file in it: `{path / 'pairs.h5'}`.")
     real = path.resolve()  # writing to a link would replace its target
-    if real.suffix.lower() not in SUFFIXES:
+    if real.suffix.lower() not in PAIR_SUFFIXES:
         name = real.with_suffix(".h5").name
         raise ParameterError(f"`{real.name}` must end in .h5 or .hdf5: `{name}`.")
 
@@ -68,7 +68,7 @@ class PairWriter:
         check_path(path)
         if dtype not in ("uint8", "uint16", "float32"):
             raise ParameterError(f"`dtype` ('{dtype}') must be 'uint8', 'uint16' or 'float32'.")
-        for name, shape in zip(NAMES, shapes, strict=True):
+        for name, shape in zip(PAIR_PARTS, shapes, strict=True):
             if len(shape) != 3 or min(shape) < 1:
                 raise ParameterError(f"`{name}_shape` {tuple(shape)} must be (height, width, channels), all positive.")
             if np.dtype(dtype).itemsize * math.prod(shape) > PICTURE_BYTES:
@@ -79,7 +79,8 @@ class PairWriter:
             if not isinstance(value, str | int | float) or key == VERSION_KEY:
                 raise ParameterError(f"`attributes` must hold text and numbers; '{key}' is {type(value).__name__}.")
         self.path, self.dtype = path, np.dtype(dtype)
-        self._shapes, self._attributes, self._psf = dict(zip(NAMES, shapes, strict=True)), attributes, _psf_array(psf)
+        self._shapes = dict(zip(PAIR_PARTS, shapes, strict=True))
+        self._attributes, self._psf = attributes, _psf_array(psf)
         self._stack = ExitStack()
         self._data: dict[str, Any] = {}
         self._disk: CheckedFile | None = None
@@ -97,7 +98,7 @@ class PairWriter:
 
     def _set_up(self, file: Any) -> None:  # noqa: ANN401
         """Make the data sets of an `h5py.File`, without rows."""
-        file.attrs.update({VERSION_KEY: VERSION, **self._attributes})
+        file.attrs.update({VERSION_KEY: FORMAT_VERSION, **self._attributes})
         for name, shape in self._shapes.items():
             self._data[name] = add_rows(file, name, shape, self.dtype)
         if self._psf is not None:
@@ -130,14 +131,14 @@ class PairWriter:
         """
         if self._disk is None:
             raise ImageError(f"`{self.path}` is not open. Append inside `with PairFile.create(...) as file:`.")
-        rows = [self._rows(name, pixels) for name, pixels in zip(NAMES, (measurement, scene), strict=True)]
+        rows = [self._rows(name, pixels) for name, pixels in zip(PAIR_PARTS, (measurement, scene), strict=True)]
         if len(rows[0]) != len(rows[1]):
             raise ShapeError(
                 f"`measurement` ({len(rows[0])}) and `scene` ({len(rows[1])}) must match. Append whole pairs."
             )
         for pair in zip(*rows, strict=True):
             with as_image_error(self.path, f" at pair {self._length + 1:,}"):
-                self._write(dict(zip(NAMES, pair, strict=True)))
+                self._write(dict(zip(PAIR_PARTS, pair, strict=True)))
             self._length += 1
 
     def _write(self, pair: dict[str, Frame]) -> None:

@@ -15,7 +15,7 @@ from torch.utils.data import Dataset
 
 from mwdn.data.hdf5 import as_damage, as_incomplete, find_rows, names_in, open_hdf5, open_hdf5_header, read_attributes
 from mwdn.data.journal import IDENTITY
-from mwdn.data.pair_writer import NAMES, VERSION, VERSION_KEY, Attribute, PairWriter, PixelType, Shape
+from mwdn.data.pair_writer import FORMAT_VERSION, PAIR_PARTS, VERSION_KEY, Attribute, PairWriter, PixelType, Shape
 from mwdn.errors import ImageError, ParameterError, shown
 from mwdn.types import Psf
 
@@ -116,7 +116,7 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
         if not -len(self) <= number < len(self):
             raise IndexError(f"`{self.path}` has {len(self):,} pairs; there is no pair {number}.")
         number %= len(self)
-        measurement, scene = (self._read(name, number) for name in NAMES)
+        measurement, scene = (self._read(name, number) for name in PAIR_PARTS)
         return measurement, scene
 
     @property
@@ -178,7 +178,7 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
         file = open_hdf5(self.path, _MAKE_AGAIN)
         if not self._is_same(file):
             raise ImageError(f"`{self.path}` was replaced by another file meanwhile. Start again.")
-        mine = file, {name: file[name] for name in NAMES}
+        mine = file, {name: file[name] for name in PAIR_PARTS}
         first = self._opened.setdefault(process, mine)
         if first is not mine:  # another thread was faster
             file.close()
@@ -195,7 +195,7 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
             stored = self._open()[1][name][number]
         pixels = stored.transpose(2, 0, 1).astype(np.float32, order="C")
         if stored.dtype.kind == "u":
-            bits = self.raw_bits if name == NAMES[0] else None  # 12 bits are in the lower bits of 16
+            bits = self.raw_bits if name == PAIR_PARTS[0] else None  # 12 bits are in the lower bits of 16
             pixels /= np.float32(2**bits - 1 if bits else np.iinfo(stored.dtype).max)
         return torch.from_numpy(pixels)
 
@@ -203,8 +203,8 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
 def _read_header(path: Path, file: Any) -> _Header:  # noqa: ANN401
     shapes = _read_shapes(path, file)
     attributes = read_attributes(path, file, _MAKE_AGAIN)
-    if (version := attributes.pop(VERSION_KEY, VERSION)) != VERSION:
-        raise ImageError(f"`{path}` has format version {version}, but version {VERSION} is needed. Update mwdn.")
+    if (version := attributes.pop(VERSION_KEY, FORMAT_VERSION)) != FORMAT_VERSION:
+        raise ImageError(f"`{path}` has format version {version}, but version {FORMAT_VERSION} is needed. Update mwdn.")
     return _Header(*shapes, attributes)
 
 
@@ -213,7 +213,7 @@ def _read_shapes(path: Path, file: Any) -> tuple[int, Shape, Shape]:  # noqa: AN
         if "gt" in file and "blur" in file:
             raise ImageError(f"`{path}` is the authors' file: `mwdn import mwdn {quote(str(path))} -o pairs.h5`.")
     shapes = []
-    for name in NAMES:
+    for name in PAIR_PARTS:
         data = find_rows(path, file, name, _MAKE_AGAIN)
         if data is None:
             raise ImageError(f"`{path}` must have the data set `{name}`, but has {names_in(path, file)}. {_MAKE_AGAIN}")
@@ -229,7 +229,7 @@ def _read_shapes(path: Path, file: Any) -> tuple[int, Shape, Shape]:  # noqa: AN
 
 def refuse_non_finite(pair: tuple[Tensor, Tensor], number: int) -> None:
     """Raise a `ParameterError` if measurement or scene of the pair of this number hold NaN or infinity."""
-    for name, picture in zip(NAMES, pair, strict=True):
+    for name, picture in zip(PAIR_PARTS, pair, strict=True):
         if not picture.isfinite().all():
             raise ParameterError(
                 f"The {name} of pair {number}, counted from 0, holds NaN or infinity. Make the file anew without it."

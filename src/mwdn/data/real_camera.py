@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from mwdn.data.mismatch import REAL, TAIL_RADIUS, Mismatch
+from mwdn.data.mismatch import REAL_OPTIONS, TAIL_RADIUS, Mismatch
 from mwdn.data.random import seeded, uniform
 from mwdn.fourier.convolution import convolve
 from mwdn.optics.aperture import displaced_envelope, low_order_field, scattered
@@ -27,7 +27,7 @@ STREAM = 16
 POINTS = ((0, 0), (1, 0), (0, 1), (1, 1), (1, -1))
 """Points (down, right) of a 3 x 3 grid at which PSFs off the axis are computed; opposite points have equal PSFs."""
 
-ORDER = 4
+FIELD_ORDER = 4
 """Gain over the aperture, and the outline between two depths: cosines of up to one and a half periods a side."""
 
 SPOT = (0.15, 0.5)
@@ -114,7 +114,7 @@ class RealCamera:
         return torch.stack([gamma_coded(one[None], GAMMA, GAMMA * (1 + e))[0] if yes else one for one, yes, e in coded])
 
     def _generators(self, option: str) -> list[torch.Generator]:
-        return [seeded(seed ^ (STREAM + REAL.index(option) << 24)) for seed in self.seeds]
+        return [seeded(seed ^ (STREAM + REAL_OPTIONS.index(option) << 24)) for seed in self.seeds]
 
     def _amount(self, option: str) -> tuple[Tensor, list[torch.Generator]]:
         """(B, 1, 1, 1) random values of an option, 0 in exact samples; and the generators for what else it needs."""
@@ -129,7 +129,7 @@ class RealCamera:
 
     def _gains(self, generators: list[torch.Generator], channels: int, size: Size) -> Tensor:
         """(B, C, H, W) in [-1, 1], of which 0.7 is common to all colours."""
-        parts = torch.stack([torch.randn(1 + channels, ORDER, ORDER, generator=g) for g in generators])
+        parts = torch.stack([torch.randn(1 + channels, FIELD_ORDER, FIELD_ORDER, generator=g) for g in generators])
         fields = low_order_field(parts, size)
         return 0.7 * fields[:, :1] + 0.3 * fields[:, 1:]
 
@@ -138,7 +138,8 @@ class RealCamera:
         generators = self._generators("depth")
         for generator in generators:
             torch.rand(1, generator=generator)  # the amount
-        fields = low_order_field(torch.stack([torch.randn(1, ORDER, ORDER, generator=g) for g in generators]), size)
+        parts = torch.stack([torch.randn(1, FIELD_ORDER, FIELD_ORDER, generator=g) for g in generators])
+        fields = low_order_field(parts, size)
         return (fields > fields.flatten(1).median(1).values[:, None, None, None]).float()
 
 

@@ -10,7 +10,7 @@ from mwdn.errors import ParameterError, UnknownNameError
 Split = dict[str, range | list[int]]
 """Positions of the pairs for ``"train"``, ``"test"`` and, if the protocol has it, ``"validation"``."""
 
-KINDS = ("paper", "diffusercam", "phlatcam", "in-order", "random", "folds")
+SPLIT_KINDS = ("paper", "diffusercam", "phlatcam", "in-order", "random", "folds")
 
 
 def split(
@@ -75,7 +75,7 @@ def split(
             return _by_fractions(np.random.default_rng(seed).permutation(count), fractions)
         case "folds":
             return _folds(count, folds, fold)
-    raise UnknownNameError("split", kind, KINDS)
+    raise UnknownNameError("split", kind, SPLIT_KINDS)
 
 
 def _require(count: int, least: int, kind: str) -> None:

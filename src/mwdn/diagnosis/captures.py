@@ -12,14 +12,14 @@ from mwdn.diagnosis.verdict import Verdict
 from mwdn.errors import ImageError
 from mwdn.types import Frame, Measurement
 
-DIM = 0.03
+MIN_PEAK = 0.03
 """Fraction of the full scale that the brightest thousandth of a capture must reach."""
 
 NEGATIVE = 0.15
 """Part of a measurement's light that may be below 0. The noise of a small object through PhlatCam's PSF causes 0.003 at
 2,000 electrons and 0.10 at 100; the paper's PSF leaves no dark pixels."""
 
-FAINT = 0.05
+MAX_AMBIENT = 0.05
 """Fraction of the light that may be ambient without a remark."""
 
 
@@ -72,7 +72,7 @@ def darkness(frame: Frame, calibration: Calibration) -> Verdict:
     brightest = float(pixels.kthvalue(pixels.numel() - pixels.numel() // 1000).values)
     part = brightest / calibration.frames.full_scale(frame)
     text = f"The brightest thousandth of the capture starts at {part:.1%} of the full scale"
-    if part < DIM:
+    if part < MIN_PEAK:
         bits = calibration.frames.possible_bit_depth(frame)
         text = f"{text}: too dark" + (", or in the lower bits of its file." if bits else ".")
         return Verdict("capture", "darkness", "doubt", text, "darkness", f"--bit-depth {bits}" if bits else "")
@@ -91,7 +91,7 @@ def ambient_light(frame: Frame, calibration: Calibration) -> Verdict:
     floor = torch.stack([half.flatten(2).amin(-1).clamp(min=0).sum() for half in halves]).amax()
     part = float(floor / measurement.mean((-2, -1)).sum().clamp(min=1e-30))
     text = f"At most {part:.0%} of the capture's light is ambient light"
-    if part < FAINT:
+    if part < MAX_AMBIENT:
         return Verdict("capture", "ambient-light", "good", f"{text}.")
     text = f"{text}: the room's light, or bright surroundings."
     return Verdict("capture", "ambient-light", "unknown", text, options="--ambient FILE")

@@ -37,19 +37,19 @@ from mwdn.types import Frame, Image, Psf
 
 FloatArray = npt.NDArray[np.float64]
 
-BLOCK = 8
+BLOCK_PX = 8
 """Pixels along each side of a block whose noise and level are measured."""
 
-GROUPS = 10
+LEVEL_GROUPS = 10
 """Groups of blocks of similar level. The median over a group ignores blocks with sharp detail."""
 
-LARGEST = 1024
+NOISE_SIDE_PX = 1024
 """Pixels along each side of the noise measurement, in the middle of the frame."""
 
-SMALLEST = 64
+MIN_MEASUREMENT_PX = 64
 """Pixels along each side that a measurement must have."""
 
-SURE = 1.3
+MIN_EVIDENCE = 1.3
 """Smallest logarithm of the likelihood ratio that decides: 1.1 gave 4 wrong answers of 200 with seed 28, 1.3 gives 3,
 and none of 200 with seed 29, which was not used to choose it."""
 
@@ -130,7 +130,7 @@ def gamma(frame: Frame, calibration: Calibration, *, for_viewing: bool = False) 
         calibration: the camera's; the capture must fit its PSF.
         for_viewing: the capture's file is of a type for viewing, such as JPEG.
     """
-    if min(calibration.size) < SMALLEST:
+    if min(calibration.size) < MIN_MEASUREMENT_PX:
         return Verdict("capture", "gamma", "unknown", "The capture is too small to show whether it is gamma-coded.")
     if frame.min() < 0 and calibration.frames.gamma is None:
         return Verdict(
@@ -138,15 +138,15 @@ def gamma(frame: Frame, calibration: Calibration, *, for_viewing: bool = False) 
         )
     slope = noise_slope(frame, calibration)
     evidence, reasons = slope.evidence, [f"its noise has a variance proportional to level^{slope.slope:.1f}"]
-    if abs(evidence) < 3 * SURE:
+    if abs(evidence) < 3 * MIN_EVIDENCE:
         fits = misfits(frame, calibration)
         evidence += fits.evidence
-        reasons = reasons if abs(slope.evidence) > SURE / 2 else []
+        reasons = reasons if abs(slope.evidence) > MIN_EVIDENCE / 2 else []
         reasons += [f"the PSF leaves {fits.stored:.1%} of its detail unexplained, decoded from sRGB {fits.decoded:.1%}"]
     if for_viewing:
         evidence += FOR_VIEWING
         reasons += ["it is a JPEG or WebP"] if evidence < 0 else []
-    if abs(evidence) < SURE:
+    if abs(evidence) < MIN_EVIDENCE:
         text = "This capture cannot tell whether it is gamma-coded. Frames of a sensor are linear, JPEGs are coded."
         return Verdict("capture", "gamma", "unknown", text)
     is_linear, is_decoded = evidence > 0, calibration.frames.gamma is not None
@@ -164,9 +164,9 @@ def noise_slope(frame: Frame, calibration: Calibration) -> NoiseSlope:
     d = y[1:, 1:] - y[:-1, 1:] - y[1:, :-1] + y[:-1, :-1]  # four times the variance of white noise
     variance, level = _blocks(d * d / 4).mean((1, 3)).ravel(), _blocks(y[:-1, :-1]).mean((1, 3)).ravel()
     lit = (level > 0.02 * level.max(initial=0)) & (level < 0.97 * y.max(initial=0))
-    if lit.sum() < 4 * GROUPS:
+    if lit.sum() < 4 * LEVEL_GROUPS:
         return NoiseSlope(0.0, math.inf)
-    groups = np.array_split(np.argsort(level[lit]), GROUPS)
+    groups = np.array_split(np.argsort(level[lit]), LEVEL_GROUPS)
     x = np.log([level[lit][group].mean() for group in groups])
     total = np.array([np.median(variance[lit][group]) for group in groups])
     rounding = step**2 / 12
@@ -174,7 +174,7 @@ def noise_slope(frame: Frame, calibration: Calibration) -> NoiseSlope:
     z = np.log(np.maximum(total - rounding, rounding / 2) + 1e-30)
     spread = ((x - x.mean()) ** 2).sum()
     slope = ((x - x.mean()) * z).sum() / max(spread, 1e-12)
-    scatter = ((z - z.mean() - slope * (x - x.mean())) ** 2).sum() / (GROUPS - 2) / max(spread, 1e-12)
+    scatter = ((z - z.mean() - slope * (x - x.mean())) ** 2).sum() / (LEVEL_GROUPS - 2) / max(spread, 1e-12)
     hidden = 1.8 * rounding / max(float(np.median(total)) - rounding, 1e-6 * rounding + 1e-30)
     return NoiseSlope(float(slope), math.sqrt(4 * scatter + hidden**2))
 
@@ -224,7 +224,7 @@ def _green(frame: Frame, mosaic: Mosaic | None) -> tuple[FloatArray, float]:
     else:
         row, column = divmod(mosaic.index("g"), 2)
         plane = frame[row::2, column::2, 0]
-    rows, columns = (slice(max(0, (n - LARGEST) // 2), (n + LARGEST) // 2) for n in plane.shape)
+    rows, columns = (slice(max(0, (n - NOISE_SIDE_PX) // 2), (n + NOISE_SIDE_PX) // 2) for n in plane.shape)
     plane = plane[rows, columns].astype(np.float64)
     scale = max(float(plane.max()), 1e-30)
     steps = np.diff(np.unique(plane))
@@ -232,6 +232,6 @@ def _green(frame: Frame, mosaic: Mosaic | None) -> tuple[FloatArray, float]:
 
 
 def _blocks(plane: FloatArray) -> FloatArray:
-    """Blocks of pixels: (rows, BLOCK, columns, BLOCK)."""
-    rows, columns = (length // BLOCK for length in plane.shape)
-    return plane[: rows * BLOCK, : columns * BLOCK].reshape(rows, BLOCK, columns, BLOCK)
+    """Blocks of pixels: (rows, BLOCK_PX, columns, BLOCK_PX)."""
+    rows, columns = (length // BLOCK_PX for length in plane.shape)
+    return plane[: rows * BLOCK_PX, : columns * BLOCK_PX].reshape(rows, BLOCK_PX, columns, BLOCK_PX)

@@ -23,7 +23,7 @@ from mwdn.diagnosis.verdict import Verdict
 from mwdn.fourier.transforms import frequency_grid, spectrum
 from mwdn.types import Frame
 
-PEAK = 0.03
+PEAK_RADIUS = 0.03
 """Radius of a peak in cycles per pixel: colours that change over 30 pixels and more."""
 
 RING = 0.12
@@ -40,10 +40,10 @@ mosaic 0.0025 and less."""
 MIN_COHERENCE = 0.5
 """Smallest coherence of the peaks at (1/2, 0) and (0, 1/2) that shows the diagonal of green; 1 without noise."""
 
-LARGEST = 1024
+EXAMINED_SIDE_PX = 1024
 """Pixels along each side that are examined, in the middle of the frame."""
 
-SMALLEST = 64
+MIN_MOSAIC_PX = 64
 """Pixels along each side that a frame must have: a peak then holds 6 of them."""
 
 
@@ -87,7 +87,7 @@ def mosaic(frame: Frame, calibration: Calibration) -> Verdict:
     given = calibration.frames.mosaic or ""
     if frame.shape[-1] != 1:
         return Verdict("capture", "mosaic", "good", "The frame has colours.")
-    if min(frame.shape[:2]) < SMALLEST:
+    if min(frame.shape[:2]) < MIN_MOSAIC_PX:
         return Verdict("capture", "mosaic", "unknown", "The frame is too small to show whether it is raw.", given)
     peaks = find_peaks(torch.from_numpy(frame[..., 0].astype(np.float32)))
     measured = f"alternate pixels differ by {peaks.amplitude:.1%} of the mean"
@@ -108,8 +108,8 @@ def mosaic(frame: Frame, calibration: Calibration) -> Verdict:
 
 
 def find_peaks(plane: Tensor) -> Peaks:
-    """Measure the peaks of a picture (H, W) of at least `SMALLEST` pixels along each side."""
-    height, width = (min(length, LARGEST) // 2 * 2 for length in plane.shape)
+    """Measure the peaks of a picture (H, W) of at least `MIN_MOSAIC_PX` pixels along each side."""
+    height, width = (min(length, EXAMINED_SIDE_PX) // 2 * 2 for length in plane.shape)
     top, left = ((length - cut) // 4 * 2 for length, cut in zip(plane.shape, (height, width), strict=True))
     image = plane[top : top + height, left : left + width].float()
     # The window keeps jumps at the border of the frame out of the peaks.
@@ -118,7 +118,7 @@ def find_peaks(plane: Tensor) -> Peaks:
     F = spectrum(torch.stack([image, image * x, image * y, image * x * y])[None], (height, width))[0]
     rows, columns = frequency_grid((height, width))
     distance = torch.hypot(rows, columns)
-    inside, ring = distance < PEAK, (distance > 1.5 * PEAK) & (distance < RING)
+    inside, ring = distance < PEAK_RADIUS, (distance > 1.5 * PEAK_RADIUS) & (distance < RING)
     energy = F.abs().square()
     peaks = energy[:, inside].mean(1)
     level = energy[:, ring].mean(1)

@@ -27,13 +27,13 @@ QUARTER_TURNS = tuple(name for name in get_args(Orientation) if swaps_axes(name)
 CLEAR = 1.17
 """Contrast above which the best orientation is certain."""
 
-ALIKE = 1.12
+MIN_LEAD = 1.12
 """Contrast below which the PSF is another camera's."""
 
 MAX_NOISE = 0.6
 """`OrientationFit.noise` above which orientations fit alike even if one of them is right."""
 
-MIN_SIDE = 96
+MIN_CAPTURE_PX = 96
 """Height and width in pixels of a capture below which that is so, too."""
 
 MAX_SATURATED = 0.1
@@ -90,7 +90,7 @@ class OrientationFit:
             text = f"The PSF is mirrored or turned: as it is, it leaves {self.contrast**-1 - 1:.0%} more unexplained."
             return Verdict("psf", "orientation", "doubt", text, right, f"--psf-orientation {right}")
         alike = f"The PSF's mirror images and turns fit the capture alike (to {self.lead - 1:.0%})"
-        if self.lead >= ALIKE or self.noise > MAX_NOISE or self.side < MIN_SIDE:
+        if self.lead >= MIN_LEAD or self.noise > MAX_NOISE or self.side < MIN_CAPTURE_PX:
             return Verdict("psf", "orientation", "unknown", f"{alike}: the PSF cannot be judged by this capture.")
         text = f"{alike}: it is another camera's, or at another resolution."
         return Verdict("psf", "another-camera", "doubt", text, "another-camera")

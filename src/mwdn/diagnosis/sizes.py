@@ -26,10 +26,10 @@ from mwdn.types import Measurement, Psf, Size
 BINS = range(1, 9)
 """Bins of the PSF or the capture that are tried."""
 
-MIN_SIDE = 64
+MIN_COMMON_PX = 64
 """Pixels of the shorter side that PSF and capture must have in common."""
 
-LARGEST = 60_000
+MAX_FIT_PIXELS = 60_000
 """Pixels of the largest frame that is not halved: 8 bins take a few seconds."""
 
 
@@ -55,7 +55,7 @@ def fit_sizes(measurement: Measurement, psf: Psf) -> list[Fit]:
     fits = []
     for psf_bin, bin in bins:
         sides = [min(a // bin, b // psf_bin) for a, b in zip(capture.shape[-2:], grey.shape[-2:], strict=True)]
-        if min(sides) >= MIN_SIDE:
+        if min(sides) >= MIN_COMMON_PX:
             size = sides[0], sides[1]
             both = (crop_centre(bin_pixels(image, by), size) for image, by in ((capture, bin), (grey, psf_bin)))
             fits.append(Fit(psf_bin, bin, size, _lead(*both)))
@@ -68,8 +68,8 @@ def _lead(capture: Measurement, psf: Psf) -> float:
 
 
 def _fit(capture: Measurement, psf: Psf, turns: tuple[str, ...]) -> OrientationFit:
-    """`fit_turns` of grey pictures of at most `LARGEST` pixels."""
-    while capture[0, 0].numel() > LARGEST:
+    """`fit_turns` of grey pictures of at most `MAX_FIT_PIXELS` pixels."""
+    while capture[0, 0].numel() > MAX_FIT_PIXELS:
         capture, psf = F.avg_pool2d(capture, 2), F.avg_pool2d(psf, 2)
     return fit_turns(capture, psf / psf.sum(), turns)
 

@@ -25,7 +25,7 @@ from mwdn.fourier.transforms import fast_length, inverse_spectrum, spectrum
 from mwdn.solvers.alignment import fine_detail
 from mwdn.types import Measurement, Psf, Scene
 
-PARTS = 20
+PARTS_PER_SIDE = 20
 """Parts along the shorter side of a picture."""
 
 
@@ -58,7 +58,7 @@ def support_map(measurement: Measurement, psf: Psf, scene: Scene) -> Support:
     s = fine_detail(convolve(scene.float() / unit, psf))
     gain = ((s * d).sum((-2, -1), keepdim=True) / s.square().sum((-2, -1), keepdim=True).clamp(min=1e-30)).clamp(min=0)
     x, r, h = gain * scene.float() / unit, d - gain * s, fine_detail(psf)
-    step = max(4, min(x.shape[-2:]) // PARTS)
+    step = max(4, min(x.shape[-2:]) // PARTS_PER_SIDE)
     matched = correlate(r, h)
     parts, products = _parts(x, step), _parts(matched * x, step)
     nearby = _autocorrelation(h, 2 * step)

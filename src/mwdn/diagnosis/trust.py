@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 
 import torch
 
-from mwdn.calibration.size_advice import SMALLEST
+from mwdn.calibration.size_advice import MIN_PSF_PX
 from mwdn.diagnosis.orientation import OrientationFit, fit_orientations
 from mwdn.diagnosis.support_map import Support, support_map
 from mwdn.diagnosis.verdict import Verdict
@@ -87,10 +87,10 @@ class Trust:
 def check_size(psf: Psf) -> None:
     """Raise a `PsfError` if a PSF is too small for a reliable result."""
     height, width = psf.shape[-2:]
-    if min(height, width) < SMALLEST:
+    if min(height, width) < MIN_PSF_PX:
         raise PsfError(
-            f"The PSF ({height} x {width}) must have at least {SMALLEST} pixels along each side. Take the whole frame "
-            "of the sensor, or crop and bin it less: `crop`, `bin`, `psf_bin`."
+            f"The PSF ({height} x {width}) must have at least {MIN_PSF_PX} pixels along each side. Take the whole "
+            "frame of the sensor, or crop and bin it less: `crop`, `bin`, `psf_bin`."
         )
 
 

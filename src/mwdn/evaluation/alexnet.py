@@ -19,7 +19,7 @@ from mwdn.types import Image
 from mwdn.weights.checkpoint import first_difference
 from mwdn.weights.torch_file import read_plain
 
-SMALLEST = 31
+ALEXNET_MIN_PX = 31
 """Fewest pixels along each axis: 31 -> 7 (stride 4) -> 3 -> 1 (pooled); with fewer, relu3 to relu5 are empty."""
 
 CHANNELS = 64, 192, 384, 256, 256
@@ -72,9 +72,9 @@ class AlexNet(nn.Module):
             relu1 to relu``last``, (B, `CHANNELS`, h, w), h and w about H and W over 4, 8, 16, 16, 16.
 
         Raises:
-            ShapeError: neither 1 nor 3 channels, or a side shorter than `SMALLEST`.
+            ShapeError: neither 1 nor 3 channels, or a side shorter than `ALEXNET_MIN_PX`.
         """
-        check_picture(image, SMALLEST, "AlexNet", "`feature_mse` and `lpips`")
+        check_picture(image, ALEXNET_MIN_PX, "AlexNet", "`feature_mse` and `lpips`")
         value, outputs = image.expand(-1, 3, -1, -1), []
         for layer in self.features:
             value = layer(value)

@@ -14,7 +14,7 @@ from torch import nn
 
 from mwdn.data.pairs import refuse_non_finite
 from mwdn.errors import ParameterError, ShapeError
-from mwdn.evaluation.alexnet import SMALLEST
+from mwdn.evaluation.alexnet import ALEXNET_MIN_PX
 from mwdn.evaluation.distances import WINDOW
 from mwdn.evaluation.metrics import METRICS, Perceptual, Protocol, Variant, measure
 from mwdn.evaluation.report import Report, Scores
@@ -92,8 +92,10 @@ def evaluate(
     side = min(protocol.crop(pairs[0][1][None]).shape[-2:])
     if side < WINDOW:
         raise ShapeError(f"`protocol` ({protocol.name}) must leave at least {WINDOW} x {WINDOW} pixels, for SSIM.")
-    if side < SMALLEST:
-        perceptual = Perceptual.none(f"the part {protocol.name} has less than {SMALLEST} pixels a side, for AlexNet")
+    if side < ALEXNET_MIN_PX:
+        perceptual = Perceptual.none(
+            f"the part {protocol.name} has less than {ALEXNET_MIN_PX} pixels a side, for AlexNet"
+        )
     perceptual = perceptual or Perceptual.load()
     first = [pairs[i] for i in range(min(shown, len(pairs)))]
     rows = [[scene[None], measurement[None]] for measurement, scene in first]

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from mwdn.evaluation.alexnet import PublicWeights, check_picture, load_weights, locate
 from mwdn.types import Image
 
-SMALLEST = 8
+VGG_MIN_PX = 8
 """Fewest pixels along each axis: relu4_3 is at 1/8."""
 
 VGG16 = PublicWeights(
@@ -42,9 +42,9 @@ class Vgg16(nn.Module):
         """relu2_2, (B, 128, H/2, W/2), and relu4_3, (B, 512, H/8, W/8), of a picture (B, 1 or 3, H, W).
 
         Raises:
-            ShapeError: neither 1 nor 3 channels, or a side shorter than `SMALLEST`.
+            ShapeError: neither 1 nor 3 channels, or a side shorter than `VGG_MIN_PX`.
         """
-        check_picture(image, SMALLEST, "VGG-16", "`vgg_mse`")
+        check_picture(image, VGG_MIN_PX, "VGG-16", "`vgg_mse`")
         middle = self.features[:9](image.expand(-1, 3, -1, -1))
         return middle, self.features[9:](middle)
 

@@ -23,7 +23,7 @@ from mwdn.export.onnx_operations import OPERATIONS, Handler, filled, source, val
 if TYPE_CHECKING:
     import onnx
 
-REAL = OPERATIONS | LAYERS
+REAL_HANDLERS = OPERATIONS | LAYERS
 """Handlers of operations on real tensors."""
 
 _aten = torch.ops.aten
@@ -128,7 +128,7 @@ def _convert(g: OnnxGraph, step: fx.Node, arguments: Any, options: Any) -> Any: 
         return None  # the batch size, which the shapes hold
     if step.target is operator.getitem or (step.target is _aten.select.int and isinstance(arguments[0], Pair)):
         return arguments[0][arguments[-1]]
-    handlers = _TRANSFORMS if step.target in _AXIS else REAL
+    handlers = _TRANSFORMS if step.target in _AXIS else REAL_HANDLERS
     if step.target not in _AXIS and any(_is_complex(source) for source in step.all_input_nodes):
         handlers = _ON_PAIRS
     if step.target not in handlers:
@@ -197,7 +197,7 @@ _TRANSFORMS: dict[Any, Handler] = {_ROWS: _rows, _TO_ROWS: _to_rows, _COLUMNS: _
 
 def _on_both(target: Any) -> Handler:  # noqa: ANN401
     return lambda g, node, pair, *arguments, **options: Pair(
-        *(REAL[target](g, node, part, *arguments, **options) for part in pair)
+        *(REAL_HANDLERS[target](g, node, part, *arguments, **options) for part in pair)
     )
 
 

@@ -9,12 +9,12 @@ from torch import Tensor
 
 from mwdn.calibration import Calibration
 from mwdn.calibration.pixel_repair import PixelRepair
-from mwdn.calibration.refinement import DIMMEST
+from mwdn.calibration.refinement import MIN_FIELD
 from mwdn.errors import ParameterError
 from mwdn.export.exporter import Exported, agreement, check_agreement, simulate_captures
 from mwdn.export.network_models import NetworkModels, network_models, run_models
 from mwdn.export.site_scripts import constant, joined_modules, read_static, stored
-from mwdn.export.web_runtime import BINARIES, LIBRARIES, PACKAGE, VERSION, read_runtime
+from mwdn.export.web_runtime import BINARIES, LIBRARIES, PACKAGE, RUNTIME_VERSION, read_runtime
 from mwdn.inference.methods import Method, as_method
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import as_parameter_error, atomic, check_folder, refuse_foreign
@@ -29,7 +29,7 @@ SAMPLES = ("astronaut", "coffee", "cat")
 CHECKED = 4096
 """Pixels of the first sample's scene that the page compares with the package's."""
 
-FILES = (
+SITE_FILES = (
     "index.html",
     "page.css",
     "site.css",
@@ -78,7 +78,7 @@ def export_site(
     if out.exists() and not out.is_dir():
         raise ParameterError(f"`out` ({out}) must be a folder, but is a file. Choose another one: `-o site`.")
     check_folder(out)
-    refuse_foreign(out, FILES, _MARK)
+    refuse_foreign(out, SITE_FILES, _MARK)
     network = _network(method)
     binaries = read_runtime(None if runtime is None else Path(runtime))
     channels = network.channels or calibration.psf.shape[1]
@@ -88,12 +88,12 @@ def export_site(
     scenes = exact.as_recorded(exact.on_device(captures.float() / 65535))
     reached = _compare(models, calibration, captures, scenes, channels)
     check_agreement(reached, "The page", _title(method), least=least)
-    about = {"method": _title(method), "version": __version__, "runtime": f"{PACKAGE} {VERSION}"}
+    about = {"method": _title(method), "version": __version__, "runtime": f"{PACKAGE} {RUNTIME_VERSION}"}
     camera = _camera(calibration, about | {"name": name}, channels, scenes)
     images = {key: _bytes(image) for key, image in _images(calibration).items()}
     frames = captures.movedim(1, -1).numpy().astype("uint16")
     samples = {f"{key}.png": encode_png(frame, f"{key}.png") for key, frame in zip(SAMPLES, frames, strict=True)}
-    texts = [name for name in FILES if not name.endswith(".js")]
+    texts = [name for name in SITE_FILES if not name.endswith(".js")]
     contents = {name: read_static(name) for name in texts}
     contents |= {
         "page.js": joined_modules(),
@@ -184,7 +184,7 @@ def _images(calibration: Calibration) -> dict[str, Tensor]:
         "offset": calibration.offset,
         "flat": calibration.corrections.flat,
         "stray": stray,
-        "field": None if field is None else field.clamp(min=DIMMEST),
+        "field": None if field is None else field.clamp(min=MIN_FIELD),
     }
     return {name: image for name, image in images.items() if image is not None}
 
@@ -214,6 +214,6 @@ def _runtime_scripts(binaries: Mapping[str, bytes]) -> dict[str, str]:
 
 
 def _write(out: Path, contents: Mapping[str, str]) -> None:
-    for name in FILES:
+    for name in SITE_FILES:
         with as_parameter_error(out), atomic(out / name) as temporary:
             temporary.write_text(contents[name], encoding="utf-8")

@@ -15,7 +15,7 @@ from mwdn.errors import ExportError
 from mwdn.io.files import atomic, cache_folder
 
 PACKAGE = "onnxruntime-web"
-VERSION = "1.30.0"
+RUNTIME_VERSION = "1.30.0"
 INTEGRITY = "sha512-q0y+JrrtukXSzsBWEMccVfqX25LRmosXHF+CaRJmg8pZClzcV7svNc4rKY3jL02Vb7QmRMDs1SigqR4CXAfKYQ=="
 """SHA-512 of the package's archive, as `npm view onnxruntime-web@1.30.0 dist.integrity` prints it."""
 
@@ -26,7 +26,7 @@ BINARIES = {"wasm": "ort-wasm-simd-threaded", "webgpu": "ort-wasm-simd-threaded.
 FETCH_S = 600.0
 """Longest time for the archive, 33 MB."""
 
-NAMES = [*LIBRARIES.values(), *(name + suffix for name in BINARIES.values() for suffix in (".mjs", ".wasm"))]
+RUNTIME_FILES = [*LIBRARIES.values(), *(name + suffix for name in BINARIES.values() for suffix in (".mjs", ".wasm"))]
 """The files of both."""
 
 
@@ -47,15 +47,15 @@ def _from_folder(folder: Path) -> dict[str, bytes]:
     try:
         about = json.loads((folder / "package.json").read_bytes())
         found = f"{about['name']} {about['version']}"
-        files = {name: (folder / "dist" / name).read_bytes() for name in NAMES}
+        files = {name: (folder / "dist" / name).read_bytes() for name in RUNTIME_FILES}
     except (OSError, ValueError, KeyError, TypeError) as error:
         reason = getattr(error, "strerror", None) or "it has another `package.json`"
         raise ExportError(
-            f"`runtime` ({folder}) must be the unpacked npm package {PACKAGE} {VERSION}: {reason}. Get it by "
-            f"`npm install {PACKAGE}@{VERSION}`; it is then `node_modules/{PACKAGE}`."
+            f"`runtime` ({folder}) must be the unpacked npm package {PACKAGE} {RUNTIME_VERSION}: {reason}. Get it by "
+            f"`npm install {PACKAGE}@{RUNTIME_VERSION}`; it is then `node_modules/{PACKAGE}`."
         ) from error
-    if found != f"{PACKAGE} {VERSION}":
-        raise ExportError(f"`runtime` ({folder}) must be {PACKAGE} {VERSION}, but is {found}.")
+    if found != f"{PACKAGE} {RUNTIME_VERSION}":
+        raise ExportError(f"`runtime` ({folder}) must be {PACKAGE} {RUNTIME_VERSION}, but is {found}.")
     return files
 
 
@@ -69,7 +69,7 @@ def _from_archive(archive: Path) -> dict[str, bytes]:
         )
     try:
         with tarfile.open(archive) as package:
-            members = ((name, package.extractfile(f"package/dist/{name}")) for name in NAMES)
+            members = ((name, package.extractfile(f"package/dist/{name}")) for name in RUNTIME_FILES)
             return {name: member.read() for name, member in members if member is not None}
     except (tarfile.TarError, zlib.error, KeyError, OSError) as error:
         raise ExportError(f"`{archive}` cannot be read: {error}. Delete it and run the command again.") from error
@@ -77,17 +77,18 @@ def _from_archive(archive: Path) -> dict[str, bytes]:
 
 def _archive() -> Path:
     """The package's archive in the cache, fetched if it is not there."""
-    archive = cache_folder() / f"{PACKAGE}-{VERSION}.tgz"
+    archive = cache_folder() / f"{PACKAGE}-{RUNTIME_VERSION}.tgz"
     if archive.is_file():
         return archive
     npm = shutil.which("npm")
-    other = f"or get the package elsewhere (`npm install {PACKAGE}@{VERSION}`) and name its folder: `--runtime FOLDER`"
+    install = f"npm install {PACKAGE}@{RUNTIME_VERSION}"
+    other = f"or get the package elsewhere (`{install}`) and name its folder: `--runtime FOLDER`"
     if npm is None:
         raise ExportError(f"{PACKAGE} comes from npm, which is not installed. Install Node.js, {other}.")
     # A warning is printed even if logging is not set up: 33 MB take a while.
-    logging.getLogger(__name__).warning("Fetching %s %s by npm (33 MB, once)", PACKAGE, VERSION)
+    logging.getLogger(__name__).warning("Fetching %s %s by npm (33 MB, once)", PACKAGE, RUNTIME_VERSION)
     with tempfile.TemporaryDirectory(prefix="mwdn-") as folder:
-        command = [npm, "pack", f"{PACKAGE}@{VERSION}", "--ignore-scripts", "--pack-destination", folder]
+        command = [npm, "pack", f"{PACKAGE}@{RUNTIME_VERSION}", "--ignore-scripts", "--pack-destination", folder]
         try:
             subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=FETCH_S, check=True)
             with atomic(archive) as temporary:
@@ -96,6 +97,6 @@ def _archive() -> Path:
             lines = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
             reason = next((line for line in lines if "code" in line.lower()), lines[-1] if lines else "")
             raise ExportError(
-                f"{PACKAGE} {VERSION} cannot be fetched by npm: {reason}. Check the connection, {other}."
+                f"{PACKAGE} {RUNTIME_VERSION} cannot be fetched by npm: {reason}. Check the connection, {other}."
             ) from error
     return archive

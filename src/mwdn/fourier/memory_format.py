@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from mwdn.types import Size
 
-LARGEST = 2**26
+CHUNK_VALUES = 2**26
 """Largest number of values of an image that `chunked` processes at once, by default."""
 
 
@@ -42,10 +42,10 @@ def chunked(
         function: maps an image and ``other`` to an image of the same shape, channel by channel.
         image: (B, C, H, W).
         other: (B, 1 or C, ...).
-        step: channels at a time. By default all; of an image of more than `LARGEST` numbers an even number, so that
-            they can be paired by `as_complex`.
+        step: channels at a time. By default all; of an image of more than `CHUNK_VALUES` numbers an even number, so
+            that they can be paired by `as_complex`.
     """
-    step = step or max(2, LARGEST // max(1, image[:, :1].numel()) // 2 * 2)
+    step = step or max(2, CHUNK_VALUES // max(1, image[:, :1].numel()) // 2 * 2)
     if step >= image.shape[1]:
         return function(image, other)
     result = torch.empty_like(image)

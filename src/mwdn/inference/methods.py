@@ -11,7 +11,7 @@ from mwdn.errors import CheckpointError, ParameterError, UnknownNameError
 from mwdn.networks import DENOISERS, NETWORKS, Network
 from mwdn.types import Measurement, Psf, Scene
 from mwdn.weights.bundled import BUNDLED, find_weights, stored_metadata
-from mwdn.weights.checkpoint import SUFFIXES, load_checkpoint
+from mwdn.weights.checkpoint import WEIGHT_SUFFIXES, load_checkpoint
 
 Method = Callable[[Measurement, Psf], Scene]
 """A solver or a network, called as ``method(measurement, psf)``."""
@@ -38,7 +38,7 @@ def find_method(name: str | Path, **options: Any) -> Method:  # noqa: ANN401
             "See `mwdn methods`."
         )
     path = find_weights(str(name)) or Path(name)
-    if path.suffix in SUFFIXES or path.is_file():
+    if path.suffix in WEIGHT_SUFFIXES or path.is_file():
         network = load_checkpoint(path)
         if isinstance(network, tuple(DENOISERS.values())):
             raise CheckpointError(

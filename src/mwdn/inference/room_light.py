@@ -39,7 +39,7 @@ from mwdn.weights.tensors import fill, read_header, read_tensors
 PIXELS = 4000
 """The capture is halved until it has at most so many pixels. A spot is fitted again in four times as many."""
 
-FAINT = 0.08
+MIN_ROOM_LIGHT = 0.08
 """Smaller shares of light that the network finds are not subtracted. It wrongly finds larger ones in 2 of 54 captures
 of real-like cameras without room light, and in 2 of the 384 captures of docs/universal.md, which lose 0.9 dB."""
 
@@ -114,7 +114,7 @@ def _learned_light(b: Measurement, psf: Psf, coarse: tuple[Tensor, Tensor]) -> M
     """What the network finds in coarse captures and PSFs, for captures (B, C, H, W); 0 where it does not count."""
     size = b.shape[-2], b.shape[-1]
     light = F.interpolate(estimate_room_light(*coarse), size, mode="bilinear")
-    counts = light.mean((1, 2, 3)) > FAINT * b.mean((1, 2, 3))
+    counts = light.mean((1, 2, 3)) > MIN_ROOM_LIGHT * b.mean((1, 2, 3))
     if counts.any():
         scene = PsfPyramid.from_psf(psf, size, LEVELS[:1]).solve(subtract_light(b, light)).scene
         counts &= dark_part(scene) >= DARK_PART

@@ -15,7 +15,7 @@ import numpy as np
 from mwdn.errors import FrameShapeError, FrameTypeError, ImageError, cut, one_line, reason, shown
 from mwdn.io.decoder_messages import decoder_messages
 from mwdn.io.exif import orientation_in, upright
-from mwdn.io.headers import COPY_AGAIN, START, check_decoded, check_whole, picture_claim
+from mwdn.io.headers import COPY_AGAIN, MAX_HEADER_BYTES, check_decoded, check_whole, picture_claim
 from mwdn.io.npy import read_npy
 from mwdn.io.raw import is_raw, read_raw
 from mwdn.io.reading import open_regular
@@ -125,9 +125,9 @@ def _kind(start: bytes) -> str:
 
 def _content(kind: str, file: BinaryIO) -> bytes:
     """All bytes of a file, if its header allows that many."""
-    size, start = os.fstat(file.fileno()).st_size, file.read(START)
+    size, start = os.fstat(file.fileno()).st_size, file.read(MAX_HEADER_BYTES)
     needed = math.prod(_check_claim(kind, start, size))
-    if size > 2 * needed + START:
+    if size > 2 * needed + MAX_HEADER_BYTES:
         raise ImageError(f"has {size:,} bytes, too many for a picture of {needed:,}. {COPY_AGAIN}")
     return start + file.read(size - len(start)) if size > len(start) else start
 

@@ -10,10 +10,10 @@ from mwdn.errors import ImageError
 
 COPY_AGAIN = "Copy it from its source again."
 
-START = 2**24
+MAX_HEADER_BYTES = 2**24
 """Bytes at the start of a file in which its header must be: 16 MiB."""
 
-MAX_BYTES = 2**30
+MAX_DECODED_BYTES = 2**30
 """Most bytes of decoded numbers: 1 GiB, 179 million pixels of RGB in 16 bits."""
 
 _ALWAYS = 2**28
@@ -48,7 +48,7 @@ def picture_claim(kind: str, start: bytes, size: int) -> Claim:
 
     Args:
         kind: PNG, JPEG, WebP or BMP.
-        start: first bytes of the file; `START` are enough.
+        start: first bytes of the file; `MAX_HEADER_BYTES` are enough.
         size: bytes of the whole file.
 
     Raises:
@@ -79,10 +79,10 @@ def check_decoded(size: int, stored: int) -> None:
         stored: bytes of the file.
 
     Raises:
-        ImageError: over `MAX_BYTES`, or far more than the file can hold of a capture.
+        ImageError: over `MAX_DECODED_BYTES`, or far more than the file can hold of a capture.
     """
-    if size > MAX_BYTES:
-        raise ImageError(f"claims {size:,} bytes of pixels; at most {MAX_BYTES:,} are read. Crop or bin it.")
+    if size > MAX_DECODED_BYTES:
+        raise ImageError(f"claims {size:,} bytes of pixels; at most {MAX_DECODED_BYTES:,} are read. Crop or bin it.")
     if size > max(_ALWAYS, _RATIO * stored):
         raise ImageError(
             f"claims {size:,} bytes of pixels in a file of {stored:,}. It is damaged, or made to fill the memory; a "

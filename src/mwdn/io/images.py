@@ -33,9 +33,9 @@ def read_frame(path: str | Path, *, bgr: bool = False, upside_down: bool = False
 
     Raises:
         ImageError: no such regular file; damaged, cut off, or of an unknown format; a stack of pictures; other numbers
-            or axes than these; more than `mwdn.io.formats.MAX_PIXELS` pixels or `mwdn.io.headers.MAX_BYTES`, or far
-            more than the file can hold; NaN or infinity. Damage is found by checksums, lengths and libjpeg's warnings:
-            changed numbers of a BMP, PGM, PPM, NPY, WebP or uncompressed TIFF cannot be told from a capture.
+            or axes than these; more than `mwdn.io.formats.MAX_PIXELS` pixels or `mwdn.io.headers.MAX_DECODED_BYTES`, or
+            far more than the file can hold; NaN or infinity. Damage is found by checksums, lengths and libjpeg's
+            warnings: changed numbers of a BMP, PGM, PPM, NPY, WebP or uncompressed TIFF cannot be told from a capture.
     """
     frame = read(Path(path), photograph=upright)
     return np.ascontiguousarray(frame[:: -1 if upside_down else 1, :, :: -1 if bgr else 1])

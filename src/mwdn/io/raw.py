@@ -8,7 +8,7 @@ import numpy as np
 
 from mwdn.errors import ImageError, cut, one_line, reason
 from mwdn.io.decoder_messages import decoder_messages
-from mwdn.io.headers import COPY_AGAIN, MAX_BYTES, check_decoded
+from mwdn.io.headers import COPY_AGAIN, MAX_DECODED_BYTES, check_decoded
 from mwdn.io.reading import read_bytes
 from mwdn.runtime.requirement import require
 from mwdn.types import Frame
@@ -16,7 +16,7 @@ from mwdn.types import Frame
 RAW = frozenset({".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef"})
 """Suffixes, in lower case, of raw files. Most of them are TIFFs inside, so the content does not identify them."""
 
-WHITE = 65535
+RAW_WHITE = 65535
 """The number at which the sensor saturates, after scaling. 14 bits become 16: a step of the sensor is 4 numbers."""
 
 Mosaic = Literal["rggb", "bggr", "grbg", "gbrg"]
@@ -27,8 +27,8 @@ class RawFrame(NamedTuple):
     """The frame of a raw file, and the order of its colours.
 
     Args:
-        frame: (H, W, 1), uint16, the visible part of the sensor: 0 is the file's black level, `WHITE` its white level.
-            Noise below the black level becomes 0. (H, W, 3), RGB, from a linear DNG such as a phone's ProRAW.
+        frame: (H, W, 1), uint16, the visible part of the sensor: 0 is the file's black level, `RAW_WHITE` its white
+            level. Noise below the black level becomes 0. (H, W, 3), RGB, from a linear DNG such as a phone's ProRAW.
         mosaic: colours of a 2 x 2 cell, row by row, ``"rggb"``; H and W are then even. ``None`` for a grey sensor and
             for a linear DNG.
     """
@@ -50,7 +50,7 @@ def read_raw(path: str | Path) -> RawFrame:
         ImageError: the file cannot be read, or its mosaic is not of 2 x 2 pixels.
     """
     rawpy = require("rawpy", "raw", purpose=f"`{path}`, a camera's raw file,")
-    data = read_bytes(path, most=MAX_BYTES)
+    data = read_bytes(path, most=MAX_DECODED_BYTES)
     try:
         with decoder_messages() as lines, rawpy.imread(io.BytesIO(data)) as file:
             _check_size(file, len(data))
@@ -75,7 +75,7 @@ def _check_size(file: Any, stored: int) -> None:  # noqa: ANN401
 
 
 def _scaled(file: Any) -> RawFrame:  # noqa: ANN401
-    """The visible part of the sensor, its black level at 0 and its white level at `WHITE`."""
+    """The visible part of the sensor, its black level at 0 and its white level at `RAW_WHITE`."""
     stored, black = file.raw_image_visible, np.asarray(file.black_level_per_channel, np.float32)
     mosaic = None
     if stored.ndim == 3:  # a linear DNG: the camera has demosaiced it, and pads RGB to four numbers
@@ -89,8 +89,8 @@ def _scaled(file: Any) -> RawFrame:  # noqa: ANN401
         black = np.tile(black[file.raw_pattern], (height // 2, width // 2))[..., None]
     if not file.white_level > black.max():
         raise ImageError(f"has a white level ({file.white_level}) that is not above its black level ({black.max():g}).")
-    light = (stored - black) * (WHITE / (file.white_level - black))
-    return RawFrame(np.rint(light.clip(0, WHITE)).astype(np.uint16), mosaic)
+    light = (stored - black) * (RAW_WHITE / (file.white_level - black))
+    return RawFrame(np.rint(light.clip(0, RAW_WHITE)).astype(np.uint16), mosaic)
 
 
 def _mosaic(file: Any) -> Mosaic:  # noqa: ANN401

@@ -27,7 +27,7 @@ _TEXT = re.compile(r"""\"(?:[^"\\\n]|\\.)*"|'[^'\n]*'|#[^\n]*""")
 """Text in quotes on one line, and comments."""
 
 
-LARGEST = 1e9
+MAX_NUMBER = 1e9
 """Largest number in a table: its square is far within float32, in which samples are simulated."""
 
 
@@ -95,7 +95,7 @@ def to_dataclass(cls: type[T], name: str, table: dict[str, Any]) -> T:
 
     Raises:
         UnknownNameError: the dataclass has no such field.
-        ParameterError: a value has another type than its default, or is outside its range or above `LARGEST`.
+        ParameterError: a value has another type than its default, or is outside its range or above `MAX_NUMBER`.
     """
     table = current_names(cls, name, table)
     defaults = {f.name: f.default for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
@@ -138,8 +138,8 @@ def check_numbers(value: Any, name: str) -> None:  # noqa: ANN401
         raise ParameterError(f"`{name}` ({shown(value)}) must have 63 bits at most.")
     elif isinstance(value, float) and not math.isfinite(value):
         raise ParameterError(f"`{name}` ({value}) must be finite.")
-    elif isinstance(value, float) and not abs(value) <= LARGEST:
-        raise ParameterError(f"`{name}` ({value:g}) must be {LARGEST:g} at most.")
+    elif isinstance(value, float) and not abs(value) <= MAX_NUMBER:
+        raise ParameterError(f"`{name}` ({value:g}) must be {MAX_NUMBER:g} at most.")
 
 
 def current_names(kind: type, name: str, table: dict[str, Any], *, warn: bool = True) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from mwdn.solvers.pyramid import PsfPyramid
 from mwdn.solvers.smooth_light import COARSEST, bright_mask, on_grid
 from mwdn.types import Measurement, Psf
 
-ORDER = 3.0
+MAX_FREQUENCY = 3.0
 """Highest frequency of the light in half periods over the frame's width: planes, and spots with a standard deviation of
 a quarter of the width or more."""
 
@@ -98,6 +98,6 @@ def _enlarged(features: Tensor, like: Tensor) -> Tensor:
 
 
 def _smooth(light: Tensor) -> Tensor:
-    """The part of light (B, C, h, w) that consists of the cosines up to `ORDER`."""
-    basis = cosines((light.shape[-2], light.shape[-1]), light.device, ORDER)
+    """The part of light (B, C, h, w) that consists of the cosines up to `MAX_FREQUENCY`."""
+    basis = cosines((light.shape[-2], light.shape[-1]), light.device, MAX_FREQUENCY)
     return (basis.coefficients(light.float()) @ basis.light.flatten(1)).view(light.shape)

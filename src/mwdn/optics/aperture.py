@@ -14,7 +14,7 @@ ENVELOPE_BLUR = 0.04
 """Standard deviation of the blur that leaves a PSF's envelope, over the shorter side of the frame: 13 pixels of 320,
 the distance of the lines of the paper's PSF."""
 
-DIMMEST = 0.1
+MIN_ENVELOPE = 0.1
 """Fraction of the envelope's maximum below which the PSF is not brightened: the pattern is too uncertain there."""
 
 
@@ -40,7 +40,7 @@ def displaced_envelope(psf: Psf, shift: Tensor, *, blur: float = ENVELOPE_BLUR) 
         warp(one[None], torch.eye(2), (down, right))
         for one, (down, right) in zip(envelope, shift.tolist(), strict=True)
     ]
-    floor = (DIMMEST * envelope.amax((-2, -1), keepdim=True)).square().clamp(min=1e-30)
+    floor = (MIN_ENVELOPE * envelope.amax((-2, -1), keepdim=True)).square().clamp(min=1e-30)
     return psf * (torch.cat(moved) * envelope + floor) / (envelope.square() + floor)
 
 

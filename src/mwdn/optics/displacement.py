@@ -10,7 +10,7 @@ from mwdn.errors import ShapeError, check_batch
 from mwdn.fourier.transforms import fast_length, frequency_grid, inverse_spectrum, spectrum
 from mwdn.types import Psf, Size, Spectrum
 
-STEPS = (0.1, 0.01)
+PEAK_STEPS_PX = (0.1, 0.01)
 """Steps in pixels by which the peak is refined, each from -10 to 10."""
 
 
@@ -59,7 +59,7 @@ def displacement(image: Psf, reference: Psf) -> Displacement:
     surface = inverse_spectrum(product, grid, grid)[0, 0]
     down, right = (float(place) for place in divmod(int(surface.argmax()), grid[1]))
     peak = float(surface.max())
-    for step in STEPS:
+    for step in PEAK_STEPS_PX:
         around = step * torch.arange(-10, 11, dtype=torch.float64)
         values = _between_pixels(product, grid, down + around, right + around)
         row, column = divmod(int(values.argmax()), len(around))

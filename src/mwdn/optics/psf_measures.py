@@ -19,7 +19,7 @@ LOSSLESS_WIDTH = 6.0
 MIN_BOX = 5
 """Pixels along each side of the lit part of a PSF, below which it is a spot without lines and gaps."""
 
-MIN_SIDE = 100
+MIN_BINNED_PX = 100
 """Fewest pixels of the shorter side of a frame that is binned automatically."""
 
 
@@ -87,12 +87,12 @@ def coarsest_bin(psf: Psf) -> int:
     `pyramid` gains 0.3 dB on average and is 29 times as fast, `universal-small` loses 0.2 dB; with 3 % noise they gain
     0.8 and 0.2 dB. Binned by w / 4, they lose up to 2 dB.
 
-    The shorter side of the binned frame keeps `MIN_SIDE` pixels at least.
+    The shorter side of the binned frame keeps `MIN_BINNED_PX` pixels at least.
 
     Args:
         psf: (1, C, H, W), at the resolution of the captures.
     """
-    return max(1, min(round(autocorrelation(psf).width / LOSSLESS_WIDTH), min(psf.shape[-2:]) // MIN_SIDE))
+    return max(1, min(round(autocorrelation(psf).width / LOSSLESS_WIDTH), min(psf.shape[-2:]) // MIN_BINNED_PX))
 
 
 def _detail(plane: Tensor, grid: Size) -> Tensor:

@@ -12,7 +12,7 @@ from mwdn.errors import ParameterError
 from mwdn.fourier.transforms import frequency_grid, spectrum
 from mwdn.types import Image, Psf
 
-CONTRAST = 0.5
+SCENE_CONTRAST = 0.5
 """Standard deviation of a photograph's linear light over its mean; 0.4 to 0.8 is usual."""
 
 
@@ -131,7 +131,7 @@ def spectral_zeros(psf: Psf) -> tuple[float, tuple[float, ...]]:
 def resolved_frequency(psf: Psf, noise: float) -> float:
     """Highest frequency, in cycles per pixel, at which a photograph exceeds the measurement's noise.
 
-    A photograph's power spectrum S falls as ``1 / f^2``, here scaled to a contrast of `CONTRAST`. A frequency is
+    A photograph's power spectrum S falls as ``1 / f^2``, here scaled to a contrast of `SCENE_CONTRAST`. A frequency is
     resolved where ``|H|^2 S(f) >= noise^2``. One ring in ten below the result may fail. The maximum is 0.5, a period
     of two pixels.
 
@@ -145,7 +145,7 @@ def resolved_frequency(psf: Psf, noise: float) -> float:
     _, counts, frequency = _power(psf)
     falling = 1 / frequency.clamp(min=1e-9).square()
     falling[0, 0] = 0
-    scale = CONTRAST**2 / float(_mean(falling, counts))
+    scale = SCENE_CONTRAST**2 / float(_mean(falling, counts))
     mean = radial_power(psf)
     visible = mean.power[1:] * scale / mean.frequency[1:].square() >= noise**2
     part = visible.float().cumsum(0) / torch.arange(1, len(visible) + 1)

@@ -18,7 +18,7 @@ from starlette.staticfiles import StaticFiles
 
 from mwdn.calibration import Calibration
 from mwdn.errors import MwdnError, ParameterError
-from mwdn.preview.cameras import OPTIONS, StoredCameras, checked_camera
+from mwdn.preview.cameras import CAMERA_OPTIONS, StoredCameras, checked_camera
 from mwdn.preview.guard import Guard, failed, log
 from mwdn.preview.jobs import ENDED, Job, Jobs
 from mwdn.preview.limits import Limits, RefusedError
@@ -31,13 +31,13 @@ from mwdn.preview.psf_report import psf_report
 from mwdn.preview.reconstruction import Order, Reconstructions
 from mwdn.preview.result import MEDIA, Look, encode
 from mwdn.preview.routing import route
-from mwdn.preview.samples import CAMERA, NAMES, sample_png
+from mwdn.preview.samples import NAMES, SAMPLE_CAMERA, sample_png
 from mwdn.preview.uploads import LOOKS, Form, look_query, parse_look, read_form
 from mwdn.version import __version__
 
 STATIC = Path(__file__).parent / "static"
-FILES = ("capture", "psf", "ambient")
-TEXTS = ("camera", "calibration", "method", "options", "align", "trust", "room_light", *LOOKS)
+FORM_FILES = ("capture", "psf", "ambient")
+FORM_TEXTS = ("camera", "calibration", "method", "options", "align", "trust", "room_light", *LOOKS)
 
 
 class Preview:
@@ -123,12 +123,12 @@ class Preview:
     async def methods(self, _: Request) -> Response:
         """Methods and their options."""
         live = self.live and self.live.camera.name
-        about = {"camera_options": OPTIONS, "limits": vars(self.limits), "live": live}
+        about = {"camera_options": CAMERA_OPTIONS, "limits": vars(self.limits), "live": live}
         return JSONResponse({"methods": list_methods(), **about})
 
     async def samples(self, _: Request) -> Response:
         """Captures to try."""
-        return JSONResponse({"camera": CAMERA, "captures": NAMES})
+        return JSONResponse({"camera": SAMPLE_CAMERA, "captures": NAMES})
 
     async def sample(self, request: Request) -> Response:
         """A capture to try, as a 16-bit PNG."""
@@ -179,7 +179,7 @@ class Preview:
 
     async def reconstruct(self, request: Request) -> Response:
         """Reconstruct a capture: the picture, with the report in a header."""
-        form = await read_form(request, self.limits, FILES, TEXTS)
+        form = await read_form(request, self.limits, FORM_FILES, FORM_TEXTS)
         look = parse_look(form.texts)
         job = await self._ended(request, self._submit(form))
         result = self.jobs.result(job.id)
@@ -188,7 +188,7 @@ class Preview:
 
     async def add_job(self, request: Request) -> Response:
         """Start a reconstruction, and answer at once."""
-        form = await read_form(request, self.limits, FILES, TEXTS)
+        form = await read_form(request, self.limits, FORM_FILES, FORM_TEXTS)
         parse_look(form.texts)  # a mistake is reported now
         job = self._submit(form)
         job.look = {name: form.texts[name] for name in LOOKS if name in form.texts}

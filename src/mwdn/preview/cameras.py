@@ -16,16 +16,16 @@ from mwdn.io.files import atomic_write, is_full, write_json
 from mwdn.io.formats import at_most_pixels
 from mwdn.io.reading import read_bytes, read_json, unexpected_content
 from mwdn.preview.limits import Limits, RefusedError
-from mwdn.preview.samples import CAMERA, sample_calibration
+from mwdn.preview.samples import SAMPLE_CAMERA, sample_calibration
 
 NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,39}")
-OPTIONS = tuple(sorted(field.name for kind in (FrameFormat, PsfFormat) for field in fields(kind)))
+CAMERA_OPTIONS = tuple(sorted(field.name for kind in (FrameFormat, PsfFormat) for field in fields(kind)))
 """Options of a calibration that a client may set: those that name no file."""
 
 LIVE_CAMERA = "live"
 """Name of the live camera's calibration, which no client can take."""
 
-KEPT = 8
+KEPT_UPLOADS = 8
 """Calibrations of uploaded PSFs that are kept, for the next capture of the same camera."""
 
 
@@ -62,7 +62,7 @@ class StoredCameras:
         with self._lock:
             named = [("given", *item) for item in self.given.items()]
             named += [("stored", *item) for item in sorted(self._stored.items())]
-        named.append(("sample", CAMERA, sample_calibration()))
+        named.append(("sample", SAMPLE_CAMERA, sample_calibration()))
         return [describe(name, kind, calibration) for kind, name, calibration in named]
 
     def described(self, name: str) -> dict[str, Any]:
@@ -84,10 +84,10 @@ class StoredCameras:
         """
         with self._lock:
             known = {**self._stored, **self.given}
-        if name == CAMERA and name not in known:
+        if name == SAMPLE_CAMERA and name not in known:
             return sample_calibration()
         if name not in known:
-            raise RefusedError(404, str(UnknownNameError("camera", name, [*known, CAMERA])))
+            raise RefusedError(404, str(UnknownNameError("camera", name, [*known, SAMPLE_CAMERA])))
         return known[name]
 
     def calibrate(self, psf: bytes, options: dict[str, Any]) -> Calibration:
@@ -95,7 +95,7 @@ class StoredCameras:
 
         Args:
             psf: PNG, TIFF, NPY ...
-            options: of `OPTIONS`.
+            options: of `CAMERA_OPTIONS`.
 
         Raises:
             MwdnError: the file or an option is wrong. The message names no path.
@@ -112,7 +112,7 @@ class StoredCameras:
         check_pixels("psf", calibration.size, self.limits)
         with self._lock:
             self._recent[key] = calibration
-            while len(self._recent) > KEPT:
+            while len(self._recent) > KEPT_UPLOADS:
                 self._recent.popitem(last=False)
         return calibration
 
@@ -131,7 +131,7 @@ class StoredCameras:
         _checked_name(name)
         calibration = self.calibrate(psf, options)
         with self._lock:
-            if name in (*self.given, *self._stored, CAMERA, LIVE_CAMERA):
+            if name in (*self.given, *self._stored, SAMPLE_CAMERA, LIVE_CAMERA):
                 raise RefusedError(409, f"`name` ({name}) is taken. Remove that camera, or choose another name.")
             if len(self._stored) >= self.limits.cameras:
                 raise RefusedError(
@@ -193,11 +193,11 @@ def checked_camera(options: dict[str, Any]) -> dict[str, Any]:
     """Options of a calibration, with tuples for the lists of JSON.
 
     Raises:
-        UnknownNameError: a name is none of `OPTIONS`; files are no options here.
+        UnknownNameError: a name is none of `CAMERA_OPTIONS`; files are no options here.
     """
     for name in options:
-        if name not in OPTIONS:
-            raise UnknownNameError("option of a camera", name, OPTIONS)
+        if name not in CAMERA_OPTIONS:
+            raise UnknownNameError("option of a camera", name, CAMERA_OPTIONS)
     return {name: tuple(value) if isinstance(value, list) else value for name, value in options.items()}
 
 

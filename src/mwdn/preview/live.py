@@ -16,7 +16,7 @@ from mwdn.errors import CameraError, ImageError, MwdnError
 from mwdn.preview.limits import RefusedError
 from mwdn.preview.live_pictures import LivePicture, LivePictures, finite
 from mwdn.preview.live_recording import LiveRecording
-from mwdn.preview.live_settings import CAMERA, LiveSettings
+from mwdn.preview.live_settings import CAMERA_SETTINGS, LiveSettings
 from mwdn.preview.metrics import Metrics
 from mwdn.runtime.devices import select_device
 from mwdn.runtime.streams import latest_results
@@ -128,7 +128,7 @@ class Live:
     def control(self, message: dict[str, Any]) -> None:
         """Follow a message, of `mwdn.preview.live_settings.check_message`."""
         message, self._refused = dict(message), ""
-        self._pending |= {name: float(message.pop(name)) for name in CAMERA if name in message}
+        self._pending |= {name: float(message.pop(name)) for name in CAMERA_SETTINGS if name in message}
         self.recording.is_wanted = message.pop("record", self.recording.is_wanted)
         if message:
             self.pictures.change(message)

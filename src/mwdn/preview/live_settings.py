@@ -14,10 +14,10 @@ from mwdn.preview.result import Look
 from mwdn.preview.uploads import parse_white_balance
 from mwdn.solvers import Admm, Fista, WarmStart
 
-CAMERA = ("exposure_s", "gain")
+CAMERA_SETTINGS = ("exposure_s", "gain")
 """Settings of the camera itself."""
 
-KINDS: dict[str, tuple[type, ...]] = {
+SETTING_TYPES: dict[str, tuple[type, ...]] = {
     "exposure_s": (int, float),
     "gain": (int, float),
     "record": (bool,),
@@ -103,6 +103,6 @@ def check_message(message: Any) -> dict[str, Any]:  # noqa: ANN401
     if not isinstance(message, dict):
         raise ParameterError("A message must be a JSON object.")
     for name, value in message.items():
-        if type(value) not in KINDS.get(name, ()):
-            raise ParameterError(f"`{name[:40]}` must be one of {', '.join(KINDS)}, of the right type.")
+        if type(value) not in SETTING_TYPES.get(name, ()):
+            raise ParameterError(f"`{name[:40]}` must be one of {', '.join(SETTING_TYPES)}, of the right type.")
     return message

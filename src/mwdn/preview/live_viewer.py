@@ -69,7 +69,7 @@ async def serve_viewer(live: Live, socket: Any) -> None:  # noqa: ANN401
     """Serve one viewer: a slow one skips frames, and does not delay the others.
 
     It may send ``{"shown": true}`` after each frame, ``{"clock": number}`` to compare clocks, and the settings of
-    `mwdn.preview.live_settings.KINDS`.
+    `mwdn.preview.live_settings.SETTING_TYPES`.
     """
     from starlette.websockets import WebSocketDisconnect
 

@@ -11,7 +11,7 @@ from mwdn.io.pictures import dark_scene
 from mwdn.optics import Camera, Sensor, Variety, sample_camera
 from mwdn.types import Frame
 
-CAMERA = "sample"
+SAMPLE_CAMERA = "sample"
 SIZE = (320, 320)
 NAMES = ("astronaut", "coffee", "cat")
 SENSOR = Sensor()

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mwdn.calibration import Calibration
 from mwdn.data.hdf5 import as_damage, find_rows, open_hdf5
-from mwdn.data.pair_writer import NAMES
+from mwdn.data.pair_writer import PAIR_PARTS
 from mwdn.data.pairs import PairFile
 from mwdn.errors import ImageError, ParameterError
 from mwdn.io.images import srgb_decode
@@ -61,7 +61,7 @@ class SessionPairs:
 
     def __enter__(self) -> "SessionPairs":
         self._file = open_hdf5(self.path, _ADVICE)
-        self._rows = {name: find_rows(self.path, self._file, name, _ADVICE) for name in NAMES}
+        self._rows = {name: find_rows(self.path, self._file, name, _ADVICE) for name in PAIR_PARTS}
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -91,7 +91,7 @@ class SessionPairs:
             MwdnError: as for `measurement` and `picture`.
         """
         for name in _PATTERNS:
-            parts = [find_rows(self.path, self._file, f"patterns/{name}/{part}", _ADVICE) for part in NAMES]
+            parts = [find_rows(self.path, self._file, f"patterns/{name}/{part}", _ADVICE) for part in PAIR_PARTS]
             if None in parts or not all(map(len, parts)) or parts[1].shape[1:3] != self.picture_size:
                 continue
             with as_damage(f"`patterns/{name}` of `{self.path}` cannot be read", _ADVICE):

@@ -23,7 +23,7 @@ from mwdn.types import FloatFrame, Size
 
 Array = npt.NDArray[np.float64]
 
-MARGIN = 0.08
+DARK_RIM = 0.08
 """Dark rim around the displayed picture, as a fraction of its size, that is compared, too, because the border is an
 edge."""
 
@@ -133,7 +133,7 @@ def sample(projection: Projection, views: Views, blur: float, *, step: float) ->
     sides = _side_lengths(projection)
     step = max(step, np.sqrt(len(views) * sides.prod() / _SAMPLES))
     rows, columns = (max(8, round(length / step)) for length in sides)
-    rim_y, rim_x = max(2, round(MARGIN * rows)), max(2, round(MARGIN * columns))
+    rim_y, rim_x = max(2, round(DARK_RIM * rows)), max(2, round(DARK_RIM * columns))
     values = []
     for picture in views.pictures:
         small = cv2.resize(picture, (columns, rows), interpolation=cv2.INTER_AREA)

@@ -17,7 +17,7 @@ from mwdn.registration.search import search
 from mwdn.registration.views import Views
 from mwdn.types import Size
 
-SURE = 0.8
+SURE_CORRELATION = 0.8
 """Correlation after coarse refinement at which no other start is tried. Wrong turns and mirror images of ordinary
 pictures reach 0.75, because their dark surround is right."""
 
@@ -89,7 +89,7 @@ def estimate(views: Views, *, corners: Points | None = None) -> Registered:
     tried: list[tuple[Refined, str]] = []
     for start, name in _starts(few, views, corners):
         tried.append((refine(start, few, blurs=(4.0, 2.0)), name))
-        if name != "search" and tried[-1][0].correlation > SURE:
+        if name != "search" and tried[-1][0].correlation > SURE_CORRELATION:
             break
     result, name = _single(tried, few)
     result = refine(result.projection, views, blurs=(2.0, 1.0))

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mwdn.calibration.psf_identity import psf_identity
-from mwdn.data.pair_checks import REFINED, WHITE
+from mwdn.data.pair_checks import DISPLAY_WHITE, REFINED
 from mwdn.data.pair_writer import Attribute
 from mwdn.data.pairs import PairFile
 from mwdn.errors import AlignmentError
@@ -103,7 +103,7 @@ def write_aligned(
         KEY: as_attribute(content),
         **psf_identity(pairs.calibration),
         "source": pairs.path.name,
-        WHITE: brightest,
+        DISPLAY_WHITE: brightest,
         **({REFINED: "align"} if pairs.calibration.refinement else {}),
     }
     with PairFile.create(

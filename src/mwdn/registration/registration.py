@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mwdn.data.hdf5 import open_hdf5_header, read_attributes
-from mwdn.data.pair_writer import SUFFIXES
+from mwdn.data.pair_writer import PAIR_SUFFIXES
 from mwdn.errors import ParameterError
 from mwdn.io.reading import parse_json, read_json, unexpected_content
 from mwdn.registration.projection import Points, Projection
@@ -68,7 +68,7 @@ def read_projection(path: str | Path) -> Projection:
         ImageError: no such file.
     """
     path = Path(path)
-    if path.suffix.lower() in SUFFIXES:
+    if path.suffix.lower() in PAIR_SUFFIXES:
         advice = "Align again: `mwdn align`."
         with open_hdf5_header(path, advice) as file:
             attributes = read_attributes(path, file, advice)

@@ -18,7 +18,7 @@ from torch.nn import functional as F
 from mwdn.optics.polynomials import coefficient_count, polynomials
 from mwdn.registration.distortion import MARGIN
 
-BLOCK = 8
+SQUARE_PX = 8
 """Side of the squares that are averaged first: shading is smooth."""
 
 STEPS = 8
@@ -51,7 +51,7 @@ def _blocks(picture: Tensor) -> Tensor:
     """Means of squares of a picture (N, H, W) without its margin, (N, squares)."""
     margin = round(MARGIN * min(picture.shape[-2:]))
     inner = picture[:, margin : picture.shape[-2] - margin, margin : picture.shape[-1] - margin]
-    return F.avg_pool2d(inner.double(), min(BLOCK, *inner.shape[-2:])).flatten(1)
+    return F.avg_pool2d(inner.double(), min(SQUARE_PX, *inner.shape[-2:])).flatten(1)
 
 
 def _fit(pairs: list[tuple[Tensor, Tensor]], P: Tensor) -> Tensor:

@@ -1,11 +1,11 @@
 """Find a Gaussian spot of light in the part of a capture that no scene explains.
 
-With ``r(a) = b - B a - C H v(a)``, where v(a) is the best scene for the background B a of cosines up to `ORDER`, and
-``J = dr / da``, a spot of shape B s and amplitude A changes r by ``A J s``. For each s of a grid of centres and widths,
-the best amplitude of a colour is ``A = -(s^T q) / (s^T G s)`` with ``q = J^T r``, ``G = J^T J``. It explains ``(s^T
-q)^2 / (s^T G s)`` of the energy ``|r|^2``. The spot that explains most in all colours together is taken. Only G and q
-are needed for all shapes: thousands of them cost less than one iteration of the solver. (The code keeps J transposed,
-one row a cosine.)
+With ``r(a) = b - B a - C H v(a)``, where v(a) is the best scene for the background B a of cosines up to `COSINE_ORDER`,
+and ``J = dr / da``, a spot of shape B s and amplitude A changes r by ``A J s``. For each s of a grid of centres and
+widths, the best amplitude of a colour is ``A = -(s^T q) / (s^T G s)`` with ``q = J^T r``, ``G = J^T J``. It explains
+``(s^T q)^2 / (s^T G s)`` of the energy ``|r|^2``. The spot that explains most in all colours together is taken. Only G
+and q are needed for all shapes: thousands of them cost less than one iteration of the solver. (The code keeps J
+transposed, one row a cosine.)
 
 A scene can imitate the smoothest part of a spot, so that part is missing from r. It follows from the spot's shape,
 because a spot has five numbers, not one for each cosine. Narrow spots are estimated best; a spot as wide as the PSF is
@@ -22,7 +22,7 @@ from torch import Tensor
 from mwdn.solvers.unexplained import differences, energy, unexplained
 from mwdn.types import Measurement, Psf, Size
 
-ORDER = 6.0
+COSINE_ORDER = 6.0
 """Highest frequency of the cosines in half periods over the frame's width. A spot with a standard deviation of 0.15 of
 the width has 2 % of its amplitude there."""
 
@@ -35,7 +35,7 @@ SIGMAS = 0.1, 0.12, 0.15, 0.18, 0.22, 0.27, 0.33, 0.4
 
 _STEP = (1 + 2 * OUTSIDE) / (CENTRES - 1), (1 + 2 * OUTSIDE) / (CENTRES - 1), 0.03  # of the grid
 
-STEPS = 5
+SEARCH_STEPS = 5
 """Steps of the search. In each, less of the spot is left in the capture, so J is more exact. Photographs that fill the
 frame need all of them."""
 
@@ -69,7 +69,7 @@ class Cosines(NamedTuple):
         return light.flatten(-2) @ self.light.flatten(1).T / self.light[0].numel()
 
 
-def cosines(size: Size, device: torch.device, order: float = ORDER) -> Cosines:
+def cosines(size: Size, device: torch.device, order: float = COSINE_ORDER) -> Cosines:
     """All cosines up to a frequency, in half periods over the width, for a frame of this size."""
     height, width = size
     down, right = (torch.arange(n, device=device) for n in size)
@@ -127,11 +127,11 @@ def refine_spot(b: Measurement, psf: Psf, saturated: Tensor, spot: Spot) -> Spot
 
 
 def _fit(b: Measurement, psf: Psf, saturated: Tensor, spot: Spot, *, promising: float) -> tuple[Spot, Tensor, Tensor]:
-    """Improve a spot in up to `STEPS` steps; returns the best one, and the unexplained energy (B,) before and after."""
+    """Improve a spot up to `SEARCH_STEPS` times; returns the best, and the unexplained energy (B,) before and after."""
     basis = cosines((b.shape[-2], b.shape[-1]), b.device)
     best, r = spot, unexplained(b - spot.light(basis.size), psf, saturated)
     start = least = energy(r)
-    for _ in range(STEPS):
+    for _ in range(SEARCH_STEPS):
         J = differences(b - spot.light(basis.size), psf, saturated, basis.light)
         spot = best_spot(r - basis.coefficients(spot.light(basis.size)) @ J, J, basis)
         r = unexplained(b - spot.light(basis.size), psf, saturated)

@@ -33,7 +33,7 @@ from mwdn.types import Measurement, Psf, Scene, Size
 COARSEST = replace(LEVELS[0], downsampling=1)
 """The iterations for a scene in these coarse pixels."""
 
-FAINT = 0.06
+MIN_SMOOTH_LIGHT = 0.06
 """Least share of the light that the first phase must find. It finds 0.00 to 0.06 in 20 real captures without room
 light, and 0.08 to 0.2 where the room's light is 0.17 to 0.23 of the capture."""
 
@@ -115,7 +115,7 @@ def find_smooth_light(b: Measurement, psf: Psf) -> tuple[SmoothLight, Tensor]:
     basis = cosines(size, b.device)
     none = SmoothLight(b.new_zeros(*b.shape[:2], 3), Spot.none(b))
     light, _ = _run(CAUTIOUS, none, b, pyramid, basis)
-    found = light.on(size).mean((1, 2, 3)) >= FAINT
+    found = light.on(size).mean((1, 2, 3)) >= MIN_SMOOTH_LIGHT
     if not found.any():
         return light, found
     light, misfit = _run(THOROUGH, light, b, pyramid, basis)
@@ -204,7 +204,7 @@ def on_grid(frame: Tensor, scene: Scene) -> Tensor:
 
 CAUTIOUS = Phase(4, _without_surface, a=1.5, advantage=1.0)
 """v' keeps faint objects and all light from outside the frame. So only a part of the room's light is found, but next to
-nothing of the scene's. If it is too little (`FAINT`), there is no more to do."""
+nothing of the scene's. If it is too little (`MIN_SMOOTH_LIGHT`), there is no more to do."""
 
 THOROUGH = Phase(8, _bright_part, a=1.5, advantage=2.0)
 """v' is the bright part of the frame: all other light is the room's."""

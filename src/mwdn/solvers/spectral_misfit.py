@@ -28,7 +28,7 @@ _BANDS = (0.03, 0.06, 0.09, 0.12, 0.16, 0.2, 0.25, 0.3, 0.36, 0.43, 0.5)
 _FADE = 0.2
 """Part of the frame at each border over which the window fades in."""
 
-LARGEST = 120_000
+MAX_MISFIT_PIXELS = 120_000
 """Pixels of the largest frame that is not halved: 8 PSFs of 320 x 320 pixels take a second on one core."""
 
 
@@ -36,7 +36,7 @@ LARGEST = 120_000
 def spectral_misfit(measurement: Measurement, psf: Psf) -> Tensor:
     """Misfit of the best scene through each PSF of a batch, averaged over bands of frequencies.
 
-    Colours are averaged, and large frames halved until they have at most `LARGEST` pixels.
+    Colours are averaged, and large frames halved until they have at most `MAX_MISFIT_PIXELS` pixels.
 
     Args:
         measurement: (1 or B, C, H, W).
@@ -49,7 +49,7 @@ def spectral_misfit(measurement: Measurement, psf: Psf) -> Tensor:
     b, h = measurement.float().mean(1, keepdim=True), psf.float().mean(1, keepdim=True)
     b = b / b.abs().amax((1, 2, 3), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
     variance, halvings = noise_level(b).square().sum((1, 2, 3)), 0
-    while b[0, 0].numel() > LARGEST:
+    while b[0, 0].numel() > MAX_MISFIT_PIXELS:
         b, h, halvings = halve(b), halve_psf(h), halvings + 1
     residual = solve(b.expand(len(h), -1, -1, -1), h, SMOOTH_LEVELS).residual
     rows, columns = (_fade(length, b.device) for length in b.shape[-2:])

@@ -10,7 +10,7 @@ from mwdn.types import Measurement, Psf
 ITERATIONS = 40
 """ADMM iterations for each scene. With 20 the best scenes are not reached."""
 
-DELTA = 0.05
+BACKGROUND_STEP = 0.05
 """Step of the finite differences of the background, as a part of the mean measurement."""
 
 _PENALTIES = Penalties(0.15, 0.0, 0.6)
@@ -42,7 +42,7 @@ def energy(r: Tensor) -> Tensor:
 
 def differences(b: Measurement, psf: Psf, saturated: Tensor, lights: Tensor) -> Tensor:
     """Derivatives (B, T, pixels) of `unexplained` of the mean colour by each light (T, h, w), as finite differences."""
-    trials = b.mean(1, keepdim=True) - DELTA * torch.cat([torch.zeros_like(lights[:1]), lights])
+    trials = b.mean(1, keepdim=True) - BACKGROUND_STEP * torch.cat([torch.zeros_like(lights[:1]), lights])
     psf, saturated = psf.mean(1, keepdim=True), saturated.any(1, keepdim=True)
     r = unexplained(trials, *(each.expand(-1, trials.shape[1], -1, -1) for each in (psf, saturated)))
-    return (r[:, 1:] - r[:, :1]) / DELTA
+    return (r[:, 1:] - r[:, :1]) / BACKGROUND_STEP

@@ -33,7 +33,7 @@ from mwdn.training.report import Report
 from mwdn.training.selfsupervised import SelfSupervisedTask
 from mwdn.training.tasks import SupervisedTask, Task, pair_tasks, supervised_task, with_stored_psf
 from mwdn.training.trainer import Trainer
-from mwdn.training.validation import SHOWN, Validator
+from mwdn.training.validation import SHEET_ROWS, Validator
 from mwdn.types import Measurement, Psf
 
 FILE_START = 2 * 10**12
@@ -215,7 +215,7 @@ def _read_captures(
         return None
     files = find_captures(recipe.sheet.captures, exclude=exclude)
     learns = recipe.selfsupervised.consistency > 0
-    return read_captures(files if learns else files[:SHOWN], calibration, lit=learns).to(device)
+    return read_captures(files if learns else files[:SHEET_ROWS], calibration, lit=learns).to(device)
 
 
 def _simulated_pairs(recipe: Recipe, photographs: Photographs, psf: Psf, *, grey: bool) -> SimulatedPairs:

@@ -22,7 +22,7 @@ DISTANCES: dict[str, Callable[..., Tensor]] = {
     "ssim": lambda image, reference: 1 - ssim(image, reference),
     "vgg_mse": vgg_mse,
 }
-NAMES = tuple(DISTANCES)
+LOSS_PARTS = tuple(DISTANCES)
 """Parts of a `Loss`."""
 NEED_ALEXNET = {"feature_mse", "lpips"}
 """Parts that compare AlexNet's features."""
@@ -34,7 +34,7 @@ class Loss(nn.Module):
     AlexNet, VGG-16 and the linear heads of LPIPS are loaded only if a part needs them; move them with ``.to(device)``.
 
     Args:
-        weights: of each part by its name in `NAMES`; the last phase of the MWDN paper's training has
+        weights: of each part by its name in `LOSS_PARTS`; the last phase of the MWDN paper's training has
             ``{"mse": 1.0, "feature_mse": 0.05}``. "ssim" is 1 - SSIM. A part of weight 0 is reported, not trained on.
         alexnet: file of AlexNet's weights; see `mwdn.evaluation.alexnet.load_alexnet`.
         heads: file of LPIPS's linear heads; see `mwdn.evaluation.alexnet.load_heads`.
@@ -86,10 +86,10 @@ class Loss(nn.Module):
 def checked_weights(weights: Mapping[str, Any]) -> dict[str, float]:
     """Check the weights of a `Loss`; raises its errors."""
     if not weights:
-        raise ParameterError(f"The loss must name at least one of {', '.join(NAMES)}, for example `mse = 1.0`.")
+        raise ParameterError(f"The loss must name at least one of {', '.join(LOSS_PARTS)}, for example `mse = 1.0`.")
     for name, weight in weights.items():
-        if name not in NAMES:
-            raise UnknownNameError("loss", name, NAMES)
+        if name not in LOSS_PARTS:
+            raise UnknownNameError("loss", name, LOSS_PARTS)
         if not (isinstance(weight, int | float) and 0 <= weight < 2**63):
             raise ParameterError(f"The weight of `{name}` ({shown(weight)}) must be finite and not negative.")
     if not any(weights.values()):

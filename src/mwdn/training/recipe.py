@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from mwdn.data.cameras import Cameras
-from mwdn.data.mismatch import REAL, Mismatch
+from mwdn.data.mismatch import REAL_OPTIONS, Mismatch
 from mwdn.data.noisy import Denoising
 from mwdn.data.recorded import Division
 from mwdn.data.simulated import Placement
@@ -24,7 +24,7 @@ LR_SCHEDULES = ("cosine", "constant", "plateau")
 BEST_BY = ("psnr", "loss")
 OPTIMISERS = ("adam", "adamw")
 LATER = {
-    "mismatch": REAL,
+    "mismatch": REAL_OPTIONS,
     "pairs": ("folds", "fold", "aligned", "best_gain"),
     "schedule": ("anchor", "start_share", "filter_rate", "best_by"),
 }

@@ -20,7 +20,7 @@ from mwdn.training.training_state import Header, damaged, read_state
 from mwdn.weights.tensors import read_header
 
 MAKE_ROOM = "Make room and give the same command again: it resumes from the last saved state."
-WEIGHTS = ("last", "best")
+WEIGHT_NAMES = ("last", "best")
 STATE_BYTES = 2**33
 """Limit of the bytes of a state: 8 GiB, twice what the largest network that is built needs (weights, average, two
 moments)."""
@@ -106,7 +106,7 @@ class RunFolder:
     def _read_owner(self) -> bytes:
         """Identity of the run whose weights are in the folder; empty without weights."""
         recipe = self.path / "recipe.json"
-        if not any(self.weights(name).exists() for name in WEIGHTS):
+        if not any(self.weights(name).exists() for name in WEIGHT_NAMES):
             return b""
         if not recipe.exists():
             raise CheckpointError(

@@ -12,10 +12,10 @@ from mwdn.training.recipe import Recipe
 from mwdn.training.tasks import Task, reconstruct_aligned
 from mwdn.types import Image, Measurement, Psf
 
-START = 10**12
+VALIDATION_START = 10**12
 """Number of the first validation sample, far above those of any training."""
 
-SHOWN = 6
+SHEET_ROWS = 6
 """Rows of a contact sheet."""
 
 
@@ -64,11 +64,12 @@ class Validator:
         schedule, psnrs, losses = self.recipe.schedule, [], []
         rows: list[list[Tensor]] = []
         for start in range(0, schedule.validation, schedule.batch):
-            numbers = range(START + start, START + min(start + schedule.batch, schedule.validation))
+            end = min(start + schedule.batch, schedule.validation)
+            numbers = range(VALIDATION_START + start, VALIDATION_START + end)
             scores = self.task.score(network, distance, numbers)
             psnrs.append(scores.psnr)
             losses.append(len(numbers) * scores.loss)
-            rows += _rows(*(pictures[: SHOWN - len(rows)] for pictures in scores.pictures))
+            rows += _rows(*(pictures[: SHEET_ROWS - len(rows)] for pictures in scores.pictures))
         blocks = [rows, *([self.reconstruct_captures(network)] if self.captures is not None else [])]
         left, right = self.task.columns
         sheet = _sheet(blocks, (left, title, right), self.psf)
@@ -77,7 +78,7 @@ class Validator:
     @torch.no_grad()
     def reconstruct_captures(self, network: nn.Module) -> list[list[Tensor]]:
         """The first six captures with their reconstructions, one at a time: they may be more than a batch."""
-        captures = [] if self.captures is None else [one[None] for one in self.captures[:SHOWN]]
+        captures = [] if self.captures is None else [one[None] for one in self.captures[:SHEET_ROWS]]
         return [row for capture in captures for row in _rows(capture, reconstruct_aligned(network, capture, self.psf))]
 
 

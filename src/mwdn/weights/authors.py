@@ -9,7 +9,7 @@ from mwdn.errors import CheckpointError, ParameterError
 from mwdn.networks.empty import build_empty
 from mwdn.weights.tensors import check_shapes, fill
 
-OPTIONS: dict[str, Any] = {"pooling": "average", "boundary": "circular", "authors_form": True}
+AUTHORS_OPTIONS: dict[str, Any] = {"pooling": "average", "boundary": "circular", "authors_form": True}
 """Where their code differs from their paper, for both networks."""
 
 # Their module names and ours. Each scale is a double convolution, which theirs wraps in one more module.
@@ -55,7 +55,7 @@ def load_authors(state: dict[str, Tensor]) -> nn.Module:
         )
     ours = renamed(state, name)
     try:
-        network = build_empty(name, **OPTIONS, **extra, channels=first.shape[1], width=first.shape[0])
+        network = build_empty(name, **AUTHORS_OPTIONS, **extra, channels=first.shape[1], width=first.shape[0])
     except ParameterError as error:
         raise CheckpointError(f"These weights have the names of the authors' {name}, but {error}") from error
     shapes = {key: tuple(value.shape) for key, value in ours.items()}

@@ -22,7 +22,7 @@ BUNDLED = {
 HUB = "hub:"
 """Prefix: ``hub:owner/name`` is model.safetensors of that repository, ``hub:owner/name/file`` another file."""
 
-WEIGHTS = "model.safetensors"
+WEIGHTS_FILE = "model.safetensors"
 """Checkpoint in a folder of `mwdn.bridges.save_pretrained`, or in a repository on the hub."""
 
 BEST = "best.safetensors"
@@ -37,7 +37,7 @@ def bundled_file(name: str) -> Path:
 
 
 def find_weights(name: str) -> Path | None:
-    """File of a bundled network, of a folder with `WEIGHTS` or `BEST`, or of one on the hub, downloaded once.
+    """File of a bundled network, of a folder with `WEIGHTS_FILE` or `BEST`, or of one on the hub, downloaded once.
 
     ``None`` for other names.
 
@@ -46,7 +46,7 @@ def find_weights(name: str) -> Path | None:
     """
     if name in BUNDLED:
         return bundled_file(name)
-    for file in (WEIGHTS, BEST):
+    for file in (WEIGHTS_FILE, BEST):
         if (path := Path(name) / file).is_file():
             return path
     return _download(name) if name.startswith(HUB) else None
@@ -85,7 +85,7 @@ def _download(name: str) -> Path:
     from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
 
     try:
-        return Path(hf_hub_download(f"{owner}/{repository}", file or WEIGHTS))
+        return Path(hf_hub_download(f"{owner}/{repository}", file or WEIGHTS_FILE))
     except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError, OSError, ValueError) as error:
         raise CheckpointError(
             f"`{name}` cannot be fetched from the hub: {reason(error)}. Check the name and the network, or "

@@ -16,7 +16,7 @@ from mwdn.weights.authors import is_authors, load_authors
 from mwdn.weights.tensors import Header, check_shapes, fill, is_safetensors, read_header, read_tensors
 from mwdn.weights.torch_file import read_plain
 
-SUFFIXES = frozenset({".safetensors", ".pt", ".pth", ".tar", ".ckpt"})
+WEIGHT_SUFFIXES = frozenset({".safetensors", ".pt", ".pth", ".tar", ".ckpt"})
 """Suffixes of weight files."""
 
 
