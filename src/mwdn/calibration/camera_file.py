@@ -16,7 +16,7 @@ from mwdn.errors import ParameterError, PsfError, UnknownNameError, fits_type, o
 from mwdn.io.files import as_parameter_error, atomic, file_sha256
 from mwdn.io.headers import MAX_DECODED_BYTES
 from mwdn.io.listing import FRAMES
-from mwdn.io.toml import check_numbers, read_toml
+from mwdn.io.toml import as_tuple, check_numbers, read_toml
 from mwdn.optics.sensor import Sensor
 
 _TYPES: dict[str, Any] = {
@@ -120,7 +120,7 @@ def read_camera(path: str | Path) -> dict[str, Any]:
         raise ParameterError(f'`{path}` must name the camera\'s PSF: `psf = "psf.png"`.')
     files = {key: _file(path, table[key]) for key in _FILES if key in table}
     lists = {key: tuple(_file(path, name) for name in table[key]) for key in _LISTS if key in table}
-    return {**{key: _as_tuple(value) for key, value in table.items()}, **files, **lists}
+    return {**{key: as_tuple(value) for key, value in table.items()}, **files, **lists}
 
 
 def _file(path: Path, name: str) -> Path:
@@ -161,10 +161,6 @@ def check_length(name: str, length: float | None) -> None:
     """Raise a `ParameterError` unless `pitch_um` or `distance_mm` is positive, and no longer than `MAX_LENGTH`."""
     if length is not None and not 0 < length <= MAX_LENGTH:
         raise ParameterError(f"`{name}` ({shown(length)}) must be above 0 and at most {MAX_LENGTH:g}.")
-
-
-def _as_tuple(value: Any) -> Any:  # noqa: ANN401
-    return tuple(map(_as_tuple, value)) if isinstance(value, list) else value
 
 
 def pop_sensor(camera: dict[str, Any]) -> Sensor | None:

@@ -102,14 +102,14 @@ def to_dataclass(cls: type[T], name: str, table: dict[str, Any]) -> T:
     for key, value in table.items():
         if key not in defaults:
             raise UnknownNameError(f"key of [{name}]", key, defaults)
-        if not _same_type(_as_tuple(value), defaults[key]):
+        if not _same_type(as_tuple(value), defaults[key]):
             wanted, example = type_in_words(get_type_hints(cls)[key]), json.dumps(defaults[key])
             raise ParameterError(f"`{key}` of [{name}] ({shown(value)}) must be {wanted}; the default is {example}.")
     with named_table(name):
         for key, value in table.items():
             check_numbers(value, key)  # whole numbers first: a float cannot hold one of 400 digits
-            check_numbers(_as_float(_as_tuple(value), defaults[key]), key)
-        return cls(**{key: _as_float(_as_tuple(value), defaults[key]) for key, value in table.items()})
+            check_numbers(_as_float(as_tuple(value), defaults[key]), key)
+        return cls(**{key: _as_float(as_tuple(value), defaults[key]) for key, value in table.items()})
 
 
 @contextmanager
@@ -164,8 +164,9 @@ def current_names(kind: type, name: str, table: dict[str, Any], *, warn: bool = 
     return {renamed.get(key, key): value for key, value in table.items()}
 
 
-def _as_tuple(value: Any) -> Any:  # noqa: ANN401
-    return tuple(value) if isinstance(value, list) else value
+def as_tuple(value: Any) -> Any:  # noqa: ANN401
+    """Tuples for the lists of TOML and JSON, nested ones too; other values as they are."""
+    return tuple(map(as_tuple, value)) if isinstance(value, list) else value
 
 
 def _same_type(value: object, default: object) -> bool:

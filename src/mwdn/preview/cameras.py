@@ -15,6 +15,7 @@ from mwdn.errors import ImageError, MwdnError, ParameterError, UnknownNameError
 from mwdn.io.files import atomic_write, is_full, write_json
 from mwdn.io.formats import at_most_pixels
 from mwdn.io.reading import read_bytes, read_json, unexpected_content
+from mwdn.io.toml import as_tuple
 from mwdn.preview.limits import Limits, RefusedError
 from mwdn.preview.samples import SAMPLE_CAMERA, sample_calibration
 
@@ -198,7 +199,7 @@ def checked_camera(options: dict[str, Any]) -> dict[str, Any]:
     for name in options:
         if name not in CAMERA_OPTIONS:
             raise UnknownNameError("option of a camera", name, CAMERA_OPTIONS)
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in options.items()}
+    return {name: as_tuple(value) for name, value in options.items()}
 
 
 def check_pixels(what: str, size: tuple[int, int], limits: Limits) -> None:
