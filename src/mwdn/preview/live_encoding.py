@@ -8,13 +8,11 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from mwdn.io.contact_sheets import BRIGHTEST
 from mwdn.io.images import srgb_encode
 
 QUALITY = 90
 """Of the JPEGs."""
-
-BRIGHTEST = 0.003
-"""Part of the numbers that may be white, as in `mwdn.io.contact_sheets.to_display`."""
 
 
 def brightest(image: Tensor) -> float:
