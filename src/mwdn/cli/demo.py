@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.contact_sheets import contact_sheet, to_display
 from mwdn.io.files import check_folder, refuse_foreign, write_text
 from mwdn.io.images import write_frame, write_linear, write_picture
-from mwdn.io.pictures import dark_scene
+from mwdn.io.pictures import PICTURES, Picture, dark_scene
 from mwdn.optics import Camera, Contour, Sensor, Setup
 from mwdn.optics.design import design_camera
 
@@ -30,8 +30,6 @@ SENSOR = Sensor(full_well=60_000.0)
 MASK = Contour(size_mm=(3.0, 2.5), pitch_um=4.0)
 """The open part of the paper's mask, with squares twice as large: takes a second to simulate."""
 
-Picture = Literal["astronaut", "coffee", "cat"]
-PICTURES: tuple[Picture, ...] = ("astronaut", "coffee", "cat")
 EXPOSED_PEAK = 0.9
 """Light of the brightest pixel over saturation, as a well exposed capture has it."""
 

@@ -185,7 +185,7 @@ def simulate_captures(calibration: Calibration, names: tuple[str, ...], channels
 
     Args:
         calibration: of the simulated camera.
-        names: of pictures in `mwdn.io.pictures`.
+        names: of `mwdn.io.pictures.PICTURES`.
         channels: 1 or 3.
     """
     side = max(1, min(calibration.size) // 2)

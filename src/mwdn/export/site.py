@@ -19,12 +19,10 @@ from mwdn.inference.methods import Method, as_method
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import as_parameter_error, atomic, check_folder, refuse_foreign
 from mwdn.io.images import encode_png
+from mwdn.io.pictures import PICTURES
 from mwdn.networks.network import Network
 from mwdn.types import Measurement, Scene
 from mwdn.version import __version__
-
-SAMPLES = ("astronaut", "coffee", "cat")
-"""Pictures in `mwdn.io.pictures` whose simulated captures the page offers."""
 
 CHECKED = 4096
 """Pixels of the first sample's scene that the page compares with the package's."""
@@ -92,7 +90,7 @@ def export_site(
     camera = _camera(calibration, about | {"name": name}, channels, scenes)
     images = {key: _bytes(image) for key, image in _images(calibration).items()}
     frames = captures.movedim(1, -1).numpy().astype("uint16")
-    samples = {f"{key}.png": encode_png(frame, f"{key}.png") for key, frame in zip(SAMPLES, frames, strict=True)}
+    samples = {f"{key}.png": encode_png(frame, f"{key}.png") for key, frame in zip(PICTURES, frames, strict=True)}
     texts = [name for name in SITE_FILES if not name.endswith(".js")]
     contents = {name: read_static(name) for name in texts}
     contents |= {
@@ -126,8 +124,8 @@ def _title(method: Method | str | Path) -> str:
 
 
 def _sample_captures(calibration: Calibration) -> Tensor:
-    """Measurements of `SAMPLES` as whole numbers up to 65,535, (3, C, H, W)."""
-    captures = simulate_captures(calibration, SAMPLES, calibration.psf.shape[1])[: len(SAMPLES)]
+    """Measurements of `PICTURES` as whole numbers up to 65,535, (3, C, H, W)."""
+    captures = simulate_captures(calibration, PICTURES, calibration.psf.shape[1])[: len(PICTURES)]
     return (captures.clamp(0, 1) * 65535).round().int()
 
 
@@ -157,7 +155,7 @@ def _camera(calibration: Calibration, about: Mapping[str, str], channels: int, s
             name: {"channels": image.shape[1], "height": image.shape[2], "width": image.shape[3]}
             for name, image in _images(calibration).items()
         },
-        "samples": SAMPLES,
+        "samples": PICTURES,
         "expected": {"step": step, "values": [float(f"{value:.7g}") for value in values[::step].tolist()]},
     }
 

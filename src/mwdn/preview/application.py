@@ -18,6 +18,7 @@ from starlette.staticfiles import StaticFiles
 
 from mwdn.calibration import Calibration
 from mwdn.errors import MwdnError, ParameterError
+from mwdn.io.pictures import PICTURES
 from mwdn.preview.cameras import CAMERA_OPTIONS, StoredCameras, checked_camera
 from mwdn.preview.guard import Guard, failed, log
 from mwdn.preview.jobs import ENDED, Job, Jobs
@@ -31,7 +32,7 @@ from mwdn.preview.psf_report import psf_report
 from mwdn.preview.reconstruction import Order, Reconstructions
 from mwdn.preview.result import MEDIA, Look, encode
 from mwdn.preview.routing import route
-from mwdn.preview.samples import NAMES, SAMPLE_CAMERA, sample_png
+from mwdn.preview.samples import SAMPLE_CAMERA, sample_png
 from mwdn.preview.uploads import LOOKS, Form, look_query, parse_look, read_form
 from mwdn.version import __version__
 
@@ -128,13 +129,13 @@ class Preview:
 
     async def samples(self, _: Request) -> Response:
         """Captures to try."""
-        return JSONResponse({"camera": SAMPLE_CAMERA, "captures": NAMES})
+        return JSONResponse({"camera": SAMPLE_CAMERA, "captures": PICTURES})
 
     async def sample(self, request: Request) -> Response:
         """A capture to try, as a 16-bit PNG."""
         name = request.path_params["name"]
-        if name not in NAMES:
-            raise RefusedError(404, f"No sample of this name. Known: {', '.join(NAMES)}.")
+        if name not in PICTURES:
+            raise RefusedError(404, f"No sample of this name. Known: {', '.join(PICTURES)}.")
         return Response(await self._thread(partial(sample_png, name)), media_type="image/png")
 
     async def list_cameras(self, _: Request) -> Response:

@@ -2,11 +2,11 @@
 
 from typing import Any, get_args
 
+from mwdn.io.pictures import PICTURES
 from mwdn.preview.cameras import NAME
 from mwdn.preview.jobs import State
 from mwdn.preview.limits import Limits
 from mwdn.preview.result import MEDIA, STOPS, PictureFormat
-from mwdn.preview.samples import NAMES
 from mwdn.version import __version__
 
 _ERRORS = {
@@ -64,7 +64,7 @@ def _paths() -> dict[str, Any]:
     camera = {**_object(required=["name", "psf"], **psf["properties"])}
     camera["properties"]["name"] = {"type": "string", "pattern": f"^{NAME.pattern}$"}
     either = _object(psf=_FILE, calibration=_json(), camera={"type": "string"})
-    sample = _path("name") | {"schema": {"enum": list(NAMES)}}
+    sample = _path("name") | {"schema": {"enum": list(PICTURES)}}
     text = {"text/plain": {"schema": {"type": "string"}}}
     return {
         "/reconstruct": {"post": _operation("Reconstruct a capture and wait for the picture", _PICTURE, body=order)},

@@ -7,14 +7,12 @@ import torch
 from mwdn.calibration import Calibration
 from mwdn.data.random import seeded
 from mwdn.io.images import encode_png
-from mwdn.io.pictures import dark_scene
+from mwdn.io.pictures import PICTURES, dark_scene
 from mwdn.optics import Camera, Sensor, Variety, sample_camera
 from mwdn.types import Frame
 
 SAMPLE_CAMERA = "sample"
 SIZE = (320, 320)
-NAMES = ("astronaut", "coffee", "cat")
-SENSOR = Sensor()
 _PEAK = 0.8
 
 
@@ -30,10 +28,10 @@ def sample_capture(name: str) -> Frame:
     """A capture of a photograph on a dark wall, (H, W, 3) uint16, with the sensor's noise.
 
     Args:
-        name: one of `NAMES`.
+        name: one of `PICTURES`.
     """
     light = Camera(sample_calibration().psf).forward(dark_scene(name, SIZE, side=200))
-    exposed = SENSOR.expose(light * (_PEAK / light.max()), generator=seeded(NAMES.index(name)))
+    exposed = Sensor().expose(light * (_PEAK / light.max()), generator=seeded(PICTURES.index(name)))
     return (exposed.clamp(0, 1) * 65535).round()[0].movedim(0, -1).to(torch.int32).numpy().astype("uint16")
 
 
