@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from mwdn.calibration import Calibration
+from mwdn.data.pair_writer import PAIR_SUFFIXES
 from mwdn.data.pairs import PairFile
 from mwdn.errors import ParameterError
 from mwdn.inference.reconstructor import Reconstructor
@@ -21,7 +22,7 @@ from mwdn.weights.bundled import BUNDLED
 WIDGET_METHODS = (*BUNDLED, "pyramid", "admm", "fista", "wiener")
 """Choices of the widget."""
 
-READ_SUFFIXES = frozenset({".h5", ".hdf5", ".toml", ".npy", ".png", ".tif", ".tiff"}) | RAW
+READ_SUFFIXES = frozenset({*PAIR_SUFFIXES, ".toml", ".npy", ".png", ".tif", ".tiff"}) | RAW
 """Of the files that are read."""
 
 Layer = tuple[Any, dict[str, Any], str]
@@ -47,7 +48,7 @@ def _read(path: str | list[str]) -> list[Layer]:
 
 
 def _layers(path: Path) -> list[Layer]:
-    if path.suffix.lower() in (".h5", ".hdf5"):
+    if path.suffix.lower() in PAIR_SUFFIXES:
         file = PairFile(path)
         shapes = {"measurement": file.measurement_shape, "scene": file.scene_shape}
         return [_layer(_stack(file, part, shapes[name]), f"{path.stem} {name}") for part, name in enumerate(shapes)]

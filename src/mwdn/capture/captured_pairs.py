@@ -17,7 +17,7 @@ from mwdn.capture.screen import Picture
 from mwdn.capture.source import CameraFrame
 from mwdn.data.hdf5 import add_rows, as_damage, find_rows, open_hdf5, write_row
 from mwdn.data.journal import Growing, create_growing, open_growing
-from mwdn.data.pair_writer import FORMAT_VERSION, VERSION_KEY
+from mwdn.data.pair_writer import FORMAT_VERSION, PAIR_PARTS, VERSION_KEY
 from mwdn.errors import ImageError, ParameterError
 from mwdn.io.files import as_image_error
 
@@ -56,7 +56,7 @@ class SessionFile:
     @property
     def kinds(self) -> dict[str, tuple[int | str, ...]]:
         """Height, width, channels and type of ``measurement`` and ``scene``."""
-        return {name: (*self._file[name].shape[1:], str(self._file[name].dtype)) for name in ("measurement", "scene")}
+        return {name: (*self._file[name].shape[1:], str(self._file[name].dtype)) for name in PAIR_PARTS}
 
     def set_attributes(self, values: Mapping[str, Any]) -> None:
         """Add attributes, and make everything so far permanent."""

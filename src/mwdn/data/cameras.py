@@ -75,7 +75,7 @@ class CameraPairs(Samples):
         device = self.pairs.psf.device
         psfs = []
         for number in numbers:
-            generator = seeded((self.pairs.seed * 1_000_003 + number) ^ (CAMERA_SEED << 24))
+            generator = seeded(self.pairs.sample_seed(number) ^ (CAMERA_SEED << 24))
             names = self.cameras.families or tuple(FAMILIES)
             family = names[int(torch.randint(len(names), (), generator=generator))]
             psfs.append(sample_camera(generator, size, family=family, device=device))

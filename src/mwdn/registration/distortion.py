@@ -31,6 +31,8 @@ MARGIN = 1 / 20
 """Rim of the frame that is not compared, over its shorter side: light from outside is not in the scene."""
 
 STEPS = 8
+"""Gauss-Newton steps."""
+
 RIDGE = 1e-4
 """Ridge of the normal equations, over the mean of their diagonal."""
 

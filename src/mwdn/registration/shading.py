@@ -16,12 +16,11 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.optics.polynomials import coefficient_count, polynomials
-from mwdn.registration.distortion import MARGIN
+from mwdn.registration.distortion import MARGIN, STEPS
 
 SQUARE_PX = 8
 """Side of the squares that are averaged first: shading is smooth."""
 
-STEPS = 8
 RIDGE = 0.03
 """Ridge of the normal equations, over the mean of their diagonal: it draws c to 0, and so separates S from a_n. With
 0.001 eight real pairs come out within 0.01 dB."""
