@@ -84,12 +84,12 @@ def _step(pairs: list[_Detail], coefficients: Tensor) -> Tensor:
     """Solution of the normal equations of (1), (2, K)."""
     height, width = pairs[0].scene.shape[-2:]
     order = polynomial_order(coefficients.shape[1]) or 0
-    over_frame = _inner(polynomials(order, (height, width)).to(coefficients))
+    over_frame = without_margin(polynomials(order, (height, width)).to(coefficients)).flatten(1)
     count = coefficients.numel()
     A, g = coefficients.new_zeros(count, count), coefficients.new_zeros(count)
     for pair in pairs:
-        T = _inner(pair.scene[0])[0]
-        seen, down, right = _inner(undistort(pair.seen, coefficients)[0])
+        T = without_margin(pair.scene[0]).flatten()
+        seen, down, right = without_margin(undistort(pair.seen, coefficients)[0]).flatten(1)
         J = torch.cat([down * (height - 1) / 2 * over_frame, right * (width - 1) / 2 * over_frame])
         J, residual = _without(T, J), _without(T, seen[None])[0]
         A, g = A + J @ J.T, g + J @ residual
@@ -101,17 +101,17 @@ def _unexplained(pairs: list[_Detail], coefficients: Tensor) -> float:
     """E of (1) over the same without scenes."""
     residual = total = 0.0
     for pair in pairs:
-        seen = _inner(undistort(pair.seen, coefficients)[0, :1])
-        residual += float(_without(_inner(pair.scene[0])[0], seen).square().sum())
+        seen = without_margin(undistort(pair.seen, coefficients)[0, :1]).flatten(1)
+        residual += float(_without(without_margin(pair.scene[0]).flatten(), seen).square().sum())
         total += float(seen.square().sum())
     return residual / max(total, 1e-12)
 
 
-def _inner(pictures: Tensor) -> Tensor:
-    """Pictures (N, H, W) without their margin, (N, pixels)."""
+def without_margin(pictures: Tensor) -> Tensor:
+    """Pictures (N, H, W) without the rim that is not compared."""
     margin = round(MARGIN * min(pictures.shape[-2:]))
     height, width = pictures.shape[-2:]
-    return pictures[:, margin : height - margin, margin : width - margin].flatten(1)
+    return pictures[:, margin : height - margin, margin : width - margin]
 
 
 def _without(T: Tensor, rows: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.optics.polynomials import coefficient_count, polynomials
-from mwdn.registration.distortion import MARGIN, STEPS
+from mwdn.registration.distortion import STEPS, without_margin
 
 SQUARE_PX = 8
 """Side of the squares that are averaged first: shading is smooth."""
@@ -48,8 +48,7 @@ def measure_shading(pictures: Sequence[Tensor], scenes: Sequence[Tensor], order:
 
 def _blocks(picture: Tensor) -> Tensor:
     """Means of squares of a picture (N, H, W) without its margin, (N, squares)."""
-    margin = round(MARGIN * min(picture.shape[-2:]))
-    inner = picture[:, margin : picture.shape[-2] - margin, margin : picture.shape[-1] - margin]
+    inner = without_margin(picture)
     return F.avg_pool2d(inner.double(), min(SQUARE_PX, *inner.shape[-2:])).flatten(1)
 
 
