@@ -14,6 +14,7 @@ PACKAGE = ROOT / "src" / "mwdn"
 
 FLOORS = [
     "errors",
+    "arguments",
     "first_use",
     "types",
     "version",
@@ -42,7 +43,7 @@ FLOORS = [
 ]
 """From the ground up: a folder imports from itself and from those before it in this list, nothing else."""
 
-NETWORKS_MAY_IMPORT = {"errors", "types", "fourier", "runtime", "optics", "solvers", "networks"}
+NETWORKS_MAY_IMPORT = {"errors", "arguments", "types", "fourier", "runtime", "optics", "solvers", "networks"}
 HEAVY = {"cv2", "h5py", "starlette", "uvicorn", "matplotlib", "tifffile", "rawpy", "skimage", "scipy"}
 
 LONGEST = 300

@@ -251,6 +251,16 @@ def test_command(common, tmp_path, capsys):
     assert run("evaluate", "winer", *common) == 2
 
 
+def test_a_method_that_returns_nan_is_named_and_costs_no_other_its_scores(pairs):
+    """The contact sheet was refused, with advice for programmers, and the table was not printed."""
+    methods = {"good": lambda measurement: measurement, "bad": lambda measurement: measurement * math.nan}
+    with pytest.warns(UserWarning, match=r"`bad` returned NaN or infinity for (\d+) of \1 pictures"):
+        report = evaluate(methods, pairs, Protocol.parse("full"), perceptual=Perceptual.none())
+    assert report.sheet().isfinite().all()
+    (psnr,) = (column.cells for column in report.table().columns if "PSNR" in str(column.header))
+    assert [(cell.startswith("[bold]"), cell.startswith("nan")) for cell in psnr] == [(True, False), (False, True)]
+
+
 @pytest.mark.parametrize(
     ("out", "message"), [("file", "must be a folder that can be written to"), ("mine", "would overwrite an input")]
 )

@@ -6,6 +6,7 @@ import tomllib
 import warnings
 from pathlib import Path
 
+import httpx2 as httpx
 import numpy as np
 import pytest
 import torch
@@ -16,8 +17,11 @@ from mwdn.errors import ParameterError, UnknownNameError
 from mwdn.io.pictures import dark_scene
 from mwdn.networks import NETWORKS
 from mwdn.optics import MASKS, Setup, sample_camera
+from mwdn.preview.cameras import StoredCameras
+from mwdn.preview.server import make_server
 from mwdn.runtime import plugins
 from mwdn.solvers import SOLVERS
+from preview_server import LIMITS
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "plugin"
 REGISTRIES = (SOLVERS, NETWORKS, MASKS, SOURCES)
@@ -220,6 +224,73 @@ def test_what_plugins_return_is_checked_and_inherited_options_work(install, run,
     assert (code, "must return a `mwdn.optics.Mask`, not 3" in err) == (2, True), err
     code, _, err = run("design lost")
     assert (code, "No module named 'no_such_module'" in err) == (2, True), err
+
+
+FAILING = """
+import sys
+
+class Raises:
+    def __call__(self, measurement, psf):
+        raise RuntimeError("boom")
+
+class Exits:
+    def __call__(self, measurement, psf):
+        sys.exit(0)
+
+class Unmade:
+    def __init__(self):
+        raise ValueError("no licence")
+
+    def __call__(self, measurement, psf):
+        return measurement
+"""
+
+
+@pytest.fixture
+def failing(install):
+    """Three plugins: their calls raise an error, or exit; or they cannot be made."""
+    names = {"raises": "Raises", "exits": "Exits", "unmade": "Unmade"}
+    folder = install("mwdn-failing", {"mwdn.solvers": {name: f"fails:{kind}" for name, kind in names.items()}})
+    (folder / "fails.py").write_text(FAILING)
+    yield
+    sys.modules.pop("fails", None)
+
+
+@pytest.mark.usefixtures("failing", "files")
+def test_errors_of_a_plugin_name_it_and_cost_one_capture(run):
+    """They ended a folder of captures in a traceback, or the command as if all was well."""
+    Path("captures").mkdir()
+    for name in ("a", "b"):
+        Path(f"captures/{name}.npy").write_bytes(Path("capture.npy").read_bytes())
+    line = "reconstruct captures --psf psf.npy --background 0 --bin 1 --no-trust --out out --method"
+    for name, why in (("raises", "RuntimeError: boom"), ("exits", "SystemExit: 0")):
+        code, out, err = run(f"{line} {name}")
+        assert (code, err.count(f"`{name}`, a plugin's (`fails`), has failed: {why}.")) == (1, 2), err
+        assert "0 of 2 captures" in out
+    code, _, err = run(f"{line} unmade")
+    assert (code, "`unmade`, a plugin's (`fails`), has failed: ValueError: no licence." in err) == (2, True), err
+
+
+@pytest.mark.usefixtures("failing")
+def test_errors_of_the_callers_own_object_pass(files):
+    psf, light = files
+    with pytest.raises(RuntimeError, match=r"^boom$"):
+        mwdn.Reconstructor(SOLVERS["raises"](), mwdn.Calibration(psf), device="cpu")(light)
+
+
+@pytest.mark.usefixtures("failing")
+def test_the_page_outlives_a_plugin_that_exits(files):
+    """The worker ended, no later request was answered, and the server still called itself healthy."""
+    psf, _ = files
+    server = make_server(StoredCameras(LIMITS, None, {"camera": mwdn.Calibration(psf)}), LIMITS, device="cpu")
+    server.start()
+    capture = Path("capture.npy").read_bytes()
+    for method, status in (("exits", 500), ("raises", 500), ("wiener", 200)):
+        data = {"camera": "camera", "method": method, "trust": "false"}
+        answer = httpx.post(f"{server.url}reconstruct", files={"capture": capture}, data=data, timeout=120)
+        assert answer.status_code == status, answer.text[:300]
+        assert status == 200 or f"`{method}`, a plugin's (`fails`), has failed" in answer.json()["error"]
+    server.stop()
 
 
 @pytest.mark.parametrize("line", ["--help", "reconstruct --help", "design contour --help", "recipes"])

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field, replace
 from inspect import signature
 from typing import Any
 
-from mwdn.errors import ParameterError, UnknownNameError, check_options, shown
+from mwdn.arguments import check_options
+from mwdn.errors import ParameterError, UnknownNameError, shown
 from mwdn.io.toml import check_table, named_table, to_dataclass
 from mwdn.networks import NETWORKS
 from mwdn.training.recipe import Schedule

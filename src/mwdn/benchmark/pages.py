@@ -4,6 +4,7 @@ import base64
 import html
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import quote
 
 from rich.table import Table
 
@@ -108,7 +109,7 @@ def _as_markdown(block: Block) -> str:
         case Table():
             return markdown_table(block)
         case Picture():
-            return f"![{block.words}](pictures/{block.name})"
+            return f"![{block.words}](pictures/{quote(block.name)})"
         case Code():
             return f"```\n{block.text}\n```"
     return block

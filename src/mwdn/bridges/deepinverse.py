@@ -7,8 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from mwdn.arguments import MIN_LIGHT, check_options
 from mwdn.bridges.forward_model import ForwardModel
-from mwdn.errors import MIN_LIGHT, ParameterError, check_options
+from mwdn.errors import ParameterError
 from mwdn.fourier import convolve, correlate
 from mwdn.optics import Camera, Sensor
 from mwdn.optics.psf import checked_psf

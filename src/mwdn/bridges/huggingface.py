@@ -9,7 +9,8 @@ from typing import Any
 
 from torch import nn
 
-from mwdn.errors import CheckpointError, MwdnError, checked
+from mwdn.arguments import checked
+from mwdn.errors import CheckpointError, MwdnError
 from mwdn.io.files import as_parameter_error, atomic, refuse_foreign, write_json, write_text
 from mwdn.io.reading import read_json
 from mwdn.weights.bundled import WEIGHTS_FILE, find_weights, load_network

@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mwdn.arguments import checked
 from mwdn.bridges.forward_model import ForwardModel, Shape
-from mwdn.errors import ParameterError, checked
+from mwdn.errors import ParameterError
 from mwdn.optics import Camera, FieldCamera
 from mwdn.runtime.requirement import require
 from mwdn.types import Size

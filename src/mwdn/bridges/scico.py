@@ -2,8 +2,8 @@
 
 from typing import Any
 
+from mwdn.arguments import checked
 from mwdn.bridges.forward_model import ForwardModel
-from mwdn.errors import checked
 from mwdn.fourier.transforms import fast_length
 from mwdn.optics import Camera
 from mwdn.runtime.requirement import require

@@ -7,12 +7,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, get_type_hints
 
+from mwdn.arguments import fits_type
 from mwdn.calibration.frame_format import FrameFormat
 from mwdn.calibration.place_files import PlaceFiles
 from mwdn.calibration.psf_format import PsfFormat
 from mwdn.calibration.refinement import Refinement
 from mwdn.calibration.white_balance import WhiteBalance
-from mwdn.errors import ParameterError, PsfError, UnknownNameError, fits_type, one_line, shown
+from mwdn.errors import ParameterError, PsfError, UnknownNameError, one_line, shown
 from mwdn.io.files import as_parameter_error, atomic, file_sha256
 from mwdn.io.headers import MAX_DECODED_BYTES
 from mwdn.io.listing import FRAMES

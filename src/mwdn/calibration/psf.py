@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from mwdn.arguments import check_batch, checked
 from mwdn.calibration.ambient_frame import denoise_ambient
 from mwdn.calibration.camera_file import check_length, check_psf_file, pop_places, pop_sensor, read_camera, with_changes
 from mwdn.calibration.corrections import Corrections
@@ -19,7 +20,7 @@ from mwdn.calibration.psf_levels import background_level, check_psf_frame, empty
 from mwdn.calibration.refinement import TERMS, Refinement
 from mwdn.calibration.size_advice import advise_size
 from mwdn.calibration.white_balance import WhiteBalance, check_white_balance
-from mwdn.errors import ParameterError, PsfError, ShapeError, check_batch, checked, shown
+from mwdn.errors import ParameterError, PsfError, ShapeError, shown
 from mwdn.io.formats import as_frame
 from mwdn.optics.psf import checked_psf, psf_hash
 from mwdn.optics.sensor import Sensor
@@ -202,8 +203,7 @@ class Calibration:
         total = psf.sum((-2, -1), keepdim=True)
         if not (total > 0).all():
             raise PsfError(empty(total.flatten() > 0, level.flatten(), with_dark=dark is not None))
-        background = tuple(round(float(value), 6) for value in level.flatten())
-        light = tuple(total.flatten().tolist())
+        background, light = tuple(round(float(value), 6) for value in level.flatten()), tuple(total.flatten().tolist())
         return replace(draft, psf=psf_format.turn(psf / total, frames), background=background, light=light)
 
     def psf_image(self, frame: Frame) -> Image:
@@ -224,12 +224,12 @@ class Calibration:
         if self.psf.ndim != 4 or self.psf.shape[0] != 1 or self.psf.shape[1] not in (1, 3) or 0 in self.psf.shape:
             raise PsfError(f"`psf` {tuple(self.psf.shape)} must be (1, 1 or 3, H, W): grey or RGB.")
         object.__setattr__(self, "psf", checked_psf(self.psf).float())
-        for name in ("dark", "ambient"):
-            if getattr(self, name) is not None:
-                check_batch(getattr(self, name), name)
+        for name, frame in (("dark", self.dark), ("ambient", self.ambient)):
+            if frame is not None:
+                check_batch(frame, name)
         check_white_balance(self.white_balance, self.light)
-        for name in ("pitch_um", "distance_mm"):
-            check_length(name, getattr(self, name))
+        check_length("pitch_um", self.pitch_um)
+        check_length("distance_mm", self.distance_mm)
 
     def __repr__(self) -> str:
         colours = "RGB" if self.psf.shape[1] == 3 else "grey"

@@ -6,8 +6,9 @@ from typing import Any, Literal
 
 from torch import Tensor
 
+from mwdn.arguments import checked
 from mwdn.calibration.frame_format import FrameFormat, Gamma, check_gamma
-from mwdn.errors import ParameterError, UnknownNameError, checked
+from mwdn.errors import ParameterError, UnknownNameError
 from mwdn.optics.orientation import Orientation, check_orientation, swaps_axes, turn
 
 Background = float | Literal["estimate"]

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mwdn.errors import ParameterError, checked
+from mwdn.arguments import checked
+from mwdn.errors import ParameterError
 from mwdn.optics.aperture import displaced_envelope
 from mwdn.optics.polynomials import frame_places, polynomial, polynomial_order
 from mwdn.optics.psf import unit_sum

@@ -5,7 +5,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from mwdn.errors import ParameterError, fits_type, shown
+from mwdn.arguments import fits_type
+from mwdn.errors import ParameterError, shown
 from mwdn.types import Scene
 
 WhiteBalance = Literal["grey-world", "psf"] | tuple[float, float, float]

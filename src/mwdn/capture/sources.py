@@ -6,8 +6,9 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any, NamedTuple
 
+from mwdn.arguments import check_options
 from mwdn.capture.source import CameraSource
-from mwdn.errors import CameraError, UnknownNameError, check_options
+from mwdn.errors import CameraError, UnknownNameError
 from mwdn.io.toml import parse_value
 from mwdn.runtime.plugins import Registry
 from mwdn.runtime.requirement import require

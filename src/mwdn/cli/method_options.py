@@ -9,8 +9,9 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from cyclopts import App, Parameter
 
+from mwdn.arguments import type_in_words
 from mwdn.cli.wrong_calls import long_options, unknown_option
-from mwdn.errors import ParameterError, type_in_words
+from mwdn.errors import ParameterError
 from mwdn.inference.method_options import Option, list_options
 from mwdn.solvers import SOLVERS
 

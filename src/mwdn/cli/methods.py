@@ -6,8 +6,9 @@ from rich.markup import escape
 from rich.padding import Padding
 from rich.table import Table
 
+from mwdn.arguments import type_in_words
 from mwdn.cli.terminal import results
-from mwdn.errors import UnknownNameError, type_in_words
+from mwdn.errors import UnknownNameError
 from mwdn.inference.method_options import REQUIRED, Option, list_options, summary
 from mwdn.networks import NETWORKS
 from mwdn.solvers import SOLVERS

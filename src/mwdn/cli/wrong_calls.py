@@ -12,7 +12,8 @@ from cyclopts.argument import Argument
 from cyclopts.exceptions import ArgumentOrderError, RepeatArgumentError, UnknownCommandError, UnusedCliTokensError
 from cyclopts.token import Token
 
-from mwdn.errors import ParameterError, UnknownNameError, type_in_words
+from mwdn.arguments import type_in_words
+from mwdn.errors import ParameterError, UnknownNameError
 
 
 def wrong_call(error: CycloptsError, commands: Iterable[str]) -> ParameterError:

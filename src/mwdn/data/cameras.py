@@ -5,9 +5,10 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from mwdn.arguments import checked
 from mwdn.data.random import seeded
 from mwdn.data.simulated import Batch, Samples, SimulatedPairs, full_precision
-from mwdn.errors import ParameterError, checked
+from mwdn.errors import ParameterError
 from mwdn.optics.random_psf import FAMILIES, sample_camera
 from mwdn.types import Size
 

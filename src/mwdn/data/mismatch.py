@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from mwdn.arguments import checked
 from mwdn.data.random import uniform
-from mwdn.errors import ParameterError, checked
+from mwdn.errors import ParameterError
 from mwdn.optics.warp import affine, hazed
 from mwdn.types import Psf, Size
 

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 
 import torch
 
+from mwdn.arguments import checked
 from mwdn.data.random import uniform
 from mwdn.data.simulated import Batch, Samples, SimulatedPairs, full_precision
-from mwdn.errors import ParameterError, checked
+from mwdn.errors import ParameterError
 
 
 @checked

@@ -19,7 +19,9 @@ from mwdn.data.pair_writer import FORMAT_VERSION, PAIR_PARTS, VERSION_KEY, Attri
 from mwdn.errors import ImageError, ParameterError, shown
 from mwdn.types import Psf
 
-_MAKE_AGAIN = "Make it again, with `mwdn import`."
+_MAKE_AGAIN = (
+    "Make it again: remove it, and repeat the `mwdn import`, `align`, `simulate` or `benchmark` that wrote it."
+)
 
 
 @dataclass(frozen=True)
@@ -216,7 +218,9 @@ def _read_shapes(path: Path, file: Any) -> tuple[int, Shape, Shape]:  # noqa: AN
     for name in PAIR_PARTS:
         data = find_rows(path, file, name, _MAKE_AGAIN)
         if data is None:
-            raise ImageError(f"`{path}` must have the data set `{name}`, but has {names_in(path, file)}. {_MAKE_AGAIN}")
+            raise ImageError(
+                f"`{path}` must have the data set `{name}`, but has {names_in(path, file)}. `mwdn import` makes one."
+            )
         if data.ndim != 4 or data.dtype.str not in ("|u1", "<u2", ">u2", "<f4", ">f4"):
             raise ImageError(
                 f"`{name}` of `{path}` ({data.shape}, {data.dtype}) must be (N, H, W, C) of uint8, uint16 or float32."

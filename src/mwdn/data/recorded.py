@@ -14,13 +14,14 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from mwdn.arguments import checked
 from mwdn.calibration.refinement import Refinement
 from mwdn.data.pair_checks import check_pairs, missing_refinement
 from mwdn.data.pair_writer import Attribute
 from mwdn.data.pairs import PairFile, refuse_non_finite
 from mwdn.data.simulated import Batch, Samples
 from mwdn.data.splits import Split, split
-from mwdn.errors import ParameterError, checked
+from mwdn.errors import ParameterError
 from mwdn.runtime.transfers import to_device
 from mwdn.solvers.alignment import align
 from mwdn.solvers.pose import Pose

@@ -14,11 +14,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from mwdn.arguments import checked
 from mwdn.data.mismatch import Mismatch, perturb, shading
 from mwdn.data.photographs import Photographs
 from mwdn.data.random import seeded, uniform
 from mwdn.data.real_camera import RealCamera
-from mwdn.errors import ParameterError, checked
+from mwdn.errors import ParameterError
 from mwdn.optics.field import FieldCamera
 from mwdn.optics.sensor import Sensor
 from mwdn.optics.warp import affine

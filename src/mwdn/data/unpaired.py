@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from mwdn.arguments import checked
 from mwdn.data.random import seeded
 from mwdn.data.simulated import NumberedSamples, full_precision
-from mwdn.errors import ParameterError, checked
+from mwdn.errors import ParameterError
 from mwdn.fourier.convolution import convolve
 from mwdn.optics.noise import noise_level
 from mwdn.solvers.alignment import align

@@ -18,7 +18,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mwdn.errors import ShapeError, check_batch
+from mwdn.arguments import check_batch
+from mwdn.errors import ShapeError
 from mwdn.fourier.convolution import check_fit, convolve
 from mwdn.optics.noise import noise_level
 from mwdn.optics.psf import checked_psf

@@ -17,7 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mwdn.errors import ParameterError, ShapeError, check_batch
+from mwdn.arguments import check_batch
+from mwdn.errors import ParameterError, ShapeError
 from mwdn.evaluation.alexnet import AlexNet, Heads, load_alexnet, load_heads
 from mwdn.evaluation.vgg import Vgg16
 from mwdn.io.formats import as_frame

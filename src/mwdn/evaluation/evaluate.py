@@ -4,6 +4,7 @@ import ctypes
 import sys
 import time
 import typing
+import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -103,11 +104,12 @@ def evaluate(
     for name, method in methods.items():
         peak = _warm_up(method, pairs[0][0][None])
         values: dict[str, list[float]] = {metric: [] for metric in METRICS}
-        seconds = []
+        seconds, wrong = [], 0
         for i in range(len(pairs)):
             measurement, scene = pairs[i]
             reconstruction, elapsed = _timed(method, measurement[None])
             seconds.append(elapsed)
+            wrong += not reconstruction.isfinite().all()
             numbers = measure(reconstruction.cpu(), scene[None], protocol, variant=variant, perceptual=perceptual)
             for metric, number in numbers.items():
                 values[metric].append(number.item())
@@ -115,6 +117,11 @@ def evaluate(
                 rows[i].append(reconstruction.cpu())
             if progress:
                 progress(name, i)
+        if wrong:
+            warnings.warn(
+                f"`{name}` returned NaN or infinity for {wrong:,} of {len(pairs):,} pictures: its scores mean nothing.",
+                stacklevel=2,
+            )
         columns = {metric: tuple(column) for metric, column in values.items()}
         scores[name] = Scores(columns, tuple(seconds), peak, _device(method).type, learnable_numbers(method))
     return Report(protocol.name, variant or protocol.variant, scores, perceptual.missing, rows)

@@ -10,7 +10,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from mwdn.errors import CheckpointError, ParameterError, ShapeError, check_batch, checked
+from mwdn.arguments import check_batch, checked
+from mwdn.errors import CheckpointError, ParameterError, ShapeError
 from mwdn.evaluation import distances
 from mwdn.evaluation.alexnet import AlexNet, Heads, load_alexnet, load_heads
 from mwdn.types import Image

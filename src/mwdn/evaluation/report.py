@@ -162,8 +162,12 @@ class Report:
         }
 
     def sheet(self) -> Tensor:
-        """Contact sheet of the first pictures, (1, 3, H, W) in linear light: scene, measurement, each method."""
-        return contact_sheet(self.rows, ["scene", "measurement", *(Path(name).name for name in self.methods)])
+        """Contact sheet of the first pictures, (1, 3, H, W) in linear light: scene, measurement, each method.
+
+        NaN and infinity are black.
+        """
+        rows = [[picture.nan_to_num(0, 0, 0) for picture in row] for row in self.rows]
+        return contact_sheet(rows, ["scene", "measurement", *(Path(name).name for name in self.methods)])
 
     def write(self, out: Path) -> None:
         """Write ``report.json`` and ``comparison.png`` into a folder, atomically.
@@ -177,7 +181,8 @@ class Report:
 
     def _best(self, metric: str) -> set[str]:
         means = {name: statistics.fmean(scores.values[metric]) for name, scores in self.methods.items()}
-        best = (max if metric in LARGER_IS_BETTER else min)(means.values())
+        finite = [mean for mean in means.values() if not math.isnan(mean)]
+        best = (max if metric in LARGER_IS_BETTER else min)(finite, default=None)
         return {name for name, mean in means.items() if mean == best}
 
 

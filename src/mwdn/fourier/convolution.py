@@ -4,7 +4,8 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from mwdn.errors import ShapeError, check_batch, checked
+from mwdn.arguments import check_batch, checked
+from mwdn.errors import ShapeError
 from mwdn.fourier.transforms import fast_length, inverse_spectrum, spectrum, transfer_function
 from mwdn.types import Image, Measurement, Psf, Scene, Size, Spectrum
 

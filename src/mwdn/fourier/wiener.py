@@ -2,7 +2,8 @@
 
 from torch import Tensor
 
-from mwdn.errors import ParameterError, ShapeError, checked
+from mwdn.arguments import checked
+from mwdn.errors import ParameterError, ShapeError
 from mwdn.fourier.convolution import check_fit
 from mwdn.fourier.filtering import filter_image
 from mwdn.fourier.padding import Boundary

@@ -2,6 +2,8 @@
 
 import copy
 from collections.abc import Iterable, Iterator
+from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any, overload
 
@@ -9,9 +11,10 @@ import torch
 from torch import Tensor, nn
 
 from mwdn import solvers
+from mwdn.arguments import check_batch, check_light, check_options, checked
 from mwdn.calibration import Calibration
 from mwdn.calibration.white_balance import WhiteBalance, apply_white_balance, check_white_balance
-from mwdn.errors import ParameterError, ShapeError, check_batch, check_light, check_options, checked, shown
+from mwdn.errors import ParameterError, ShapeError, shown
 from mwdn.fourier.convolution import check_fit
 from mwdn.inference.engine import Engine, Precision
 from mwdn.inference.ensemble import Ensemble
@@ -21,7 +24,8 @@ from mwdn.io.formats import as_frame
 from mwdn.networks.blocks import check_channels
 from mwdn.networks.network import Network, as_network
 from mwdn.optics.saturation import subtract_light
-from mwdn.runtime.devices import select_device
+from mwdn.runtime.devices import memory_errors, select_device
+from mwdn.runtime.plugins import plugin_errors
 from mwdn.runtime.transfers import to_device, to_host
 from mwdn.solvers.alignment import has_detail
 from mwdn.types import ArrayPicture, FloatFrame, Frame, Measurement, Scene
@@ -63,6 +67,7 @@ class Reconstructor:
     Raises:
         UnknownNameError: no such method, or it has no such option.
         CheckpointError: the checkpoint cannot be used.
+        PluginError: the method is a plugin's and raises an error.
         ParameterError: ``calibration`` is no `Calibration`, no such device or precision, an option is out of range, or
             the network has no weights; ``ensemble`` with a solver.
     """
@@ -93,10 +98,12 @@ class Reconstructor:
         self.calibration = calibration
         self.white_balance = calibration.white_balance if white_balance is None else white_balance
         check_white_balance(self.white_balance, calibration.light)
-        self.name = method_name(method)
+        self.name, is_named = method_name(method), isinstance(method, str | Path)
         warning = psf_warning(method, calibration) if isinstance(method, str | Path) else None
         self.method: Method = as_method(method, **options)
         method = self.method
+        # Errors of the caller's own object pass as they are.
+        self._plugin_errors = partial(plugin_errors, self.name, type(method)) if is_named else nullcontext
         self.warning = warning or background_warning(self.name, method, calibration)
         aligns = isinstance(method, Network) and method.align
         self.align = aligns if align is None else align
@@ -104,7 +111,8 @@ class Reconstructor:
         self.psf = psf_for(method, calibration).to(self.device)
         self.engine: Engine[Any] | Ensemble[Any] | None = None
         if isinstance(method, nn.Module):
-            engine = Engine(as_network(method), self.psf, precision=precision)
+            with self._plugin_errors():
+                engine = Engine(as_network(method), self.psf, precision=precision)
             self.engine = Ensemble(engine) if ensemble else engine
         elif ensemble:
             raise ParameterError(f"`ensemble` is for networks: {self.name} gives mirrored captures mirrored pictures.")
@@ -189,7 +197,8 @@ class Reconstructor:
     def _reconstruct(self, measurement: Measurement) -> Scene:
         if self.align:
             return self.at(solvers.align(measurement, self.psf))._reconstruct(measurement)
-        return self.engine(measurement) if self.engine else self._by_method(measurement)
+        with self._plugin_errors():
+            return self.engine(measurement) if self.engine else self._by_method(measurement)
 
     def _by_method(self, measurement: Measurement) -> Scene:
         """The result of a method that may be a plugin's or the caller's own."""
@@ -240,8 +249,9 @@ class Reconstructor:
         Raises:
             ShapeError: the measurement is not a batch, or its size or channels do not fit the PSF or the network.
             ImageError: the array or picture is not a frame.
+            PluginError: the method was given by its name, is a plugin's and raises an error.
             ParameterError: the measurement is a tensor of integers or holds NaN, infinity, no light or a scale beyond
-                `mwdn.errors.MAX_LIGHT`; floats of an array exceed 1 by far; or the device does not have enough
+                `mwdn.arguments.MAX_LIGHT`; floats of an array exceed 1 by far; or the device does not have enough
                 memory for pictures of this size.
         """
         if isinstance(measurement, Tensor):
@@ -279,19 +289,10 @@ class Reconstructor:
         return self._in_chunks(measurement)
 
     def _in_chunks(self, measurement: Measurement) -> Scene:
-        try:
+        with memory_errors("measurement", tuple(measurement.shape), self.device):
             parts = torch.split(measurement, self._pictures_per_chunk(measurement))
             scenes = [self._reconstruct(self.without_room_light(to_device(part, self.device))[0]) for part in parts]
             return scenes[0] if len(scenes) == 1 else torch.cat(scenes)
-        except (MemoryError, RuntimeError) as error:
-            out_of_memory = isinstance(error, MemoryError | torch.OutOfMemoryError)
-            out_of_memory |= "can't allocate memory" in str(error)  # torch has no error type for this on a CPU
-            if not out_of_memory:
-                raise
-            raise ParameterError(
-                f"`measurement` {tuple(measurement.shape)} needs more memory than {self.device} has free. Bin or crop "
-                "it: `bin=2`, `crop=(1000, 1000)`; or try `device='cpu'`, `method='wiener'`."
-            ) from error
 
 
 def _plain(scene: Scene) -> Scene:

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from mwdn.errors import checked
+from mwdn.arguments import checked
 from mwdn.fourier.convolution import check_fit
 from mwdn.networks.room_light import RoomLightUNet, clues
 from mwdn.optics.psf import checked_psf, unit_sum

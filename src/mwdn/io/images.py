@@ -6,7 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mwdn.errors import ImageError, ParameterError, checked
+from mwdn.arguments import checked
+from mwdn.errors import ImageError, ParameterError
 from mwdn.io.files import atomic_write
 from mwdn.io.formats import as_frame, decode, kind_of, read
 from mwdn.types import FloatFrame, Frame, Image

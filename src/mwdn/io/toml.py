@@ -11,7 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
-from mwdn.errors import MwdnError, ParameterError, UnknownNameError, reason, shown, type_in_words
+from mwdn.arguments import type_in_words
+from mwdn.errors import MwdnError, ParameterError, UnknownNameError, reason, shown
 from mwdn.io.reading import read_text
 
 T = TypeVar("T")

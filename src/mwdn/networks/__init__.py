@@ -4,7 +4,8 @@ from typing import Any
 
 from torch import nn
 
-from mwdn.errors import ParameterError, UnknownNameError, check_options
+from mwdn.arguments import check_options
+from mwdn.errors import ParameterError, UnknownNameError
 from mwdn.networks.drunet import Drunet
 from mwdn.networks.flatnet import FlatNet
 from mwdn.networks.ifin import Ifin

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from mwdn.errors import ParameterError, ShapeError, check_batch
+from mwdn.arguments import check_batch
+from mwdn.errors import ParameterError, ShapeError
 from mwdn.fourier.filtering import filter_image
 from mwdn.fourier.memory_format import chunked
 from mwdn.fourier.padding import Boundary

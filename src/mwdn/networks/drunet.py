@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from mwdn.errors import checked
+from mwdn.arguments import checked
 from mwdn.fourier.memory_format import pixel_unshuffle
 from mwdn.types import Image
 

@@ -5,7 +5,8 @@ from typing import Any, Generic, TypeVar
 import torch
 from torch import Tensor, nn
 
-from mwdn.errors import ParameterError, checked
+from mwdn.arguments import checked
+from mwdn.errors import ParameterError
 from mwdn.fourier.convolution import check_fit
 from mwdn.optics.psf import checked_psf
 from mwdn.types import Measurement, Psf, Scene, Size
@@ -28,7 +29,7 @@ class Network(nn.Module, Generic[Prepared]):
             colour and the background, as the MWDN authors' code does (`mwdn.inference.methods.psf_for`). Others take
             each channel as of unit sum.
 
-    Arguments of every subclass are checked against their annotations (`mwdn.errors.checked`).
+    Arguments of every subclass are checked against their annotations (`mwdn.arguments.checked`).
     """
 
     channels: int = 0

@@ -7,7 +7,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from mwdn.errors import ParameterError, checked
+from mwdn.arguments import checked
+from mwdn.errors import ParameterError
 from mwdn.optics.masks import Mask, sample_counts
 from mwdn.optics.propagation import UM_PER_MM, check_positive, coordinates
 from mwdn.optics.setup import Setup

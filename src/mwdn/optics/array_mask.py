@@ -11,7 +11,8 @@ import numpy.typing as npt
 import torch
 from torch.nn import functional as F
 
-from mwdn.errors import ImageError, ParameterError, ShapeError, UnknownNameError, checked, shown
+from mwdn.arguments import checked
+from mwdn.errors import ImageError, ParameterError, ShapeError, UnknownNameError, shown
 from mwdn.io.images import read_frame
 from mwdn.io.npy import read_array
 from mwdn.optics.mask_files import read_mask

@@ -4,7 +4,8 @@ from dataclasses import dataclass, field
 
 import torch
 
-from mwdn.errors import ShapeError, checked
+from mwdn.arguments import checked
+from mwdn.errors import ShapeError
 from mwdn.fourier.convolution import convolve, correlate
 from mwdn.optics.psf import checked_psf, psf_hash
 from mwdn.optics.sensor import Sensor, check_sensor_size

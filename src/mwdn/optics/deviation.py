@@ -6,7 +6,8 @@ from typing import ClassVar
 
 import torch
 
-from mwdn.errors import ParameterError, checked
+from mwdn.arguments import checked
+from mwdn.errors import ParameterError
 from mwdn.optics.field import Aberration, FieldCamera, field_psfs
 from mwdn.optics.warp import hazed, warp
 from mwdn.types import Psf, Size

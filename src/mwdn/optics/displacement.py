@@ -6,7 +6,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from mwdn.errors import ShapeError, check_batch
+from mwdn.arguments import check_batch
+from mwdn.errors import ShapeError
 from mwdn.fourier.transforms import fast_length, frequency_grid, inverse_spectrum, spectrum
 from mwdn.types import Psf, Size, Spectrum
 

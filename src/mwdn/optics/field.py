@@ -8,7 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from mwdn.errors import ParameterError, ShapeError, checked
+from mwdn.arguments import checked
+from mwdn.errors import ParameterError, ShapeError
 from mwdn.fourier.convolution import convolve, correlate
 from mwdn.fourier.transforms import fast_length, gaussian_transfer, inverse_spectrum, spectrum
 from mwdn.optics.sensor import Sensor, check_sensor_size

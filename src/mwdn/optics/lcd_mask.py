@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from mwdn.errors import ParameterError, ShapeError, checked
+from mwdn.arguments import checked
+from mwdn.errors import ParameterError, ShapeError
 from mwdn.optics.masks import Mask, check_samples, mask_psf
 from mwdn.optics.propagation import check_positive
 from mwdn.optics.psf import unit_sum

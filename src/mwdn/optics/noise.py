@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mwdn.errors import check_batch
+from mwdn.arguments import check_batch
 from mwdn.types import Image
 
 SAMPLED = 2**15

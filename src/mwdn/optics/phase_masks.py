@@ -7,7 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mwdn.errors import ParameterError, checked
+from mwdn.arguments import checked
+from mwdn.errors import ParameterError
 from mwdn.optics.drawing import contours
 from mwdn.optics.masks import Mask, check_index, check_levels, quantise, sample_counts
 from mwdn.optics.phase_retrieval import retrieve_phase

@@ -5,7 +5,8 @@ import hashlib
 import torch
 from torch import Tensor
 
-from mwdn.errors import PsfError, check_batch
+from mwdn.arguments import check_batch
+from mwdn.errors import PsfError
 from mwdn.types import Psf
 
 SUM_TOLERANCE = 1e-3

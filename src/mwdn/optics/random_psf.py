@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from mwdn.errors import ParameterError, UnknownNameError, checked
+from mwdn.arguments import checked
+from mwdn.errors import ParameterError, UnknownNameError
 from mwdn.fourier.transforms import fast_length, gaussian_transfer, inverse_spectrum, spectrum
 from mwdn.optics.drawing import contour_lines, scatter_light, smooth_field
 from mwdn.optics.psf import unit_sum

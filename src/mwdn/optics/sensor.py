@@ -4,7 +4,8 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from mwdn.errors import ParameterError, ShapeError, check_batch, checked
+from mwdn.arguments import check_batch, checked
+from mwdn.errors import ParameterError, ShapeError
 from mwdn.types import Image, Size
 
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mwdn.errors import ParameterError, check_options
+from mwdn.arguments import check_options
+from mwdn.errors import ParameterError
 from mwdn.io.formats import MAX_PIXELS
 from mwdn.optics.propagation import check_positive
 from mwdn.types import Size

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from mwdn.errors import MwdnError
+from mwdn.errors import MwdnError, PluginError
 from mwdn.preview.limits import Limits, RefusedError
 from mwdn.preview.result import Result
 
@@ -155,9 +155,12 @@ class Jobs:
             work(job)
             job.advance(1.0)
             job.end("done")
+        except PluginError as error:
+            LOG.exception("reconstruction")
+            job.end("failed", RefusedError(500, str(error)))
         except MwdnError as error:
             job.end("cancelled" if job.cancelled else "failed", error)
-        except Exception as error:  # a defect of this package must not end the server
+        except BaseException as error:  # a defect of this package must not end the server
             LOG.exception("reconstruction")
             what = type(error).__name__
             job.end("failed", RefusedError(500, f"An error of mwdn itself: {what}. The server's log says more."))

@@ -2,7 +2,8 @@
 
 from typing import Any, get_args, get_origin
 
-from mwdn.errors import ParameterError, UnknownNameError, type_in_words
+from mwdn.arguments import type_in_words
+from mwdn.errors import ParameterError, UnknownNameError
 from mwdn.inference.method_options import REQUIRED, Option, list_options, summary
 from mwdn.io.toml import check_numbers
 from mwdn.solvers import SOLVERS

@@ -29,6 +29,26 @@ def select_device(device: str | torch.device | None = None) -> torch.device:
     return torch.device(device)
 
 
+@contextmanager
+def memory_errors(name: str, shape: tuple[int, ...], device: torch.device) -> Iterator[None]:
+    """Turn a device's lack of memory for pictures of this shape, the argument called ``name``, into one sentence.
+
+    Raises:
+        ParameterError: the device has too little memory.
+    """
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        out_of_memory = isinstance(error, MemoryError | torch.OutOfMemoryError)
+        out_of_memory |= "can't allocate memory" in str(error)  # torch has no error type for this on a CPU
+        if not out_of_memory:
+            raise
+        raise ParameterError(
+            f"`{name}` {shape} needs more memory than {device} has free. Bin or crop it: `bin=2`, "
+            "`crop=(1000, 1000)`; or try `device='cpu'`, `method='wiener'`."
+        ) from error
+
+
 def has_bfloat16(device: torch.device) -> bool:
     """Whether the device computes bfloat16 in hardware. Emulated bfloat16 is slower than float32."""
     if device.type == "cuda":

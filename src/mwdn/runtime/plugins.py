@@ -3,11 +3,12 @@
 import inspect
 import warnings
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
-from mwdn.errors import ParameterError, reason
+from mwdn.errors import MwdnError, ParameterError, PluginError, reason
 
 Entry = TypeVar("Entry")
 
@@ -118,6 +119,28 @@ def check_complete(entry: Callable[..., Any], what: str, options: Mapping[str, A
         can_be_named = argument.kind in (argument.KEYWORD_ONLY, argument.POSITIONAL_OR_KEYWORD)
         if can_be_named and argument.default is argument.empty and name not in options:
             raise ParameterError(f"`{name}` of {what} is missing: it has no default.")
+
+
+@contextmanager
+def plugin_errors(name: str, of: type) -> Iterator[None]:
+    """Turn an error of a plugin's own code into one that names the plugin; those of this package's classes pass.
+
+    Args:
+        name: of the plugin, or of what is made with it.
+        of: class of the object whose code runs.
+
+    Raises:
+        PluginError: the plugin raised an error, or wanted to end the process.
+    """
+    try:
+        yield
+    except MwdnError:
+        raise
+    except (Exception, SystemExit) as error:
+        if of.__module__.partition(".")[0] == "mwdn":
+            raise
+        text = f"`{name}`, a plugin's (`{of.__module__}`), has failed: {type(error).__name__}: {reason(error)}."
+        raise PluginError(text) from error
 
 
 def _package(point: EntryPoint | None) -> str:

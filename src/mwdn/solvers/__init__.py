@@ -12,10 +12,11 @@ changed since its calibration.
 from collections.abc import Callable
 from typing import Any
 
-from mwdn.errors import ParameterError, UnknownNameError, check_options
+from mwdn.arguments import check_options
+from mwdn.errors import ParameterError, UnknownNameError
 from mwdn.optics.noise import noise_level
 from mwdn.runtime.forks import survive_forks
-from mwdn.runtime.plugins import Registry, check_complete
+from mwdn.runtime.plugins import Registry, check_complete, plugin_errors
 from mwdn.solvers.admm import Admm
 from mwdn.solvers.alignment import align
 from mwdn.solvers.fista import Fista
@@ -59,6 +60,7 @@ def build(name: str, **options: Any) -> Callable[[Measurement, Psf], Scene]:  # 
     Raises:
         UnknownNameError: there is no such solver, or it has no such option.
         ParameterError: ``name`` is a network, or an option is of another type or out of range.
+        PluginError: the class is a plugin's and raises an error.
     """
     if name in NETWORK_NAMES:
         raise ParameterError(
@@ -69,7 +71,8 @@ def build(name: str, **options: Any) -> Callable[[Measurement, Psf], Scene]:  # 
         raise UnknownNameError("solver", name, SOLVERS)
     check_options(SOLVERS[name], f"the solver '{name}'", options)
     check_complete(SOLVERS[name], f"the solver '{name}'", options)
-    return SOLVERS[name](**options)
+    with plugin_errors(name, SOLVERS[name]):
+        return SOLVERS[name](**options)
 
 
 __all__ = [

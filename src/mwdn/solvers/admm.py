@@ -7,7 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from mwdn.errors import ParameterError, checked
+from mwdn.arguments import checked
+from mwdn.errors import ParameterError
 from mwdn.fourier.convolution import check_fit
 from mwdn.optics.psf import checked_psf
 from mwdn.runtime.iterations import repeat

@@ -6,7 +6,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from mwdn.errors import ParameterError, checked
+from mwdn.arguments import checked
+from mwdn.errors import ParameterError
 from mwdn.fourier.transforms import inverse_spectrum, spectrum
 from mwdn.optics.psf import checked_psf
 from mwdn.runtime.iterations import iterations

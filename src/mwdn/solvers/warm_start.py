@@ -5,7 +5,8 @@ from typing import Any
 
 import torch
 
-from mwdn.errors import ParameterError, checked
+from mwdn.arguments import checked
+from mwdn.errors import ParameterError
 from mwdn.solvers.admm import Admm
 from mwdn.solvers.fista import Fista
 from mwdn.solvers.levels import root_mean_square

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mwdn.errors import ParameterError, checked
+from mwdn.arguments import checked
+from mwdn.errors import ParameterError
 from mwdn.fourier.convolution import check_fit
 from mwdn.fourier.padding import Boundary, pad
 from mwdn.fourier.transforms import inverse_spectrum, spectrum, transfer_function

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import torch
 
+from mwdn.arguments import checked
 from mwdn.calibration import Calibration
 from mwdn.calibration.places import field_camera
 from mwdn.calibration.psf_identity import psf_identity
@@ -22,7 +23,7 @@ from mwdn.data.photographs import Photographs
 from mwdn.data.recorded import HELD_OUT, record, recorded_pairs
 from mwdn.data.simulated import Samples, SimulatedPairs
 from mwdn.data.unpaired import UnpairedCaptures
-from mwdn.errors import CheckpointError, ParameterError, checked
+from mwdn.errors import CheckpointError, ParameterError
 from mwdn.io.listing import refuse_within
 from mwdn.networks.empty import build_empty
 from mwdn.optics.sensor import Sensor

@@ -6,13 +6,14 @@ from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+from mwdn.arguments import checked
 from mwdn.data.cameras import Cameras
 from mwdn.data.mismatch import REAL_OPTIONS, Mismatch
 from mwdn.data.noisy import Denoising
 from mwdn.data.recorded import Division
 from mwdn.data.simulated import Placement
 from mwdn.data.unpaired import SelfSupervised
-from mwdn.errors import ParameterError, UnknownNameError, checked
+from mwdn.errors import ParameterError, UnknownNameError
 from mwdn.io.toml import check_table, current_names, find_recipe, named_table, read_toml, to_dataclass
 from mwdn.networks import DENOISERS
 from mwdn.networks.empty import build_empty

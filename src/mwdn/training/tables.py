@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass
 
-from mwdn.errors import ParameterError, checked
+from mwdn.arguments import checked
+from mwdn.errors import ParameterError
 
 
 @checked

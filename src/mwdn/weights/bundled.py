@@ -7,7 +7,8 @@ from typing import Any
 import torch
 from torch import nn
 
-from mwdn.errors import CheckpointError, checked, reason
+from mwdn.arguments import checked
+from mwdn.errors import CheckpointError, reason
 from mwdn.runtime.requirement import require
 from mwdn.weights.checkpoint import load_checkpoint, read_metadata, save_network
 from mwdn.weights.growth import grown
