@@ -20,12 +20,12 @@ from pathlib import Path
 
 import torch
 
-from mwdn.benchmark.recipe import read_benchmark
+from mwdn.benchmark.recipe_reader import read_benchmark
 from mwdn.benchmark.sets import open_dataset
 from mwdn.benchmark.training import schedule_on
 from mwdn.fourier.transforms import transfer_function
 from mwdn.networks import build
-from mwdn.networks.blocks import normalise_psf
+from mwdn.networks.wiener_filter import normalise_psf
 from mwdn.optics.psf_measures import likeness
 from mwdn.optics.warp import warp
 from mwdn.training.recipe import Recipe

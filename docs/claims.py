@@ -30,7 +30,8 @@ from torch.nn import functional as F
 
 from mwdn import Reconstructor, read_frame, to_display
 from mwdn.benchmark.methods import MEAN
-from mwdn.benchmark.recipe import Benchmark, read_benchmark
+from mwdn.benchmark.recipe import Benchmark
+from mwdn.benchmark.recipe_reader import read_benchmark
 from mwdn.benchmark.scoring import make_reconstructor
 from mwdn.benchmark.sets import Dataset, open_dataset, simulated_pairs
 from mwdn.benchmark.training import curve

@@ -12,7 +12,8 @@ from mwdn.inference.engine import Engine
 from mwdn.inference.fusion import fuse
 from mwdn.inference.tiling import StripDecoder, StripEncoder, upsample_rows
 from mwdn.networks import build
-from mwdn.networks.blocks import Decoder, Encoder, WienerFilter
+from mwdn.networks.blocks import Decoder, Encoder
+from mwdn.networks.wiener_filter import WienerFilter
 
 
 def limit_strips(network):

@@ -14,7 +14,7 @@ from skimage import io as skimage_io
 
 from image_files import BLUE, HEIGHT, RED, WIDTH, chunk, encoded, flag, noise, npy, png16, put, tiff
 from mwdn.errors import ImageError
-from mwdn.io.formats import MAX_PIXELS
+from mwdn.io.arrays import MAX_PIXELS
 from mwdn.io.images import read_frame, read_picture
 
 RGB_OF_RGBA = noise(channels=4)[..., :3]

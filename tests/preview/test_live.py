@@ -14,7 +14,7 @@ from websockets.sync.client import connect
 from mwdn.calibration import Calibration
 from mwdn.capture import open_source
 from mwdn.capture.folder import WatchedFolder
-from mwdn.io.formats import as_frame
+from mwdn.io.arrays import as_frame
 from mwdn.io.images import write_frame
 from mwdn.preview.cameras import StoredCameras
 from mwdn.preview.live import Live

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mwdn.calibration.frame_format import FrameFormat
-from mwdn.io.formats import as_frame
+from mwdn.io.arrays import as_frame
 from mwdn.types import Frame
 
 TARGET = 0.8

@@ -14,7 +14,7 @@ from mwdn.calibration.corrections import Corrections
 from mwdn.calibration.float_scale import check_float_scale
 from mwdn.calibration.frame_operations import bin_pixels, crop_centre, demosaic, subtract_dark
 from mwdn.errors import ParameterError
-from mwdn.io.formats import as_frame
+from mwdn.io.arrays import as_frame
 from mwdn.io.images import read_frame, srgb_decode, srgb_encode
 from mwdn.io.raw import Mosaic, is_raw, read_raw
 from mwdn.optics.saturation import keep_plateau

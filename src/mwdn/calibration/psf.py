@@ -21,7 +21,7 @@ from mwdn.calibration.refinement import TERMS, Refinement
 from mwdn.calibration.size_advice import advise_size
 from mwdn.calibration.white_balance import WhiteBalance, check_white_balance
 from mwdn.errors import ParameterError, PsfError, ShapeError, shown
-from mwdn.io.formats import as_frame
+from mwdn.io.arrays import as_frame
 from mwdn.optics.psf import checked_psf, psf_hash
 from mwdn.optics.sensor import Sensor
 from mwdn.types import ArrayPicture, Frame, Image, Measurement, Psf, Size

@@ -6,21 +6,18 @@ from itertools import chain
 from pathlib import Path
 from typing import cast
 
-import numpy as np
-
 from mwdn.calibration import Calibration, FrameFormat
-from mwdn.calibration.float_scale import check_float_scale
 from mwdn.calibration.frame_format import changed_fields
 from mwdn.data.authors_file import AuthorsWriter
+from mwdn.data.conversion import check_like_first, convert_pair
 from mwdn.data.kinds import KINDS, Kind, Layout
 from mwdn.data.pair_checks import DISPLAY_WHITE, REFINED
-from mwdn.data.pair_writer import Attribute, PairWriter, PixelType, Shape, check_path, quantise
+from mwdn.data.pair_writer import Attribute, PairWriter, PixelType, Shape, check_path
 from mwdn.data.pairs import PairFile
-from mwdn.data.scene_place import bin_scene, place_scene, resize_scene
 from mwdn.data.sources import Listing, Source
 from mwdn.errors import ImageError, MwdnError, ParameterError, UnknownNameError
 from mwdn.io.files import refuse_overwrite
-from mwdn.types import Frame, Psf, Size
+from mwdn.types import Frame, Psf
 
 Pair = tuple[str, Frame, Frame]
 """A name, a measurement and a scene, both (H, W, C), RGB, row 0 at the top, integers or floats in [0, 1]."""
@@ -199,9 +196,9 @@ def read_listing(
     first: tuple[Frame, Frame] | None = None
     for source in track(listing.sources):
         try:
-            pair = _convert(source, kind, layout, frames, camera)
+            pair = convert_pair(source, kind, layout, frames, camera)
             first = first or pair
-            _check_like_first(first, pair, source.name)
+            check_like_first(first, pair, source.name)
         except MwdnError as error:
             reason = str(error) if isinstance(error, ImageError) else f"`{source.name}`: {error}"
             if skipped is None:
@@ -209,92 +206,3 @@ def read_listing(
             skipped[source.name] = reason
             continue
         yield source.name, *pair
-
-
-def _convert(
-    source: Source, kind: Kind, layout: Layout, changes: FrameFormat, camera: Calibration | None
-) -> tuple[Frame, Frame]:
-    """Load a pair as RGB, row 0 at the top, both with the capture's channels, in the smallest type exact for both."""
-    stored = source.load()
-    capture, scene = stored.capture, stored.scene
-    usual = kind.raw_frames if kind.raw_frames is not None and capture.shape[2] == 1 else kind.frames
-    frames = replace(usual, **changed_fields(changes)).with_mosaic(stored.mosaic, of=f"`{source.name}`")
-    full_size, whole = frames.full_size(capture), replace(frames, crop=None).full_size(capture)
-    if frames.bgr:
-        capture, scene = (np.ascontiguousarray(frame[..., ::-1]) for frame in (capture, scene))
-    capture = _upright(_correct_levels(capture, frames, source.name, camera), frames)
-    # The scene gets the channels of the capture: the mean of its colours, or equal colours.
-    grey = capture.shape[2] == 1 < scene.shape[2]
-    scene = _correct_levels(scene, FrameFormat(gamma=layout.scene_gamma, grey=grey), source.name)
-    if scene.shape[2] == 1 < capture.shape[2]:  # a few of ImageNet's photographs are grey
-        scene = scene.repeat(3, axis=2)
-    if layout.scene_size is not None:
-        scene = resize_scene(scene, layout.scene_size)
-    scene = _upright(scene, frames)
-    place = _place(kind, layout, (scene.shape[0], scene.shape[1]), full_size, whole)
-    if place is not None:
-        scene = bin_scene(place_scene(scene, full_size, place, source.name), frames.bin)
-
-    flat = camera is not None and camera.corrections.flat is not None
-    shifted = flat or (camera is not None and camera.offset is not None)
-    floats = shifted or "f" in (stored.capture.dtype.kind, stored.scene.dtype.kind)
-    dtype = np.dtype("float32" if floats else "uint8" if capture.dtype == scene.dtype == np.uint8 else "uint16")
-    capture = quantise(capture, dtype, f"capture of {source.name}", has_flat=flat)
-    return capture, quantise(scene, dtype, f"scene of {source.name}")
-
-
-def _place(kind: Kind, layout: Layout, scene: Size, frame: Size, whole: Size) -> Size | None:
-    """Where a scene is in the frame, the middle of the whole one; ``None`` if it is not placed."""
-    if layout.scene_place is not None:
-        return layout.scene_place
-    if scene == frame:
-        return 0, 0
-    fits = scene[0] <= whole[0] and scene[1] <= whole[1]
-    place = kind.place(scene, whole) if fits and kind.place is not None else None
-    return place and (place[0] + frame[0] // 2 - whole[0] // 2, place[1] + frame[1] // 2 - whole[1] // 2)
-
-
-def _correct_levels(frame: Frame, frames: FrameFormat, name: str, camera: Calibration | None = None) -> Frame:
-    """Apply every step of the format but channel order and orientation; without any, the numbers stay as stored."""
-    if frames.bit_depth is not None and frames.bit_depth > 8 * frame.dtype.itemsize:
-        raise ImageError(f"The capture of `{name}` has {frame.dtype}, fewer than {frames.bit_depth} bits.")
-    if frames.bit_depth is not None:
-        check_float_scale(frame, frames.bit_depth)
-    steps = replace(frames, bgr=False, upside_down=False)
-    if camera is None:
-        return frame if steps == FrameFormat() else steps.to_measurement(frame)[0].movedim(0, -1).numpy()
-    if camera.offset is not None:
-        _check_scale(camera.frames, frames)
-    measurement = steps.to_measurement(frame, camera.offset, camera.corrections.of_capture)
-    return measurement[0].movedim(0, -1).numpy()
-
-
-def _check_scale(own: FrameFormat, frames: FrameFormat) -> None:
-    """Raise a `ParameterError` if the camera's dark frame was read on another scale than captures of this format."""
-    for key in ("bit_depth", "gamma", "mosaic"):
-        wanted, got = getattr(frames, key), getattr(own, key)
-        if wanted != got:
-            raise ParameterError(
-                f"`{key}` of the camera ({got}), in which its dark or ambient frame was read, must be that of the "
-                f"captures ({wanted}). State it in the camera file."
-            )
-
-
-def _upright(frame: Frame, frames: FrameFormat) -> Frame:
-    """Row 0 at the top."""
-    return frame[::-1] if frames.upside_down else frame
-
-
-def _check_like_first(first: tuple[Frame, Frame], pair: tuple[Frame, Frame], name: str) -> None:
-    for what, expected, got in zip(("capture", "scene"), first, pair, strict=True):
-        if expected.shape != got.shape or expected.dtype != got.dtype:
-            actual, wanted = (f"{' x '.join(map(str, frame.shape))}, {frame.dtype}" for frame in (got, expected))
-            if expected.shape == got.shape:
-                advice = "Captures and scenes together must have 8 bits, 16 bits or floats in all pairs: convert them."
-            elif expected.shape[:2] == got.shape[:2]:
-                advice = "All captures must be in colour, or all grey: convert them, or give `--grey`."
-            else:
-                advice = "Convert it, or for scenes of several sizes give `--scene-size 384 384`."
-            raise ImageError(
-                f"The {what} of `{name}` ({actual}) must be like that of the first pair ({wanted}). {advice}"
-            )

@@ -21,7 +21,7 @@ from mwdn.arguments import check_batch
 from mwdn.errors import ParameterError, ShapeError
 from mwdn.evaluation.alexnet import AlexNet, Heads, load_alexnet, load_heads
 from mwdn.evaluation.vgg import Vgg16
-from mwdn.io.formats import as_frame
+from mwdn.io.arrays import as_frame
 from mwdn.types import ArrayPicture, Image
 
 

@@ -11,11 +11,11 @@ from torch.nn import functional as F
 from mwdn.errors import ParameterError
 from mwdn.fourier.convolution import convolve
 from mwdn.fourier.transforms import transfer_function
-from mwdn.networks.blocks import WienerFilter, normalise_psf
 from mwdn.networks.mwdn import Mwdn
 from mwdn.networks.mwdn_cpsf import MwdnCpsf
 from mwdn.networks.wiener import WienerNetwork
 from mwdn.networks.wiener_bank import WienerBank
+from mwdn.networks.wiener_filter import WienerFilter, normalise_psf
 from mwdn.networks.wiener_unet import WienerUNet
 from mwdn.optics.psf import checked_psf
 from mwdn.solvers.alignment import align

@@ -20,7 +20,7 @@ from mwdn.inference.engine import Engine, Precision
 from mwdn.inference.ensemble import Ensemble
 from mwdn.inference.methods import Method, as_method, background_warning, method_name, psf_for, psf_warning
 from mwdn.inference.room_light import find_room_light
-from mwdn.io.formats import as_frame
+from mwdn.io.arrays import as_frame
 from mwdn.networks.blocks import check_channels
 from mwdn.networks.network import Network, as_network
 from mwdn.optics.saturation import subtract_light

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from mwdn.first_use import at_first_use
 
 if TYPE_CHECKING:
-    from mwdn.io.formats import as_frame
+    from mwdn.io.arrays import as_frame
     from mwdn.io.images import (
         read_frame,
         read_picture,

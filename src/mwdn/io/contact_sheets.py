@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.arguments import check_batch
-from mwdn.io.formats import as_frame
+from mwdn.io.arrays import as_frame
 from mwdn.io.images import srgb_decode
 from mwdn.types import ArrayPicture, FloatFrame, Image
 

@@ -8,8 +8,9 @@ from torch import Tensor
 
 from mwdn.arguments import checked
 from mwdn.errors import ImageError, ParameterError
+from mwdn.io.arrays import as_frame
 from mwdn.io.files import atomic_write
-from mwdn.io.formats import as_frame, decode, kind_of, read
+from mwdn.io.formats import decode, kind_of, read
 from mwdn.types import FloatFrame, Frame, Image
 
 READABLE = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".npy"})
@@ -34,7 +35,7 @@ def read_frame(path: str | Path, *, bgr: bool = False, upside_down: bool = False
 
     Raises:
         ImageError: no such regular file; damaged, cut off, or of an unknown format; a stack of pictures; other numbers
-            or axes than these; more than `mwdn.io.formats.MAX_PIXELS` pixels or `mwdn.io.headers.MAX_DECODED_BYTES`, or
+            or axes than these; more than `mwdn.io.arrays.MAX_PIXELS` pixels or `mwdn.io.headers.MAX_DECODED_BYTES`, or
             far more than the file can hold; NaN or infinity. Damage is found by checksums, lengths and libjpeg's
             warnings: changed numbers of a BMP, PGM, PPM, NPY, WebP or uncompressed TIFF cannot be told from a capture.
     """

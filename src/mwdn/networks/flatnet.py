@@ -10,9 +10,10 @@ from mwdn.fourier.filtering import filter_image
 from mwdn.fourier.padding import Boundary
 from mwdn.fourier.transforms import transfer_function
 from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
-from mwdn.networks.blocks import check_channels, normalise_psf, resize
+from mwdn.networks.blocks import check_channels, resize
 from mwdn.networks.flatnet_unet import FlatNetUNet
 from mwdn.networks.network import Network
+from mwdn.networks.wiener_filter import normalise_psf
 from mwdn.optics.psf import unit_sum
 from mwdn.types import Measurement, Psf, Scene, Size, Transfer
 

@@ -10,17 +10,9 @@ from torch.nn import functional as F
 from mwdn.fourier.convolution import convolve
 from mwdn.fourier.padding import Boundary
 from mwdn.fourier.wiener import wiener
-from mwdn.networks.blocks import (
-    Decoder,
-    Encoder,
-    WienerFilter,
-    check_channels,
-    check_sides,
-    convolutions,
-    normalise_psf,
-    paper_widths,
-)
+from mwdn.networks.blocks import Decoder, Encoder, check_channels, check_sides, convolutions, paper_widths
 from mwdn.networks.network import Network
+from mwdn.networks.wiener_filter import WienerFilter, normalise_psf
 from mwdn.optics.psf import unit_sum
 from mwdn.types import Measurement, Psf, Scene, Size
 

@@ -7,8 +7,8 @@ from torch import Tensor, nn
 
 from mwdn.errors import ParameterError
 from mwdn.fourier.transforms import fast_length, transfer_function
-from mwdn.networks.blocks import check_size, unit_psf
 from mwdn.networks.network import Network
+from mwdn.networks.wiener_filter import check_size, unit_psf
 from mwdn.solvers.proximal import Variation
 from mwdn.solvers.splitting import Penalties, Problem, initial_state, make_filters, rescale, update_copies, update_scene
 from mwdn.types import Measurement, Psf, Scene, Size, Transfer

@@ -3,18 +3,9 @@
 from torch import Tensor
 
 from mwdn.fourier.padding import Boundary
-from mwdn.networks.blocks import (
-    Decoder,
-    Encoder,
-    Pooling,
-    WienerFilter,
-    WienerFilters,
-    check_sides,
-    normalise_psf,
-    paper_widths,
-    pooling_layer,
-)
+from mwdn.networks.blocks import Decoder, Encoder, Pooling, check_sides, paper_widths, pooling_layer
 from mwdn.networks.network import Network
+from mwdn.networks.wiener_filter import WienerFilter, WienerFilters, normalise_psf
 from mwdn.types import Measurement, Psf, Scene, Size
 
 

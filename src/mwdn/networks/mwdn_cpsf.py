@@ -6,17 +6,9 @@ import torch
 from torch import Tensor, nn
 
 from mwdn.fourier.padding import Boundary
-from mwdn.networks.blocks import (
-    Decoder,
-    Encoder,
-    Pooling,
-    WienerFilter,
-    WienerFilters,
-    check_sides,
-    normalise_psf,
-    paper_widths,
-)
+from mwdn.networks.blocks import Decoder, Encoder, Pooling, check_sides, paper_widths
 from mwdn.networks.network import Network
+from mwdn.networks.wiener_filter import WienerFilter, WienerFilters, normalise_psf
 from mwdn.types import Measurement, Psf, Scene, Size
 
 

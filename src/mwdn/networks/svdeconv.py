@@ -9,9 +9,10 @@ from mwdn.errors import ParameterError
 from mwdn.fourier.padding import Boundary, pad
 from mwdn.fourier.transforms import inverse_spectrum, spectrum, transfer_function
 from mwdn.fourier.wiener import deconvolution_grid
-from mwdn.networks.blocks import check_channels, normalise_psf, resize
+from mwdn.networks.blocks import check_channels, resize
 from mwdn.networks.flatnet_unet import FlatNetUNet
 from mwdn.networks.network import Network
+from mwdn.networks.wiener_filter import normalise_psf
 from mwdn.types import Measurement, Psf, Scene, Size
 
 

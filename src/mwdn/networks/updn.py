@@ -7,8 +7,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mwdn.fourier.convolution import Convolution
-from mwdn.networks.blocks import check_channels, check_sides, normalise_psf, resize
+from mwdn.networks.blocks import check_channels, check_sides, resize
 from mwdn.networks.network import Network
+from mwdn.networks.wiener_filter import normalise_psf
 from mwdn.types import Measurement, Psf, Scene, Size, Transfer
 
 

@@ -3,8 +3,8 @@
 from torch import Tensor
 
 from mwdn.fourier.padding import Boundary
-from mwdn.networks.blocks import WienerFilter, normalise_psf
 from mwdn.networks.network import Network
+from mwdn.networks.wiener_filter import WienerFilter, normalise_psf
 from mwdn.types import Measurement, Psf, Scene, Size
 
 

@@ -12,10 +12,11 @@ from mwdn.fourier.padding import Boundary, pad
 from mwdn.fourier.transforms import inverse_spectrum, spectrum
 from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
 from mwdn.networks.block_means import block_means
-from mwdn.networks.blocks import Decoder, Encoder, check_channels, normalise_psf, paper_widths
+from mwdn.networks.blocks import Decoder, Encoder, check_channels, paper_widths
 from mwdn.networks.drunet import Drunet
 from mwdn.networks.evidence import MAPS, against_psf, doubt_of_psf
 from mwdn.networks.network import FixedFront
+from mwdn.networks.wiener_filter import normalise_psf
 from mwdn.optics.distortion import distort, undistort
 from mwdn.optics.polynomials import coefficient_count
 from mwdn.optics.psf import unit_sum

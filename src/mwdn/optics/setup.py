@@ -8,7 +8,7 @@ from torch import Tensor
 
 from mwdn.arguments import check_options
 from mwdn.errors import ParameterError
-from mwdn.io.formats import MAX_PIXELS
+from mwdn.io.arrays import MAX_PIXELS
 from mwdn.optics.propagation import check_positive
 from mwdn.types import Size
 

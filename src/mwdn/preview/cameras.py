@@ -12,8 +12,8 @@ from typing import Any
 
 from mwdn.calibration import Calibration, FrameFormat, PsfFormat
 from mwdn.errors import ImageError, MwdnError, ParameterError, UnknownNameError
+from mwdn.io.arrays import at_most_pixels
 from mwdn.io.files import atomic_write, is_full, write_json
-from mwdn.io.formats import at_most_pixels
 from mwdn.io.reading import read_bytes, read_json, unexpected_content
 from mwdn.io.toml import as_tuple
 from mwdn.preview.limits import Limits, RefusedError
