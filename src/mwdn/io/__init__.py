@@ -32,4 +32,4 @@ __all__ = [
     "write_picture",
 ]
 
-__getattr__ = at_first_use(__name__, dict.fromkeys(__all__, "images") | {"as_frame": "formats"})
+__getattr__ = at_first_use(__name__, dict.fromkeys(__all__, "images") | {"as_frame": "arrays"})
