@@ -12,7 +12,7 @@ from mwdn.calibration import Calibration, PsfFormat
 from mwdn.diagnosis import sizes
 from mwdn.errors import ImageError, ShapeError
 from mwdn.inference import capture_pipeline
-from mwdn.inference.capture_pipeline import CapturePipeline, Prepared
+from mwdn.inference.capture_pipeline import CapturePipeline, PreparedCapture
 from mwdn.inference.reconstructor import Reconstructor
 
 SIZE = 32, 40
@@ -86,6 +86,6 @@ def test_bins_are_searched_once_for_each_wrong_size(psf, monkeypatch):
 
 @pytest.mark.parametrize("wrong", [float("nan"), float("inf")])
 def test_a_scene_that_is_not_finite_is_refused(psf, wrong):
-    prepared = Prepared(torch.full((1, 3, *SIZE), 0.25))
+    prepared = PreparedCapture(torch.full((1, 3, *SIZE), 0.25))
     with pytest.raises(ImageError, match=r"brightest pixel is 0\.25"):
         make(psf).examine_scene(prepared, torch.full((1, 3, *SIZE), wrong), ())

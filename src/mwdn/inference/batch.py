@@ -15,7 +15,7 @@ from mwdn.data.captures import read_capture
 from mwdn.diagnosis import Verdict
 from mwdn.diagnosis.trust import Trust
 from mwdn.errors import ImageError, MwdnError
-from mwdn.inference.capture_pipeline import CapturePipeline, Prepared, refuse_infinite
+from mwdn.inference.capture_pipeline import CapturePipeline, PreparedCapture, refuse_infinite
 from mwdn.inference.origin import origin, settings_hash
 from mwdn.inference.outputs import (
     SUMMARY,
@@ -72,7 +72,7 @@ class _Read(NamedTuple):
     job: Job
     origin: str
     """Hash of everything the picture depends on, see `mwdn.inference.origin`."""
-    prepared: Prepared
+    prepared: PreparedCapture
     full_size: Size | None
     """Height and width of the picture, if it is to be larger than the measurement."""
 

@@ -3,8 +3,6 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-
 from mwdn.diagnosis.captures import examine_capture, refuse_dark
 from mwdn.diagnosis.exif import exif_turn, settle_exif
 from mwdn.diagnosis.psf_encoding import PsfGammaTest
@@ -21,7 +19,7 @@ from mwdn.types import Frame, Measurement, Scene, Size
 
 
 @dataclass(frozen=True)
-class Prepared:
+class PreparedCapture:
     """A capture, ready for the method.
 
     Args:
@@ -76,13 +74,13 @@ class CapturePipeline:
             raise self._mismatches[size] from None
         refuse_dark(measurement)
 
-    def prepare(self, measurement: Measurement, *, pose: bool) -> Prepared:
+    def prepare(self, measurement: Measurement, *, pose: bool) -> PreparedCapture:
         """Subtract the light of the room, if the reconstruction does, and estimate the PSF's pose if requested."""
         measurement, share = self.reconstruct.without_room_light(to_device(measurement, self.reconstruct.device))
         found = align(measurement, self.reconstruct.psf) if pose else None
-        return Prepared(measurement, None if share is None else float(share), found)
+        return PreparedCapture(measurement, None if share is None else float(share), found)
 
-    def solve(self, prepared: Prepared) -> Scene:
+    def solve(self, prepared: PreparedCapture) -> Scene:
         """The scene, (1, C, H, W) on the device, as the camera sees it: without `Reconstructor.finish`."""
         return self.reconstruct.without_search(prepared.pose).on_device(prepared.measurement)
 
@@ -99,9 +97,8 @@ class CapturePipeline:
             verdicts += (exif_turn(orientation(file), self._psf_turn),)
         return verdicts
 
-    @torch.inference_mode()
     def examine_scene(
-        self, prepared: Prepared, scene: Scene, verdicts: tuple[Verdict, ...]
+        self, prepared: PreparedCapture, scene: Scene, verdicts: tuple[Verdict, ...]
     ) -> tuple[Trust, tuple[Verdict, ...]]:
         """How far to trust a scene, and all verdicts.
 
@@ -121,13 +118,13 @@ class CapturePipeline:
         return trust, settle_exif((*verdicts, *trust.verdicts))
 
 
-def refuse_infinite(prepared: Prepared, scene: Scene) -> None:
+def refuse_infinite(prepared: PreparedCapture, scene: Scene) -> None:
     """Raise an `ImageError` if a scene holds NaN or infinity."""
     if not scene.isfinite().all():
         raise _not_finite(prepared)
 
 
-def _not_finite(prepared: Prepared) -> ImageError:
+def _not_finite(prepared: PreparedCapture) -> ImageError:
     return ImageError(
         "The reconstruction holds NaN, infinity or too large numbers. The capture's brightest pixel is "
         f"{prepared.measurement.amax():.3g}, where 1 is saturation. Scale it, or use another method."
