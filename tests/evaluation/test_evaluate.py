@@ -261,6 +261,23 @@ def test_a_method_that_returns_nan_is_named_and_costs_no_other_its_scores(pairs)
     assert [(cell.startswith("[bold]"), cell.startswith("nan")) for cell in psnr] == [(True, False), (False, True)]
 
 
+def test_scenes_of_another_scale_are_named(pairs):
+    brighter = [(measurement, 100 * scene) for measurement, scene in pairs]
+    with pytest.warns(UserWarning, match=r"scenes go up to \d+.*in \[0, 1\]"):
+        evaluate(
+            {"same": lambda measurement: measurement}, brighter, Protocol.parse("full"), perceptual=Perceptual.none()
+        )
+
+
+def test_one_picture_has_no_interval(pairs):
+    def cells(pairs):
+        report = evaluate({"same": lambda light: light}, pairs, Protocol.parse("full"), perceptual=Perceptual.none())
+        return [cell for column in report.table().columns for cell in column.cells]
+
+    assert any("[" in cell.replace("[bold]", "").replace("[/bold]", "") for cell in cells(pairs))
+    assert not any("[" in cell.replace("[bold]", "").replace("[/bold]", "") for cell in cells(pairs[:1]))
+
+
 @pytest.mark.parametrize(
     ("out", "message"), [("file", "must be a folder that can be written to"), ("mine", "would overwrite an input")]
 )

@@ -24,6 +24,9 @@ from mwdn.types import Measurement, Scene
 Method = Callable[[Measurement], Scene]
 """Reconstruction for one camera, (1, C, H, W) to (1, C, H, W): a `Reconstructor`, or any such function."""
 
+BRIGHTEST_SCENE = 2.0
+"""Largest number of scenes without a warning: a highlight may exceed white."""
+
 
 @typing.runtime_checkable
 class Pairs(typing.Protocol):
@@ -131,8 +134,15 @@ def _check_pairs(pairs: Pairs) -> None:
     """Check all pairs before the first reconstruction."""
     if not len(pairs):
         raise ParameterError("`pairs` must not be empty: the file holds none. Make it anew with `mwdn import`.")
+    brightest = 0.0
     for i in range(len(pairs)):
         refuse_non_finite(pairs[i], i)
+        brightest = max(brightest, float(pairs[i][1].max()))
+    if brightest > BRIGHTEST_SCENE:
+        warnings.warn(
+            f"The scenes go up to {brightest:.3g}: the scores are of scenes in [0, 1]. Divide them in the file.",
+            stacklevel=3,
+        )
 
 
 def learnable_numbers(method: Method) -> int:

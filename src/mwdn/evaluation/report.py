@@ -120,7 +120,8 @@ class Report:
         """
         more = more or {}
         noun = "picture" if self.pictures == 1 else "pictures"
-        title = f"{self.pictures:,} {noun}, protocol {self.protocol}, {self.variant}: mean [95 % confidence]"
+        what = "the scores" if self.pictures == 1 else "mean [95 % confidence]"
+        title = f"{self.pictures:,} {noun}, protocol {self.protocol}, {self.variant}: {what}"
         style: dict[str, Any] = {"box": box.SIMPLE_HEAD, "padding": 0, "show_edge": False, "leading": 1}
         caption = self._missing() or None
         table = Table(title=title, caption=caption, caption_justify="left", **(style if narrow else {}))
@@ -188,8 +189,9 @@ class Report:
 
 def _cell(metric: str, summary: tuple[float, float, float], best: bool) -> str:
     mean, low, high = (format(value, _FORMATS[metric]) for value in summary)
-    # The backslash keeps rich from parsing the interval as a style.
-    return f"{f'[bold]{mean}[/bold]' if best else mean} \\[{low}, {high}]"
+    # The backslash keeps rich from parsing the interval as a style. One picture has no interval.
+    interval = "" if summary[1] == summary[2] else f" \\[{low}, {high}]"
+    return f"{f'[bold]{mean}[/bold]' if best else mean}{interval}"
 
 
 def _costs(scores: Scores) -> tuple[str, str, str]:
