@@ -33,7 +33,7 @@ import arithmetic
 from mwdn import Calibration, Reconstructor
 from mwdn.fourier.filtering import reference_filter
 from mwdn.inference.methods import find_method
-from mwdn.networks import NETWORKS, blocks, build
+from mwdn.networks import NETWORKS, build, wiener_filter
 from mwdn.optics import sample_camera
 from mwdn.solvers import SOLVERS
 from mwdn.weights.bundled import BUNDLED
@@ -73,8 +73,8 @@ def contenders(method, calibration, device, names=CONTENDERS):
 
     @torch.inference_mode()
     def plain(batch):
-        whole = mock.patch.object(blocks.WienerFilter, "max_grid_pixels", 2**60)
-        with mock.patch.object(blocks, "filter_image", reference_filter), whole:
+        whole = mock.patch.object(wiener_filter.WienerFilter, "max_grid_pixels", 2**60)
+        with mock.patch.object(wiener_filter, "filter_image", reference_filter), whole:
             return network(batch.to(device), psf).cpu()
 
     return {"plain": plain, **runs}

@@ -5,6 +5,8 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import reduce
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -119,6 +121,33 @@ def test_only_fourier_mentions_torch_fft():
     """There alone: float32, and where the centre of a PSF is."""
     pattern = re.compile(r"torch\.fft|from\s+torch\s+import\s[^\n]*\bfft\b|\bfft\.i?r?fftn?2?\(")
     assert [dotted(path) for path, text in FILES.items() if pattern.search(text)] == ["mwdn.fourier.transforms"]
+
+
+SCRIPTS = [path for folder in ("benchmarks", "docs", "examples") for path in sorted((ROOT / folder).rglob("*.py"))]
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: f"{path.parent.name}/{path.name}")
+def test_scripts_name_what_the_package_has(path):
+    """No other test runs most of them: `benchmarks/engine.py` patched a function that had moved."""
+    tree, found = ast.parse(path.read_text(encoding="utf-8")), {}
+    lost = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "mwdn":
+            if node.module == "mwdn.bridges":  # of libraries that need not be installed
+                continue
+            module = import_module(node.module)
+            for alias in node.names:
+                full = f"{node.module}.{alias.name}"
+                value = import_module(full) if full in MODULES else getattr(module, alias.name, None)
+                lost += [full] if value is None else []
+                found[alias.asname or alias.name] = value
+        if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("patch.object"):
+            owner, name = node.args[0], node.args[1]
+            parts = ast.unparse(owner).split(".")
+            value = reduce(lambda value, part: getattr(value, part, None), parts[1:], found.get(parts[0]))
+            named = name.value if isinstance(name, ast.Constant) else ""
+            lost += [f"{ast.unparse(owner)}.{named}"] if value is None or not hasattr(value, named) else []
+    assert not lost
 
 
 HELP = "from mwdn.cli import main\nwith suppress(SystemExit): main({})"

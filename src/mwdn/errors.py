@@ -24,7 +24,9 @@ MwdnError
 import difflib
 import reprlib
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, TypeVar
+
+Error = TypeVar("Error", bound=BaseException)
 
 LONGEST = 300
 """Characters of a message at most, besides those of paths."""
@@ -121,6 +123,12 @@ def reason(error: BaseException) -> str:
     """First line of another library's error, at most 120 characters; its type if it says nothing."""
     lines = str(error).strip().splitlines()
     return cut(one_line(lines[0]).rstrip("."), 120) if lines else type(error).__name__
+
+
+def without_traceback(error: Error) -> Error:
+    """The error to keep. Its traceback, and those of its causes, would keep all their local variables: pictures."""
+    error.__cause__ = error.__context__ = None
+    return error.with_traceback(None)
 
 
 def cut(text: str, most: int) -> str:

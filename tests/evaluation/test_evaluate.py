@@ -263,7 +263,7 @@ def test_a_method_that_returns_nan_is_named_and_costs_no_other_its_scores(pairs)
 
 def test_scenes_of_another_scale_are_named(pairs):
     brighter = [(measurement, 100 * scene) for measurement, scene in pairs]
-    with pytest.warns(UserWarning, match=r"scenes go up to \d+.*in \[0, 1\]"):
+    with pytest.warns(UserWarning, match=r"scenes have values up to \d+, but scores are defined for 0 to 1"):
         evaluate(
             {"same": lambda measurement: measurement}, brighter, Protocol.parse("full"), perceptual=Perceptual.none()
         )

@@ -1,5 +1,8 @@
 """The steps from a raw frame to a scene and the verdicts on it, in batches and for the preview."""
 
+import gc
+import weakref
+
 import cv2
 import numpy as np
 import pytest
@@ -9,10 +12,8 @@ from PIL import Image
 from cameras import contour_psf
 from mwdn import Camera, read_frame
 from mwdn.calibration import Calibration, PsfFormat
-from mwdn.diagnosis import sizes
 from mwdn.errors import ImageError, ShapeError
-from mwdn.inference import capture_pipeline
-from mwdn.inference.capture_pipeline import CapturePipeline, PreparedCapture
+from mwdn.inference.capture_pipeline import CapturePipeline, PreparedCapture, refuse_infinite
 from mwdn.inference.reconstructor import Reconstructor
 
 SIZE = 32, 40
@@ -57,6 +58,15 @@ def test_steps_give_what_the_reconstructor_returns(psf, capture):
     torch.testing.assert_close(pipeline.solve(prepared), pipeline.reconstruct(measurement), rtol=0, atol=0)
 
 
+def test_room_light_and_pose_are_found_once_for_the_method_and_the_verdicts(psf, capture):
+    reconstruct = Reconstructor("wiener", Calibration(psf), align=True, room_light=True, device="cpu")
+    pipeline, measurement = CapturePipeline(reconstruct), reconstruct.calibration.correct(read_frame(capture))
+    prepared = pipeline.prepare(measurement, pose=True)
+    assert prepared.room_light is not None
+    assert prepared.pose is not None
+    torch.testing.assert_close(pipeline.solve(prepared), reconstruct(measurement), rtol=0, atol=1e-6)
+
+
 def test_verdicts_on_a_file_and_on_its_content_are_equal(psf, capture):
     file = turned(capture, 6)
     frame = read_frame(file)
@@ -72,20 +82,20 @@ def test_exif_of_the_psf_needs_its_file_and_no_given_orientation(psf, capture):
         assert "exif" not in {verdict.topic for verdict in pipeline.examine_frame(frame, capture)}
 
 
-def test_bins_are_searched_once_for_each_wrong_size(psf, monkeypatch):
-    searched = []
-    monkeypatch.setattr(
-        capture_pipeline, "mismatch", lambda error, *rest: searched.append(rest) or sizes.mismatch(error, *rest)
-    )
-    pipeline = make(psf)
-    for size in ((32, 48), (32, 48), (40, 48)):
-        with pytest.raises(ShapeError, match=f"{size[0]} x {size[1]}"):
-            pipeline.check(torch.rand(1, 3, *size))
-    assert len(searched) == 2
+def test_a_refused_capture_is_not_kept(psf):
+    """The error was kept with its traceback, and with that the capture."""
+    pipeline, size = make(psf), (40, 48)
+    measurement = torch.rand(1, 3, *size)
+    kept = weakref.ref(measurement)
+    with pytest.raises(ShapeError, match=f"{size[0]} x {size[1]}"):
+        pipeline.check(measurement)
+    del measurement
+    gc.collect()
+    assert kept() is None
 
 
 @pytest.mark.parametrize("wrong", [float("nan"), float("inf")])
-def test_a_scene_that_is_not_finite_is_refused(psf, wrong):
+def test_a_scene_that_is_not_finite_is_refused(wrong):
     prepared = PreparedCapture(torch.full((1, 3, *SIZE), 0.25))
-    with pytest.raises(ImageError, match=r"brightest pixel is 0\.25"):
-        make(psf).examine_scene(prepared, torch.full((1, 3, *SIZE), wrong), ())
+    with pytest.raises(ImageError, match=r"^The reconstruction gave NaN or infinity\..*brightest pixel is 0\.25"):
+        refuse_infinite(prepared, torch.full((1, 3, *SIZE), wrong))

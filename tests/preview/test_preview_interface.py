@@ -5,6 +5,7 @@ import io
 import json
 import socket
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from urllib.parse import urlsplit
@@ -20,6 +21,7 @@ from mwdn.calibration import Calibration
 from mwdn.errors import ImageError, ParameterError
 from mwdn.io.images import srgb_encode
 from mwdn.preview.cameras import StoredCameras
+from mwdn.preview.jobs import Jobs
 from mwdn.preview.reconstruction import with_ambient
 from mwdn.preview.samples import SAMPLE_CAMERA
 from mwdn.preview.server import make_server
@@ -199,6 +201,40 @@ def test_a_psf_for_viewing_is_doubted_as_on_the_command_line(client, psf, captur
     response = client.post("/reconstruct", files={"capture": capture, "psf": file.tobytes()}, data={"method": "wiener"})
     verdicts = json.loads(response.headers["mwdn-report"])["verdicts"]
     assert [each["options"] for each in verdicts if each["topic"] == "psf-gamma"] == ["--psf-gamma srgb"]
+
+
+def test_verdicts_on_the_psfs_file_need_the_file(client, psf, capture):
+    """A stored camera of the same PSF has the same calibration, but not its file."""
+    coded = srgb_encode(psf / psf.max() * 0.9)[0].movedim(0, -1).numpy()
+    file = cv2.imencode(".jpg", (255 * coded[..., ::-1]).round().astype(np.uint8))[1].tobytes()
+    assert client.post("/cameras", files={"psf": file}, data={"name": "coded"}).status_code == 201
+
+    def options(**source):
+        files = {"capture": capture} | {name: value for name, value in source.items() if name == "psf"}
+        data = {"method": "wiener"} | {name: value for name, value in source.items() if name == "camera"}
+        report = json.loads(client.post("/reconstruct", files=files, data=data).headers["mwdn-report"])
+        return [each["options"] for each in report["verdicts"] if each["topic"] == "psf-gamma"]
+
+    assert options(camera="coded") != ["--psf-gamma srgb"]
+    assert options(psf=file) == ["--psf-gamma srgb"]
+    assert client.delete("/cameras/coded").status_code == 204
+
+
+def test_work_that_exits_ends_its_job_alone():
+    """The worker ended with it, and no later job was done."""
+    jobs = Jobs(LIMITS)
+
+    def leave(job):
+        raise SystemExit(0)
+
+    try:
+        ended = [jobs.submit(work, size=1) for work in (leave, lambda job: None)]
+        while any(job.state not in ("failed", "done") for job in ended):
+            time.sleep(0.01)
+        assert [job.state for job in ended] == ["failed", "done"]
+        assert "SystemExit" in str(ended[0].error)
+    finally:
+        jobs.close()
 
 
 def test_exif_turns_that_differ_are_doubted_as_on_the_command_line(client, psf, capture):

@@ -13,7 +13,7 @@ import torch
 
 import mwdn
 from mwdn.capture import SOURCES, open_source
-from mwdn.errors import ParameterError, UnknownNameError
+from mwdn.errors import ParameterError, PluginError, UnknownNameError
 from mwdn.io.pictures import dark_scene
 from mwdn.networks import NETWORKS
 from mwdn.optics import MASKS, Setup, sample_camera
@@ -229,13 +229,36 @@ def test_what_plugins_return_is_checked_and_inherited_options_work(install, run,
 FAILING = """
 import sys
 
+import torch
+from mwdn.networks import Network
+
 class Raises:
+    calls = 0
+
     def __call__(self, measurement, psf):
+        Raises.calls += 1
+        if Raises.calls == 2:
+            return measurement
         raise RuntimeError("boom")
 
 class Exits:
     def __call__(self, measurement, psf):
         sys.exit(0)
+
+class Large:
+    def __call__(self, measurement, psf):
+        raise MemoryError
+
+class ExitsWhenMade(Network):
+    def __init__(self):
+        super().__init__()
+        sys.exit(0)
+
+    def prepare(self, psf, size):
+        return psf
+
+    def reconstruct(self, measurement, prepared):
+        return measurement
 
 class Unmade:
     def __init__(self):
@@ -248,9 +271,10 @@ class Unmade:
 
 @pytest.fixture
 def failing(install):
-    """Three plugins: their calls raise an error, or exit; or they cannot be made."""
-    names = {"raises": "Raises", "exits": "Exits", "unmade": "Unmade"}
-    folder = install("mwdn-failing", {"mwdn.solvers": {name: f"fails:{kind}" for name, kind in names.items()}})
+    """Plugins that raise an error in all calls but the second, or exit, or cannot be made."""
+    names = {"raises": "Raises", "exits": "Exits", "large": "Large", "unmade": "Unmade"}
+    groups = {"mwdn.solvers": {name: f"fails:{kind}" for name, kind in names.items()}}
+    folder = install("mwdn-failing", groups | {"mwdn.networks": {"ends": "fails:ExitsWhenMade"}})
     (folder / "fails.py").write_text(FAILING)
     yield
     sys.modules.pop("fails", None)
@@ -263,12 +287,16 @@ def test_errors_of_a_plugin_name_it_and_cost_one_capture(run):
     for name in ("a", "b"):
         Path(f"captures/{name}.npy").write_bytes(Path("capture.npy").read_bytes())
     line = "reconstruct captures --psf psf.npy --background 0 --bin 1 --no-trust --out out --method"
-    for name, why in (("raises", "RuntimeError: boom"), ("exits", "SystemExit: 0")):
+    for name, why, failed in (("raises", "RuntimeError: boom", 1), ("exits", "SystemExit: 0", 2)):
         code, out, err = run(f"{line} {name}")
-        assert (code, err.count(f"`{name}`, a plugin's (`fails`), has failed: {why}.")) == (1, 2), err
-        assert "0 of 2 captures" in out
+        assert (code, err.count(f"The plugin `{name}` (module `fails`) failed: {why}.")) == (1, failed), err
+        assert f"{2 - failed} of 2 captures" in out
     code, _, err = run(f"{line} unmade")
-    assert (code, "`unmade`, a plugin's (`fails`), has failed: ValueError: no licence." in err) == (2, True), err
+    assert (code, "The plugin `unmade` (module `fails`) failed: ValueError: no licence." in err) == (2, True), err
+    code, _, err = run(f"{line} large")
+    assert (code, err.count("needs more memory than cpu has free")) == (1, 2), err
+    with pytest.raises(PluginError, match=r"^The plugin `ends` \(module `fails`\) failed: SystemExit: 0\.$"):
+        mwdn.build("ends")
 
 
 @pytest.mark.usefixtures("failing")
@@ -285,12 +313,14 @@ def test_the_page_outlives_a_plugin_that_exits(files):
     server = make_server(StoredCameras(LIMITS, None, {"camera": mwdn.Calibration(psf)}), LIMITS, device="cpu")
     server.start()
     capture = Path("capture.npy").read_bytes()
-    for method, status in (("exits", 500), ("raises", 500), ("wiener", 200)):
-        data = {"camera": "camera", "method": method, "trust": "false"}
-        answer = httpx.post(f"{server.url}reconstruct", files={"capture": capture}, data=data, timeout=120)
-        assert answer.status_code == status, answer.text[:300]
-        assert status == 200 or f"`{method}`, a plugin's (`fails`), has failed" in answer.json()["error"]
-    server.stop()
+    try:
+        for method, status in (("exits", 500), ("raises", 500), ("wiener", 200)):
+            data = {"camera": "camera", "method": method, "trust": "false"}
+            answer = httpx.post(f"{server.url}reconstruct", files={"capture": capture}, data=data, timeout=120)
+            assert answer.status_code == status, answer.text[:300]
+            assert status == 200 or f"The plugin `{method}` (module `fails`) failed" in answer.json()["error"]
+    finally:
+        server.stop()
 
 
 @pytest.mark.parametrize("line", ["--help", "reconstruct --help", "design contour --help", "recipes"])

@@ -43,8 +43,10 @@ from mwdn.io.files import file_sha256, refuse_overwrite
 POLL_S = 0.3
 """Seconds between two looks at a watched folder."""
 
-_PLACES = ("distance_psfs", "distances_mm", "field_psfs", "field_positions")
-_OF_A_PSF = ("psf_corrected", "psf_gain", "envelope_shift", *_PLACES)
+_PSF_KEYS = (
+    *("psf_corrected", "psf_gain", "envelope_shift"),
+    *("distance_psfs", "distances_mm", "field_psfs", "field_positions"),
+)
 """Keys of a camera file that do not hold for another PSF."""
 
 _Write = Callable[[Path], tuple[str, Calibration]]
@@ -213,7 +215,7 @@ def _prepare_one_picture(bench: BenchFrames, psf_format: PsfFormat, content: dic
 
 def _write_one_picture(options: CameraOptions, content: dict[str, Any], out: Path) -> tuple[str, Calibration]:
     if options.psf != content.get("psf"):
-        content = {**content, **dict.fromkeys(_OF_A_PSF)}
+        content = {**content, **dict.fromkeys(_PSF_KEYS)}
     psf_done = bool(content.get("psf_corrected"))
     corrections = Corrections.read(content["flat_field"], content.get("hot_pixels"), psf_done=psf_done)
     calibration = options.load(corrections)
@@ -237,7 +239,7 @@ def _prepare_averaged(bench: BenchFrames, content: dict[str, Any], out: Path) ->
 
 def _write_averaged(done: CameraContent, content: dict[str, Any], out: Path) -> tuple[str, Calibration]:
     balance = _flat_balance(done.flat_colour) if content["white_balance"] == "flat" else content["white_balance"]
-    content = {**content, "white_balance": balance, **dict.fromkeys((*PSF_OWN_FORMAT, *_OF_A_PSF)), **done.content}
+    content = {**content, "white_balance": balance, **dict.fromkeys((*PSF_OWN_FORMAT, *_PSF_KEYS)), **done.content}
     written = write_camera_with_parts(out, content, done.parts)
     calibration = Calibration.load(out)
     check_white_balance(calibration.white_balance, calibration.light)
@@ -258,7 +260,10 @@ def _flat_balance(colour: tuple[float, ...]) -> tuple[float, float, float]:
 
 
 def _write_and_refine(out: Path, pairs: Path | None, write: _Write) -> None:
-    """Write the camera file, refined if there are pairs: it appears when it is complete and checked."""
+    """Write the camera file, refined if there are pairs, and print how to use it.
+
+    The file appears when it is complete and checked.
+    """
     interrupted = f"Interrupted. {out} is written at the end: nothing has changed."
     with if_interrupted(lambda: interrupted), draft_of(out) as draft:
         verdict, calibration = write(draft)

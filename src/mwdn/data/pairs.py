@@ -219,7 +219,8 @@ def _read_shapes(path: Path, file: Any) -> tuple[int, Shape, Shape]:  # noqa: AN
         data = find_rows(path, file, name, _MAKE_AGAIN)
         if data is None:
             raise ImageError(
-                f"`{path}` must have the data set `{name}`, but has {names_in(path, file)}. `mwdn import` makes one."
+                f"`{path}` must have the data set `{name}`, but has {names_in(path, file)}. `mwdn import` makes "
+                "a file of pairs."
             )
         if data.ndim != 4 or data.dtype.str not in ("|u1", "<u2", ">u2", "<f4", ">f4"):
             raise ImageError(

@@ -25,10 +25,10 @@ QUARTER_TURNS = tuple(name for name in get_args(Orientation) if swaps_axes(name)
 """Turns that exchange rows and columns: those of a square frame only."""
 
 CLEAR = 1.17
-"""Contrast above which the best orientation is certain."""
+"""Lead above which the best orientation is certain."""
 
 MIN_LEAD = 1.12
-"""Contrast below which the PSF is another camera's."""
+"""Lead below which no orientation of the PSF fits: it is another camera's."""
 
 MAX_NOISE = 0.6
 """`OrientationFit.noise` above which orientations fit alike even if one of them is right."""

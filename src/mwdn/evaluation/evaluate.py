@@ -24,7 +24,7 @@ from mwdn.types import Measurement, Scene
 Method = Callable[[Measurement], Scene]
 """Reconstruction for one camera, (1, C, H, W) to (1, C, H, W): a `Reconstructor`, or any such function."""
 
-BRIGHTEST_SCENE = 2.0
+MAX_SCENE = 2.0
 """Largest number of scenes without a warning: a highlight may exceed white."""
 
 
@@ -136,11 +136,13 @@ def _check_pairs(pairs: Pairs) -> None:
         raise ParameterError("`pairs` must not be empty: the file holds none. Make it anew with `mwdn import`.")
     brightest = 0.0
     for i in range(len(pairs)):
-        refuse_non_finite(pairs[i], i)
-        brightest = max(brightest, float(pairs[i][1].max()))
-    if brightest > BRIGHTEST_SCENE:
+        pair = pairs[i]
+        refuse_non_finite(pair, i)
+        brightest = max(brightest, float(pair[1].max()))
+    if brightest > MAX_SCENE:
         warnings.warn(
-            f"The scenes go up to {brightest:.3g}: the scores are of scenes in [0, 1]. Divide them in the file.",
+            f"The scenes have values up to {brightest:.3g}, but scores are defined for 0 to 1. Divide the scenes by "
+            "their white, and write the file again.",
             stacklevel=3,
         )
 

@@ -132,7 +132,7 @@ class Report:
             table.add_column(short if narrow else heading, justify="right", no_wrap=narrow)
         best = {metric: self._best(metric) for metric in measured}
         for name, scores in self.methods.items():
-            cells = [_cell(metric, scores.summary(metric), name in best[metric]) for metric in measured]
+            cells = [_cell(metric, scores, name in best[metric]) for metric in measured]
             cells += [*_costs(scores), *(escape(column.get(name, "")) for column in more.values())]
             table.add_row(escape(name), *(cell.replace(" ", "\n") if narrow else cell for cell in cells))
         return table
@@ -182,15 +182,15 @@ class Report:
 
     def _best(self, metric: str) -> set[str]:
         means = {name: statistics.fmean(scores.values[metric]) for name, scores in self.methods.items()}
-        finite = [mean for mean in means.values() if not math.isnan(mean)]
-        best = (max if metric in LARGER_IS_BETTER else min)(finite, default=None)
+        numbers = [mean for mean in means.values() if not math.isnan(mean)]
+        best = (max if metric in LARGER_IS_BETTER else min)(numbers, default=None)
         return {name for name, mean in means.items() if mean == best}
 
 
-def _cell(metric: str, summary: tuple[float, float, float], best: bool) -> str:
-    mean, low, high = (format(value, _FORMATS[metric]) for value in summary)
+def _cell(metric: str, scores: Scores, best: bool) -> str:
+    mean, low, high = (format(value, _FORMATS[metric]) for value in scores.summary(metric))
     # The backslash keeps rich from parsing the interval as a style. One picture has no interval.
-    interval = "" if summary[1] == summary[2] else f" \\[{low}, {high}]"
+    interval = "" if len(scores.seconds) == 1 else f" \\[{low}, {high}]"
     return f"{f'[bold]{mean}[/bold]' if best else mean}{interval}"
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -14,9 +14,10 @@ from mwdn.calibration.frame_operations import enlarge_binned
 from mwdn.data.captures import read_capture
 from mwdn.diagnosis import Verdict
 from mwdn.diagnosis.trust import Trust
-from mwdn.errors import ImageError, MwdnError
+from mwdn.errors import ImageError, MwdnError, ShapeError, without_traceback
 from mwdn.inference.capture_pipeline import CapturePipeline, PreparedCapture, refuse_infinite
-from mwdn.inference.origin import origin, settings_hash
+from mwdn.inference.origin import origin as origin_hash
+from mwdn.inference.origin import settings_hash
 from mwdn.inference.outputs import (
     SUMMARY,
     Format,
@@ -35,7 +36,7 @@ from mwdn.runtime import distributed
 from mwdn.runtime.iterations import watch_iterations
 from mwdn.runtime.streams import prefetch
 from mwdn.runtime.transfers import to_host
-from mwdn.types import Scene, Size
+from mwdn.types import Measurement, Scene, Size
 
 SHOWN = 12
 """Number of captures on the summary: the first ones."""
@@ -94,7 +95,7 @@ def _attempt(job: Job, step: Callable[[], _Result]) -> _Result | Job:
     except MwdnError as error:
         if is_full(error.__cause__):
             raise
-        return replace(job, error=error)
+        return replace(job, error=without_traceback(error))
 
 
 @dataclass(frozen=True)
@@ -127,6 +128,7 @@ class Batch:
     resume: bool = False
     psf_file: Path | None = None
     full_size: bool = False
+    _refused: dict[Size, str] = field(default_factory=dict, init=False, repr=False)
 
     def run(
         self,
@@ -168,29 +170,40 @@ class Batch:
             yield from finished
 
     def _read(self, job: Job) -> _Read | Job:
-        made_of = origin(self._settings_hash, job.capture)
-        if self.resume and self._exists(job, made_of):
+        origin = origin_hash(self._settings_hash, job.capture)
+        if self.resume and self._exists(job, origin):
             return replace(job, existing=True)
         calibration = self.reconstruct.calibration
         frame = calibration.frames.read(job.capture)
         measurement = calibration.to_measurement(frame)
-        self._pipeline.check(measurement)
+        self._check(measurement)
         prepared = self._pipeline.prepare(measurement, pose=self.check_consistency)
         if self.check_consistency:
             job = replace(job, verdicts=self._pipeline.examine_frame(frame, job.capture))
         full_size = calibration.frames.full_size(frame) if self.full_size else None
-        return _Read(replace(job, room_light=prepared.room_light), made_of, prepared, full_size)
+        return _Read(replace(job, room_light=prepared.room_light), origin, prepared, full_size)
+
+    def _check(self, measurement: Measurement) -> None:
+        """`CapturePipeline.check`; captures of a size that was refused before are refused for the same reason."""
+        size = (measurement.shape[-2], measurement.shape[-1])
+        if size in self._refused:
+            raise ShapeError(self._refused[size])
+        try:
+            self._pipeline.check(measurement)
+        except ShapeError as error:
+            self._refused[size] = str(error)
+            raise
 
     def _solve(self, read: _Read) -> _Solved:
         return _Solved(read, self._pipeline.solve(read.prepared))
 
     def _write(self, solved: _Solved) -> Job:
         (job, origin, prepared, _), scene = solved
+        refuse_infinite(prepared, scene)
         calibration = self.reconstruct.calibration
         content: dict[str, object] = {"method": self.method, "psf_hash": calibration.psf_hash, "origin": origin}
         content |= {"file": job.output.name, "bin": calibration.frames.bin}
         content |= {} if job.room_light is None else {"room_light": round(job.room_light, 4)}
-        refuse_infinite(prepared, scene)
         if self.check_consistency:
             trust, verdicts = self._pipeline.examine_scene(prepared, scene, job.verdicts)
             content |= {**trust.content, "verdicts": [asdict(verdict) for verdict in verdicts]}

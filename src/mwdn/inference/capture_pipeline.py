@@ -15,7 +15,7 @@ from mwdn.io.exif import orientation
 from mwdn.io.formats import is_for_viewing
 from mwdn.runtime.transfers import to_device
 from mwdn.solvers import Pose, align
-from mwdn.types import Frame, Measurement, Scene, Size
+from mwdn.types import Frame, Measurement, Scene
 
 
 @dataclass(frozen=True)
@@ -36,13 +36,12 @@ class PreparedCapture:
 class CapturePipeline:
     """From the captures of one camera to scenes and verdicts.
 
-    Each method is one step, so that the caller can report and overlap them. Steps may run in different threads, one
-    capture in each.
+    Each method is one step, so that the caller can report and overlap them. Methods may be called from several threads.
 
     Args:
         reconstruct: the method and the camera.
-        psf_file: file of the PSF, or its content: its type tells about its gamma, and its EXIF orientation is compared
-            with the captures'.
+        psf_file: file of the PSF, or its content. A JPEG or WebP is probably gamma-coded; its EXIF orientation is
+            compared with the captures'.
 
     Attributes:
         reconstruct: as given.
@@ -54,24 +53,18 @@ class CapturePipeline:
         for_viewing = psf_file is not None and is_for_viewing(psf_file)
         self._psf_gamma = PsfGammaTest(self.calibration, for_viewing)
         self._psf_turn = None if psf_file is None else orientation(psf_file)
-        self._mismatches: dict[Size, ShapeError] = {}
 
     def check(self, measurement: Measurement) -> None:
         """Check that a measurement fits the camera.
 
-        The first one of each wrong size is compared with the PSF at other bins.
-
         Raises:
-            ShapeError: it does not fit.
+            ShapeError: it does not fit. It is compared with the PSF at other bins, which takes seconds.
             ImageError: it is dark.
         """
         try:
             self.calibration.check_fit(measurement)
         except ShapeError as error:
-            size = (measurement.shape[-2], measurement.shape[-1])
-            if size not in self._mismatches:
-                self._mismatches[size] = mismatch(error, measurement, self.calibration)
-            raise self._mismatches[size] from None
+            raise mismatch(error, measurement, self.calibration) from None
         refuse_dark(measurement)
 
     def prepare(self, measurement: Measurement, *, pose: bool) -> PreparedCapture:
@@ -104,28 +97,27 @@ class CapturePipeline:
 
         Args:
             prepared: the capture.
-            scene: result of `solve`.
+            scene: result of `solve`, which is finite.
             verdicts: of `examine_frame`.
 
         Raises:
-            ImageError: the scene or the result is not finite.
+            ImageError: the result is not finite.
         """
-        refuse_infinite(prepared, scene)
         given = self.calibration.psf_format.psf_orientation
         trust = examine_picture(prepared.measurement, self.reconstruct.psf, scene, pose=prepared.pose, given=given)
         if not trust.finite:
-            raise _not_finite(prepared)
+            raise _not_finite("check of the picture", prepared)
         return trust, settle_exif((*verdicts, *trust.verdicts))
 
 
 def refuse_infinite(prepared: PreparedCapture, scene: Scene) -> None:
     """Raise an `ImageError` if a scene holds NaN or infinity."""
     if not scene.isfinite().all():
-        raise _not_finite(prepared)
+        raise _not_finite("reconstruction", prepared)
 
 
-def _not_finite(prepared: PreparedCapture) -> ImageError:
+def _not_finite(what: str, prepared: PreparedCapture) -> ImageError:
     return ImageError(
-        "The reconstruction holds NaN, infinity or too large numbers. The capture's brightest pixel is "
-        f"{prepared.measurement.amax():.3g}, where 1 is saturation. Scale it, or use another method."
+        f"The {what} gave NaN or infinity. The capture's brightest pixel is {prepared.measurement.amax():.3g}, where 1 "
+        "is saturation: scale the capture, or use another method."
     )

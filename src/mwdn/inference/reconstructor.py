@@ -100,8 +100,7 @@ class Reconstructor:
         check_white_balance(self.white_balance, calibration.light)
         self.name, is_named = method_name(method), isinstance(method, str | Path)
         warning = psf_warning(method, calibration) if isinstance(method, str | Path) else None
-        self.method: Method = as_method(method, **options)
-        method = self.method
+        self.method = method = as_method(method, **options)
         # Errors of the caller's own object pass as they are.
         self._plugin_errors = partial(plugin_errors, self.name, type(method)) if is_named else nullcontext
         self.warning = warning or background_warning(self.name, method, calibration)
@@ -268,7 +267,8 @@ class Reconstructor:
 
     def as_recorded(self, scene: Scene) -> Scene:
         """Apply `mwdn.networks.network.Network.as_recorded` if the method is a network."""
-        return self.method.as_recorded(scene) if isinstance(self.method, Network) else scene
+        with self._plugin_errors():
+            return self.method.as_recorded(scene) if isinstance(self.method, Network) else scene
 
     def balance(self, scene: Scene) -> Scene:
         """Apply the white balance."""

@@ -12,7 +12,7 @@ from mwdn.io.arrays import as_frame
 from mwdn.io.images import srgb_decode
 from mwdn.types import ArrayPicture, FloatFrame, Image
 
-BRIGHTEST = 0.003
+CLIPPED_SHARE = 0.003
 """Part of a picture's values that are white in a display: `to_display` clips them."""
 
 
@@ -45,7 +45,7 @@ def to_display(image: Tensor | ArrayPicture) -> Tensor | FloatFrame:
         return to_display(frame.movedim(-1, 0)[None])[0].movedim(0, -1).numpy().reshape(np.asarray(image).shape)
     check_batch(image, "image")
     pixels = image.float().flatten(1)
-    brightest = pixels.kthvalue(pixels.shape[1] - int(BRIGHTEST * pixels.shape[1])).values
+    brightest = pixels.kthvalue(pixels.shape[1] - int(CLIPPED_SHARE * pixels.shape[1])).values
     return (image / brightest.clamp(min=1e-12)[:, None, None, None]).clamp(0, 1)
 
 

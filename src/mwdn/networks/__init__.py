@@ -21,7 +21,7 @@ from mwdn.networks.updn import Updn
 from mwdn.networks.wiener import WienerNetwork
 from mwdn.networks.wiener_bank import WienerBank
 from mwdn.networks.wiener_unet import WienerUNet
-from mwdn.runtime.plugins import Registry, check_complete
+from mwdn.runtime.plugins import Registry, check_complete, plugin_errors
 from mwdn.solvers import BUNDLED_NAMES, SOLVERS
 
 _OWN: dict[str, type[Network[Any]]] = {
@@ -62,6 +62,7 @@ def build(name: str, **options: Any) -> nn.Module:  # noqa: ANN401
 
     Raises:
         UnknownNameError: no such network, or it has no such option.
+        PluginError: the class is a plugin's and raises an error.
         ParameterError: ``name`` is a solver, ``width`` or ``channels`` is below 1, or an option is of another type.
     """
     kind = DENOISERS.get(name) or NETWORKS.get(name)
@@ -75,7 +76,8 @@ def build(name: str, **options: Any) -> nn.Module:  # noqa: ANN401
         if options.get(size, 1) < 1:
             raise ParameterError(f"`{size}` ({options[size]}) must be at least 1.")
     # JSON and TOML have lists, not tuples.
-    network = kind(**{key: tuple(v) if isinstance(v, list) else v for key, v in options.items()})
+    with plugin_errors(name, kind):
+        network = kind(**{key: tuple(v) if isinstance(v, list) else v for key, v in options.items()})
     return network.float()  # also where `torch.set_default_dtype` says otherwise
 
 

@@ -1,4 +1,4 @@
-"""Blocks of the U-Nets: double convolution, encoder, decoder."""
+"""Blocks of the U-Nets: double convolution, encoder, decoder; checks and sizes of pictures for all networks."""
 
 import math
 from itertools import pairwise

@@ -1,4 +1,4 @@
-"""Learnable Wiener filters, eq. (2), and the PSFs that networks take."""
+"""Learnable Wiener filters, eq. (2), and checks and scaling of PSFs."""
 
 import math
 from collections.abc import Iterator

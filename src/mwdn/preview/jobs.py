@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from mwdn.errors import MwdnError, PluginError
+from mwdn.errors import MwdnError, PluginError, without_traceback
 from mwdn.preview.limits import Limits, RefusedError
 from mwdn.preview.result import Result
 
@@ -58,7 +58,7 @@ class Job:
     def end(self, state: State, error: MwdnError | None = None) -> None:
         """Set the last state, and call the listeners."""
         with self._lock:
-            self.error, self.state = error, state
+            self.error, self.state = error and without_traceback(error), state
             self.result = self.result if state == "done" else None
             listeners, self._listeners = self._listeners, []
         for call in listeners:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from mwdn.calibration import Calibration
 from mwdn.capture.source import CameraFrame, CameraSource, SilentCameraError
-from mwdn.errors import CameraError, ImageError, MwdnError
+from mwdn.errors import CameraError, ImageError, MwdnError, PluginError
 from mwdn.preview.limits import RefusedError
 from mwdn.preview.live_pictures import LivePicture, LivePictures, finite
 from mwdn.preview.live_recording import LiveRecording
@@ -150,7 +150,9 @@ class Live:
             except Exception as error:
                 failure = error
                 said = str(error)
-                if not isinstance(error, MwdnError):  # a defect of this package must not end the live picture for good
+                if isinstance(error, PluginError):
+                    LOG.exception("live picture")
+                elif not isinstance(error, MwdnError):  # a defect of this package must not end the picture for good
                     LOG.exception("live picture")
                     said = f"An error of mwdn itself: {type(error).__name__}. The server's log says more."
                 self._publish({"error": said}, b"", b"")

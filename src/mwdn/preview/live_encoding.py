@@ -8,7 +8,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from mwdn.io.contact_sheets import BRIGHTEST
+from mwdn.io.contact_sheets import CLIPPED_SHARE
 from mwdn.io.images import srgb_encode
 
 QUALITY = 90
@@ -18,7 +18,7 @@ QUALITY = 90
 def brightest(image: Tensor) -> float:
     """The number that becomes white: that of `to_display`, estimated from each fourth pixel. At least 1e-12."""
     numbers = np.ascontiguousarray(image[0, :, ::2, ::2].numpy()).ravel()
-    rank = numbers.size - 1 - int(BRIGHTEST * numbers.size)
+    rank = numbers.size - 1 - int(CLIPPED_SHARE * numbers.size)
     return max(float(np.partition(numbers, rank)[rank]), 1e-12)
 
 

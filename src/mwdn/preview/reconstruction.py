@@ -64,7 +64,7 @@ class Reconstructions:
         self._prepared: OrderedDict[tuple[Any, ...], tuple[Calibration, CapturePipeline]] = OrderedDict()
 
     def prepare(self, order: Order, calibration: Calibration) -> CapturePipeline:
-        """The method for the camera.
+        """The pipeline of a method and a camera, from the cache if it is there.
 
         Raises:
             MwdnError: no such method or option, or it does not fit the camera.
@@ -115,7 +115,7 @@ class Reconstructions:
             job.state = "checking"
             verdicts = pipeline.examine_frame(frame, order.capture)
             trust, verdicts = pipeline.examine_scene(prepared, scene, verdicts)
-            job.result = replace(job.result, report=report | _found(trust, verdicts))
+            job.result = replace(job.result, report=report | _verdict_report(trust, verdicts))
 
 
 def with_ambient(calibration: Calibration, ambient: bytes, limits: Limits) -> Calibration:
@@ -145,7 +145,7 @@ def _report(order: Order, reconstruct: Reconstructor, seconds: float) -> dict[st
     }
 
 
-def _found(trust: Trust, verdicts: tuple[Verdict, ...]) -> dict[str, Any]:
+def _verdict_report(trust: Trust, verdicts: tuple[Verdict, ...]) -> dict[str, Any]:
     """The verdicts, and the numbers behind them."""
     listed = [{**asdict(verdict), "sentence": verdict.sentence} for verdict in verdicts]
     return {**trust.content, "summary": trust.sentence, "verdicts": listed}

@@ -30,7 +30,7 @@ LOCAL = 1 / 16
 MARGIN = 1 / 20
 """Rim of the frame that is not compared, over its shorter side: light from outside is not in the scene."""
 
-STEPS = 8
+GAUSS_NEWTON_STEPS = 8
 """Gauss-Newton steps."""
 
 RIDGE = 1e-4
@@ -75,7 +75,7 @@ def _detail(picture: Tensor, scene: Tensor, blur: float) -> _Detail:
 def _fit(levels: list[list[_Detail]], coefficients: Tensor) -> Tensor:
     """Gauss-Newton steps at each blur."""
     for pairs in levels:
-        for _ in range(STEPS):
+        for _ in range(GAUSS_NEWTON_STEPS):
             coefficients = coefficients - _step(pairs, coefficients)
     return coefficients
 

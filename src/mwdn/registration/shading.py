@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.optics.polynomials import coefficient_count, polynomials
-from mwdn.registration.distortion import STEPS, without_margin
+from mwdn.registration.distortion import GAUSS_NEWTON_STEPS, without_margin
 
 SQUARE_PX = 8
 """Side of the squares that are averaged first: shading is smooth."""
@@ -55,7 +55,7 @@ def _blocks(picture: Tensor) -> Tensor:
 def _fit(pairs: list[tuple[Tensor, Tensor]], P: Tensor) -> Tensor:
     """Gauss-Newton steps on (1) for c, (C, K)."""
     c = torch.zeros(len(pairs[0][0]), len(P)).to(P)
-    for _ in range(STEPS):
+    for _ in range(GAUSS_NEWTON_STEPS):
         A, g = torch.zeros(c.numel(), c.numel()).to(P), torch.zeros(c.numel()).to(P)
         for picture, scene in pairs:
             shaded, residual, gain = _without_gain(picture, scene, P, c)

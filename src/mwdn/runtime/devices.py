@@ -29,6 +29,11 @@ def select_device(device: str | torch.device | None = None) -> torch.device:
     return torch.device(device)
 
 
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether an error says that a device has too little memory. On a CPU torch has no type for it."""
+    return isinstance(error, MemoryError | torch.OutOfMemoryError) or "can't allocate memory" in str(error)
+
+
 @contextmanager
 def memory_errors(name: str, shape: tuple[int, ...], device: torch.device) -> Iterator[None]:
     """Turn a device's lack of memory for pictures of this shape, the argument called ``name``, into one sentence.
@@ -39,9 +44,7 @@ def memory_errors(name: str, shape: tuple[int, ...], device: torch.device) -> It
     try:
         yield
     except (MemoryError, RuntimeError) as error:
-        out_of_memory = isinstance(error, MemoryError | torch.OutOfMemoryError)
-        out_of_memory |= "can't allocate memory" in str(error)  # torch has no error type for this on a CPU
-        if not out_of_memory:
+        if not is_out_of_memory(error):
             raise
         raise ParameterError(
             f"`{name}` {shape} needs more memory than {device} has free. Bin or crop it: `bin=2`, "

@@ -123,7 +123,9 @@ def check_complete(entry: Callable[..., Any], what: str, options: Mapping[str, A
 
 @contextmanager
 def plugin_errors(name: str, of: type) -> Iterator[None]:
-    """Turn an error of a plugin's own code into one that names the plugin; those of this package's classes pass.
+    """Turn an error of a plugin's own code into one that names the plugin.
+
+    Errors of mwdn's own classes, and those of a lack of memory, are raised unchanged.
 
     Args:
         name: of the plugin, or of what is made with it.
@@ -137,9 +139,11 @@ def plugin_errors(name: str, of: type) -> Iterator[None]:
     except MwdnError:
         raise
     except (Exception, SystemExit) as error:
-        if of.__module__.partition(".")[0] == "mwdn":
+        from mwdn.runtime.devices import is_out_of_memory  # which imports torch
+
+        if of.__module__.partition(".")[0] == "mwdn" or is_out_of_memory(error):
             raise
-        text = f"`{name}`, a plugin's (`{of.__module__}`), has failed: {type(error).__name__}: {reason(error)}."
+        text = f"The plugin `{name}` (module `{of.__module__}`) failed: {type(error).__name__}: {reason(error)}."
         raise PluginError(text) from error
 
 
