@@ -66,6 +66,12 @@ def test_train_then_reconstruct(run, camera):
     assert run(TRAIN)[0] == 0  # nothing left to do
 
 
+def test_a_run_that_ends_within_its_warmup_says_so(run, camera):
+    sentence = "The warm-up (50 steps) is not over when the run ends (4)"
+    assert sentence in flat(run(TRAIN)[2])
+    assert "warm-up" not in flat(run(f"{TRAIN.replace('runs/x', 'runs/y')} --schedule.warmup 2")[2])
+
+
 def test_any_key_of_the_recipe_by_its_name(run, camera):
     changes = "--learning-rate 3e-4 --bfloat16=false --seed -2 --mismatch.blur-px 1 --placement.extent [0.3,0.5]"
     code, _, err = run(f"{TRAIN} {changes} --network.width 6 --schedule.crop 16 --pool 8")

@@ -26,7 +26,7 @@ from mwdn.optics.shading import shading
 from mwdn.runtime import distributed
 from mwdn.training import experiment
 from mwdn.training.network import takes_channels
-from mwdn.training.recipe import read_recipe
+from mwdn.training.recipe import Schedule, read_recipe
 from mwdn.training.report import Report
 from mwdn.training.tables import Sheet
 from mwdn.training.tensorboard import TensorBoard
@@ -97,6 +97,8 @@ def train(  # noqa: PLR0913
             _note_colours(calibration, "--grey --network.channels 1")
         if is_first and pairs_file is not None:
             warn(other_camera(PairFile(pairs_file), calibration))
+        if is_first:
+            _note_warmup(trainer.schedule)
         if is_first and trainer.finished:
             note(f"The run in `{out}` was finished before. To train anew: another `--out`.")
         board = (
@@ -123,6 +125,16 @@ def _note_colours(calibration: Calibration, options: str) -> None:
     frames = calibration.frames
     if calibration.psf.shape[1] == 1 and not frames.grey and frames.mosaic is None:
         note(f"The PSF is grey; captures are simulated in colour. If those of the camera are grey: `{options}`.")
+
+
+def _note_warmup(schedule: Schedule) -> None:
+    """Say that a run ends within its warm-up, as a short trial of a recipe does."""
+    if schedule.lr_schedule != "plateau" and schedule.steps <= schedule.warmup:
+        shorter = f"--schedule.warmup {schedule.steps // 10}"
+        note(
+            f"The warm-up ({schedule.warmup:,} steps) is not over when the run ends ({schedule.steps:,}): the learning "
+            f"rate does not reach {schedule.learning_rate:g}. To shorten it: `{shorter}`."
+        )
 
 
 def _train(trainer: Trainer, progress: Progressing, board: TensorBoard | None) -> None:
