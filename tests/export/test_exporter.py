@@ -364,14 +364,16 @@ def test_iterations_are_a_loop_in_the_file(tmp_path, generator):
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.acceptance] * (name in ("admm", "pyramid"))) for name in SOLVERS]
+    "name", [pytest.param(name, marks=[pytest.mark.acceptance] * (name != "wiener")) for name in SOLVERS]
 )
 def test_every_solver(name, tmp_path):
     options = {"iterations": 5} if name == "fista" else {}  # the others are loops
     export(build_solver(name, **options), camera(), tmp_path / "camera.onnx", least=100)
 
 
-@pytest.mark.parametrize(("precision", "share"), [("float16", 2), ("int8", 4)])
+@pytest.mark.parametrize(
+    ("precision", "share"), [("float16", 2), pytest.param("int8", 4, marks=pytest.mark.acceptance)]
+)
 def test_lower_precisions(precision, share, tmp_path):
     """The first convolution and, with int8, the last one stay float32: a few thousand bytes of 350,000 numbers."""
     import onnx

@@ -30,7 +30,9 @@ def reconstructed(pictures, truth, generator, *, full_well, iterations):
     return list(Admm(iterations=iterations)(captures, psf))
 
 
-@pytest.mark.parametrize(("picture", "turn"), [(board(), 172), (dots(), 7)])
+@pytest.mark.parametrize(
+    ("picture", "turn"), [pytest.param(board(), 172, marks=pytest.mark.acceptance), pytest.param(dots(), 7)]
+)
 def test_boards_and_dots_within_three_tenths_of_a_pixel(picture, turn, generator):
     truth = placed(picture.shape[:2], CAMERA, turn=turn, fill=0.6, mirrored=True)
     views = Views.of(tensors([picture]), reconstructed([picture], truth, generator, full_well=1500, iterations=60))
