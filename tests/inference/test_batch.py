@@ -39,24 +39,6 @@ from mwdn.solvers import Admm, Fista, Wiener
 SIZE = 32, 40
 
 
-@pytest.fixture
-def psf(generator):
-    return contour_psf(SIZE, cell=10, generator=generator).expand(1, 3, -1, -1).contiguous()
-
-
-@pytest.fixture
-def captures(tmp_path, psf, generator):
-    """Three of them, 16-bit PNG."""
-    (tmp_path / "in").mkdir()
-    for number in range(3):
-        scene = torch.zeros(1, 3, *SIZE)
-        scene[..., 10:20, 12 + 4 * number : 22 + 4 * number] = torch.tensor([0.9, 0.5, 0.2])[:, None, None]
-        seen = Camera(psf).simulate(scene, generator=generator)[0].movedim(0, -1)
-        frame = (seen.clamp(0, 1) * 65535).round().numpy().astype(np.uint16)
-        cv2.imwrite(str(tmp_path / f"in/{number}.png"), frame[..., ::-1])
-    return [tmp_path / f"in/{number}.png" for number in range(3)]
-
-
 def make_batch(psf, out, method="wiener", *, check_consistency=False, **options):
     """Without the check, which takes longer than the rest together."""
     calibration = psf if isinstance(psf, Calibration) else Calibration(psf)

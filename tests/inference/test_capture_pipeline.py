@@ -3,14 +3,11 @@
 import gc
 import weakref
 
-import cv2
-import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from cameras import contour_psf
-from mwdn import Camera, read_frame
+from mwdn import read_frame
 from mwdn.calibration import Calibration, PsfFormat
 from mwdn.errors import ImageError, ShapeError
 from mwdn.inference.capture_pipeline import CapturePipeline, PreparedCapture, refuse_infinite
@@ -20,19 +17,9 @@ SIZE = 32, 40
 
 
 @pytest.fixture
-def psf(generator):
-    return contour_psf(SIZE, cell=10, generator=generator).expand(1, 3, -1, -1).contiguous()
-
-
-@pytest.fixture
-def capture(psf, generator, tmp_path):
+def capture(captures):
     """File of a capture."""
-    scene = torch.zeros(1, 3, *SIZE)
-    scene[..., 10:20, 12:22] = 0.7
-    seen = Camera(psf).simulate(scene, generator=generator)[0].movedim(0, -1)
-    frame = (seen.clamp(0, 1) * 255).round().numpy().astype(np.uint8)
-    cv2.imwrite(str(tmp_path / "capture.png"), frame[..., ::-1])
-    return tmp_path / "capture.png"
+    return captures[0]
 
 
 def turned(file, orientation):

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from cameras import contour_psf
 from made import touch
 from mwdn import Camera, solvers
 from mwdn.calibration import Calibration, FrameFormat
@@ -23,11 +22,6 @@ from mwdn.solvers import SOLVERS, Admm, Wiener
 from mwdn.weights.checkpoint import save_network
 
 SIZE = 32, 40
-
-
-@pytest.fixture
-def psf(generator):
-    return contour_psf(SIZE, cell=10, generator=generator).expand(1, 3, -1, -1).contiguous()
 
 
 @pytest.fixture

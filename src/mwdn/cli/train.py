@@ -97,10 +97,10 @@ def train(  # noqa: PLR0913
             _note_colours(calibration, "--grey --network.channels 1")
         if is_first and pairs_file is not None:
             warn(other_camera(PairFile(pairs_file), calibration))
-        if is_first:
-            _note_warmup(trainer.schedule)
         if is_first and trainer.finished:
             note(f"The run in `{out}` was finished before. To train anew: another `--out`.")
+        elif is_first:
+            _note_warmup(trainer.schedule)
         board = (
             stack.enter_context(TensorBoard(out / "tensorboard", trainer.step)) if tensorboard and is_first else None
         )

@@ -1,7 +1,6 @@
 """What surrounds every request: who may ask, how much they may send, security headers, and one line in the log."""
 
 import json
-import logging
 import time
 from typing import Any
 from urllib.parse import parse_qs
@@ -12,11 +11,9 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 
 from mwdn.errors import MwdnError
-from mwdn.preview.limits import Limits, RefusedError
+from mwdn.preview.limits import LOG, Limits, RefusedError
 from mwdn.preview.metrics import Metrics
 from mwdn.runtime.web_access import is_allowed
-
-LOG = logging.getLogger("mwdn.preview")
 
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "

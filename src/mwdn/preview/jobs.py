@@ -1,6 +1,5 @@
 """Reconstructions in progress: a bounded queue, progress, cancellation, and results until they are forgotten."""
 
-import logging
 import secrets
 import threading
 import time
@@ -9,16 +8,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from mwdn.errors import MwdnError, PluginError, without_traceback
-from mwdn.preview.limits import Limits, RefusedError
+from mwdn.errors import MwdnError, without_traceback
+from mwdn.preview.limits import Limits, RefusedError, for_client
 from mwdn.preview.result import Result
 
 State = Literal["waiting", "reconstructing", "checking", "done", "failed", "cancelled"]
 ENDED = ("done", "failed", "cancelled")
 
 STOPPED = "The server is being stopped."
-
-LOG = logging.getLogger("mwdn.preview")
 
 REMEMBERED = 1000
 """Jobs whose state is known, besides those in progress."""
@@ -155,15 +152,9 @@ class Jobs:
             work(job)
             job.advance(1.0)
             job.end("done")
-        except PluginError as error:
-            LOG.exception("reconstruction")
-            job.end("failed", RefusedError(500, str(error)))
-        except MwdnError as error:
-            job.end("cancelled" if job.cancelled else "failed", error)
         except BaseException as error:  # a defect of this package must not end the server
-            LOG.exception("reconstruction")
-            what = type(error).__name__
-            job.end("failed", RefusedError(500, f"An error of mwdn itself: {what}. The server's log says more."))
+            told = for_client(error, "reconstruction")
+            job.end("cancelled" if job.cancelled and told is error else "failed", told)
         self._forget()
 
     def _forget(self) -> None:

@@ -1,8 +1,11 @@
-"""Limits of what a client may ask for. Each is named in the error of a request that exceeds it."""
+"""Limits of what a client may ask for, each named in the error of a request that exceeds it; errors for clients."""
 
+import logging
 from dataclasses import dataclass
 
-from mwdn.errors import MwdnError, ParameterError
+from mwdn.errors import MwdnError, ParameterError, PluginError
+
+LOG = logging.getLogger("mwdn.preview")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,3 +58,17 @@ class RefusedError(MwdnError):
     def __init__(self, status: int, message: str) -> None:
         super().__init__(message)
         self.status = status
+
+
+def for_client(error: BaseException, work: str) -> MwdnError:
+    """The error that a client is told. One that is not the client's fault is logged and becomes a `RefusedError` 500.
+
+    Args:
+        error: that ended the work; a plugin's, or a defect of this package, is not the client's fault.
+        work: that it ended, for the log.
+    """
+    if isinstance(error, MwdnError) and not isinstance(error, PluginError):
+        return error
+    LOG.error(work, exc_info=error)
+    own = f"An error of mwdn itself: {type(error).__name__}. The server's log says more."
+    return RefusedError(500, str(error) if isinstance(error, PluginError) else own)

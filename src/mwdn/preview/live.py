@@ -1,7 +1,6 @@
 """The live picture: one camera and one reconstruction for all viewers; the newest frame wins, nothing queues."""
 
 import json
-import logging
 import threading
 import time
 from collections import deque
@@ -12,8 +11,8 @@ from typing import Any, NamedTuple
 
 from mwdn.calibration import Calibration
 from mwdn.capture.source import CameraFrame, CameraSource, SilentCameraError
-from mwdn.errors import CameraError, ImageError, MwdnError, PluginError
-from mwdn.preview.limits import RefusedError
+from mwdn.errors import CameraError, ImageError, MwdnError
+from mwdn.preview.limits import RefusedError, for_client
 from mwdn.preview.live_pictures import LivePicture, LivePictures, finite
 from mwdn.preview.live_recording import LiveRecording
 from mwdn.preview.live_settings import CAMERA_SETTINGS, LiveSettings
@@ -21,8 +20,6 @@ from mwdn.preview.metrics import Metrics
 from mwdn.runtime.devices import select_device
 from mwdn.runtime.streams import latest_results
 from mwdn.runtime.threads import usable_processors
-
-LOG = logging.getLogger("mwdn.preview")
 
 RATE_FRAMES = 20
 """Frames over which the rate is averaged."""
@@ -148,14 +145,8 @@ class Live:
                 with self.camera, closing(self.recording), closing(self._results()) as results:
                     self._show(results)
             except Exception as error:
-                failure = error
-                said = str(error)
-                if isinstance(error, PluginError):
-                    LOG.exception("live picture")
-                elif not isinstance(error, MwdnError):  # a defect of this package must not end the picture for good
-                    LOG.exception("live picture")
-                    said = f"An error of mwdn itself: {type(error).__name__}. The server's log says more."
-                self._publish({"error": said}, b"", b"")
+                failure = error  # a defect of this package must not end the live picture for good
+                self._publish({"error": str(for_client(error, "live picture"))}, b"", b"")
             # When a camera is back, its recording goes on in another file. The next viewer starts none.
             if not (isinstance(failure, CameraError) and self.camera.live):
                 self.recording.is_wanted = False
