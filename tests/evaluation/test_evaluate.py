@@ -18,7 +18,7 @@ from mwdn.calibration import Calibration
 from mwdn.cli import app, weights
 from mwdn.cli import evaluate as command
 from mwdn.data.pairs import PairFile
-from mwdn.errors import CheckpointError, ParameterError, ShapeError, UnknownNameError
+from mwdn.errors import CheckpointError, ParameterError, PluginError, ShapeError, UnknownNameError
 from mwdn.evaluation import First, Perceptual, Protocol, Report, Scores, alexnet, evaluate, learnable_numbers, measure
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.images import read_frame, write_linear
@@ -259,6 +259,30 @@ def test_a_method_that_returns_nan_is_named_and_costs_no_other_its_scores(pairs)
     assert report.sheet().isfinite().all()
     (psnr,) = (column.cells for column in report.table().columns if "PSNR" in str(column.header))
     assert [(cell.startswith("[bold]"), cell.startswith("nan")) for cell in psnr] == [(True, False), (False, True)]
+
+
+def test_a_method_that_fails_is_named_and_costs_no_other_its_scores(pairs):
+    """Its error ended the comparison after the others had been measured."""
+    calls = []
+
+    def fail_late(measurement):
+        calls.append(0)
+        if len(calls) > 3:  # two calls warm up
+            raise PluginError("The plugin `mine` failed.")
+        return measurement
+
+    def fail_at_once(measurement):
+        raise ParameterError("`lambda_` must be positive.")
+
+    methods = {"late": fail_late, "at once": fail_at_once, "same": lambda light: light}
+    report = evaluate(methods, pairs, Protocol.parse("full"), perceptual=Perceptual.none())
+    assert list(report.methods) == ["same"]
+    assert report.failed.keys() == {"late", "at once"}
+    assert json.loads(report.json())["failed"]["late"] == "The plugin `mine` failed."
+    assert {len(row) for row in report.rows} == {3}, "a scene, a measurement and the picture of one method"
+    del methods["same"]
+    with pytest.raises(PluginError, match="`mine` failed"):
+        evaluate(methods, pairs, Protocol.parse("full"), perceptual=Perceptual.none())
 
 
 def test_scenes_of_another_scale_are_named(pairs):

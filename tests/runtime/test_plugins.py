@@ -1,5 +1,6 @@
 """Entries of other packages: the example of examples/plugin, and packages that are broken."""
 
+import json
 import math
 import sys
 import tomllib
@@ -13,6 +14,7 @@ import torch
 
 import mwdn
 from mwdn.capture import SOURCES, open_source
+from mwdn.data.pairs import PairFile
 from mwdn.errors import ParameterError, PluginError, UnknownNameError
 from mwdn.io.pictures import dark_scene
 from mwdn.networks import NETWORKS
@@ -291,6 +293,11 @@ def test_errors_of_a_plugin_name_it_and_cost_one_capture(run):
         code, out, err = run(f"{line} {name}")
         assert (code, err.count(f"The plugin `{name}` (module `fails`) failed: {why}.")) == (1, failed), err
         assert f"{2 - failed} of 2 captures" in out
+    with PairFile.create("pairs.h5", measurement_shape=(*SIZE, 3), scene_shape=(*SIZE, 3)) as file:
+        file.append(torch.rand(3, *SIZE), torch.rand(3, *SIZE))
+    code, out, err = run("evaluate wiener exits --data pairs.h5 --psf psf.npy --background 0 --no-lpips --json")
+    assert (code, "no scores: The plugin `exits` (module `fails`) failed" in err) == (1, True), err
+    assert (list(json.loads(out)["methods"]), list(json.loads(out)["failed"])) == (["wiener"], ["exits"])
     code, _, err = run(f"{line} unmade")
     assert (code, "The plugin `unmade` (module `fails`) failed: ValueError: no licence." in err) == (2, True), err
     code, _, err = run(f"{line} large")

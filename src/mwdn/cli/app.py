@@ -120,7 +120,7 @@ def make_app(command: str | None = None) -> App:
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
-    """Run the command line and exit: 0 on success, 1 if some captures failed, 2 for a wrong call.
+    """Run the command line and exit: 0 on success, 1 if some captures or methods failed, 2 for a wrong call.
 
     The other exit codes are those of `mwdn.cli.signals`.
     """

@@ -7,18 +7,19 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
+from rich.markup import escape
 
 from mwdn import evaluation
 from mwdn.cli.camera import CameraOptions
 from mwdn.cli.folders import no_empty_folder
 from mwdn.cli.method_options import MethodOptions, read_options
 from mwdn.cli.progress import show_progress
-from mwdn.cli.terminal import Json, results, say, warn
+from mwdn.cli.terminal import Json, complain, results, say, warn
 from mwdn.cli.weights import ask_for_lpips
 from mwdn.data.pair_checks import check_pairs, missing_refinement, other_camera
 from mwdn.data.pairs import PairFile, Part
 from mwdn.data.recorded import Division, RefinedPairs
-from mwdn.errors import ParameterError
+from mwdn.errors import MwdnError, ParameterError, one_line
 from mwdn.evaluation import Perceptual, Report, Variant
 from mwdn.evaluation.alexnet import ALEXNET_MIN_PX
 from mwdn.evaluation.evaluate import Pairs
@@ -42,7 +43,7 @@ def evaluate(  # noqa: PLR0913
     device: str | None = None,
     json: Json = False,
     **options: MethodOptions,
-) -> None:
+) -> int:
     """Compare methods on pairs of measurements and scenes: quality, time, memory.
 
     Options of solvers: --regularisation 1e-4, --iterations 50 ... apply to each of the methods that has them; `mwdn
@@ -105,7 +106,10 @@ def evaluate(  # noqa: PLR0913
         )
     report.write(out)
     _print_report(report, json=json)
+    for name, reason in report.failed.items():
+        complain(f"[red]{escape(one_line(name))}:[/]", MwdnError(f"no scores: {reason}"))
     say(f"Look at {out}")
+    return 1 if report.failed else 0
 
 
 def _refuse_capture_options(camera: CameraOptions) -> None:

@@ -8,13 +8,14 @@ import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
 from torch import nn
 
 from mwdn.data.pairs import refuse_non_finite
-from mwdn.errors import ParameterError, ShapeError
+from mwdn.errors import MwdnError, ParameterError, ShapeError, without_traceback
 from mwdn.evaluation.alexnet import ALEXNET_MIN_PX
 from mwdn.evaluation.distances import WINDOW
 from mwdn.evaluation.metrics import METRICS, Perceptual, Protocol, Variant, measure
@@ -85,10 +86,14 @@ def evaluate(
         shown: number of pictures that the report keeps for its contact sheet.
         progress: called with the method's name and the picture's index after each picture.
 
+    Returns:
+        The scores of each method. A method that raises an `MwdnError` costs the others nothing: the report has the
+        reason.
+
     Raises:
         ParameterError: no method, no pair, or NaN or infinity in a pair.
-        ShapeError: a reconstruction and its scene differ in shape, or the protocol's part exceeds them, or is too
-            small for SSIM.
+        ShapeError: the protocol's part exceeds the scenes, or is too small for SSIM.
+        MwdnError: every method fails; this is the first one's error.
     """
     if not methods:
         raise ParameterError("`methods` must not be empty. Name one: admm, wiener, universal, or a checkpoint.")
@@ -103,31 +108,54 @@ def evaluate(
     perceptual = perceptual or Perceptual.load()
     first = [pairs[i] for i in range(min(shown, len(pairs)))]
     rows = [[scene[None], measurement[None]] for measurement, scene in first]
-    scores = {}
+    compare = partial(measure, protocol=protocol, variant=variant, perceptual=perceptual)
+    scores: dict[str, Scores] = {}
+    failed: dict[str, MwdnError] = {}
     for name, method in methods.items():
-        peak = _warm_up(method, pairs[0][0][None])
-        values: dict[str, list[float]] = {metric: [] for metric in METRICS}
-        seconds, wrong = [], 0
-        for i in range(len(pairs)):
-            measurement, scene = pairs[i]
-            reconstruction, elapsed = _timed(method, measurement[None])
-            seconds.append(elapsed)
-            wrong += not reconstruction.isfinite().all()
-            numbers = measure(reconstruction.cpu(), scene[None], protocol, variant=variant, perceptual=perceptual)
-            for metric, number in numbers.items():
-                values[metric].append(number.item())
-            if i < len(rows):
-                rows[i].append(reconstruction.cpu())
-            if progress:
-                progress(name, i)
-        if wrong:
-            warnings.warn(
-                f"`{name}` returned NaN or infinity for {wrong:,} of {len(pairs):,} pictures: its scores mean nothing.",
-                stacklevel=2,
-            )
-        columns = {metric: tuple(column) for metric, column in values.items()}
-        scores[name] = Scores(columns, tuple(seconds), peak, _device(method).type, learnable_numbers(method))
-    return Report(protocol.name, variant or protocol.variant, scores, perceptual.missing, rows)
+        try:
+            scores[name], pictures = _score(name, method, pairs, compare, len(rows), progress)
+        except MwdnError as error:
+            failed[name] = without_traceback(error)
+        else:
+            for row, picture in zip(rows, pictures, strict=True):
+                row.append(picture)
+    if not scores:
+        raise next(iter(failed.values()))
+    reasons = {name: str(error) for name, error in failed.items()}
+    return Report(protocol.name, variant or protocol.variant, scores, perceptual.missing, rows, reasons)
+
+
+def _score(
+    name: str,
+    method: Method,
+    pairs: Pairs,
+    compare: Callable[[Scene, Scene], Mapping[str, torch.Tensor]],
+    shown: int,
+    progress: Callable[[str, int], None] | None,
+) -> tuple[Scores, list[Scene]]:
+    """Scores of one method on all pairs, and its pictures of the first ``shown``."""
+    peak = _warm_up(method, pairs[0][0][None])
+    values: dict[str, list[float]] = {metric: [] for metric in METRICS}
+    pictures: list[Scene] = []
+    seconds, wrong = [], 0
+    for i in range(len(pairs)):
+        measurement, scene = pairs[i]
+        reconstruction, elapsed = _timed(method, measurement[None])
+        seconds.append(elapsed)
+        wrong += not reconstruction.isfinite().all()
+        for metric, number in compare(reconstruction.cpu(), scene[None]).items():
+            values[metric].append(number.item())
+        if i < shown:
+            pictures.append(reconstruction.cpu())
+        if progress:
+            progress(name, i)
+    if wrong:
+        warnings.warn(
+            f"`{name}` returned NaN or infinity for {wrong:,} of {len(pairs):,} pictures: its scores mean nothing.",
+            stacklevel=3,
+        )
+    columns = {metric: tuple(column) for metric, column in values.items()}
+    return Scores(columns, tuple(seconds), peak, _device(method).type, learnable_numbers(method)), pictures
 
 
 def _check_pairs(pairs: Pairs) -> None:

@@ -98,6 +98,7 @@ class Report:
         missing: metrics that could not be measured, with the reason.
         rows: of the contact sheet, one per picture: scene, measurement, then one reconstruction per method, each
             (1, C, H, W).
+        failed: methods without scores, with the reason.
     """
 
     protocol: str
@@ -105,6 +106,7 @@ class Report:
     methods: dict[str, Scores]
     missing: dict[str, str]
     rows: list[list[Tensor]] = field(repr=False)
+    failed: dict[str, str] = field(default_factory=dict)
 
     @property
     def pictures(self) -> int:
@@ -159,6 +161,7 @@ class Report:
             "variant": self.variant,
             "pictures": self.pictures,
             "missing": self.missing,
+            "failed": self.failed,
             "methods": {name: scores.content() for name, scores in self.methods.items()},
         }
 
