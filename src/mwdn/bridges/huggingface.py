@@ -2,11 +2,11 @@
 
 import json
 import re
-import shutil
 import warnings
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
+from safetensors.torch import load_file, save_file
 from torch import nn
 
 from mwdn.arguments import checked
@@ -28,7 +28,8 @@ def save_pretrained(method: str | Path, folder: str | Path, *, license: str | No
     """Write a trained network as a folder that can be uploaded to the Hugging Face hub.
 
     ``config.json`` names the network and its options, ``model.safetensors`` is the checkpoint, ``README.md`` the model
-    card with metadata. A card that was edited stays, with a warning.
+    card with metadata. A card that was edited stays, with a warning. Of absolute paths in the recipe only the last part
+    is published.
 
     Args:
         method: path of a checkpoint of this package, or ``universal`` or ``universal-small``.
@@ -43,7 +44,7 @@ def save_pretrained(method: str | Path, folder: str | Path, *, license: str | No
         ParameterError: the folder cannot be written to, or holds files of another origin.
     """
     source, folder = find_weights(str(method)) or Path(method), Path(folder)
-    network, metadata = load_checkpoint(source), read_metadata(source)
+    network, metadata = load_checkpoint(source), _without_folders(read_metadata(source))
     refuse_foreign(folder, (CONFIG, WEIGHTS_FILE), b'"library_name": "mwdn"')
     config = {"library_name": _LIBRARY, "model_type": metadata["name"], **metadata}
     card, title = folder / CARD, folder.resolve().name
@@ -51,7 +52,7 @@ def save_pretrained(method: str | Path, folder: str | Path, *, license: str | No
     with as_parameter_error(folder, "Choose another one: `folder`."):
         write_json(folder / CONFIG, config)
         with atomic(folder / WEIGHTS_FILE) as temporary:
-            shutil.copyfile(source, temporary)
+            save_file(load_file(source), temporary, metadata={"mwdn": json.dumps(metadata)})
         if is_own or not card.exists():
             write_text(card, _card(title, network, metadata, license or license_before))
         else:
@@ -60,6 +61,17 @@ def save_pretrained(method: str | Path, folder: str | Path, *, license: str | No
                 stacklevel=3,
             )
     return folder
+
+
+def _without_folders(value: Any) -> Any:  # noqa: ANN401
+    """Metadata with the last part of each absolute path, of any system: folders may name people and projects."""
+    if isinstance(value, dict):
+        return {key: _without_folders(part) for key, part in value.items()}
+    if isinstance(value, list):
+        return [_without_folders(part) for part in value]
+    if isinstance(value, str) and (value.startswith(("/", "~")) or PureWindowsPath(value).drive):
+        return PureWindowsPath(value).name
+    return value
 
 
 def _own_card(folder: Path) -> tuple[bool, str | None]:
