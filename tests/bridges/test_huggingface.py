@@ -34,7 +34,11 @@ def test_a_network_returns_with_the_same_weights(checkpoint, tmp_path):
 
 def test_folders_of_the_author_are_not_published(tmp_path):
     """The paths of photographs and pairs, with the name of the user, were in all three files."""
-    paths = {"photos": "/home/lovelace/secret/photos", "psf": r"C:\Users\lovelace\psf.png", "pairs": ["~/lovelace/pairs.h5"]}
+    paths = {
+        "photos": "/home/lovelace/secret/photos",
+        "psf": r"C:\Users\lovelace\psf.png",
+        "pairs": ["~/lovelace/pairs.h5"],
+    }
     network = mwdn.build("mwdn", width=2).half()
     metadata = {"recipe": {"data": {**paths, "kind": "centre/128"}, "steps": 3}}
     save_network(tmp_path / "best.safetensors", network, "mwdn", {"width": 2}, **metadata)

@@ -15,7 +15,7 @@ from skimage import io as skimage_io
 from image_files import BLUE, HEIGHT, RED, WIDTH, chunk, encoded, flag, noise, npy, png16, put, tiff
 from mwdn.errors import ImageError
 from mwdn.io.arrays import MAX_PIXELS
-from mwdn.io.images import read_frame, read_picture
+from mwdn.io.images import read_frame, read_picture, srgb_decode
 
 RGB_OF_RGBA = noise(channels=4)[..., :3]
 OPAQUE = np.concatenate([RGB_OF_RGBA, np.full_like(RGB_OF_RGBA[..., :1], 255)], -1)
@@ -242,6 +242,15 @@ def test_transparent_pixels_are_refused_in_frames_and_dropped_in_photographs(tmp
     with pytest.raises(ImageError, match=r"is transparent in \d.*% of its pixels"):
         read_frame(path)
     assert read_picture(path).shape == (1, 3, *noise().shape[:2])
+
+
+def test_white_of_a_photograph_is_the_largest_number_of_its_pgm(tmp_path: Path) -> None:
+    """A photograph of 12 bits was sixteen times too dark. Frames stay as they are stored."""
+    path = tmp_path / "12_bits.pgm"
+    path.write_bytes(b"P5 3 1 4095\n" + np.array([0, 2048, 4095], ">u2").tobytes())
+    light = srgb_decode(torch.tensor([0, 2048 / 4095, 1]))
+    torch.testing.assert_close(read_picture(path), light.expand(1, 3, 1, 3), rtol=1e-4, atol=0)
+    assert read_frame(path).ravel().tolist() == [0, 2048, 4095]
 
 
 def test_a_huge_npy_that_is_whole(tmp_path: Path) -> None:

@@ -141,7 +141,7 @@ def decode(kind: str, data: bytes, photograph: bool) -> Frame:
     """
     _check_claim(kind, data, len(data))
     if kind == "PGM":
-        return _read_pgm(data)
+        return _read_pgm(data, photograph)
     check_whole(kind, data)
     pixels = np.atleast_3d(_decode(kind, data, photograph))
     pixels = without_alpha(pixels) if pixels.shape[2] == 4 else pixels
@@ -176,22 +176,29 @@ def _decode(kind: str, data: bytes, photograph: bool) -> Frame:
     return pixels
 
 
-def _pgm_header(data: bytes) -> tuple[int, int, int, int, int]:
-    """Height, width, bytes of a pixel, channels, and the position of the numbers."""
+def _pgm_header(data: bytes) -> tuple[int, int, int, int, int, int]:
+    """Height, width, bytes of a pixel, channels, the largest number, and the position of the numbers."""
     if not (header := _PGM_HEADER.match(data[: 2**16])):
         raise ImageError(f"is damaged: this PGM or PPM has no width, height and largest number. {COPY_AGAIN}")
     kind, width, height, largest = map(int, header.groups())
     if not 0 < largest <= 65535:
         raise ImageError(f"is damaged: the largest number of this PGM or PPM ({largest:,}) must be 1 to 65,535.")
     channels = 1 if kind == 5 else 3
-    return height, width, channels * (1 if largest < 256 else 2), channels, header.end()
+    return height, width, channels * (1 if largest < 256 else 2), channels, largest, header.end()
 
 
-def _read_pgm(data: bytes) -> Frame:
-    """A binary PGM (grey) or PPM (RGB): a header in text, then the numbers, the high byte of 16 bits first."""
-    height, width, pixel_bytes, channels, start = _pgm_header(data)
+def _read_pgm(data: bytes, photograph: bool) -> Frame:
+    """A binary PGM (grey) or PPM (RGB): a header in text, then the numbers, the high byte of 16 bits first.
+
+    The header's largest number is white: a photograph is scaled to it.
+    """
+    height, width, pixel_bytes, channels, largest, start = _pgm_header(data)
     needed = start + height * width * pixel_bytes
     if len(data) < needed:
         raise ImageError(f"is cut off: this PGM or PPM has {len(data):,} bytes and needs {needed:,}. {COPY_AGAIN}")
     dtype = np.dtype(np.uint8 if pixel_bytes == channels else ">u2")
-    return to_frame(np.frombuffer(data[start:needed], dtype), (height, width, channels))
+    frame = to_frame(np.frombuffer(data[start:needed], dtype), (height, width, channels))
+    peak = np.iinfo(frame.dtype).max
+    if not photograph or largest == peak:
+        return frame
+    return np.rint(frame.clip(max=largest) * np.float32(peak / largest)).astype(frame.dtype)
