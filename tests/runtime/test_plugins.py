@@ -14,6 +14,8 @@ import torch
 
 import mwdn
 from mwdn.capture import SOURCES, open_source
+from mwdn.capture.recipe import CameraTable, CaptureRecipe
+from mwdn.capture.set_up import open_camera
 from mwdn.data.pairs import PairFile
 from mwdn.errors import ParameterError, PluginError, UnknownNameError
 from mwdn.io.pictures import dark_scene
@@ -337,3 +339,10 @@ def test_plugins_are_not_looked_for_without_need(run, line, monkeypatch):
     monkeypatch.setattr(plugins, "entry_points", lambda **_: pytest.fail("looked for plugins"))
     with warnings.catch_warnings():
         assert run(line)[0] == 0
+
+
+@pytest.mark.usefixtures("example")
+def test_a_session_takes_a_plugins_camera_without_a_timeout():
+    """Its options had to have the `timeout_s` of the recipe, which replaced that of the camera's string."""
+    assert open_camera(CaptureRecipe(CameraTable("test-card,width=8", timeout_s=3.0))).timeout_s == 3.0
+    assert open_camera(CaptureRecipe(CameraTable("v4l2:0,timeout_s=7.5", timeout_s=3.0))).timeout_s == 7.5

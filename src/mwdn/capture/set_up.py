@@ -22,7 +22,10 @@ def open_camera(recipe: CaptureRecipe) -> CameraSource:
     table, display = recipe.camera, recipe.display
     name, _, options = parse_source(table.source)
     if name != "rig":
-        return open_source(table.source, timeout_s=table.timeout_s)
+        camera = open_source(table.source)
+        if "timeout_s" not in options:  # of the camera's own string, which a plugin's camera need not take
+            camera.timeout_s = table.timeout_s
+        return camera
     screen = Screen(
         width_px=display.width_px,
         height_px=display.height_px,
