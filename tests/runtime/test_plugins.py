@@ -17,7 +17,7 @@ from mwdn.capture import SOURCES, open_source
 from mwdn.capture.recipe import CameraTable, CaptureRecipe
 from mwdn.capture.set_up import open_camera
 from mwdn.data.pairs import PairFile
-from mwdn.errors import ParameterError, PluginError, UnknownNameError
+from mwdn.errors import CameraError, ParameterError, PluginError, UnknownNameError
 from mwdn.io.pictures import dark_scene
 from mwdn.networks import NETWORKS
 from mwdn.optics import MASKS, Setup, sample_camera
@@ -339,6 +339,63 @@ def test_plugins_are_not_looked_for_without_need(run, line, monkeypatch):
     monkeypatch.setattr(plugins, "entry_points", lambda **_: pytest.fail("looked for plugins"))
     with warnings.catch_warnings():
         assert run(line)[0] == 0
+
+
+BROKEN_CAMERAS = """
+import numpy as np
+from mwdn.capture import CameraFrame, CameraSource, Kind
+
+class Camera(CameraSource):
+    def __init__(self, *, fault=""):
+        super().__init__("broken")
+        self.fault = fault
+
+    def open(self):
+        self.fail("open")
+
+    def read(self):
+        self.fail("read")
+        arrays = {"axes": np.zeros((4, 4), np.uint8), "type": np.zeros((4, 4, 1), np.float32)}
+        return None if self.fault == "none" else CameraFrame(array=arrays.get(self.fault), bit_depth=8)
+
+    def close(self):
+        self.fail("close")
+
+    def fail(self, what):
+        if self.fault == what:
+            raise OSError(19, "No such device")
+
+def make_none():
+    return None
+
+BROKEN, NO_CAMERA = Kind(Camera), Kind(make_none)
+"""
+
+
+@pytest.fixture
+def broken_cameras(install):
+    """A plugin's camera that fails where its option says, and a plugin that makes no camera."""
+    folder = install("mwdn-broken", {"mwdn.cameras": {"broken": "broken:BROKEN", "no-camera": "broken:NO_CAMERA"}})
+    (folder / "broken.py").write_text(BROKEN_CAMERAS)
+    yield
+    sys.modules.pop("broken", None)
+
+
+@pytest.mark.usefixtures("broken_cameras")
+def test_errors_of_a_plugins_camera_name_it_and_its_frames_are_checked():
+    """They ended a session in a traceback, or as a file that cannot be written."""
+    failed = r"^The plugin `broken` \(module `broken`\) failed: OSError: \[Errno 19\] No such device\.$"
+    with pytest.raises(CameraError, match=failed):
+        open_source("broken,fault=open").open()
+    for fault, message in (("read", failed), ("none", "a `CameraFrame`, not None"), ("axes", r"\(4, 4\), uint8")):
+        with pytest.raises(CameraError, match=message):
+            open_source(f"broken,fault={fault}").read()
+    with pytest.raises(CameraError, match=r"\(4, 4, 1\), float32"):
+        open_source("broken,fault=type").read()
+    with pytest.warns(UserWarning, match="broken was not closed"):
+        open_source("broken,fault=close").close()
+    with pytest.raises(CameraError, match="`no-camera` must make a `CameraSource`"):
+        open_source("no-camera")
 
 
 @pytest.mark.usefixtures("example")

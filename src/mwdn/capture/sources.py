@@ -3,10 +3,12 @@
 import re
 import warnings
 from collections.abc import Callable
+from functools import partial
 from importlib import import_module
 from typing import Any, NamedTuple
 
 from mwdn.arguments import check_options
+from mwdn.capture.plugin_camera import PluginCamera
 from mwdn.capture.source import CameraSource
 from mwdn.errors import CameraError, UnknownNameError
 from mwdn.io.toml import parse_value
@@ -67,7 +69,7 @@ def open_source(text: str, **options: Any) -> CameraSource:  # noqa: ANN401
     Raises:
         UnknownNameError: no such kind of camera, or option.
         ParameterError: an option has another type or is outside its range.
-        CameraError: the address is missing.
+        CameraError: the address is missing, or a plugin fails.
     """
     name, address, given = parse_source(text)
     if name not in SOURCES:
@@ -82,7 +84,8 @@ def open_source(text: str, **options: Any) -> CameraSource:  # noqa: ANN401
         create = getattr(import_module(f"mwdn.capture.{module}"), cls)
     options = {**given, **options}
     check_options(create, f"the camera '{name}'", options)
-    return create(address, **options) if kind.address else create(**options)
+    make = partial(create, *([address] if kind.address else []), **options)
+    return make() if name in SOURCES.own else PluginCamera(name, create, make)
 
 
 def parse_source(text: str) -> tuple[str, str, dict[str, Any]]:

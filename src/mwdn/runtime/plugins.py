@@ -122,14 +122,14 @@ def check_complete(entry: Callable[..., Any], what: str, options: Mapping[str, A
 
 
 @contextmanager
-def plugin_errors(name: str, of: type) -> Iterator[None]:
+def plugin_errors(name: str, of: Callable[..., Any]) -> Iterator[None]:
     """Turn an error of a plugin's own code into one that names the plugin.
 
     Errors of mwdn's own classes, and those of a lack of memory, are raised unchanged.
 
     Args:
         name: of the plugin, or of what is made with it.
-        of: class of the object whose code runs.
+        of: class or function whose code runs.
 
     Raises:
         PluginError: the plugin raised an error, or wanted to end the process.
