@@ -249,6 +249,15 @@ def test_a_full_disk_keeps_the_pairs_so_far(tmp_path, recipe):
     check_pairs(out, recipe, 7)
 
 
+def test_room_is_needed_for_the_wanted_photographs_only(tmp_path, monkeypatch):
+    """All of the folder were counted, so that a smaller `count`, the advice of the error, did not help."""
+    recipe = read_capture_recipe(write(tmp_path, pictures=20))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 0, 600_000))
+    with pytest.raises(ParameterError, match="20 pairs need"):
+        session(replace(recipe, pictures=replace(recipe.pictures, count=0)), tmp_path / "all.h5").run()
+    assert session(recipe, tmp_path / "pairs.h5").run() == 7
+
+
 def test_too_little_room_is_noticed_at_the_start(tmp_path, recipe, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**6, 10**6, 10**5))
     with pytest.raises(ParameterError, match=r"pairs need \d+ MB, but .* has 0 MB left"):

@@ -92,7 +92,8 @@ class Session:
             with open_captured(self.out) as pairs:
                 check_continued(pairs, self.recipe, self._first, self._screen, self._place)
                 return self._capture(pairs)
-        self._check_room(len(self._names([])) or 1)
+        photographs = len(self._names([]))
+        self._check_room(min(photographs, self.recipe.pictures.count or photographs))
         with create_captured(self.out, self._first, self.recipe.pictures.size, self._attributes()) as pairs:
             return self._capture(pairs)
 
