@@ -172,6 +172,32 @@ def test_lost_frames_disconnections_and_drift_lose_no_pair(tmp_path):
     check_pairs(out, recipe, 7)
 
 
+def test_a_camera_may_fail_between_the_frames_of_a_pattern(tmp_path, recipe):
+    """Only the first frame of each was tried again."""
+
+    class Failing(Rig):
+        last, failures = "", 0
+
+        def show(self, picture, **options):
+            self.reads = 0
+            return super().show(picture, **options)
+
+        def read(self):
+            self.reads += 1
+            if self.reads == recipe.session.skip + 2 and self.failures < 3:  # the second frame of the same picture
+                self.failures += 1
+                raise CameraError("rig was disconnected.")
+            return super().read()
+
+    out = tmp_path / "pairs.h5"
+    with pytest.warns(UserWarning, match="Opened again, attempt 1"):
+        assert session(recipe, out, Failing(recipe.rig, open_camera(recipe).screen)).run() == 7
+    with h5py.File(out) as file:
+        assert {len(group["measurement"]) for name, group in file["patterns"].items() if name != "grey"} == {
+            recipe.session.frames
+        }
+
+
 def test_a_camera_that_stays_away_ends_the_session_and_the_next_one_goes_on(tmp_path, recipe):
     class Leaving(Rig):
         reads = 0

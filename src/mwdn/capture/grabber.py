@@ -55,7 +55,18 @@ class Grabber:
         Raises:
             CameraError, ImageError: more than `attempts` failures.
         """
-        failures, skip = 0, self._skip
+        return self._grab(shown, settle_s, self._skip)
+
+    def another(self) -> CameraFrame:
+        """A further frame of the same picture: the next one.
+
+        Raises:
+            CameraError, ImageError: as for `after`.
+        """
+        return self._grab(0.0, 0.0, 0)
+
+    def _grab(self, shown: float, settle_s: float, skip: int) -> CameraFrame:
+        failures = 0
         while True:
             try:
                 for _ in range(skip):

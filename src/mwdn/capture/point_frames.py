@@ -56,6 +56,7 @@ class Shooting(NamedTuple):
         screen: pixels and centimetres of the display.
         frame_of: shows a picture and returns the first frame of it.
         grab: the first frame whose exposure began after a moment, in seconds since 1970.
+        series: so many frames of the same picture, of which the first is given.
         lamp: switches the lamp on or off, or has a person do it; returns when it is done.
     """
 
@@ -63,6 +64,7 @@ class Shooting(NamedTuple):
     screen: Screen
     frame_of: Callable[[Picture], CameraFrame]
     grab: Callable[[float], CameraFrame]
+    series: Callable[[CameraFrame, int], list[CameraFrame]]
     lamp: Callable[[bool], None]
 
     def expose(self, exposure_s: float) -> CameraFrame:
@@ -118,7 +120,7 @@ def record_point(pairs: SessionFile, table: PointTable, shooting: Shooting, *, u
 
 def _series(shooting: Shooting, first: CameraFrame, count: int) -> list[CameraFrame]:
     """The first frame and the next ones, an even number: photon transfer takes pairs."""
-    return [first, *(shooting.camera.read() for _ in range(count + count % 2 - 1))]
+    return shooting.series(first, count + count % 2)
 
 
 def _add(pairs: SessionFile, name: str, frames: list[CameraFrame], exposure_s: float) -> None:

@@ -147,6 +147,13 @@ class Session:
             check_like(frame, self._first, self.camera.name)
         return frame
 
+    def _series(self, first: CameraFrame, count: int) -> list[CameraFrame]:
+        """So many frames of one picture, of which the first is there."""
+        frames = [first, *(self._grabber.another() for _ in range(count - 1))]
+        for frame in frames:
+            check_like(frame, first, self.camera.name)
+        return frames
+
     # Calibration of camera and display
 
     def _calibrate(self, pairs: SessionFile) -> None:
@@ -160,14 +167,14 @@ class Session:
             size = self.recipe.pictures.size
             pairs.add_pattern("grey", frames, [displayed_light(grey(v, size), self._gamma) for v in levels])
         self._gamma = float(pairs.attributes["display_gamma"])
-        shooting = Shooting(self.camera, self._screen, self._frame_of, self._grabber.after, self._lamp)
+        shooting = Shooting(self.camera, self._screen, self._frame_of, self._grabber.after, self._series, self._lamp)
         usual_s = self.recipe.camera.exposure_s or (math.nan if self._first is None else self._first.exposure_s)
         record_point(pairs, self.recipe.point, shooting, usual_s=usual_s)
         for name in self.recipe.session.shown:
             if not pairs.has_pattern(name):
                 picture = pattern(name, self.recipe.pictures.size)
                 first = self._frame_of(put(picture, self._place, self._screen))
-                frames = [first, *(self.camera.read() for _ in range(self.recipe.session.frames - 1))]
+                frames = self._series(first, self.recipe.session.frames)
                 pairs.add_pattern(name, frames, [displayed_light(picture, self._gamma)] * len(frames))
 
     def _measured_gamma(self, levels: list[int], frames: list[CameraFrame]) -> float:
