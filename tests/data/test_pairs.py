@@ -318,3 +318,12 @@ def test_wrong_calls(tmp_path, generator, unchecked):
     with pytest.raises(ImageError, match="cannot be written"), create(tmp_path / "a.h5" / "b.h5"):
         pass
     assert [file.name for file in tmp_path.iterdir()] == ["a.h5"]
+
+
+def test_channels_that_are_not_last_are_refused(tmp_path):
+    """The width was taken for the channels, and `mwdn import pairs` copied the file."""
+    with h5py.File(tmp_path / "pairs.h5", "w") as file:
+        for name in ("measurement", "scene"):
+            file[name] = np.zeros((2, 3, 16, 20), np.float32)
+    with pytest.raises(ImageError, match="1 or 3 channels last"):
+        PairFile(tmp_path / "pairs.h5")

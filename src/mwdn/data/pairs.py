@@ -222,9 +222,11 @@ def _read_shapes(path: Path, file: Any) -> tuple[int, Shape, Shape]:  # noqa: AN
                 f"`{path}` must have the data set `{name}`, but has {names_in(path, file)}. `mwdn import` makes "
                 "a file of pairs."
             )
-        if data.ndim != 4 or data.dtype.str not in ("|u1", "<u2", ">u2", "<f4", ">f4"):
+        dtypes = ("|u1", "<u2", ">u2", "<f4", ">f4")
+        if data.ndim != 4 or data.shape[-1] not in (1, 3) or data.dtype.str not in dtypes:
             raise ImageError(
-                f"`{name}` of `{path}` ({data.shape}, {data.dtype}) must be (N, H, W, C) of uint8, uint16 or float32."
+                f"`{name}` of `{path}` ({data.shape}, {data.dtype}) must be (N, H, W, C) of uint8, uint16 or float32, "
+                "with 1 or 3 channels last."
             )
         shapes.append(data.shape)
     if shapes[0][0] != shapes[1][0]:
