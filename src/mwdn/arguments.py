@@ -42,7 +42,7 @@ def check_options(of: Callable[..., Any], what: str, options: Mapping[str, Any])
             if isinstance(value, str) and names:
                 raise UnknownNameError(option, value, names)
             raise ParameterError(f"`{option}` ({shown(value)}) of {what} must be {type_in_words(types[option])}.")
-        if isinstance(value, int | float) and abs(value) >= 2**63:
+        if isinstance(value, int | float) and not abs(value) < 2**63:
             raise ParameterError(f"`{option}` ({shown(value)}) of {what} must be finite, and below 2^63.")
 
 

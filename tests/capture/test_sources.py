@@ -46,6 +46,8 @@ def test_wrong_strings_are_named(tmp_path):
         open_source("rig:3")
     with pytest.raises(UnknownNameError, match="sed"):
         open_source("rig,sed=3")
+    with pytest.raises(ParameterError, match=r"`timeout_s` \(nan\)"):
+        open_source("folder:here,timeout_s=nan")
     with pytest.raises(ParameterError, match="loop"):
         open_source("replay:a.h5,loop=maybe")
     with pytest.raises(CameraError, match="not a folder"), open_source(f"folder:{tmp_path / 'none'}"):
