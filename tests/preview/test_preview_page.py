@@ -86,6 +86,30 @@ def test_keyboard_alone_is_enough(serve, tmp_path):
         assert not page.errors
 
 
+def test_a_slider_returns_to_what_the_method_chooses(serve, tmp_path):
+    server = serve(StoredCameras(Limits()), limits=Limits())
+    value = "document.querySelector('label[for=option-regularisation] output').textContent"
+    spoken = "document.getElementById('option-regularisation').ariaValueText"
+    with open_page(server.url, tmp_path / "profile") as page:
+        page.wait("document.querySelectorAll('#samples button').length === 3")
+        page.run("document.getElementById('trust').checked = false")
+        page.run("document.getElementById('method').value = 'wiener', document.getElementById('method').onchange()")
+        assert (page.run(value), page.run(spoken)) == ("automatic", "automatic")
+        page.tab_to("e.id === 'option-regularisation'")
+        page.press("ArrowRight", 39)
+        assert page.run(value) == page.run(spoken) != "automatic"
+        page.tab_to("e.id === 'option-regularisation-reset'", most=1)
+        assert page.run("document.activeElement.textContent") == "Reset to automatic"
+        assert page.run("document.activeElement.ariaLabel") == "Reset to automatic: regularisation"
+        page.press("Enter", 13, "\r")
+        assert (page.run(value), page.run(spoken)) == ("automatic", "automatic")
+        assert page.run("document.getElementById('option-regularisation-reset').hidden")
+        assert page.run("document.activeElement.id") == "option-regularisation"  # the focus is not lost
+        page.run("import('/static/sliders.js').then(sliders => { window.sent = sliders.readSliders(); })")
+        assert page.run("window.sent") == {}  # the server chooses
+        assert not page.errors
+
+
 def test_a_capture_is_not_reconstructed_through_the_camera_of_the_samples(serve, psf_file, capture, tmp_path):
     for name, data in (("psf.npy", psf_file), ("capture.npy", capture)):
         (tmp_path / name).write_bytes(data)
