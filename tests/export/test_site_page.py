@@ -17,6 +17,7 @@ import torch
 
 from browser import CHROMIUM, fetch_axe, open_page, violations
 from mwdn import Calibration, Camera, Reconstructor, read_frame, to_display, write_picture
+from mwdn.calibration.white_balance import apply_white_balance
 from mwdn.cli.app import main
 from mwdn.data.random import seeded
 from mwdn.errors import ExportError
@@ -188,6 +189,12 @@ def check_files(page, folder, own, other):
 def check_controls(page):
     page.run("document.querySelector('#samples button').click()")
     wait_for(page, "astronaut")
+    # The linear numbers have the white balance of the picture, as from `mwdn reconstruct`.
+    plain = np.load(io.BytesIO(saved(page, "save-npy")))
+    page.run("(b => { b.value = 'grey-world'; b.onchange(); })(document.getElementById('balance'))")
+    balanced = torch.from_numpy(np.load(io.BytesIO(saved(page, "save-npy")))).movedim(-1, 0)[None]
+    expected = apply_white_balance(torch.from_numpy(plain).movedim(-1, 0)[None], "grey-world", ())
+    torch.testing.assert_close(balanced, expected, rtol=1e-5, atol=1e-7)
     before = page.run("document.getElementById('scene').src")
     page.run("(slider => { slider.value = 1; slider.oninput(); })(document.getElementById('exposure'))")
     page.wait(f"document.getElementById('scene').src !== '{before}'")

@@ -276,7 +276,7 @@ byId("balance").onchange = () => enqueue(() => show());
 byId("beside").onchange = () => byId("stack").classList.toggle("beside", byId("beside").checked);
 byId("save-png").onclick = () => enqueue(() => save(".png", () => picture(8)));
 byId("save-png16").onclick = () => enqueue(() => save("-16bit.png", () => picture(16)));
-byId("save-npy").onclick = () => enqueue(() => save(".npy", async () => encodeNpy(shown.scene)));
+byId("save-npy").onclick = () => enqueue(() => save(".npy", async () => encodeNpy(balanced())));
 // A file that misses its zone must not replace the page.
 for (const name of ["dragover", "drop"]) document.addEventListener(name, (event) => event.preventDefault());
 enqueue(start).then(() => network && !byId("chosen").dataset.current && choose(captures[0]));
