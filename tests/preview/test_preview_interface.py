@@ -411,6 +411,34 @@ def test_other_addresses_need_a_token(serve):
         assert client.get("/healthz").status_code == 200
 
 
+def test_the_page_exchanges_its_token_for_a_cookie(serve):
+    server = serve(host="0.0.0.0", token="secret")
+    port = urlsplit(server.url).port
+    with httpx.Client(base_url=f"http://127.0.0.1:{port}") as client:
+        page = client.get("/?token=secret")
+        assert (page.status_code, page.headers["location"]) == (303, "/")
+        name = f"mwdn-preview-{port}"
+        cookie = page.headers["set-cookie"]
+        assert cookie.startswith(f"{name}=")
+        assert {"HttpOnly", "SameSite=strict", "Path=/"} <= set(cookie.split("; "))
+        assert "secret" not in cookie
+        assert client.get("/").status_code == 200
+        assert client.get("/cameras").status_code == 200
+        other = {"origin": f"http://127.0.0.1:{port + 1}"}  # to this page the browser gives the cookie, too
+        assert client.post("/inspect", headers=other).status_code == 401
+        assert client.get("/cameras", headers={"authorization": "Bearer wrong"}).status_code == 401
+    with httpx.Client(base_url=f"http://127.0.0.1:{port}") as client:
+        assert "set-cookie" not in client.get("/?token=wrong").headers
+        for wrong in ("", "secret", "ü"):
+            assert client.get("/cameras", headers={"cookie": f"{name}={wrong}".encode()}).status_code == 401
+        evil = {"origin": "http://evil.example"}
+        assert "set-cookie" not in client.get("/?token=secret", headers=evil).headers
+
+
+def test_a_server_without_a_token_sets_no_cookie(client):
+    assert "set-cookie" not in client.get("/?token=secret").headers
+
+
 def test_good_and_bad_at_once_and_a_client_that_stalls(client, capture):
     expected = np.load(io.BytesIO(order(client, capture).content))
     bad = list(hostile(capture).values())

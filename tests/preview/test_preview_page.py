@@ -6,9 +6,11 @@ import pytest
 
 from browser import CHROMIUM, open_page
 from mwdn.calibration import Calibration
+from mwdn.capture import open_source
 from mwdn.preview.cameras import StoredCameras
 from mwdn.preview.limits import Limits
-from preview_server import LIMITS
+from mwdn.preview.live import Live
+from preview_server import LIMITS, SIDE
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt install chromium")
 
@@ -83,6 +85,28 @@ def test_keyboard_alone_is_enough(serve, tmp_path):
         page.press("ArrowLeft", 37)
         assert page.run("document.getElementById('stack').style.getPropertyValue('--split')") == "49%"
         page.tab_to("e.id === 'save-png'")
+        assert not page.errors
+
+
+def test_the_token_leaves_the_address(serve, tmp_path):
+    rig = open_source(f"rig,height={SIDE},width={SIDE},fps=20,prepared=2")
+    live = Live(rig, Calibration(rig.psf), method="wiener", folder=tmp_path, device="cpu")
+    server = serve(StoredCameras(LIMITS), live=live, token="secret")
+    assert "token=secret" in server.url
+    with open_page(server.url, tmp_path / "profile") as page:
+        for _ in range(2):
+            page.wait("document.querySelectorAll('#samples button').length === 3")
+            assert page.run("location.pathname + location.search") == "/"
+            assert page.run("document.cookie") == ""  # scripts cannot read it
+            page.run("window.isOld = true")
+            page.command("Page.reload")
+            page.wait("!window.isOld && document.readyState === 'complete'")
+        visited = page.command("Page.getNavigationHistory")["entries"]
+        assert not [entry for entry in visited if "secret" in entry["url"]]
+        page.wait("document.getElementById('live')?.hidden === false")
+        page.run("document.getElementById('live-start').click()")
+        page.wait("Number(document.getElementById('live-state').dataset.count) > 0")  # by a WebSocket
+        page.run("document.getElementById('live-start').click()")
         assert not page.errors
 
 

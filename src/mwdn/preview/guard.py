@@ -13,6 +13,7 @@ from starlette.responses import JSONResponse
 from mwdn.errors import MwdnError
 from mwdn.preview.limits import LOG, Limits, RefusedError
 from mwdn.preview.metrics import Metrics
+from mwdn.preview.page_cookie import has_cookie, without_token_in_address
 from mwdn.runtime.web_access import is_allowed
 
 HEADERS = {
@@ -57,8 +58,8 @@ class Guard:
         headers, path = Headers(scope=scope), scope["path"]
         scheme, _, given = headers.get("authorization", "").partition(" ")
         given = given if scheme.lower() == "bearer" else ""
-        given = given or parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
-        if path in OPEN or path.startswith("/static/"):
+        given = given or _token_in_address(scope)
+        if path in OPEN or path.startswith("/static/") or (not given and has_cookie(scope, self.token)):
             given = self.token
         return is_allowed(headers, given, self.token, any_host=self.any_host)
 
@@ -93,6 +94,8 @@ class Guard:
         try:
             refused = self._refusal(scope)
             app = self.app if refused is None else error_response(refused)
+            if refused is None and self._is_page_with_token(scope):
+                app = without_token_in_address(scope, self.token)
             await app(scope, counted, with_headers)
         finally:
             route = getattr(scope.get("route"), "path", "other")
@@ -101,15 +104,27 @@ class Guard:
             ms = round(1000 * (time.perf_counter() - start), 1)
             log("request", method=_verb(scope["method"]), route=route, status=status, ms=ms, bytes=received)
 
+    def _is_page_with_token(self, scope: Any) -> bool:  # noqa: ANN401
+        given = _token_in_address(scope) if self.token and scope["path"] == "/" else ""
+        return bool(given) and is_allowed(Headers(scope=scope), given, self.token, any_host=self.any_host)
+
     def _refusal(self, scope: Any) -> RefusedError | None:  # noqa: ANN401
         if not self._may(scope):
             if self.token:
-                return RefusedError(401, "This server needs its token: the header `Authorization: Bearer TOKEN`.")
+                return RefusedError(
+                    401,
+                    "This server needs its token: the header `Authorization: Bearer TOKEN`. In a browser, open the "
+                    "address that `mwdn preview` printed, and allow its cookie.",
+                )
             return RefusedError(403, "Requests of other sites' pages are not served. Open the page by its own address.")
         length = Headers(scope=scope).get("content-length", "0")
         if length.isdigit() and int(length[:20]) > self.limits.upload_bytes:
             return _too_large(self.limits.upload_bytes)
         return None
+
+
+def _token_in_address(scope: Any) -> str:  # noqa: ANN401
+    return parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
 
 
 def _verb(method: str) -> str:

@@ -118,7 +118,7 @@ async function drawNewest() {
 }
 
 function connect() {
-  const address = new URL(`live${location.search}`, location.href);
+  const address = new URL("live", location.href);
   address.protocol = location.protocol === "https:" ? "wss:" : "ws:";
   const own = (socket = new WebSocket(address));
   own.binaryType = "arraybuffer";

@@ -324,5 +324,4 @@ byId("inspect").onclick = () => guarded(inspect);
 for (const format of Object.keys(SAVED)) byId(`save-${format}`).onclick = () => guarded(() => save(format));
 // A file that misses its zone must not replace the page.
 for (const name of ["dragover", "drop"]) document.addEventListener(name, (event) => event.preventDefault());
-byId("openapi").href += location.search; // the token
 guarded(start);

@@ -1,14 +1,11 @@
-// Requests to the HTTP interface, with the token of this page's address if it has one.
-
-const token = new URLSearchParams(location.search).get("token");
-const headers = token ? { Authorization: `Bearer ${token}` } : {};
+// Requests to the HTTP interface. If the server needs a token, the browser sends the cookie that stands for it.
 
 export class RequestError extends Error {}
 
 async function ask(path, options = {}) {
   let response;
   try {
-    response = await fetch(path, { headers, ...options });
+    response = await fetch(path, options);
   } catch (error) {
     if (error.name === "AbortError") throw error;
     throw new RequestError("The server does not answer. Is it running?");
