@@ -10,7 +10,7 @@ from PIL import Image
 from mwdn import read_frame
 from mwdn.calibration import Calibration, PsfFormat
 from mwdn.errors import ImageError, ShapeError
-from mwdn.inference.capture_pipeline import CapturePipeline, PreparedCapture, refuse_infinite
+from mwdn.inference.capture_pipeline import CapturePipeline, PreparedCapture, PsfFile, refuse_infinite
 from mwdn.inference.reconstructor import Reconstructor
 
 SIZE = 32, 40
@@ -32,7 +32,8 @@ def turned(file, orientation):
 
 
 def make(psf, file=None, method="wiener", **options):
-    return CapturePipeline(Reconstructor(method, Calibration(psf, **options), device="cpu"), file)
+    psf_file = PsfFile() if file is None else PsfFile.read(file)
+    return CapturePipeline(Reconstructor(method, Calibration(psf, **options), device="cpu"), psf_file)
 
 
 def test_steps_give_what_the_reconstructor_returns(psf, capture):

@@ -13,7 +13,8 @@ from mwdn.capture.sources import parse_source
 from mwdn.cli.camera import CameraOptions
 from mwdn.cli.terminal import say
 from mwdn.errors import ParameterError
-from mwdn.preview.cameras import StoredCameras
+from mwdn.inference.capture_pipeline import PsfFile
+from mwdn.preview.cameras import LIVE_CAMERA, StoredCameras
 from mwdn.preview.limits import Limits
 from mwdn.preview.live import Live
 from mwdn.preview.server import log_to_stderr, make_server
@@ -55,12 +56,14 @@ def preview(  # noqa: PLR0913
         log: print each request to standard error, one JSON object a line.
     """
     given: dict[str, Calibration] = {}
+    psf_files: dict[str, PsfFile] = {}
     if camera.psf is not None:
         given[OWN] = camera.load()
+        psf_files = dict.fromkeys((OWN, LIVE_CAMERA), PsfFile.read(camera.psf_file))
     if out.exists() and not out.is_dir():
         raise ParameterError(f"`{out}` must be a folder, but is a file. Choose another one: `out`.")
     limits = Limits()
-    cameras = StoredCameras(limits, out / "cameras", given)
+    cameras = StoredCameras(limits, out / "cameras", given, psf_files)
     token = token or ("" if host in LOOPBACK else secrets.token_urlsafe(16))
     watched = None if live is None else _open_live(live, given.get(OWN), out / "recordings", device)
     server = make_server(cameras, limits, host=host, port=port, token=token, device=device, live=watched)

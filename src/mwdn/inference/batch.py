@@ -15,7 +15,7 @@ from mwdn.data.captures import read_capture
 from mwdn.diagnosis import Verdict
 from mwdn.diagnosis.trust import Trust
 from mwdn.errors import ImageError, MwdnError, ShapeError, without_traceback
-from mwdn.inference.capture_pipeline import CapturePipeline, PreparedCapture, refuse_infinite
+from mwdn.inference.capture_pipeline import CapturePipeline, PreparedCapture, PsfFile, refuse_infinite
 from mwdn.inference.origin import origin as origin_hash
 from mwdn.inference.origin import settings_hash
 from mwdn.inference.outputs import (
@@ -237,7 +237,7 @@ class Batch:
 
     @cached_property
     def _pipeline(self) -> CapturePipeline:
-        return CapturePipeline(self.reconstruct, self.psf_file)
+        return CapturePipeline(self.reconstruct, PsfFile() if self.psf_file is None else PsfFile.read(self.psf_file))
 
     @cached_property
     def _settings_hash(self) -> str:

@@ -33,6 +33,24 @@ class PreparedCapture:
     pose: Pose | None = None
 
 
+@dataclass(frozen=True)
+class PsfFile:
+    """What the file of a PSF tells besides its pixels; by default nothing is known.
+
+    Args:
+        is_for_viewing: it is a JPEG or WebP, and so probably gamma-coded.
+        orientation: of EXIF, which is compared with the captures'.
+    """
+
+    is_for_viewing: bool = False
+    orientation: int | None = None
+
+    @classmethod
+    def read(cls, file: Path | bytes) -> "PsfFile":
+        """From a file, or its content; reads a few hundred bytes, and never fails."""
+        return cls(is_for_viewing(file), orientation(file))
+
+
 class CapturePipeline:
     """From the captures of one camera to scenes and verdicts.
 
@@ -40,19 +58,17 @@ class CapturePipeline:
 
     Args:
         reconstruct: the method and the camera.
-        psf_file: file of the PSF, or its content. A JPEG or WebP is probably gamma-coded; its EXIF orientation is
-            compared with the captures'.
+        psf_file: of the camera.
 
     Attributes:
         reconstruct: as given.
         calibration: of the camera.
     """
 
-    def __init__(self, reconstruct: Reconstructor, psf_file: Path | bytes | None = None) -> None:
+    def __init__(self, reconstruct: Reconstructor, psf_file: PsfFile = PsfFile()) -> None:
         self.reconstruct, self.calibration = reconstruct, reconstruct.calibration
-        for_viewing = psf_file is not None and is_for_viewing(psf_file)
-        self._psf_gamma = PsfGammaTest(self.calibration, for_viewing)
-        self._psf_turn = None if psf_file is None else orientation(psf_file)
+        self._psf_gamma = PsfGammaTest(self.calibration, psf_file.is_for_viewing)
+        self._psf_turn = psf_file.orientation
 
     def check(self, measurement: Measurement) -> None:
         """Check that a measurement fits the camera.

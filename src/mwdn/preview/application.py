@@ -18,6 +18,7 @@ from starlette.staticfiles import StaticFiles
 
 from mwdn.calibration import Calibration
 from mwdn.errors import MwdnError, ParameterError
+from mwdn.inference.capture_pipeline import PsfFile
 from mwdn.io.pictures import PICTURES
 from mwdn.preview.cameras import CAMERA_OPTIONS, StoredCameras, checked_camera
 from mwdn.preview.guard import Guard, failed, log
@@ -216,7 +217,7 @@ class Preview:
 
     def _submit(self, form: Form) -> Job:
         """Check a form as far as that is fast, and queue its reconstruction."""
-        capture, read = form.file("capture"), self._calibration(form)
+        capture, read, named = form.file("capture"), self._calibration(form), form.texts.get("camera")
         method = form.texts.get("method") or "universal-small"
         trust = form.flag("trust")
         order = Order(
@@ -228,7 +229,7 @@ class Preview:
             trust=trust is not False,
             room_light=form.flag("room_light"),
             ambient=form.files.get("ambient", b""),
-            psf_file=form.files.get("psf", b""),
+            psf_file=partial(self.cameras.psf_file, named) if named else partial(PsfFile.read, form.file("psf")),
         )
         job = self.jobs.submit(partial(self.reconstructions.run, order=order), size=sum(map(len, form.files.values())))
         job.when_ended(lambda: self._count(job, method))

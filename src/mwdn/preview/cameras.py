@@ -12,6 +12,7 @@ from typing import Any
 
 from mwdn.calibration import Calibration, FrameFormat, PsfFormat
 from mwdn.errors import ImageError, MwdnError, ParameterError, UnknownNameError
+from mwdn.inference.capture_pipeline import PsfFile
 from mwdn.io.arrays import at_most_pixels
 from mwdn.io.files import atomic_write, is_full, write_json
 from mwdn.io.reading import read_bytes, read_json, unexpected_content
@@ -37,12 +38,20 @@ class StoredCameras:
         limits: of the server.
         folder: where stored calibrations are kept; in memory unless given.
         given: calibrations of the command line.
+        psf_files: of those of them whose PSF was read from a file.
     """
 
-    def __init__(self, limits: Limits, folder: Path | None = None, given: dict[str, Calibration] | None = None) -> None:
+    def __init__(
+        self,
+        limits: Limits,
+        folder: Path | None = None,
+        given: dict[str, Calibration] | None = None,
+        psf_files: dict[str, PsfFile] | None = None,
+    ) -> None:
         self.limits, self.folder, self.given = limits, folder, dict(given or {})
         self._lock = threading.Lock()
         self._stored: dict[str, Calibration] = {}
+        self._given_files, self._stored_files = dict(psf_files or {}), dict[str, PsfFile]()
         self._recent: OrderedDict[str, Calibration] = OrderedDict()
         if folder is not None and folder.is_dir():
             for entry in sorted(folder.glob("*.json")):
@@ -57,6 +66,7 @@ class StoredCameras:
             name, options = str(content["name"]), content["options"]
             psf = read_bytes(entry.with_suffix(".psf"), most=self.limits.upload_bytes)
             self._stored[_checked_name(name)] = self.calibrate(psf, options)
+            self._stored_files[name] = PsfFile.read(psf)
 
     def list(self) -> list[dict[str, Any]]:
         """For JSON: name, kind, size and PSF hash of each."""
@@ -90,6 +100,11 @@ class StoredCameras:
         if name not in known:
             raise RefusedError(404, str(UnknownNameError("camera", name, [*known, SAMPLE_CAMERA])))
         return known[name]
+
+    def psf_file(self, name: str) -> PsfFile:
+        """What the PSF's file of a calibration tells besides its pixels; nothing if the PSF is no file's."""
+        with self._lock:
+            return {**self._stored_files, **self._given_files}.get(name, PsfFile())
 
     def calibrate(self, psf: bytes, options: dict[str, Any]) -> Calibration:
         """A calibration from the file of a PSF.
@@ -140,7 +155,7 @@ class StoredCameras:
                 )
             if self.folder is not None:
                 self._write(name, psf, options)
-            self._stored[name] = calibration
+            self._stored[name], self._stored_files[name] = calibration, PsfFile.read(psf)
         return calibration
 
     def _write(self, name: str, psf: bytes, options: dict[str, Any]) -> None:
@@ -164,7 +179,7 @@ class StoredCameras:
         with self._lock:
             if name not in self._stored:
                 raise RefusedError(409, f"`name` ({name}) is of the server itself and cannot be removed.")
-            del self._stored[name]
+            del self._stored[name], self._stored_files[name]
             if self.folder is not None:
                 entry = self._entry(name)
                 entry.unlink(missing_ok=True)

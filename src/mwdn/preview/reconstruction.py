@@ -11,7 +11,7 @@ from typing import Any
 from mwdn.calibration import Calibration
 from mwdn.diagnosis.trust import Trust, check_size
 from mwdn.diagnosis.verdict import Verdict
-from mwdn.inference.capture_pipeline import CapturePipeline, refuse_infinite
+from mwdn.inference.capture_pipeline import CapturePipeline, PsfFile, refuse_infinite
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.preview.cameras import check_pixels, read_upload
 from mwdn.preview.jobs import Job
@@ -36,7 +36,7 @@ class Order:
         trust: check the picture, which takes a second or two.
         room_light: as for `Reconstructor`.
         ambient: the file of a frame of the room's light alone, taken as the capture; empty if there is none.
-        psf_file: content of the PSF's file; empty if the camera is known to the server.
+        psf_file: reads what its PSF's file tells besides its pixels.
     """
 
     capture: bytes
@@ -47,7 +47,7 @@ class Order:
     trust: bool = True
     room_light: bool | None = None
     ambient: bytes = b""
-    psf_file: bytes = b""
+    psf_file: Callable[[], PsfFile] = PsfFile
 
 
 class Reconstructions:
@@ -72,7 +72,8 @@ class Reconstructions:
         check_size(calibration.psf)
         ambient = hashlib.sha256(order.ambient).digest()
         options = tuple(sorted(order.options.items()))
-        key = (id(calibration), bool(order.psf_file), order.method, options, order.align, order.room_light, ambient)
+        psf_file = order.psf_file()
+        key = (id(calibration), psf_file, order.method, options, order.align, order.room_light, ambient)
         with self._lock:
             if key in self._prepared:
                 self._prepared.move_to_end(key)
@@ -82,7 +83,7 @@ class Reconstructions:
         made = Reconstructor(order.method, lit, **how, **order.options)
         with self._lock:
             # The calibration is kept, so that its id stays its own.
-            self._prepared[key] = calibration, CapturePipeline(made, order.psf_file or None)
+            self._prepared[key] = calibration, CapturePipeline(made, psf_file)
             while len(self._prepared) > KEPT:
                 self._prepared.popitem(last=False)
             return self._prepared[key][1]
