@@ -52,6 +52,19 @@ def test_uploaded_psf_and_options(client, capture, psf_file):
     assert variations[0] < variations[1]
 
 
+def test_a_client_may_leave_a_number_to_the_method(client, capture):
+    """`/methods` says that the regularisation is null by default."""
+    fields = {"camera": "camera", "method": "wiener", "trust": "false", "format": "npy"}
+    answers = [
+        client.post("/reconstruct", files={"capture": capture}, data={**fields, "options": options})
+        for options in ("{}", '{"regularisation": null}')
+    ]
+    assert [answer.status_code for answer in answers] == [200, 200]
+    assert answers[0].content == answers[1].content
+    none = {**fields, "method": "admm", "options": '{"iterations": null}'}
+    assert client.post("/reconstruct", files={"capture": capture}, data=none).status_code == 422
+
+
 @pytest.mark.parametrize(
     ("format", "start"), [("png", b"\x89PNG"), ("png16", b"\x89PNG"), ("tiff", b"II*\0"), ("npy", b"\x93NUMPY")]
 )
@@ -111,7 +124,7 @@ def test_hostile_captures_are_refused(client, capture, kind):
         ({"camera": "../../etc/passwd"}, 404, "passwd"),
         ({"options": "[1]"}, 422, "options"),
         ({"options": '{"iterations": 3}'}, 422, "iterations"),
-        ({"options": '{"regularisation": NaN}'}, 422, "regularisation"),
+        ({"options": '{"regularisation": NaN}'}, 422, "`options` must be JSON: NaN"),
         ({"options": f'{{"regularisation": {400 * "9"}}}'}, 422, "regularisation"),
         ({"options": "[" * 5000}, 422, "options"),
         ({"trust": "perhaps"}, 422, "trust"),

@@ -1,5 +1,6 @@
 """Methods that a client may name: solvers with their numbers, and the bundled networks. No path is a method here."""
 
+from types import NoneType
 from typing import Any, get_args, get_origin
 
 from mwdn.arguments import type_in_words
@@ -57,7 +58,12 @@ def checked_options(name: str, options: dict[str, Any]) -> dict[str, Any]:
     for option, value in options.items():
         if option not in known:
             raise UnknownNameError(f"option of method '{name}'", option, known)
+        if value is None and NoneType in _kinds(known[option]):
+            continue  # the method chooses
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise ParameterError(f"`{option}` ({value!r}) of the method must be a number.")
         check_numbers(value, option)
-    return {option: value if int in _kinds(known[option]) else float(value) for option, value in options.items()}
+    return {
+        option: value if value is None or int in _kinds(known[option]) else float(value)
+        for option, value in options.items()
+    }

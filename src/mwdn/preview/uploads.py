@@ -66,12 +66,16 @@ def parse_object(text: str, name: str) -> dict[str, Any]:
         ParameterError: it is none.
     """
     try:
-        value = json.loads(text, parse_constant=lambda word: None)
+        value = json.loads(text, parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
         raise ParameterError(f"`{name}` must be JSON: {reason(error)}.") from None
     if not isinstance(value, dict):
         raise ParameterError(f'`{name}` must be a JSON object: `{{"bin": 2}}`.')
     return value
+
+
+def _refuse_constant(word: str) -> None:
+    raise ValueError(f"{word} is no number of JSON")
 
 
 def parse_number(text: str | None, name: str, default: float) -> float:
