@@ -186,8 +186,11 @@ def test_verdicts_are_not_those_of_the_picture_before(serve, psf, capture, tmp_p
 def test_hints_name_the_controls_of_the_page(serve, tmp_path):
     with open_page(serve().url, tmp_path / "profile") as page:
         page.wait("document.querySelectorAll('#samples button').length === 3")
-        for hint in ("--bin 2 --psf-bin 1", "bin=2, psf_bin=1"):
+        fields = 'calibration={"bin": 2, "psf_bin": 1}'
+        for hint in ("--bin 2 --psf-bin 1", "bin=2, psf_bin=1", fields):
             words = page.run(f"import('/static/hints.js').then(hints => hints.pageWords('Try `{hint}`.'))")
             assert words == "Try “Bin”: 2, “Bin of the PSF”: 1."
+        unknown = 'Keep `calibration={"upside_down": true}`, `{"x`.'
+        assert page.run(f"import('/static/hints.js').then(hints => hints.pageWords('{unknown}'))") == unknown
         for control in ("bin", "psf-bin"):
             assert page.run(f"document.getElementById('{control}').labels[0].textContent").startswith("Bin")

@@ -228,7 +228,7 @@ def check_pixels(what: str, size: tuple[int, int], limits: Limits) -> None:
         raise RefusedError(
             413,
             f"`{what}` ({height} x {width}) has more than {limits.pixels:,} pixels, the server's limit. Bin or crop "
-            'it: `{"bin": 4}`.',
+            'it: `calibration={"bin": 4}`.',
         )
 
 

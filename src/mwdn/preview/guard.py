@@ -11,6 +11,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 
 from mwdn.errors import MwdnError
+from mwdn.preview.as_fields import as_fields
 from mwdn.preview.limits import LOG, Limits, RefusedError
 from mwdn.preview.metrics import Metrics
 from mwdn.preview.page_cookie import has_cookie, without_token_in_address
@@ -140,7 +141,7 @@ def error_response(error: Exception) -> JSONResponse:
     """An error as JSON: ``{"error": "..."}``."""
     status = error.status if isinstance(error, RefusedError) else 422
     headers = {"Retry-After": "2"} if status == 503 else {"WWW-Authenticate": "Bearer"} if status == 401 else None
-    return JSONResponse({"error": str(error)}, status, headers)
+    return JSONResponse({"error": as_fields(str(error))}, status, headers)
 
 
 async def failed(_: Request, error: Exception) -> JSONResponse:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from mwdn.errors import MwdnError, without_traceback
+from mwdn.preview.as_fields import as_fields
 from mwdn.preview.limits import Limits, RefusedError, for_client
 from mwdn.preview.result import Result
 
@@ -81,7 +82,7 @@ class Job:
         """For JSON."""
         content: dict[str, Any] = {"id": self.id, "state": self.state, "progress": round(self.progress, 3)}
         if self.error is not None:
-            content["error"] = str(self.error)
+            content["error"] = as_fields(str(self.error))
         if self.result is not None:
             content["report"] = self.result.report
         return content

@@ -21,7 +21,7 @@ const NAMES = {
   white_balance: "White balance",
 };
 const CONTROLS = new Set(["align", "ambient", "bin", "bit_depth", "gamma", "method", "mosaic", "psf_bin", "psf_gamma", "psf_orientation", "white_balance"]);
-const VALUES = { FILE: "a frame of it", srgb: "sRGB", None: "none", True: "", true: "" };
+const VALUES = { FILE: "a frame of it", "@FILE": "a frame of it", srgb: "sRGB", None: "none", True: "", true: "" };
 
 function control(name, value = "") {
   const key = name.replaceAll("-", "_");
@@ -41,10 +41,20 @@ function controls(line, between, equals) {
   return words.includes(null) ? null : words.join(", ");
 }
 
+// Likewise, of `{"bin": 2, "psf_bin": 1}`.
+function fromJson(json) {
+  try {
+    const words = Object.entries(JSON.parse(json)).map(([name, value]) => control(name, String(value)));
+    return words.includes(null) ? null : words.join(", ");
+  } catch {
+    return null;
+  }
+}
+
 // "Try `--gamma srgb`." becomes "Try “Encoding of the capture”: sRGB."
 export function pageWords(text) {
   return text
     .replace(/`--([a-z][^`]*)`/g, (all, line) => controls(line, " --", " ") ?? all)
     .replace(/`([a-z_]+=[^`]*)`/g, (all, line) => controls(line, /, (?=[a-z_]+=)/, "=") ?? all)
-    .replace(/`\{"([a-z_]+)": ?([^`}]*)\}`/g, (all, name, value) => control(name, value) ?? all);
+    .replace(/`(?:calibration=|options=)?(\{"[^`]*\})`/g, (all, json) => fromJson(json) ?? all);
 }

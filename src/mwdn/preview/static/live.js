@@ -1,5 +1,6 @@
 // The live camera: one message a frame, with both pictures; a page that is slow gets fewer frames, not older ones.
 import { clockOffset, compareClocks, tellClock } from "./clock.js";
+import { pageWords } from "./hints.js";
 import { setUpSnapshots } from "./snapshots.js";
 
 const byId = (id) => document.getElementById(id);
@@ -20,7 +21,7 @@ let next = null;
 let retry = 0; // timer of the next attempt to connect
 
 function show(text, wrong = false) {
-  byId("live-state").textContent = text;
+  byId("live-state").textContent = pageWords(text);
   byId("live-state").classList.toggle("wrong", wrong);
 }
 
