@@ -52,6 +52,16 @@ def test_live_picture_is_started_used_and_stopped(serve, tmp_path):
             more_frames(page, 1)
         assert live.pictures.settings.method == "admm"
 
+        # Options and look that another page has chosen: else the next change on this page would undo them.
+        live.control({"options": {"iterations": 7}, "stops": 1.0, "white_balance": "grey-world"})
+        page.wait("document.getElementById('option-iterations').value === '7'")
+        assert page.run("document.getElementById('exposure-value').textContent") == "1.0"
+        assert page.run("document.getElementById('balance').value") == "grey-world"
+        choose(page, "balance", "none")
+        while live.pictures.settings.look.white_balance is not None:
+            more_frames(page, 1)
+        assert live.pictures.settings.options == {"iterations": 7}
+
         choose(page, "live-exposure", "20")
         while rig.exposure_s != 0.02:
             more_frames(page, 1)

@@ -259,6 +259,8 @@ class Live:
             "options": settings.options,
             "align": settings.align,
             "room_light": settings.room_light,
+            "stops": settings.look.exposure,
+            "white_balance": settings.look.white_balance_text,
             "ambient": picture.has_ambient,
         }
 

@@ -50,6 +50,13 @@ class Look:
         if isinstance(self.white_balance, tuple):
             check_white_balance(self.white_balance, (1.0,) * 3)  # gains; for the camera see `balance`
 
+    @property
+    def white_balance_text(self) -> str:
+        """The white balance as a request names it."""
+        if isinstance(self.white_balance, tuple):
+            return ",".join(map(str, self.white_balance))
+        return self.white_balance or "none"
+
     def balance(self, scene: Scene, light: tuple[float, ...], own: WhiteBalance | None) -> Scene:
         """Apply the white balance to a scene, of a camera with this light of the point source and this own balance.
 

@@ -7,11 +7,12 @@ const byId = (id) => document.getElementById(id);
 const controls = ["live-record", "live-snapshot", "live-exposure", "live-gain"].map(byId);
 const wishes = {}; // of this page, for a server that was started again
 const PATIENCE_MS = 3000; // until the server has followed a wish; then its settings are shown again
+const SHARED = ["method", "options", "align", "room_light", "stops", "white_balance"]; // by all pages
 const READABLE_MS = 250; // between changes of the numbers: those of each frame cannot be read, and cost a layout
 let toldAt = -Infinity;
 let refused = "";
 let wishedAt = -Infinity;
-let followed = "";
+let followed = ""; // the shared settings that the controls of this page show
 let page = null;
 const shown = { count: 0, latency_ms: 0 };
 let socket = null;
@@ -29,9 +30,12 @@ function send(message) {
   if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
 }
 
+const shared = (settings) => Object.fromEntries(SHARED.map((name) => [name, settings[name]]));
+
 // A setting: kept, and sent again when the connection comes back.
 export function wish(message) {
   Object.assign(wishes, message);
+  if ("method" in message) followed = JSON.stringify(shared(message));
   wishedAt = performance.now();
   send(message);
 }
@@ -75,13 +79,14 @@ function tellInWords(said) {
 }
 
 // Settings are shared: another page may have changed them.
-function showSettings({ method, options, align, room_light }) {
-  const now = JSON.stringify([method, options, align, room_light]);
-  const isMine = method === wishes.method && align === wishes.align && room_light === wishes.room_light;
-  if (isMine) wishedAt = -Infinity;
+function showSettings(said) {
+  const settings = shared(said);
+  const now = JSON.stringify(settings);
+  if (now === followed) wishedAt = -Infinity;
   if (now === followed || performance.now() - wishedAt < PATIENCE_MS) return;
   followed = now;
-  if (!isMine) page.follow({ method, options, align, room_light });
+  if ("method" in wishes) Object.assign(wishes, settings);
+  page.follow(settings);
 }
 
 async function draw(data) {

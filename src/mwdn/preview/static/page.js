@@ -246,12 +246,19 @@ async function removeCamera() {
 }
 
 // The settings of the live picture, which another page has changed.
-function followLive({ method, options, align, room_light }) {
+function followLive({ method, options, align, room_light, stops, white_balance }) {
   byId("method").value = method;
   byId("align").checked = align === true;
   byId("room-light").value = room_light === null ? "" : String(room_light);
   byId("ambient-zone").hidden = true;
+  showExposure(stops);
+  byId("balance").value = white_balance;
   chooseMethod(options);
+}
+
+function showExposure(stops) {
+  byId("exposure").value = stops;
+  byId("exposure-value").textContent = Number(stops).toFixed(1);
 }
 
 function chooseMethod(values = {}) {
@@ -309,7 +316,7 @@ for (const id of ["bin", "psf-bin", "bit-depth", "mosaic", "gamma", "psf-gamma",
 }
 for (const id of ["align", "trust"]) byId(id).onchange = () => soon(reconstruct, 0);
 byId("exposure").oninput = () => {
-  byId("exposure-value").textContent = Number(byId("exposure").value).toFixed(1);
+  showExposure(byId("exposure").value);
   soon(showPictures);
 };
 byId("balance").onchange = () => soon(showPictures, 0);
