@@ -192,5 +192,12 @@ def test_hints_name_the_controls_of_the_page(serve, tmp_path):
             assert words == "Try “Bin”: 2, “Bin of the PSF”: 1."
         unknown = 'Keep `calibration={"upside_down": true}`, `{"x`.'
         assert page.run(f"import('/static/hints.js').then(hints => hints.pageWords('{unknown}'))") == unknown
+        page.run(
+            "import('/static/verdicts.js').then(verdicts => verdicts.showVerdicts({ summary: '', verdicts: ["
+            "{ subject: 'psf', topic: 'psf-gamma', state: 'good', text: '' }, "
+            "{ subject: 'capture', topic: 'exif', state: 'good', text: '' }] }))"
+        )
+        titles = page.run("[...document.querySelectorAll('#verdicts strong')].map(title => title.textContent.trim())")
+        assert titles == ["PSF, gamma: good.", "Capture, EXIF orientation: good."]
         for control in ("bin", "psf-bin"):
             assert page.run(f"document.getElementById('{control}').labels[0].textContent").startswith("Bin")

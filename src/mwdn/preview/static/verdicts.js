@@ -4,9 +4,10 @@ import { pageWords } from "./hints.js";
 
 const WORDS = { good: "good", doubt: "doubtful", unknown: "cannot tell", bad: "bad", weak: "weak" };
 
-// "psf, little explained" as a title.
+// "psf, psf-gamma" as a title: "PSF, gamma".
 function titled(text) {
-  const words = text.replace("psf", "PSF").replace("little-", "detail ").replaceAll("-", " ");
+  const words = text.replace(/^psf, psf-/, "psf, ").replace(/^psf/, "PSF").replace("exif", "EXIF orientation")
+    .replace("little-", "detail ").replaceAll("-", " ");
   return words[0].toUpperCase() + words.slice(1);
 }
 
