@@ -149,6 +149,11 @@ def test_a_capture_is_not_reconstructed_through_the_camera_of_the_samples(serve,
         page.drop("#psf", tmp_path / "psf.npy")
         page.wait("document.getElementById('state').textContent.startsWith('universal-small: 48')")
         assert not page.run("document.getElementById('bin').matches(':disabled')")
+        for change in ("align", "room-light"):  # the pictures of all methods have been made without it
+            page.run("document.getElementById('compare').click()")
+            page.wait("document.querySelectorAll('#grid figure').length > 0")
+            page.run(f"document.getElementById('{change}').onchange()")
+            assert page.run("document.getElementById('grid-section').hidden")
         page.run("document.getElementById('compare').click()")
         page.wait("document.querySelectorAll('#grid figure').length > 0")
         page.drop("#capture", (tmp_path / "capture.npy").rename(tmp_path / "another.npy"))

@@ -189,11 +189,15 @@ async function take(what, file) {
   return true;
 }
 
+function hideMethods() {
+  comparing?.abort();
+  byId("grid-section").hidden = true;
+}
+
 // Pictures of other methods, and the verdict on a PSF, of what was chosen before.
 function hideComparison() {
-  comparing?.abort();
+  hideMethods();
   inspected += 1;
-  byId("grid-section").hidden = true;
   byId("headline").textContent = "";
   byId("findings").replaceChildren();
 }
@@ -301,6 +305,7 @@ byId("method").onchange = () => {
 };
 byId("room-light").onchange = () => {
   byId("ambient-zone").hidden = byId("room-light").value !== "frame";
+  hideMethods();
   soon(reconstruct, 0);
 };
 byId("camera").onchange = () => {
@@ -314,7 +319,11 @@ for (const id of ["bin", "psf-bin", "bit-depth", "mosaic", "gamma", "psf-gamma",
     soon(reconstruct, 0);
   };
 }
-for (const id of ["align", "trust"]) byId(id).onchange = () => soon(reconstruct, 0);
+byId("align").onchange = () => {
+  hideMethods();
+  soon(reconstruct, 0);
+};
+byId("trust").onchange = () => soon(reconstruct, 0);
 byId("exposure").oninput = () => {
   showExposure(byId("exposure").value);
   soon(showPictures);
