@@ -3,6 +3,10 @@ import { readSliders } from "./sliders.js";
 
 const byId = (id) => document.getElementById(id);
 export const UPLOAD = ""; // the camera of the PSF that was dropped
+const ROOM_LIGHT = { "": null, true: true, false: false, frame: false }; // of the live picture, by the choice
+export const ORIENTATIONS = [
+  "rotate-180", "rotate-90", "rotate-270", "flip-left-right", "flip-top-bottom", "transpose", "transverse",
+];
 export const chosen = { psf: null, capture: null, ambient: null, job: null };
 
 export function calibration() {
@@ -37,6 +41,13 @@ export function orderFields(method = byId("method").value, trust = byId("trust")
   const fields = { ...cameraFields(), ...light, capture: chosen.capture, method, align, trust: String(trust) };
   return { ...fields, options: JSON.stringify(options) };
 }
+
+// What all viewers of the live picture share.
+export const liveSettings = () => ({
+  method: byId("method").value, options: readSliders(),
+  align: byId("align").checked || null, room_light: ROOM_LIGHT[byId("room-light").value],
+  stops: Number(byId("exposure").value), white_balance: byId("balance").value,
+});
 
 export const look = (format = "png") =>
   `?format=${format}&exposure=${byId("exposure").value}&white_balance=${byId("balance").value}`;

@@ -1,24 +1,20 @@
 // The page: what is chosen becomes a reconstruction, at once.
 import { getBlob, getJson, post, remove, RequestError, runJob } from "./requests.js";
+import { compareMethods, hideMethods } from "./comparison.js";
 import { setUpDivider, setPicture } from "./divider.js";
 import { setUpDropZone } from "./dropping.js";
-import { calibration, cameraFields, chosen, look, orderFields, UPLOAD, whatIsMissing } from "./fields.js";
+import { calibration, cameraFields, chosen, liveSettings, look, ORIENTATIONS, orderFields, UPLOAD, whatIsMissing } from "./fields.js";
 import { pageWords } from "./hints.js";
 import { isLive, setUpLive, stopLive, wish } from "./live.js";
 import { saveBlob } from "./saving.js";
-import { drawSliders, readSliders } from "./sliders.js";
+import { drawSliders } from "./sliders.js";
 import { showFindings, showVerdicts } from "./verdicts.js";
 
 const byId = (id) => document.getElementById(id);
-const ORIENTATIONS = [
-  "rotate-180", "rotate-90", "rotate-270", "flip-left-right", "flip-top-bottom", "transpose", "transverse",
-];
-const ROOM_LIGHT = { "": null, true: true, false: false, frame: false }; // of the live picture, by the choice
 
 let methods = [];
 let sampleCamera = null;
 let running = null;
-let comparing = null;
 let latest = 0; // call of `showPictures`
 let inspected = 0; // PSFs that have been chosen or inspected
 const taken = {}; // number of files taken, by what they are
@@ -40,20 +36,8 @@ async function guarded(work) {
   }
 }
 
-// What all viewers of the live picture share.
-function wishLive() {
-  wish({
-    method: byId("method").value, options: readSliders(),
-    align: byId("align").checked || null, room_light: ROOM_LIGHT[byId("room-light").value],
-    stops: Number(byId("exposure").value), white_balance: byId("balance").value,
-  });
-}
-
 async function reconstruct() {
-  if (isLive()) {
-    wishLive();
-    return;
-  }
+  if (isLive()) return void wish(liveSettings());
   running?.abort();
   if (whatIsMissing()) {
     hidePicture();
@@ -111,7 +95,7 @@ function soon(work = reconstruct, wait = 150) {
 }
 
 async function showPictures(both = false) {
-  if (isLive()) wishLive();
+  if (isLive()) wish(liveSettings());
   if (isLive() || !chosen.job) return;
   const call = (latest += 1), job = chosen.job;
   const [scene, measurement] = await Promise.all([
@@ -126,30 +110,6 @@ async function showPictures(both = false) {
 
 const SAVED = { png: "reconstruction.png", png16: "reconstruction-16bit.png", tiff: "reconstruction.tif" };
 const save = async (format) => saveBlob(await getBlob(`/jobs/${chosen.job}/picture${look(format)}`), SAVED[format]);
-
-async function compareMethods() {
-  if (whatIsMissing()) return;
-  comparing?.abort();
-  const { signal } = (comparing = new AbortController());
-  byId("grid-section").hidden = false;
-  byId("grid").replaceChildren();
-  for (const [name, order] of methods.map(({ name }) => [name, orderFields(name, false)])) {
-    const figure = document.createElement("figure");
-    const picture = Object.assign(document.createElement("img"), { alt: `Reconstruction by ${name}` });
-    const caption = Object.assign(document.createElement("figcaption"), { textContent: `${name} …` });
-    figure.append(picture, caption);
-    byId("grid").append(figure);
-    try {
-      const job = await runJob(order, () => {}, signal);
-      await setPicture(picture, await getBlob(`/jobs/${job.id}/picture${look()}`));
-      caption.textContent = `${name}, ${job.report.seconds.toFixed(2)} s`;
-    } catch (error) {
-      if (signal.aborted) return;
-      caption.textContent = `${name}: ${error.message}`;
-      caption.className = "wrong";
-    }
-  }
-}
 
 async function inspect() {
   const call = (inspected += 1);
@@ -187,11 +147,6 @@ async function take(what, file) {
   if (what === "psf") chooseCamera(UPLOAD);
   hideComparison();
   return true;
-}
-
-function hideMethods() {
-  comparing?.abort();
-  byId("grid-section").hidden = true;
 }
 
 // Pictures of other methods, and the verdict on a PSF, of what was chosen before.
@@ -278,7 +233,7 @@ async function start() {
   setUpLive(listed.live, {
     started: () => {
       running?.abort();
-      if (isTouched) wishLive(); // else the settings of the server hold
+      if (isTouched) wish(liveSettings()); // else the settings of the server hold
     },
     follow: followLive,
     use: (frame, job) => guarded(() => useSnapshot(frame, job)),
@@ -333,7 +288,7 @@ byId("cancel").onclick = () => {
   running?.abort();
   say("Cancelled.");
 };
-byId("compare").onclick = () => guarded(compareMethods);
+byId("compare").onclick = () => guarded(() => compareMethods(methods));
 byId("store").onclick = () => guarded(storeCamera);
 byId("remove").onclick = () => guarded(removeCamera);
 byId("inspect").onclick = () => guarded(inspect);
