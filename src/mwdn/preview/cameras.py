@@ -51,7 +51,8 @@ class StoredCameras:
         self.limits, self.folder, self.given = limits, folder, dict(given or {})
         self._lock = threading.Lock()
         self._stored: dict[str, Calibration] = {}
-        self._given_files, self._stored_files = dict(psf_files or {}), dict[str, PsfFile]()
+        self._given_files = dict(psf_files or {})
+        self._stored_files: dict[str, PsfFile] = {}
         self._recent: OrderedDict[str, Calibration] = OrderedDict()
         if folder is not None and folder.is_dir():
             for entry in sorted(folder.glob("*.json")):
