@@ -30,12 +30,12 @@ def learned_once(network, measurement, psf):
 @pytest.mark.parametrize("synchronised", [False, True])
 @pytest.mark.parametrize("name", ["unet", "wiener-unet", "mwdn", "mwdn-cpsf", "wiener-bank"])
 def test_gradients_and_statistics_are_the_same(name, synchronised, generator):
-    network = build(name, width=8).train()
+    network = build(name, width=4).train()
     for module in network.modules():
         if synchronised and isinstance(module, nn.BatchNorm2d):
             module.__class__ = GlobalBatchNorm2d
-    psf = torch.rand(1, 3, 33, 47, generator=generator) ** 8
-    measurement = torch.rand(2, 3, 33, 47, generator=generator)
+    psf = torch.rand(1, 3, 17, 31, generator=generator) ** 8
+    measurement = torch.rand(2, 3, 17, 31, generator=generator)
     other = copy.deepcopy(network)
     checkpoint_activations(other)
     gradients, statistics, kept = learned_once(network, measurement, psf)

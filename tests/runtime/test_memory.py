@@ -20,9 +20,9 @@ def faults():
     work()
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 
-usual = min(faults() for _ in range(10))  # the heap reaches its final size after a few rounds
+usual = min(faults() for _ in range(5))  # the heap reaches its final size after a few rounds
 assert keep_memory()
-print(usual, min(faults() for _ in range(10)))
+print(usual, min(faults() for _ in range(5)))
 """
 
 

@@ -198,7 +198,7 @@ def test_admm_without_prior_reaches_the_least_squares_of_scipy(sensor, psf, rela
     problem = splitting.Problem.from_psf(b / b.norm(), h / h.norm())
     state, mu = splitting.initial_state(problem), Penalties(data=0.1, gradient=1e-3, sign=0.1)
     filters = splitting.make_filters(problem, mu)
-    for _ in range(1000):
+    for _ in range(600):
         state = splitting.update_copies(state, problem, mu, 0.0, "anisotropic", relaxation)
         state = splitting.update_scene(state, problem, filters)
     value = objective(problem, state.v, h / h.norm()) * b.square().sum().item()
@@ -327,7 +327,7 @@ def test_shape_sign_and_finiteness(solver, sensor, psf, channels, psf_channels, 
     assert result.min() >= 0
 
 
-@pytest.mark.parametrize("factor", [1e-3, 7.0, 4095.0])
+@pytest.mark.parametrize("factor", [1e-3, 4095.0])
 def test_scene_scales_with_the_measurement_and_not_with_the_psf(solver, factor, generator):
     _, b, h = capture(generator)
     result = solver(b, h)
