@@ -24,7 +24,7 @@ from mwdn.networks import build
 from mwdn.weights.checkpoint import save_network
 
 RECIPE = """
-network = { name = "wiener-bank", width = 4, finest = 0, align = false }
+network = { name = "wiener" }
 schedule = { steps = 9, batch = 2, validate_every = 2, validation = 2, bfloat16 = false }
 placement = { extent = [0.4, 0.4] }
 """
@@ -51,11 +51,13 @@ def flat(text):
 
 
 TRAIN = "train r.toml --psf psf.npy --photos photos --steps 4 --device cpu --out runs/x"
+BANK = "--network.name wiener-bank --network.width 2 --network.finest 0 --network.align=false"
 RECONSTRUCT = "reconstruct capture.npy --method runs/x/best.safetensors --device cpu --psf"
 
 
 def test_train_then_reconstruct(run, camera):
-    code, out, err = run(TRAIN)
+    line = f"{TRAIN} {BANK}"
+    code, out, err = run(line)
     assert code == 0, err
     assert "Weights in runs/x/best.safetensors" in out
     assert re.search(r"step 4: validation \d+\.\d\d dB, best \d+\.\d\d dB", flat(err))
@@ -63,7 +65,7 @@ def test_train_then_reconstruct(run, camera):
     assert code == 0
     assert "capture.npy: the picture reproduces" in out + err
     assert read_frame("results/reconstruct/capture.png").shape == (32, 40, 3)
-    assert run(TRAIN)[0] == 0  # nothing left to do
+    assert run(line)[0] == 0  # nothing left to do
 
 
 def test_a_run_that_ends_within_its_warmup_says_so(run, camera):
@@ -74,13 +76,13 @@ def test_a_run_that_ends_within_its_warmup_says_so(run, camera):
 
 def test_any_key_of_the_recipe_by_its_name(run, camera):
     changes = "--learning-rate 3e-4 --bfloat16=false --seed -2 --mismatch.blur-px 1 --placement.extent [0.3,0.5]"
-    code, _, err = run(f"{TRAIN} {changes} --network.width 6 --schedule.crop 16 --pool 8")
+    code, _, err = run(f"{TRAIN} {BANK} {changes} --schedule.crop 16 --pool 8")
     assert code == 0, err
     recipe = json.loads((camera / "runs/x/recipe.json").read_text(encoding="utf-8"))["recipe"]
     schedule = recipe["schedule"]
     assert [schedule[key] for key in ("learning_rate", "seed", "crop", "pool")] == [3e-4, -2, 16, 8]
     assert (recipe["mismatch"]["blur_px"], recipe["placement"]["extent"]) == (1.0, [0.3, 0.5])
-    assert recipe["network"] == {"name": "wiener-bank", "width": 6, "finest": 0, "align": False}
+    assert recipe["network"] == {"name": "wiener-bank", "width": 2, "finest": 0, "align": False}
     for wrong, said in (
         ("--learnin-rate 1", "No key of [schedule] named 'learnin_rate'. Did you mean 'learning_rate'?"),
         ("--sensor.iso 100", "No key of [sensor] named 'iso'"),
@@ -332,7 +334,7 @@ def test_full_disk_is_one_message_and_leaves_the_last_state(run, camera):
     """A limit on the size of files, below that of a state, stands for a full disk."""
     import resource
 
-    line = TRAIN.replace("--steps 4", "--steps 2")
+    line = f"{TRAIN.replace('--steps 4', '--steps 2')} {BANK.replace('width 2', 'width 4')}"  # largest: the state
     assert run(line)[0] == 0
     files = sorted(path.name for path in (camera / "runs/x").iterdir())
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
