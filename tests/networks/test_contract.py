@@ -28,8 +28,8 @@ ANY_SIDE = (*FEW, "wiener-bank", "le-admm-u", "mmcn", "flatnet", "svdeconv")
 LEARN_SLOWLY = (*SLOW, "wiener-bank", "flatnet", "wiener-unet", "unet", "mwdn")
 """Networks that take 2 to 10 seconds to learn four pairs; `mwdn-cpsf` has the blocks of `unet` and `mwdn`."""
 
-EXPORTED_ELSEWHERE = ("wiener", "unet", "mwdn-cpsf")
-"""Networks that `test_exporter` exports and compares, too."""
+EXPORTED_ELSEWHERE = ("wiener", "unet", "mwdn-cpsf", "wiener-unet", "mwdn")
+"""Networks that `test_exporter` exports and compares, too, and those of the same blocks."""
 
 NARROW = {"le-admm-u": 8, "mmcn": 12, "updn": 4}
 """Widths of networks that compute small pictures on grids of twice or four times their sides."""
@@ -38,7 +38,8 @@ NARROW = {"le-admm-u": 8, "mmcn": 12, "updn": 4}
 def small(name, **options):
     """A narrow network of few steps; options that it does not have are left out."""
     parameters = inspect.signature(NETWORKS[name]).parameters
-    options = {"width": 8, "size": (24, 24), "depth": 2, "iterations": 2, **options}
+    width = 8 if name == "mwdn-cpsf" else 4  # of 4, no feature of the PSF is left at the coarsest scales
+    options = {"width": width, "size": (24, 24), "depth": 2, "iterations": 2, **options}
     network = build(name, **{key: value for key, value in options.items() if key in parameters})
     if name == "wiener-bank":  # 66 iterations, of which those of one level are alike
         network.levels = tuple(replace(level, iterations=2) for level in network.levels)
