@@ -240,7 +240,6 @@ def test_the_file_of_pairs_and_the_table_have_one_name(run, camera):
     """`--pairs` is a file and `--pairs.split` a key of the recipe, in either order."""
     assert run("simulate photos --psf psf.npy -o pairs.h5 --count 20 --recipe r.toml")[0] == 0
     line = TRAIN.replace("--photos photos --steps 4", "--pairs pairs.h5 --pairs.split random --best-by loss --steps 1")
-    line += " --network.name unet --network.width 2"
     code, _, err = run(line)
     assert code == 0, err
     assert re.search(r"validation \d+\.\d\d dB, best loss \d", flat(err))
@@ -259,8 +258,7 @@ def test_the_file_of_pairs_and_the_table_have_one_name(run, camera):
 def test_a_checkpoint_is_evaluated_on_the_pairs_that_its_training_left_out(run, camera):
     assert run("simulate photos --psf psf.npy -o pairs.h5 --count 20 --recipe r.toml")[0] == 0
     line = TRAIN.replace("--photos photos --steps 4", "--pairs pairs.h5 --pairs.split folds --steps 1")
-    network = " --network.name unet --network.width 2"
-    assert run(f"{line} --pairs.fold 1{network}")[0] == 0
+    assert run(f"{line} --pairs.fold 1")[0] == 0
     evaluate = "evaluate runs/x/best.safetensors --data pairs.h5 --psf psf.npy --device cpu --no-lpips --json"
 
     scores, said = [], []
@@ -274,7 +272,7 @@ def test_a_checkpoint_is_evaluated_on_the_pairs_that_its_training_left_out(run, 
     assert scores[2] == pytest.approx([scores[0][n] for n in held_out], abs=1e-3)
     save_pretrained("runs/x/best.safetensors", "hub")
     assert "was trained on 15 of these 20" in flat(run(evaluate.replace("runs/x/best.safetensors", "hub"))[2])
-    assert run(line.replace("runs/x", "runs/y") + network)[0] == 0
+    assert run(line.replace("runs/x", "runs/y"))[0] == 0
     code, _, err = run(
         evaluate.replace("best.safetensors ", "best.safetensors runs/y/best.safetensors ") + " --split folds"
     )
