@@ -35,7 +35,9 @@ class Iterate(NamedTuple):
 @checked
 @dataclass(frozen=True)
 class Admm:
-    """Minimise ``1/2 |crop(h * v) - b|^2 + tau |Psi v|_1`` over scenes ``v >= 0``.
+    """ADMM with total variation and non-negative light: the classical reference.
+
+    Minimises ``1/2 |crop(h * v) - b|^2 + tau |Psi v|_1`` over scenes ``v >= 0``.
 
     Called with a measurement (B, C, H, W) and a PSF, it returns the part (B, C, H, W) of the scene that faces the
     sensor, in the units of the measurement; the scale of the PSF does not matter. PSF and measurement are scaled to

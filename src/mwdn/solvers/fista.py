@@ -31,7 +31,9 @@ class Iterate(NamedTuple):
 @checked
 @dataclass(frozen=True)
 class Fista:
-    """Minimise ``1/2 |crop(h * v) - b|^2`` over scenes ``v >= 0`` by accelerated projected gradient steps.
+    """Accelerated projected gradient steps to a non-negative scene that explains the measurement.
+
+    Minimises ``1/2 |crop(h * v) - b|^2`` over scenes ``v >= 0``.
 
     Called with a measurement (B, C, H, W) and a PSF, it returns the part (B, C, H, W) of the scene that faces the
     sensor. There is no prior but the sign: the number of iterations is the regularisation. Few give a smooth image,
