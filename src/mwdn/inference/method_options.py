@@ -42,12 +42,12 @@ def _type(parameter: inspect.Parameter) -> Any:  # noqa: ANN401
 
 
 def _docstring_arguments(docstring: str) -> dict[str, str]:
-    """Entries of a Google-style Args section, each as one line."""
+    """Entries of a Google-style Args section, each as one line; code is in single backticks, as in messages."""
     section = re.search(r"^Args:\n((?: +.*\n?|\n)*)", docstring, re.MULTILINE)
     entries = re.findall(r"^ {4}(\w+): (.*(?:\n {5,}.*)*)", section[1], re.MULTILINE) if section else []
-    return {name: " ".join(text.split()) for name, text in entries}
+    return {name: " ".join(text.split()).replace("``", "`") for name, text in entries}
 
 
 def summary(method: Callable[..., Any]) -> str:
-    """First line of a docstring."""
-    return (inspect.getdoc(method) or "").partition("\n")[0]
+    """First line of a docstring; code is in single backticks."""
+    return (inspect.getdoc(method) or "").partition("\n")[0].replace("``", "`")

@@ -40,7 +40,7 @@ class FlatNet(Network[Tensor]):
         width: feature channels at the U-Net's finest scale.
         size: height and width for which the correction is stored; ``None`` for a plain Wiener filter.
         regularisation: lambda of the Wiener filter, for a PSF of unit sum.
-        boundary: see `mwdn.fourier.padding.Boundary`.
+        boundary: values beyond the border of what is filtered, see `mwdn.fourier.padding.Boundary`.
 
     References:
         S. S. Khan et al., FlatNet: towards photorealistic scene reconstruction from lensless measurements, IEEE Trans.

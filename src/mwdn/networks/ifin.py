@@ -24,7 +24,7 @@ class Exchange(nn.Module):
         inputs: channels of each stream at the previous scale.
         width: channels at this scale.
         regularisation: initial value of the Wiener filter's lambda, learned for each channel.
-        boundary: see `mwdn.fourier.padding.Boundary`.
+        boundary: values beyond the border of what is filtered, see `mwdn.fourier.padding.Boundary`.
     """
 
     def __init__(self, inputs: int, width: int, *, regularisation: float, boundary: Boundary) -> None:
@@ -76,7 +76,8 @@ class Ifin(Network[IfinPsfs]):
         channels: colours of the measurement and the PSF.
         width: feature channels at full resolution.
         regularisation: initial value of every lambda.
-        boundary: of the Wiener filters, see `mwdn.fourier.padding.Boundary`.
+        boundary: of the Wiener filters: values beyond the border of what is filtered, see
+            `mwdn.fourier.padding.Boundary`.
 
     References:
         Integrated forward-inverse network, openreview.net/forum?id=q1TpQ6guwX (ECCV 2026).

@@ -23,7 +23,8 @@ class Mwdn(Network[list[Tensor]]):
         psf_pooling: between the PSF's scales; the paper takes the maximum, the authors' code averages.
         weight: initial value of w, for a PSF whose peak is 1 (the value of the authors' code).
         regularisation: initial value of lambda (the value of the authors' code).
-        boundary: see `mwdn.fourier.padding.Boundary`. The paper writes linear convolutions; its code is circular.
+        boundary: values beyond the border of what is filtered, see `mwdn.fourier.padding.Boundary`.
+            The paper writes linear convolutions; its code is circular.
         authors_form: learn w and lambda as the authors' code does, themselves instead of their logarithms, so that w
             may become negative; and take the PSF as stored (`mwdn.networks.Network.stored_psf`). For exact comparison,
             together with both poolings "average" and the boundary "circular".

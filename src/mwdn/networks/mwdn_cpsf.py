@@ -23,10 +23,11 @@ class MwdnCpsf(Network[list[Tensor]]):
         width: feature channels at full resolution.
         pooling: of both encoders; max in the paper, average in the authors' code.
         regularisation: initial value of lambda (the value of the authors' code).
-        boundary: see `mwdn.fourier.padding.Boundary`. The paper writes linear convolutions; its code is circular.
+        boundary: values beyond the border of what is filtered, see `mwdn.fourier.padding.Boundary`.
+            The paper writes linear convolutions; its code is circular.
         authors_scalars: add two scalars of the authors' code that are not in the paper: a learned weight of the PSF
             before its encoder, and an unused fifth lambda. 21,956,745 learnable parameters.
-        authors_form: see `mwdn.networks.Mwdn`.
+        authors_form: the authors' form of w and lambda, see `mwdn.networks.Mwdn`.
         orthonormal: divide each corrected PSF by the square root of its number of pixels N, as an orthonormal Fourier
             transform would. Ours, not the paper's. BatchNorm gives corrected PSFs values of about 1 at every pixel, so
             that ``|H|^2`` is about N: lambda is negligible beside it, noise is inverted at all frequencies, and the

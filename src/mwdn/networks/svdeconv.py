@@ -54,7 +54,7 @@ class SvDeconv(Network[Tensor]):
         field: K, local PSFs along each side of the field.
         size: height and width for which the corrections are stored.
         regularisation: initial value of each lambda.
-        boundary: see `mwdn.fourier.padding.Boundary`.
+        boundary: values beyond the border of what is filtered, see `mwdn.fourier.padding.Boundary`.
 
     References:
         X. Cai et al., PhoCoLens: photorealistic and consistent reconstruction in lensless imaging, NeurIPS (2024);

@@ -14,8 +14,8 @@ class WienerNetwork(Network[Tensor]):
     Args:
         weight: initial value of w, for a PSF whose peak is 1.
         regularisation: initial value of lambda.
-        boundary: see `mwdn.fourier.padding.Boundary`.
-        authors_form: see `mwdn.networks.Mwdn`.
+        boundary: values beyond the border of what is filtered, see `mwdn.fourier.padding.Boundary`.
+        authors_form: the authors' form of w and lambda, see `mwdn.networks.Mwdn`.
     """
 
     def __init__(

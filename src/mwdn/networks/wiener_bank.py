@@ -97,7 +97,8 @@ class WienerBank(FixedFront[BankTransfers]):
             the crop; their shading and colour are up to 5 dB better than a U-Net's.
         rounds: rounds of plug and play (`mwdn.solvers.plug_and_play`) between the iterations and the bank, for
             ``finest`` 1. The denoiser is trained separately on noisy pictures and frozen here; 0 for none.
-        mean_light: see `MeanLight`; needs iterations unless ``kept``.
+        mean_light: how far the U-Net may change a block's mean light: not at all (``kept``), without limit (``free``),
+            or where the measurement contradicts the PSF (``gated``). All but ``kept`` need iterations.
         evidence: whether U-Net and denoiser are also told what speaks against the PSF (`mwdn.networks.evidence`);
             needs iterations.
         distortion: order of the polynomials of the recorded scenes' distortion; 0 for none.

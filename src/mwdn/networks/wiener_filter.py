@@ -25,7 +25,7 @@ class WienerFilter(nn.Module):
     Args:
         weight: initial value of w; ``None`` leaves w out (MWDN-CPSF, whose PSF is learned).
         regularisation: initial value of lambda.
-        boundary: see `mwdn.fourier.padding.Boundary`.
+        boundary: values beyond the border of what is filtered, see `mwdn.fourier.padding.Boundary`.
         linear: learn w and lambda themselves, as the authors' code does. w may then be or become negative, and training
             moves both by about the learning rate a step, whatever their size.
 

@@ -19,8 +19,8 @@ class WienerUNet(Network[Tensor]):
         pooling: between the encoder's scales; the authors' code averages.
         weight: initial value of w.
         regularisation: initial value of lambda.
-        boundary: see `mwdn.fourier.padding.Boundary`.
-        authors_form: see `mwdn.networks.Mwdn`.
+        boundary: values beyond the border of what is filtered, see `mwdn.fourier.padding.Boundary`.
+        authors_form: the authors' form of w and lambda, see `mwdn.networks.Mwdn`.
     """
 
     def __init__(

@@ -29,7 +29,7 @@ class Wiener:
             within its noise and ``tolerance``.
         tolerance: part of the measurement's contrast that may remain as residual besides the noise: the error of a
             cropped pattern, a measured PSF and a field that is not quite shift-invariant.
-        boundary: see `mwdn.fourier.padding.Boundary`.
+        boundary: values beyond the border of what is filtered, see `mwdn.fourier.padding.Boundary`.
 
     Raises:
         ParameterError: a constant is not positive.
