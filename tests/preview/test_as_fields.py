@@ -13,11 +13,14 @@ EXAMPLES = {
     "Give `mosaic='rggb'`.": 'Give `calibration={"mosaic": "rggb"}`.',
     "Try `--gamma srgb`.": 'Try `calibration={"gamma": "srgb"}`.',
     "See `--gamma`.": "See `gamma`.",
+    "See `--iterations`.": "See `iterations`.",
     "Try `iterations=50`.": 'Try `options={"iterations": 50}`.',
     "Gains: `white_balance=(1.8, 1, 1.5)`.": "Gains: `white_balance=1.8,1,1.5`.",
     "Try `--ambient FILE`, `--align`.": "Try `ambient=@FILE`, `align=true`.",
     "`bin` ('2') of `FrameFormat` must be whole.": "`bin` ('2') of `calibration` must be whole.",
     **{same: same for same in ("`bin=`, `f=(`", "`--flat a.png`", "`mwdn explain size`", "`x=1`", "`--dark`")},
+    # Text of a client, which the error repeats.
+    **{same: same for same in ("`bin={1,2}`", "`--bin 4 --`", f"`x={'-' * 5000}1`", f"`bin={'(' * 5000}`")},
 }
 
 
@@ -34,3 +37,8 @@ def test_answers_and_jobs_name_fields(client, capture, psf_file):
         pass
     assert answer.json()["error"] == job["error"]
     assert 'calibration={"psf_bin": 2}' in job["error"]
+
+
+def test_a_name_of_a_client_is_refused_whatever_it_is(client):
+    """Some of them, read as arguments of Python, ended in an error of the server itself."""
+    assert client.get("/cameras/`bin={1,2}`").status_code == 404

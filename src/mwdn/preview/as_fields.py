@@ -1,6 +1,5 @@
 """Messages of the package in the words of the HTTP interface: `bin=4` and `--bin 4` are `calibration={"bin": 4}`."""
 
-import ast
 import json
 import re
 from typing import Any
@@ -19,15 +18,15 @@ def as_fields(message: str) -> str:
         The message. What is no field, such as a frame that only files of the command line hold, stays as it is.
     """
     message = re.sub(r"`--([a-z-]+)`", lambda match: _field(match[1]) or match[0], message)
-    message = re.sub(r"`--([a-z-]+ [^`]*)`", lambda match: _fields(_typed(match[1])) or match[0], message)
-    message = re.sub(r"`([a-z]\w*=[^`]*)`", lambda match: _fields(_arguments(match[1])) or match[0], message)
+    message = re.sub(r"`--([a-z-]+ [^`]{,200})`", lambda match: _fields(_typed(match[1])) or match[0], message)
+    message = re.sub(r"`([a-z]\w*=[^`]{,200})`", lambda match: _fields(_arguments(match[1])) or match[0], message)
     return re.sub(r"(?<= of )`(FrameFormat|PsfFormat)`", "`calibration`", message)
 
 
 def _field(option: str) -> str:
     """An option of the command line that has no value there."""
     name = option.replace("-", "_")
-    return f"`{name}`" if name in CAMERA_OPTIONS else _fields({name: True})
+    return f"`{name}`" if name in (*CAMERA_OPTIONS, *RANGES) else _fields({name: True})
 
 
 def _fields(values: dict[str, Any]) -> str:
@@ -36,7 +35,7 @@ def _fields(values: dict[str, Any]) -> str:
     if values and values.keys() <= RANGES.keys():
         return f"`options={json.dumps(values)}`"
     match values:
-        case {"white_balance": tuple() as gains}:
+        case {"white_balance": list() as gains}:
             return f"`white_balance={','.join(map(str, gains))}`"
         case {"align": True}:
             return "`align=true`"
@@ -51,23 +50,23 @@ def _typed(line: str) -> dict[str, Any]:
     """Names and values of ``bin 4 --crop 8 8 --grey``."""
     options = {}
     for option in line.split(" --"):
-        name, *words = option.split()
+        name, *words = option.split(" ")
         values = [_value(word) for word in words]
-        options[name.replace("-", "_")] = True if not values else values[0] if len(values) == 1 else tuple(values)
+        options[name.replace("-", "_")] = True if not values else values[0] if len(values) == 1 else values
     return options
 
 
 def _value(word: str) -> Any:  # noqa: ANN401
     try:
-        return ast.literal_eval(word)
-    except (SyntaxError, ValueError):
+        return json.loads(word)
+    except ValueError:
         return word
 
 
 def _arguments(text: str) -> dict[str, Any]:
-    """Names and values of ``bin=4, crop=(8, 8)``; empty for any other text."""
+    """Names and values of ``bin=4, crop=(8, 8)``; empty for any other text, such as one of a client."""
+    pairs = re.sub(r"([a-z]\w*)=", r'"\1": ', text).translate(str.maketrans("()'", '[]"')).replace("True", "true")
     try:
-        call = ast.parse(f"f({text})", mode="eval").body
-        return {each.arg or "": ast.literal_eval(each.value) for each in getattr(call, "keywords", ())}
-    except (SyntaxError, ValueError):
+        return dict(json.loads(f"{{{pairs}}}"))
+    except ValueError:
         return {}
