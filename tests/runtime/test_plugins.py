@@ -300,6 +300,8 @@ def test_errors_of_a_plugin_name_it_and_cost_one_capture(run):
     code, out, err = run("evaluate wiener exits --data pairs.h5 --psf psf.npy --background 0 --no-lpips --json")
     assert (code, "no scores: The plugin `exits` (module `fails`) failed" in err) == (1, True), err
     assert (list(json.loads(out)["methods"]), list(json.loads(out)["failed"])) == (["wiener"], ["exits"])
+    code, _, err = run("--debug evaluate exits --data pairs.h5 --psf psf.npy --background 0 --no-lpips")
+    assert (code, "fails.py" in err) == (2, True), "where it happened"
     code, _, err = run(f"{line} unmade")
     assert (code, "The plugin `unmade` (module `fails`) failed: ValueError: no licence." in err) == (2, True), err
     code, _, err = run(f"{line} large")

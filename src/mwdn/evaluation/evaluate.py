@@ -115,6 +115,8 @@ def evaluate(
         try:
             scores[name], pictures = _score(name, method, pairs, compare, len(rows), progress)
         except MwdnError as error:
+            if len(methods) == 1:
+                raise  # with its traceback
             failed[name] = without_traceback(error)
         else:
             for row, picture in zip(rows, pictures, strict=True):
