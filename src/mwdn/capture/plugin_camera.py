@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from mwdn.capture.source import CameraFrame, CameraSource
 from mwdn.errors import CameraError, MwdnError, PluginError, shown
@@ -14,17 +15,25 @@ class PluginCamera(CameraSource):
 
     Args:
         kind: name of the plugin.
-        make: its class or function.
-        create: calls that with the address and the options.
+        create: its class or function.
+        *address: of the camera, if this kind has one.
+        **options: of the camera.
 
     Raises:
         CameraError: the plugin failed, or has made something else.
     """
 
-    def __init__(self, kind: str, make: Callable[..., CameraSource], create: Callable[[], CameraSource]) -> None:
-        self._kind, self._make = kind, make
+    def __init__(
+        self,
+        kind: str,
+        create: Callable[..., CameraSource],
+        /,
+        *address: str,
+        **options: Any,  # noqa: ANN401
+    ) -> None:
+        self._kind, self._create = kind, create
         with self._errors():
-            self.camera = create()
+            self.camera = create(*address, **options)
         if not isinstance(self.camera, CameraSource):
             raise CameraError(f"The plugin `{kind}` must make a `CameraSource`, not {shown(self.camera)}.")
         super().__init__(self.camera.name, self.camera.timeout_s)
@@ -33,7 +42,7 @@ class PluginCamera(CameraSource):
     @contextmanager
     def _errors(self) -> Iterator[None]:
         try:
-            with plugin_errors(self._kind, self._make):
+            with plugin_errors(self._kind, self._create):
                 yield
         except PluginError as error:  # a session opens a camera again after a `CameraError`
             raise CameraError(str(error)) from error

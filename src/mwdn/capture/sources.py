@@ -84,8 +84,9 @@ def open_source(text: str, **options: Any) -> CameraSource:  # noqa: ANN401
         create = getattr(import_module(f"mwdn.capture.{module}"), cls)
     options = {**given, **options}
     check_options(create, f"the camera '{name}'", options)
-    make = partial(create, *([address] if kind.address else []), **options)
-    return make() if name in SOURCES.own else PluginCamera(name, create, make)
+    if name not in SOURCES.own:
+        create = partial(PluginCamera, name, create)
+    return create(address, **options) if kind.address else create(**options)
 
 
 def parse_source(text: str) -> tuple[str, str, dict[str, Any]]:
