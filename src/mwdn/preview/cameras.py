@@ -38,7 +38,7 @@ class StoredCameras:
         limits: of the server.
         folder: where stored calibrations are kept; in memory unless given.
         given: calibrations of the command line.
-        psf_files: of those of them whose PSF was read from a file.
+        psf_files: what the PSF's files of `given` tell, by the same names; those that are missing are unknown.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class StoredCameras:
         return known[name]
 
     def psf_file(self, name: str) -> PsfFile:
-        """What the PSF's file of a calibration tells besides its pixels; nothing if the PSF is no file's."""
+        """What the PSF's file of a calibration tells besides its pixels; nothing if its PSF is not from a file."""
         with self._lock:
             return {**self._stored_files, **self._given_files}.get(name, PsfFile())
 

@@ -31,5 +31,5 @@ def _name(scope: Any) -> str:  # noqa: ANN401
 
 
 def _value(token: str) -> str:
-    """Derived from the token, which other servers on this host, which get the cookie too, must not learn."""
+    """Derived from the token: browsers send the cookie to other servers on this host, too, which must not learn it."""
     return hmac.new(token.encode(), b"cookie of the page of mwdn preview", hashlib.sha256).hexdigest()

@@ -36,7 +36,7 @@ class Order:
         trust: check the picture, which takes a second or two.
         room_light: as for `Reconstructor`.
         ambient: the file of a frame of the room's light alone, taken as the capture; empty if there is none.
-        psf_file: reads what its PSF's file tells besides its pixels.
+        psf_file: returns what the PSF's file tells besides its pixels.
     """
 
     capture: bytes
