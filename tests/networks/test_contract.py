@@ -38,7 +38,7 @@ NARROW = {"le-admm-u": 8, "mmcn": 12, "updn": 4}
 def small(name, **options):
     """A narrow network of few steps; options that it does not have are left out."""
     parameters = inspect.signature(NETWORKS[name]).parameters
-    width = 8 if name == "mwdn-cpsf" else 4  # of 4, no feature of the PSF is left at the coarsest scales
+    width = 8 if name == "mwdn-cpsf" else 4  # with 4, no feature of the PSF is left at the coarsest scales
     options = {"width": width, "size": (24, 24), "depth": 2, "iterations": 2, **options}
     network = build(name, **{key: value for key, value in options.items() if key in parameters})
     if name == "wiener-bank":  # 66 iterations, of which those of one level are alike
