@@ -92,6 +92,13 @@ def test_rows_without_a_partner_are_named(tmp_path):
     assert list(done.skipped) == ["row 3", "row 4"]
 
 
+def test_numbers_of_another_type_are_named_and_not_the_data_sets(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["blur"] = file["gt"] = np.ones((2, 3, 8, 10), np.float32)
+    with pytest.raises(ImageError, match=r"`blur` of .* not \(2, 3, 8, 10\) of float32"):
+        import_pairs("mwdn", tmp_path / "a.h5", tmp_path / "pairs.h5")
+
+
 def test_damaged_rows_and_files_of_the_authors_kind(tmp_path):
     path = tmp_path / "a.h5"
     with h5py.File(path, "w") as file:

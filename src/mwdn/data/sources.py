@@ -124,10 +124,15 @@ def list_hdf5(path: Path, captures: str, scenes: str) -> Listing:
     file = open_hdf5(path, COPY_AGAIN)
     for name in (captures, scenes):
         data = find_rows(path, file, name, COPY_AGAIN)
-        if data is None or data.ndim != 4 or data.shape[1] not in (1, 3) or data.dtype != "u1":
+        if data is None:
             raise ImageError(
                 f"`{path}` must have `{name}`, (N, 3, H, W) of uint8, but has {names_in(path, file)}. "
                 "Name the data sets: `--captures blur --scenes gt`."
+            )
+        if data.ndim != 4 or data.shape[1] not in (1, 3) or data.dtype != "u1":
+            raise ImageError(
+                f"`{name}` of `{path}` must be (N, 3, H, W) of uint8, not {data.shape} of {data.dtype}. Convert it, or "
+                "write its pictures to two folders: `mwdn import folders`."
             )
     counts = [len(file[name]) for name in (captures, scenes)]
     complete = min(counts)
