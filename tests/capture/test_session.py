@@ -445,6 +445,9 @@ def test_wrong_recipes_are_named(tmp_path):
         read_capture_recipe(path, display={"gamma": 9.0})
     with pytest.raises(ParameterError, match="kind"):
         read_capture_recipe(path, display={"kind": "page"})
+    with pytest.raises(ParameterError) as wrong:
+        read_capture_recipe(path, point={"frames": -2})
+    assert str(wrong.value).count("[point]") == 1
     empty = read_capture_recipe(path, pictures={"folder": "none"})
     with pytest.raises(ParameterError, match="none"):
         session(empty, tmp_path / "a.h5").run()

@@ -33,8 +33,8 @@ class CameraTable:
     def __post_init__(self) -> None:
         if not self.timeout_s > 0 or self.attempts < 0 or self.exposure_s < 0:
             raise ParameterError(
-                f"`timeout_s` ({self.timeout_s:g}) of [camera] must be positive, `attempts` ({self.attempts}) and "
-                f"`exposure_s` ({self.exposure_s:g}) not negative."
+                f"`timeout_s` ({self.timeout_s:g}) must be positive, `attempts` ({self.attempts}) and `exposure_s` "
+                f"({self.exposure_s:g}) not negative."
             )
 
 
@@ -101,12 +101,11 @@ class PointTable:
     def __post_init__(self) -> None:
         if not 0 <= self.frames <= 1000 or not 1 <= self.exposures <= 4:
             raise ParameterError(
-                f"`frames` ({self.frames}) of [point] must be from 0 to 1,000, and `exposures` ({self.exposures}) from "
-                "1 to 4."
+                f"`frames` ({self.frames}) must be from 0 to 1,000, and `exposures` ({self.exposures}) from 1 to 4."
             )
         for name, least in (("size_cm", 0.0), ("ratio", 1.0), ("most_s", 0.0)):
             if not getattr(self, name) > least:
-                raise ParameterError(f"`{name}` ({getattr(self, name)}) of [point] must be above {least:g}.")
+                raise ParameterError(f"`{name}` ({getattr(self, name)}) must be above {least:g}.")
 
 
 @dataclass(frozen=True)
