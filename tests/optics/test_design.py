@@ -132,7 +132,7 @@ def test_recipe_of_the_paper_is_the_default(run, monkeypatch):
         ("--mask none.npy", "`none.npy` does not exist"),
         ("--mask a.npy --levls 3", "Did you mean --levels?"),
         ("pinholes --stl --size-mm 0.4 0.4 --count 2", "no heights for an STL"),
-        ("diffuser --stl --size-mm 0.4 0.4 --stl-every 0", "`every` (0) at least 1"),
+        ("diffuser --stl --size-mm 0.4 0.4 --stl-every 0", "Error: `--stl-every` (0) must be at least 1."),
         ("diffuser --size-mm 0.4 0.4 --stl-every 2", "`--stl-every` needs `--stl`"),
         ("--mask a.npy --values amplitude --pitch-um 2 --levels 4 --index 2", "leave out `--index`, `--levels`"),
         ("--mask a.npy --values height --pitch-um 2 --phase-nm 532", "leave out `--phase-nm`"),

@@ -56,6 +56,8 @@ class Output:
         from mwdn.optics.design import check_replaced, design_camera
         from mwdn.optics.mask_files import check_stl, write_gds, write_stl
 
+        if self.stl_every < 1:
+            raise ParameterError(f"`stl_every` ({self.stl_every}) must be at least 1.")
         if self.stl_every != 1 and not self.stl:
             raise ParameterError("`stl_every` needs `stl`. Give it, too, or leave `stl_every` out.")
         check_replaced(self.out, gds=self.gds, stl=self.stl)
