@@ -87,8 +87,7 @@ def evaluate(
         progress: called with the method's name and the picture's index after each picture.
 
     Returns:
-        The scores of each method. A method that raises an `MwdnError` costs the others nothing: the report has the
-        reason.
+        The scores of each method. If a method raises an `MwdnError`, the report has the reason in place of its scores.
 
     Raises:
         ParameterError: no method, no pair, or NaN or infinity in a pair.
@@ -135,7 +134,7 @@ def _score(
     shown: int,
     progress: Callable[[str, int], None] | None,
 ) -> tuple[Scores, list[Scene]]:
-    """Scores of one method on all pairs, and its pictures of the first ``shown``."""
+    """Scores of one method on all pairs, and its pictures of the first ``shown`` pairs."""
     peak = _warm_up(method, pairs[0][0][None])
     values: dict[str, list[float]] = {metric: [] for metric in METRICS}
     pictures: list[Scene] = []
