@@ -14,7 +14,16 @@ from skimage import io as skimage_io
 
 from image_files import HEIGHT, WIDTH, encoded, flag, noise, npy, put
 from mwdn.errors import ImageError, ParameterError
-from mwdn.io.images import READABLE, read_frame, read_picture, srgb_decode, srgb_encode, write_linear, write_picture
+from mwdn.io.images import (
+    READABLE,
+    read_frame,
+    read_picture,
+    srgb_decode,
+    srgb_encode,
+    write_frame,
+    write_linear,
+    write_picture,
+)
 
 
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF"])
@@ -158,3 +167,18 @@ def test_png_has_8_or_16_bits(tmp_path: Path) -> None:
 def test_readable_suffixes_are_in_lower_case() -> None:
     assert {".png", ".tif", ".npy"} <= READABLE
     assert all(suffix == suffix.lower() and suffix.startswith(".") for suffix in READABLE)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tif", "a.npy"])
+@pytest.mark.parametrize("dtype", ["uint8", "<u2", ">u2"])
+def test_a_frame_without_a_channel_axis_is_not_mirrored(tmp_path: Path, name: str, dtype: str) -> None:
+    frame = np.arange(12).reshape(3, 4).astype(dtype)
+    write_frame(tmp_path / name, frame)
+    np.testing.assert_array_equal(read_frame(tmp_path / name)[..., 0], frame)
+
+
+@pytest.mark.parametrize("frame", [np.full((3, 4, 1), 0.4, np.float32), np.zeros((3, 4, 2), np.uint8)])
+def test_what_a_png_cannot_hold_is_not_written(tmp_path: Path, frame: np.ndarray) -> None:
+    with pytest.raises(ImageError):
+        write_frame(tmp_path / "a.png", frame)
+    assert not list(tmp_path.iterdir())

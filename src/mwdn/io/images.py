@@ -163,12 +163,13 @@ def write_frame(path: str | Path, frame: Frame) -> None:
 
     Args:
         path: PNG for uint8 or uint16; NPY, or by any other suffix TIFF, for floats, too.
-        frame: (H, W, 1) or (H, W, 3), RGB.
+        frame: (H, W), (H, W, 1) or (H, W, 3), RGB; other floats become float32.
 
     Raises:
-        ImageError: the file cannot be written, or a PNG has over a million rows or columns.
+        ImageError: it is no frame, see `as_frame`; the file cannot be written; or a PNG has floats, or over a million
+            rows or columns.
     """
-    path = Path(path)
+    path, frame = Path(path), as_frame(frame)
     suffix = path.suffix.lower()
     data = encode_png(frame, path) if suffix == ".png" else b""  # before there is a temporary file
     with atomic_write(path) as temporary:
@@ -187,14 +188,17 @@ def encode_png(frame: Frame, name: str | Path) -> bytes:
     """A frame as a PNG of 8 or 16 bits: the content of the file that `write_frame` writes.
 
     Args:
-        frame: (H, W, 1) or (H, W, 3), RGB, uint8 or uint16.
+        frame: (H, W), (H, W, 1) or (H, W, 3), RGB, uint8 or uint16.
         name: of the picture, for the error.
 
     Raises:
-        ImageError: it has over a million rows or columns.
+        ImageError: it is no frame, has floats, or over a million rows or columns.
     """
     import cv2
 
+    frame = as_frame(frame)  # else the columns of (H, W) would be mirrored below
+    if frame.dtype.kind == "f":  # OpenCV would round them to 8 bits
+        raise ImageError(f"`{name}` cannot be written: PNG holds uint8 or uint16, not floats. Write a .tif or .npy.")
     try:
         encoded, data = cv2.imencode(".png", np.ascontiguousarray(frame[..., ::-1]))
     except cv2.error as error:
