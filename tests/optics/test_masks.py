@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from mwdn.errors import ParameterError
+from mwdn.errors import ParameterError, UnknownNameError
 from mwdn.optics import MASKS, amplitude_masks
 from mwdn.optics.amplitude_masks import CodedAperture, Pinholes, ZoneAperture
 from mwdn.optics.deviation import Deviation
@@ -319,3 +319,10 @@ def test_pitch_that_cannot_sample_the_surface():
         mask_psf(mask, SMALL)
     with pytest.raises(ParameterError, match=r"`index` \(1\) must be above 1"):
         Mask("phase", torch.zeros(4, 4), 1.0)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_another_kind_of_mask_is_refused():
+    """It was taken for a phase mask of index 1, which is transparent."""
+    with pytest.raises(UnknownNameError, match="Did you mean 'amplitude'"):
+        Mask("Amplitude", torch.zeros(4, 4), 1.0)

@@ -6,6 +6,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 
+from mwdn.arguments import checked
 from mwdn.errors import ParameterError
 from mwdn.optics.propagation import UM_PER_MM, UM_PER_NM, check_positive, integrate, overlap, point_source, propagate
 from mwdn.optics.setup import Setup
@@ -14,6 +15,7 @@ from mwdn.types import Field, Plane, Psf, Size
 Kind = Literal["phase", "amplitude"]
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Mask:
     """A thin element that delays light (phase mask) or blocks it (amplitude mask); opaque beyond its border.
@@ -27,6 +29,7 @@ class Mask:
         step_um: height of one level; 0 for a continuous surface.
 
     Raises:
+        UnknownNameError: `kind` is neither.
         ParameterError: `pitch_um` is not positive, or `index` of a phase mask not above 1.
     """
 
