@@ -76,6 +76,7 @@ def dot(a, b):
 def test_fast_length_is_the_next_even_smooth_number():
     for length in range(1, 700):
         assert fourier.fast_length(length) == oracles.smooth_even(length)
+    assert fourier.fast_length(0) == 2  # it never returned
 
 
 @pytest.mark.parametrize("grid", [(1, 2), (6, 10), (7, 9), (12, 5)])

@@ -18,8 +18,8 @@ from mwdn.types import Image, Psf, Size, Spectrum
 
 @cache
 def fast_length(length: int) -> int:
-    """Smallest even number of at least ``length`` with no prime factor above 7: fast to transform."""
-    candidate = length + length % 2
+    """Smallest even number, 2 or more, of at least ``length`` with no prime factor above 7: fast to transform."""
+    candidate = max(2, length + length % 2)
     while True:
         factor = candidate
         for prime in (2, 3, 5, 7):
