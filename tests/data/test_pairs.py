@@ -300,6 +300,8 @@ def test_wrong_calls(tmp_path, generator, unchecked):
         assert len(file) == 0
     with pytest.raises(ParameterError, match="`scene_shape`"):
         PairFile.create(tmp_path / "b.h5", measurement_shape=MEASUREMENT, scene_shape=(3, 0, 3))
+    with pytest.raises(ParameterError, match="1 channel or 3"):  # the file could be written, and never read
+        PairFile.create(tmp_path / "b.h5", measurement_shape=(6, 7, 2), scene_shape=MEASUREMENT)
     with pytest.raises(ParameterError, match="`dtype`"):
         create(tmp_path / "b.h5", "int8")
     with pytest.raises(ParameterError, match="'shape' is list"):

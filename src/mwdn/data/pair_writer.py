@@ -71,6 +71,10 @@ class PairWriter:
         for name, shape in zip(PAIR_PARTS, shapes, strict=True):
             if len(shape) != 3 or min(shape) < 1:
                 raise ParameterError(f"`{name}_shape` {tuple(shape)} must be (height, width, channels), all positive.")
+            if shape[2] not in (1, 3):
+                raise ParameterError(
+                    f"`{name}_shape` {tuple(shape)} must have 1 channel or 3: a `PairFile` has no others."
+                )
             if np.dtype(dtype).itemsize * math.prod(shape) > PICTURE_BYTES:
                 raise ParameterError(
                     f"`{name}_shape` {tuple(shape)} must have {PICTURE_BYTES:,} bytes at most: crop it."

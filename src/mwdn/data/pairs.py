@@ -82,7 +82,7 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
 
         Args:
             path: of the file, ending in .h5 or .hdf5. An existing file is replaced only after success.
-            measurement_shape: (H, W, C) of each measurement.
+            measurement_shape: (H, W, C) of each measurement, C of 1 or 3.
             scene_shape: (H, W, C) of each scene, which may be larger than the sensor.
             dtype: of both. float32 keeps negative noise; integers clip it.
             attributes: metadata of the camera.
