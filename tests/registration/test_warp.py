@@ -3,7 +3,7 @@ import pytest
 import torch
 from displayed import placed, seen_from
 
-from mwdn.errors import ShapeError
+from mwdn.errors import ParameterError, ShapeError
 from mwdn.registration import Projection, warp_pictures
 
 
@@ -46,3 +46,12 @@ def test_light_is_where_another_program_puts_it():
 def test_another_size_is_refused():
     with pytest.raises(ShapeError, match="20 x 30"):
         warp_pictures(picture(20, 30), placed((90, 120), (64, 80)))
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_one_picture_without_a_batch_is_refused():
+    """Its colours were taken for pictures, whose columns were taken for colours."""
+    with pytest.raises(ShapeError, match=r"`pictures\[None\]`"):
+        warp_pictures(picture(90, 120)[0], placed((90, 120), (64, 80)))
+    with pytest.raises(ParameterError, match="uint8"):
+        warp_pictures(picture(90, 120).mul(255).byte(), placed((90, 120), (64, 80)))

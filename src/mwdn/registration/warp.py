@@ -4,6 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mwdn.arguments import check_batch
 from mwdn.errors import ShapeError
 from mwdn.registration.projection import Points, Projection
 from mwdn.types import FloatFrame, Image, Scene
@@ -28,8 +29,10 @@ def warp_pictures(pictures: Scene, projection: Projection) -> Image:
         (B, C, H, W), the camera's size.
 
     Raises:
-        ShapeError: the pictures have another size than the projection's.
+        ParameterError: the pictures are no tensor of floats.
+        ShapeError: they are no batch, or have another size than the projection's.
     """
+    check_batch(pictures, "pictures")
     if tuple(pictures.shape[-2:]) != tuple(projection.picture_size):
         (h, w), (H, W) = pictures.shape[-2:], projection.picture_size
         raise ShapeError(f"`pictures` ({h} x {w}) must have the projection's size ({H} x {W}): `for_picture`.")
