@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -227,6 +228,20 @@ def test_wrong_calls():
         field_psfs(psfs[0], (0, 2), Aberration())
     with pytest.raises(ShapeError, match="from_psfs"):
         FieldCamera.from_psfs(psfs, (5, 5)).forward(torch.ones(1, 1, 6, 5))
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("scene", [torch.ones(1, 1, 5, 5, dtype=torch.uint8), np.ones((1, 1, 5, 5))])
+def test_scenes_of_another_type_are_refused_as_by_a_camera(scene):
+    """8 bits became light of up to 255."""
+    psf = torch.ones(1, 1, 3, 3)
+    for camera in (Camera(psf, size=(5, 5)), FieldCamera.from_psfs(psf[None], (5, 5))):
+        with pytest.raises(ParameterError, match="`scene`"):
+            camera.forward(scene)
+
+
+def test_psfs_without_light_give_darkness():
+    assert not FieldCamera.from_psfs(torch.zeros(2, 2, 1, 3, 3), (5, 5)).forward(torch.ones(1, 1, 5, 5)).any()
 
 
 def test_two_depths_divide_the_scene_between_two_cameras(generator):

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from mwdn.arguments import checked
+from mwdn.arguments import check_batch, checked
 from mwdn.errors import ParameterError, ShapeError
 from mwdn.fourier.convolution import convolve, correlate
 from mwdn.fourier.transforms import fast_length, gaussian_transfer, inverse_spectrum, spectrum
@@ -152,7 +152,7 @@ class FieldCamera:
             raise ParameterError(f"`rank` ({rank}) must be at least 1.")
         rows, columns, *shape = psfs.shape
         left, values, right = torch.linalg.svd(psfs.reshape(rows * columns, -1), full_matrices=False)
-        kept = min(rank or int((values > 1e-6 * values[0]).sum()), len(values))
+        kept = min(rank or max(1, int((values > 1e-6 * values[0]).sum())), len(values))  # 1 of PSFs without light
         coefficients = (left[:, :kept] * values[:kept]).T.reshape(kept, 1, rows, columns)
         weights = F.interpolate(coefficients, scene_size, mode="bilinear", align_corners=True)
         lost = float(values[kept:].norm() / values.norm().clamp(min=1e-30))
@@ -182,7 +182,9 @@ class FieldCamera:
 
         Raises:
             ShapeError: the scene does not have `scene_size`.
+            ParameterError: it is no tensor of floats.
         """
+        check_batch(scene, "scene")
         if (scene.shape[-2], scene.shape[-1]) != self.scene_size:
             raise ShapeError(
                 f"`scene` {tuple(scene.shape)} must have the camera's scene size {self.scene_size}. "
