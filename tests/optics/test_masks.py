@@ -286,6 +286,8 @@ def test_impossible_masks(design, message):
         ({"pixels": (100_000, 100_000), "bin": 1}, "100,000 x 100,000 pixels"),  # 120 GB
         ({"band_nm": (760.0, 400.0)}, "`band_nm` (760.0, 400.0) must be the shortest and the longest"),
         ({"wavelengths": 0}, "`wavelengths` (0) must be positive"),
+        ({"aperture_mm": (math.inf, 1.0)}, "`aperture_mm` (inf, 1.0) must be finite"),
+        ({"band_nm": (400.0, math.inf)}, "`band_nm` (400.0, inf) must be finite"),
         ({"distance_mm": "a"}, "`distance_mm` ('a')"),
         ({"source_mm": "inf"}, "`source_mm` ('inf')"),
         ({"aperture_mm": 3.0}, "`aperture_mm` (3.0)"),

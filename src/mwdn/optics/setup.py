@@ -59,6 +59,9 @@ class Setup:
         )
         if math.isinf(self.distance_mm):
             raise ParameterError("`distance_mm` (inf) must be finite: the sensor is near the mask.")
+        for name in ("aperture_mm", "band_nm"):
+            if math.inf in getattr(self, name):
+                raise ParameterError(f"`{name}` {getattr(self, name)} must be finite.")
         if not 0 < self.band_nm[0] <= self.band_nm[1]:
             raise ParameterError(f"`band_nm` {self.band_nm} must be the shortest and the longest wavelength, positive.")
         if self.bin > min(self.pixels):
