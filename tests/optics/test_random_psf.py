@@ -174,6 +174,16 @@ def test_impossible_varieties_are_refused(wrong):
         Variety(**wrong)
 
 
+@pytest.mark.parametrize(
+    "wrong", [{"support": 0.5}, {"offset": (0.0, 0.1)}, {"halo": None}, {"support": (0.1, 0.2, 0.3)}]
+)
+@pytest.mark.usefixtures("unchecked")
+def test_a_range_is_no_number(wrong):
+    with pytest.raises(ParameterError, match=next(iter(wrong))):
+        Variety(**wrong)
+    assert Variety(halo=[0.0, 0.2]).halo == [0.0, 0.2]  # as of JSON
+
+
 @pytest.mark.usefixtures("unchecked")
 def test_numpys_numbers_are_seeds():
     assert torch.equal(sample_camera(np.int64(3), (16, 24)), sample_camera(3, (16, 24)))

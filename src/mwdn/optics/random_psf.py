@@ -22,6 +22,7 @@ from mwdn.types import Psf, Size
 Range = tuple[float, float]
 
 
+@checked
 @dataclass(frozen=True)
 class Variety:
     """Ranges from which the properties of random cameras are drawn, uniformly for each camera.
@@ -42,6 +43,9 @@ class Variety:
         colour_blur: largest relative difference of the blur of red and blue from green's, of opposite signs.
         colour_tilt: largest relative change of a colour's brightness from the middle to a side of the frame.
         grey: probability that all colours are alike.
+
+    Raises:
+        ParameterError: a number is out of its range, or of another type.
     """
 
     support: Range = (0.4, 1.15)
@@ -62,7 +66,7 @@ class Variety:
     def __post_init__(self) -> None:
         for part in fields(self):
             value = getattr(self, part.name)
-            low, high = value if isinstance(value, tuple) else (value, value)
+            low, high = value if isinstance(value, tuple | list) else (value, value)
             if not 0 <= low <= high:
                 raise ParameterError(f"`{part.name}` ({value}) must not be negative, and a range must rise.")
         for name, low in (("support", self.support[0]), ("detail_px", self.detail_px[0]), ("line_px", self.line_px[0])):
