@@ -259,7 +259,9 @@ IMPOSSIBLE = [
     (CodedAperture(feature_um=3.0), "`pitch_um` (2) cannot sample squares of 3 um: use at most 1.5 um"),
     (CodedAperture(order=40), "`order` (40) of an mls must be 2 to 11"),
     (CodedAperture("mura", 33), "`order` (33) of a mura must be"),
+    (Diffuser(deflection_degrees=95.0), "`deflection_degrees` (95) must be below 90"),
     (Pinholes(count=0), "`count` (0) must be positive"),
+    (Pinholes(count=20_000), "`count` (20000) holes"),  # its search took days
     (Pinholes(diameter_um=3.0), "`diameter_um` (3) must be at least 2 samples, 4 um"),
     (Pinholes(size_mm=(0.3, 0.3)), "`size_mm` (0.3, 0.3)"),
     (Pinholes(size_mm=(0.1, 0.3), count=1, diameter_um=110.0), "`diameter_um` (110) must be"),

@@ -192,17 +192,21 @@ def _holes(design: Pinholes, size: Size) -> Tensor:
     generator = torch.Generator().manual_seed(design.seed)
     y, x = coordinates(size[0], design.pitch_um), coordinates(size[1], design.pitch_um)
     room = (torch.tensor(design.size_mm, dtype=torch.float64) * UM_PER_MM - 2 * design.diameter_um).clamp(min=0)
-    places: list[Tensor] = []
-    for _ in range(200 * design.count):
+    # Disks of two diameters around the holes do not overlap: no more of them than their area allows.
+    most = int((room + 2 * design.diameter_um).prod() / (math.pi * design.diameter_um**2))
+    places, found = torch.empty(min(design.count, most), 2, dtype=torch.float64), 0
+    for _ in range(200 * design.count if design.count <= most else 0):
         place = (torch.rand(2, generator=generator, dtype=torch.float64) - 0.5) * room
-        if all((place - other).norm() > 2 * design.diameter_um for other in places):
-            places.append(place)
-        if len(places) == design.count:
+        if ((place - places[:found]).norm(dim=1) > 2 * design.diameter_um).all():
+            places[found] = place
+            found += 1
+        if found == design.count:
             break
     else:
+        fitted = f"{found} did" if found else f"{most} at most would"
         raise ParameterError(
             f"`count` ({design.count}) holes of `diameter_um` ({design.diameter_um:g}) do not fit into `size_mm` "
-            f"{design.size_mm} two diameters apart; {len(places)} did. Use fewer or smaller holes, or a larger mask."
+            f"{design.size_mm} two diameters apart; {fitted}. Use fewer or smaller holes, or a larger mask."
         )
     open_ = torch.zeros(size)
     for place in places:

@@ -136,6 +136,8 @@ class Diffuser:
         size = sample_counts(self.size_mm, self.pitch_um)
         check_index(self.index)
         check_positive(feature_um=self.feature_um, deflection_degrees=self.deflection_degrees)
+        if not self.deflection_degrees < 90:
+            raise ParameterError(f"`deflection_degrees` ({self.deflection_degrees:g}) must be below 90.")
         _check_feature("feature_um", self.feature_um, self.pitch_um, self.size_mm)
         field = _hills(size, self.feature_um / self.pitch_um, torch.Generator().manual_seed(self.seed))
         slope = torch.stack([field.diff(dim=axis).square().mean() for axis in (0, 1)]).mean().sqrt().item()
