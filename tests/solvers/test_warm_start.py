@@ -6,7 +6,7 @@ from torch.nn import functional as F
 
 from cameras import contour_psf
 from mwdn import Camera
-from mwdn.errors import ParameterError
+from mwdn.errors import ParameterError, ShapeError
 from mwdn.solvers import Admm, Fista, WarmStart
 
 SIZE = 40, 48
@@ -118,3 +118,12 @@ def test_streams_of_a_batch_are_one_by_one(solver, psf, film):
 def test_zero_iterations_are_refused():
     with pytest.raises(ParameterError, match=r"`iterations` \(0\) must be at least 1"):
         WarmStart(Admm(), iterations=0)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_what_is_no_batch_is_refused_as_by_the_solver(psf, film):
+    for solve in (Admm(iterations=1), WarmStart(Admm(iterations=1))):
+        with pytest.raises(ShapeError, match="must be"):
+            solve(film[0][0], psf)
+        with pytest.raises(ParameterError, match="`measurement`"):
+            solve(film[0].numpy(), psf)

@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 
-from mwdn.arguments import checked
+from mwdn.arguments import check_batch, checked
 from mwdn.errors import ParameterError
 from mwdn.solvers.admm import Admm
 from mwdn.solvers.fista import Fista
@@ -41,6 +41,7 @@ class WarmStart:
 
     def __call__(self, measurement: Measurement, psf: Psf) -> Scene:
         """Reconstruct the next frame, or a batch of frames of as many streams."""
+        check_batch(measurement, "measurement")
         light = root_mean_square(measurement)
         warm = self.last is not None and psf is self.psf and measurement.shape == self.shape
         warm = warm and bool(((light < CUT * self.brightness) & (self.brightness < CUT * light)).all())
