@@ -87,6 +87,9 @@ def test_what_is_no_operator_is_refused(psf):
         linear_operator(Camera(psf.expand(2, -1, -1, -1)))
     with pytest.raises(ShapeError, match=r"`channels` \(2\)"):
         linear_operator(Camera(psf), channels=2)
+    for wrong in ({"channels": 0}, {"scene_size": (0, 4)}):
+        with pytest.raises(ShapeError, match="must be positive"):
+            linear_operator(Camera(psf[:, :1]), **wrong)
     with pytest.raises(ShapeError, match=r"\(1, 2\)"):
         linear_operator(FieldCamera(psf, torch.ones(1, 1, *SCENE)), scene_size=(1, 2))
     with pytest.raises(ParameterError, match="complex64"):
