@@ -157,6 +157,8 @@ def test_wrong_calls_are_refused(pairs):
             evaluate(methods, some, Protocol(), perceptual=Perceptual.none())
     with pytest.raises(ShapeError, match="must have the same shape"):
         evaluate({"small": lambda b: b[:, :1]}, pairs, Protocol(), perceptual=Perceptual.none())
+    with pytest.raises(ParameterError, match=r"`protocol` \('full'\) of `evaluate` must be"):
+        evaluate(same, pairs, "full")
 
 
 @pytest.mark.parametrize(("part", "what"), [(0, "measurement"), (1, "scene")])

@@ -14,6 +14,7 @@ from pathlib import Path
 import torch
 from torch import nn
 
+from mwdn.arguments import checked
 from mwdn.data.pairs import refuse_non_finite
 from mwdn.errors import MwdnError, ParameterError, ShapeError, without_traceback
 from mwdn.evaluation.alexnet import ALEXNET_MIN_PX
@@ -64,6 +65,7 @@ class First:
         return self.pairs[range(len(self))[index]]
 
 
+@checked
 def evaluate(
     methods: Mapping[str, Method],
     pairs: Pairs,
@@ -90,7 +92,7 @@ def evaluate(
         The scores of each method. If a method raises an `MwdnError`, the report has the reason in place of its scores.
 
     Raises:
-        ParameterError: no method, no pair, or NaN or infinity in a pair.
+        ParameterError: no method, no pair, NaN or infinity in a pair, or an argument of another type.
         ShapeError: the protocol's part exceeds the scenes, or is too small for SSIM.
         MwdnError: every method fails; this is the first one's error.
     """
@@ -153,7 +155,7 @@ def _score(
     if wrong:
         warnings.warn(
             f"`{name}` returned NaN or infinity for {wrong:,} of {len(pairs):,} pictures: its scores mean nothing.",
-            stacklevel=3,
+            stacklevel=4,
         )
     columns = {metric: tuple(column) for metric, column in values.items()}
     return Scores(columns, tuple(seconds), peak, _device(method).type, learnable_numbers(method)), pictures
@@ -172,7 +174,7 @@ def _check_pairs(pairs: Pairs) -> None:
         warnings.warn(
             f"The scenes have values up to {brightest:.3g}, but scores are defined for 0 to 1. Divide the scenes by "
             "their white, and write the file again.",
-            stacklevel=3,
+            stacklevel=4,
         )
 
 
