@@ -528,3 +528,12 @@ def test_command(tmp_path, capsys):
     assert ended.value.code == 0
     assert "agrees to" in capsys.readouterr().out
     assert read_about(out)["method"] == "wiener"
+
+
+@pytest.mark.parametrize("name", ["a.onnx", "a.pt2"])
+def test_a_file_without_a_description_is_refused(tmp_path, name):
+    with pytest.raises(ExportError, match=name):
+        read_about(tmp_path / name)
+    (tmp_path / name).write_text("hi")  # as ONNX this was a model without metadata
+    with pytest.raises(ExportError, match=name):
+        read_about(tmp_path / name)

@@ -86,14 +86,22 @@ def read_about(file: Path) -> dict[str, str]:
 
     Args:
         file: .pt2 or .onnx.
-    """
-    if file.suffix == ".pt2":
-        extra = {ABOUT: ""}
-        torch.export.load(file, extra_files=extra)
-        return json.loads(extra[ABOUT])
-    import onnx
 
-    return {entry.key: entry.value for entry in onnx.load(str(file)).metadata_props}
+    Raises:
+        MissingPackageError: onnx is not installed.
+        ExportError: the file cannot be read, or `export` did not write it.
+    """
+    onnx = None if file.suffix == ".pt2" else require("onnx", "export", purpose="ONNX")
+    with as_export_error(file):
+        if onnx is None:
+            extra = {ABOUT: ""}
+            torch.export.load(file, extra_files=extra)
+            about = json.loads(extra[ABOUT])
+        else:
+            about = {entry.key: entry.value for entry in onnx.load(str(file)).metadata_props}
+        if "method" not in about:
+            raise ValueError("it has no description")
+        return about
 
 
 def publish(file: Path, out: Path) -> None:
