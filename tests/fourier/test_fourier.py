@@ -73,6 +73,15 @@ def dot(a, b):
     return (a.double() * b.double()).sum().item()
 
 
+def test_a_convolution_refuses_images_of_another_size():
+    """A larger scene was cropped at its top left corner without a word."""
+    camera = fourier.Convolution.from_psf(torch.ones(1, 1, 3, 3), (6, 7), (4, 5))
+    assert camera.adjoint(camera.forward(torch.ones(1, 1, 6, 7))).shape == (1, 1, 6, 7)
+    for apply, name in ((camera.forward, "scene"), (camera.adjoint, "measurement")):
+        with pytest.raises(ShapeError, match=f"`{name}`"):
+            apply(torch.ones(1, 1, 20, 20))
+
+
 def test_fast_length_is_the_next_even_smooth_number():
     for length in range(1, 700):
         assert fourier.fast_length(length) == oracles.smooth_even(length)

@@ -119,9 +119,24 @@ class Convolution(NamedTuple):
         return cls(transfer, (transfer.shape[-2], 2 * (transfer.shape[-1] - 1)), scene, sensor)  # its grid is even
 
     def forward(self, scene: Scene) -> Image:
-        """Convolve a scene and crop it to the sensor."""
+        """Convolve a scene and crop it to the sensor.
+
+        Raises:
+            ShapeError: the scene has another size.
+        """
+        _check_size(scene, self.scene, "scene")
         return inverse_spectrum(spectrum(scene, self.grid) * self.transfer, self.grid, self.sensor)
 
     def adjoint(self, measurement: Measurement) -> Scene:
-        """Exact adjoint of `forward`."""
+        """Exact adjoint of `forward`.
+
+        Raises:
+            ShapeError: the measurement has another size.
+        """
+        _check_size(measurement, self.sensor, "measurement")
         return inverse_spectrum(spectrum(measurement, self.grid) * self.transfer.conj(), self.grid, self.scene)
+
+
+def _check_size(image: Tensor, size: Size, name: str) -> None:
+    if tuple(image.shape[-2:]) != tuple(size):  # a transform would crop it, or pad it
+        raise ShapeError(f"`{name}` {tuple(image.shape)} must have the size {tuple(size)} of this `Convolution`.")
