@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from mwdn.errors import ShapeError
 from mwdn.io.contact_sheets import contact_sheet, to_display
 
 GAP, HEAD = 6, 26
@@ -30,6 +31,11 @@ def test_darkness_and_negative_numbers_are_black():
     assert (to_display(torch.zeros(1, 3, 4, 4)) == 0).all()
     assert (to_display(-torch.rand(1, 3, 4, 4)) == 0).all()
     assert to_display(torch.full((1, 1, 1, 1), 3.0)).item() == 1
+
+
+def test_a_picture_without_pixels_is_refused():
+    with pytest.raises(ShapeError, match=r"\(1, 3, 0, 4\)"):
+        to_display(torch.zeros(1, 3, 0, 4))
 
 
 @pytest.mark.parametrize("height", [10, 20, 50])

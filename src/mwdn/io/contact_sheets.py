@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.arguments import check_batch
+from mwdn.errors import ShapeError
 from mwdn.io.arrays import as_frame
 from mwdn.io.images import srgb_decode
 from mwdn.types import ArrayPicture, FloatFrame, Image
@@ -37,13 +38,15 @@ def to_display(image: Tensor | ArrayPicture) -> Tensor | FloatFrame:
 
     Raises:
         ImageError: an array has other axes or types, NaN or infinity.
-        ShapeError: a tensor has other axes.
+        ShapeError: a tensor has other axes, or no pixels.
         ParameterError: a tensor of integers.
     """
     if not isinstance(image, Tensor):
         frame = torch.from_numpy(as_frame(image).astype(np.float32))
         return to_display(frame.movedim(-1, 0)[None])[0].movedim(0, -1).numpy().reshape(np.asarray(image).shape)
     check_batch(image, "image")
+    if 0 in image.shape[1:]:
+        raise ShapeError(f"`image` {tuple(image.shape)} must have pixels.")
     pixels = image.float().flatten(1)
     brightest = pixels.kthvalue(pixels.shape[1] - int(CLIPPED_SHARE * pixels.shape[1])).values
     return (image / brightest.clamp(min=1e-12)[:, None, None, None]).clamp(0, 1)
