@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from displayed import placed
 
-from mwdn.errors import AlignmentError, ParameterError
+from mwdn.errors import AlignmentError, ParameterError, ShapeError
 from mwdn.registration import Place, Projection, through_corners
 from mwdn.registration.point_fit import correct, fit_points
 
@@ -115,6 +115,14 @@ def test_four_points_are_exact_and_three_are_refused():
         fit_points(corners[:3], corners[:3], **SIZES)
     with pytest.raises((AlignmentError, ParameterError)):
         through_corners(np.array([[0, 0], [10, 10], [20, 20], [30.0, 30]]), **SIZES)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_corners_may_be_a_list_and_are_four():
+    corners = [[60, 40], [150, 45], [140, 120], [55, 110]]
+    assert through_corners(corners, **SIZES).corners() == pytest.approx(np.array(corners, float))
+    with pytest.raises(ShapeError, match="four points"):  # OpenCV's error
+        through_corners(corners[:3], **SIZES)
 
 
 @pytest.mark.parametrize(("turn", "mirrored"), [(-1.3, False), (30, False), (-100, True), (170, True)])

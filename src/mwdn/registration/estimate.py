@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mwdn.errors import AlignmentError
+from mwdn.errors import AlignmentError, ShapeError
 from mwdn.registration.correlation import Refined, correlation_at, refine
 from mwdn.registration.features import match_features
 from mwdn.registration.markers import match_markers
@@ -103,8 +103,12 @@ def through_corners(corners: Points, picture_size: Size, camera_size: Size) -> P
     """The projection that puts the picture's corners, from its own top left clockwise, to these pixels (4, 2).
 
     Raises:
+        ShapeError: they are not four points.
         AlignmentError: three of them lie on a line.
     """
+    corners = np.asarray(corners, np.float64)
+    if corners.shape != (4, 2):
+        raise ShapeError(f"`corners` {corners.shape} must be four points (4, 2): x to the right and y down, in pixels.")
     return fit_points(
         picture_corners(picture_size), corners, picture_size=picture_size, camera_size=camera_size
     ).projection
