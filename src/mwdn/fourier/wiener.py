@@ -36,7 +36,8 @@ def wiener(
         (B, C, H, W), float32; its range is that of ``measurement`` over the sum of ``psf``.
 
     Raises:
-        ShapeError: batch or channels do not fit, or ``regularisation`` has other axes.
+        ShapeError: batch or channels do not fit, ``psf`` exceeds `deconvolution_grid`, or ``regularisation`` has other
+            axes.
         ParameterError: ``regularisation`` is a number that is not positive, or ``boundary`` is unknown.
 
     References:

@@ -21,7 +21,10 @@ def psf_hash(psf: Psf) -> str:
 
 
 def unit_sum(psf: Tensor) -> Tensor:
-    """Divide each channel (..., h, w) by its sum: the camera then keeps the energy of the scene."""
+    """Divide each channel (..., h, w) by its sum: the camera then keeps the energy of the scene.
+
+    Nothing is checked, see `mwdn.optics.psf.checked_psf`: a channel without light becomes NaN.
+    """
     return psf / psf.sum((-2, -1), keepdim=True)
 
 
