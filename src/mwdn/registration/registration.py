@@ -64,8 +64,8 @@ def read_projection(path: str | Path) -> Projection:
     """Read the projection of a registration from its JSON file, or from a file of aligned pairs.
 
     Raises:
-        ParameterError: the file holds none, or is damaged.
-        ImageError: no such file.
+        ParameterError: a JSON file cannot be read; or the file holds none, or is damaged.
+        ImageError: a file of pairs cannot be read.
     """
     path = Path(path)
     if path.suffix.lower() in PAIR_SUFFIXES:
