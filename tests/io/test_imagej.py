@@ -44,6 +44,19 @@ def test_the_numbers_return(channels, scene, tmp_path):
     np.testing.assert_array_equal(frame, scene[0, :channels].movedim(0, -1).numpy())
 
 
+@pytest.mark.parametrize("shape", [(7, 1), (7, 1, 3), (1, 1, 3), (1, 7, 3)])
+def test_frames_of_one_row_or_column_return(shape, tmp_path):
+    frame = np.random.default_rng(0).random(shape, np.float32)
+    write_imagej(tmp_path / "scene.tif", frame)
+    np.testing.assert_array_equal(mwdn.read_frame(tmp_path / "scene.tif"), np.atleast_3d(frame))
+
+
+def test_without_light_the_display_range_ends_at_1(tmp_path):
+    write_imagej(tmp_path / "scene.tif", np.full((5, 7), -0.1, np.float32))
+    with tifffile.TiffFile(tmp_path / "scene.tif") as file:
+        assert (file.imagej_metadata["min"], file.imagej_metadata["max"]) == (0, 1)
+
+
 @pytest.mark.parametrize("channels", [1, 3])
 def test_tifffile_finds_channels_scale_and_range(channels, scene, tmp_path):
     write_imagej(tmp_path / "scene.tif", scene[:, :channels], pixel_um=2.5)
@@ -74,6 +87,9 @@ def test_without_a_pitch_there_is_no_scale(scene, tmp_path):
 def test_impossible_files_are_refused(scene, tmp_path):
     with pytest.raises(ParameterError, match=r"`pixel_um` \(0\.0\)"):
         write_imagej(tmp_path / "scene.tif", scene, pixel_um=0.0)
+    for pixel_um in (1e-300, 1e10):  # no fraction of a TIFF
+        with pytest.raises(ParameterError, match="1e-9 to 1e9"):
+            write_imagej(tmp_path / "scene.tif", scene, pixel_um=pixel_um)
     with pytest.raises(ImageError, match="NaN"):
         write_imagej(tmp_path / "scene.tif", scene / 0 * 0)
     with pytest.raises(ImageError, match=r"\.png"):

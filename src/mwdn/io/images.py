@@ -140,22 +140,25 @@ def write_imagej(path: str | Path, image: Tensor | FloatFrame, *, pixel_um: floa
         pixel_um: distance between pixels in micrometres, ImageJ's scale; without it, ImageJ counts pixels.
 
     Raises:
-        ParameterError: ``pixel_um`` is not positive.
+        ParameterError: ``pixel_um`` is not from 1e-9 to 1e9, the fractions that a TIFF can hold.
         ImageError: as for `write_linear`.
     """
     import tifffile
 
-    if pixel_um is not None and not 0 < pixel_um < float("inf"):
-        raise ParameterError(f"`pixel_um` ({pixel_um}) must be positive: micrometres between pixels.")
+    if pixel_um is not None and not 1e-9 <= pixel_um <= 1e9:
+        raise ParameterError(f"`pixel_um` ({pixel_um}) must be from 1e-9 to 1e9: micrometres between pixels.")
     frame = _float_frame(Path(path), image, ".tif", ".tiff")
-    white = float(np.quantile(frame, 0.997)) or 1.0
-    about: dict[str, object] = {"axes": "CYX", "mode": "composite", "Ranges": (0.0, white) * frame.shape[-1]}
+    brightest = float(np.quantile(frame, 0.997))
+    white = brightest if brightest > 0 else 1.0
+    axes = "TZCYXS"  # all six: tifffile would take a frame of one column for one without columns
+    about: dict[str, object] = {"axes": axes, "mode": "composite", "Ranges": (0.0, white) * frame.shape[-1]}
     if frame.shape[-1] == 1:
-        about = {"axes": "CYX", "min": 0.0, "max": white}
+        about = {"axes": axes, "min": 0.0, "max": white}
     resolution = None if pixel_um is None else (1 / pixel_um, 1 / pixel_um)
     about |= {"unit": "um"} if resolution else {}
     with atomic_write(path) as temporary:
-        tifffile.imwrite(temporary, np.moveaxis(frame, -1, 0), imagej=True, metadata=about, resolution=resolution)
+        planes = np.moveaxis(frame, -1, 0)[None, None, ..., None]
+        tifffile.imwrite(temporary, planes, imagej=True, metadata=about, resolution=resolution)
 
 
 def write_frame(path: str | Path, frame: Frame) -> None:
