@@ -100,6 +100,26 @@ def test_what_is_recorded_is_played_to_the_bit(tmp_path):
         assert [camera.read().number for _ in range(7)] == [0, 1, 2, 3, 4, 0, 1]
 
 
+def test_the_order_of_bytes_is_the_computers_in_a_recording(tmp_path):
+    path, array = tmp_path / "frames.h5", np.arange(12, dtype=np.uint16).reshape(3, 4, 1)
+    for first, second in ((">u2", ">u2"), ("<u2", ">u2"), (">u2", "<u2")):
+        with record(path) as recorder:
+            for dtype in (first, second):
+                recorder.append(CameraFrame(array=array.astype(dtype), bit_depth=12))
+        with open_source(f"replay:{path}") as camera:
+            for _ in range(2):
+                np.testing.assert_array_equal(camera.read().array, array)
+        path.unlink()
+
+
+@pytest.mark.parametrize(
+    "array", [np.zeros((3, 4), np.uint8), np.zeros((3, 4, 2), np.uint8), np.zeros((3, 4, 1), np.float32)]
+)
+def test_frames_that_could_not_be_played_are_not_recorded(array, tmp_path):
+    with pytest.raises(CameraError, match="`array`"), record(tmp_path / "frames.h5") as recorder:
+        recorder.append(CameraFrame(array=array, bit_depth=8))
+
+
 def test_a_recording_waits_as_long_as_it_was_recorded(tmp_path):
     with record(tmp_path / "a.h5") as recorder:
         for number in range(3):

@@ -20,7 +20,7 @@ from mwdn.data.hdf5 import (
     write_row,
 )
 from mwdn.data.journal import Growing, create_growing
-from mwdn.errors import CameraError, ImageError
+from mwdn.errors import CameraError, ImageError, shown
 from mwdn.io.files import as_image_error
 
 COLUMNS = {"exposure_s": "f8", "gain": "f8", "timestamp": "f8", "number": "i8", "dropped": "i8"}
@@ -47,10 +47,12 @@ class Recorder:
         """Add a frame. With ``commit_every`` 1 it is on the disk when this returns.
 
         Raises:
-            CameraError: its size, type, bit depth or mosaic differs from the first frame's.
+            CameraError: its array is not as `CameraFrame` says, or its size, type, bit depth or mosaic differs from
+                the first frame's.
             ImageError: the disk is full. The frames of earlier commits are kept.
         """
         if self._first is None:
+            _check_array(frame)
             self._first = frame
             set_format(self._growing.file.attrs, frame)
             self._rows = FrameRows(self._growing.file, "frames", "frame_data", frame)
@@ -117,6 +119,16 @@ class FrameRows:
         write_row(self.data, frame.array)
         for key, column in self.columns.items():
             write_row(column, getattr(frame, key))
+
+
+def _check_array(frame: CameraFrame) -> None:
+    """Raise a `CameraError` for an array that `Replay` would refuse."""
+    shape, dtype = frame.array.shape, frame.array.dtype
+    if len(shape) != 3 or shape[2] not in (1, 3) or 0 in shape or dtype.name not in ("uint8", "uint16"):
+        raise CameraError(
+            f"`array` ({shown(frame.array)}) of a frame must be (H, W, 1 or 3) of uint8 or uint16. For a grey one "
+            "(H, W): `array[..., None]`."
+        )
 
 
 def set_format(attributes: Any, frame: CameraFrame) -> None:  # noqa: ANN401

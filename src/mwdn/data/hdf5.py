@@ -79,7 +79,8 @@ def add_rows(file: Any, name: str, shape: tuple[int, ...], dtype: np.dtype[Any])
     if name in file:
         return file[name]
     chunk = (1, *shape) if shape else (1024,)
-    return file.create_dataset(name, (0, *shape), dtype, maxshape=(None, *shape), chunks=chunk, track_times=False)
+    native = dtype.newbyteorder("=")
+    return file.create_dataset(name, (0, *shape), native, maxshape=(None, *shape), chunks=chunk, track_times=False)
 
 
 def write_row(data: Any, value: Any) -> None:  # noqa: ANN401
@@ -87,7 +88,7 @@ def write_row(data: Any, value: Any) -> None:  # noqa: ANN401
     number = len(data)
     data.resize(number + 1, axis=0)
     if data.ndim > 1:  # past HDF5's cache of chunks: on the disk at once, in a third of the time
-        data.id.write_direct_chunk((number, *[0] * (data.ndim - 1)), np.ascontiguousarray(value))
+        data.id.write_direct_chunk((number, *[0] * (data.ndim - 1)), np.ascontiguousarray(value, data.dtype))
     else:
         data[number] = value
 
