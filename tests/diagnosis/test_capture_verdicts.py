@@ -6,7 +6,7 @@ import torch
 
 from cameras import contour_psf
 from mwdn.calibration import Calibration
-from mwdn.diagnosis.captures import ambient_light, darkness, saturation
+from mwdn.diagnosis.captures import ambient_light, darkness, examine_capture, saturation
 from mwdn.diagnosis.noise import noise, noise_bounds
 from mwdn.diagnosis.trust import examine_picture
 from mwdn.optics.camera import Camera
@@ -44,6 +44,11 @@ def test_good_capture(light, calibration):
     states = [check(frame, calibration).state for check in (saturation, darkness, noise)]
     assert states[:2] == ["good", "good"]
     assert states[2] != "doubt"
+
+
+def test_a_frame_without_an_axis_of_channels_gives_the_same(light, calibration):
+    frame = stored(with_noise(light, 0.002))
+    assert examine_capture(frame[..., 0], calibration) == examine_capture(frame, calibration)
 
 
 def test_noise_beyond_half_of_the_detail(light, calibration):

@@ -10,6 +10,7 @@ from mwdn.diagnosis.mosaic import mosaic
 from mwdn.diagnosis.noise import noise
 from mwdn.diagnosis.verdict import Verdict
 from mwdn.errors import ImageError
+from mwdn.io.arrays import as_frame
 from mwdn.types import Frame, Measurement
 
 MIN_PEAK = 0.03
@@ -29,10 +30,11 @@ def examine_capture(frame: Frame, calibration: Calibration, *, for_viewing: bool
     A new check is one more entry here: a function that returns a `Verdict`.
 
     Args:
-        frame: (H, W, C), as `FrameFormat.read` returns it.
+        frame: (H, W) or (H, W, C), as `FrameFormat.read` returns it.
         calibration: the camera's.
         for_viewing: the capture's file is of a type for viewing (`mwdn.io.formats.is_for_viewing`).
     """
+    frame = as_frame(frame, finite=False)
     raw = mosaic(frame, calibration)
     verdicts = *(check(frame, calibration) for check in (saturation, darkness, noise, ambient_light)), raw
     if raw.state == "doubt":  # the noise test needs a known mosaic
