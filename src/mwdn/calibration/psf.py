@@ -255,9 +255,9 @@ class Calibration:
         """The sensor of a measurement's pixels."""
         return self.sensor and self.sensor.binned(self.frames.bin)
 
-    def saturated_part(self, frame: Frame) -> float:
+    def saturated_part(self, frame: ArrayPicture) -> float:
         """Fraction of a raw frame's pixels that are saturated; 0 for floats, which have no known maximum."""
-        return self.frames.saturated(frame)[0] / (frame.shape[0] * frame.shape[1])
+        return self.frames.saturated(frame := as_frame(frame, finite=False))[0] / (frame.shape[0] * frame.shape[1])
 
     def correct(self, frame: ArrayPicture) -> Measurement:
         """Turn a raw frame into a measurement of the PSF's size.
