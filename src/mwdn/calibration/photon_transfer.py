@@ -10,6 +10,7 @@ from torch import Tensor
 from mwdn.calibration.frame_format import FrameFormat
 from mwdn.calibration.noise_model import clipped_variance, fit_line
 from mwdn.errors import ParameterError
+from mwdn.io.arrays import as_frame
 from mwdn.optics.sensor import Sensor
 from mwdn.types import Frame
 
@@ -64,22 +65,31 @@ def photon_transfer(
     through the dark pair and the flat pairs gives g and the read noise.
 
     Args:
-        flats: (H, W, C), consecutive pairs of the same light, at any number of levels; 20 to 80 % of saturation.
-        darks: (H, W, C), consecutive pairs, at least one, of the same exposure as the flats.
+        flats: (H, W) or (H, W, C), consecutive pairs of the same light, at any number of levels; 20 to 80 % of
+            saturation.
+        darks: of the same size, consecutive pairs, at least one, of the same exposure as the flats.
         format: of the frames; linear in light.
         bad: (1, 1, H, W), bool, pixels that are left out.
         black: level without any light, as a fraction of the full scale; that of the dark frames unless given. If they
             are brighter, light of the room is in them, and its noise is no read noise.
 
     Raises:
-        ParameterError: too few frames, an encoded file, unequal light within a pair, or nothing but saturated flats.
+        ImageError: an array is no frame.
+        ParameterError: too few frames, frames of several sizes, an encoded file, unequal light within a pair, or
+            nothing but saturated flats.
     """
+    flats, darks = ([as_frame(frame, finite=False) for frame in frames] for frames in (flats, darks))
     if format.gamma is not None or any(frame.dtype.kind == "f" for frame in (*flats, *darks)):
         raise ParameterError("Photon transfer needs the sensor's integers, linear in light: no floats, no `gamma`.")
     if len(flats) < 2 or len(darks) < 2:
         raise ParameterError(
             f"Photon transfer needs two flat frames of the same light and two dark ones, not {len(flats)} and "
             f"{len(darks)}: `--flat a.png b.png --dark c.png d.png`."
+        )
+    if len(sizes := {frame.shape for frame in (*flats, *darks)}) > 1:
+        raise ParameterError(
+            f"All frames of a photon transfer must have one size, not {' and '.join(map(str, sorted(sizes)))}. Use the "
+            "same camera settings."
         )
     good = ~(np.zeros(flats[0].shape[:2], bool) if bad is None else bad[0, 0].numpy())
     full = format.full_scale(darks[0])
