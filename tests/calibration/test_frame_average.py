@@ -178,6 +178,20 @@ def test_photon_transfer_finds_gain_and_noise(sensor):
     assert (found.error < 0.02, found.clipped) == (True, False)
 
 
+def test_frames_without_an_axis_of_channels_give_the_same(bench):
+    darks, flats = [bench.dark() for _ in range(2)], [bench.flat(0.5) for _ in range(2)]
+    plane_darks, plane_flats = ([frame[..., 0] for frame in frames] for frames in (darks, flats))
+    assert photon_transfer(plane_flats, plane_darks, FORMAT) == photon_transfer(flats, darks, FORMAT)
+    average, of_planes = (average_frames(frames, FORMAT, kind="dark") for frames in (darks, plane_darks))
+    assert torch.equal(average.image, of_planes.image)
+
+
+def test_an_outlier_takes_no_frame_of_its_name_along(bench, dark):
+    frames = [bench.point(0.5), *(bench.point() for _ in range(4))]
+    average = average_frames(frames, FORMAT, names=["a.png", "b.png", "a.png", "b.png", "c.png"], dark=dark.image)
+    assert (average.count, [*average.rejected]) == (4, ["a.png (1)"])
+
+
 def test_photon_transfer_finds_pixels_that_are_full_before_the_converter():
     bench, sensor = Bench(hot=0), Sensor(15_000.0, 3.0, 12, 0.01)
     shape = torch.zeros(1, 1, 128, 160)
@@ -201,6 +215,7 @@ def test_photon_transfer_refuses_what_tells_nothing(bench):
         (([bench.flat(4.0)] * 2 + [flats[0], bench.flat(0.8)], darks), "frames 3 and 4 must have the same light"),
         (([bench.flat(4.0)] * 2, darks), "saturated"),
         (([flats[0]] * 2, darks), "no noisier"),
+        ((flats, [dark[:-2] for dark in darks]), "one size"),
     ):
         with pytest.raises(ParameterError, match=message):
             photon_transfer(*wrong, FORMAT)

@@ -12,6 +12,7 @@ from mwdn.calibration.frame_format import FrameFormat
 from mwdn.calibration.frame_operations import bin_pixels
 from mwdn.calibration.noise_model import NoiseModel, fit_noise
 from mwdn.errors import ImageError, ParameterError
+from mwdn.io.arrays import as_frame
 from mwdn.optics.displacement import displacement
 from mwdn.types import Frame, Image
 
@@ -78,17 +79,20 @@ def average_frames(
     themselves. With two frames, the higher of two such values is left out, because a cosmic hit only adds light.
 
     Args:
-        frames: (H, W, C), as stored, all of one shape and type.
+        frames: (H, W) or (H, W, C), as stored, all of one shape and type.
         format: of the frames; only its numbers count (bit depth, gamma), not its crop, mosaic and bin.
-        names: of the frames, for messages.
+        names: of the frames, for messages; those of the same name are numbered.
         kind: what they show. Darkness has no light to compare, and even light no pattern.
         dark: (1, C or 1, H, W), subtracted from each; in linear units of the full scale.
 
     Raises:
-        ImageError: no frames, frames of another size, or more than `MAX_TOTAL_BYTES`.
+        ImageError: no frames, no frame, frames of another size, or more than `MAX_TOTAL_BYTES`.
         ParameterError: most frames are outliers, or two disagree.
     """
+    frames = [as_frame(frame, finite=False) for frame in frames]
     names = list(names) or [f"frame {number}" for number in range(1, len(frames) + 1)]
+    if len(set(names)) < len(names):  # an outlier would take the others of its name along
+        names = [f"{name} ({number})" for number, name in enumerate(names, 1)]
     _check_alike(frames, names)
     if dark is not None and tuple(dark.shape[-2:]) != frames[0].shape[:2]:
         got, wanted = (" x ".join(map(str, size)) for size in (frames[0].shape[:2], dark.shape[-2:]))
