@@ -20,7 +20,7 @@ from made import trained
 from mwdn import Calibration, Reconstructor, read_frame, to_display
 from mwdn.calibration import FrameFormat
 from mwdn.cli.app import main
-from mwdn.errors import ExportError, MissingPackageError, ParameterError
+from mwdn.errors import ExportError, MissingPackageError, ParameterError, ShapeError
 from mwdn.export import export, read_about, run_file
 from mwdn.export.dft import column_matrices, inverse_row_matrix, row_matrix
 from mwdn.export.exporter import MIN_AGREEMENT, agreement, simulate_captures
@@ -159,6 +159,17 @@ def test_bound_network_is_the_same_function_for_any_batch(exported, generator):
         assert agreement(run_file(done.path, batch), exact(batch)) >= 100
 
 
+def test_a_file_is_run_by_its_name_on_floats_of_any_type(exported, generator):
+    path, batch = str(exported[0].path), random_batch(generator, 2)
+    assert torch.equal(run_file(path, batch.double().requires_grad_()), run_file(path, batch))
+    assert read_about(path) == exported[0].about
+    with pytest.raises(ShapeError, match="measurement"):
+        run_file(path, batch[0])
+    for wrong in (batch.numpy(), (255 * batch).byte()):
+        with pytest.raises(ParameterError, match="measurement"):
+            run_file(path, wrong)
+
+
 def test_the_file_says_what_it_is(exported):
     import onnx
 
@@ -290,7 +301,7 @@ def test_the_example_says_in_one_line_what_is_wrong(arguments, message, unchange
         write_frame(Path(name), np.full((*size, 3), 9, np.uint16))
     write_frame(Path("16.png"), np.full((*SIZE, 3), 5000, np.uint16))
     assert cv2.imwrite("clear.png", np.full((*SIZE, 4), 9, np.uint16))
-    write_frame(Path("nan.tif"), np.full((*SIZE, 3), np.nan, np.float32))
+    assert cv2.imwrite("nan.tif", np.full((*SIZE, 3), np.nan, np.float32))  # `write_frame` refuses NaN
     with pytest.raises(SystemExit, match=message) as ended:
         example(monkeypatch, *arguments)
     assert "\n" not in str(ended.value)

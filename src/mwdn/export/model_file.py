@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 from torch.export import ExportedProgram
 
+from mwdn.arguments import check_batch
 from mwdn.errors import ExportError
 from mwdn.export.onnx_program import to_onnx
 from mwdn.io.files import atomic
@@ -65,13 +66,22 @@ def _onnx(program: ExportedProgram, about: dict[str, str]) -> bytes:
     return model.SerializeToString()
 
 
-def run_file(file: Path, measurement: Measurement) -> Scene:
+def run_file(file: str | Path, measurement: Measurement) -> Scene:
     """Reconstruct a batch with an exported file, on the CPU.
+
+    Args:
+        file: .pt2 or .onnx.
+        measurement: (B, C, H, W), of the size and channels of the file.
 
     Raises:
         MissingPackageError: onnxruntime is not installed.
+        ShapeError: the measurement is no batch.
+        ParameterError: the measurement holds integers, or is no tensor.
         ExportError: the file cannot be read or run.
     """
+    file = Path(file)
+    check_batch(measurement, "measurement")
+    measurement = measurement.detach().cpu().float()
     if file.suffix == ".pt2":
         with as_export_error(file), torch.no_grad():
             return torch.export.load(file).module()(measurement)
@@ -81,7 +91,7 @@ def run_file(file: Path, measurement: Measurement) -> Scene:
         return torch.from_numpy(session.run(["scene"], {"measurement": measurement.numpy()})[0])
 
 
-def read_about(file: Path) -> dict[str, str]:
+def read_about(file: str | Path) -> dict[str, str]:
     """The description that `export` stored in a file: method, version, PSF, size and units, each as text.
 
     Args:
@@ -91,6 +101,7 @@ def read_about(file: Path) -> dict[str, str]:
         MissingPackageError: onnx is not installed.
         ExportError: the file cannot be read, or `export` did not write it.
     """
+    file = Path(file)
     onnx = None if file.suffix == ".pt2" else require("onnx", "export", purpose="ONNX")
     with as_export_error(file):
         if onnx is None:
