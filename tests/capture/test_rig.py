@@ -176,6 +176,8 @@ def test_wrong_options_are_named():
         RigOptions(mosaic="rgb")
     with pytest.raises(ParameterError, match="drop"):
         RigOptions(drop=1.0)
+    with pytest.raises(ParameterError, match="display_black"):  # white would be darker than black
+        RigOptions(display_black=1.0)
     with pytest.raises(ShapeError, match="psf"):
         rig(torch.ones(1, 1, 96, 96))
     with pytest.raises(ShapeError, match="display"):

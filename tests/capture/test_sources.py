@@ -187,6 +187,14 @@ def test_files_that_were_there_before_can_be_skipped(tmp_path):
         assert int(camera.read().array[0, 0, 0]) == 2
 
 
+def test_a_short_timeout_suffices_for_a_file_that_is_there(tmp_path):
+    write_frame(tmp_path / "a.png", np.zeros((3, 4, 1), np.uint8))
+    with open_source(f"folder:{tmp_path},timeout_s=0.0", wait=lambda _: None) as camera:
+        assert camera.read().array.shape == (3, 4, 1)
+        with pytest.raises(CameraError, match="no frame"):
+            camera.read()
+
+
 def test_a_half_written_file_is_waited_for(tmp_path):
     whole = numbered(tmp_path, 7).read_bytes()
     part, waited = tmp_path / "7.png", []

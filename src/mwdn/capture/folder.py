@@ -30,7 +30,7 @@ class WatchedFolder(CameraSource):
         bit_depth: of the sensor; by default that of the files' type.
         mosaic: colours of a 2 x 2 cell of raw frames; a camera's raw file says its own.
         existing: also read the files that are there when the folder is opened.
-        timeout_s: seconds to wait for a file.
+        timeout_s: seconds to wait for a file; two scans take place in any case.
         wait: sleeps for a number of seconds.
 
     Raises:
@@ -75,7 +75,7 @@ class WatchedFolder(CameraSource):
         if self._seen is None:
             raise self.not_open()
         before: dict[tuple[str, int], tuple[int, int]] = {}  # size, and how often it was the same
-        looks = max(int(self.timeout_s / POLL_S), 1)
+        looks = max(int(self.timeout_s / POLL_S), 2)
         while looks > 0:
             now = self._states()
             for key in sorted(now.keys() - self._seen, key=lambda key: (key[1], key[0])):

@@ -84,6 +84,8 @@ class RigOptions:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) of the rig must be positive.")
         if not 0 <= self.drop < 1:
             raise ParameterError(f"`drop` ({self.drop}) must be in [0, 1): a probability.")
+        if not self.display_black < 1:
+            raise ParameterError(f"`display_black` ({self.display_black}) must be below 1, the light of a white pixel.")
         for name in ("drift", "disconnect_every", "latency", "fps", "display_black", "prepared"):
             if not getattr(self, name) >= 0:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) of the rig must not be negative.")
