@@ -13,6 +13,8 @@ from urllib.parse import urlsplit
 import httpx2 as httpx
 import numpy as np
 import pytest
+import tifffile
+import torch
 
 from mwdn import Reconstructor
 from mwdn.calibration import Calibration
@@ -186,6 +188,18 @@ def test_job_has_progress_and_a_result(client, capture):
     assert client.get(f"{place}/picture").content.startswith(b"\x89PNG")
     assert client.get(f"{place}/picture?fromat=npy").status_code == 422
     assert np.load(io.BytesIO(client.get(f"{place}/measurement?format=npy").content)).shape == (SIDE, SIDE, 3)
+
+
+def test_the_numbers_of_a_measurement_may_be_negative(serve, capture, psf):
+    camera = Calibration(psf, dark=torch.full((1, 1, SIDE, SIDE), 0.02))
+    server = serve(StoredCameras(LIMITS, None, {"camera": camera}))
+    with httpx.Client(base_url=server.url, timeout=120) as client:
+        place = order(client, capture).headers["location"]
+        expected = camera.correct(np.load(io.BytesIO(capture)))[0].movedim(0, -1).numpy()
+        assert expected.min() < -0.01
+        for format, read in (("npy", np.load), ("tiff", tifffile.imread)):
+            stored = client.get(f"{place}/measurement?format={format}").content
+            np.testing.assert_allclose(read(io.BytesIO(stored)), expected, atol=1e-6)
 
 
 def test_job_can_be_cancelled(client, capture):
