@@ -17,6 +17,7 @@ from mwdn import Calibration
 from mwdn.calibration import FrameFormat, PsfFormat
 from mwdn.calibration.camera_file import KEYS, named_files, read_camera, write_camera
 from mwdn.calibration.camera_parts import draft_of, write_camera_with_parts
+from mwdn.calibration.corrections import Corrections
 from mwdn.errors import ImageError, MwdnError, ParameterError, PsfError, UnknownNameError
 from mwdn.io.images import read_frame, write_frame
 from mwdn.io.toml import read_toml
@@ -121,6 +122,16 @@ def test_calibration_of_a_camera_file(folder):
     assert (other.size, other.frames.bin, other.ambient is None) == ((6, 8), 4, False)
     with pytest.raises(ParameterError, match="`bin=4`"):
         Calibration.from_file(path, FrameFormat(bin=4))
+
+
+def test_formats_and_corrections_besides_those_of_the_file_are_refused(folder):
+    path = folder / "camera.toml"
+    write_camera(path, {"psf": folder / "lab/psf.png"})
+    given = {"frames": FrameFormat(bin=2), "psf_format": PsfFormat(psf_bin=2)}
+    given |= {"corrections": Corrections(defects=torch.zeros(1, 1, *SIZE) > 0)}
+    for name, value in given.items():
+        with pytest.raises(ParameterError, match="its own"):
+            Calibration.from_file(path, **{name: value})
 
 
 def test_pitch_follows_the_bin(folder):

@@ -126,7 +126,7 @@ class Calibration:
             psf_format: where the PSF's file differs from it.
             dark: frame taken with the same exposure and no light; subtracted from the PSF and from captures.
             ambient: frame of the room's light alone, with the captures' exposure; subtracted from captures alone.
-            corrections: flat field and hot pixels; a camera file has its own.
+            corrections: flat field and hot pixels; not for a camera file, which has its own.
             **options: fields of `FrameFormat` and `PsfFormat`, which replace those of ``frames`` and ``psf_format``:
                 ``bin=4, bit_depth=12, gamma="srgb", background=0.0, psf_bin=8``.
 
@@ -138,8 +138,8 @@ class Calibration:
             UnknownNameError: an option has another name.
         """
         if Path(path).suffix.lower() == ".toml":
-            if (frames, psf_format) != (FrameFormat(), PsfFormat()):
-                raise ParameterError(f"`{path}` has its own `frames` and `psf_format`. Give what differs: `bin=4`.")
+            if (frames, psf_format, corrections.flat, corrections.defects) != (FrameFormat(), PsfFormat(), None, None):
+                raise ParameterError(f"`{path}` has its own format and `corrections`. Give what differs: `bin=4`.")
             frame_files = {"dark": dark, "ambient": ambient}
             return cls.load(path, **options, **{name: file for name, file in frame_files.items() if file is not None})
         frames, psf_format = with_options(frames, psf_format, options)
