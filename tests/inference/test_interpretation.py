@@ -9,7 +9,7 @@ import torch
 
 from cameras import contour_psf
 from made import trained
-from mwdn.errors import ParameterError
+from mwdn.errors import ParameterError, ShapeError
 from mwdn.inference.interpretation import Panel, interpret
 from mwdn.inference.interpretation_page import display
 from mwdn.networks import build
@@ -105,6 +105,11 @@ def test_methods_without_filters_are_refused(measurement, psf):
     for method in (Admm(), build("unet", width=2)):
         with pytest.raises(ParameterError, match=r"has no learned Wiener filters.*universal-small, or the checkpoint"):
             interpret(method, measurement, psf)
+
+
+def test_several_captures_are_refused(measurement, psf):
+    with pytest.raises(ShapeError, match="one"):
+        interpret(build("wiener"), torch.cat([measurement, measurement]), psf)
 
 
 def test_panels_of_millions_of_pixels_are_drawn():

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from mwdn.errors import ParameterError
+from mwdn.arguments import check_batch
+from mwdn.errors import ParameterError, ShapeError
 from mwdn.fourier.convolution import convolve
 from mwdn.fourier.transforms import transfer_function
 from mwdn.networks.mwdn import Mwdn
@@ -88,13 +89,19 @@ def interpret(network: object, measurement: Measurement, psf: Psf) -> Interpreta
 
     Raises:
         ParameterError: another network.
-        ShapeError: measurement and PSF do not fit.
+        ShapeError: measurement and PSF do not fit, or there are several measurements.
     """
     if not isinstance(network, Mwdn | MwdnCpsf | WienerNetwork | WienerUNet | WienerBank):
         kind = "network" if isinstance(network, nn.Module) else "solver"
         raise ParameterError(
             f"The {kind} `{type(network).__name__}` has no learned Wiener filters to look into. Use universal, "
             f"universal-small, or the checkpoint of a network that has some: {EXPLAINED}."
+        )
+    check_batch(measurement, "measurement")
+    if len(measurement) != 1:
+        raise ShapeError(
+            f"`measurement` {tuple(measurement.shape)} must be one, (1, C, H, W), because the numbers are of one "
+            "capture: `measurement[:1]`."
         )
     network = copy.deepcopy(network).eval()
     psf, pose = checked_psf(psf, scale=not network.stored_psf), {}
