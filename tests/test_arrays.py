@@ -81,6 +81,13 @@ def test_distances_of_arrays_are_those_of_tensors(distance):
     )
 
 
+def test_the_saturated_part_of_a_picture_is_that_of_its_array():
+    frame = np.zeros((4, 5), np.uint8)
+    frame[1, :2] = 255
+    for given in (frame, frame[..., None], frame[None], Image.fromarray(frame)):
+        assert CALIBRATION.saturated_part(given) == pytest.approx(2 / 20)
+
+
 # --- What is refused ----------------------------------------------------------------------------------
 
 TAKE_ARRAYS = {
