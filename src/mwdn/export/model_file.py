@@ -102,15 +102,15 @@ def read_about(file: str | Path) -> dict[str, str]:
         ExportError: the file cannot be read, or `export` did not write it.
     """
     file = Path(file)
-    onnx = None if file.suffix == ".pt2" else require("onnx", "export", purpose="ONNX")
-    with as_export_error(file):
-        if onnx is None:
-            extra = {ABOUT: ""}
+    if file.suffix == ".pt2":
+        extra = {ABOUT: ""}
+        with as_export_error(file, "read"):
             torch.export.load(file, extra_files=extra)
-            about = json.loads(extra[ABOUT])
-        else:
-            about = {entry.key: entry.value for entry in onnx.load(str(file)).metadata_props}
-        if "method" not in about:
+            return json.loads(extra[ABOUT])
+    onnx = require("onnx", "export", purpose="ONNX")
+    with as_export_error(file, "read"):
+        about = {entry.key: entry.value for entry in onnx.load(str(file)).metadata_props}
+        if "method" not in about:  # onnx takes any text for a model
             raise ValueError("it has no description")
         return about
 
@@ -129,11 +129,11 @@ def publish(file: Path, out: Path) -> None:
 
 
 @contextmanager
-def as_export_error(file: Path) -> Iterator[None]:
+def as_export_error(file: Path, use: str = "run") -> Iterator[None]:
     """Turn the many kinds of errors of onnxruntime and torch into an `ExportError`."""
     try:
         yield
     except Exception as error:
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         advice = "Export it again: as .onnx, as .pt2, or with another `--precision`."
-        raise ExportError(f"`{file.name}` cannot be run: {reason.rstrip('.')}. {advice}") from error
+        raise ExportError(f"`{file.name}` cannot be {use}: {reason.rstrip('.')}. {advice}") from error
