@@ -36,8 +36,10 @@ class ForwardModel(NamedTuple):
             ShapeError: the PSF has another number of channels than 1 or these; or there is one for each sample; or the
                 size is not that of a `FieldCamera`; or a number is not positive.
         """
-        if min(scene_size or (1, 1)) < 1 or (channels is not None and channels < 1):
-            raise ShapeError(f"`scene_size` {scene_size} and `channels` ({channels}) must be positive.")
+        if min(scene_size or (1, 1)) < 1:
+            raise ShapeError(f"`scene_size` {scene_size} must be positive.")
+        if channels is not None and channels < 1:
+            raise ShapeError(f"`channels` ({channels}) must be positive.")
         if isinstance(camera, FieldCamera):
             if scene_size not in (None, camera.scene_size):
                 raise ShapeError(f"`scene_size` {scene_size} must be the camera's own, {camera.scene_size}.")
