@@ -81,7 +81,7 @@ def average_frames(
     Args:
         frames: (H, W) or (H, W, C), as stored, all of one shape and type.
         format: of the frames; only its numbers count (bit depth, gamma), not its crop, mosaic and bin.
-        names: of the frames, for messages; those of the same name are numbered.
+        names: of the frames, for messages; numbered if two are the same.
         kind: what they show. Darkness has no light to compare, and even light no pattern.
         dark: (1, C or 1, H, W), subtracted from each; in linear units of the full scale.
 
@@ -91,7 +91,7 @@ def average_frames(
     """
     frames = [as_frame(frame, finite=False) for frame in frames]
     names = list(names) or [f"frame {number}" for number in range(1, len(frames) + 1)]
-    if len(set(names)) < len(names):  # an outlier would take the others of its name along
+    if len(set(names)) < len(names):  # an outlier would exclude all frames of its name
         names = [f"{name} ({number})" for number, name in enumerate(names, 1)]
     _check_alike(frames, names)
     if dark is not None and tuple(dark.shape[-2:]) != frames[0].shape[:2]:

@@ -192,7 +192,7 @@ def _holes(design: Pinholes, size: Size) -> Tensor:
     generator = torch.Generator().manual_seed(design.seed)
     y, x = coordinates(size[0], design.pitch_um), coordinates(size[1], design.pitch_um)
     room = (torch.tensor(design.size_mm, dtype=torch.float64) * UM_PER_MM - 2 * design.diameter_um).clamp(min=0)
-    # Disks of two diameters around the holes do not overlap: no more of them than their area allows.
+    # Disks of twice the diameter around the holes do not overlap, so their area limits the number of holes.
     most = int((room + 2 * design.diameter_um).prod() / (math.pi * design.diameter_um**2))
     places, found = torch.empty(min(design.count, most), 2, dtype=torch.float64), 0
     for _ in range(200 * design.count if design.count <= most else 0):

@@ -214,7 +214,7 @@ class Preview:
         """The measurement of a job: the capture, corrected, cropped and binned; for viewing without light below 0."""
         measurement, look = self.jobs.result(request.path_params["id"]).measurement, parse_look(look_query(request))
         shown = measurement if look.format in ("tiff", "npy") else measurement.clamp(min=0)
-        return await self._encoded(lambda look: encode(shown, look), look)
+        return await self._encoded(partial(encode, shown), look)
 
     def _submit(self, form: Form) -> Job:
         """Check a form as far as that is fast, and queue its reconstruction."""
