@@ -6,7 +6,7 @@ SPINS = "1000"
 """Turns of a waiting thread before it sleeps, about 20 us: GNU OpenMP's own number for more threads than cores.
 
 Otherwise it takes 300,000, which is 6 ms. Where another program takes a core, threads then spin while the thread that
-they wait for cannot run. 1,000 turns cost no measurable time on an idle machine, and save 40 % beside another program
+they wait for cannot run. 1,000 turns cost 5 % of the time on an idle machine, and save 40 % beside another program
 (``benchmarks/spinning.py``).
 """
 
