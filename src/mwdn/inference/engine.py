@@ -48,7 +48,7 @@ class Engine(Generic[Prepared]):
         self.precision, psf = precision, checked_psf(psf, scale=not network.stored_psf)
         exact = copy.deepcopy(network).to(psf.device).float().eval().requires_grad_(False)
         half = half_precision(psf.device) if precision == "fast" else None
-        self.network = cast(Network[Prepared], fuse(copy.deepcopy(exact), half))
+        self.network = cast(Network[Prepared], fuse(exact if half is None else copy.deepcopy(exact), half))
         # Prepares the PSF, because spectra and regularisation need float32.
         self.exact = self.network if half is None else cast(Network[Prepared], fuse(exact, None))
         self._set_psf(psf)

@@ -1,5 +1,7 @@
 """Fusion of convolution, BatchNorm and ReLU into one operation, in half precision where that is fast."""
 
+import math
+from functools import cache
 from typing import Any, TypeGuard
 
 import torch
@@ -54,7 +56,7 @@ class FusedConvolution(nn.Module):
         self.relu, self.padding = relu, [int(p) for p in convolution.padding]
         self.weight = weight.to(self.dtype).contiguous(memory_format=torch.channels_last)
         self.bias = bias.to(self.dtype)
-        self.packs = pack and _can_pack(self.weight, self.padding)
+        self.packs = pack and self._can_be_packed()
         self.packed: dict[tuple[int, ...], Tensor] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -63,7 +65,10 @@ class FusedConvolution(nn.Module):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)  # type: ignore[no-untyped-call]
-        self.packs = self.packs and _can_pack(self.weight, self.padding)
+        self.packs = self.packs and self._can_be_packed()
+
+    def _can_be_packed(self) -> bool:
+        return self.weight.device.type == "cpu" and _can_pack(self.dtype, self.weight.shape[-2:], tuple(self.padding))
 
     def forward(self, features: Tensor) -> Tensor:
         """Features in channels-last layout and the precision of the weights."""
@@ -104,23 +109,25 @@ def _pack(weight: Tensor, padding: list[int], shape: list[int]) -> Tensor:
     return torch._C._nn.mkldnn_reorder_conv2d_weight(weight.to_mkldnn(), padding, [1, 1], [1, 1], 1, shape)  # type: ignore[call-arg]
 
 
-def _can_pack(weight: Tensor, padding: list[int]) -> bool:
-    """Whether this torch has the fused operation for packed weights.
+@cache
+def _can_pack(dtype: torch.dtype, kernel: tuple[int, int], padding: tuple[int, ...]) -> bool:
+    """Whether this torch has the fused operation for packed weights on the CPU.
 
-    Both functions belong to torch's compiler and are not public, so a small input is checked first.
+    Both functions belong to torch's compiler and are not public, so a small convolution is checked first.
     """
-    if weight.device.type != "cpu" or not torch.backends.mkldnn.is_available():  # type: ignore[no-untyped-call]
+    if not torch.backends.mkldnn.is_available():  # type: ignore[no-untyped-call]
         return False
+    features = torch.linspace(-1, 1, 16 * 8 * 8, dtype=dtype).reshape(1, 16, 8, 8)
+    weight = torch.linspace(-1, 1, 16 * 16 * math.prod(kernel), dtype=dtype).reshape(16, 16, *kernel)
+    features, weight = (t.contiguous(memory_format=torch.channels_last) for t in (features, weight))
     try:
-        probe = weight.new_ones((1, weight.shape[1], 4, 4)).contiguous(memory_format=torch.channels_last)
-        packed = _pack(weight, padding, list(probe.shape))
-        bias = torch.zeros_like(weight[:, 0, 0, 0])
+        packed = _pack(weight, list(padding), list(features.shape))
         convolve = torch.ops.mkldnn._convolution_pointwise
-        result = convolve(probe, packed, bias, padding, [1, 1], [1, 1], 1, "relu", [], "").float()
+        result = convolve(features, packed, weight.new_zeros(16), list(padding), [1, 1], [1, 1], 1, "relu", [], "")
     except (AttributeError, RuntimeError, TypeError):
         return False
-    expected = F.conv2d(probe.float(), weight.float(), padding=padding).relu()
-    return torch.allclose(result, expected, rtol=0.05, atol=0.05 * expected.max().item())
+    expected = F.conv2d(features.float(), weight.float(), padding=padding).relu()
+    return torch.allclose(result.float(), expected, rtol=0.05, atol=0.05 * expected.max().item())
 
 
 def fuse(module: nn.Module, dtype: torch.dtype | None, *, pack: bool = True) -> nn.Module:
