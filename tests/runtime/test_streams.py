@@ -1,6 +1,7 @@
 """Prefetching, the newest frame and the newest result of a source, and their memory."""
 
 import threading
+import time
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
@@ -240,6 +241,19 @@ def fail(frame):
 def test_error_ends_the_results(results, request):
     with pytest.raises(OSError, match="source" if "source" in request.node.name else "work"):
         list(results())
+
+
+def test_error_of_the_source_comes_after_the_result_of_its_last_frame():
+    """A recording lost its last frame: the frame was still in progress when the source ended."""
+
+    def source():
+        yield 0
+        raise OSError("ended")
+
+    with closing(latest_results(lambda frame: lambda: time.sleep(0.1) or frame, source(), workers=2)) as results:
+        assert next(results) == 0
+        with pytest.raises(OSError, match="ended"):
+            next(results)
 
 
 def test_threads_are_those_of_the_caller_alone():

@@ -111,7 +111,8 @@ def latest_results(
         threads: on which torch computes each of them.
 
     Yields:
-        Results in the order of their frames. An error of the source, of ``begin`` or of its function is raised.
+        Results in the order of their frames. An error of the source, of ``begin`` or of its function is raised after
+        the results of frames in progress.
     """
     team = _Team(begin, latest(frames), workers, threads)
     try:
@@ -130,7 +131,7 @@ class _Team(Generic[A, B]):
         self.turn, self.changed = Lock(), Condition()
         self.newest: deque[tuple[int, B]] = deque(maxlen=1)
         self.ended: list[BaseException | None] = []
-        self.taken, self.closed = 0, False
+        self.taken, self.done, self.closed = 0, 0, False
         self.workers = [Thread(target=self.run, daemon=True) for _ in range(workers)]
         for worker in self.workers:
             worker.start()
@@ -158,19 +159,27 @@ class _Team(Generic[A, B]):
             finish = self.begin(next(self.frames))
             self.taken += 1
             number = self.taken
-        result = finish()
-        del finish  # and the frame: the condition may take a while
-        with self.changed:
-            if not self.newest or self.newest[0][0] < number:
-                self.newest.append((number, result))
+        try:
+            result = finish()
+            del finish  # and the frame: the condition may take a while
+            with self.changed:
+                if not self.newest or self.newest[0][0] < number:
+                    self.newest.append((number, result))
+        finally:
+            with self.changed:
+                self.done += 1
                 self.changed.notify()
+
+    def has_ended(self) -> bool:
+        """Whether no result will come. After an error no worker waits for the next frame: the source may have none."""
+        return len(self.ended) == len(self.workers) or (any(self.ended) and self.done == self.taken)
 
     def results(self) -> Iterator[B]:
         """The newest result each time, and the first error after it."""
         shown = 0
         while True:
             with self.changed:
-                self.changed.wait_for(lambda: self.newest or any(self.ended) or len(self.ended) == len(self.workers))
+                self.changed.wait_for(lambda: self.newest or self.has_ended())
                 if not self.newest:
                     break
                 number, result = self.newest.popleft()
