@@ -182,12 +182,21 @@ def test_changed_psf_is_refused_unless_it_is_given(folder):
         ('psf_orientation = "rotate-45"', ParameterError, r"`psf_orientation` \('rotate-45'\)"),
         ('white_balance = "gray"', ParameterError, r"`white_balance` \('gray'\)"),
         ("bin = ", ParameterError, "cannot be read as a camera file"),
+        ('dark = "a\\u0000.png"', ParameterError, "zero byte"),
     ],
 )
 def test_wrong_lines_are_named(tmp_path, line, error, message):
     (tmp_path / "camera.toml").write_text(f'psf = "psf.png"\n{line}\n')
     with pytest.raises(error, match=message):
         read_camera(tmp_path / "camera.toml")
+
+
+@pytest.mark.parametrize("name", ["camera.toml", "other.TOML", "\\u0000"])
+def test_the_psf_is_a_picture(tmp_path, name):
+    """A file that named itself ended in a `RecursionError`, a zero byte in a `ValueError`."""
+    (tmp_path / "camera.toml").write_text(f'psf = "{name}"\n')
+    with pytest.raises(ParameterError, match=r"must be a picture|zero byte"):
+        Calibration.load(tmp_path / "camera.toml")
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -204,6 +213,7 @@ def test_wrong_lines_are_named(tmp_path, line, error, message):
             for value in ("nan", "0", "1e300")
         ),
         *("read_noise_electrons = -1", "black_level = 1", "distances_mm = [nan]", "field_positions = [[inf, 0.0]]"),
+        *(f"{key} = [[]]" for key in ("psf_gain", "sensor_field", "stray_light")),
     ],
 )
 def test_values_out_of_any_range_are_named_on_one_short_line(folder, monkeypatch, line):

@@ -119,6 +119,8 @@ def read_camera(path: str | Path) -> dict[str, Any]:
         _check_range(key, value)
     if "psf" not in table:
         raise ParameterError(f'`{path}` must name the camera\'s PSF: `psf = "psf.png"`.')
+    if table["psf"].lower().endswith(".toml"):
+        raise ParameterError(f"`psf` ({shown(table['psf'])}) in `{path}` must be a picture, not a camera file.")
     files = {key: _file(path, table[key]) for key in _FILES if key in table}
     lists = {key: tuple(_file(path, name) for name in table[key]) for key in _LISTS if key in table}
     return {**{key: as_tuple(value) for key, value in table.items()}, **files, **lists}
@@ -126,6 +128,8 @@ def read_camera(path: str | Path) -> dict[str, Any]:
 
 def _file(path: Path, name: str) -> Path:
     """A file that the camera file names: beside it, or if it is a link, beside its target."""
+    if "\0" in name:
+        raise ParameterError(f"`{path}` names a file with a zero byte ({shown(name)}), which no file can have.")
     file = path.parent / name
     return file if not path.is_symlink() or os.path.lexists(file) else path.resolve().parent / name
 

@@ -38,4 +38,4 @@ def coefficient_count(order: int) -> int:
 def polynomial_order(count: int) -> int | None:
     """Order of the polynomials with ``count`` coefficients; ``None`` if no order has as many."""
     order = (math.isqrt(8 * count + 1) - 3) // 2
-    return order if coefficient_count(order) == count else None
+    return order if count and coefficient_count(order) == count else None
