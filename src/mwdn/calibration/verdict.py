@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
 from mwdn.calibration.report import Levels, PsfReport
+from mwdn.calibration.size_advice import MIN_PSF_PX
 
 Weight = Literal["bad", "weak", "good"]
 """``bad`` costs most of the quality, ``weak`` some of it, ``good`` none."""
@@ -19,7 +20,7 @@ class Finding(NamedTuple):
 
 def verdict(report: PsfReport) -> tuple[Finding, ...]:
     """Say what the numbers of a report mean, the worst first."""
-    parts = (_levels, _sensor, _light, _detail, _frequencies, _noise, _colours, _places)
+    parts = (_size, _levels, _sensor, _light, _detail, _frequencies, _noise, _colours, _places)
     findings = [finding for part in parts for finding in part(report)]
     return tuple(sorted(findings, key=lambda finding: ("bad", "weak", "good").index(finding.weight)))
 
@@ -41,6 +42,16 @@ def _count(number: int, singular: str, plural: str = "") -> str:
 
 def _percent(part: float) -> str:
     return f"{100 * part:.1f} %" if part < 0.1 else f"{100 * part:.0f} %"
+
+
+def _size(report: PsfReport) -> Iterator[Finding]:
+    height, width = report.size
+    if min(height, width) < MIN_PSF_PX:
+        text = (
+            f"It has {height} x {width} pixels, but `mwdn reconstruct` needs {MIN_PSF_PX} along each side. Take the "
+            "whole frame of the sensor, or crop and bin it less: `--crop`, `--bin`, `--psf-bin`."
+        )
+        yield Finding("bad", text)
 
 
 def _levels(report: PsfReport) -> Iterator[Finding]:
