@@ -194,6 +194,21 @@ def test_the_scale_of_imagej_is_the_pitch_of_the_pixels(tmp_path, captures, psf)
             assert file.imagej_metadata["unit"] == "um"
 
 
+@pytest.mark.parametrize("height", [120, 121, 124])
+def test_full_size_pictures_of_frames_upside_down_are_turned_ones(tmp_path, generator, height):
+    """They were displaced by up to ``bin`` pixels: a frame is binned before it is turned."""
+    psf, scene = contour_psf((height, 130), line=6.0, generator=generator), torch.zeros(1, 1, height, 130)
+    scene[..., 40:50, 60:66] = 1
+    for name, image in (("psf.npy", psf), ("raw.npy", Camera(psf).forward(scene))):
+        np.save(tmp_path / name, (image / image.max())[0, 0].numpy())
+    pictures = []
+    for upside_down in (False, True):
+        calibration = Calibration.from_file(tmp_path / "psf.npy", bin=3, upside_down=upside_down)
+        batch = make_batch(calibration, tmp_path / f"{upside_down}", format="npy", full_size=True)
+        pictures += [read_frame(job.output)[..., 0] for job in batch.run([tmp_path / "raw.npy"])]
+    np.testing.assert_allclose(pictures[1], pictures[0][::-1], atol=0.02 * pictures[0].max())
+
+
 @pytest.mark.parametrize(("format", "steps"), [("png", 255), ("png16", 65535)])
 def test_png_is_the_same_picture_in_srgb(tmp_path, format, steps, captures, psf):
     batch = make_batch(psf, tmp_path, format=format)

@@ -214,7 +214,11 @@ class Batch:
     def _picture(self, solved: _Solved) -> Scene:
         """The picture, on the CPU, in the size that was requested."""
         picture, size = to_host(self.reconstruct.finish(solved.scene)), solved.read.full_size
-        return picture if size is None else enlarge_binned(picture, self.reconstruct.calibration.frames.bin, size)
+        if size is None:
+            return picture
+        frames = self.reconstruct.calibration.frames
+        axes = [-2] if frames.upside_down else []  # captures are binned before they are turned
+        return enlarge_binned(picture.flip(axes), frames.bin, size).flip(axes)
 
     def _write_files(self, job: Job, picture: Scene, content: dict[str, object]) -> None:
         """Write the picture, the map and the sidecar, which is last: a picture with a sidecar is complete."""
