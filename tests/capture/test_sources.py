@@ -131,6 +131,18 @@ def test_a_recording_waits_as_long_as_it_was_recorded(tmp_path):
     assert waits == pytest.approx([0, 100, 200], abs=30)
 
 
+def test_a_clock_that_was_set_during_a_recording_does_not_stop_it(tmp_path):
+    """A Raspberry Pi sets its clock after the start: the picture stood still for 56 years. NaN ended it."""
+    times = [50.0, 150.0, 1.8e9, 1.8e9 + 100, float("nan"), float("inf"), 1.8e9 + 200, 10.0, 110.0]
+    with record(tmp_path / "a.h5") as recorder:
+        for number, timestamp in enumerate(times):
+            recorder.append(frame(number, timestamp=timestamp))
+    waits = []
+    with open_source(f"replay:{tmp_path / 'a.h5'}", realtime=True, wait=waits.append) as camera:
+        assert [camera.read().number for _ in times] == [*range(9)]
+    assert waits == pytest.approx([0, 100, 100, 200, 100], abs=30)
+
+
 def test_a_recording_that_was_torn_keeps_its_committed_frames(tmp_path):
     path = tmp_path / "frames.h5"
     with record(path, commit_every=1) as recorder:

@@ -29,6 +29,10 @@ COLUMNS = {"exposure_s": "f8", "gain": "f8", "timestamp": "f8", "number": "i8", 
 ROWS = {"recording": "frames", "captured pairs": "measurement"}
 """Data set of the frames in each kind of file that can be played."""
 
+MAX_PAUSE_S = 3600.0
+"""Longest wait for a frame of a recording. A clock that was set meanwhile, as a Raspberry Pi's after its start, puts
+years between two timestamps."""
+
 _ADVICE = "Record it again."
 
 
@@ -142,7 +146,8 @@ class Replay(CameraSource):
     Args:
         path: an .h5 file from `record` or `mwdn capture`.
         loop: start again at the end.
-        realtime: wait between frames as long as between their timestamps; otherwise each is there at once.
+        realtime: wait between frames as long as between their timestamps, but not if that is more than `MAX_PAUSE_S`;
+            otherwise each is there at once.
         timeout_s: has no effect.
         wait: sleeps for a number of seconds.
     """
@@ -213,9 +218,12 @@ class Replay(CameraSource):
         with as_damage(f"Frame {self._number} of `{self.path}` cannot be read", _ADVICE):
             array = self._data[self._number]
             values = {key: column[self._number].item() for key, column in self._columns.items()}
-            first = float(self._columns["timestamp"][0]) if self._columns else math.nan
+            played = values.get("timestamp", math.nan) - float(self._columns.get("timestamp", [math.nan])[0])
         self._number += 1
-        if self.realtime and values:
-            self._wait(max(values["timestamp"] - first - (time.monotonic() - self._started), 0.0))
+        pause = played - (time.monotonic() - self._started)
+        if self.realtime and abs(pause) <= MAX_PAUSE_S:
+            self._wait(max(pause, 0.0))
+        elif math.isfinite(pause):  # those that follow are played from here on
+            self._started = time.monotonic() - played
         frame = {"number": self._number - 1, "timestamp": 0.0, **values}
         return CameraFrame(array=array, bit_depth=self._bits, mosaic=self._mosaic, **frame)  # type: ignore[arg-type]
