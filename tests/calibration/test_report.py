@@ -87,6 +87,14 @@ def test_background_is_reported(tmp_path, psf):
     assert kept.support.glow > report.support.glow + 0.3
 
 
+def test_a_background_that_is_too_high(tmp_path, psf):
+    """The verdict was "A usable PSF", with advice to do the same in other programs."""
+    frame = frame_of(psf, level=0.1)
+    for background, weights in ((0.1, []), (0.12, []), (0.18, ["weak"]), (0.4, ["bad"])):
+        report = report_of(tmp_path, frame, background=background)
+        assert [finding.weight for finding in said(report, "faint parts", "--background")] == weights
+
+
 def test_a_psf_from_which_too_much_was_subtracted(tmp_path, psf):
     frame = (psf / psf.max())[0].movedim(0, -1).numpy()
     noise = 0.002 * np.random.default_rng(0).standard_normal(frame.shape)

@@ -124,7 +124,14 @@ def _background(levels: Levels) -> Iterator[Finding]:
             "as `--dark`: this removes stray light and keeps light from the mask, which belongs to the PSF."
         )
         yield Finding("weak", text)
-    if levels.pedestal > 0.02 and not any(levels.subtracted):
+    excess = max(levels.subtracted, default=0.0) - max(levels.between, *levels.background)
+    if levels.integers and excess > 0.05 * levels.peak:
+        text = (
+            f"{subtracted} of the full scale was subtracted, but the darkest 5 % of the frame are at {level}: the PSF "
+            "has lost its faint parts. Leave out `--background`, which estimates it."
+        )
+        yield Finding("bad" if excess > 0.2 * levels.peak else "weak", text)
+    elif levels.pedestal > 0.02 and not any(levels.subtracted):
         text = (
             f"A uniform background of {level} of the {unit} contains {_percent(levels.pedestal)} of the light and was "
         )
