@@ -31,9 +31,10 @@ def check_float_scale(frame: Frame, bit_depth: int | None, *, of: str | None = N
         )
     if bit_depth is not None or not largest > MAX_FLOAT:
         return
-    way_out = ", or give the sensor's `bit_depth`" if of else ""
-    if not of and (bits := next((bits for bits in (8, 10, 12, 14, 16) if largest < 2**bits), None)):
-        way_out = f", or give `bit_depth={bits}`"
+    way_out = ", or give the sensor's `bit_depth`"
+    if not of:
+        bits = next((bits for bits in (8, 10, 12, 14, 16) if largest < 2**bits), None)
+        way_out = f", or give `bit_depth={bits}`" if bits else ""
     raise ParameterError(
         f"{of or 'The frame'} holds floats up to {largest:g}, but 1 is saturation. Divide them by the camera's largest "
         f"number{way_out}."

@@ -111,7 +111,7 @@ def average_frames(
     rows = max(1, _ROWS // (frames[0].shape[1] * frames[0].shape[2] * max(1, len(kept) // 4)))
     for top in range(0, frames[0].shape[0], rows):
         band = slice(top, top + rows)
-        stack = _linear([frames[i][band] for i in kept], format, scales, _band(dark, band))
+        stack = _linear([frames[i][band] for i in kept], format, scales, None if dark is None else dark[..., band, :])
         parts.append(_clipped_mean(stack, noise))
     saturated = _saturated([frames[i] for i in kept], format)
     image = torch.cat(parts, -2)
@@ -134,10 +134,6 @@ def _linear(frames: Sequence[Frame], format: FrameFormat, scales: Sequence[float
     images = torch.cat([format.normalise(frame) for frame in frames])
     images = images if dark is None else images - dark
     return images / torch.tensor(scales)[:, None, None, None]
-
-
-def _band(image: Image | None, rows: slice) -> Image | None:
-    return None if image is None else image[..., rows, :]
 
 
 def _small(frame: Frame, format: FrameFormat, dark: Image | None) -> Image:

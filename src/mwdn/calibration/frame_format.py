@@ -209,10 +209,10 @@ class FrameFormat:
 
     def denormalise(self, image: Image) -> Frame:
         """Inverse of `read` and `normalise`: a frame of floats (H, W, C) in the order of the camera's files."""
-        frame = image if self.gamma is None else image.clamp(min=0)
         if self.gamma is not None:
-            frame = srgb_encode(frame) if self.gamma == "srgb" else frame ** (1 / self.gamma)
-        pixels = frame[0].movedim(0, -1) * (1 if self.bit_depth is None else 2**self.bit_depth - 1)
+            light = image.clamp(min=0)
+            image = srgb_encode(light) if self.gamma == "srgb" else light ** (1 / self.gamma)
+        pixels = image[0].movedim(0, -1) * (1 if self.bit_depth is None else 2**self.bit_depth - 1)
         return (pixels.flip(-1) if self.bgr else pixels).contiguous().numpy().astype(np.float32)
 
     def full_scale(self, frame: Frame) -> float:
@@ -263,12 +263,10 @@ class FrameFormat:
         return int((frame.max(axis=-1) >= maximum).sum()), maximum
 
     def possible_bit_depth(self, frame: Frame) -> int | None:
-        """Least of 10, 12 and 14 bits that hold a 16-bit frame; ``None`` if a bit depth is given.
-
-        A frame may also fit because it is dark.
-        """
-        is_open = self.bit_depth is None and frame.dtype == np.uint16
-        return next((bits for bits in (10, 12, 14) if is_open and frame.max() < 2**bits), None)
+        """Least of 10, 12 and 14 bits that hold a 16-bit frame, which may just be dark; ``None`` if they are given."""
+        if self.bit_depth is not None or frame.dtype != np.uint16:
+            return None
+        return next((bits for bits in (10, 12, 14) if frame.max() < 2**bits), None)
 
     def full_size(self, frame: Frame) -> Size:
         """Height and width of a raw frame's measurement before binning."""
@@ -277,8 +275,10 @@ class FrameFormat:
 
     def with_bin(self, bin: int) -> "FrameFormat":
         """The format of frames of the same view at another resolution: ``crop`` is scaled with ``bin``."""
-        height, width = (length // self.cell * bin // self.bin * self.cell for length in self.crop or (0, 0))
-        return replace(self, bin=bin, crop=self.crop and (height, width))
+        if self.crop is None:
+            return replace(self, bin=bin)
+        height, width = (length // self.cell * bin // self.bin * self.cell for length in self.crop)
+        return replace(self, bin=bin, crop=(height, width))
 
 
 def changed_fields(format: Any) -> dict[str, Any]:  # noqa: ANN401

@@ -18,9 +18,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from mwdn.calibration.refinement import Refinement
+from mwdn.calibration.refinement import Refinement, displaced
 from mwdn.fourier.convolution import convolve
-from mwdn.optics.aperture import displaced_envelope
 from mwdn.optics.polynomials import coefficient_count, polynomials
 from mwdn.types import Measurement, Psf, Scene, Size
 
@@ -118,13 +117,13 @@ class PairModel:
         size = psf.shape[-2], psf.shape[-1]
         self.block = max(1, min(size) // BLOCKS)
         self.shift = shift
-        moved = psf if shift is None else _displaced(psf, shift)
+        moved = psf if shift is None else displaced(psf, shift)
         over_frame = polynomials(3, size)[:, None].float()
         bases = [((0, 0), moved), *(((m, k), moved * over_frame[m]) for m, k in kernels)]
         steps = {(-1, 0): (DISPLACEMENT_STEP, 0.0), (-2, 0): (0.0, DISPLACEMENT_STEP)} if moves else {}
         for name, (down, right) in steps.items():
-            ends = (_displaced(moved, (sign * down, sign * right)) for sign in (1, -1))
-            bases.append((name, next(ends) / (2 * DISPLACEMENT_STEP) - next(ends) / (2 * DISPLACEMENT_STEP)))
+            ahead, back = (displaced(moved, (sign * down, sign * right)) for sign in (1, -1))
+            bases.append((name, ahead / (2 * DISPLACEMENT_STEP) - back / (2 * DISPLACEMENT_STEP)))
         self.kernels = [name for name, _ in bases]
         ones = torch.ones(1, psf.shape[1], *size)
         self.even = self._reduce(ones, ones, bases, over_frame)[1]
@@ -237,8 +236,3 @@ class PairModel:
 
 def _rows(first: float, rest: Tensor) -> tuple[tuple[float, ...], ...]:
     return tuple((first, *(round(value, 6) for value in row)) for row in rest.tolist())
-
-
-def _displaced(psf: Psf, shift: tuple[float, float]) -> Psf:
-    """`displaced_envelope` by parts of the shorter side; the sum may change, which the gain a makes up for."""
-    return displaced_envelope(psf, torch.tensor([shift], dtype=psf.dtype) * min(psf.shape[-2:]))

@@ -16,7 +16,7 @@ from mwdn.calibration.float_scale import check_float_scale
 from mwdn.calibration.frame_format import FrameFormat
 from mwdn.calibration.place_files import PlaceFiles
 from mwdn.calibration.psf_format import PsfFormat, current_options, with_options
-from mwdn.calibration.psf_levels import background_level, check_psf_frame, empty
+from mwdn.calibration.psf_levels import background_level, check_light, check_psf_frame
 from mwdn.calibration.refinement import TERMS, Refinement
 from mwdn.calibration.size_advice import advise_size
 from mwdn.calibration.white_balance import WhiteBalance, check_white_balance
@@ -97,12 +97,14 @@ class Calibration:
         extra |= {"sensor": pop_sensor(camera), "places": pop_places(camera)}
         files = (camera.pop(name, None) for name in ("flat_field", "hot_pixels"))
         corrections = Corrections.read(*files, psf_done=camera.pop("psf_corrected", False))
-        return replace(cls.from_file(camera.pop("psf"), corrections=corrections, **camera), **extra).refined(terms)
+        calibration = cls.from_file(camera.pop("psf"), corrections=corrections, **camera)
+        return replace(calibration, **extra).refined(terms)
 
     def refined(self, refinement: Refinement) -> "Calibration":
         """Apply a refinement to a calibration that has none yet: to its PSF and to all measurements."""
-        terms: dict[str, Any] = {"psf": refinement.psf(self.psf), "refinement": refinement}
-        return replace(self, **terms, unrefined_hash=self.psf_hash) if refinement else self
+        if not refinement:
+            return self
+        return replace(self, psf=refinement.psf(self.psf), refinement=refinement, unrefined_hash=self.psf_hash)
 
     @classmethod
     @checked
@@ -138,7 +140,8 @@ class Calibration:
             UnknownNameError: an option has another name.
         """
         if Path(path).suffix.lower() == ".toml":
-            if (frames, psf_format, corrections.flat, corrections.defects) != (FrameFormat(), PsfFormat(), None, None):
+            has_corrections = corrections.flat is not None or corrections.defects is not None
+            if frames != FrameFormat() or psf_format != PsfFormat() or has_corrections:
                 raise ParameterError(f"`{path}` has its own format and `corrections`. Give what differs: `bin=4`.")
             frame_files = {"dark": dark, "ambient": ambient}
             return cls.load(path, **options, **{name: file for name, file in frame_files.items() if file is not None})
@@ -189,21 +192,17 @@ class Calibration:
         corrections: Corrections = Corrections(),
     ) -> "Calibration":
         check_psf_frame(psf_format.own_frames(frames), frame)
+        dark_image, room = frames.offset(dark, "dark"), frames.offset(ambient, "ambient")
         draft = cls(
-            torch.ones(1, 1, 1, 1),
-            frames,
-            frames.offset(dark, "dark"),
-            ambient=frames.offset(ambient, "ambient"),
-            psf_format=psf_format,
-            corrections=corrections,
+            torch.ones(1, 1, 1, 1), frames, dark_image, ambient=room, psf_format=psf_format, corrections=corrections
         )
         psf = draft.psf_image(frame)
         level = background_level(psf, psf_format.background)
         psf = (psf - level).clamp(min=0)
         total = psf.sum((-2, -1), keepdim=True)
-        if not (total > 0).all():
-            raise PsfError(empty(total.flatten() > 0, level.flatten(), with_dark=dark is not None))
-        background, light = tuple(round(float(value), 6) for value in level.flatten()), tuple(total.flatten().tolist())
+        check_light(total.flatten(), level.flatten(), with_dark=dark is not None)
+        background = tuple(round(float(value), 6) for value in level.flatten())
+        light = tuple(total.flatten().tolist())
         return replace(draft, psf=psf_format.turn(psf / total, frames), background=background, light=light)
 
     def psf_image(self, frame: Frame) -> Image:
@@ -257,7 +256,8 @@ class Calibration:
 
     def saturated_part(self, frame: ArrayPicture) -> float:
         """Fraction of a raw frame's pixels that are saturated; 0 for floats, which have no known maximum."""
-        return self.frames.saturated(frame := as_frame(frame, finite=False))[0] / (frame.shape[0] * frame.shape[1])
+        frame = as_frame(frame, finite=False)
+        return self.frames.saturated(frame)[0] / (frame.shape[0] * frame.shape[1])
 
     def correct(self, frame: ArrayPicture) -> Measurement:
         """Turn a raw frame into a measurement of the PSF's size.

@@ -51,14 +51,16 @@ def background_level(psf: Tensor, background: Background) -> Tensor:
     return torch.full((1, psf.shape[1], 1, 1), float(background))
 
 
-def empty(has_light: Tensor, level: Tensor, *, with_dark: bool) -> str:
-    """The message for a PSF without light in some channels after this level was subtracted."""
-    names = ["grey"] if len(has_light) == 1 else ["red", "green", "blue"]
-    empty = [name for name, light in zip(names, has_light.tolist(), strict=True) if not light]
+def check_light(total: Tensor, level: Tensor, *, with_dark: bool) -> None:
+    """Raise a `PsfError` if a channel's sum, ``total`` (C,), is not positive after its level (C,) was subtracted."""
+    names = ["grey"] if len(total) == 1 else ["red", "green", "blue"]
+    empty = [name for name, light in zip(names, total.tolist(), strict=True) if not light > 0]
+    if not empty:
+        return
     advice = ["Expose longer"]
     advice += ["take the dark frame without light"] if with_dark else []
     advice += ["give `background=0`"] if level.max() > 0 else []
-    return (
+    raise PsfError(
         f"PSF is empty: no light is left in {', '.join(empty)} after subtracting the background "
         f"({', '.join(f'{v:.3g}' for v in level)} of the full scale). {', or '.join(advice)}."
     )

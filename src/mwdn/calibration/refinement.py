@@ -73,8 +73,7 @@ class Refinement:
         if self.envelope_shift is None and not self.psf_gain:
             return psf  # not normalised again: rounding would change its hash
         if self.envelope_shift is not None:
-            shift = torch.tensor([self.envelope_shift], dtype=psf.dtype) * min(psf.shape[-2:])
-            psf = displaced_envelope(psf, shift.expand(len(psf), -1))
+            psf = displaced(psf, self.envelope_shift)
         if self.psf_gain:
             psf = psf * self._field("psf_gain", psf).clamp(min=MIN_FIELD)
         return unit_sum(psf)
@@ -104,6 +103,11 @@ class Refinement:
         if len(rows) == 3 and image.shape[1] == 1:
             raise ParameterError(f"`{name}` has a row for each colour, but the frame is grey. Refine with grey pairs.")
         return smooth_field(rows, (image.shape[-2], image.shape[-1])).to(image)
+
+
+def displaced(psf: Psf, shift: tuple[float, float]) -> Psf:
+    """A PSF (1, C, H, W) whose envelope is displaced by parts of the shorter side. Its sum may change."""
+    return displaced_envelope(psf, torch.tensor([shift], dtype=psf.dtype) * min(psf.shape[-2:]))
 
 
 def smooth_field(rows: Coefficients, size: Size) -> Tensor:

@@ -249,7 +249,7 @@ def _mean_flat(
         ParameterError: all are saturated or dark.
     """
     levels = [float(frames.normalise(frame).mean()) - (0.0 if dark is None else float(dark.mean())) for frame in flats]
-    total, variance, weight, notes = None, None, 0.0, list[str]()
+    total, variance, weight, notes = torch.zeros(1), torch.zeros(1), 0.0, list[str]()
     for start, stop in _runs(levels):
         average = average_frames(flats[start:stop], frames, names=names[start:stop], kind="flat", dark=dark)
         notes += average.rejected.values()
@@ -258,11 +258,11 @@ def _mean_flat(
             continue
         # Relative to the level, noise falls with the square root of the electrons.
         part = average.count * levels[start]
-        total = part * average.image / levels[start] + (0.0 if total is None else total)
+        total = total + part * average.image / levels[start]
         noise = (average.noise or TYPICAL).variance(average.image) / average.count
-        variance = (part / levels[start]) ** 2 * noise + (0.0 if variance is None else variance)
+        variance = variance + (part / levels[start]) ** 2 * noise
         weight += part
-    if total is None or variance is None or weight <= 0:
+    if weight <= 0:
         raise ParameterError("All flat frames are saturated or dark. Expose them to about half of the full scale.")
     return total / weight, variance.sqrt() / weight, notes
 
