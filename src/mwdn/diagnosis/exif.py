@@ -24,11 +24,12 @@ def exif_turn(capture: int, psf: int) -> Verdict:
     """
     if capture == psf:
         return Verdict("capture", "exif", "good", f"The capture and the PSF have EXIF orientation {psf}.")
-    turn = _BACK[capture] if psf == 1 else TURNS[psf] if capture == 1 else ""
     text = f"The capture has EXIF orientation {capture}, the PSF {psf}. Frames are not turned."
-    if turn:
-        text += " If the picture is wrong, a program has turned the pixels of the file with orientation 1."
-    return Verdict("capture", "exif", "doubt", text, turn, turn and f"--psf-orientation {turn}")
+    if 1 not in (capture, psf):
+        return Verdict("capture", "exif", "doubt", text)
+    turn = _BACK[capture] if psf == 1 else TURNS[psf]
+    text += " If the picture is wrong, a program has turned the pixels of the file with orientation 1."
+    return Verdict("capture", "exif", "doubt", text, turn, f"--psf-orientation {turn}")
 
 
 def settle_exif(verdicts: tuple[Verdict, ...]) -> tuple[Verdict, ...]:

@@ -30,7 +30,7 @@ LINEAR = -0.06
 CODED = 0.1
 """Score above which it is coded. Linear PSFs have 0.07 and less."""
 
-JUDGES = 3
+MAX_CAPTURES = 3
 """Largest number of captures from which the gamma of a PSF's file is detected."""
 
 
@@ -85,7 +85,7 @@ class PsfGammaTest:
             verdicts: on this capture, see `mwdn.diagnosis.captures.examine_capture`.
         """
         gamma = [verdict.value for verdict in verdicts if verdict.topic == "gamma"]
-        if gamma and len(self.known) < JUDGES and all(verdict.state == "unknown" for verdict in self.known):
+        if gamma and len(self.known) < MAX_CAPTURES and all(verdict.state == "unknown" for verdict in self.known):
             self.known.append(psf_gamma(frame, self.calibration, gamma[0], for_viewing=self.for_viewing))
         return tuple(self.known[-1:])
 

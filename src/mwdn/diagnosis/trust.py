@@ -54,7 +54,7 @@ class Trust:
         text = self.consistency.sentence
         if picture.state == "unknown":  # numbers and pose are then fits to noise
             text = picture.text[0].lower() + picture.text[1:].rstrip(".")
-        return text + "; this capture cannot judge the PSF" * (psf.state == "unknown")
+        return f"{text}; this capture cannot judge the PSF" if psf.state == "unknown" else text
 
     @property
     def content(self) -> dict[str, object]:

@@ -203,7 +203,8 @@ class Batch:
         calibration = self.reconstruct.calibration
         content: dict[str, object] = {"method": self.method, "psf_hash": calibration.psf_hash, "origin": origin}
         content |= {"file": job.output.name, "bin": calibration.frames.bin}
-        content |= {} if job.room_light is None else {"room_light": round(job.room_light, 4)}
+        if job.room_light is not None:
+            content["room_light"] = round(job.room_light, 4)
         if self.check_consistency:
             trust, verdicts = self._pipeline.examine_scene(prepared, scene, job.verdicts)
             content |= {**trust.content, "verdicts": [asdict(verdict) for verdict in verdicts]}
@@ -222,13 +223,16 @@ class Batch:
 
     def _write_files(self, job: Job, picture: Scene, content: dict[str, object]) -> None:
         """Write the picture, the map and the sidecar, which is last: a picture with a sidecar is complete."""
-        frames, pitch = self.reconstruct.calibration.frames, self.reconstruct.calibration.pitch_um
+        calibration = self.reconstruct.calibration
+        pitch = calibration.pitch_um
+        if pitch is not None and self.full_size:
+            pitch = pitch / calibration.frames.bin
         sidecar, map_file = job.output.with_suffix(".json"), support_name(job.output)
         before = read_sidecar(sidecar)
         with as_image_error(sidecar):  # the new picture must not have an old sidecar or map
             sidecar.unlink(missing_ok=True)
             map_file.unlink(missing_ok=True)
-        write_output(job.output, picture, self.format, pitch and (pitch / frames.bin if self.full_size else pitch))
+        write_output(job.output, picture, self.format, pitch)
         try:
             if job.trust and self.map:
                 write_picture(map_file, support_picture(picture, job.trust.support.map))
@@ -250,9 +254,10 @@ class Batch:
     def _exists(self, job: Job, origin: str) -> bool:
         """Whether a job's picture is complete, of this origin, and checked if that is requested."""
         content = read_sidecar(job.output.with_suffix(".json"))
-        checked = "doubtful" in content or not self.check_consistency
-        checked &= not self.map or support_name(job.output).is_file()
-        return checked and content.get("origin") == origin != "" and job.output.is_file()
+        same_origin = origin != "" and content.get("origin") == origin
+        checked = not self.check_consistency or "doubtful" in content
+        mapped = not self.map or support_name(job.output).is_file()
+        return same_origin and checked and mapped and job.output.is_file()
 
     def summarise(self, captures: Iterable[str | Path]) -> None:
         """Write a contact sheet of the first captures and their pictures on the disk, unless there are none.

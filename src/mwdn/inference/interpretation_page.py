@@ -50,9 +50,8 @@ def display(panel: Panel) -> Tensor:
     """
     picture = panel.picture.float().cpu()
     if panel.kind in ("light", "psf"):
-        shown = srgb_encode(to_display(picture.clamp(min=0)))
-        if panel.kind == "psf":
-            shown = to_display(picture.clamp(min=0)).sqrt()
+        light = to_display(picture.clamp(min=0))
+        shown = light.sqrt() if panel.kind == "psf" else srgb_encode(light)
     elif panel.kind == "change":
         shown = 0.5 + 0.5 * picture / max(_quantiles(picture.abs(), 0.997)[0], 1e-12)
     else:

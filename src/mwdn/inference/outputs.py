@@ -44,6 +44,13 @@ def check_outputs(
         raise ParameterError(f"`{out}` must be a folder, but is a file. Choose another one: `out`.")
     real = path_resolver()
     inputs = {real(str(path)) for path in (*captures, *protected) if path is not None}
+    paths = list(out.iterdir()) if out.exists() else []
+    existing = {path.name for path in paths}
+    links = {str(path): path.readlink() for path in paths if path.is_symlink()}
+    start = str(out / "x").removesuffix("x")  # text instead of paths: there may be a million captures
+    folders = {str(Path(capture).parent) for capture in captures}
+    holds_pictures = any(name.endswith(".json") and read_sidecar(out / name) for name in existing)
+    is_foreign = real(str(out)) in map(real, folders) or not holds_pictures
 
     def check(output: str) -> None:
         if real(output) in inputs:
@@ -51,34 +58,25 @@ def check_outputs(
         if output in links:
             raise ParameterError(f"`{output}` is a link to `{links[output]}`. Choose another folder: `out`.")
 
-    paths = list(out.iterdir()) if out.exists() else []
-    existing = {path.name for path in paths}
-    folders = {str(Path(capture).parent) for capture in captures}
-    holds_pictures = any(name.endswith(".json") and read_sidecar(out / name) for name in existing)
-    is_foreign = real(str(out)) in map(real, folders) or not holds_pictures
-
-    def refuse(foreign: str) -> None:
+    def refuse(file: str) -> None:
         raise ParameterError(
-            f"`{start}{foreign}` was not written by mwdn and would be lost. Choose another folder: `out`."
+            f"`{start}{file}` was not written by mwdn and would be lost. Choose another folder: `out`."
         )
 
-    links = {str(path): path.readlink() for path in paths if path.is_symlink()}
-    start = str(out / "x").removesuffix("x")  # text instead of paths: there may be a million captures
     check(str(out / SUMMARY))
     if SUMMARY in existing and not holds_pictures:
         refuse(SUMMARY)
     sources: dict[str, str] = {}
     for capture in captures:
         name = output_name(capture, format)
-        sidecar = name.removesuffix(_SUFFIX[format]) + ".json"
-        check(start + name)
-        check(start + sidecar)
-        support = name.removesuffix(_SUFFIX[format]) + _SUPPORT
-        check(start + support)
+        stem = name.removesuffix(_SUFFIX[format])
+        sidecar, support = f"{stem}.json", stem + _SUPPORT
+        for file in (name, sidecar, support):
+            check(start + file)
         # Among other pictures of a run, one without its sidecar is of a run that was killed between the two.
-        foreign = next((each for each in (sidecar, name, support) if each in existing), None)
-        if foreign and (foreign == sidecar or is_foreign) and not read_sidecar(out / sidecar):
-            refuse(foreign)
+        present = next((file for file in (sidecar, name, support) if file in existing), None)
+        if present and (present == sidecar or is_foreign) and not read_sidecar(out / sidecar):
+            refuse(present)
         if name == SUMMARY:
             raise ParameterError(f"`{capture}` has the name of the summary picture, `{SUMMARY}`. Rename it.")
         if name in sources:

@@ -253,13 +253,10 @@ class Reconstructor:
                 `mwdn.arguments.MAX_LIGHT`; floats of an array exceed 1 by far; or the device does not have enough
                 memory for pictures of this size.
         """
-        if isinstance(measurement, Tensor):
-            return _plain(self._to_host(measurement))
-        return self._to_host(self.calibration.correct(as_frame(measurement)))[0].movedim(0, -1).numpy()
-
-    @torch.inference_mode()
-    def _to_host(self, measurement: Measurement) -> Scene:
-        return to_host(self.finish(self.on_device(measurement)))
+        batch = measurement if isinstance(measurement, Tensor) else self.calibration.correct(as_frame(measurement))
+        with torch.inference_mode():
+            scene = to_host(self.finish(self.on_device(batch)))
+        return _plain(scene) if isinstance(measurement, Tensor) else scene[0].movedim(0, -1).numpy()
 
     def finish(self, scene: Scene) -> Scene:
         """Apply `as_recorded` and `balance` to the result of `on_device`."""
