@@ -10,7 +10,7 @@ import torch
 
 from mwdn.errors import ImageError, ParameterError
 from mwdn.optics import Mask
-from mwdn.optics.mask_files import read_mask, write_gds, write_mask, write_stl
+from mwdn.optics.mask_files import BASE_UM, read_mask, write_gds, write_mask, write_stl
 
 
 @pytest.fixture
@@ -101,7 +101,7 @@ def read_stl(path):
 
 def test_stl_is_a_closed_body_of_the_right_volume(generator, tmp_path):
     mask = Mask("phase", 5 * torch.rand(6, 9, generator=generator), 2.0, 1.5)
-    write_stl(tmp_path / "mask.stl", mask, base_um=30.0)
+    write_stl(tmp_path / "mask.stl", mask)
     normals, corners = read_stl(tmp_path / "mask.stl")
     # Closed: the triangles traverse each edge once in each direction.
     edges = Counter()
@@ -114,7 +114,7 @@ def test_stl_is_a_closed_body_of_the_right_volume(generator, tmp_path):
     # Oriented outwards: the divergence theorem gives the volume with a positive sign.
     wide = corners.astype(np.float64)
     volume = np.einsum("ni,ni->n", wide[:, 0], np.cross(wide[:, 1], wide[:, 2])).sum() / 6
-    h = mask.values.double().numpy() + 30.0
+    h = mask.values.double().numpy() + BASE_UM
     cells = (h[:-1, :-1] + h[1:, 1:]) / 3 + (h[1:, :-1] + h[:-1, 1:]) / 6  # two triangles with a shared diagonal
     sides = [2.0 * np.array([1.5, *[1.0] * (count - 3), 1.5]) for count in h.shape]  # the outermost are at the edges
     assert volume == pytest.approx((cells * np.outer(*sides)).sum(), rel=1e-5)
@@ -140,7 +140,7 @@ def test_stl_refuses_what_it_cannot_show(levels, tmp_path):
         write_stl(tmp_path / "a.stl", Mask("amplitude", torch.ones(4, 4), 1.0))
     with pytest.raises(ParameterError, match="`--stl-every 3`"):
         write_stl(tmp_path / "a.stl", Mask("phase", torch.zeros(1).expand(5000, 5000), 1.0, 1.5))
-    with pytest.raises(ParameterError, match=r"`base_um` \(0\) must be positive"):
-        write_stl(tmp_path / "a.stl", levels, base_um=0.0)
+    with pytest.raises(ParameterError, match=r"`every` \(0\) must be at least 1"):
+        write_stl(tmp_path / "a.stl", levels, every=0)
     write_stl(tmp_path / "a.stl", levels, every=2)
     assert len(read_stl(tmp_path / "a.stl")[1]) == 2 * 4 * 6 + 3 * 2 * (4 + 6)

@@ -30,28 +30,27 @@ def grey_levels() -> list[int]:
     return [round(255 * step / (GREY_STEPS - 1)) for step in range(GREY_STEPS)]
 
 
-def point(screen: Screen, size_cm: float = 0.1, at_cm: tuple[float, float] = (0.0, 0.0)) -> Picture:
-    """A white square on a black display: a point source for the PSF.
+def point(screen: Screen, size_cm: float = 0.1) -> Picture:
+    """A white square in the middle of a black display: a point source for the PSF.
 
     Args:
         screen: the display.
         size_cm: side of the square. At 20 cm, 0.1 cm is 0.3 degrees: smaller than the PSF's finest line must be, or
             the PSF is blurred by it.
-        at_cm: its middle, from the display's middle to the right and down.
 
     Raises:
-        ParameterError: it lies outside of the display.
+        ParameterError: it is larger than the display.
     """
     canvas = grey(0, (screen.height_px, screen.width_px))
     edges = []
-    for at, per_cm, length in zip(at_cm, screen.px_per_cm, (screen.width_px, screen.height_px), strict=True):
+    for per_cm, length in zip(screen.px_per_cm, (screen.width_px, screen.height_px), strict=True):
         side = max(round(size_cm * per_cm), 1)
-        first = round(length / 2 + at * per_cm - side / 2)
-        if not 0 <= first <= length - side:
+        if side > length:
             raise ParameterError(
-                f"A point of `size_cm` {size_cm:g} at {at_cm} cm must be on the display, {screen.width_cm} x "
-                f"{screen.height_cm} cm. Make it smaller."
+                f"A point of `size_cm` {size_cm:g} must be on the display, {screen.width_cm} x {screen.height_cm} cm. "
+                "Make it smaller."
             )
+        first = round(length / 2 - side / 2)
         edges.append(slice(first, first + side))
     canvas[edges[1], edges[0]] = 255
     return canvas

@@ -58,14 +58,14 @@ class Consistency:
         noise = f" ({self.possible:.0%} is not noise)" if self.explained <= self.possible else ""
         summary = f"the picture reproduces {self.explained:.0%} of the capture's detail{noise}"
         displacement = math.hypot(self.envelope_down, self.envelope_right)
-        changes = [
-            f"turned by {self.turn_degrees:.2f} degrees" * (abs(self.turn_degrees) > 0.2),
-            f"scaled by {self.scale:+.1%}" * (abs(self.scale) > 0.005),
-            f"behind an aperture displaced by {displacement:.1%} of the frame" * (displacement > 0.005),
-            f"under {self.haze:.0%} of haze" * (self.haze >= 0.02),
-        ]
-        pose = ", ".join(filter(None, changes))
-        return summary + (f"; fits best with the PSF {pose}" if pose else "")
+        changes = {
+            f"turned by {self.turn_degrees:.2f} degrees": abs(self.turn_degrees) > 0.2,
+            f"scaled by {self.scale:+.1%}": abs(self.scale) > 0.005,
+            f"behind an aperture displaced by {displacement:.1%} of the frame": displacement > 0.005,
+            f"under {self.haze:.0%} of haze": self.haze >= 0.02,
+        }
+        pose = ", ".join(change for change, is_large in changes.items() if is_large)
+        return f"{summary}; fits best with the PSF {pose}" if pose else summary
 
 
 @torch.inference_mode()

@@ -27,6 +27,9 @@ _GDS_END = b"\0\4\4\0"  # the record ENDLIB
 MAX_STL_SAMPLES = 4_000_000
 """Two triangles of 50 bytes a sample: 400 MB, about the largest file that slicers open."""
 
+BASE_UM = 100.0
+"""Thickness of an STL's body below height 0."""
+
 
 def write_mask(path: str | Path, mask: Mask) -> None:
     """Write a mask as 16-bit grey TIFF, atomically: ``value = number * scale``.
@@ -143,12 +146,12 @@ def write_gds(path: str | Path, mask: Mask) -> None:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def check_stl(mask: Mask, *, base_um: float = 100.0, every: int = 1) -> None:
+def check_stl(mask: Mask, *, every: int = 1) -> None:
     """Raise the `ParameterError` of `write_stl` for the same arguments, before anything is written."""
     if mask.kind != "phase":
         raise ParameterError("An amplitude mask has no heights for an STL. Use GDSII: `gds`.")
-    if not base_um > 0 or every < 1:
-        raise ParameterError(f"`base_um` ({base_um:g}) must be positive and `every` ({every}) at least 1.")
+    if every < 1:
+        raise ParameterError(f"`every` ({every}) must be at least 1.")
     rows, columns = (len(_chosen(length, every)) for length in mask.values.shape)
     if rows * columns > MAX_STL_SAMPLES or min(rows, columns) < 2:
         needed = every
@@ -160,7 +163,7 @@ def check_stl(mask: Mask, *, base_um: float = 100.0, every: int = 1) -> None:
         )
 
 
-def write_stl(path: str | Path, mask: Mask, *, base_um: float = 100.0, every: int = 1) -> None:
+def write_stl(path: str | Path, mask: Mask, *, every: int = 1) -> None:
     """Write a phase mask as a closed body in binary STL, in um: the surface, four walls and a flat bottom.
 
     It has the mask's size, and the origin of `write_gds`: the outermost samples lie at the mask's edges.
@@ -169,19 +172,18 @@ def write_stl(path: str | Path, mask: Mask, *, base_um: float = 100.0, every: in
         path: the file.
         mask: a phase mask. A step from one level to the next becomes a slope as wide as the pitch; at the edges
             the slope is half a sample wider.
-        base_um: thickness below height 0.
         every: use every n-th sample along each axis, and the last one.
 
     Raises:
         ParameterError: an amplitude mask, a number that is not positive, or more than `MAX_STL_SAMPLES`.
         ImageError: the file cannot be written.
     """
-    check_stl(mask, base_um=base_um, every=every)
+    check_stl(mask, every=every)
     rows, columns = (_chosen(length, every) for length in mask.values.shape)
     heights = mask.values.numpy()[np.ix_(rows, columns)].astype(np.float64)
     height, width = mask.values.shape
     y, x = -_places(rows, height) * mask.pitch_um, _places(columns, width) * mask.pitch_um
-    triangles = np.concatenate(list(_body(heights + base_um, y, x)))
+    triangles = np.concatenate(list(_body(heights + BASE_UM, y, x)))
     sides = triangles[:, 1:] - triangles[:, :1]
     normals = np.cross(sides[:, 0], sides[:, 1])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)

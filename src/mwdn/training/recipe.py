@@ -170,13 +170,12 @@ class Recipe:
         self._check_task()
 
     def _check_schedule(self) -> None:
-        plateau_only = {"plateau": self.plateau != Plateau(), "later_loss": bool(self.later_loss)}
-        if self.schedule.lr_schedule != "plateau" and any(plateau_only.values()):
-            name = next(name for name, present in plateau_only.items() if present)
-            raise ParameterError(
-                f"[{name}] needs `lr_schedule` ({self.schedule.lr_schedule}) to be plateau. "
-                f'Set `lr_schedule = "plateau"` in [schedule], or leave [{name}] out.'
-            )
+        for name, is_given in (("plateau", self.plateau != Plateau()), ("later_loss", self.later_loss != {})):
+            if is_given and self.schedule.lr_schedule != "plateau":
+                raise ParameterError(
+                    f"[{name}] needs `lr_schedule` ({self.schedule.lr_schedule}) to be plateau. "
+                    f'Set `lr_schedule = "plateau"` in [schedule], or leave [{name}] out.'
+                )
         if self.schedule.lr_schedule == "plateau" and self.schedule.learning_rate < self.plateau.stop:
             raise ParameterError(
                 f"`learning_rate` ({self.schedule.learning_rate:g}) must be at least `stop` ({self.plateau.stop:g}) of "
