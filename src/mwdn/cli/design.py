@@ -71,7 +71,8 @@ class Output:
         if self.stl:
             write_stl(self.out / "mask.stl", designed.mask, every=self.stl_every)
         for option, written in (("gds", self.gds), ("stl", self.stl)):
-            if not written and (old := self.out / f"mask.{option}").exists():
+            old = self.out / f"mask.{option}"
+            if old.exists() and not written:
                 warn(f"`{old}` is from before, and may be of another mask. Write it again: `--{option}`.")
         made = designed.report()["made"]
         light = ", ".join(f"{part:.1%}" for part in made["light_on_sensor"])

@@ -31,5 +31,5 @@ class Doubts:
         """Print how many other captures each doubt concerns, too."""
         for (topic, _), (first, *others) in self._captures.items():
             if others:
-                names = ", ".join(others[:NAMED]) + " ..." * (len(others) > NAMED)
+                names = ", ".join(others[:NAMED]) + (" ..." if len(others) > NAMED else "")
                 warn(f"{topic}: {counted(len(others), 'other capture')} like {first}: {names}")

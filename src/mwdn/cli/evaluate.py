@@ -114,8 +114,9 @@ def evaluate(  # noqa: PLR0913
 
 def _refuse_capture_options(camera: CameraOptions) -> None:
     """Raise a `ParameterError` for options that act on raw captures alone; a camera file may have them."""
-    given = {"ambient": camera.ambient, "gamma": camera.frames.gamma}
-    if camera.camera is None and (names := [f"`{name}`" for name, value in given.items() if value is not None]):
+    given = {"`ambient`": camera.ambient, "`gamma`": camera.frames.gamma}
+    names = [name for name, value in given.items() if value is not None]
+    if names and camera.camera is None:
         raise ParameterError(
             f"The captures of a file of pairs are corrected already: leave out {' and '.join(names)}. Corrections are "
             "for `mwdn import` and `mwdn align`, which write the file."
@@ -136,8 +137,8 @@ def _division(split: str, methods: Iterable[str]) -> Division:
     Raises:
         ParameterError: they were trained with different ones: the test part of one is in the training part of another.
     """
-    metadata = filter(None, map(_metadata, methods))
-    trained = {division for each in metadata if (division := _trained_with(each)).split == split}
+    divisions = {_trained_with(metadata) for metadata in map(_metadata, methods) if metadata}
+    trained = {division for division in divisions if division.split == split}
     if len(trained) > 1:
         raise ParameterError(f"The checkpoints divided '{split}' in different ways. Evaluate each by itself.")
     return trained.pop() if trained else Division(split)

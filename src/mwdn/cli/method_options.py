@@ -54,7 +54,7 @@ def _unknown(name: str, known: Mapping[str, Iterable[str]], command: Callable[..
     app = App()
     app.default(command)
     options = [_flag(option) for option in dict.fromkeys(chain.from_iterable(known.values()))]
-    methods = f"method{'s' * (len(known) != 1)} {', '.join(map(repr, known))}"
+    methods = f"{'method' if len(known) == 1 else 'methods'} {', '.join(map(repr, known))}"
     listed = ", ".join(options) or f"none; solvers ({', '.join(SOLVERS)}) have some"
     sentence = unknown_option(_flag(name), [*options, *long_options(app.assemble_argument_collection())])
     return f"{sentence} Options of the {methods}: {listed}. See `mwdn methods`."

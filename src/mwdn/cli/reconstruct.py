@@ -96,7 +96,8 @@ def reconstruct(  # noqa: PLR0913
         check_size(calibration.psf)
         # Listed by the first process: files may be added to a folder meanwhile.
         files: list[str] = distributed.broadcast_json(lambda: _list_files(captures, camera, out, format))
-        if auto_bin and (coarse := binned(calibration, camera, method, files)):
+        coarse = binned(calibration, camera, method, files) if auto_bin else None
+        if coarse is not None:
             calibration, remarks = coarse
         reconstructor = Reconstructor(
             method,
@@ -116,7 +117,7 @@ def reconstruct(  # noqa: PLR0913
             check_consistency=trust,
             map=map,
             resume=distributed.world_size() > 1 if resume is None else resume,
-            psf_file=Path(camera.psf_file),
+            psf_file=camera.psf_file,
             full_size=full_size,
         )
         is_first = distributed.rank() == 0
@@ -190,13 +191,14 @@ def _run(batch: Batch, files: list[str]) -> _Outcome:
             failed[files[job.number]] = str(job.error)
         elif not job.existing and orientation(job.capture) != 1:
             turned.append(job.capture.name)
-        done, existing = done + (job.error is None), existing + job.existing
+        done += job.error is None
+        existing += job.existing
         _report(job)
         doubts.add(one_line(job.capture.name), job.verdicts)
 
-    def show_part(done: float) -> None:
-        checking = batch.check_consistency and done == len(files)
-        progress.update(done, "checking" if checking else "", len(files) if done else None)
+    def show_part(reconstructed: float) -> None:
+        checking = batch.check_consistency and reconstructed == len(files)
+        progress.update(reconstructed, "checking" if checking else "", len(files) if reconstructed else None)
 
     with if_interrupted(go_on), show_progress(enabled=distributed.rank() == 0) as progress:
         progress.start("Reconstructing", len(files) if len(files) > 1 else None)

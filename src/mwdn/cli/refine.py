@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from mwdn.calibration import Calibration
 from mwdn.calibration.camera_file import read_camera, write_camera
 from mwdn.calibration.pair_model import Terms
-from mwdn.calibration.refinement import TERMS
+from mwdn.calibration.refinement import TERMS, Refinement
 from mwdn.calibration.scene_encoding import scene_gamma, unexplained_by_gamma
 from mwdn.calibration.term_selection import MIN_PAIRS, Selection, Step, left_out, select_terms
 from mwdn.cli.progress import show_progress
@@ -149,12 +149,9 @@ def _pictures(calibration: Calibration, selection: Selection, file: "PairFile") 
     with show_progress() as progress:
         progress.start("Reconstructing left-out pairs", len(steps) * len(file))
         for number, step in enumerate(steps):
-            refinements = {
-                pair: refinement
-                for part in left_out(len(file))
-                for refinement in [selection.fit(step.terms, without=part).refinement()]
-                for pair in part
-            }
+            refinements: dict[int, Refinement] = {}
+            for part in left_out(len(file)):
+                refinements |= dict.fromkeys(part, selection.fit(step.terms, without=part).refinement())
             scores = []
             for pair, (b, v) in enumerate(_all(file)):
                 reconstruct = Reconstructor(METHOD, calibration.refined(refinements[pair]))
