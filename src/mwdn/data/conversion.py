@@ -53,8 +53,9 @@ def _place(kind: Kind, layout: Layout, scene: Size, frame: Size, whole: Size) ->
         return layout.scene_place
     if scene == frame:
         return 0, 0
-    fits = scene[0] <= whole[0] and scene[1] <= whole[1]
-    place = kind.place(scene, whole) if fits and kind.place is not None else None
+    if kind.place is None or scene[0] > whole[0] or scene[1] > whole[1]:
+        return None
+    place = kind.place(scene, whole)
     return place and (place[0] + frame[0] // 2 - whole[0] // 2, place[1] + frame[1] // 2 - whole[1] // 2)
 
 

@@ -228,10 +228,14 @@ def _label(value: object) -> str:
 
 def _with_patterns(listing: Listing, patterns: Container[str]) -> Listing:
     """The pairs of known patterns; the others are refused."""
-    kept = [source for source in listing.sources if source.mask in patterns]
-    others = {source.name: source.mask for source in listing.sources if source.mask not in patterns}
-    whys = {name: f"the pattern `masks/mask_{label}.npy`" if label else f"a {LABEL}" for name, label in others.items()}
-    return Listing(kept, listing.refused | {name: f"`{name}` lacks {why}." for name, why in whys.items()})
+    kept, refused = [], {**listing.refused}
+    for source in listing.sources:
+        if source.mask in patterns:
+            kept.append(source)
+        else:
+            missing = f"the pattern `masks/mask_{source.mask}.npy`" if source.mask else f"a {LABEL}"
+            refused[source.name] = f"`{source.name}` lacks {missing}."
+    return Listing(kept, refused)
 
 
 def _read_row(shard: Shard, levels: FrameFormat, row: int) -> Stored:
@@ -254,9 +258,9 @@ def _list_pictures(
 ) -> tuple[Listing, bool]:
     listing, labels = list_folders(path, captures, scenes), _read_labels(path)
     rooms = files_by_stem(path / background) if (path / background).is_dir() else {}
-    if rooms and len(rooms) > 1:  # one for each capture
-        missing = {one.name: f"`{one.name}` has no frame in `{path / background}`." for one in listing.sources}
-        listing.refused.update({name: why for name, why in missing.items() if name not in rooms})
+    if len(rooms) > 1:  # one for each capture
+        missing = [one.name for one in listing.sources if one.name not in rooms]
+        listing.refused.update({name: f"`{name}` has no frame in `{path / background}`." for name in missing})
     sources = []
     for one in listing.sources:
         if one.name in listing.refused:

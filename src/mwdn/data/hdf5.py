@@ -262,7 +262,9 @@ def read_attributes(path: Path, file: Any, advice: str) -> dict[str, Numbers]:  
 
     attributes = {}
     with as_damage(f"The attributes of `{path}` cannot be read", advice):
-        for name in (each for each in file.attrs if isinstance(each, str)):  # not UTF-8: bytes
+        for name in file.attrs:
+            if not isinstance(name, str):  # bytes: not UTF-8
+                continue
             stored = file.attrs.get_id(name)
             # HDF5 crashes on a sequence of numbers whose length is damaged; damage can turn the type of a text into
             # this one.

@@ -205,7 +205,8 @@ class PairFile(Dataset[tuple[Tensor, Tensor]]):
 def _read_header(path: Path, file: Any) -> _Header:  # noqa: ANN401
     shapes = _read_shapes(path, file)
     attributes = read_attributes(path, file, _MAKE_AGAIN)
-    if (version := attributes.pop(VERSION_KEY, FORMAT_VERSION)) != FORMAT_VERSION:
+    version = attributes.pop(VERSION_KEY, FORMAT_VERSION)
+    if version != FORMAT_VERSION:
         raise ImageError(f"`{path}` has format version {version}, but version {FORMAT_VERSION} is needed. Update mwdn.")
     return _Header(*shapes, attributes)
 

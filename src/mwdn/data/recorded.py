@@ -120,7 +120,8 @@ class RecordedPairs(Samples):
         """Hash of up to `FINGERPRINTED` numbers: of all pairs of a small file, of 16 or more over a large one."""
         digest, count = hashlib.sha256(), len(self.file)
         size = math.prod(self.file.measurement_shape) + math.prod(self.file.scene_shape)
-        for row in range(0, count, max(1, -(-count // max(16, FINGERPRINTED // size)))):
+        most = max(16, FINGERPRINTED // size)
+        for row in range(0, count, max(1, -(-count // most))):
             for picture in self.file[row]:
                 digest.update(picture.numpy().tobytes())
         return digest.hexdigest()

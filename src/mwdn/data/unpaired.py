@@ -133,14 +133,8 @@ class UnpairedCaptures(NumberedSamples):
     def _moved(self, scene: Tensor, number: int) -> Tensor:
         generator = self._generator(number, 2)
         flips = torch.randint(2, (3,), generator=generator).tolist()
-        down, right = (
-            int(part * length)
-            for part, length in zip(
-                (self.settings.shift * (2 * torch.rand(2, generator=generator) - 1)).tolist(),
-                scene.shape[-2:],
-                strict=True,
-            )
-        )
+        parts = self.settings.shift * (2 * torch.rand(2, generator=generator) - 1)
+        down, right = (int(part * length) for part, length in zip(parts.tolist(), scene.shape[-2:], strict=True))
         scene = F.pad(scene, (right, -right, down, -down))
         scene = scene.flip([axis for axis, flip in zip((-2, -1), flips, strict=False) if flip])
         return scene.transpose(-2, -1) if flips[2] and scene.shape[-2] == scene.shape[-1] else scene
