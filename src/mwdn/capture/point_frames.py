@@ -104,16 +104,16 @@ def record_point(pairs: SessionFile, table: PointTable, shooting: Shooting, *, u
         if table.lamp:
             shooting.lamp(True)
         exposures = _exposures(shooting, table, usual_s, hot_pixels(series["dark"]))
-        for kind in ("point", "dark"):
-            if kind == "dark":
-                if table.lamp:
-                    shooting.lamp(False)
-                shooting.frame_of(black)
-            for number, exposure_s in enumerate(exposures, 1):
-                frames = _series(shooting, shooting.expose(exposure_s), table.frames)
-                if kind == "dark" and number == 1:
-                    _check_contrast(pairs, frames[0], table)
-                _add(pairs, f"{kind}-{number}", frames, exposure_s)
+        for number, exposure_s in enumerate(exposures, 1):
+            _add(pairs, f"point-{number}", _series(shooting, shooting.expose(exposure_s), table.frames), exposure_s)
+        if table.lamp:
+            shooting.lamp(False)
+        shooting.frame_of(black)
+        for number, exposure_s in enumerate(exposures, 1):
+            frames = _series(shooting, shooting.expose(exposure_s), table.frames)
+            if number == 1:
+                _check_contrast(pairs, frames[0], table)
+            _add(pairs, f"dark-{number}", frames, exposure_s)
     finally:
         shooting.camera.configure(exposure_s=usual_s)
 

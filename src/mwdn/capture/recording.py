@@ -26,8 +26,8 @@ from mwdn.io.files import as_image_error
 COLUMNS = {"exposure_s": "f8", "gain": "f8", "timestamp": "f8", "number": "i8", "dropped": "i8"}
 """Metadata of each frame, and their types in a file."""
 
-ROWS = {"recording": "frames", "captured pairs": "measurement"}
-"""Data set of the frames in each kind of file that can be played."""
+ROWS = ("frames", "measurement")
+"""Data sets of raw frames that can be played: those of a recording, and of captured pairs."""
 
 MAX_PAUSE_S = 3600.0
 """Longest wait for a frame of a recording. A clock that was set meanwhile, as a Raspberry Pi's after its start, puts
@@ -184,7 +184,7 @@ class Replay(CameraSource):
         self._file, self._number, self._started = file, 0, time.monotonic()
 
     def _load(self, file: Any) -> None:  # noqa: ANN401
-        data = next(filter(None, (find_rows(self.path, file, name, _ADVICE) for name in ROWS.values())), None)
+        data = next(filter(None, (find_rows(self.path, file, name, _ADVICE) for name in ROWS)), None)
         if data is None or data.ndim != 4 or data.dtype not in (np.uint8, np.uint16) or not len(data):
             raise ImageError(f"`{self.path}` holds no raw frames. Give a recording, or pairs of `mwdn capture`.")
         self._data = data

@@ -88,7 +88,7 @@ class Rig(CameraSource):
         self._scale = options.white / float((white + self._room).max())
         self.exposure_s, self.gain, self._drift, self._number = EXPOSURE_S, 1.0, 0.0, -1
         self._started, self._stale = 0.0, 0
-        self._shown = self._before = self._dark()
+        self._shown = self._before = torch.zeros(1, 3, *size)
         self._entry, self._lit, self._frames = -1, -1, PreparedFrames(options.prepared)
         self.show(point(screen) if picture is None else picture)
         self._before, self._stale = self._shown, 0
@@ -185,9 +185,6 @@ class Rig(CameraSource):
             self._wait(max((self._number + 1 + dropped) / self.options.fps + self._started - time.monotonic(), 0.0))
         return dropped
 
-    def _dark(self) -> Measurement:
-        return torch.zeros(1, 3, self.options.height, self.options.width)
-
     def _light(self, picture: Picture) -> Measurement:
         """Light (1, 3, H, W) on the sensor of a picture on the display, without the room's."""
         shown = (picture / np.float32(255)) ** self.options.display_gamma
@@ -217,15 +214,15 @@ def open_rig(**options: Any) -> Rig:  # noqa: ANN401
     ``pictures`` is a folder of pictures, each shown for ``picture_s`` seconds, or a video; either is played again and
     again.
     """
-    own = {name: options.pop(name) for name in ("timeout_s",) if name in options}
+    timeout_s = options.pop("timeout_s", TIMEOUT_S)
 
     def part(cls: type, name: str) -> Any:  # noqa: ANN401
         names = {each.name for each in fields(cls)}
         return to_dataclass(cls, name, {key: options.pop(key) for key in names & options.keys()})
 
     display = part(Screen, "display")
-    own["playlist"] = open_playlist(part(PlaylistOptions, "display"), (display.height_px, display.width_px))
-    return Rig(to_dataclass(RigOptions, "rig", options), display, **own)
+    playlist = open_playlist(part(PlaylistOptions, "display"), (display.height_px, display.width_px))
+    return Rig(to_dataclass(RigOptions, "rig", options), display, playlist=playlist, timeout_s=timeout_s)
 
 
 def _mosaic(light: Tensor, mosaic: str) -> Tensor:
