@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.fourier.convolution import convolve, correlate
-from mwdn.fourier.transforms import fast_length, inverse_spectrum, spectrum
+from mwdn.fourier.transforms import column_counts, fast_length, inverse_spectrum, spectrum
 from mwdn.solvers.alignment import fine_detail
 from mwdn.types import Measurement, Psf, Scene
 
@@ -95,9 +95,8 @@ def _autocorrelation(h: Psf, reach: int) -> Tensor:
 def _energies(parts: Tensor, nearby: Tensor) -> Tensor:
     """``<x_B, H^T H x_B>`` of each part, (parts,)."""
     grid = nearby.shape[-2], nearby.shape[-1]
-    twice = torch.full((grid[1] // 2 + 1,), 2.0, device=parts.device)
-    twice[0] = twice[-1] = 1.0
-    power = spectrum(parts, grid).abs().square() * spectrum(nearby, grid).real * twice
+    counts = column_counts(grid[1], device=parts.device)
+    power = spectrum(parts, grid).abs().square() * spectrum(nearby, grid).real * counts
     return power.sum((1, 2, 3)) / (grid[0] * grid[1])
 
 

@@ -36,6 +36,15 @@ def frequency_grid(grid: Size, *, device: torch.device | str | None = None) -> t
     return rows, torch.fft.rfftfreq(grid[1], device=device, dtype=torch.float32)[None]
 
 
+def column_counts(width: int, *, device: torch.device | str | None = None) -> Tensor:
+    """Columns of the whole spectrum that each column of a `spectrum` stands for: 2, or 1 where it is its own mirror."""
+    counts = torch.full((width // 2 + 1,), 2.0, device=device, dtype=torch.float32)
+    counts[0] = 1
+    if width % 2 == 0:
+        counts[-1] = 1
+    return counts
+
+
 def gaussian_transfer(grid: Size, sigma: float, *, device: torch.device | str | None = None) -> Tensor:
     """Transfer function of a blur by a Gaussian of standard deviation ``sigma`` in pixels."""
     rows, columns = frequency_grid(grid, device=device)

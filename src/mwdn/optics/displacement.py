@@ -8,7 +8,7 @@ from torch import Tensor
 
 from mwdn.arguments import check_batch
 from mwdn.errors import ShapeError
-from mwdn.fourier.transforms import fast_length, frequency_grid, inverse_spectrum, spectrum
+from mwdn.fourier.transforms import column_counts, fast_length, frequency_grid, inverse_spectrum, spectrum
 from mwdn.types import Psf, Size, Spectrum
 
 PEAK_STEPS_PX = (0.1, 0.01)
@@ -72,14 +72,12 @@ def displacement(image: Psf, reference: Psf) -> Displacement:
 def _between_pixels(product: Spectrum, grid: Size, rows: Tensor, columns: Tensor) -> Tensor:
     """Values (rows, columns) at fractional places of the image (1, 1, *grid) with this spectrum.
 
-    The inverse transform is computed at these places only, as two matrix products. Each column of the half spectrum,
-    except the first and the last, also stands for its mirror image.
+    The inverse transform is computed at these places only, as two matrix products.
     """
     vertical, horizontal = (each.double() for each in frequency_grid(grid, device=product.device))
-    twice = torch.full_like(horizontal, 2.0)
-    twice[:, 0] = twice[:, -1] = 1.0
+    counts = column_counts(grid[1], device=product.device)[:, None]
     phase_rows = torch.exp(2j * math.pi * rows[:, None].to(product.device) * vertical.T)
-    phase_columns = twice.T * torch.exp(2j * math.pi * horizontal.T * columns[None].to(product.device))
+    phase_columns = counts * torch.exp(2j * math.pi * horizontal.T * columns[None].to(product.device))
     return (phase_rows @ product[0, 0].to(torch.complex128) @ phase_columns).real / (grid[0] * grid[1])
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mwdn.errors import ParameterError
-from mwdn.fourier.transforms import frequency_grid, spectrum
+from mwdn.fourier.transforms import column_counts, frequency_grid, spectrum
 from mwdn.types import Image, Psf
 
 SCENE_CONTRAST = 0.5
@@ -20,11 +20,7 @@ def _power(psf: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """|H|^2 (..., H, W // 2 + 1) on the PSF's own grid, the multiplicity of each value, and its frequency."""
     height, width = psf.shape[-2:]
     power = spectrum(psf, (height, width)).abs().square()
-    # A column of the half spectrum stands for two, except the first and, for an even width, the last.
-    counts = torch.full((width // 2 + 1,), 2.0, device=psf.device)
-    counts[0] = 1
-    if width % 2 == 0:
-        counts[-1] = 1
+    counts = column_counts(width, device=psf.device)
     rows, columns = frequency_grid((height, width), device=psf.device)
     return power, counts.expand(height, -1), (rows.square() + columns.square()).sqrt()
 

@@ -16,7 +16,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from mwdn.fourier.transforms import frequency_grid, spectrum
+from mwdn.fourier.transforms import column_counts, frequency_grid, spectrum
 from mwdn.optics.noise import noise_level
 from mwdn.solvers.alignment import SMOOTH_LEVELS, halve_psf
 from mwdn.solvers.pyramid import halve, solve
@@ -76,8 +76,7 @@ def _bands(image: Image, halvings: int) -> tuple[Tensor, Tensor]:
     grid = image.shape[-2], image.shape[-1] + image.shape[-1] % 2
     rows, columns = frequency_grid(grid, device=image.device)
     radius = (rows.square() + columns.square()).sqrt().flatten()
-    once = (columns == 0) | (columns == 0.5)
-    times = torch.where(once, 1.0, 2.0).expand(grid[0], -1).flatten()
+    times = column_counts(grid[1], device=image.device).expand(grid[0], -1).flatten()
     bands = torch.stack([times * ((radius >= low) & (radius < high)) for low, high in pairwise(_BANDS)])
     return bands, bands @ (_noise_power(rows, halvings) * _noise_power(columns, halvings)).flatten()
 

@@ -9,7 +9,7 @@ from mwdn.arguments import checked
 from mwdn.errors import ParameterError
 from mwdn.fourier.convolution import check_fit
 from mwdn.fourier.padding import Boundary, pad
-from mwdn.fourier.transforms import inverse_spectrum, spectrum, transfer_function
+from mwdn.fourier.transforms import column_counts, inverse_spectrum, spectrum, transfer_function
 from mwdn.fourier.wiener import deconvolution_grid
 from mwdn.optics.noise import noise_level
 from mwdn.optics.psf import checked_psf
@@ -77,10 +77,8 @@ class Wiener:
         contrast = measurement.float().std((-2, -1), correction=0, keepdim=True)
         contrast = contrast.clamp(min=torch.finfo(torch.float32).tiny)
         allowed = (noise_level(measurement) / contrast).square() + self.tolerance**2
-        # Parseval: sum |B|^2 = pixels x variance. In a half spectrum all columns count twice but the first and, of an
-        # even width, the last. The mean is left out.
-        count = torch.ones(B.shape[-2:], device=B.device, dtype=torch.float32)
-        count[:, 1 : (width + 1) // 2] = 2
+        # Parseval: sum |B|^2 = pixels x variance. The mean is left out.
+        count = column_counts(width, device=B.device).repeat(B.shape[-2], 1)
         count[0, 0] = 0
         power, filtered = (B.abs() / contrast).square() * count, H.abs().square()
         target = allowed * power.sum((-2, -1), keepdim=True)
