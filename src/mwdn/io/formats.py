@@ -178,7 +178,8 @@ def _decode(kind: str, data: bytes, photograph: bool) -> Frame:
 
 def _pgm_header(data: bytes) -> tuple[int, int, int, int, int, int]:
     """Height, width, bytes of a pixel, channels, the largest number, and the position of the numbers."""
-    if not (header := _PGM_HEADER.match(data[: 2**16])):
+    header = _PGM_HEADER.match(data[: 2**16])
+    if header is None:
         raise ImageError(f"is damaged: this PGM or PPM has no width, height and largest number. {COPY_AGAIN}")
     kind, width, height, largest = map(int, header.groups())
     if not 0 < largest <= 65535:

@@ -57,7 +57,8 @@ def decode_frame(data: bytes, name: str) -> Frame:
         ImageError: damaged, cut off, or of another format.
     """
     try:
-        if (kind := kind_of(data)) not in ("PNG", "JPEG", "BMP"):
+        kind = kind_of(data)
+        if kind not in ("PNG", "JPEG", "BMP"):
             raise ImageError(f"must be PNG, JPEG or BMP, but starts with {data[:8]!r}. Export it as PNG.")
         return np.ascontiguousarray(decode(kind, data, photograph=False))
     except ImageError as error:
@@ -155,7 +156,8 @@ def write_imagej(path: str | Path, image: Tensor | FloatFrame, *, pixel_um: floa
     if frame.shape[-1] == 1:
         about = {"axes": axes, "min": 0.0, "max": white}
     resolution = None if pixel_um is None else (1 / pixel_um, 1 / pixel_um)
-    about |= {"unit": "um"} if resolution else {}
+    if resolution is not None:
+        about["unit"] = "um"
     with atomic_write(path) as temporary:
         planes = np.moveaxis(frame, -1, 0)[None, None, ..., None]
         tifffile.imwrite(temporary, planes, imagej=True, metadata=about, resolution=resolution)

@@ -39,7 +39,8 @@ def list_folder(folder: Path) -> tuple[list[str], list[str]]:
     """
     with os.scandir(folder) as entries:
         # A pipe or a link to itself is listed as a frame; reading it reports the error.
-        names = sorted(entry.name + "/" * _is_folder(entry) for entry in entries if not entry.name.startswith("."))
+        visible = [entry for entry in entries if not entry.name.startswith(".")]
+        names = sorted(f"{entry.name}/" if _is_folder(entry) else entry.name for entry in visible)
     start = str(folder / "x").removesuffix("x")
     frames = [start + name for name in names if not name.endswith("/") and Path(name).suffix.lower() in FRAMES]
     return frames, _left_out(folder, names, FRAMES)

@@ -79,7 +79,8 @@ class Deviation:
         Raises:
             ParameterError: unknown name, or the number leaves its range.
         """
-        if name not in (names := [field.name for field in fields(self)]):
+        names = [field.name for field in fields(self)]
+        if name not in names:
             raise ParameterError(f"`name` ({name}) must be one of {', '.join(names)}.")
         return replace(self, **{name: getattr(self, name) + size})
 
