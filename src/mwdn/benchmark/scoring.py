@@ -131,12 +131,8 @@ def score(
     """
     path = folder / f"{method.label}.json"
     captures = list(dataset.recipe.captures)
-    record_identity = {
-        **identity(method, checkpoint, dataset),
-        "device": device.type,
-        "shown": shown,
-        "captures": captures,
-    }
+    record_identity = identity(method, checkpoint, dataset)
+    record_identity |= {"device": device.type, "shown": shown, "captures": captures}
     # Their files and those of the camera may change under the same names. Earlier records lack it.
     captured = psf_hash(dataset.captures)
     record = read_record(path, record_identity)

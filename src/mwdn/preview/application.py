@@ -220,14 +220,13 @@ class Preview:
         """Check a form as far as that is fast, and queue its reconstruction."""
         capture, read, named = form.file("capture"), self._calibration(form), form.texts.get("camera")
         method = form.texts.get("method") or "universal-small"
-        trust = form.flag("trust")
         order = Order(
             capture=capture,
             calibration=read,
             method=method,
             options=checked_options(method, form.json("options")),
             align=form.flag("align"),
-            trust=trust is not False,
+            trust=form.flag("trust") is not False,
             room_light=form.flag("room_light"),
             ambient=form.files.get("ambient", b""),
             psf_file=partial(self.cameras.psf_file, named) if named else partial(PsfFile.read, form.file("psf")),

@@ -140,7 +140,7 @@ def _too_large(most: int) -> RefusedError:
 def error_response(error: Exception) -> JSONResponse:
     """An error as JSON: ``{"error": "..."}``."""
     status = error.status if isinstance(error, RefusedError) else 422
-    headers = {"Retry-After": "2"} if status == 503 else {"WWW-Authenticate": "Bearer"} if status == 401 else None
+    headers = {401: {"WWW-Authenticate": "Bearer"}, 503: {"Retry-After": "2"}}.get(status)
     return JSONResponse({"error": as_fields(str(error))}, status, headers)
 
 

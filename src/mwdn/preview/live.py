@@ -74,7 +74,7 @@ class Live:
         self._pending: dict[str, float] = {}
         self._is_stopped = False
         self._refused = self._unread = ""
-        self._newest: bytes | None = None
+        self.newest: bytes | None = None  # message for viewers
         self._shown: _Shown | None = None
 
     def join(self, wake: Callable[[], None]) -> int:
@@ -90,7 +90,7 @@ class Live:
             number = max(self._wake, default=0) + 1
             self._wake[number] = wake
             if self._thread is None:
-                self._is_stopped, self._newest, self._shown = False, None, None
+                self._is_stopped, self.newest, self._shown = False, None, None
                 self._thread = threading.Thread(target=self._run, daemon=True)
                 self._thread.start()
             return number
@@ -106,11 +106,6 @@ class Live:
     def viewers(self) -> int:
         """Number of viewers."""
         return len(self._wake)
-
-    @property
-    def newest(self) -> bytes | None:
-        """The newest message for viewers."""
-        return self._newest
 
     def snapshot(self) -> LivePicture:
         """The newest frame and its picture.
@@ -270,7 +265,7 @@ class Live:
     def _publish(self, said: dict[str, Any], measurement: bytes, scene: bytes) -> None:
         said |= {"measurement_bytes": len(measurement), "scene_bytes": len(scene)}
         head = json.dumps(said).encode()
-        self._newest = len(head).to_bytes(4, "little") + head + measurement + scene
+        self.newest = len(head).to_bytes(4, "little") + head + measurement + scene
         with self._lock:
             wake = list(self._wake.values())
         for call in wake:

@@ -63,17 +63,14 @@ class LiveSettings:
         Raises:
             MwdnError: no such method or option, or a value is outside its range.
         """
-        own = {name: message[name] for name in message if name in {part.name for part in fields(self)}}
+        own = {part.name: message[part.name] for part in fields(self) if part.name in message}
         if "method" in own and own["method"] != self.method:
             own.setdefault("options", {})
         changed = replace(self, **own)
         options = checked_options(changed.method, changed.options)
-        look = Look(
-            exposure=float(message.get("stops", self.look.exposure)),
-            white_balance=parse_white_balance(message["white_balance"])
-            if "white_balance" in message
-            else self.look.white_balance,
-        )
+        look = replace(self.look, exposure=float(message.get("stops", self.look.exposure)))
+        if "white_balance" in message:
+            look = replace(look, white_balance=parse_white_balance(message["white_balance"]))
         if look.white_balance != "camera":
             check_white_balance(look.white_balance, light)
         return replace(changed, options=options, look=look)

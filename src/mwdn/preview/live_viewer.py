@@ -6,7 +6,7 @@ import time
 from contextlib import suppress
 from typing import Any
 
-from mwdn.errors import MwdnError, ParameterError
+from mwdn.errors import MwdnError
 from mwdn.preview.live import Live
 from mwdn.preview.live_settings import check_message
 
@@ -54,12 +54,10 @@ class Viewer:
         """
         while True:
             message = json.loads(await self.socket.receive_text())
-            if not isinstance(message, dict):
-                raise ParameterError("A message must be a JSON object.")
             if message == {"shown": True}:
                 self._shown = min((self._shown or 0) + 1, self._sent)
                 self._fresh.set()
-            elif message.keys() == {"clock"} and isinstance(message["clock"], int | float):
+            elif isinstance(message, dict) and list(message) == ["clock"] and isinstance(message["clock"], int | float):
                 await self.socket.send_text(json.dumps({"clock": message["clock"], "server": time.time()}))
             else:
                 self.live.control(check_message(message))

@@ -60,9 +60,8 @@ def _paths() -> dict[str, Any]:
     look = [_query("format", {"enum": list(get_args(PictureFormat))}), _query("exposure", _exposure())]
     look.append(_query("white_balance", {"type": "string"}))
     job = {"application/json": {"schema": {"$ref": "#/components/schemas/Job"}}}
-    psf = _object(required=["psf"], psf=_FILE, calibration=_json())
-    camera = {**_object(required=["name", "psf"], **psf["properties"])}
-    camera["properties"]["name"] = {"type": "string", "pattern": f"^{NAME.pattern}$"}
+    camera_name = {"type": "string", "pattern": f"^{NAME.pattern}$"}
+    camera = _object(required=["name", "psf"], psf=_FILE, calibration=_json(), name=camera_name)
     either = _object(psf=_FILE, calibration=_json(), camera={"type": "string"})
     sample = _path("name") | {"schema": {"enum": list(PICTURES)}}
     text = {"text/plain": {"schema": {"type": "string"}}}
