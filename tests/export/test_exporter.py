@@ -32,6 +32,7 @@ from mwdn.networks import NETWORKS, build
 from mwdn.optics.saturation import saturated_pixels
 from mwdn.solvers import SOLVERS
 from mwdn.solvers import build as build_solver
+from mwdn.weights.checkpoint import save_network
 
 onnx = pytest.importorskip("onnx", reason="The extra is missing: pip install 'mwdn[export]'")
 pytest.importorskip("onnxruntime", reason="The extra is missing: pip install 'mwdn[export]'")
@@ -475,11 +476,17 @@ def test_a_file_that_onnxruntime_refuses_is_not_written(precision, tmp_path, mon
 
 
 @pytest.mark.parametrize("suffix", [".onnx", ".pt2"])
-def test_a_foreign_file_is_not_run(suffix, tmp_path):
+def test_a_foreign_file_is_not_run(suffix, tmp_path, caplog):
+    """torch logged the traceback of its first attempt."""
     file = tmp_path / f"camera{suffix}"
-    file.write_bytes(b"something else")
-    with pytest.raises(ExportError, match=rf"`camera{suffix}` cannot be run: "):
-        run_file(file, torch.rand(1, 3, *SIZE))
+    for content in (None, b"something else"):
+        if content:
+            file.write_bytes(content)
+        with pytest.raises(ExportError, match=rf"`camera{suffix}` cannot be run: "):
+            run_file(file, torch.rand(1, 3, *SIZE))
+        with pytest.raises(ExportError, match=rf"`camera{suffix}` cannot be read: "):
+            read_about(file)
+    assert not caplog.records
 
 
 @pytest.mark.parametrize("suffix", [".onnx", ".pt2"])
@@ -501,14 +508,24 @@ def test_options_of_an_object_are_refused(tmp_path):
     [
         ("camera.pt", {}, r"must end in .onnx or .pt2, not '.pt'"),
         ("camera.pt2", {"precision": "int8"}, r"`precision` int8 .*\.onnx"),
-        ("camera.onnx", {"precision": "half"}, r"`precision` must be float32, float16 or int8, not 'half'"),
+        ("camera.onnx", {"precision": "half"}, r"No precision named 'half'"),
+        ("camera.onnx", {"least": "80"}, r"`least` \('80'\) .* must be a number"),
+        ("camera.onnx", {"calibration": "psf.png"}, r"`calibration` \('psf.png'\) .* must be `Calibration`"),
         ("camera.onnx", {"channels": 2}, r"`channels` \(2\) must be 1 or 3"),
         ("camera.onnx", {"channels": 1}, r"`channels` \(1\) must be 3, because the PSF has colours"),
     ],
 )
 def test_wrong_calls(out, options, message, tmp_path):
+    arguments = {"calibration": camera(), **options}
     with pytest.raises(ParameterError, match=message):
-        export(network("wiener"), camera(), tmp_path / out, **options)
+        export(network("wiener"), out=tmp_path / out, **arguments)
+
+
+def test_a_network_of_another_camera_is_exported_with_a_warning(tmp_path):
+    """As it is used by `Reconstructor`; the file was written without a word."""
+    save_network(tmp_path / "best.safetensors", network("wiener"), "wiener", {}, psf_hash="0123456789abcdef")
+    with pytest.warns(UserWarning, match="best.safetensors` was trained for PSF 0123456789abcdef"):
+        export(tmp_path / "best.safetensors", camera(), tmp_path / "camera.pt2")
 
 
 def test_the_file_says_how_raw_frames_become_measurements(tmp_path):

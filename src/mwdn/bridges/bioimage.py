@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from mwdn.arguments import checked
 from mwdn.calibration import Calibration
 from mwdn.errors import ParameterError
 from mwdn.export.exporter import Exported, Precision, export, simulate_captures
@@ -26,6 +27,7 @@ _PAPER = (
 )
 
 
+@checked
 def export_bioimage(
     method: Method | str | Path,
     calibration: Calibration,

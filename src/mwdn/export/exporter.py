@@ -6,22 +6,24 @@ agree with those of `Reconstructor`.
 
 import copy
 import tempfile
+import warnings
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 from torch.utils._pytree import tree_flatten, tree_unflatten
 
+from mwdn.arguments import checked
 from mwdn.calibration import Calibration
 from mwdn.errors import ExportError, ParameterError
 from mwdn.export.loops import as_loops
 from mwdn.export.model_file import as_export_error, publish, require_onnx, run_file, write_file
 from mwdn.inference.fusion import fuse
-from mwdn.inference.methods import Method, as_method, method_name, psf_for
+from mwdn.inference.methods import Method, as_method, method_name, psf_for, psf_warning
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import refuse_overwrite
 from mwdn.io.pictures import dark_scene
@@ -88,6 +90,7 @@ class FixedPsf(nn.Module):
         return self.method.as_recorded(self.method.reconstruct(measurement, prepared).float())
 
 
+@checked
 def export(
     method: Method | str | Path,
     calibration: Calibration,
@@ -116,16 +119,16 @@ def export(
         ExportError: the method cannot be written in this format, the file's results agree too little, or the file
             cannot be written.
         MissingPackageError: onnx or onnxruntime is not installed.
-        ParameterError: another suffix or precision, ``out`` is a symbolic link, or options of a
+        ParameterError: another suffix, an argument of another type, ``out`` is a symbolic link, or options of a
             method that is not given by its name.
-        UnknownNameError: no such method or option.
+        UnknownNameError: no such method, option or precision.
         CheckpointError: the checkpoint cannot be used.
         ShapeError: the network takes another number of channels.
     """
     out = Path(out)
     _check(out, precision, channels)
     refuse_overwrite(out)
-    name = method_name(method)
+    given, name = method, method_name(method)
     method = as_method(method, **options)
     if precision != "float32" and not isinstance(method, nn.Module):
         raise ParameterError(f"`precision` ({precision}) is for networks: a solver has no convolutions. Leave it out.")
@@ -136,7 +139,7 @@ def export(
     if isinstance(method, Network) and method.align:
         about["alignment"] = "off: the PSF is taken as it is"
     measurement = simulate_captures(calibration, ("astronaut",), channels)
-    exact = Reconstructor(method, calibration, align=False, room_light=False, device="cpu", precision="exact")
+    exact = exact_reconstructor(given, method, calibration)
     expected = exact.as_recorded(exact.on_device(measurement))
     with torch.no_grad(), tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / out.name
@@ -155,6 +158,15 @@ def export(
         check_agreement(reached, f"`{out}`", name, least=least, precision=precision)
         publish(file, out)
     return Exported(out, reached, about)
+
+
+def exact_reconstructor(given: Method | str | Path, method: Method, calibration: Calibration) -> Reconstructor:
+    """What a file of the method is compared with; warns if the network, as given, is for another PSF."""
+    exact = Reconstructor(method, calibration, align=False, room_light=False, device="cpu", precision="exact")
+    warning = psf_warning(given, calibration) if isinstance(given, str | Path) else None
+    if warning := warning or exact.warning:
+        warnings.warn(warning, stacklevel=4)
+    return exact
 
 
 def agreement(result: Scene, expected: Scene) -> float:
@@ -200,8 +212,6 @@ def simulate_captures(calibration: Calibration, names: tuple[str, ...], channels
 def _check(out: Path, precision: str, channels: int | None) -> None:
     if channels not in (None, 1, 3):
         raise ParameterError(f"`channels` ({channels}) must be 1 or 3: grey or RGB.")
-    if precision not in get_args(Precision):
-        raise ParameterError(f"`precision` must be float32, float16 or int8, not {precision!r}.")
     if out.suffix not in (".onnx", ".pt2"):
         raise ParameterError(f"`{out}` must end in .onnx or .pt2, not '{out.suffix}'.")
     if out.suffix == ".pt2" and precision == "int8":

@@ -2,6 +2,7 @@
 
 import io
 import json
+import logging
 import shutil
 import warnings
 from collections.abc import Iterator
@@ -84,7 +85,7 @@ def run_file(file: str | Path, measurement: Measurement) -> Scene:
     measurement = measurement.detach().cpu().float()
     if file.suffix == ".pt2":
         with as_export_error(file), torch.no_grad():
-            return torch.export.load(file).module()(measurement)
+            return _load_pt2(file).module()(measurement)
     onnxruntime = require("onnxruntime", "export", purpose="ONNX")
     with as_export_error(file):
         session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
@@ -105,7 +106,7 @@ def read_about(file: str | Path) -> dict[str, str]:
     if file.suffix == ".pt2":
         extra = {ABOUT: ""}
         with as_export_error(file, "read"):
-            torch.export.load(file, extra_files=extra)
+            _load_pt2(file, extra)
             return json.loads(extra[ABOUT])
     onnx = require("onnx", "export", purpose="ONNX")
     with as_export_error(file, "read"):
@@ -113,6 +114,15 @@ def read_about(file: str | Path) -> dict[str, str]:
         if "method" not in about:  # onnx takes any text for a model
             raise ValueError("it has no description")
         return about
+
+
+def _load_pt2(file: Path, extra: dict[str, str] | None = None) -> ExportedProgram:
+    log = logging.getLogger(torch.export.__name__)
+    log.disabled = True  # torch prints the traceback of an error that it then raises in other words
+    try:
+        return torch.export.load(file, extra_files=extra)
+    finally:
+        log.disabled = False
 
 
 def publish(file: Path, out: Path) -> None:

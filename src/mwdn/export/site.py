@@ -7,16 +7,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from mwdn.arguments import checked
 from mwdn.calibration import Calibration
 from mwdn.calibration.pixel_repair import PixelRepair
 from mwdn.calibration.refinement import MIN_FIELD
 from mwdn.errors import ParameterError
-from mwdn.export.exporter import Exported, agreement, check_agreement, simulate_captures
+from mwdn.export.exporter import Exported, agreement, check_agreement, exact_reconstructor, simulate_captures
 from mwdn.export.network_models import NetworkModels, network_models, run_models
 from mwdn.export.site_scripts import constant, joined_modules, read_static, stored
 from mwdn.export.web_runtime import BINARIES, LIBRARIES, PACKAGE, RUNTIME_VERSION, read_runtime
 from mwdn.inference.methods import Method, as_method
-from mwdn.inference.reconstructor import Reconstructor
 from mwdn.io.files import as_parameter_error, atomic, check_folder, refuse_foreign
 from mwdn.io.images import encode_png
 from mwdn.io.pictures import PICTURES
@@ -44,6 +44,7 @@ SITE_FILES = (
 _MARK = b"<!-- mwdn export -->"
 
 
+@checked
 def export_site(
     method: Method | str | Path,
     calibration: Calibration,
@@ -82,7 +83,7 @@ def export_site(
     channels = network.channels or calibration.psf.shape[1]
     models = network_models(network, calibration.size, channels)
     captures = _sample_captures(calibration)
-    exact = Reconstructor(network, calibration, align=False, room_light=False, device="cpu", precision="exact")
+    exact = exact_reconstructor(method, network, calibration)
     scenes = exact.as_recorded(exact.on_device(captures.float() / 65535))
     reached = _compare(models, calibration, captures, scenes, channels)
     check_agreement(reached, "The page", _title(method), least=least)
