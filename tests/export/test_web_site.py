@@ -235,7 +235,11 @@ def test_a_site_of_a_grey_camera_replaces_an_earlier_one(site, runtime, tmp_path
 
 @pytest.mark.parametrize(
     ("method", "message"),
-    [("fista", r"\(fista\) must be a network"), (build("wiener-bank", width=4), r"aligns the PSF to each capture")],
+    [
+        ("fista", r"\(fista\) must be a network"),
+        (build("wiener-bank", width=4), r"aligns the PSF to each capture"),
+        (build("wiener", authors_form=True), r"takes the PSF as its file stores it"),  # it agreed to 7 dB
+    ],
 )
 def test_methods_that_a_page_cannot_run(method, message, runtime, tmp_path):
     with pytest.raises(ParameterError, match=message):

@@ -70,7 +70,8 @@ def export_site(
 
     Raises:
         ExportError: the network cannot be written as ONNX or agrees too little; or onnxruntime-web cannot be had.
-        ParameterError: the method is a solver or aligns, or ``out`` cannot be written or holds files of others.
+        ParameterError: the method is a solver, aligns or takes the PSF as stored; or ``out`` cannot be written or holds
+            files of others.
         MwdnError: as for `Reconstructor`.
     """
     out = Path(out)
@@ -115,6 +116,11 @@ def _network(method: Method | str | Path) -> Network[Any]:
         raise ParameterError(
             f"`method` ({_title(method)}) aligns the PSF to each capture by dozens of reconstructions, which takes too "
             "long in a browser. Use `universal-small`."
+        )
+    if network.stored_psf:
+        raise ParameterError(
+            f"`method` ({_title(method)}) takes the PSF as its file stores it, as the authors' networks do, but a page "
+            "scales each colour to unit sum. Use `universal-small`."
         )
     return network
 
