@@ -297,6 +297,8 @@ def test_wrong_calls(tmp_path, generator, unchecked):
             file.append(measurement, scene * torch.nan)
         with pytest.raises(ParameterError, match="int64"):
             file.append(np.zeros(MEASUREMENT, int), scene[0])
+        with pytest.raises(ParameterError, match=r"`measurement` .* must be a tensor or an array"):
+            file.append([[0.5]], scene[0])
         assert len(file) == 0
     with pytest.raises(ParameterError, match="`scene_shape`"):
         PairFile.create(tmp_path / "b.h5", measurement_shape=MEASUREMENT, scene_shape=(3, 0, 3))
@@ -308,6 +310,8 @@ def test_wrong_calls(tmp_path, generator, unchecked):
         create(tmp_path / "b.h5", attributes={"shape": [1]})
     with pytest.raises(ShapeError, match="`psf`"):
         create(tmp_path / "b.h5", psf=torch.zeros(3, 3))
+    with pytest.raises(ParameterError, match=r"`psf` .* must be a tensor"):
+        create(tmp_path / "b.h5", psf=np.zeros((1, 3, 3)))
     with pytest.raises(ImageError, match="is a folder"), create(tmp_path):
         pass
     (tmp_path / "photo.png").touch()

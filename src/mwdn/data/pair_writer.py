@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mwdn.calibration.sensor_frames import MIN_RESPONSE
 from mwdn.data.hdf5 import PICTURE_BYTES, CheckedFile, add_rows, create_hdf5, write_row
-from mwdn.errors import ImageError, ParameterError, ShapeError
+from mwdn.errors import ImageError, ParameterError, ShapeError, shown
 from mwdn.io.files import as_image_error, atomic
 from mwdn.types import Frame
 
@@ -130,7 +130,7 @@ class PairWriter:
 
         Raises:
             ShapeError: the size is not the file's, or the numbers of scenes and measurements differ.
-            ParameterError: NaN, or numbers on another scale than [0, 1].
+            ParameterError: no tensor or array, NaN, or numbers on another scale than [0, 1].
             ImageError: the file cannot be written, or is not open.
         """
         if self._disk is None:
@@ -157,8 +157,10 @@ class PairWriter:
             # numpy has no bfloat16, which autocast may give.
             stored = pixels.detach().cpu().to(torch.float32 if pixels.dtype == torch.bfloat16 else pixels.dtype)
             array = stored.movedim(-3, -1).numpy() if stored.ndim >= 3 else stored.numpy()
-        else:
+        elif isinstance(pixels, np.ndarray):
             array = pixels
+        else:
+            raise ParameterError(f"`{name}` ({shown(pixels)}) must be a tensor or an array. A list: `numpy.asarray`.")
         batch = array[None] if array.ndim == 3 else array
         if batch.ndim != 4 or batch.shape[1:] != self._shapes[name]:
             got, wanted = (" x ".join(map(str, shape)) for shape in (array.shape, self._shapes[name]))
@@ -197,6 +199,8 @@ def quantise(pixels: Frame, dtype: np.dtype[Any], name: str = "pixels", *, has_f
 def _psf_array(psf: Tensor | None) -> Frame | None:
     if psf is None:
         return None
+    if not isinstance(psf, Tensor):
+        raise ParameterError(f"`psf` ({shown(psf)}) must be a tensor (C, H, W), as `Calibration.psf` is.")
     picture = psf[0] if psf.ndim == 4 and len(psf) == 1 else psf
     if picture.ndim != 3:
         raise ShapeError(f"`psf` {tuple(psf.shape)} must be (C, H, W) or (1, C, H, W).")
