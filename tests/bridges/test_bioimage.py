@@ -3,17 +3,20 @@
 An export takes four seconds of processor time, most of it torch's tracing: acceptance tests.
 """
 
+import re
 import zipfile
 
 import numpy as np
 import pytest
 import torch
 import yaml
+from torch import nn
 
 pytest.importorskip("onnxruntime", reason="the extra `export` is not installed")
 
+from full_disk import full_after
 from mwdn import Calibration, Camera, Reconstructor
-from mwdn.errors import ParameterError
+from mwdn.errors import ExportError, ParameterError
 from mwdn.optics import sample_camera
 
 SIZE = (24, 32)
@@ -69,6 +72,37 @@ def test_another_suffix_is_refused(calibration, tmp_path):
 
     with pytest.raises(ParameterError, match=r"\.zip"):
         export_bioimage("wiener", calibration, tmp_path / "camera.onnx")
+
+
+class Unchanged(nn.Module):
+    """The quickest to export."""
+
+    def forward(self, measurement, psf):
+        return measurement * 1.0
+
+
+def test_a_full_temporary_folder_is_named(calibration, tmp_path):
+    """The test tensors and the zip ended in a traceback."""
+    from mwdn.bridges import export_bioimage
+
+    out = tmp_path / "camera.zip"
+    out.write_bytes(b"an older one")
+    for size in (8000, 16000):  # the ONNX has 2 kB, each tensor 9 kB, the zip 18 kB
+        with full_after(size), pytest.raises(ExportError, match=r"cannot be written to: .*TMPDIR"):
+            export_bioimage(Unchanged(), calibration, out)
+    assert out.read_bytes() == b"an older one"
+
+
+def test_the_name_is_one_that_the_format_allows(calibration, tmp_path):
+    """At most 128 characters, letters without accents."""
+    from mwdn.bridges import export_bioimage
+
+    method = type("Größe" * 40, (Unchanged,), {})()
+    export_bioimage(method, calibration, tmp_path / "camera.zip")
+    with zipfile.ZipFile(tmp_path / "camera.zip") as archive:
+        name = yaml.safe_load(archive.read("rdf.yaml"))["name"]
+    assert re.fullmatch(r"[A-Za-z0-9_+ ()-]{5,128}", name)
+    assert name.endswith(calibration.psf_hash)
 
 
 @pytest.mark.acceptance

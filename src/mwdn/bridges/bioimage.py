@@ -14,7 +14,7 @@ from mwdn.arguments import checked
 from mwdn.calibration import Calibration
 from mwdn.errors import ParameterError
 from mwdn.export.exporter import Exported, Precision, export, simulate_captures
-from mwdn.export.model_file import publish, run_file
+from mwdn.export.model_file import publish, run_file, temporary_files
 from mwdn.inference.methods import Method
 from mwdn.io.files import file_sha256, refuse_overwrite
 from mwdn.types import Image
@@ -65,15 +65,16 @@ def export_bioimage(
         exported = export(method, calibration, weights, precision=precision, channels=channels, least=least, **options)
         measurement = simulate_captures(calibration, ("astronaut",), channels or calibration.psf.shape[1])[:1]
         scene = run_file(weights, measurement)
-        np.save(folder / "measurement.npy", measurement.numpy())
-        np.save(folder / "scene.npy", scene.numpy())
-        (folder / "README.md").write_text(_documentation(exported), encoding="utf-8")
-        description = json.dumps(_description(exported, folder, measurement, scene), indent=2, ensure_ascii=False)
-        (folder / "rdf.yaml").write_text(description, encoding="utf-8")  # JSON is YAML
-        package = folder / "package.zip"
-        with zipfile.ZipFile(package, "w", zipfile.ZIP_DEFLATED) as archive:
-            for name in ("rdf.yaml", "README.md", "measurement.npy", "scene.npy", "weights.onnx"):
-                archive.write(folder / name, name)
+        with temporary_files(folder):
+            np.save(folder / "measurement.npy", measurement.numpy())
+            np.save(folder / "scene.npy", scene.numpy())
+            (folder / "README.md").write_text(_documentation(exported), encoding="utf-8")
+            description = json.dumps(_description(exported, folder, measurement, scene), indent=2, ensure_ascii=False)
+            (folder / "rdf.yaml").write_text(description, encoding="utf-8")  # JSON is YAML
+            package = folder / "package.zip"
+            with zipfile.ZipFile(package, "w", zipfile.ZIP_DEFLATED) as archive:
+                for name in ("rdf.yaml", "README.md", "measurement.npy", "scene.npy", "weights.onnx"):
+                    archive.write(folder / name, name)
         publish(package, out)
     return Exported(out, exported.agreement, exported.about)
 
@@ -84,7 +85,8 @@ def _description(exported: Exported, folder: Path, measurement: Image, scene: Im
 
     opset = max(each.version for each in onnx.load(exported.path, load_external_data=False).opset_import)
     about = exported.about
-    name = re.sub(r"[^\w -]", "-", f"mwdn {Path(about['method']).stem} for PSF {about['psf_hash']}")
+    title = f"mwdn {Path(about['method']).stem[:96]} for PSF {about['psf_hash']}"  # 128 characters at most
+    name = re.sub(r"[^\w -]", "-", title, flags=re.ASCII)
     file = {"source": "weights.onnx", "sha256": file_sha256(exported.path)}
     return {
         "type": "model",

@@ -37,11 +37,18 @@ def write_file(file: Path, program: ExportedProgram, about: dict[str, str]) -> N
             is full.
     """
     content = _pt2(program, about) if file.suffix == ".pt2" else _onnx(program, about)
-    try:
+    with temporary_files(file.parent):
         file.write_bytes(content)
+
+
+@contextmanager
+def temporary_files(folder: Path) -> Iterator[None]:
+    """Turn an `OSError` while writing into a folder for temporary files into an `ExportError` that names it."""
+    try:
+        yield
     except OSError as error:
         raise ExportError(
-            f"`{file.parent}` for temporary files cannot be written to: {error.strerror or error}. Make room, or name "
+            f"`{folder}` for temporary files cannot be written to: {error.strerror or error}. Make room, or name "
             "another folder: `export TMPDIR=/PATH`."
         ) from error
 
