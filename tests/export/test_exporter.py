@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import jaxtyping
@@ -24,6 +25,7 @@ from mwdn.errors import ExportError, MissingPackageError, ParameterError, ShapeE
 from mwdn.export import export, read_about, run_file
 from mwdn.export.dft import column_matrices, inverse_row_matrix, row_matrix
 from mwdn.export.exporter import MIN_AGREEMENT, agreement, simulate_captures
+from mwdn.export.model_file import serialise
 from mwdn.export.onnx_program import REAL_HANDLERS
 from mwdn.fourier.filtering import filter_image
 from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
@@ -487,6 +489,21 @@ def test_a_foreign_file_is_not_run(suffix, tmp_path, caplog):
         with pytest.raises(ExportError, match=rf"`camera{suffix}` cannot be read: "):
             read_about(file)
     assert not caplog.records
+
+
+def test_more_than_onnx_holds_is_an_error_of_mwdn():
+    """protobuf's error, which `ByteSize` raises as well, ended the command with a traceback."""
+
+    from google.protobuf.message import EncodeError
+
+    class Large:
+        graph = SimpleNamespace(initializer=[SimpleNamespace(raw_data=range(3 * 2**30))])
+
+        def SerializeToString(self):  # noqa: N802
+            raise EncodeError("Failed to serialize proto")
+
+    with pytest.raises(ExportError, match=r"would have 3\.0 GB; ONNX files hold 2"):
+        serialise(Large())
 
 
 @pytest.mark.parametrize("suffix", [".onnx", ".pt2"])

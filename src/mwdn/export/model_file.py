@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from torch.export import ExportedProgram
@@ -18,6 +19,9 @@ from mwdn.export.onnx_program import to_onnx
 from mwdn.io.files import atomic
 from mwdn.runtime.requirement import require
 from mwdn.types import Measurement, Scene
+
+if TYPE_CHECKING:
+    import onnx
 
 ABOUT = "mwdn.json"
 """Name of the description inside a ``.pt2`` file; an ONNX file holds it as its metadata."""
@@ -67,11 +71,27 @@ def _onnx(program: ExportedProgram, about: dict[str, str]) -> bytes:
     model = to_onnx(program)
     onnx.helper.set_model_props(model, about)
     model.producer_name, model.producer_version = "mwdn", about["version"]
-    if model.ByteSize() >= onnx.checker.MAXIMUM_PROTOBUF:
-        size = model.ByteSize() / 2**30
-        raise ExportError(f"The file would have {size:.1f} GB; ONNX files hold 2. Export to .pt2, or `--bin 2`.")
-    onnx.checker.check_model(model)
-    return model.SerializeToString()
+    return serialise(model)
+
+
+def serialise(model: "onnx.ModelProto") -> bytes:
+    """The content of an ONNX file, checked.
+
+    Raises:
+        ExportError: it would exceed 2 GB, the maximum of ONNX.
+    """
+    import onnx
+    from google.protobuf.message import EncodeError
+
+    try:
+        content = model.SerializeToString()
+    except (EncodeError, ValueError) as error:  # `ByteSize` raises it, too
+        size = sum(len(constant.raw_data) for constant in model.graph.initializer) / 2**30
+        raise ExportError(
+            f"The file would have {size:.1f} GB; ONNX files hold 2. Export to .pt2, or `--bin 2`."
+        ) from error
+    onnx.checker.check_model(content)
+    return content
 
 
 def run_file(file: str | Path, measurement: Measurement) -> Scene:
