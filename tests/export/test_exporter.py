@@ -542,7 +542,8 @@ def test_a_network_of_another_camera_is_exported_with_a_warning(tmp_path):
     """As it is used by `Reconstructor`; the file was written without a word."""
     save_network(tmp_path / "best.safetensors", network("wiener"), "wiener", {}, psf_hash="0123456789abcdef")
     with pytest.warns(UserWarning, match="best.safetensors` was trained for PSF 0123456789abcdef"):
-        export(tmp_path / "best.safetensors", camera(), tmp_path / "camera.pt2")
+        done = export(tmp_path / "best.safetensors", camera(), tmp_path / "camera.pt2")
+    assert done.about["method"] == "best.safetensors"  # packages are published: without the folders
 
 
 def test_the_file_says_how_raw_frames_become_measurements(tmp_path):

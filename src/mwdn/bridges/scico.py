@@ -26,7 +26,7 @@ def scico_operator(camera: Camera, *, scene_size: Size | None = None, channels: 
     linop = require("scico.linop", "scico")
     numpy = require("scico.numpy", "scico")
     model = ForwardModel.of(camera, scene_size, channels)
-    psf = camera.psf[0].cpu().numpy()
+    psf = camera.psf[0].detach().cpu().numpy()
     pad, crop, grid = [(0, 0)], [(0, 0)], [model.scene[0]]
     for s, o, p in zip(model.scene[1:], model.measurement[1:], psf.shape[1:], strict=True):
         # The scene starts at `start`, the sensor at `first`: no end of the full convolution leaves the grid and wraps.

@@ -226,7 +226,7 @@ def _about(name: str, calibration: Calibration, channels: int, precision: str) -
     """Description of a file: what another program needs to know to use it."""
     height, width = calibration.size
     about = {
-        "method": name,
+        "method": Path(name).name if Path(name).is_absolute() else name,  # folders may name people and projects
         "version": __version__,
         "precision": precision,
         "psf_hash": calibration.psf_hash,
