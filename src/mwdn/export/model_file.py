@@ -81,11 +81,10 @@ def serialise(model: "onnx.ModelProto") -> bytes:
         ExportError: it would exceed 2 GB, the maximum of ONNX.
     """
     import onnx
-    from google.protobuf.message import EncodeError
 
     try:
         content = model.SerializeToString()
-    except (EncodeError, ValueError) as error:  # `ByteSize` raises it, too
+    except Exception as error:  # EncodeError or ValueError, by protobuf's version; `ByteSize` raises it, too
         size = sum(len(constant.raw_data) for constant in model.graph.initializer) / 2**30
         raise ExportError(
             f"The file would have {size:.1f} GB; ONNX files hold 2. Export to .pt2, or `--bin 2`."
