@@ -163,8 +163,8 @@ def export(
 def exact_reconstructor(given: Method | str | Path, method: Method, calibration: Calibration) -> Reconstructor:
     """What a file of the method is compared with; warns if the network, as given, is for another PSF."""
     exact = Reconstructor(method, calibration, align=False, room_light=False, device="cpu", precision="exact")
-    warning = psf_warning(given, calibration) if isinstance(given, str | Path) else None
-    if warning := warning or exact.warning:
+    warning = (psf_warning(given, calibration) if isinstance(given, str | Path) else None) or exact.warning
+    if warning:
         warnings.warn(warning, stacklevel=4)
     return exact
 
