@@ -181,40 +181,36 @@ def _single_row(network: WienerNetwork | WienerUNet, measurement: Measurement, p
 
 
 def _bank_rows(network: WienerBank, measurement: Measurement, psf: Psf, result: Scene) -> list[Row]:
-    """The estimates in front of the U-Net, smoothest first, and what the U-Net changes."""
-    channels = network.channels
-    coloured = measurement.expand(-1, channels, -1, -1) if measurement.shape[1] == 1 else measurement
-    estimates = network.estimates(coloured, psf)
-    parts = torch.split(estimates[:, : network.pictures], channels, dim=1)
-    rows = []
-    start = None
+    """Rows of the iterations if there are any, of the bank, smoothest first, and of the U-Net."""
+    measurement = measurement.expand(-1, network.channels, -1, -1)  # a grey one: equal colours
+    pictures = network.estimates(measurement, psf)[:, : network.pictures]
+    *estimates, _ = torch.split(pictures, network.channels, dim=1)  # the last picture is the measurement
+    lambdas = network.regularisations
+    filtered = zip(lambdas, estimates[-len(lambdas) :], strict=True)
+    bank = Row(
+        "Wiener bank",
+        tuple(Panel(f"lambda {value:g}", picture) for value, picture in filtered),
+        {f"lambda_{number}": value for number, value in enumerate(lambdas, 1)},
+    )
+    smoothest = estimates[0]
+    change = result - smoothest
+    unet = Row(
+        "U-Net",
+        (Panel("U-Net's change", change, "change"), Panel("reconstruction", result)),
+        {"share_of_picture": _share(change, result)},
+    )
+    return [_iterations_row(network, measurement, psf, smoothest), bank, unet] if network.levels else [bank, unet]
+
+
+def _iterations_row(network: WienerBank, measurement: Measurement, psf: Psf, scene: Scene) -> Row:
+    """The scene after the iterations and plug and play; with plug and play, also the one before it and the change."""
+    panels = [Panel("iterations", scene)]
     if network.rounds:
-        plain = copy.copy(network)
-        plain.rounds = 0
-        start = plain.estimates(coloured, psf)[:, :channels]
-    if network.levels:
-        smooth = [Panel("iterations", parts[0] if start is None else start)]
-        numbers: dict[str, float | None] = {"residual": _share(coloured - convolve(parts[0], psf), coloured)}
-        if start is not None:
-            smooth += [
-                Panel(f"after {network.rounds} rounds", parts[0]),
-                Panel("the rounds' change", parts[0] - start, "change"),
-            ]
-        rows.append(Row("iterations", tuple(smooth), numbers))
-    details = parts[1:] if network.levels else parts
-    bank = tuple(
-        Panel(f"lambda {value:g}", picture) for value, picture in zip(network.regularisations, details, strict=False)
-    )
-    rows.append(Row("Wiener bank", bank, {f"lambda_{i + 1}": v for i, v in enumerate(network.regularisations)}))
-    change = result - parts[0]
-    rows.append(
-        Row(
-            "U-Net",
-            (Panel("U-Net's change", change, "change"), Panel("reconstruction", result)),
-            {"share_of_picture": _share(change, result)},
-        )
-    )
-    return rows
+        prepared = network.prepare(psf, (measurement.shape[-2], measurement.shape[-1]))
+        start = network.iterate(measurement.float(), prepared).scene
+        after = Panel(f"after {network.rounds} rounds", scene)
+        panels = [Panel("iterations", start), after, Panel("the rounds' change", scene - start, "change")]
+    return Row("iterations", tuple(panels), {"residual": _share(measurement - convolve(scene, psf), measurement)})
 
 
 def _filter_numbers(wiener: WienerFilter, psf: Tensor) -> dict[str, float | None]:
