@@ -12,7 +12,7 @@ unknowns are smooth.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,7 +21,7 @@ from torch.nn import functional as F
 from mwdn.calibration.refinement import Refinement, displaced
 from mwdn.fourier.convolution import convolve
 from mwdn.optics.polynomials import coefficient_count, polynomials
-from mwdn.types import Measurement, Psf, Scene, Size
+from mwdn.types import Image, Measurement, Psf, Scene
 
 BLOCKS = 32
 """Blocks along the shorter side in which means are compared."""
@@ -31,6 +31,9 @@ RIDGE = 1e-4
 
 DISPLACEMENT_STEP = 0.01
 """Displacement of the envelope for finite differences, over the shorter side."""
+
+DOWN, RIGHT = (-1, 0), (-2, 0)
+"""Stand for (m, k) of two kernels without a polynomial: derivatives of the PSF by the envelope's displacement."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +97,17 @@ class Fit:
         )
 
 
+class _Explained(NamedTuple):
+    """One colour of a picture, with the best o, e and a for given common unknowns."""
+
+    field: Tensor  # S, (pixels,)
+    images: Tensor  # (2, pixels), of ones and of the scene: the factors of S e and S a
+    free: Tensor  # (3, pixels), whose factors are o, e and a: ones, and S times the images
+    inverse: Tensor  # (3, 3), of the Gram matrix of `free`
+    factors: Tensor  # o, e and a
+    residual: Tensor  # of the measurement, (pixels,)
+
+
 class PairModel:
     """Pairs of one camera, reduced to what fits need.
 
@@ -115,54 +129,43 @@ class PairModel:
         moves: bool = True,
     ) -> None:
         size = psf.shape[-2], psf.shape[-1]
-        self.block = max(1, min(size) // BLOCKS)
-        self.shift = shift
-        moved = psf if shift is None else displaced(psf, shift)
-        over_frame = polynomials(3, size)[:, None].float()
-        bases = [((0, 0), moved), *(((m, k), moved * over_frame[m]) for m, k in kernels)]
-        steps = {(-1, 0): (DISPLACEMENT_STEP, 0.0), (-2, 0): (0.0, DISPLACEMENT_STEP)} if moves else {}
-        for name, (down, right) in steps.items():
-            ahead, back = (displaced(moved, (sign * down, sign * right)) for sign in (1, -1))
-            bases.append((name, ahead / (2 * DISPLACEMENT_STEP) - back / (2 * DISPLACEMENT_STEP)))
-        self.kernels = [name for name, _ in bases]
-        ones = torch.ones(1, psf.shape[1], *size)
-        self.even = self._reduce(ones, ones, bases, over_frame)[1]
-        reduced = [self._reduce(b, v, bases, over_frame) for b, v in pairs]
-        self.b = torch.stack([b for b, _ in reduced])
-        self.parts = torch.stack([parts for _, parts in reduced])
-        self.scale = self.b.square().mean((1, 2)).sqrt().clamp(min=1e-12)
-        self.small = self.size_of_blocks(size)
+        self.shift, self.block = shift, max(1, min(size) // BLOCKS)
+        psf = psf if shift is None else displaced(psf, shift)
+        P = polynomials(3, size)[:, None].float()  # P[0] is 1
+        psfs = {(m, k): psf * P[m] for m, k in ((0, 0), *kernels)}
+        if moves:
+            psfs |= {DOWN: _derivative(psf, DISPLACEMENT_STEP, 0.0), RIGHT: _derivative(psf, 0.0, DISPLACEMENT_STEP)}
+        self.kernels = [*psfs]
 
-    def size_of_blocks(self, size: Size) -> Size:
-        """Height and width in blocks."""
-        return size[0] // self.block, size[1] // self.block
+        def images(scene: Scene) -> Tensor:
+            """(C, kernels, pixels)."""
+            return torch.stack([self._means(convolve(scene * P[k], kernel)) for (_, k), kernel in psfs.items()], 1)
+
+        self.even = images(torch.ones(1, psf.shape[1], *size))
+        reduced = [(self._means(b), images(v)) for b, v in pairs]
+        self.measurements = torch.stack([b for b, _ in reduced])
+        self.images = torch.stack([seen for _, seen in reduced])
+        self.scale = self.measurements.square().mean((1, 2)).sqrt().clamp(min=1e-12)
+        self.over_sensor = polynomials(3, (size[0] // self.block, size[1] // self.block)).flatten(1)  # (J, pixels)
+
+    def _means(self, image: Image) -> Tensor:
+        """(C, pixels), over blocks."""
+        return F.avg_pool2d(image.double(), self.block)[0].flatten(1)
 
     def __len__(self) -> int:
-        return len(self.b)
-
-    @cached_property
-    def over_sensor(self) -> Tensor:
-        """P, (K, pixels)."""
-        return polynomials(3, self.small).flatten(1)
-
-    def _reduce(
-        self, b: Measurement, v: Scene, bases: list[tuple[tuple[int, int], Psf]], over_frame: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Measurement b (C, pixels) and the images (C, kernels, pixels) of one pair, as means over blocks."""
-        images = [convolve(v * over_frame[k] if k else v, kernel) for (_, k), kernel in bases]
-        b, *images = (F.avg_pool2d(image.double(), self.block)[0].flatten(1) for image in (b, *images))
-        return b, torch.stack(images, 1)
+        return len(self.measurements)
 
     def start(self, terms: Terms) -> Fit:
         """The start of a fit: no change of the calibration."""
-        colours, zeros = self.b.shape[1], torch.zeros
+        colours, zeros = self.measurements.shape[1], torch.zeros
         field, stray = (coefficient_count(order) - 1 for order in (terms.sensor_field, terms.stray_light))
         kernels = zeros(colours, len(self._columns(terms)), dtype=torch.float64)
         return Fit(terms, kernels, zeros(field).double(), zeros(colours, stray).double(), self.shift)
 
     def _columns(self, terms: Terms) -> list[int]:
+        """Numbers of the terms' kernels; a displacement that is in the PSF already needs none."""
         moves = terms.envelope > (self.shift is not None)
-        wanted = terms.kernels + ([(-1, 0), (-2, 0)] if moves else [])
+        wanted = [*terms.kernels, *((DOWN, RIGHT) if moves else ())]
         return [self.kernels.index(name) for name in wanted]
 
     def fit(self, terms: Terms, pairs: Sequence[int], *, start: Fit | None = None, steps: int = 4) -> Fit:
@@ -175,63 +178,58 @@ class PairModel:
     def _step(self, fit: Fit, pairs: list[int]) -> Fit:
         colours, kernels = fit.gain.shape
         field, stray = len(fit.field), fit.stray.shape[1]
-        count = colours * kernels + field + colours * stray
+        parts = [colours * kernels, field, colours * stray]
+        count = sum(parts)
         if not count:
             return fit
+        of_gain, of_field, of_stray = torch.split(torch.arange(count), parts)
         A, y = torch.zeros(count, count).double(), torch.zeros(count).double()
         for c in range(colours):
-            own = [*range(c * kernels, (c + 1) * kernels), *range(colours * kernels, colours * kernels + field)]
-            first = colours * kernels + field + c * stray
-            own += range(first, first + stray)
-            for i in pairs:
-                J, r = self._linear(fit, i, c)
-                A[torch.tensor(own)[:, None], torch.tensor(own)] += J @ J.T
+            own = torch.cat([of_gain.view(colours, kernels)[c], of_field, of_stray.view(colours, stray)[c]])
+            for pair in pairs:
+                J, r = self._linear(fit, pair, c)
+                A[own[:, None], own] += J @ J.T
                 y[own] += J @ r
         step = torch.linalg.solve(A + RIDGE * A.diagonal().mean() * torch.eye(count).double(), y)
-        gain, s, light = step.split([colours * kernels, field, colours * stray])
-        return replace(
-            fit,
-            gain=fit.gain + gain.view(colours, kernels),
-            field=fit.field + s,
-            stray=fit.stray + light.view(colours, stray),
-        )
+        gain, s, light = torch.split(step, parts)
+        gain, light = gain.view_as(fit.gain), light.view_as(fit.stray)
+        return replace(fit, gain=fit.gain + gain, field=fit.field + s, stray=fit.stray + light)
 
-    def _linear(self, fit: Fit, i: int, c: int) -> tuple[Tensor, Tensor]:
-        """Derivatives (unknowns of this colour, pixels) and residual of a picture's colour, without a, e and o."""
+    def _linear(self, fit: Fit, pair: int, colour: int) -> tuple[Tensor, Tensor]:
+        """Derivatives (unknowns of this colour, pixels) and residual of a picture's colour, without o, e and a."""
         columns, P = self._columns(fit.terms), self.over_sensor
-        S, images, light = self._forward(fit, i, c)
-        free, inverse, residual = self._eliminate(self.b[i, c] - light, S * images)
-        e, a = (inverse @ (free @ (self.b[i, c] - light)))[1:]
-        field, stray = P[1 : 1 + len(fit.field)], P[1 : 1 + fit.stray.shape[1]]
-        parts = a * self.parts[i, c, columns] + e * self.even[c, columns]
-        J = torch.cat([S * parts, field * (a * images[1] + e * images[0]), stray])
+        S, images, free, inverse, (_, e, a), residual = self._explained(fit, pair, colour)
+        by_gain = S * (a * self.images[pair, colour, columns] + e * self.even[colour, columns])
+        by_field = P[1 : 1 + len(fit.field)] * (a * images[1] + e * images[0])
+        J = torch.cat([by_gain, by_field, P[1 : 1 + fit.stray.shape[1]]])
         J = J - (J @ free.T) @ inverse @ free
-        return J / self.scale[i], residual / self.scale[i]
+        return J / self.scale[pair], residual / self.scale[pair]
 
-    def _forward(self, fit: Fit, i: int, c: int) -> tuple[Tensor, Tensor, Tensor]:
-        """S, the images (2, pixels) of an even scene and of the pair's scene, and B."""
+    def _explained(self, fit: Fit, pair: int, colour: int) -> _Explained:
+        """Least squares for o, e and a: b - B = o + S (e image of ones + a image of v)."""
         columns, P = self._columns(fit.terms), self.over_sensor
-        both = torch.stack([self.even[c], self.parts[i, c]])
-        images = both[:, 0] + torch.einsum("k,nkp->np", fit.gain[c], both[:, columns])
+        both = torch.stack([self.even[colour], self.images[pair, colour]])
+        images = both[:, 0] + torch.einsum("k,nkp->np", fit.gain[colour], both[:, columns])
         S = 1 + fit.field @ P[1 : 1 + len(fit.field)]
-        return S, images, fit.stray[c] @ P[1 : 1 + fit.stray.shape[1]]
-
-    @staticmethod
-    def _eliminate(b: Tensor, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Rows whose factors are o, e and a, the inverse of their Gram matrix, and the residual without them."""
-        free = torch.cat([torch.ones_like(b)[None], images])
+        b = self.measurements[pair, colour] - fit.stray[colour] @ P[1 : 1 + fit.stray.shape[1]]
+        free = torch.cat([torch.ones_like(b)[None], S * images])
         inverse = torch.linalg.pinv(free @ free.T, hermitian=True)
-        return free, inverse, b - (inverse @ (free @ b)) @ free
+        factors = inverse @ (free @ b)
+        return _Explained(S, images, free, inverse, factors, b - factors @ free)
 
     def unexplained(self, fit: Fit, pair: int) -> float:
         """Root mean square residual of a pair over the standard deviation of its measurement."""
         square, total = 0.0, 0.0
-        for c in range(self.b.shape[1]):
-            S, images, light = self._forward(fit, pair, c)
-            _, _, residual = self._eliminate(self.b[pair, c] - light, S * images)
-            square += float(residual.square().sum())
-            total += float((self.b[pair, c] - self.b[pair, c].mean()).square().sum())
+        for colour, measurement in enumerate(self.measurements[pair]):
+            square += float(self._explained(fit, pair, colour).residual.square().sum())
+            total += float((measurement - measurement.mean()).square().sum())
         return (square / max(total, 1e-30)) ** 0.5
+
+
+def _derivative(psf: Psf, down: float, right: float) -> Psf:
+    """Central difference of a PSF by a step of its envelope's displacement."""
+    ahead, back = displaced(psf, (down, right)), displaced(psf, (-down, -right))
+    return ahead / (2 * DISPLACEMENT_STEP) - back / (2 * DISPLACEMENT_STEP)
 
 
 def _rows(first: float, rest: Tensor) -> tuple[tuple[float, ...], ...]:
