@@ -54,11 +54,11 @@ class LivePicture:
 
     def result(self) -> Result:
         """As a finished reconstruction, with the frame's metadata in its report."""
-        frame = self.frame
+        frame, camera = self.frame, self.calibration
         report = {
             "method": self.settings.method,
             "options": self.settings.options,
-            "psf_hash": self.calibration.psf_hash,
+            "psf_hash": camera.psf_hash,
             "height": self.scene.shape[-2],
             "width": self.scene.shape[-1],
             "number": frame.number,
@@ -68,7 +68,6 @@ class LivePicture:
             "bit_depth": frame.bit_depth,
             "mosaic": frame.mosaic,
         }
-        camera = self.calibration
         return Result(self.measurement, self.scene, camera.light, camera.white_balance, report, frame=frame.array)
 
 
@@ -165,37 +164,39 @@ class LivePictures:
         return LivePicture(frame, shown, scene, settings, calibration, has_ambient=has_ambient, wrong=wrong)
 
     def _prepared(self, frame: CameraFrame) -> tuple[Reconstructor, str]:
-        """The method for the current settings, or that of the settings before; and why the frame does not fit.
-
-        If the method for the current settings is refused, the settings before are restored.
-        """
+        """The method for the current settings or, if it is refused, the one before; and why the frame does not fit."""
         with self._lock:
             settings, takes_ambient, self._takes_ambient = self.settings, self._takes_ambient, None
-        if takes_ambient is not None:
-            self._ambient, self._reconstruct = frame if takes_ambient else None, None
-        elif self._ambient is not None and not _is_alike(self._ambient, frame):
-            self._ambient = self._reconstruct = None
+        self._choose_ambient(frame, takes_ambient)
+        before, frame_format = self._reconstruct, (frame.bit_depth, frame.mosaic)
+        if before is not None and frame_format == self._format and settings.is_same_method(self._used):
+            self._used = settings
+            return before, ""
+        try:
+            calibration = self._calibration(frame)
+        except MwdnError as error:
+            if before is None:
+                raise
+            return before, str(error)
+        try:
+            self._reconstruct = after = settings.prepare(calibration, self.device)
+            self._format, self._used = frame_format, settings
+        except MwdnError as error:
+            if before is None:
+                raise
+            after, self._used = before, replace(self._used, look=settings.look)
+            with self._lock:
+                if self.settings is settings:  # a newer wish is for the next frame
+                    self.settings, self.refused = self._used, str(error)
+        return after, ""
+
+    def _choose_ambient(self, frame: CameraFrame, is_wanted: bool | None) -> None:
+        """Take the frame as that of the room's light, or drop that frame; ``None`` drops it if the exposure changes."""
+        if is_wanted is None and (self._ambient is None or _is_alike(self._ambient, frame)):
+            return
+        if is_wanted is None:
             self.refused = "The exposure has changed: take the frame of the room's light again."
-        frame_format = frame.bit_depth, frame.mosaic
-        if self._reconstruct is None or frame_format != self._format or not settings.is_same_method(self._used):
-            try:
-                calibration = self._calibration(frame)
-            except MwdnError as error:
-                if self._reconstruct is None:
-                    raise
-                return self._reconstruct, str(error)
-            try:
-                self._reconstruct = settings.prepare(calibration, self.device)
-                self._format = frame_format
-            except MwdnError as error:
-                if self._reconstruct is None:
-                    raise
-                wished, settings = settings, replace(self._used, look=settings.look)
-                with self._lock:
-                    if self.settings is wished:  # a newer wish is for the next frame
-                        self.settings, self.refused = settings, str(error)
-        self._used = settings
-        return self._reconstruct, ""
+        self._ambient, self._reconstruct = frame if is_wanted else None, None
 
     def _calibration(self, frame: CameraFrame) -> Calibration:
         """The calibration, with what the camera says about its frames, and the room's light."""
@@ -210,7 +211,5 @@ class LivePictures:
 
 def _is_alike(a: CameraFrame, b: CameraFrame) -> bool:
     """Whether two frames have the same exposure and gain, or the camera does not say."""
-    return all(
-        not math.isfinite(x - y) or math.isclose(x, y, rel_tol=0.01)
-        for x, y in ((a.exposure_s, b.exposure_s), (a.gain, b.gain))
-    )
+    pairs = (a.exposure_s, b.exposure_s), (a.gain, b.gain)
+    return all(not math.isfinite(x - y) or math.isclose(x, y, rel_tol=0.01) for x, y in pairs)
