@@ -2,9 +2,8 @@
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -49,8 +48,8 @@ _PSF_KEYS = (
 )
 """Keys of a camera file that do not hold for another PSF."""
 
-_Write = Callable[[Path], tuple[str, Calibration]]
-"""Writes a camera file to a path; returns the PSF's verdict and the calibration."""
+_Inspected = tuple[str, Calibration]
+"""Verdict on a PSF, and the calibration."""
 
 
 def calibrate(  # noqa: PLR0913
@@ -110,33 +109,33 @@ def calibrate(  # noqa: PLR0913
     before = _read_before(camera)
     refuse_two_psfs(files, psf, before)
     given = _by_own_paths(BenchFrames(pictures, photographs, frames), before)
-    with bench_frames(given, before.get("dark")) as recorded:
+    interrupted = f"Interrupted. {out} is written at the end: nothing has changed."
+    with if_interrupted(lambda: interrupted), bench_frames(given, before.get("dark")) as recorded:
         bench = _with_dark_exposure(recorded, psf_format, before, camera)
         check_bits(before, bench.frames.bit_depth, bench.photographs)
-        content = {
+        content = {  # `None` removes a key
             **before,
-            "dark": None,  # `photographs` names it
+            "dark": None,  # `bench` names it
             "dark_exposure": before.get("dark_exposure") if _keeps_dark(bench, before) else None,
             "flat_field": None if photographs.flat == WITHOUT else before.get("flat_field"),
             **_values(psf_format),
             **_values(bench.frames),
             "ambient": ambient,
-            "background": before.get("background") if auto_background else psf_format.background,
+            "background": _background(bench, before) if auto_background else psf_format.background,
             "bin": None if auto_bin else bench.frames.bin,
             "white_balance": white_balance,
             "pitch_um": pitch_um,
             "distance_mm": distance_mm,
         }
+        inspected = None
         if bench.photographs.are_one_picture(bench.pictures):
-            write = _prepare_one_picture(bench, psf_format, content, out)
+            new, inspected = _name_picture(bench, psf_format, content, out)
         else:
             refuse_psf_format(psf_format, before)
             refuse_two_distances(distance_mm, bench.photographs.distances, before)
             refuse_corrected(camera, before, bench.pictures)
-            if auto_background:
-                content["background"] = _background(bench, before)
-            write = _prepare_averaged(bench, content, out)
-        _write_and_refine(out, pairs, write)
+            new = _average(bench, content, out)
+        _write(out, new, inspected, pairs)
 
 
 def _read_before(camera: Path | None) -> dict[str, Any]:
@@ -197,23 +196,23 @@ def _values(format: PsfFormat | FrameFormat) -> dict[str, Any]:
 
 
 def _background(bench: BenchFrames, before: dict[str, Any]) -> Background | None:
-    """The background of averaged frames if no option gives it: 0 comes and goes with the dark frame."""
+    """The background if no option gives it: that of averaged frames, if 0, comes and goes with the dark frame."""
     background: Background | None = before.get("background")
+    if bench.photographs.are_one_picture(bench.pictures):
+        return background
     if bench.photographs.dark_files:
         # A dark frame with the room's light has no background left; tails below the lines are then the PSF's own.
         return 0.0 if background is None else background
     return None if background == 0 and "dark" in before else background
 
 
-def _prepare_one_picture(bench: BenchFrames, psf_format: PsfFormat, content: dict[str, Any], out: Path) -> _Write:
-    """Prepare a camera file that names the PSF's picture as it is."""
+def _name_picture(
+    bench: BenchFrames, psf_format: PsfFormat, content: dict[str, Any], out: Path
+) -> tuple[CameraContent, _Inspected]:
+    """A camera file that names the PSF's picture as it is."""
     dark, ambient = next(iter(expanded(bench.photographs.dark_files)), None), content["ambient"]
     options = CameraOptions(bench.pictures[0], bench.frames, psf_format=psf_format, dark=dark, ambient=ambient)
     refuse_overwrite(out, options.psf, dark, ambient)
-    return partial(_write_one_picture, options, content)
-
-
-def _write_one_picture(options: CameraOptions, content: dict[str, Any], out: Path) -> tuple[str, Calibration]:
     if options.psf != content.get("psf"):
         content = {**content, **dict.fromkeys(_PSF_KEYS)}
     psf_done = bool(content.get("psf_corrected"))
@@ -224,29 +223,19 @@ def _write_one_picture(options: CameraOptions, content: dict[str, Any], out: Pat
     check_white_balance(content["white_balance"], calibration.light)
     own_resolution = load_at_psf_resolution(options, corrections)
     report = inspect_psf(own_resolution, own_resolution.frames.read(options.psf_file))
-    write_camera_with_parts(out, {**content, "psf": options.psf_file, "dark": options.dark}, {})
-    return headline(report), calibration
+    content = {**content, "psf": options.psf_file, "dark": dark}
+    return CameraContent(content, {}, [], []), (headline(report), calibration)
 
 
-def _prepare_averaged(bench: BenchFrames, content: dict[str, Any], out: Path) -> _Write:
-    """Prepare a camera file with pictures that are made of the frames."""
+def _average(bench: BenchFrames, content: dict[str, Any], out: Path) -> CameraContent:
+    """A camera file with pictures that are made of the frames."""
     photographs = bench.photographs
     known = Corrections.read(content["flat_field"], content.get("hot_pixels"))
     refuse_overwrite(out, *expanded((*bench.pictures, *photographs.dark_files, *photographs.flat)))
     done = calibrate_frames(photographs.of(bench.pictures), bench.frames, known)
-    return partial(_write_averaged, done, content)
-
-
-def _write_averaged(done: CameraContent, content: dict[str, Any], out: Path) -> tuple[str, Calibration]:
     balance = _flat_balance(done.flat_colour) if content["white_balance"] == "flat" else content["white_balance"]
-    content = {**content, "white_balance": balance, **dict.fromkeys((*PSF_OWN_FORMAT, *_PSF_KEYS)), **done.content}
-    written = write_camera_with_parts(out, content, done.parts)
-    calibration = Calibration.load(out)
-    check_white_balance(calibration.white_balance, calibration.light)
-    verdict = headline(inspect_psf(calibration, calibration.frames.read(written["psf"])))
-    note(*done.notes)
-    say(*done.results)
-    return verdict, calibration
+    without = dict.fromkeys((*PSF_OWN_FORMAT, *_PSF_KEYS))
+    return replace(done, content={**content, "white_balance": balance, **without, **done.content})
 
 
 def _flat_balance(colour: tuple[float, ...]) -> tuple[float, float, float]:
@@ -259,14 +248,16 @@ def _flat_balance(colour: tuple[float, ...]) -> tuple[float, float, float]:
     return round(green / red, 4), 1.0, round(green / blue, 4)
 
 
-def _write_and_refine(out: Path, pairs: Path | None, write: _Write) -> None:
+def _write(out: Path, new: CameraContent, inspected: _Inspected | None, pairs: Path | None) -> None:
     """Write the camera file, refined if there are pairs, and print how to use it.
 
-    The file appears when it is complete and checked.
+    The file appears when it is complete and checked: a PSF that is averaged is inspected as it was written.
     """
-    interrupted = f"Interrupted. {out} is written at the end: nothing has changed."
-    with if_interrupted(lambda: interrupted), draft_of(out) as draft:
-        verdict, calibration = write(draft)
+    with draft_of(out) as draft:
+        psf_file = write_camera_with_parts(draft, new.content, new.parts)["psf"]
+        verdict, calibration = inspected or _inspected(draft, psf_file)
+        note(*new.notes)
+        say(*new.results)
         if pairs is not None:
             refine(draft, pairs, out.with_name(f"{out.stem}-refinement.json"))
             calibration = Calibration.load(draft)
@@ -276,6 +267,12 @@ def _write_and_refine(out: Path, pairs: Path | None, write: _Write) -> None:
         f"PSF {calibration.psf_hash}, {height} x {width} pixels. More about it: mwdn inspect --camera {quoted(out)}",
         f"Use it: mwdn reconstruct CAPTURES --camera {quoted(out)}",
     )
+
+
+def _inspected(camera: Path, psf_file: Path) -> _Inspected:
+    calibration = Calibration.load(camera)
+    check_white_balance(calibration.white_balance, calibration.light)
+    return headline(inspect_psf(calibration, calibration.frames.read(psf_file))), calibration
 
 
 def _watch(folder: Path, frames: FrameFormat, exposures: tuple[float, ...]) -> None:
