@@ -19,32 +19,32 @@ def convert_pair(
     source: Source, kind: Kind, layout: Layout, changes: FrameFormat, camera: Calibration | None
 ) -> tuple[Frame, Frame]:
     """Load a pair as RGB, row 0 at the top, both with the capture's channels, in the smallest type exact for both."""
-    stored = source.load()
-    capture, scene = stored.capture, stored.scene
-    usual = kind.raw_frames if kind.raw_frames is not None and capture.shape[2] == 1 else kind.frames
-    frames = replace(usual, **changed_fields(changes)).with_mosaic(stored.mosaic, of=f"`{source.name}`")
-    full_size, whole = frames.full_size(capture), replace(frames, crop=None).full_size(capture)
+    stored, name = source.load(), source.name
+    raw, scene = stored.capture, stored.scene
+    usual = kind.raw_frames if kind.raw_frames is not None and raw.shape[2] == 1 else kind.frames
+    frames = replace(usual, **changed_fields(changes)).with_mosaic(stored.mosaic, of=f"`{name}`")
     if frames.bgr:
-        capture, scene = (np.ascontiguousarray(frame[..., ::-1]) for frame in (capture, scene))
-    capture = _upright(_correct_levels(capture, frames, source.name, camera), frames)
-    # The scene gets the channels of the capture: the mean of its colours, or equal colours.
-    grey = capture.shape[2] == 1 < scene.shape[2]
-    scene = _correct_levels(scene, FrameFormat(gamma=layout.scene_gamma, grey=grey), source.name)
-    if scene.shape[2] == 1 < capture.shape[2]:  # a few of ImageNet's photographs are grey
-        scene = scene.repeat(3, axis=2)
-    if layout.scene_size is not None:
-        scene = resize_scene(scene, layout.scene_size)
-    scene = _upright(scene, frames)
+        raw, scene = (np.ascontiguousarray(frame[..., ::-1]) for frame in (raw, scene))
+    capture = _upright(_correct_levels(raw, frames, name, camera), frames)
+    scene = _upright(_convert_scene(scene, layout, capture.shape[2], name), frames)
+    full_size, whole = (each.full_size(raw) for each in (frames, replace(frames, crop=None)))
     place = _place(kind, layout, (scene.shape[0], scene.shape[1]), full_size, whole)
     if place is not None:
-        scene = bin_scene(place_scene(scene, full_size, place, source.name), frames.bin)
+        scene = bin_scene(place_scene(scene, full_size, place, name), frames.bin)
 
     flat = camera is not None and camera.corrections.flat is not None
     shifted = flat or (camera is not None and camera.offset is not None)
-    floats = shifted or "f" in (stored.capture.dtype.kind, stored.scene.dtype.kind)
+    floats = shifted or "f" in (raw.dtype.kind, stored.scene.dtype.kind)
     dtype = np.dtype("float32" if floats else "uint8" if capture.dtype == scene.dtype == np.uint8 else "uint16")
-    capture = quantise(capture, dtype, f"capture of {source.name}", has_flat=flat)
-    return capture, quantise(scene, dtype, f"scene of {source.name}")
+    return quantise(capture, dtype, f"capture of {name}", has_flat=flat), quantise(scene, dtype, f"scene of {name}")
+
+
+def _convert_scene(scene: Frame, layout: Layout, channels: int, name: str) -> Frame:
+    """A scene in linear light and its size, with the capture's channels: the mean of its colours, or equal colours."""
+    scene = _correct_levels(scene, FrameFormat(gamma=layout.scene_gamma, grey=channels == 1 < scene.shape[2]), name)
+    if scene.shape[2] == 1 < channels:  # a few of ImageNet's photographs are grey
+        scene = scene.repeat(3, axis=2)
+    return scene if layout.scene_size is None else resize_scene(scene, layout.scene_size)
 
 
 def _place(kind: Kind, layout: Layout, scene: Size, frame: Size, whole: Size) -> Size | None:
