@@ -71,6 +71,7 @@ class Rig(CameraSource):
         if psf.shape[1:] != (3, *size):
             raise ShapeError(f"`psf` {tuple(psf.shape)} must be (1, 3, {size[0]}, {size[1]}), as `height` and `width`.")
         self.options, self.screen, self.playlist = options, screen, playlist
+        # The true camera, in which nothing changes.
         self._real = RealCamera(options.mismatch, (options.seed,), (False,))
         self.psf: Psf = self._real.psf(psf)
         """(1, 3, H, W): the true response to a point on the axis."""
@@ -80,18 +81,18 @@ class Rig(CameraSource):
         )
         self.homography: Homography = project(screen, pose, size, focal_px)
         """(3, 3), from the display's pixels (x, y, 1) to those of a measurement."""
-        self._noise, self._chance = seeded(options.seed), random.Random(options.seed)
-        self._wait, self._is_open, self._reads = wait, False, 0
         self._shading = shading(options.mismatch, [seeded(options.seed)], size)
         white = self._light(np.full((screen.height_px, screen.width_px, 3), 255, np.uint8))
         self._room = self._real.lit(white) - white
         self._scale = options.white / float((white + self._room).max())
-        self.exposure_s, self.gain, self._drift, self._number = EXPOSURE_S, 1.0, 0.0, -1
-        self._started, self._stale = 0.0, 0
-        self._shown = self._before = torch.zeros(1, 3, *size)
-        self._entry, self._lit, self._frames = -1, -1, PreparedFrames(options.prepared)
-        self.show(point(screen) if picture is None else picture)
-        self._before, self._stale = self._shown, 0
+        # Exposure, gain and noise.
+        self.exposure_s, self.gain, self._drift = EXPOSURE_S, 1.0, 0.0
+        self._noise, self._chance = seeded(options.seed), random.Random(options.seed)
+        # What the display shows: its light on the sensor, that of the picture before, and frames that still show that.
+        self._shown = self._before = self._light(point(screen) if picture is None else picture)
+        self._stale, self._entry, self._frames = 0, -1, PreparedFrames(options.prepared)
+        # The connection, and the number of the newest frame since `open`.
+        self._is_open, self._started, self._reads, self._number, self._wait = False, 0.0, 0, -1, wait
 
     def show(self, picture: Picture, *, lamp: float = 0.0) -> None:
         """Show a picture (H, W, 3) of the display's size; the next `latency` frames have some light of the last one.
@@ -101,9 +102,6 @@ class Rig(CameraSource):
         Raises:
             ShapeError: it has another size.
         """
-        if picture.shape != (self.screen.height_px, self.screen.width_px, 3):
-            wanted = f"{self.screen.height_px} x {self.screen.width_px} x 3"
-            raise ShapeError(f"`picture` {picture.shape} must have the display's size, {wanted}.")
         light = self._light(picture)
         if lamp:
             light = light + lamp * (self._light(point(self.screen)) - self._light(np.zeros_like(picture)))
@@ -112,8 +110,7 @@ class Rig(CameraSource):
 
     def open(self) -> None:
         """Connect; after a disconnection, too."""
-        self._is_open, self._reads, self._started = True, 0, time.monotonic()
-        self._number = -1
+        self._is_open, self._started, self._reads, self._number = True, time.monotonic(), 0, -1
 
     def configure(self, exposure_s: float | None = None, gain: float | None = None) -> None:
         """Set exposure in seconds and gain, a factor; both take effect at once.
@@ -149,10 +146,10 @@ class Rig(CameraSource):
             raise CameraError(f"{self.name} was disconnected after {options.disconnect_every:,} frames. Connect it.")
         dropped = self._pass_frames()
         self._number += 1 + dropped
-        self._entry = self._entry if self.playlist is None else self.playlist.entry
+        entry = -1 if self.playlist is None else self.playlist.entry
         self._drift += options.drift * self._chance.gauss(0, 1)
         return CameraFrame(
-            array=self._frames.next((self._entry, self.exposure_s, self.gain), lambda: self._expose(self._seen())),
+            array=self._frames.next((entry, self.exposure_s, self.gain), lambda: self._expose(self._seen(entry))),
             bit_depth=options.bit_depth,
             mosaic=options.mosaic or None,  # type: ignore[arg-type]
             exposure_s=self.exposure_s,
@@ -163,11 +160,11 @@ class Rig(CameraSource):
             dropped=dropped,
         )
 
-    def _seen(self) -> Measurement:
-        """Light on the sensor of what the display shows."""
-        if self.playlist is not None and self._lit != self._entry:
-            self._shown = self._before = self._light(self.playlist.read(self._entry))
-            self._lit = self._entry
+    def _seen(self, entry: int) -> Measurement:
+        """Light on the sensor of what the display shows, which is this entry of a playlist."""
+        if self.playlist is not None and self._entry != entry:
+            self._shown = self._before = self._light(self.playlist.read(entry))
+            self._entry = entry
         if not self._stale:
             return self._shown
         self._stale -= 1  # rows from some row on were read out before the change
@@ -187,6 +184,9 @@ class Rig(CameraSource):
 
     def _light(self, picture: Picture) -> Measurement:
         """Light (1, 3, H, W) on the sensor of a picture on the display, without the room's."""
+        if picture.shape != (self.screen.height_px, self.screen.width_px, 3):
+            wanted = f"{self.screen.height_px} x {self.screen.width_px} x 3"
+            raise ShapeError(f"`picture` {picture.shape} must have the display's size, {wanted}.")
         shown = (picture / np.float32(255)) ** self.options.display_gamma
         shown = self.options.display_black + (1 - self.options.display_black) * shown
         scene = view(shown.astype(np.float32), self.homography, (self.options.height, self.options.width))
