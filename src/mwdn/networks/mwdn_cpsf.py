@@ -74,15 +74,11 @@ class MwdnCpsf(Network[list[Tensor]]):
     def prepare(self, psf: Psf, size: Size) -> list[Tensor]:
         """Transfer functions of each scale's filter, one per feature channel."""
         check_sides(psf, len(self.filters))
-        psfs = self.pyramid(normalise_psf(psf, size, self.channels, stored=self.stored_psf))
-        return [wiener.prepare(psfs.pop(0)) for wiener in self.filters]
+        return self.filters.prepare(self.pyramid(normalise_psf(psf, size, self.channels, stored=self.stored_psf)))
 
     def reconstruct(self, measurement: Measurement, prepared: list[Tensor]) -> Scene:
         """Scene (B, C, H, W)."""
-        features = self.encoder(measurement)
-        for scale, (wiener, transfer) in enumerate(zip(self.filters, prepared, strict=True)):
-            features[scale] = wiener.deconvolve(features[scale], transfer)
-        return self.decoder(features)
+        return self.decoder(self.filters.deconvolve(self.encoder(measurement), prepared))
 
 
 def _orthonormal(psf: Tensor) -> Tensor:

@@ -118,6 +118,16 @@ class WienerFilters(nn.ModuleList):
     def __iter__(self) -> Iterator[WienerFilter]:
         return cast(Iterator[WienerFilter], super().__iter__())
 
+    def prepare(self, psfs: list[Tensor]) -> list[Tensor]:
+        """Transfer function of each scale's filter. The list is emptied: each PSF is freed once it is used."""
+        return [wiener.prepare(psfs.pop(0)) for wiener in self]
+
+    def deconvolve(self, features: list[Tensor], prepared: list[Tensor]) -> list[Tensor]:
+        """The list of features, in which those of each scale with a filter are replaced by deconvolved ones."""
+        for scale, (wiener, transfer) in enumerate(zip(self, prepared, strict=True)):
+            features[scale] = wiener.deconvolve(features[scale], transfer)
+        return features
+
 
 def normalise_psf(psf: Psf, size: Size, channels: int | None = None, *, stored: bool = False) -> Tensor:
     """Scale each channel to unit sum, then each PSF to a peak of 1, as the paper's PSFs have.
