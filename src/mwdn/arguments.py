@@ -149,6 +149,20 @@ def check_batch(image: Any, name: str) -> None:  # noqa: ANN401
         raise ParameterError(f"`{name}` ({image.dtype}, {kind}) must be a tensor that holds all its numbers.{way_out}")
 
 
+def check_at_least(least: int, **numbers: Any) -> None:  # noqa: ANN401
+    """Check that counts, given by name, also those of numpy, are not below ``least``."""
+    for name, value in numbers.items():
+        if value < least:
+            raise ParameterError(f"`{name}` ({value}) must be at least {least}.")
+
+
+def check_not_negative(**numbers: Any) -> None:  # noqa: ANN401
+    """Check that numbers, given by name, are not negative."""
+    for name, value in numbers.items():
+        if not value >= 0:
+            raise ParameterError(f"`{name}` ({value}) must not be negative.")
+
+
 def check_light(image: Any, name: str) -> None:  # noqa: ANN401
     """Check that the numbers of the image (B, C, H, W) called ``name`` can be a measurement.
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mwdn.arguments import check_not_negative
 from mwdn.capture.patterns import PATTERNS, check_size
 from mwdn.capture.rig_options import RigOptions
 from mwdn.errors import ParameterError, UnknownNameError
@@ -158,9 +159,7 @@ class SessionTable:
         for name in self.shown:
             if name not in PATTERNS:
                 raise UnknownNameError("pattern", name, PATTERNS)
-        for name in ("settle_s", "skip", "references_every"):
-            if not getattr(self, name) >= 0:
-                raise ParameterError(f"`{name}` ({getattr(self, name)}) must not be negative.")
+        check_not_negative(settle_s=self.settle_s, skip=self.skip, references_every=self.references_every)
         if not self.drift > 0 or self.frames < 1:
             raise ParameterError(f"`drift` ({self.drift}) and `frames` ({self.frames}) must be positive.")
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from mwdn.arguments import checked
+from mwdn.arguments import check_not_negative, checked
 from mwdn.data.random import seeded
 from mwdn.data.simulated import NumberedSamples, full_precision
 from mwdn.errors import ParameterError
@@ -41,9 +41,7 @@ class SelfSupervised:
     shift: float = 0.1
 
     def __post_init__(self) -> None:
-        for name in ("consistency", "equivariance", "recorruption"):
-            if not getattr(self, name) >= 0:
-                raise ParameterError(f"`{name}` ({getattr(self, name)}) must not be negative.")
+        check_not_negative(consistency=self.consistency, equivariance=self.equivariance, recorruption=self.recorruption)
         if not 0 <= self.shift < 1:
             raise ParameterError(f"`shift` ({self.shift}) must be in [0, 1): it is a fraction of each side.")
 

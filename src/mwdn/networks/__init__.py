@@ -4,7 +4,7 @@ from typing import Any
 
 from torch import nn
 
-from mwdn.arguments import check_options
+from mwdn.arguments import check_at_least, check_options
 from mwdn.errors import ParameterError, UnknownNameError
 from mwdn.networks.drunet import Drunet
 from mwdn.networks.flatnet import FlatNet
@@ -72,9 +72,7 @@ def build(name: str, **options: Any) -> nn.Module:  # noqa: ANN401
         raise UnknownNameError("network", name, NETWORKS)
     check_options(kind, f"the network '{name}'", options)
     check_complete(kind, f"the network '{name}'", options)
-    for size in ("width", "channels"):
-        if options.get(size, 1) < 1:
-            raise ParameterError(f"`{size}` ({options[size]}) must be at least 1.")
+    check_at_least(1, width=options.get("width", 1), channels=options.get("channels", 1))
     # JSON and TOML have lists, not tuples.
     with plugin_errors(name, kind):
         network = kind(**{key: tuple(v) if isinstance(v, list) else v for key, v in options.items()})

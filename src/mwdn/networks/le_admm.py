@@ -5,6 +5,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from mwdn.arguments import check_at_least
 from mwdn.errors import ParameterError
 from mwdn.fourier.transforms import fast_length, transfer_function
 from mwdn.networks.network import Network
@@ -53,8 +54,7 @@ class LeAdmm(Network[Tensor]):
         variation: Variation = "isotropic",
     ) -> None:
         super().__init__()
-        if iterations < 1:
-            raise ParameterError(f"`iterations` ({iterations}) must be at least 1.")
+        check_at_least(1, iterations=iterations)
         for name, value in (("penalty", penalty), ("threshold", threshold)):
             if not value > 0:
                 raise ParameterError(f"`{name}` ({value}) must be positive: its logarithm is learned.")

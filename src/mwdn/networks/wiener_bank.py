@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from mwdn.arguments import check_at_least
 from mwdn.errors import ParameterError
 from mwdn.fourier.memory_format import pixel_shuffle, pixel_unshuffle
 from mwdn.fourier.padding import Boundary, pad
@@ -51,12 +52,6 @@ class BankTransfers(NamedTuple):
 
     levels: tuple[tuple[Tensor, Tensor], ...]
     filters: tuple[Tensor, ...]
-
-
-def _check_at_least(least: int, **numbers: int) -> None:
-    for name, value in numbers.items():
-        if value < least:
-            raise ParameterError(f"`{name}` ({value}) must be at least {least}.")
 
 
 def _check_iterations(finest: int, rounds: int, mean_light: MeanLight, *, evidence: bool) -> None:
@@ -132,8 +127,8 @@ class WienerBank(FixedFront[BankTransfers]):
         super().__init__()
         if not regularisations or min(regularisations) <= 0:
             raise ParameterError(f"`regularisations` {tuple(regularisations)} must be one or more positive numbers.")
-        _check_at_least(1, width=width, fold=fold, block=block)
-        _check_at_least(0, rounds=rounds, distortion=distortion, shading=shading or 0)
+        check_at_least(1, width=width, fold=fold, block=block)
+        check_at_least(0, rounds=rounds, distortion=distortion, shading=shading or 0)
         _check_iterations(finest, rounds, mean_light, evidence=evidence)
         self.channels, self.fold, self.regularisations = channels, fold, regularisations
         self.finest, self.align, self.block = finest, align, block

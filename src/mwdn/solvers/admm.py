@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from mwdn.arguments import checked
+from mwdn.arguments import check_at_least, check_not_negative, checked
 from mwdn.errors import ParameterError
 from mwdn.fourier.convolution import check_fit
 from mwdn.optics.psf import checked_psf
@@ -68,10 +68,8 @@ class Admm:
     variation: Variation = "colour"
 
     def __post_init__(self) -> None:
-        if not self.regularisation >= 0:
-            raise ParameterError(f"`regularisation` ({self.regularisation}) must not be negative.")
-        if self.iterations < 1:
-            raise ParameterError(f"`iterations` ({self.iterations}) must be at least 1.")
+        check_not_negative(regularisation=self.regularisation)
+        check_at_least(1, iterations=self.iterations)
         if not all((torch.as_tensor(mu) > 0).all() for mu in self.penalties):
             raise ParameterError(f"`penalties` {tuple(self.penalties)} must be positive.")
 

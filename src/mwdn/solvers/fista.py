@@ -6,8 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from mwdn.arguments import checked
-from mwdn.errors import ParameterError
+from mwdn.arguments import check_at_least, checked
 from mwdn.fourier.transforms import inverse_spectrum, spectrum
 from mwdn.optics.psf import checked_psf
 from mwdn.runtime.iterations import iterations
@@ -52,8 +51,7 @@ class Fista:
     iterations: int = 200
 
     def __post_init__(self) -> None:
-        if self.iterations < 1:
-            raise ParameterError(f"`iterations` ({self.iterations}) must be at least 1.")
+        check_at_least(1, iterations=self.iterations)
 
     def __call__(self, measurement: Measurement, psf: Psf) -> Scene:
         """Reconstruct a batch."""

@@ -5,8 +5,7 @@ from typing import Any
 
 import torch
 
-from mwdn.arguments import check_batch, checked
-from mwdn.errors import ParameterError
+from mwdn.arguments import check_at_least, check_batch, checked
 from mwdn.solvers.admm import Admm
 from mwdn.solvers.fista import Fista
 from mwdn.solvers.levels import root_mean_square
@@ -34,8 +33,7 @@ class WarmStart:
     """
 
     def __init__(self, solver: Admm | Fista, *, iterations: int = 10) -> None:
-        if iterations < 1:
-            raise ParameterError(f"`iterations` ({iterations}) must be at least 1.")
+        check_at_least(1, iterations=iterations)
         self.first, self.following = solver, replace(solver, iterations=iterations)
         self.shape, self.psf, self.last, self.brightness = torch.Size(), torch.empty(0), None, torch.empty(0)
 

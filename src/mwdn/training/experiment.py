@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import torch
 
-from mwdn.arguments import checked
+from mwdn.arguments import check_at_least, checked
 from mwdn.calibration import Calibration
 from mwdn.calibration.places import field_camera
 from mwdn.calibration.psf_identity import psf_identity
@@ -282,8 +282,7 @@ def simulate(
     recipe = recipe if isinstance(recipe, Recipe) else read_recipe(recipe)
     out = Path(out)
     check_path(out)
-    if count < 1:
-        raise ParameterError(f"`count` ({count}) must be at least 1.")
+    check_at_least(1, count=count)
     grey, photographs = calibration.frames.grey, Photographs(Path(photos))
     pairs = _simulated_pairs(_with_sensor(recipe, calibration), photographs, calibration.psf, grey=grey)
     if exact:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from mwdn.arguments import checked
+from mwdn.arguments import check_not_negative, checked
 from mwdn.data.cameras import Cameras
 from mwdn.data.mismatch import REAL_OPTIONS, Mismatch
 from mwdn.data.noisy import Denoising
@@ -108,9 +108,8 @@ class Schedule:
         for name in ("steps", "batch", "learning_rate", "validate_every", "validation", "filter_rate"):
             if not getattr(self, name) > 0:
                 raise ParameterError(f"`{name}` ({getattr(self, name)}) must be positive.")
-        for name in ("epochs", "warmup", "weight_decay", "clip", "pool", "crop", "anchor"):
-            if not getattr(self, name) >= 0:
-                raise ParameterError(f"`{name}` ({getattr(self, name)}) must not be negative.")
+        check_not_negative(epochs=self.epochs, warmup=self.warmup, weight_decay=self.weight_decay)
+        check_not_negative(clip=self.clip, pool=self.pool, crop=self.crop, anchor=self.anchor)
         if not abs(self.seed) < 2**63:
             raise ParameterError(f"`seed` ({self.seed}) must have 63 bits at most.")
         if self.learning_rate == math.inf:

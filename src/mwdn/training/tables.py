@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from mwdn.arguments import checked
+from mwdn.arguments import check_not_negative, checked
 from mwdn.errors import ParameterError
 
 
@@ -29,9 +29,7 @@ class Plateau:
     def __post_init__(self) -> None:
         if not 0 < self.factor < 1:
             raise ParameterError(f"`factor` ({self.factor}) must be in (0, 1): it reduces the learning rate.")
-        for name in ("patience", "later", "stop"):
-            if not getattr(self, name) >= 0:
-                raise ParameterError(f"`{name}` ({getattr(self, name)}) must not be negative.")
+        check_not_negative(patience=self.patience, later=self.later, stop=self.stop)
 
 
 @dataclass(frozen=True)
