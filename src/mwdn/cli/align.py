@@ -227,7 +227,7 @@ def _outline(scene: Scene, linear: Scene, corners: Points | None) -> _Placed:
     start = "outline" if corners is None else "points"
     if corners is None:
         views = Views.of([*scene, *linear], [*scene, *linear])
-        corners = find_outline(views.roots[0], views.reconstructions[1])
+        corners = find_outline(np.sqrt(views.reconstructions[0]), views.reconstructions[1])
     place = Place.of(corners)
     shape = max(2, round(place.height)), max(2, round(place.width))
     projection = through_corners(corners, shape, (scene.shape[-2], scene.shape[-1]))

@@ -31,7 +31,7 @@ MARGIN = 1 / 20
 """Rim of the frame that is not compared, over its shorter side: light from outside is not in the scene."""
 
 GAUSS_NEWTON_STEPS = 8
-"""Gauss-Newton steps."""
+"""Steps of each fit, also in `mwdn.registration.shading`."""
 
 RIDGE = 1e-4
 """Ridge of the normal equations, over the mean of their diagonal."""
@@ -98,7 +98,7 @@ def _step(pairs: list[_Detail], coefficients: Tensor) -> Tensor:
 
 
 def _unexplained(pairs: list[_Detail], coefficients: Tensor) -> float:
-    """E of (1) over the same without scenes."""
+    """E of (1) over the energy of the reconstructions."""
     residual = total = 0.0
     for pair in pairs:
         seen = without_margin(undistort(pair.seen, coefficients)[0, :1]).flatten(1)

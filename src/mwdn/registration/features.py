@@ -9,7 +9,7 @@ import numpy.typing as npt
 from mwdn.errors import AlignmentError
 from mwdn.registration.point_fit import fit_points
 from mwdn.registration.projection import Points, Projection
-from mwdn.registration.views import Views
+from mwdn.registration.views import Bytes, Views
 
 _RATIO = 0.8
 """Lowe's ratio of the nearest and the second nearest feature: above it a match is ambiguous."""
@@ -20,8 +20,6 @@ _ENLARGED = 400
 """Pictures below this many pixels a side are enlarged: SIFT finds few features of less than 4 pixels."""
 
 _MAX_VIEWS = 40
-
-Bytes = npt.NDArray[np.uint8]
 
 
 def match_features(views: Views) -> list[Projection]:
@@ -56,8 +54,8 @@ def _matches(picture: Bytes, seen: Bytes) -> tuple[Points, Points]:
     import cv2
 
     sift = cv2.SIFT_create(contrastThreshold=0.02)  # type: ignore[attr-defined]
-    described = [_describe(sift, image) for image in (picture, seen)]
-    (displayed, first), (camera, second) = described
+    displayed, first = _describe(sift, picture)
+    camera, second = _describe(sift, seen)
     if min(len(displayed), len(camera)) < 2:
         return np.empty((0, 2)), np.empty((0, 2))
     nearest = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first, second, k=2)

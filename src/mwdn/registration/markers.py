@@ -5,19 +5,16 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from mwdn.errors import AlignmentError
 from mwdn.registration.point_fit import fit_points
 from mwdn.registration.projection import Points, Projection
-from mwdn.registration.views import Views
+from mwdn.registration.views import Bytes, Views
 
 _DICTIONARIES = ("4X4_50", "4X4_100", "5X5_50", "5X5_100", "6X6_250", "ARUCO_ORIGINAL", "APRILTAG_36h11")
 _TOLERANCE_PX = 3.0
 _MARKER_PX = 1200
 """Reconstructions are enlarged to this many pixels a side: a marker of 4 x 4 bits then has enough for its bits."""
-
-Bytes = npt.NDArray[np.uint8]
 
 
 def match_markers(views: Views) -> list[Projection]:

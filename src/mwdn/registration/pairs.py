@@ -1,5 +1,6 @@
 """From captured pairs to aligned ones: the displayed pictures warped to the camera's frame."""
 
+import json
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from mwdn.fourier.convolution import convolve
 from mwdn.inference.reconstructor import Reconstructor
 from mwdn.registration.captured import SessionPairs
 from mwdn.registration.projection import Projection
-from mwdn.registration.registration import KEY, as_attribute
+from mwdn.registration.registration import KEY
 from mwdn.registration.views import Views
 from mwdn.registration.warp import warp_pictures
 from mwdn.types import Psf
@@ -100,7 +101,7 @@ def write_aligned(
     colours = torch.ones(first.shape[1]) if levels is None else levels / brightest
     shape = (*first.shape[-2:], first.shape[1])
     attributes: dict[str, Attribute] = {
-        KEY: as_attribute(content),
+        KEY: json.dumps(content, allow_nan=False),
         **psf_identity(pairs.calibration),
         "source": pairs.path.name,
         DISPLAY_WHITE: brightest,

@@ -1,10 +1,7 @@
 """A registration, a projection with its quality: as a file, and in words."""
 
-import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -44,7 +41,9 @@ class Place:
         edges = np.roll(corners, -1, 0) - corners
         mirrored = edges[0, 0] * edges[1, 1] - edges[0, 1] * edges[1, 0] < 0
         along = edges[0] - edges[2]  # the picture's own rows
-        turn = np.degrees(np.arctan2(*(along if not mirrored else -along)[::-1]))
+        if mirrored:
+            along = -along
+        turn = np.degrees(np.arctan2(along[1], along[0]))
         first = corners[corners.sum(1).argmin()]
         lengths = np.hypot(*edges.T)
         upright = abs((turn + 90) % 180 - 90) <= 45
@@ -79,8 +78,3 @@ def read_projection(path: str | Path) -> Projection:
         content = read_json(path)
     with unexpected_content(path):
         return Projection.from_dict(content)
-
-
-def as_attribute(content: Mapping[str, Any]) -> str:
-    """A registration as the text of an attribute."""
-    return json.dumps(content, allow_nan=False)

@@ -14,7 +14,7 @@ _SIDE = 64
 """Longer side of the frames that are searched: a picture of 12 % of the frame keeps 8 pixels."""
 
 _SCALES = 0.12 * 1.15 ** np.arange(18)
-"""Width of the picture relative to the frame's: 0.12 to 1.3 in steps of 15 %. Refinement mends half a step."""
+"""Width of the picture relative to the frame's: 0.12 to 1.3 in steps of 15 %. Refinement corrects half a step."""
 
 _TURNS = range(0, 360, 15)
 _BLUR = 1.2

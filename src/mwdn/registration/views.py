@@ -11,6 +11,9 @@ from torch import Tensor
 from mwdn.errors import ShapeError
 from mwdn.types import FloatFrame, Size
 
+Bytes = npt.NDArray[np.uint8]
+"""A grey picture of 8 bits, (H, W)."""
+
 
 @dataclass(frozen=True, eq=False)
 class Views:
@@ -53,17 +56,12 @@ class Views:
         return self.reconstructions.shape[1], self.reconstructions.shape[2]
 
     def first(self, count: int) -> "Views":
-        """Some of them, evenly spread."""
+        """At most ``count`` of them, evenly spread."""
         chosen = np.unique(np.linspace(0, len(self) - 1, min(count, len(self))).round().astype(int))
         return Views(self.pictures[chosen], self.reconstructions[chosen])
 
-    @property
-    def roots(self) -> FloatFrame:
-        """(N, H, W), square roots of the reconstructions."""
-        return np.sqrt(self.reconstructions)
-
     @cached_property
-    def bytes(self) -> tuple[list[npt.NDArray[np.uint8]], list[npt.NDArray[np.uint8]]]:
+    def bytes(self) -> tuple[list[Bytes], list[Bytes]]:
         """Pictures and reconstructions as 8 bits, for OpenCV's detectors."""
         return [_as_bytes(each) for each in self.pictures], [_as_bytes(each) for each in self.reconstructions]
 
@@ -74,7 +72,7 @@ def _grey(image: Tensor) -> FloatFrame:
     return (grey / bright).clip(0, 1.4).astype(np.float32)
 
 
-def _as_bytes(image: FloatFrame) -> npt.NDArray[np.uint8]:
+def _as_bytes(image: FloatFrame) -> Bytes:
     return (255 * np.sqrt(image.clip(0, 1))).round().astype(np.uint8)
 
 
