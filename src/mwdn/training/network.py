@@ -142,9 +142,3 @@ def update_average(
             mean.copy_(value)
     # All at once: hundreds of small operations take long on a GPU.
     get_ema_multi_avg_fn(decay)(means, values, None)  # type: ignore[no-untyped-call]
-
-
-def name_and_options(recipe: Recipe) -> tuple[str, dict[str, Any]]:
-    """Name and options of the network, as a checkpoint holds them."""
-    options = dict(recipe.network)
-    return options.pop("name"), options

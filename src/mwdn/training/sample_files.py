@@ -23,18 +23,8 @@ _SAMPLE_BYTES = 2**30
 FREE_PART = 0.5
 """Samples are kept only if they take at most this part of the disk's free space."""
 
-
 _FOLDER = re.compile("[0-9a-f]{16}")
 _FILE = re.compile(r"\d{6,}\.safetensors|\.mwdn-.*")
-
-
-def _remove(folder: Path) -> None:
-    """Remove a folder of samples, but no file that this class does not write."""
-    with suppress(OSError):
-        for path in folder.iterdir():
-            if _FILE.fullmatch(path.name):
-                path.unlink()
-        folder.rmdir()
 
 
 class Sample(NamedTuple):
@@ -107,3 +97,12 @@ class SampleFiles:
 
     def _file(self, row: int) -> Path:
         return self.path / f"{row:06}.safetensors"
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder of samples, unless it also holds other files: these stay."""
+    with suppress(OSError):
+        for path in folder.iterdir():
+            if _FILE.fullmatch(path.name):
+                path.unlink()
+        folder.rmdir()

@@ -21,7 +21,7 @@ from mwdn.runtime.interrupts import deferred_interrupt
 from mwdn.training.batch_norm import freeze_cancelled, synchronise
 from mwdn.training.gradient import Gradient
 from mwdn.training.losses import Loss
-from mwdn.training.network import MEASURED_BUFFERS, build_network, measure_scenes, name_and_options, update_average
+from mwdn.training.network import MEASURED_BUFFERS, build_network, measure_scenes, update_average
 from mwdn.training.recipe import Recipe
 from mwdn.training.report import Report
 from mwdn.training.run_folder import MAKE_ROOM, RunFolder, run_identity
@@ -269,9 +269,10 @@ class Trainer:
         if distributed.rank() > 0:
             return
         metadata = {**self.psf_identity, **self.identity, "step": self.step, "psnr": validation.psnr}
-        name, options = name_and_options(self.recipe)
+        options = dict(self.recipe.network)
+        name = options.pop("name")
         with as_parameter_error(self.out, MAKE_ROOM):
-            for file in ("last", *(["best"] if score == self.best else [])):
+            for file in ("last", "best") if score == self.best else ("last",):
                 save_network(self.folder.weights(file), self.average, name, options, **metadata)
         self._save_state()
 
@@ -282,8 +283,7 @@ class Trainer:
         header = {"identity": json.dumps(self.identity), "step": str(self.step), "best": repr(self.best)}
         header |= {"lr_schedule": json.dumps(self.lr_schedule.state()), "samples": self.fingerprint}
         with as_parameter_error(self.out, MAKE_ROOM):
-            path = self.folder.state
-            write_state(path, header, network=self.network, average=self.average, optimiser=self.optimiser)
+            write_state(self.folder.state, header, network=self.network, average=self.average, optimiser=self.optimiser)
 
     def _resume(self) -> None:
         saved = self.folder.read()

@@ -49,9 +49,9 @@ def read_state(path: Path, content: bytes) -> tuple[dict[str, Tensor], Header]:
         raise damaged(path, reason(error)) from error
 
 
-def damaged(path: Path, reason: object) -> CheckpointError:
+def damaged(path: Path, why: str) -> CheckpointError:
     """The error for a state that cannot be used."""
-    return CheckpointError(f"`{path}` is damaged: {reason}. Remove it to start again.")
+    return CheckpointError(f"`{path}` is damaged: {why}. Remove it to start again.")
 
 
 def restore(

@@ -70,7 +70,7 @@ class Validator:
             psnrs.append(scores.psnr)
             losses.append(len(numbers) * scores.loss)
             rows += _rows(*(pictures[: SHEET_ROWS - len(rows)] for pictures in scores.pictures))
-        blocks = [rows, *([self.reconstruct_captures(network)] if self.captures is not None else [])]
+        blocks = [rows] if self.captures is None else [rows, self.reconstruct_captures(network)]
         left, right = self.task.columns
         sheet = _sheet(blocks, (left, title, right), self.psf)
         return Validation(float(torch.cat(psnrs).mean()), sum(losses) / schedule.validation, sheet)
@@ -78,8 +78,12 @@ class Validator:
     @torch.no_grad()
     def reconstruct_captures(self, network: nn.Module) -> list[list[Tensor]]:
         """The first six captures with their reconstructions, one at a time: they may be more than a batch."""
-        captures = [] if self.captures is None else [one[None] for one in self.captures[:SHEET_ROWS]]
-        return [row for capture in captures for row in _rows(capture, reconstruct_aligned(network, capture, self.psf))]
+        if self.captures is None:
+            return []
+        rows = []
+        for capture in self.captures[:SHEET_ROWS, None]:
+            rows += _rows(capture, reconstruct_aligned(network, capture, self.psf))
+        return rows
 
 
 def _rows(*pictures: Tensor) -> list[list[Tensor]]:
@@ -88,7 +92,7 @@ def _rows(*pictures: Tensor) -> list[list[Tensor]]:
 
 def _sheet(blocks: list[list[list[Tensor]]], titles: tuple[str, str, str], psf: Psf) -> Image:
     """Samples on the left, captures on the right; white where one has fewer rows than the other."""
-    heads = [*titles, *(["capture", titles[1]] if len(blocks) > 1 else [])]
+    heads = [*titles, "capture", titles[1]] if len(blocks) > 1 else list(titles)
     white = torch.ones(1, 1, *psf.shape[-2:])
     blanks = [[white] * len(block[0]) for block in blocks]
     lines = [

@@ -77,17 +77,14 @@ def renamed(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:
             continue
         module = next((module for module in _MODULES if key.startswith(module + ".")), None)
         ours[key.replace(module, _MODULES[module], 1) if module else key] = value
-    for i, regularisation in enumerate(_positive("delta", state["delta"][:4])):
+    regularisations = state["delta"][:4]
+    if not (regularisations > 0).all():
+        raise CheckpointError(
+            f"`delta` ({regularisations.tolist()}) must be positive: a filter with a negative lambda has poles. Take "
+            "another checkpoint of the training."
+        )
+    for i, regularisation in enumerate(regularisations):
         ours[f"filters.{i}.linear_regularisation"] = regularisation
     if name == "mwdn-cpsf":
         return ours | {"weight": state["w"], "unused_regularisation": state["delta"][4]}
     return ours | {f"filters.{i}.linear_weight": weight for i, weight in enumerate(state["w"])}
-
-
-def _positive(name: str, values: Tensor) -> Tensor:
-    if not (values > 0).all():
-        raise CheckpointError(
-            f"`{name}` ({values.tolist()}) must be positive: a filter with a negative lambda has poles. Take another "
-            "checkpoint of the training."
-        )
-    return values

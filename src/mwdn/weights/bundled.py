@@ -48,7 +48,8 @@ def find_weights(name: str) -> Path | None:
     if name in BUNDLED:
         return bundled_file(name)
     for file in (WEIGHTS_FILE, BEST):
-        if (path := Path(name) / file).is_file():
+        path = Path(name) / file
+        if path.is_file():
             return path
     return _download(name) if name.startswith(HUB) else None
 
@@ -78,7 +79,8 @@ def load_network(name: str | Path) -> nn.Module:
 
 
 def _download(name: str) -> Path:
-    owner, repository, file = (*name.removeprefix(HUB).split("/", 2), "", "")[:3]
+    owner, _, rest = name.removeprefix(HUB).partition("/")
+    repository, _, file = rest.partition("/")
     if not (owner and repository):
         raise CheckpointError(f"`{name}` must be hub:owner/name or hub:owner/name/file.safetensors.")
     require("huggingface_hub", "hub", purpose=f"`{name}`")

@@ -95,11 +95,12 @@ def load_checkpoint(path: str | Path) -> nn.Module:
     metadata = _metadata(path, header)
     name = metadata["name"]
     try:
-        network = build_empty(name, **{key: v for key, v in metadata["options"].items() if key != "outputs"})
+        options = {key: v for key, v in metadata["options"].items() if key != "outputs"}  # of earlier versions
+        network = build_empty(name, **options)
     except (TypeError, ParameterError) as error:  # TypeError: `name` is one of the options, too
-        version, why = (shorten(str(text), n) for text, n in ((metadata.get("version", "unknown"), 20), (error, 180)))
+        version = shorten(str(metadata.get("version", "unknown")), 20)
         raise CheckpointError(
-            f"`{path}`, of mwdn {version}, has a network that cannot be built: {why} Update "
+            f"`{path}`, of mwdn {version}, has a network that cannot be built: {shorten(str(error), 180)} Update "
             "mwdn, or install the package of the plugin that has it."
         ) from error
     shapes = {key: entry.shape for key, entry in header.entries.items()}
