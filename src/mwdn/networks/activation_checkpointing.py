@@ -23,10 +23,10 @@ class CheckpointedModule(nn.Module):
         """Compute one scale, ``function(*inputs)``."""
         if not (self.checkpoints_activations and torch.is_grad_enabled()):
             return function(*inputs)
-        contexts: Callable[[], tuple[AbstractContextManager[None], ...]] = lambda: (  # noqa: E731
-            nullcontext(),
-            _frozen_statistics(self),
-        )
+
+        def contexts() -> tuple[AbstractContextManager[None], ...]:
+            return nullcontext(), _frozen_statistics(self)  # of the first pass and of its repetition
+
         # No layer uses random numbers, so their state need not be saved.
         return checkpoint(function, *inputs, use_reentrant=False, preserve_rng_state=False, context_fn=contexts)  # type: ignore[arg-type]
 

@@ -86,7 +86,8 @@ class LeAdmm(Network[Tensor]):
         constants = (self.log_data, self.log_gradient, self.log_sign, self.log_threshold)
         for data, gradient, sign, threshold in zip(*(logarithm.exp() for logarithm in constants), strict=True):
             mu = Penalties(data, gradient, sign)
-            state = state if previous is None else rescale(state, previous, mu)
+            if previous is not None:
+                state = rescale(state, previous, mu)
             state = update_copies(state, problem, mu, threshold * gradient, self.variation)
             state = update_scene(state, problem, make_filters(problem, mu))
             previous = mu

@@ -68,7 +68,7 @@ class MwdnCpsf(Network[list[Tensor]]):
         """Corrected PSFs, one per feature channel, at scales 1, 1/2, 1/4, 1/8."""
         psfs = self.psf_encoder(self.weight * psf if hasattr(self, "weight") else psf)
         if self.orthonormal:
-            psfs = [_orthonormal(psfs.pop(0)) for _ in self.filters]
+            psfs = [_orthonormal(psfs.pop(0)) for _ in self.filters]  # each is freed once it is divided
         return psfs
 
     def prepare(self, psf: Psf, size: Size) -> list[Tensor]:

@@ -61,12 +61,9 @@ class PrimalDual(nn.Module):
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        dual, primal = 2 * width + 1, 2 * width
-        self.dual = nn.Sequential(
-            nn.Conv2d(dual, 2 * dual, 3, padding=1), nn.ReLU(inplace=True), nn.Conv2d(2 * dual, width, 1)
-        )
-        self.primal = nn.Sequential(
-            nn.Conv2d(primal, 2 * primal, 3, padding=1), nn.ReLU(inplace=True), nn.Conv2d(2 * primal, width, 1)
+        self.dual, self.primal = (
+            nn.Sequential(nn.Conv2d(n, 2 * n, 3, padding=1), nn.ReLU(inplace=True), nn.Conv2d(2 * n, width, 1))
+            for n in (2 * width + 1, 2 * width)
         )
 
     def forward(self, primal: Tensor, dual: Tensor, b: Tensor, camera: Convolution) -> tuple[Tensor, Tensor]:

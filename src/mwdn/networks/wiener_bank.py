@@ -94,7 +94,7 @@ class WienerBank(FixedFront[BankTransfers]):
             ``finest`` 1. The denoiser is trained separately on noisy pictures and frozen here; 0 for none.
         mean_light: how far the U-Net may change a block's mean light: not at all (``kept``), without limit (``free``),
             or where the measurement contradicts the PSF (``gated``). All but ``kept`` need iterations.
-        evidence: whether U-Net and denoiser are also told what speaks against the PSF (`mwdn.networks.evidence`);
+        evidence: whether evidence against the PSF (`mwdn.networks.evidence`) is also an input of U-Net and denoiser;
             needs iterations.
         distortion: order of the polynomials of the recorded scenes' distortion; 0 for none.
         shading: order of the polynomials of the recorded scenes' shading, 0 for a gain of each colour; ``None`` for
@@ -131,17 +131,15 @@ class WienerBank(FixedFront[BankTransfers]):
         check_at_least(0, rounds=rounds, distortion=distortion, shading=shading or 0)
         _check_iterations(finest, rounds, mean_light, evidence=evidence)
         self.channels, self.fold, self.regularisations = channels, fold, regularisations
-        self.finest, self.align, self.block = finest, align, block
+        self.finest, self.align, self.block, self.rounds = finest, align, block, rounds
         self.levels = pyramid_levels(finest)
-        self.rounds = rounds
         if rounds:
             self.denoiser = Drunet(channels=channels, conditions=1 + evidence).requires_grad_(False)
         self.register_buffer("distortion", torch.zeros(2, coefficient_count(distortion)) if distortion else None)
         self.register_buffer("shading", None if shading is None else torch.zeros(channels, coefficient_count(shading)))
-        self.mean_light = mean_light
+        self.mean_light, self.has_evidence = mean_light, evidence
         self.pictures = channels * (len(regularisations) + (2 if self.levels else 1))
         evidence_channels = channels + MAPS if evidence else 0
-        self.has_evidence = evidence
         self.encoder = Encoder(self.pictures * fold**2 + evidence_channels, paper_widths(width))
         self.decoder = Decoder(channels * fold**2 + (mean_light == "gated"), paper_widths(width))
         with torch.no_grad():
@@ -217,8 +215,8 @@ class WienerBank(FixedFront[BankTransfers]):
         """The denoiser of plug and play. With evidence, its inputs are the level sigma and sigma times the doubt."""
         if not self.has_evidence:
             return self.denoiser
-        told = doubt_of_psf(estimate)
-        return lambda image, level: self.denoiser(image, torch.cat([level, level * told], dim=1))
+        doubt = doubt_of_psf(estimate)
+        return lambda image, level: self.denoiser(image, torch.cat([level, level * doubt], dim=1))
 
     def _filter(self, picture: Tensor, transfers: tuple[Tensor, ...], boundary: Boundary) -> list[Tensor]:
         """Wiener filters of the bank, applied to one spectrum."""
@@ -248,7 +246,9 @@ class WienerBank(FixedFront[BankTransfers]):
         without plug and play, for live pictures, show no such border; training uses crops, which have no border of a
         frame.
         """
-        return 0 if self.training or not self.rounds else min(self.block, *(n - 1 for n in estimates.shape[-2:]))
+        if self.training or not self.rounds:
+            return 0
+        return min(self.block, *(n - 1 for n in estimates.shape[-2:]))
 
     def _correct(self, estimates: Tensor, unit: Tensor) -> Scene:
         first = estimates[:, : self.channels]

@@ -195,9 +195,10 @@ class PsfPyramid:
         scale = smoothing_scale(noise) if smooth else torch.ones_like(unit)
         size_factor = math.sqrt(size[0] * size[1]) / REFERENCE_SIDE
         saturated = saturated_pixels(b)
-        sizes, parts = {1: b}, {1: saturated.float()}
-        while (side := max(sizes)) < self.bands[0].level.downsampling:
+        sizes, parts, side = {1: b}, {1: saturated.float()}, 1
+        while side < self.bands[0].level.downsampling:
             sizes[2 * side], parts[2 * side] = halve(sizes[side]), halve(parts[side])
+            side *= 2
         scene: Tensor = b.new_zeros((1, 1, 1, 1))
         work = [band.level.iterations / band.level.downsampling**2 for band in self.bands]  # in proportion to time
         for number, band in enumerate(self.bands):

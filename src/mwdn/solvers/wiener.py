@@ -87,8 +87,6 @@ class Wiener:
             middle = (low + high) / 2
             regularisation = 10**middle
             residual = (power * (regularisation / (filtered + regularisation)).square()).sum((-2, -1), keepdim=True)
-            low, high = (
-                torch.where(residual < target, middle, low),
-                torch.where(residual < target, high, middle),
-            )
+            fits = residual < target
+            low, high = torch.where(fits, middle, low), torch.where(fits, high, middle)
         return 10**high
