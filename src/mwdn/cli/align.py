@@ -137,7 +137,7 @@ class _Task:
             result = estimate(views, corners=self.corners)
             return result.projection, result.content(), result.residuals
         projection = self.given.for_picture(views.picture_size)
-        correlation = correlation_at(projection, views, 1.0, robust=True)
+        correlation = correlation_at(projection, views, robust=True)
         if correlation < WORST:
             warn(
                 f"The first picture fits badly where `homography` puts it: its correlation is {correlation:.2f}, below "

@@ -42,12 +42,7 @@ class WienerFilter(nn.Module):
     linear_regularisation: nn.Parameter
 
     def __init__(
-        self,
-        *,
-        weight: float | None = 1e-3,
-        regularisation: float = 1e-2,
-        boundary: Boundary = "taper",
-        linear: bool = False,
+        self, *, weight: float | None, regularisation: float, boundary: Boundary, linear: bool = False
     ) -> None:
         super().__init__()
         self.boundary, self.linear, self.has_weight = boundary, linear, weight is not None
@@ -73,12 +68,8 @@ class WienerFilter(nn.Module):
         """lambda, a scalar."""
         return self.linear_regularisation if self.linear else self.log_regularisation.exp()
 
-    def forward(self, features: Tensor, psf: Psf) -> Tensor:
-        """Deconvolve features (B, C, H, W) with a PSF of 1 or C channels."""
-        return self.deconvolve(features, self.prepare(psf))
-
     def prepare(self, psf: Psf) -> Tensor:
-        """Transfer function of the filter; the PSF itself where that would exceed `max_grid_pixels`."""
+        """Transfer function of a PSF of 1 or C channels; the PSF itself where that would exceed `max_grid_pixels`."""
         grid = self.grid(psf)
         if psf[:, :, 0, 0].numel() * grid[0] * grid[1] > self.max_grid_pixels:
             return psf.contiguous()
@@ -93,7 +84,7 @@ class WienerFilter(nn.Module):
         return wiener_transfer(psf, self.regularisation, self.grid(psf))
 
     def deconvolve(self, features: Tensor, prepared: Tensor) -> Tensor:
-        """Deconvolve features with the result of `prepare`."""
+        """Deconvolve features (B, C, H, W) with the result of `prepare`."""
         grid = self.grid(features)
         if prepared.is_complex():
             return filter_image(features, prepared, grid, self.boundary)

@@ -27,6 +27,9 @@ DARK_RIM = 0.08
 """Dark rim around the displayed picture, as a fraction of its size, that is compared, too, because the border is an
 edge."""
 
+FINE_BLUR = 1.0
+"""Standard deviation in pixels of the camera of the Gaussian under which a fit is judged."""
+
 _OWN_BLURS = (0.0, 0.7, 1.4, 2.1, 3.0)
 """Standard deviations of a reconstruction's own blur in pixels: the one that gives the best correlation is taken."""
 
@@ -95,17 +98,16 @@ def refine(projection: Projection, views: Views, *, blurs: tuple[float, ...]) ->
     return result
 
 
-def correlation_at(projection: Projection, views: Views, blur: float, *, robust: bool = False) -> float:
-    """Correlation of pictures and reconstructions smoothed by ``blur``.
+def correlation_at(projection: Projection, views: Views, *, robust: bool = False) -> float:
+    """Correlation of pictures and reconstructions smoothed by `FINE_BLUR`.
 
     Args:
         projection: from pictures to reconstructions.
         views: pictures and reconstructions.
-        blur: standard deviation in pixels of the camera.
         robust: with Tukey's weights, as `refine`; they hide a small difference between a picture and its mirror image.
     """
-    smooth = smooth_images(views.reconstructions, blur)
-    samples = matched_samples(projection, views, smooth, blur)
+    smooth = smooth_images(views.reconstructions, FINE_BLUR)
+    samples = matched_samples(projection, views, smooth, FINE_BLUR)
     motion = np.zeros((len(samples.points), 2, 0))
     return linearise(projection.to_camera(samples.points), motion, samples, smooth, robust=robust).correlation
 

@@ -94,7 +94,7 @@ def estimate(views: Views, *, corners: Points | None = None) -> Registered:
     result, name = _single(tried, few)
     result = refine(result.projection, views, blurs=(2.0, 1.0))
     projection, residuals = _through_parts(result.projection, views)
-    result = Refined(projection, correlation_at(projection, views, 1.0, robust=True))
+    result = Refined(projection, correlation_at(projection, views, robust=True))
     _check(result, residuals)
     return Registered(result.projection, result.correlation, residuals, name)
 
@@ -134,7 +134,7 @@ def _single(tried: list[tuple[Refined, str]], few: Views) -> tuple[Refined, str]
     close = [(each, name) for each, name in tried if best - each.correlation < _CLOSE]
     if len(close) > 1:
         detailed = [(refine(each.projection, few, blurs=(1.0,)).projection, name) for each, name in close]
-        close = [(Refined(each, correlation_at(each, few, 1.0)), name) for each, name in detailed]
+        close = [(Refined(each, correlation_at(each, few)), name) for each, name in detailed]
     result, name = max(close, key=lambda each: each[0].correlation)
     corners = result.projection.corners()
     size = float(np.ptp(corners, axis=0).max())

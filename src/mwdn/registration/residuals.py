@@ -5,11 +5,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from mwdn.registration.correlation import Samples, Smooth, linearise, matched_samples, smooth_images
+from mwdn.registration.correlation import FINE_BLUR, Samples, Smooth, linearise, matched_samples, smooth_images
 from mwdn.registration.projection import Points, Projection
 from mwdn.registration.views import Views
 
-_BLUR = 1.0
 _MAX_PARTS, _MIN_PARTS, _PART_PX = 6, 3, 14
 """The picture is divided into rows and columns of parts of this many pixels of the camera at least, each with a
 displacement of its own."""
@@ -48,8 +47,8 @@ def measure_residuals(projection: Projection, views: Views) -> Residuals:
     Each part has its own gain and offset, so shading does not displace it. The picture's border is not compared: where
     light ends, a blur that is not quite that of the reconstruction looks like a displacement.
     """
-    images = smooth_images(views.reconstructions, _BLUR)
-    samples = matched_samples(projection, views, images, _BLUR)
+    images = smooth_images(views.reconstructions, FINE_BLUR)
+    samples = matched_samples(projection, views, images, FINE_BLUR)
     points = projection.to_camera(samples.points)
     count = int(np.clip(min(samples.shape) // _PART_PX, _MIN_PARTS, _MAX_PARTS))
     height, width = views.picture_size

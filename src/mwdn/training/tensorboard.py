@@ -1,7 +1,6 @@
 """Progress of a run in TensorBoard, an optional dependency."""
 
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from mwdn.io.files import as_parameter_error
@@ -43,7 +42,5 @@ class TensorBoard:
     def __enter__(self) -> "TensorBoard":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._writer.close()
