@@ -68,7 +68,8 @@ def to_onnx(program: ExportedProgram, outputs: Sequence[str] = ("scene",)) -> "o
                     values[step] = _convert(g, step, arguments, options)
             else:
                 values[step] = _convert(g, step, arguments, options)
-                in_loop |= {step} if in_loop else set()
+                if in_loop:
+                    in_loop.add(step)
         elif step.op == "output":
             results: Any = step.args[0]
             named = zip(outputs, results if isinstance(results, tuple | list) else [results], strict=True)

@@ -13,9 +13,9 @@ from importlib.resources import files
 from typing import Any
 
 MODULES = ("png", "npy", "hot_pixels", "frames", "psf", "display", "network", "divider", "dropping", "saving", "site")
-"""Each after those that it imports; those in `_SHARED` are of `mwdn preview`. Their top-level names differ."""
+"""In the order of their imports. They are joined in one scope, so their top-level names must differ."""
 
-_SHARED = {"divider.js", "dropping.js", "saving.js", "page.css", "icon.svg", "welcome.svg"}
+_SHARED = {"divider.js", "dropping.js", "saving.js", "page.css", "icon.svg", "welcome.svg"}  # of `mwdn preview`
 
 
 def read_static(name: str) -> str:

@@ -21,13 +21,13 @@ INTEGRITY = "sha512-q0y+JrrtukXSzsBWEMccVfqX25LRmosXHF+CaRJmg8pZClzcV7svNc4rKY3j
 
 LIBRARIES = {"wasm": "ort.wasm.min.js", "webgpu": "ort.webgpu.min.js"}
 BINARIES = {"wasm": "ort-wasm-simd-threaded", "webgpu": "ort-wasm-simd-threaded.asyncify"}
-"""Of each processor: a script for pages, and the name of the WebAssembly that it loads with its loader."""
+"""For each processor: its script for pages; and the module and the WebAssembly that this loads, which share a name."""
 
 FETCH_S = 600.0
 """Longest time for the archive, 33 MB."""
 
 RUNTIME_FILES = [*LIBRARIES.values(), *(name + suffix for name in BINARIES.values() for suffix in (".mjs", ".wasm"))]
-"""The files of both."""
+"""All these files."""
 
 
 def read_runtime(folder: Path | None = None) -> dict[str, bytes]:

@@ -59,7 +59,7 @@ def find_outline(reconstruction: FloatFrame, linear: FloatFrame | None = None) -
             "No bright display with four straight sides was found in the reconstruction. Give the displayed picture, "
             "`mwdn align CAPTURE PICTURE`, or pick its four corners: `--points`."
         )
-    return _from_top_left(best)
+    return np.roll(best, -int(best.sum(1).argmin()), 0)
 
 
 def _straightest(image: FloatFrame, starts: list[Points | None]) -> tuple[Points | None, float]:
@@ -85,7 +85,8 @@ def _rough(image: FloatFrame, threshold: float) -> Points | None:
     largest: Any = max(contours, key=lambda contour: _light_inside(smooth, contour))
     if cv2.contourArea(largest) < _SMALLEST * image.size:
         return None
-    return _clockwise(cv2.boxPoints(cv2.minAreaRect(largest)).astype(np.float64))
+    corners = cv2.boxPoints(cv2.minAreaRect(largest)).astype(np.float64)
+    return corners if _area(corners) > 0 else corners[::-1].copy()
 
 
 def _light_inside(image: Any, contour: Any) -> float:  # noqa: ANN401
@@ -164,11 +165,3 @@ def _area(corners: Points) -> float:
     """Signed area: positive if clockwise as seen, y downwards."""
     x, y = corners.T
     return float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2)
-
-
-def _clockwise(corners: Points) -> Points:
-    return corners if _area(corners) > 0 else corners[::-1].copy()
-
-
-def _from_top_left(corners: Points) -> Points:
-    return np.roll(corners, -int(corners.sum(1).argmin()), 0)

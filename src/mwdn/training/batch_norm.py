@@ -12,6 +12,9 @@ from mwdn.runtime import distributed
 PSF_ENCODER = "psf_encoder"
 """Name of the submodule that processes only the PSF; every process has its whole batch."""
 
+AXES = (0, 2, 3)
+"""All axes but the channels."""
+
 
 def freeze_cancelled(network: nn.Module) -> None:
     """Freeze each bias in front of a BatchNorm, which subtracts it again.
@@ -62,10 +65,6 @@ class GlobalBatchNorm2d(nn.BatchNorm2d):
                 running.lerp_(new.to(running), self.momentum)  # type: ignore[union-attr, arg-type]
         numbers = (mean, variance, count, self.eps)
         return _Normalise.apply(input, self.weight, self.bias, *numbers)  # type: ignore[no-untyped-call]
-
-
-AXES = (0, 2, 3)
-"""All axes but the channels."""
 
 
 @torch.no_grad()

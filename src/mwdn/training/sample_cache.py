@@ -153,9 +153,10 @@ class SampleCache:
 
     def _window(self, number: int, scene: Tensor) -> tuple[Any, ...]:
         """Index of a random square of the frame."""
-        height, width = (min(self.crop, length) for length in scene.shape[-2:])
-        at = torch.rand(2, generator=seeded(self.seed * 1_000_003 + number + 1))
-        top, left = (int(at[i] * (scene.shape[i - 2] - side + 1)) for i, side in enumerate((height, width)))
+        rows, columns = scene.shape[-2:]
+        height, width = min(self.crop, rows), min(self.crop, columns)
+        down, right = torch.rand(2, generator=seeded(self.seed * 1_000_003 + number + 1))
+        top, left = int(down * (rows - height + 1)), int(right * (columns - width + 1))
         return ..., slice(top, top + height), slice(left, left + width)
 
     @torch.no_grad()

@@ -149,10 +149,10 @@ class Trainer:
     def _fill_cache(self, progress: Progress) -> None:
         """Compute this process's cached samples that the rest of the run needs."""
         cache, batch = self.task.cache, self.schedule.batch
-        # Twice the size of the cache contains a whole epoch.
-        steps = range(self.step, self.schedule.steps)[: 2 * cache.size // batch if cache else 0]
-        if cache is None or not steps:
+        if cache is None or self.step >= self.schedule.steps:
             return
+        # Twice the size of the cache contains a whole epoch.
+        steps = range(self.step, self.schedule.steps)[: 2 * cache.size // batch]
         files = self.folder.samples(cache.pairs.content)
         if distributed.rank() == 0:
             files.remove_others()

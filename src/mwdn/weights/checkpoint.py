@@ -66,9 +66,8 @@ def _metadata(path: Path, header: Header) -> dict[str, Any]:
         raise CheckpointError(
             f"The metadata of `{path}` is damaged: {reason(error)}. Copy it from its source again."
         ) from error
-    if not (
-        isinstance(content, dict) and isinstance(content.get("name"), str) and isinstance(content.get("options"), dict)
-    ):
+    has_name = isinstance(content, dict) and isinstance(content.get("name"), str)
+    if not (has_name and isinstance(content.get("options"), dict)):
         raise CheckpointError(f"The metadata of `{path}` must hold a name and options. Save it with `save_network`.")
     return content
 
