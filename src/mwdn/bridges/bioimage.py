@@ -65,10 +65,12 @@ def export_bioimage(
         exported = export(method, calibration, weights, precision=precision, channels=channels, least=least, **options)
         measurement = simulate_captures(calibration, ("astronaut",), channels or calibration.psf.shape[1])[:1]
         scene = run_file(weights, measurement)
+        rows = "\n".join(f"| {name} | {value} |" for name, value in exported.about.items())
         with temporary_files(folder):
             np.save(folder / "measurement.npy", measurement.numpy())
             np.save(folder / "scene.npy", scene.numpy())
-            (folder / "README.md").write_text(_documentation(exported), encoding="utf-8")
+            documentation = _TEXT.format(rows=rows, agreement=exported.agreement)
+            (folder / "README.md").write_text(documentation, encoding="utf-8")
             description = json.dumps(_description(exported, folder, measurement, scene), indent=2, ensure_ascii=False)
             (folder / "rdf.yaml").write_text(description, encoding="utf-8")  # JSON is YAML
             package = folder / "package.zip"
@@ -118,11 +120,6 @@ def _tensor(name: str, image: Image, folder: Path, description: str) -> dict[str
         "data": {"type": "float32"},
         "test_tensor": {"source": file.name, "sha256": file_sha256(file)},
     }
-
-
-def _documentation(exported: Exported) -> str:
-    rows = "\n".join(f"| {name} | {value} |" for name, value in exported.about.items())
-    return _TEXT.format(rows=rows, agreement=exported.agreement)
 
 
 _TEXT = """# Reconstruction for one lensless camera

@@ -14,14 +14,14 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
-from torch.export import Dim, ExportedProgram
+from torch.export import Dim
 from torch.utils._pytree import tree_flatten, tree_unflatten
 
 from mwdn.arguments import checked
 from mwdn.calibration import Calibration
 from mwdn.errors import ExportError, ParameterError
 from mwdn.export.loops import as_loops
-from mwdn.export.model_file import as_export_error, publish, require_onnx, run_file, write_file
+from mwdn.export.model_file import as_export_error, publish, require_onnx, run_file, trace, write_file
 from mwdn.inference.fusion import fuse
 from mwdn.inference.methods import Method, as_method, method_name, psf_for, psf_warning
 from mwdn.inference.reconstructor import Reconstructor
@@ -147,7 +147,8 @@ def export(
         # torch's own file holds one iteration after the other.
         loops = as_loops() if file.suffix == ".onnx" else nullcontext()
         with loops:
-            program = _program(module.eval(), measurement)
+            any_batch = ({0: Dim("batch", min=1)},)
+            program = trace(module, (measurement,), f"`{type(module.method).__name__}`", dynamic_shapes=any_batch)
         write_file(file, program, about)
         if precision == "int8":
             from mwdn.export.quantise import quantise
@@ -265,12 +266,3 @@ def _about(name: str, calibration: Calibration, channels: int, precision: str) -
         "sensor_field": (refinement.sensor_field, "measurements must be divided by the camera's sensor field"),
     }
     return about | {key: text for key, (applies, text) in more.items() if applies}
-
-
-def _program(module: FixedPsf, measurement: Measurement) -> ExportedProgram:
-    """The method as a graph of operations, for batches of any size."""
-    try:
-        return torch.export.export(module, (measurement,), dynamic_shapes=({0: Dim("batch", min=1)},))
-    except (RuntimeError, ValueError, TypeError) as error:  # torch raises many kinds of errors
-        reason = str(error).strip().splitlines()[0]
-        raise ExportError(f"`{type(module.method).__name__}` cannot be exported: {reason}") from error

@@ -8,9 +8,10 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import Tensor, nn
 from torch.export import ExportedProgram
 
 from mwdn.arguments import check_batch
@@ -31,6 +32,18 @@ def require_onnx() -> None:
     """Raise a `MissingPackageError` unless onnx and onnxruntime are installed."""
     for module in ("onnx", "onnxruntime"):
         require(module, "export", purpose="ONNX")
+
+
+def trace(module: nn.Module, arguments: tuple[Tensor, ...], name: str, **options: Any) -> ExportedProgram:  # noqa: ANN401
+    """The program of a module, called ``name`` in the message, by `torch.export.export` with these ``options``.
+
+    Raises:
+        ExportError: torch cannot follow it.
+    """
+    try:
+        return torch.export.export(module.eval(), arguments, **options)
+    except (RuntimeError, ValueError, TypeError) as error:  # torch raises many kinds of errors
+        raise ExportError(f"{name} cannot be exported: {str(error).strip().splitlines()[0]}") from error
 
 
 def write_file(file: Path, program: ExportedProgram, about: dict[str, str]) -> None:

@@ -13,8 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils._pytree import TreeSpec, tree_flatten, tree_unflatten
 
-from mwdn.errors import ExportError
-from mwdn.export.model_file import as_export_error, require_onnx, serialise
+from mwdn.export.model_file import as_export_error, require_onnx, serialise, trace
 from mwdn.export.onnx_program import to_onnx
 from mwdn.inference.fusion import fuse
 from mwdn.networks.network import Network, as_network
@@ -106,10 +105,7 @@ def _parts(tensors: list[Tensor]) -> Iterator[Tensor]:
 
 
 def _model(module: nn.Module, arguments: tuple[Tensor, ...], outputs: list[str]) -> bytes:
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torch warns about constants that it copies
-            program = torch.export.export(module.eval(), arguments)
-    except (RuntimeError, ValueError, TypeError) as error:  # torch raises many kinds of errors
-        raise ExportError(f"The network cannot be exported: {str(error).strip().splitlines()[0]}") from error
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch warns about constants that it copies
+        program = trace(module, arguments, "The network")
     return serialise(to_onnx(program, outputs))

@@ -51,6 +51,7 @@ def to_onnx(program: ExportedProgram, outputs: Sequence[str] = ("scene",)) -> "o
     g = OnnxGraph()
     inputs = {}
     in_loop: set[fx.Node] = set()  # that depend on the state of the loop that has begun
+    arguments: Any
     for step in steps:
         if step.op == "placeholder":
             values[step] = step.name
@@ -58,10 +59,12 @@ def to_onnx(program: ExportedProgram, outputs: Sequence[str] = ("scene",)) -> "o
         elif step.op == "call_function":
             arguments, options = fx.map_arg((step.args, step.kwargs), values.get)
             if step.target is BEGIN:
-                values[step] = _begin_loop(g, arguments)
+                state, count = arguments
+                values[step] = _like(state, g.begin_loop(_parts(state), count))
                 in_loop = {step}
             elif step.target is END:
-                values[step] = _end_loop(g, arguments)
+                (state,) = arguments
+                values[step] = _like(state, g.end_loop(_parts(state)))
                 in_loop = set()
             elif in_loop and in_loop.isdisjoint(step.all_input_nodes):
                 with g.outside():
@@ -84,28 +87,17 @@ def _fold_constants(module: fx.GraphModule) -> tuple[dict[fx.Node, Any], list[fx
     for node in module.graph.nodes:
         if node.op == "get_attr":
             values[node] = operator.attrgetter(str(node.target))(module)
-        elif _is_constant(node) and all(source in values for source in node.all_input_nodes):
+        elif (
+            node.op == "call_function"
+            and node.target not in (BEGIN, END)
+            and all(source in values for source in node.all_input_nodes)
+        ):
             arguments, options = fx.map_arg((node.args, node.kwargs), values.__getitem__)
             values[node] = node.target(*arguments, **options)
         elif node.op != "call_module" and node.target is not _aten._assert_tensor_metadata.default:  # only checks
             steps.append(node)
     pairs = {node: Pair(v.real, v.imag) for node, v in values.items() if isinstance(v, Tensor) and v.is_complex()}
     return values | pairs, steps
-
-
-def _is_constant(node: fx.Node) -> bool:
-    """Whether the result of an operation is constant if its arguments are."""
-    return node.op == "call_function" and node.target not in (BEGIN, END)
-
-
-def _begin_loop(g: OnnxGraph, arguments: Any) -> list[Any]:  # noqa: ANN401
-    state, count = arguments
-    return _like(state, g.begin_loop(_parts(state), count))
-
-
-def _end_loop(g: OnnxGraph, arguments: Any) -> list[Any]:  # noqa: ANN401
-    (state,) = arguments
-    return _like(state, g.end_loop(_parts(state)))
 
 
 def _parts(state: list[Any]) -> list[Any]:

@@ -44,12 +44,10 @@ def dual_projection(u: Gradient, bound: float | Tensor, variation: Variation) ->
     t = bound if isinstance(bound, Tensor) else torch.full_like(u[0][:1, :1, :1, :1], bound)
     if variation == "anisotropic":
         return u[0].clamp(-t, t), u[1].clamp(-t, t)
-    square = u[0].square() + u[1].square() if variation == "isotropic" else _colour_square(u)
+    if variation == "isotropic":
+        square = u[0].square() + u[1].square()
+    else:
+        square = u[0].square().sum(dim=1, keepdim=True) + u[1].square().sum(dim=1, keepdim=True)
     smallest = t.square().clamp(min=torch.finfo(t.dtype).tiny)
     factor = t / torch.maximum(square, smallest).sqrt_()
     return u[0] * factor, u[1] * factor
-
-
-def _colour_square(u: Gradient) -> Tensor:
-    """Squared length of the gradients of all colours together."""
-    return u[0].square().sum(dim=1, keepdim=True) + u[1].square().sum(dim=1, keepdim=True)
