@@ -77,8 +77,7 @@ class Encoder(CheckpointedModule):
         self.channels = channels
         self.pool = pooling_layer(pooling)
         self.scales = nn.ModuleList(
-            convolutions(inputs, width, width, norm=norm)
-            for inputs, width in zip((channels, *widths), widths, strict=False)
+            convolutions(inputs, width, width, norm=norm) for inputs, width in pairwise((channels, *widths))
         )
 
     def forward(self, picture: Image) -> list[Tensor]:

@@ -1,5 +1,7 @@
 """Denoising U-Net of Le-ADMM-U and MMCN."""
 
+from itertools import pairwise
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -37,8 +39,7 @@ class DenoisingUNet(nn.Module):
         self.channels = channels
         widths = scaled_widths(width)
         self.encoders = nn.ModuleList(
-            convolutions(before, after, after, bias=False)
-            for before, after in zip((channels, *widths), widths, strict=False)
+            convolutions(before, after, after, bias=False) for before, after in pairwise((channels, *widths))
         )
         self.centre = convolutions(widths[-1] + bottleneck_channels, widths[-1], bias=False)
         # 512 + 512 -> 256, 256 + 256 -> 128, ..., 24 + 24 -> 24.

@@ -1,6 +1,7 @@
 """IFIN-like network: sensor and scene features coupled by forward and inverse operators at every scale."""
 
 import math
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -100,7 +101,7 @@ class Ifin(Network[IfinPsfs]):
         self.log_gain = nn.Parameter(torch.full((len(widths),), math.log(0.01)))
         self.scales = nn.ModuleList(
             Exchange(before, after, regularisation=regularisation, boundary=boundary)
-            for before, after in zip((channels, *widths), widths, strict=False)
+            for before, after in pairwise((channels, *widths))
         )
         self.bottleneck = convolutions(2 * widths[-1], last, last, norm="group")
         self.decoder = Decoder(channels, (*widths, last), norm="group")
@@ -115,7 +116,7 @@ class Ifin(Network[IfinPsfs]):
         return result
 
     def prepare(self, psf: Psf, size: Size) -> IfinPsfs:
-        """PSF for the first Wiener filter, and kernels of each scale."""
+        """Transfer function of the first Wiener filter, and the kernels of each scale."""
         psf = normalise_psf(psf, size, self.channels)
         check_sides(psf, len(self.scales))
         return IfinPsfs(self.first.prepare(unit_sum(psf)), self.kernels(psf))

@@ -32,9 +32,7 @@ class SmallUNet(nn.Module):
     def __init__(self, inputs: int, width: int) -> None:
         super().__init__()
         widths = [width * 2**scale for scale in range(5)]
-        self.encoders = nn.ModuleList(
-            _rectified(before, after, after) for before, after in zip((inputs, *widths), widths, strict=False)
-        )
+        self.encoders = nn.ModuleList(_rectified(before, after, after) for before, after in pairwise((inputs, *widths)))
         self.ups = nn.ModuleList(nn.ConvTranspose2d(2 * after, after, 2, stride=2) for after in widths[-2::-1])
         self.decoders = nn.ModuleList(_rectified(2 * after, after, after) for after in widths[-2::-1])
         self.head = nn.Conv2d(width, 1, 1)

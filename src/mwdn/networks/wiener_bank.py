@@ -253,6 +253,7 @@ class WienerBank(FixedFront[BankTransfers]):
     def _correct(self, estimates: Tensor, unit: Tensor) -> Scene:
         first = estimates[:, : self.channels]
         height, width = estimates.shape[-2:]
+        # To whole blocks, and at least 32 x 32 of them.
         below, right = (max(-size % self.fold, 32 * self.fold - size) for size in (height, width))
         if below or right:
             estimates = F.pad(estimates, (0, right, 0, below))

@@ -140,7 +140,7 @@ def normalise_psf(psf: Psf, size: Size, channels: int | None = None, *, stored: 
 
 
 def unit_psf(psf: Psf) -> Tensor:
-    """Scale each channel to unit sum. An exported `prepare` takes such PSFs only, and has no operation for it."""
+    """Scale each channel to unit sum; not in an export, whose `prepare` takes such PSFs only."""
     return psf if torch.compiler.is_exporting() else checked_psf(psf, values=False)
 
 

@@ -87,7 +87,7 @@ def stored_psf(recipe: Recipe, calibration: Calibration, device: torch.device) -
     """The PSF (1, C, H, W) for a network that takes it as stored; ``None`` for the others, which take the samples'.
 
     Raises:
-        ParameterError: such a network has one camera, and pairs to learn from.
+        ParameterError: it does, but the recipe has random cameras, captures without scenes, or aligned pairs.
     """
     network = build_empty(**recipe.network)
     if not (isinstance(network, Network) and network.stored_psf):

@@ -137,8 +137,7 @@ def pair_tasks(
 ) -> tuple[SupervisedTask, SupervisedTask]:
     """Tasks of training and validation on pairs.
 
-    Pairs that are aligned and cached are few, so that all are cached, those for validation, too: each is aligned and
-    estimated once.
+    Aligned pairs are few, so the cache holds all of them, also those of the validation: each is aligned only once.
 
     Args:
         training: at most ``pool`` are used, if they are cached. The cache of aligned ones is a multiple of the batch:

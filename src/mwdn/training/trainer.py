@@ -102,7 +102,7 @@ class Trainer:
             self.folder.claim(self.step)
 
     def compare_samples(self) -> bool:
-        """Whether a resumed run had the same samples. Hashes them, which takes time, for this and for saved states."""
+        """Whether a resumed run had the same samples. Their hash, which takes time, is also kept for saved states."""
         saved, self.fingerprint = self.fingerprint, self.task.samples.fingerprint
         return saved in ("", self.fingerprint)
 
