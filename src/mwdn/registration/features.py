@@ -14,7 +14,6 @@ from mwdn.registration.views import Bytes, Views
 _RATIO = 0.8
 """Lowe's ratio of the nearest and the second nearest feature: above it a match is ambiguous."""
 
-_TOLERANCE_PX = 3.0
 _FEWEST = 10
 _ENLARGED = 400
 """Pictures below this many pixels a side are enlarged: SIFT finds few features of less than 4 pixels."""
@@ -37,13 +36,7 @@ def match_features(views: Views) -> list[Projection]:
         if mirrored and len(displayed):
             displayed[:, 0] = views.picture_size[1] - 1 - displayed[:, 0]
         with suppress(AlignmentError):
-            fit = fit_points(
-                displayed,
-                seen,
-                picture_size=views.picture_size,
-                camera_size=views.camera_size,
-                tolerance_px=_TOLERANCE_PX,
-            )
+            fit = fit_points(displayed, seen, picture_size=views.picture_size, camera_size=views.camera_size)
             if fit.inliers.sum() >= _FEWEST:
                 fits.append((int(fit.inliers.sum()), fit.projection))
     return [projection for _, projection in sorted(fits, key=lambda each: -each[0])]

@@ -12,7 +12,6 @@ from mwdn.registration.projection import Points, Projection
 from mwdn.registration.views import Bytes, Views
 
 _DICTIONARIES = ("4X4_50", "4X4_100", "5X5_50", "5X5_100", "6X6_250", "ARUCO_ORIGINAL", "APRILTAG_36h11")
-_TOLERANCE_PX = 3.0
 _MARKER_PX = 1200
 """Reconstructions are enlarged to this many pixels a side: a marker of 4 x 4 bits then has enough for its bits."""
 
@@ -30,15 +29,9 @@ def match_markers(views: Views) -> list[Projection]:
         seen += [by_number[number] for number in common]
     if len(displayed) < 2:
         return []
+    points = np.concatenate(displayed), np.concatenate(seen)
     with suppress(AlignmentError):
-        fit = fit_points(
-            np.concatenate(displayed),
-            np.concatenate(seen),
-            picture_size=views.picture_size,
-            camera_size=views.camera_size,
-            tolerance_px=_TOLERANCE_PX,
-        )
-        return [fit.projection]
+        return [fit_points(*points, picture_size=views.picture_size, camera_size=views.camera_size).projection]
     return []
 
 

@@ -9,6 +9,9 @@ from mwdn.errors import AlignmentError
 from mwdn.registration.projection import Points, Projection
 from mwdn.types import Size
 
+TOLERANCE_PX = 3.0
+"""Points of the camera farther from the fit than this are outliers."""
+
 _ITERATIONS = 20
 _STRONG = 10.0
 """Difference of the Bayesian information criterion that is strong evidence (Kass and Raftery, 1995)."""
@@ -29,12 +32,10 @@ class PointFit(NamedTuple):
 
     Args:
         projection: fitted to the inliers.
-        residuals: (N, 2), seen minus fitted position of every point, in pixels of the camera.
         inliers: (N,), points within the tolerance.
     """
 
     projection: Projection
-    residuals: Points
     inliers: npt.NDArray[np.bool_]
 
 
@@ -65,7 +66,6 @@ def fit_points(
     picture_size: Size,
     camera_size: Size,
     errors: npt.NDArray[np.float64] | None = None,
-    tolerance_px: float = 3.0,
 ) -> PointFit:
     """Fit a homography to points of the displayed picture and where the camera sees them.
 
@@ -75,7 +75,6 @@ def fit_points(
         picture_size: height and width of the displayed picture.
         camera_size: height and width of the reconstruction.
         errors: (N,), standard errors of the points in the reconstruction; equal unless given.
-        tolerance_px: points farther from the fit are outliers.
 
     Raises:
         AlignmentError: fewer than 4 points, or no homography fits 4 of them.
@@ -86,22 +85,21 @@ def fit_points(
     count = len(picture)
     if count < 4:
         raise AlignmentError(f"A homography needs 4 points; {count} were found. Show a picture with more detail.")
-    matrix, inlier_mask = _consensus(picture, camera, tolerance_px)
+    matrix, inlier_mask = _consensus(picture, camera)
     if matrix is None or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-12:
         raise AlignmentError(f"No homography fits the {count} points. Three of them may lie on a line.")
     inliers = inlier_mask.ravel() > 0 if count > 4 else np.ones(count, bool)
-    _check_inliers(inliers, tolerance_px)
+    _check_inliers(inliers)
     start = Projection.from_homography(matrix, picture_size, camera_size)
     best = _descend(start, _Seen.of(picture, camera, errors).part(inliers), radial=False)
-    residuals = camera - best.to_camera(picture)
-    inliers = np.hypot(*residuals.T) <= tolerance_px
-    _check_inliers(inliers, tolerance_px)
-    return PointFit(best, residuals, inliers)
+    inliers = np.hypot(*(camera - best.to_camera(picture)).T) <= TOLERANCE_PX
+    _check_inliers(inliers)
+    return PointFit(best, inliers)
 
 
-def _check_inliers(inliers: npt.NDArray[np.bool_], tolerance_px: float) -> None:
+def _check_inliers(inliers: npt.NDArray[np.bool_]) -> None:
     if inliers.sum() < 4:
-        raise AlignmentError(f"No homography fits 4 of the {len(inliers)} points within {tolerance_px:g} px.")
+        raise AlignmentError(f"No homography fits 4 of the {len(inliers)} points within {TOLERANCE_PX:g} px.")
 
 
 def correct(
@@ -128,7 +126,7 @@ def correct(
     return best if _evidence(projection, best, seen, 9 if best.radial else 8) > _STRONG else projection
 
 
-def _consensus(picture: Points, camera: Points, tolerance_px: float) -> tuple[Points | None, npt.NDArray[np.uint8]]:
+def _consensus(picture: Points, camera: Points) -> tuple[Points | None, npt.NDArray[np.uint8]]:
     """Homography that most points agree with, and which they are."""
     import cv2
 
@@ -136,7 +134,7 @@ def _consensus(picture: Points, camera: Points, tolerance_px: float) -> tuple[Po
     for flip in (np.eye(3), np.diag([-1.0, 1.0, 1.0])):  # USAC refuses homographies that mirror
         points = picture @ flip[:2, :2]
         method = cv2.USAC_MAGSAC if len(picture) > 4 else 0
-        matrix, inlier_mask = cv2.findHomography(points, camera, method, tolerance_px, maxIters=5000, confidence=0.9999)
+        matrix, inlier_mask = cv2.findHomography(points, camera, method, TOLERANCE_PX, maxIters=5000, confidence=0.9999)
         if matrix is not None and (best[0] is None or inlier_mask.sum() > best[1].sum()):
             best = matrix @ flip, inlier_mask.astype(np.uint8)
     return best
