@@ -43,10 +43,9 @@ class Mwdn(Network[list[Tensor]]):
         authors_form: bool = False,
     ) -> None:
         super().__init__()
-        self.stored_psf = authors_form
+        self.channels, self.stored_psf = channels, authors_form
         widths = paper_widths(width)
         self.encoder = Encoder(channels, widths, pooling=pooling)
-        self.channels = channels
         self.filters = WienerFilters(
             WienerFilter(weight=weight, regularisation=regularisation, boundary=boundary, linear=authors_form)
             for _ in widths[:-1]

@@ -49,12 +49,10 @@ class MwdnCpsf(Network[list[Tensor]]):
         orthonormal: bool = False,
     ) -> None:
         super().__init__()
-        self.stored_psf = authors_form
-        self.orthonormal = orthonormal
+        self.channels, self.stored_psf, self.orthonormal = channels, authors_form, orthonormal
         widths = paper_widths(width)
         self.encoder = Encoder(channels, widths, pooling=pooling)
         self.psf_encoder = Encoder(channels, widths[:-1], pooling=pooling)
-        self.channels = channels
         self.filters = WienerFilters(
             WienerFilter(weight=None, regularisation=regularisation, boundary=boundary, linear=authors_form)
             for _ in widths[:-1]

@@ -110,11 +110,11 @@ class WienerFilters(nn.ModuleList):
         return cast(Iterator[WienerFilter], super().__iter__())
 
     def prepare(self, psfs: list[Tensor]) -> list[Tensor]:
-        """Transfer function of each scale's filter. The list is emptied: each PSF is freed once it is used."""
+        """Transfer function of each scale's filter. The list is emptied, which frees each PSF once it is used."""
         return [wiener.prepare(psfs.pop(0)) for wiener in self]
 
     def deconvolve(self, features: list[Tensor], prepared: list[Tensor]) -> list[Tensor]:
-        """The list of features, in which those of each scale with a filter are replaced by deconvolved ones."""
+        """Deconvolve the features of each scale that has a filter, in the list itself, which frees those before."""
         for scale, (wiener, transfer) in enumerate(zip(self, prepared, strict=True)):
             features[scale] = wiener.deconvolve(features[scale], transfer)
         return features

@@ -35,8 +35,7 @@ class WienerUNet(Network[Tensor]):
         authors_form: bool = False,
     ) -> None:
         super().__init__()
-        self.stored_psf = authors_form
-        self.channels = channels
+        self.channels, self.stored_psf = channels, authors_form
         self.wiener = WienerNetwork(
             weight=weight, regularisation=regularisation, boundary=boundary, authors_form=authors_form
         )

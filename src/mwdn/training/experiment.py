@@ -149,7 +149,7 @@ def prepare(
     return trainer
 
 
-def simulated_captures(recipe: Recipe, photos: Path, psf: Psf, *, is_grey: bool = False) -> TrainingData:
+def simulated_captures(recipe: Recipe, photos: Path, psf: Psf, *, is_grey: bool) -> TrainingData:
     """Captures simulated from photographs, through one camera or random ones; or noisy scenes for a denoiser.
 
     Raises:
@@ -169,7 +169,7 @@ def simulated_captures(recipe: Recipe, photos: Path, psf: Psf, *, is_grey: bool 
     return TrainingData(supervised_task(training, recipe.schedule), SupervisedTask(validation), len(photographs))
 
 
-def recorded_pairs_of(recipe: Recipe, pairs: Path, psf: Psf, *, refinement: Refinement = Refinement()) -> TrainingData:
+def recorded_pairs_of(recipe: Recipe, pairs: Path, psf: Psf, *, refinement: Refinement) -> TrainingData:
     """Recorded pairs of one camera."""
     if recipe.cameras.sizes:
         raise ParameterError("Recorded pairs, `--pairs`, are of one camera: leave [cameras] out of the recipe.")
