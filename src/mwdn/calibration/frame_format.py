@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mwdn.arguments import checked
+from mwdn.arguments import check_at_least, checked
 from mwdn.calibration.corrections import Corrections
 from mwdn.calibration.float_scale import check_float_scale
 from mwdn.calibration.frame_operations import bin_pixels, crop_centre, demosaic, subtract_dark
@@ -64,8 +64,7 @@ class FrameFormat:
         if self.bit_depth is not None and not 1 <= self.bit_depth <= 16:
             raise ParameterError(f"`bit_depth` ({self.bit_depth}) must be 1 to 16.")
         check_gamma("gamma", self.gamma)
-        if self.bin < 1:
-            raise ParameterError(f"`bin` ({self.bin}) must be at least 1.")
+        check_at_least(1, bin=self.bin)
         if self.crop is not None and any(length % self.cell for length in self.crop):
             height, width = self.crop
             raise ParameterError(

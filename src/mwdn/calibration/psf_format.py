@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from mwdn.arguments import checked
+from mwdn.arguments import check_at_least, checked
 from mwdn.calibration.frame_format import FrameFormat, Gamma, check_gamma
 from mwdn.errors import ParameterError, UnknownNameError
 from mwdn.optics.orientation import Orientation, check_orientation, swaps_axes, turn
@@ -46,8 +46,8 @@ class PsfFormat:
             raise ParameterError(
                 f"`background` ({self.background}) must be in [0, 1), a fraction of the full scale, or 'estimate'."
             )
-        if self.psf_bin is not None and self.psf_bin < 1:
-            raise ParameterError(f"`psf_bin` ({self.psf_bin}) must be at least 1.")
+        if self.psf_bin is not None:
+            check_at_least(1, psf_bin=self.psf_bin)
         if self.psf_bit_depth is not None and not 1 <= self.psf_bit_depth <= 16:
             raise ParameterError(f"`psf_bit_depth` ({self.psf_bit_depth}) must be 1 to 16.")
         check_gamma("psf_gamma", self.psf_gamma)

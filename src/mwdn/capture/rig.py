@@ -88,7 +88,7 @@ class Rig(CameraSource):
         # Exposure, gain and noise.
         self.exposure_s, self.gain, self._drift = EXPOSURE_S, 1.0, 0.0
         self._noise, self._chance = seeded(options.seed), random.Random(options.seed)
-        # What the display shows: its light on the sensor, that of the picture before, and frames that still show that.
+        # The display: light of its picture and of the one before, and how many frames still have some of the latter.
         self._shown = self._before = self._light(point(screen) if picture is None else picture)
         self._stale, self._entry, self._frames = 0, -1, PreparedFrames(options.prepared)
         # The connection, and the number of the newest frame since `open`.

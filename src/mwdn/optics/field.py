@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from mwdn.arguments import check_batch, checked
+from mwdn.arguments import check_at_least, check_batch, checked
 from mwdn.errors import ParameterError, ShapeError
 from mwdn.fourier.convolution import convolve, correlate
 from mwdn.fourier.transforms import fast_length, gaussian_transfer, inverse_spectrum, spectrum
@@ -148,8 +148,8 @@ class FieldCamera:
                 f"`psfs` {tuple(psfs.shape)} must be (rows, columns, C, h, w), as `field_psfs` returns them. For grey "
                 "ones: `psfs[:, :, None]`."
             )
-        if rank is not None and rank < 1:
-            raise ParameterError(f"`rank` ({rank}) must be at least 1.")
+        if rank is not None:
+            check_at_least(1, rank=rank)
         rows, columns, *shape = psfs.shape
         left, values, right = torch.linalg.svd(psfs.reshape(rows * columns, -1), full_matrices=False)
         kept = min(rank or max(1, int((values > 1e-6 * values[0]).sum())), len(values))  # 1 of PSFs without light

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from mwdn.arguments import check_at_least
 from mwdn.errors import ImageError, ParameterError, reason
 from mwdn.io.files import atomic_write
 from mwdn.io.reading import open_regular
@@ -150,8 +151,7 @@ def check_stl(mask: Mask, *, every: int = 1) -> None:
     """Raise the `ParameterError` of `write_stl` for the same arguments, before anything is written."""
     if mask.kind != "phase":
         raise ParameterError("An amplitude mask has no heights for an STL. Use GDSII: `gds`.")
-    if every < 1:
-        raise ParameterError(f"`every` ({every}) must be at least 1.")
+    check_at_least(1, every=every)
     rows, columns = (len(_chosen(length, every)) for length in mask.values.shape)
     if rows * columns > MAX_STL_SAMPLES or min(rows, columns) < 2:
         needed = every
@@ -175,7 +175,7 @@ def write_stl(path: str | Path, mask: Mask, *, every: int = 1) -> None:
         every: use every n-th sample along each axis, and the last one.
 
     Raises:
-        ParameterError: an amplitude mask, a number that is not positive, or more than `MAX_STL_SAMPLES`.
+        ParameterError: an amplitude mask, `every` below 1, or more than `MAX_STL_SAMPLES`.
         ImageError: the file cannot be written.
     """
     check_stl(mask, every=every)
