@@ -30,7 +30,7 @@ def no_page(monkeypatch):
     monkeypatch.setattr("mwdn.calibration.report_page.write_page", lambda *_: None)
 
 
-def test_page_json_and_lines(run, tmp_path):
+def test_page_json_and_lines(run, tmp_path, monkeypatch):
     """Each finding is one line where there is no terminal. A second time the command replaces its own files."""
     code, shown, problem = run("inspect", "my psf.png", "-o", "out")
     assert (code, problem) == (0, "")
@@ -43,10 +43,10 @@ def test_page_json_and_lines(run, tmp_path):
     lines = shown.splitlines()
     assert lines[:-1] == [content["headline"], *(f"{each['weight']:4} {each['text']}" for each in content["verdict"])]
     assert max(map(len, lines)) > 80
-    (tmp_path / "out" / "my psf.png").write_bytes(b"")
+    monkeypatch.setattr("mwdn.calibration.report_page.write_page", lambda path, *_: path.write_bytes(b"again"))
     code, shown, _ = run("inspect", "my psf.png", "-o", "out", "--json")
     assert (code, json.loads(shown)) == (0, content)
-    assert (tmp_path / "out" / "my psf.png").stat().st_size > 0
+    assert (tmp_path / "out" / "my psf.png").read_bytes() == b"again"
 
 
 @pytest.mark.parametrize("dark", [False, True])

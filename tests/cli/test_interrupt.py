@@ -18,7 +18,7 @@ from mwdn.training.training_state import read_state
 FULL = Path("/dev/full")
 COPIES = 100
 RECIPE = """
-network = { name = "wiener-bank", width = 2, finest = 0, align = false }
+network = { name = "wiener" }
 schedule = { steps = 1000000, batch = 1, validate_every = 2, validation = 1, bfloat16 = false }
 """
 

@@ -28,7 +28,7 @@ from mwdn.weights.growth import grown
 
 OPTIONS = {"width": 2, "regularisations": (1e-2, 1e-4), "mean_light": "free", "finest": 8}
 SCHEDULE = Schedule(
-    steps=3, pool=200, batch=2, learning_rate=1e-2, warmup=0, validate_every=3, ema=0.0, weight_decay=0.0,
+    steps=2, pool=200, batch=2, learning_rate=1e-2, warmup=0, validate_every=2, ema=0.0, weight_decay=0.0,
     anchor=1.0, fixed_norms=True, start="start.safetensors",
 )  # fmt: skip
 LARGE = 96, 96

@@ -102,6 +102,11 @@ def whole(tmp_path_factory):
     return unbroken_run(RECIPE, tmp_path_factory.mktemp("whole"))
 
 
+@pytest.fixture(scope="module")
+def whole_float32(tmp_path_factory):
+    return unbroken_run(few(bfloat16=False), tmp_path_factory.mktemp("float32"))
+
+
 @pytest.fixture
 def finished(whole, photos, tmp_path):
     """The folder `run` of a run that has ended, a copy of `whole`."""
@@ -159,15 +164,14 @@ def test_overfits_four_pairs(photos, calibration, tmp_path):
     assert best > -10 * torch.log10(scenes.square().mean())  # better than black
 
 
-def test_checkpointing_is_the_same_run(trainer, tmp_path):
+def test_checkpointing_is_the_same_run(trainer, whole_float32, tmp_path):
     """It may be switched on in the middle of a run, if memory is too short."""
-    trainer(few(bfloat16=False), "kept").run()
     advance(trainer(few(bfloat16=False), "changed"))
     second = trainer(few(bfloat16=False, checkpointing=True), "changed")
     assert second.step == 3
     second.run()
     assert second.network.encoder.checkpoints_activations
-    kept, changed = (load_file(tmp_path / name / "last.safetensors") for name in ("kept", "changed"))
+    kept, changed = (load_file(run / "last.safetensors") for run in (whole_float32, tmp_path / "changed"))
     for key, value in kept.items():
         torch.testing.assert_close(changed[key], value, rtol=1e-3, atol=1e-5)
 
@@ -244,17 +248,16 @@ def test_the_best_weights_are_chosen_by_psnr_or_loss(trainer, tmp_path, best_by,
     assert trainer(few(best_by=best_by)).best == run.best
 
 
-def test_resumed_run_ends_bit_identical(trainer, tmp_path):
+def test_resumed_run_ends_bit_identical(trainer, whole_float32, tmp_path):
     """In float32; `RECIPE`, in bfloat16, in the test after this one."""
     recipe = few(bfloat16=False)
-    trainer(recipe, "whole").run()
     first = trainer(recipe, "halves")
     advance(first)
     second = trainer(recipe, "halves")
     assert (second.step, second.best) == (3, first.best)
     second.run()
     for name in ("last", "best", "state"):
-        assert same(tmp_path / "whole" / f"{name}.safetensors", tmp_path / "halves" / f"{name}.safetensors")
+        assert same(whole_float32 / f"{name}.safetensors", tmp_path / "halves" / f"{name}.safetensors")
 
 
 def test_ctrl_c_ends_after_the_step_and_saves_it(trainer, whole, tmp_path):
@@ -481,15 +484,24 @@ def as_of_an_earlier_version(folder):
     save_file(tensors, path, metadata=header)
 
 
-@pytest.mark.parametrize(("recipe", "unbroken"), [(PAPER, "whole_paper"), (RECIPE, "whole")], ids=["plateau", "cosine"])
-def test_a_run_of_an_earlier_version_goes_on(trainer, tmp_path, request, recipe, unbroken):
-    unbroken = request.getfixturevalue(unbroken)
-    stop(trainer(recipe, "halves"), 5)
-    as_of_an_earlier_version(tmp_path / "halves")
-    second = trainer(recipe, "halves")
-    assert second.step in (3, 4)
+def test_a_run_of_an_earlier_version_goes_on(trainer, whole, tmp_path):
+    stop(trainer(), 5)
+    as_of_an_earlier_version(tmp_path / "run")
+    second = trainer()
+    assert second.step == 3
     second.run()
-    assert_same_end(tmp_path / "halves", unbroken)
+    assert_same_end(tmp_path / "run", whole)
+
+
+def test_the_plateau_of_an_earlier_version_goes_on(trainer, tmp_path):
+    """Where it was: `test_plateau_resumes` has what comes after it."""
+    stop(trainer(PAPER), 5)
+    first = trainer(PAPER)
+    as_of_an_earlier_version(tmp_path / "run")
+    second = trainer(PAPER)
+    assert second.step == first.step == 4
+    assert second.lr_schedule == first.lr_schedule
+    assert second.lr_schedule.best < float("inf")
 
 
 def test_weights_of_an_earlier_version_belong_to_the_same_run(trainer, finished):
