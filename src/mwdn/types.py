@@ -12,11 +12,15 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
+import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
 
 Size = tuple[int, int]
 """(height, width) in pixels."""
+
+TINY = torch.finfo(torch.float32).tiny
+"""Smallest normal float32: a floor for divisors, with which 0 / 0 is 0."""
 
 Image = Float[Tensor, "batch channel height width"]
 """Any image; its size and channels need not match the other arguments."""
@@ -54,3 +58,8 @@ class ArrayPicture(Protocol):
 
     @property
     def __array_interface__(self) -> dict[str, Any]: ...
+
+
+def size_of(image: Tensor) -> Size:
+    """Height and width of an image (..., height, width)."""
+    return image.shape[-2], image.shape[-1]

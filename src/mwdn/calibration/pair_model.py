@@ -21,7 +21,7 @@ from torch.nn import functional as F
 from mwdn.calibration.refinement import Refinement, displaced
 from mwdn.fourier.convolution import convolve
 from mwdn.optics.polynomials import coefficient_count, polynomials
-from mwdn.types import Image, Measurement, Psf, Scene
+from mwdn.types import Image, Measurement, Psf, Scene, size_of
 
 BLOCKS = 32
 """Blocks along the shorter side in which means are compared."""
@@ -128,7 +128,7 @@ class PairModel:
         shift: tuple[float, float] | None = None,
         moves: bool = True,
     ) -> None:
-        size = psf.shape[-2], psf.shape[-1]
+        size = size_of(psf)
         self.shift, self.block = shift, max(1, min(size) // BLOCKS)
         psf = psf if shift is None else displaced(psf, shift)
         P = polynomials(3, size)[:, None].float()  # P[0] is 1

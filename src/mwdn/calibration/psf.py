@@ -24,7 +24,7 @@ from mwdn.errors import ParameterError, PsfError, ShapeError, shown
 from mwdn.io.arrays import as_frame
 from mwdn.optics.psf import checked_psf, psf_hash
 from mwdn.optics.sensor import Sensor
-from mwdn.types import ArrayPicture, Frame, Image, Measurement, Psf, Size
+from mwdn.types import ArrayPicture, Frame, Image, Measurement, Psf, Size, size_of
 
 
 @checked
@@ -247,7 +247,7 @@ class Calibration:
     @property
     def size(self) -> Size:
         """Height and width of the PSF and of a measurement."""
-        return self.psf.shape[-2], self.psf.shape[-1]
+        return size_of(self.psf)
 
     @property
     def binned_sensor(self) -> Sensor | None:
@@ -287,7 +287,7 @@ class Calibration:
 
     def check_fit(self, measurement: Measurement) -> None:
         """Raise a `ShapeError` unless the measurement (1, C, H, W) has the PSF's size, and colours if the PSF has."""
-        size = measurement.shape[-2], measurement.shape[-1]
+        size = size_of(measurement)
         if size != self.size:
             raise ShapeError(
                 f"`psf` ({self.size[0]} x {self.size[1]}) and the capture ({size[0]} x {size[1]}) must have the same "

@@ -19,7 +19,7 @@ from mwdn.errors import ParameterError
 from mwdn.optics.aperture import displaced_envelope
 from mwdn.optics.polynomials import frame_places, polynomial, polynomial_order
 from mwdn.optics.psf import unit_sum
-from mwdn.types import Image, Measurement, Psf, Size
+from mwdn.types import Image, Measurement, Psf, Size, size_of
 
 Coefficients = tuple[tuple[float, ...], ...]
 """Coefficients of polynomials: a row for each colour, or one for all."""
@@ -102,7 +102,7 @@ class Refinement:
         rows: Coefficients = getattr(self, name)
         if len(rows) == 3 and image.shape[1] == 1:
             raise ParameterError(f"`{name}` has a row for each colour, but the frame is grey. Refine with grey pairs.")
-        return smooth_field(rows, (image.shape[-2], image.shape[-1])).to(image)
+        return smooth_field(rows, size_of(image)).to(image)
 
 
 def displaced(psf: Psf, shift: tuple[float, float]) -> Psf:

@@ -7,7 +7,7 @@ from torch import Tensor
 from mwdn.calibration.refinement import Refinement
 from mwdn.io.files import atomic_write
 from mwdn.io.images import srgb_encode
-from mwdn.types import Psf
+from mwdn.types import Psf, size_of
 
 
 def write_refinement_page(path: Path, psf: Psf, refinement: Refinement, lines: list[str]) -> None:
@@ -24,7 +24,7 @@ def write_refinement_page(path: Path, psf: Psf, refinement: Refinement, lines: l
     """
     from matplotlib.figure import Figure
 
-    size = psf.shape[-2], psf.shape[-1]
+    size = size_of(psf)
     refined = refinement.psf(psf)
     maps: list[tuple[str, Tensor]] = []
     ratio = (refined / psf.clamp(min=1e-3 * float(psf.amax())))[0]

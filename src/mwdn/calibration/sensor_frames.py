@@ -16,7 +16,7 @@ from mwdn.calibration.hot_pixels import find_dead_pixels, find_hot_pixels
 from mwdn.calibration.noise_model import TYPICAL, fit_line
 from mwdn.calibration.photon_transfer import SAME_LIGHT, PhotonTransfer, photon_transfer
 from mwdn.errors import ParameterError, ShapeError
-from mwdn.types import Frame, Image, Plane, Size
+from mwdn.types import Frame, Image, Plane, Size, size_of
 
 MIN_RESPONSE = 0.1
 """Smallest value of a flat field: a pixel with less light is replaced, not amplified."""
@@ -195,7 +195,7 @@ def _with_flats(sensor: SensorFrames, files: SensorFiles, frames: FrameFormat) -
         notes.append("Without dark frames the flat field holds the black level, too: `--dark`.")
     flat, deviation, left_out = _mean_flat(flats, names, frames, dark)
     notes += left_out
-    sensor.check_size(f"Flat frames, as `{names[0]}`", (flat.shape[-2], flat.shape[-1]))
+    sensor.check_size(f"Flat frames, as `{names[0]}`", size_of(flat))
     defects = (torch.zeros(1, 1, *flat.shape[-2:]) > 0) if defects is None else defects
     plane, noise = flat.mean((0, 1)), deviation.mean((0, 1))
     if files.flat_field:

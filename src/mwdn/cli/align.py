@@ -34,7 +34,7 @@ from mwdn.registration.registration import Place, read_projection
 from mwdn.registration.residuals import Residuals
 from mwdn.registration.views import Views
 from mwdn.registration.warp import warp_pictures
-from mwdn.types import Image, Scene, Size
+from mwdn.types import Image, Scene, Size, size_of
 
 
 @no_empty_folder
@@ -168,7 +168,7 @@ def _align_session(task: _Task, capture: Path, out: Path, count: int, *, levels:
         all_or_nothing(out),
     ):
         rows, psf = chosen(len(pairs), count), pairs.calibration.psf
-        task.check_given((psf.shape[-2], psf.shape[-1]), pairs.picture_size)
+        task.check_given(size_of(psf), pairs.picture_size)
         reconstructor = task.prepare(pairs.calibration)
         first = reconstructor(pairs.measurement(rows[0]))
         if task.given is None:
@@ -198,7 +198,7 @@ def _align_frame(task: _Task, capture: Path, picture: Path | None, out: Path) ->
     measurement = read_capture(capture, task.calibration)
     shown = None if picture is None else as_light(read_frame(picture, upright=True), task.gamma or SRGB)[None]
     if shown is not None:
-        task.check_given((measurement.shape[-2], measurement.shape[-1]), (shown.shape[-2], shown.shape[-1]))
+        task.check_given(size_of(measurement), size_of(shown))
     reconstructor = task.prepare(task.calibration)
     scene = reconstructor(measurement)
     if shown is None:
@@ -230,7 +230,7 @@ def _outline(scene: Scene, linear: Scene, corners: Points | None) -> _Placed:
         corners = find_outline(np.sqrt(views.reconstructions[0]), views.reconstructions[1])
     place = Place.of(corners)
     shape = max(2, round(place.height)), max(2, round(place.width))
-    projection = through_corners(corners, shape, (scene.shape[-2], scene.shape[-1]))
+    projection = through_corners(corners, shape, size_of(scene))
     drawn = [draw_outline(image, corners) for image in (scene, linear)]
     sheet = contact_sheet([drawn], ["reconstruction", "Wiener filter"], height=drawn[0].shape[-2])
     return _Placed(projection, {**projection.to_dict(), "start": start}, sheet)

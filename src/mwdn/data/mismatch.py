@@ -11,6 +11,7 @@ from torch.nn import functional as F
 from mwdn.arguments import checked
 from mwdn.data.random import uniform
 from mwdn.errors import ParameterError
+from mwdn.optics.psf import unit_sum
 from mwdn.optics.warp import affine, hazed
 from mwdn.types import Psf, Size
 
@@ -185,8 +186,7 @@ def perturb(psf: Psf, mismatch: Mismatch, generators: list[torch.Generator]) -> 
     if mismatch.grain:
         noise = torch.stack([torch.randn(blurred.shape[1:], generator=g) for g in generators]).to(blurred)
         blurred = blurred * (1 + mismatch.grain * noise).clamp(min=0)
-    blurred = blurred / blurred.sum((-2, -1), keepdim=True).clamp(min=1e-12)
-    return hazed(blurred, mismatch.size(generators, mismatch.haze)[..., None, None].to(psf))
+    return hazed(unit_sum(blurred), mismatch.size(generators, mismatch.haze)[..., None, None].to(psf))
 
 
 def _blur(planes: Tensor, sigma: Tensor, largest: float = 1.0) -> Tensor:

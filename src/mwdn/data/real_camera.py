@@ -16,10 +16,11 @@ from mwdn.fourier.convolution import convolve
 from mwdn.optics.aperture import displaced_envelope, low_order_field, scattered
 from mwdn.optics.deviation import off_axis_change
 from mwdn.optics.field import FieldCamera, two_depths
+from mwdn.optics.psf import unit_sum
 from mwdn.optics.room_light import even_light, sloping_light, spot_light
 from mwdn.optics.sensor import Sensor, gamma_coded
 from mwdn.optics.warp import warp
-from mwdn.types import Image, Measurement, Psf, Scene, Size
+from mwdn.types import Image, Measurement, Psf, Scene, Size, size_of
 
 STREAM = 16
 """Number of the first option's random stream; `mwdn.data.cameras` has 7."""
@@ -56,7 +57,7 @@ class RealCamera:
 
     def psf(self, psf: Psf) -> Psf:
         """The PSF (B, C, h, w) of an uneven, displaced aperture that scatters light; sums of lit channels stay 1."""
-        size, changed = (psf.shape[-2], psf.shape[-1]), psf
+        size, changed = size_of(psf), psf
         if self.mismatch.envelope_shift:
             length, generators = self._amount("envelope_shift")
             angle = uniform(generators, 0.0, 2 * math.pi)
@@ -70,14 +71,14 @@ class RealCamera:
             smallest, largest = (min(size) * end for end in TAIL_RADIUS)
             radius = uniform(generators, math.log(smallest), math.log(largest)).exp()[..., None, None]
             changed = scattered(changed, part.to(psf), radius.to(psf))
-        return psf if changed is psf else changed / changed.sum((-2, -1), keepdim=True).clamp(min=1e-12)
+        return psf if changed is psf else unit_sum(changed)
 
     def forward(self, scene: Scene, psf: Psf) -> Measurement:
         """Light on the sensor, through PSFs that depend on the place in the scene and on its depth."""
         if not (self.mismatch.off_axis or self.mismatch.depth):
             return convolve(scene, psf)
         off_axis, depth = (self._amount(name)[0].flatten().tolist() for name in ("off_axis", "depth"))
-        near = self._outlines((scene.shape[-2], scene.shape[-1])).to(scene)
+        near = self._outlines(size_of(scene)).to(scene)
         parts = zip(scene, psf, near, off_axis, depth, strict=True)
         return torch.cat([field_camera(h[None], one[None], *sizes).forward(v[None]) for v, h, one, *sizes in parts])
 
@@ -86,7 +87,7 @@ class RealCamera:
         if not self.mismatch.room_light:
             return light
         share, generators = self._amount("room_light")
-        rooms = torch.stack([_room(generator, (light.shape[-2], light.shape[-1])) for generator in generators])
+        rooms = torch.stack([_room(generator, size_of(light)) for generator in generators])
         tint = 1 + TINT * uniform(generators, -1.0, 1.0, light.shape[1])[..., None, None]
         room = share * (tint / tint.mean(1, keepdim=True)) * rooms[:, None]
         return light + room.to(light) * light.mean((1, 2, 3), keepdim=True)
@@ -152,7 +153,7 @@ def field_camera(psf: Psf, is_near: Tensor, off_axis: float, depth: float) -> Fi
         off_axis: change to the corner, see `mwdn.optics.deviation.OFF_AXIS`; bilinear between 3 x 3 points.
         depth: relative magnification of the near PSF over the far one.
     """
-    size = psf.shape[-2], psf.shape[-1]
+    size = size_of(psf)
     points = POINTS if off_axis else POINTS[:1]
     change, grid = off_axis_change(off_axis, size), torch.zeros(len(points), 1, 3, 3, device=psf.device)
     for number, (y, x) in enumerate(points):

@@ -23,7 +23,7 @@ from mwdn.errors import ParameterError
 from mwdn.optics.field import FieldCamera
 from mwdn.optics.sensor import Sensor
 from mwdn.optics.warp import affine
-from mwdn.types import Measurement, Psf, Scene, Size
+from mwdn.types import Measurement, Psf, Scene, Size, size_of
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -191,7 +191,7 @@ class SimulatedPairs(Samples):
         psf = self.psf.expand(len(scene), -1, -1, -1)
         real = RealCamera(self.mismatch, tuple(map(self.sample_seed, numbers)), (False,) * len(scene))
         true = psf if self.camera else perturb(real.psf(psf), self.mismatch, generators)
-        factors = shading(self.mismatch, generators, (psf.shape[-2], psf.shape[-1])).to(psf)
+        factors = shading(self.mismatch, generators, size_of(psf)).to(psf)
         if self.mismatch.exact:
             exact = (uniform(generators, 0.0, 1.0)[..., None, None] < self.mismatch.exact).to(psf.device)
             true, factors = torch.where(exact, psf, true), torch.where(exact, 1.0, factors)

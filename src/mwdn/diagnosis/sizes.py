@@ -21,7 +21,7 @@ from mwdn.diagnosis.orientation import CLEAR, HALF_TURNS, QUARTER_TURNS, Orienta
 from mwdn.diagnosis.verdict import Verdict
 from mwdn.errors import ShapeError
 from mwdn.optics.orientation import Orientation, compose
-from mwdn.types import Measurement, Psf, Size
+from mwdn.types import Measurement, Psf, Size, size_of
 
 BINS = range(1, 9)
 """Bins of the PSF or the capture that are tried."""
@@ -118,7 +118,7 @@ def _options(fit: Fit, calibration: Calibration, *, cropped: bool) -> str:
 
 def mismatch(error: ShapeError, measurement: Measurement, calibration: Calibration) -> ShapeError:
     """The error of `Calibration.check_fit`; for sizes that differ, with the bin and crop that explain the capture."""
-    capture, psf = ((image.shape[-2], image.shape[-1]) for image in (measurement, calibration.psf))
+    capture, psf = (size_of(image) for image in (measurement, calibration.psf))
     if capture == psf:
         return error
     verdict = fitting_size(measurement, calibration)

@@ -23,7 +23,7 @@ from torch.nn import functional as F
 from mwdn.fourier.convolution import convolve, correlate
 from mwdn.fourier.transforms import column_counts, fast_length, inverse_spectrum, spectrum
 from mwdn.solvers.alignment import fine_detail
-from mwdn.types import Measurement, Psf, Scene
+from mwdn.types import TINY, Measurement, Psf, Scene, size_of
 
 PARTS_PER_SIDE = 20
 """Parts along the shorter side of a picture."""
@@ -53,7 +53,7 @@ def support_map(measurement: Measurement, psf: Psf, scene: Scene) -> Support:
         psf: (1, 1 or C, H, W), centred, in its best pose.
         scene: (1, C, H, W), the reconstruction.
     """
-    unit = measurement.abs().amax().clamp(min=torch.finfo(torch.float32).tiny)
+    unit = measurement.abs().amax().clamp(min=TINY)
     d, psf = fine_detail(measurement.float() / unit), psf.float().expand(-1, measurement.shape[1], -1, -1)
     s = fine_detail(convolve(scene.float() / unit, psf))
     gain = ((s * d).sum((-2, -1), keepdim=True) / s.square().sum((-2, -1), keepdim=True).clamp(min=1e-30)).clamp(min=0)
@@ -94,7 +94,7 @@ def _autocorrelation(h: Psf, reach: int) -> Tensor:
 
 def _energies(parts: Tensor, nearby: Tensor) -> Tensor:
     """``<x_B, H^T H x_B>`` of each part, (parts,)."""
-    grid = nearby.shape[-2], nearby.shape[-1]
+    grid = size_of(nearby)
     counts = column_counts(grid[1], device=parts.device)
     power = spectrum(parts, grid).abs().square() * spectrum(nearby, grid).real * counts
     return power.sum((1, 2, 3)) / (grid[0] * grid[1])

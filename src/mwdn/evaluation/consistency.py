@@ -26,7 +26,7 @@ from mwdn.optics.psf import checked_psf
 from mwdn.optics.saturation import saturated_pixels
 from mwdn.solvers.alignment import align, fine_detail
 from mwdn.solvers.pose import Pose
-from mwdn.types import Measurement, Psf, Scene
+from mwdn.types import TINY, Measurement, Psf, Scene
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def consistency(measurement: Measurement, psf: Psf, scene: Scene, *, pose: Pose 
         )
     psf = checked_psf(psf)
     pose = pose or align(measurement, psf)
-    unit = measurement.abs().amax().clamp(min=torch.finfo(torch.float32).tiny)
+    unit = measurement.abs().amax().clamp(min=TINY)
     measurement, scene = measurement.float() / unit, scene.float() / unit
     aligned = pose.move(psf)
     d = fine_detail(measurement)

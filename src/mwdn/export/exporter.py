@@ -29,7 +29,7 @@ from mwdn.io.files import refuse_overwrite
 from mwdn.io.pictures import dark_scene
 from mwdn.networks.network import Network, as_network
 from mwdn.optics import Camera, Sensor
-from mwdn.types import Measurement, Psf, Scene
+from mwdn.types import Measurement, Psf, Scene, size_of
 from mwdn.version import __version__
 
 Precision = Literal["float32", "float16", "int8"]
@@ -76,7 +76,7 @@ class FixedPsf(nn.Module):
         if not isinstance(method, nn.Module):
             return
         network = as_network(copy.deepcopy(method)).cpu().float().eval().requires_grad_(False)
-        tensors, self.layout = tree_flatten(network.prepare(psf, (psf.shape[-2], psf.shape[-1])))
+        tensors, self.layout = tree_flatten(network.prepare(psf, size_of(psf)))
         self.names = [f"prepared_{index}" for index in range(len(tensors))]
         for name, tensor in zip(self.names, tensors, strict=True):
             self.register_buffer(name, tensor)

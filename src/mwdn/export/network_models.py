@@ -18,7 +18,7 @@ from mwdn.export.onnx_program import to_onnx
 from mwdn.inference.fusion import fuse
 from mwdn.networks.network import Network, as_network
 from mwdn.runtime.requirement import require
-from mwdn.types import Measurement, Psf, Scene, Size
+from mwdn.types import Measurement, Psf, Scene, Size, size_of
 
 
 class NetworkModels(NamedTuple):
@@ -40,7 +40,7 @@ class _Prepare(nn.Module):
         self.network = network
 
     def forward(self, psf: Psf) -> tuple[Tensor, ...]:
-        tensors, _ = tree_flatten(self.network.prepare(psf, (psf.shape[-2], psf.shape[-1])))
+        tensors, _ = tree_flatten(self.network.prepare(psf, size_of(psf)))
         return tuple(_parts(tensors))
 
 

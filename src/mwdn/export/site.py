@@ -168,15 +168,18 @@ def _camera(calibration: Calibration, about: Mapping[str, str], channels: int, s
 
 
 def _in_words(calibration: Calibration) -> str:
-    frames, words = calibration.frames, []
-    words += [] if frames.bit_depth is None else [f"{frames.bit_depth} bits"]
-    words += [] if frames.mosaic is None else [f"mosaic {frames.mosaic}"]
-    words += [] if frames.crop is None else [f"cropped to {frames.crop[0]} x {frames.crop[1]}"]
-    words += [] if frames.bin == 1 else [f"binned by {frames.bin}"]
-    words += [] if frames.gamma is None else [f"gamma {frames.gamma}"]
-    words += [] if calibration.dark is None else ["dark frame subtracted"]
-    words += [] if calibration.ambient is None else ["light of the room subtracted"]
-    return ", ".join(words)
+    """What the page does with a frame, for its visitors; `mwdn.export.exporter` says what a program must do."""
+    frames = calibration.frames
+    steps = (
+        "" if frames.bit_depth is None else f"{frames.bit_depth} bits",
+        "" if frames.mosaic is None else f"mosaic {frames.mosaic}",
+        "" if frames.crop is None else f"cropped to {frames.crop[0]} x {frames.crop[1]}",
+        "" if frames.bin == 1 else f"binned by {frames.bin}",
+        "" if frames.gamma is None else f"gamma {frames.gamma}",
+        "" if calibration.dark is None else "dark frame subtracted",
+        "" if calibration.ambient is None else "light of the room subtracted",
+    )
+    return ", ".join(filter(None, steps))
 
 
 def _images(calibration: Calibration) -> dict[str, Tensor]:

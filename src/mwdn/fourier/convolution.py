@@ -7,7 +7,7 @@ from torch import Tensor
 from mwdn.arguments import check_batch, checked
 from mwdn.errors import ShapeError
 from mwdn.fourier.transforms import fast_length, inverse_spectrum, spectrum, transfer_function
-from mwdn.types import Image, Measurement, Psf, Scene, Size, Spectrum
+from mwdn.types import Image, Measurement, Psf, Scene, Size, Spectrum, size_of
 
 
 def _operator(psf: Tensor, scene: Size, sensor: Size, *, circular: bool) -> tuple[Spectrum, Size]:
@@ -72,8 +72,8 @@ def convolve(scene: Scene, psf: Psf, *, size: Size | None = None, circular: bool
         Eq. (1) of the MWDN paper, without the noise.
     """
     check_fit(scene, psf, "scene")
-    size = size or (scene.shape[-2], scene.shape[-1])
-    transfer, grid = _operator(psf, (scene.shape[-2], scene.shape[-1]), size, circular=circular)
+    size = size or size_of(scene)
+    transfer, grid = _operator(psf, size_of(scene), size, circular=circular)
     return inverse_spectrum(spectrum(scene, grid) * transfer, grid, size)
 
 
@@ -94,8 +94,8 @@ def correlate(measurement: Measurement, psf: Psf, *, size: Size | None = None, c
         ShapeError: as for `convolve`.
     """
     check_fit(measurement, psf, "measurement")
-    size = size or (measurement.shape[-2], measurement.shape[-1])
-    transfer, grid = _operator(psf, size, (measurement.shape[-2], measurement.shape[-1]), circular=circular)
+    size = size or size_of(measurement)
+    transfer, grid = _operator(psf, size, size_of(measurement), circular=circular)
     return inverse_spectrum(spectrum(measurement, grid) * transfer.conj(), grid, size)
 
 

@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 from mwdn.fourier.memory_format import as_channels, as_complex, chunked, chunks, contiguous_planes, match_format
 from mwdn.fourier.padding import Boundary, border_weights, check_grid
 from mwdn.fourier.transforms import filter_field, inverse_spectrum, plane_spectrum
-from mwdn.types import Size, Spectrum
+from mwdn.types import Size, Spectrum, size_of
 
 
 class FastFilter(torch.autograd.Function):
@@ -48,7 +48,7 @@ class FastFilter(torch.autograd.Function):
         planes = contiguous_planes(image) if needs_transfer else image
         image_gradient = torch.empty_like(gradient) if needs_image else None
         transfer_gradient = torch.zeros_like(transfer) if needs_transfer else None
-        padding = Padding((image.shape[-2], image.shape[-1]), grid, ctx.boundary, gradient)
+        padding = Padding(size_of(image), grid, ctx.boundary, gradient)
         for part in chunks(gradient, grid):
             G = plane_spectrum(gradient[part], grid)
             if transfer_gradient is not None:  # (2)
@@ -70,7 +70,7 @@ def filter_planes(image: Tensor, transfer: Tensor, grid: Size, boundary: Boundar
 
     The reference spends most of its time on allocating memory for whole spectra.
     """
-    planes, size = contiguous_planes(image), (image.shape[-2], image.shape[-1])
+    planes, size = contiguous_planes(image), size_of(image)
     result = torch.empty_like(planes)
     padding = Padding(size, grid, boundary, planes)
     for part in chunks(planes, grid):
@@ -85,7 +85,7 @@ def filter_pairs(image: Tensor, transfer: Tensor, grid: Size, boundary: Boundary
     A two-dimensional complex transform is one call of MKL in each direction; the real inverse takes several, with
     copies between them. ``transfer`` is a `whole_spectrum`.
     """
-    pairs, (height, width) = as_complex(image), (image.shape[-2], image.shape[-1])
+    pairs, (height, width) = as_complex(image), size_of(image)
     result = torch.empty(pairs.shape, dtype=image.dtype, device=image.device)
     padding = Padding((height, width), grid, boundary, image)
     for part in chunks(pairs, grid):

@@ -6,7 +6,7 @@ from torch import Tensor
 from mwdn.fourier.fast_filter import FastFilter
 from mwdn.fourier.padding import Boundary, pad
 from mwdn.fourier.transforms import inverse_spectrum, spectrum
-from mwdn.types import Size
+from mwdn.types import Size, size_of
 
 
 def filter_image(image: Tensor, transfer: Tensor, grid: Size, boundary: Boundary) -> Tensor:
@@ -33,4 +33,4 @@ def filter_image(image: Tensor, transfer: Tensor, grid: Size, boundary: Boundary
 def reference_filter(image: Tensor, transfer: Tensor, grid: Size, boundary: Boundary) -> Tensor:
     """`filter_image` by its definition, ``y = C F^-1(T F(P x))``, for tests and for compilers."""
     V = transfer * spectrum(pad(image.float(), grid, boundary), grid)
-    return inverse_spectrum(V, grid, (image.shape[-2], image.shape[-1])).to(image.dtype)
+    return inverse_spectrum(V, grid, size_of(image)).to(image.dtype)

@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.errors import ParameterError, ShapeError
-from mwdn.types import Image, Size
+from mwdn.types import Image, Size, size_of
 
 Boundary = Literal["circular", "zero", "replicate", "taper"]
 """Values beyond the measurement's border while it is deconvolved.
@@ -33,7 +33,7 @@ def pad(image: Image, grid: Size, boundary: Boundary) -> Tensor:
     Raises:
         ShapeError, ParameterError: as for `check_grid`.
     """
-    size = image.shape[-2], image.shape[-1]
+    size = size_of(image)
     check_grid(size, grid, boundary)
     if size == grid or boundary == "circular":
         return image

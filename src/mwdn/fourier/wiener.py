@@ -8,7 +8,7 @@ from mwdn.fourier.convolution import check_fit
 from mwdn.fourier.filtering import filter_image
 from mwdn.fourier.padding import Boundary
 from mwdn.fourier.transforms import fast_length, transfer_function
-from mwdn.types import Image, Measurement, Psf, Size, Spectrum
+from mwdn.types import Image, Measurement, Psf, Size, Spectrum, size_of
 
 
 def deconvolution_grid(size: Size, boundary: Boundary) -> Size:
@@ -52,7 +52,7 @@ def wiener(
                 f"`regularisation` {tuple(regularisation.shape)} must broadcast against (B, C, 1, 1) of `measurement` "
                 f"{tuple(measurement.shape)}. For one a channel: `regularisation.reshape(1, -1, 1, 1)`."
             )
-    grid = deconvolution_grid((measurement.shape[-2], measurement.shape[-1]), boundary)
+    grid = deconvolution_grid(size_of(measurement), boundary)
     return filter_image(measurement.float(), wiener_transfer(psf, regularisation, grid), grid, boundary)
 
 

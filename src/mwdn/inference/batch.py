@@ -36,7 +36,7 @@ from mwdn.runtime import distributed
 from mwdn.runtime.iterations import watch_iterations
 from mwdn.runtime.streams import prefetch
 from mwdn.runtime.transfers import to_host
-from mwdn.types import Measurement, Scene, Size
+from mwdn.types import Measurement, Scene, Size, size_of
 
 SHOWN = 12
 """Number of captures on the summary: the first ones."""
@@ -185,7 +185,7 @@ class Batch:
 
     def _check(self, measurement: Measurement) -> None:
         """`CapturePipeline.check`; captures of a size that was refused before are refused for the same reason."""
-        size = (measurement.shape[-2], measurement.shape[-1])
+        size = size_of(measurement)
         if size in self._refused:
             raise ShapeError(self._refused[size])
         try:

@@ -12,7 +12,7 @@ from mwdn.inference.fusion import fuse
 from mwdn.networks.network import Network, Prepared
 from mwdn.optics.psf import checked_psf
 from mwdn.runtime.devices import has_bfloat16, without_tf32
-from mwdn.types import Measurement, Psf, Scene
+from mwdn.types import Measurement, Psf, Scene, size_of
 
 Precision = Literal["fast", "exact"]
 """Precision of a network's convolutions. Fourier transforms are float32 in both.
@@ -91,7 +91,7 @@ class Engine(Generic[Prepared]):
 
     def _reconstruct(self, measurement: Tensor) -> Tensor:
         if self.prepared is None:
-            self.prepared = self.exact.prepare(self.psf, (self.psf.shape[-2], self.psf.shape[-1]))
+            self.prepared = self.exact.prepare(self.psf, size_of(self.psf))
         return self.network.reconstruct(measurement, self.prepared).float()
 
 

@@ -20,7 +20,7 @@ from mwdn.networks.wiener_filter import WienerFilter, normalise_psf
 from mwdn.networks.wiener_unet import WienerUNet
 from mwdn.optics.psf import checked_psf
 from mwdn.solvers.alignment import align
-from mwdn.types import Measurement, Psf, Scene
+from mwdn.types import Measurement, Psf, Scene, size_of
 
 Kind = Literal["light", "psf", "features", "change"]
 """How a picture is displayed: linear light, a PSF, features of any sign, or a change of the picture around 0."""
@@ -128,7 +128,7 @@ def _scale_rows(network: Mwdn | MwdnCpsf, measurement: Measurement, psf: Psf, re
     The contribution of a filter is the change of the picture if its features are replaced by their means over the
     frame: these have no spatial information, but the level that the decoder expects.
     """
-    size = (measurement.shape[-2], measurement.shape[-1])
+    size = size_of(measurement)
     given = normalise_psf(psf, size, network.channels, stored=network.stored_psf)
     psfs = network.pyramid(given)
     *features, bottom = network.encoder(measurement)
@@ -169,7 +169,7 @@ def _used_psfs(network: Mwdn | MwdnCpsf, psf: Tensor) -> list[Panel]:
 
 def _single_row(network: WienerNetwork | WienerUNet, measurement: Measurement, psf: Psf, result: Scene) -> Row:
     wiener = network if isinstance(network, WienerNetwork) else network.wiener
-    size = (measurement.shape[-2], measurement.shape[-1])
+    size = size_of(measurement)
     used = normalise_psf(psf, size, stored=wiener.stored_psf)
     estimate = wiener.reconstruct(measurement, wiener.prepare(psf, size))
     panels = [Panel("PSF used", used, "psf"), Panel("Wiener estimate", estimate)]
@@ -206,7 +206,7 @@ def _iterations_row(network: WienerBank, measurement: Measurement, psf: Psf, sce
     """The scene after the iterations and plug and play; with plug and play, also the one before it and the change."""
     panels = [Panel("iterations", scene)]
     if network.rounds:
-        prepared = network.prepare(psf, (measurement.shape[-2], measurement.shape[-1]))
+        prepared = network.prepare(psf, size_of(measurement))
         start = network.iterate(measurement.float(), prepared).scene
         after = Panel(f"after {network.rounds} rounds", scene)
         panels = [Panel("iterations", start), after, Panel("the rounds' change", scene - start, "change")]

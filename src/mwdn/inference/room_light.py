@@ -32,7 +32,7 @@ from mwdn.solvers.levels import LEVELS
 from mwdn.solvers.light_spot import find_spot, refine_spot
 from mwdn.solvers.pyramid import MIXED, PsfPyramid, halve
 from mwdn.solvers.smooth_light import dark_part, find_smooth_light
-from mwdn.types import Measurement, Psf
+from mwdn.types import TINY, Measurement, Psf, size_of
 from mwdn.weights.bundled import bundled_file
 from mwdn.weights.tensors import fill, read_header, read_tensors
 
@@ -81,15 +81,15 @@ def find_room_light(measurement: Measurement, psf: Psf) -> RoomLight:
     # The mean is the unit below. That of darkness less its dark frame may be negative.
     usable = b.isfinite().flatten(1).all(1) & (b.mean((-2, -1)) >= 0).all(1)
     b = torch.where(usable[:, None, None, None], b, 1.0)
-    size = b.shape[-2], b.shape[-1]
+    size = size_of(b)
     if min(size) < 2:  # a slope needs two pixels
         return RoomLight(torch.zeros_like(measurement), b.new_zeros(len(b)))
-    mean = b.mean((-2, -1), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
+    mean = b.mean((-2, -1), keepdim=True).clamp(min=TINY)
     y, h, saturated = halved(b / mean, psf, PIXELS)
     spot = find_spot(y, h, saturated)
     if spot.amplitude.any():
         spot = refine_spot(*halved(b / mean, psf, 4 * PIXELS), spot)
-    y, spot_light = subtract_light(y, spot.light((y.shape[-2], y.shape[-1]))), spot.light(size) * mean
+    y, spot_light = subtract_light(y, spot.light(size_of(y))), spot.light(size) * mean
     smooth, clear = find_smooth_light(y, h)
     light = smooth.on(size) * mean
     if not clear.all():
@@ -112,7 +112,7 @@ def halved(y: Measurement, psf: Psf, pixels: int) -> tuple[Tensor, Tensor, Tenso
 
 def _learned_light(b: Measurement, psf: Psf, coarse: tuple[Tensor, Tensor]) -> Measurement:
     """What the network finds in coarse captures and PSFs, for captures (B, C, H, W); 0 where it does not count."""
-    size = b.shape[-2], b.shape[-1]
+    size = size_of(b)
     light = F.interpolate(estimate_room_light(*coarse), size, mode="bilinear")
     counts = light.mean((1, 2, 3)) > MIN_ROOM_LIGHT * b.mean((1, 2, 3))
     if counts.any():
@@ -131,7 +131,7 @@ def estimate_room_light(b: Measurement, psf: Psf) -> Measurement:
     Returns:
         (B, C, h, w), not negative.
     """
-    unit = b.mean((-2, -1), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
+    unit = b.mean((-2, -1), keepdim=True).clamp(min=TINY)
     return (_network(b.device)(clues(b / unit, psf)) * unit).clamp(min=0)
 
 

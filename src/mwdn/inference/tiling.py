@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mwdn.networks.blocks import Decoder, Encoder, check_channels, check_sides
-from mwdn.types import Size
+from mwdn.types import Size, size_of
 
 Rows = Callable[[int, int], Tensor]
 """Rows ``first`` to ``last`` of a picture, (B, C, last - first, W), as a function of both."""
@@ -34,7 +34,7 @@ class StripEncoder(nn.Module):
         """Features, finest first."""
         check_channels(picture, self.channels)
         check_sides(picture, len(self.scales) - 1)
-        size = picture.shape[-2], picture.shape[-1]
+        size = size_of(picture)
         limit = self.max_strip_numbers
         features = [apply_in_strips(self.scales[0], size, lambda first, last: picture[..., first:last, :], limit)]
         for scale in self.scales[1:]:
@@ -60,7 +60,7 @@ class StripDecoder(nn.Module):
         x = features.pop()
         for scale in self.scales:
             skip = features.pop()
-            size = skip.shape[-2], skip.shape[-1]
+            size = size_of(skip)
 
             def joined(first: int, last: int, skip: Tensor = skip, x: Tensor = x, size: Size = size) -> Tensor:
                 return torch.cat([skip[..., first:last, :], upsample_rows(x, size, first, last)], dim=1)

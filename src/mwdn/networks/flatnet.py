@@ -15,7 +15,7 @@ from mwdn.networks.flatnet_unet import FlatNetUNet
 from mwdn.networks.network import Network
 from mwdn.networks.wiener_filter import normalise_psf
 from mwdn.optics.psf import unit_sum
-from mwdn.types import Measurement, Psf, Scene, Size, Transfer
+from mwdn.types import Measurement, Psf, Scene, Size, Transfer, size_of
 
 
 class FlatNet(Network[Tensor]):
@@ -78,7 +78,7 @@ class FlatNet(Network[Tensor]):
 
     def inverse(self, measurement: Measurement, prepared: Transfer) -> Tensor:
         """Measurement (B, C, H, W) deconvolved with the learned filter."""
-        size = measurement.shape[-2], measurement.shape[-1]
+        size = size_of(measurement)
         return filter_image(measurement.float(), prepared, deconvolution_grid(size, self.boundary), self.boundary)
 
     def reconstruct(self, measurement: Measurement, prepared: Transfer) -> Scene:

@@ -111,7 +111,7 @@ class Ifin(Network[IfinPsfs]):
         result, grey = [], psf.mean(1, keepdim=True)
         for gain, features in zip(self.log_gain.exp(), self.psf_encoder(psf), strict=True):
             kernels = grey / grey.amax((-2, -1), keepdim=True) + gain * features.float()
-            result.append(kernels / kernels.sum((-2, -1), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny))
+            result.append(unit_sum(kernels))
             grey = F.avg_pool2d(grey, 2)
         return result
 

@@ -12,7 +12,7 @@ from mwdn.networks.network import Network
 from mwdn.networks.wiener_filter import check_size, unit_psf
 from mwdn.solvers.proximal import Variation
 from mwdn.solvers.splitting import Penalties, Problem, initial_state, make_filters, rescale, update_copies, update_scene
-from mwdn.types import Measurement, Psf, Scene, Size, Transfer
+from mwdn.types import TINY, Measurement, Psf, Scene, Size, Transfer
 
 
 class LeAdmm(Network[Tensor]):
@@ -97,4 +97,4 @@ class LeAdmm(Network[Tensor]):
 
 def divide_by_maximum(picture: Tensor) -> Tensor:
     """Divide each picture by its largest value."""
-    return picture / picture.amax((1, 2, 3), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
+    return picture / picture.amax((1, 2, 3), keepdim=True).clamp(min=TINY)

@@ -9,7 +9,7 @@ from mwdn.arguments import checked
 from mwdn.errors import ParameterError
 from mwdn.fourier.convolution import check_fit
 from mwdn.optics.psf import checked_psf
-from mwdn.types import Measurement, Psf, Scene, Size
+from mwdn.types import Measurement, Psf, Scene, Size, size_of
 
 Prepared = TypeVar("Prepared")
 """What a network computes from the PSF alone: tensors, or tuples and lists of tensors."""
@@ -97,7 +97,7 @@ class Network(nn.Module, Generic[Prepared]):
         weights = next(self.parameters(), psf)
         measurement, psf = measurement.to(weights.dtype), psf.to(torch.promote_types(weights.dtype, torch.float32))
         try:
-            return self.reconstruct(measurement, self.prepare(psf, (measurement.shape[-2], measurement.shape[-1])))
+            return self.reconstruct(measurement, self.prepare(psf, size_of(measurement)))
         except RuntimeError as error:  # Fourier transforms give float32, which layers of other weights refuse
             if weights.dtype == torch.float32 or isinstance(error, torch.OutOfMemoryError):
                 raise

@@ -13,7 +13,7 @@ from mwdn.fourier.transforms import inverse_spectrum, spectrum
 from mwdn.solvers.light_spot import cosines
 from mwdn.solvers.pyramid import PsfPyramid
 from mwdn.solvers.smooth_light import COARSEST, bright_mask, on_grid
-from mwdn.types import Measurement, Psf
+from mwdn.types import Measurement, Psf, size_of
 
 MAX_FREQUENCY = 3.0
 """Highest frequency of the light in half periods over the frame's width: planes, and spots with a standard deviation of
@@ -35,7 +35,7 @@ def clues(b: Measurement, psf: Psf) -> Tensor:
     7. the residual: the capture less 4 to 6
     8. the logarithm of the noise
     """
-    size = b.shape[-2], b.shape[-1]
+    size = size_of(b)
     estimate = PsfPyramid.from_psf(psf, size, (COARSEST,)).solve(b)
     (band,) = estimate.psf.bands
     whole, frame = estimate.grid_scene, estimate.scene
@@ -99,5 +99,5 @@ def _enlarged(features: Tensor, like: Tensor) -> Tensor:
 
 def _smooth(light: Tensor) -> Tensor:
     """The part of light (B, C, h, w) that consists of the cosines up to `MAX_FREQUENCY`."""
-    basis = cosines((light.shape[-2], light.shape[-1]), light.device, MAX_FREQUENCY)
+    basis = cosines(size_of(light), light.device, MAX_FREQUENCY)
     return (basis.coefficients(light.float()) @ basis.light.flatten(1)).view(light.shape)

@@ -13,7 +13,7 @@ from mwdn.networks.blocks import check_channels, resize
 from mwdn.networks.flatnet_unet import FlatNetUNet
 from mwdn.networks.network import Network
 from mwdn.networks.wiener_filter import normalise_psf
-from mwdn.types import Measurement, Psf, Scene, Size
+from mwdn.types import Measurement, Psf, Scene, Size, size_of
 
 
 def field_weights(side: int, size: Size, device: torch.device) -> Tensor:
@@ -91,7 +91,7 @@ class SvDeconv(Network[Tensor]):
         """
         check_channels(measurement, self.channels)
         total = prepared.sum((-2, -1), keepdim=True)
-        size = measurement.shape[-2], measurement.shape[-1]
+        size = size_of(measurement)
         grid = deconvolution_grid(size, self.boundary)
         B = spectrum(pad(measurement.float(), grid, self.boundary), grid)
         corrections = torch.split(resize(self.correction, size), 1, dim=1)

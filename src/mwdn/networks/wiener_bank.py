@@ -25,7 +25,7 @@ from mwdn.optics.shading import shade
 from mwdn.solvers.levels import LEVELS, pyramid_levels
 from mwdn.solvers.plug_and_play import Denoiser, plug_and_play
 from mwdn.solvers.pyramid import Band, Estimate, PsfPyramid
-from mwdn.types import Measurement, Psf, Scene, Size
+from mwdn.types import TINY, Measurement, Psf, Scene, Size, size_of
 
 BOUNDARY: Boundary = "taper"
 """Boundary handling where the bank filters the measurement itself."""
@@ -184,7 +184,7 @@ class WienerBank(FixedFront[BankTransfers]):
         """
         if measurement.shape[1] == 1:
             measurement = measurement.expand(-1, self.channels, -1, -1)
-        return self._estimates(measurement, self.prepare(psf, (measurement.shape[-2], measurement.shape[-1])))
+        return self._estimates(measurement, self.prepare(psf, size_of(measurement)))
 
     def _estimates(self, measurement: Measurement, prepared: BankTransfers) -> Tensor:
         b = measurement.float()
@@ -220,7 +220,7 @@ class WienerBank(FixedFront[BankTransfers]):
 
     def _filter(self, picture: Tensor, transfers: tuple[Tensor, ...], boundary: Boundary) -> list[Tensor]:
         """Wiener filters of the bank, applied to one spectrum."""
-        size = picture.shape[-2], picture.shape[-1]
+        size = size_of(picture)
         grid = deconvolution_grid(size, BOUNDARY)
         # `spectrum` pads with zeros itself and skips the empty rows.
         B = spectrum(picture if boundary == "zero" else pad(picture, grid, boundary), grid)
@@ -229,7 +229,7 @@ class WienerBank(FixedFront[BankTransfers]):
     def unit(self, estimates: Tensor) -> Tensor:
         """Maximum of the smoothest of the `estimates`, (B, 1, 1, 1)."""
         brightest = estimates[:, : self.channels].detach().amax((1, 2, 3), keepdim=True)
-        return brightest.clamp(min=torch.finfo(torch.float32).tiny)
+        return brightest.clamp(min=TINY)
 
     def correct(self, estimates: Tensor, unit: Tensor) -> Scene:
         """Scene (B, C, H, W) from `estimates` or a crop of them: the U-Net's correction added to the smoothest."""
@@ -251,23 +251,27 @@ class WienerBank(FixedFront[BankTransfers]):
         return min(self.block, *(n - 1 for n in estimates.shape[-2:]))
 
     def _correct(self, estimates: Tensor, unit: Tensor) -> Scene:
-        first = estimates[:, : self.channels]
-        height, width = estimates.shape[-2:]
-        # To whole blocks, and at least 32 x 32 of them.
-        below, right = (max(-size % self.fold, 32 * self.fold - size) for size in (height, width))
+        """Smoothest estimate + unit * correction; the U-Net works on blocks of ``fold`` x ``fold`` pixels."""
+        height, width = size_of(estimates)
+        rows, columns = (-(-side // self.fold) for side in (height, width))
+        output = self.decoder(self.encoder(self._unet_inputs(estimates, unit)))[..., :rows, :columns]
+        correction = pixel_shuffle(self._limit_light(output), self.fold)[..., :height, :width]
+        return estimates[:, : self.channels] + unit * correction
+
+    def _unet_inputs(self, estimates: Tensor, unit: Tensor) -> Tensor:
+        """The pictures in whole blocks, at least 32 x 32 of them, and the evidence at one pixel of each block."""
+        below, right = (max(-side % self.fold, 32 * self.fold - side) for side in size_of(estimates))
         if below or right:
             estimates = F.pad(estimates, (0, right, 0, below))
-        rows, columns = (-(-size // self.fold) for size in (height, width))
-        inputs = pixel_unshuffle(estimates[:, : self.pictures], self.fold).div_(unit)
-        if self.has_evidence:
-            evidence = estimates[:, self.pictures :, :: self.fold, :: self.fold]  # smooth
-            light, maps = evidence[:, : self.channels], evidence[:, self.channels :]
-            evidence = torch.cat([light / unit, maps], dim=1).contiguous(memory_format=torch.channels_last)
-            inputs = torch.cat([inputs, evidence], dim=1)
-        correction = self._lit(self.decoder(self.encoder(inputs))[..., :rows, :columns])
-        return first + unit * pixel_shuffle(correction, self.fold)[..., :height, :width]
+        pictures = pixel_unshuffle(estimates[:, : self.pictures], self.fold).div_(unit)
+        if not self.has_evidence:
+            return pictures
+        evidence = estimates[:, self.pictures :, :: self.fold, :: self.fold]  # smooth
+        light, maps = evidence[:, : self.channels], evidence[:, self.channels :]
+        evidence = torch.cat([light / unit, maps], dim=1).contiguous(memory_format=torch.channels_last)
+        return torch.cat([pictures, evidence], dim=1)
 
-    def _lit(self, output: Tensor) -> Tensor:
+    def _limit_light(self, output: Tensor) -> Tensor:
         """The U-Net's correction, whose mean light is limited by `MeanLight`."""
         correction = output[:, : self.channels * self.fold**2]
         if self.mean_light == "free" or not self.levels:

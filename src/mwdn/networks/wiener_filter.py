@@ -14,7 +14,7 @@ from mwdn.fourier.memory_format import chunked
 from mwdn.fourier.padding import Boundary
 from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
 from mwdn.optics.psf import checked_psf
-from mwdn.types import Psf, Size
+from mwdn.types import Psf, Size, size_of
 
 
 class WienerFilter(nn.Module):
@@ -46,15 +46,20 @@ class WienerFilter(nn.Module):
     ) -> None:
         super().__init__()
         self.boundary, self.linear, self.has_weight = boundary, linear, weight is not None
-        for name, value in (("regularisation", regularisation), ("weight", weight)):
-            if value is None:
-                continue
-            if not value > 0 and not (linear and name == "weight"):
-                why = "a filter with a negative lambda has poles" if linear else "its logarithm is learned"
-                raise ParameterError(f"`{name}` ({value}) must be positive: {why}.")
-            # The names tell `mwdn.training.schedule.make_optimiser` which numbers are logarithms.
-            learned = torch.tensor(float(value) if linear else math.log(value))
-            setattr(self, f"linear_{name}" if linear else f"log_{name}", nn.Parameter(learned))
+        if not regularisation > 0:
+            why = "a filter with a negative lambda has poles" if linear else "its logarithm is learned"
+            raise ParameterError(f"`regularisation` ({regularisation}) must be positive: {why}.")
+        if weight is not None and not weight > 0 and not linear:
+            raise ParameterError(f"`weight` ({weight}) must be positive: its logarithm is learned.")
+        # The names tell `mwdn.training.schedule.make_optimiser` which numbers are logarithms.
+        if linear:
+            self.linear_regularisation = _parameter(regularisation)
+            if weight is not None:
+                self.linear_weight = _parameter(weight)
+        else:
+            self.log_regularisation = _parameter(math.log(regularisation))
+            if weight is not None:
+                self.log_weight = _parameter(math.log(weight))
 
     @property
     def weight(self) -> Tensor | None:
@@ -96,11 +101,15 @@ class WienerFilter(nn.Module):
 
     def grid(self, image: Tensor) -> Size:
         """Size of the Fourier transforms for features or a PSF of this size."""
-        return deconvolution_grid((image.shape[-2], image.shape[-1]), self.boundary)
+        return deconvolution_grid(size_of(image), self.boundary)
 
     def _channels_per_chunk(self, grid: Size) -> int:
         """Channels whose transfer functions are computed at once: intermediate arrays take ten times their memory."""
         return max(1, self.max_grid_pixels // (32 * grid[0] * grid[1]))
+
+
+def _parameter(value: float) -> nn.Parameter:
+    return nn.Parameter(torch.tensor(float(value)))
 
 
 class WienerFilters(nn.ModuleList):

@@ -8,7 +8,7 @@ from torch import Tensor
 from mwdn.fourier.transforms import fast_length, frequency_grid, inverse_spectrum, spectrum
 from mwdn.optics.field import gaussian_blur
 from mwdn.optics.warp import warp
-from mwdn.types import Psf, Size
+from mwdn.types import Psf, Size, size_of
 
 ENVELOPE_BLUR = 0.04
 """Standard deviation of the blur that leaves a PSF's envelope, over the shorter side of the frame: 13 pixels of 320,
@@ -62,7 +62,7 @@ def scattered(psf: Psf, part: Tensor, radius: Tensor) -> Psf:
     References:
         J. E. Harvey, Appl. Opt. 51, 3 (2012): scattering by polished surfaces falls as a power of the angle.
     """
-    size = psf.shape[-2], psf.shape[-1]
+    size = size_of(psf)
     grid = fast_length(2 * size[0]), fast_length(2 * size[1])  # no circular wrap-around
     rows, columns = frequency_grid(grid, device=psf.device)
     transfer = torch.exp(-2 * math.pi * radius * (rows.square() + columns.square()).sqrt())

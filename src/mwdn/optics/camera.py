@@ -9,7 +9,7 @@ from mwdn.errors import ShapeError
 from mwdn.fourier.convolution import convolve, correlate
 from mwdn.optics.psf import checked_psf, psf_hash
 from mwdn.optics.sensor import Sensor, check_sensor_size
-from mwdn.types import Image, Measurement, Psf, Scene, Size
+from mwdn.types import Image, Measurement, Psf, Scene, Size, size_of
 
 
 @checked
@@ -48,7 +48,7 @@ class Camera:
     @property
     def sensor_size(self) -> Size:
         """Height and width of a measurement."""
-        return self.size or (self.psf.shape[-2], self.psf.shape[-1])
+        return self.size or size_of(self.psf)
 
     def forward(self, scene: Scene) -> Measurement:
         """Light on the sensor: the scene convolved with the PSF, cropped to the sensor."""

@@ -9,8 +9,9 @@ import torch
 from mwdn.arguments import checked
 from mwdn.errors import ParameterError
 from mwdn.optics.field import Aberration, FieldCamera, field_psfs
+from mwdn.optics.psf import unit_sum
 from mwdn.optics.warp import hazed, warp
-from mwdn.types import Psf, Size
+from mwdn.types import Psf, Size, size_of
 
 OFF_AXIS = Aberration(scale=0.005, stretch=0.02, vignetting=0.3)
 """Change of the PSF at the corner for an `off_axis` of 1, except the blur.
@@ -90,12 +91,12 @@ class Deviation:
         Args:
             psf: (1, C, H, W) of unit sum; scenes and measurements have its size.
         """
-        size = psf.shape[-2], psf.shape[-1]
+        size = size_of(psf)
         angle = math.radians(self.turn_degrees)
         # Acts on (row, column): a clockwise turn moves what lies to the right downwards.
         turn = torch.tensor([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
         if self.shift_px or self.turn_degrees or self.scale:
             psf = warp(psf, (1 + self.scale) * turn, (self.shift_px, self.shift_px))
-            psf = psf / psf.sum((-2, -1), keepdim=True).clamp(min=1e-12)
+            psf = unit_sum(psf)
         psfs = field_psfs(psf, (GRID, GRID) if self.off_axis else (1, 1), off_axis_change(self.off_axis, size))
         return FieldCamera.from_psfs(hazed(psfs, self.haze), size, rank=RANK)

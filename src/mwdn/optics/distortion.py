@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mwdn.optics.polynomials import frame_places, polynomial
-from mwdn.types import Image, Scene, Size
+from mwdn.types import Image, Scene, Size, size_of
 
 _INVERSIONS = 3
 """Fixed-point steps; each multiplies the error by the derivative of d, a few hundredths."""
@@ -22,14 +22,14 @@ def undistort(picture: Image, coefficients: Tensor) -> Scene:
         picture: I, (B, C, H, W).
         coefficients: (2, K), of the displacement d down and right.
     """
-    y, x = frame_places((picture.shape[-2], picture.shape[-1]))
+    y, x = frame_places(size_of(picture))
     down, right = polynomial(coefficients, y, x)
     return _look_up(picture, y + down, x + right)
 
 
 def distort(scene: Scene, coefficients: Tensor) -> Image:
     """The scene as a reconstruction shows it, the inverse of `undistort`: ``I(q) = T(p)`` with ``p = q - d(p)``."""
-    y, x = place = frame_places((scene.shape[-2], scene.shape[-1]))
+    y, x = place = frame_places(size_of(scene))
     for _ in range(_INVERSIONS):
         down, right = polynomial(coefficients, *place)
         place = y - down, x - right

@@ -14,7 +14,7 @@ from mwdn.fourier.convolution import convolve, correlate
 from mwdn.fourier.transforms import fast_length, gaussian_transfer, inverse_spectrum, spectrum
 from mwdn.optics.sensor import Sensor, check_sensor_size
 from mwdn.optics.warp import warp
-from mwdn.types import Image, Measurement, Psf, Scene, Size
+from mwdn.types import Image, Measurement, Psf, Scene, Size, size_of
 
 FieldPsfs = Float[Tensor, "rows columns psf_channel psf_height psf_width"]
 """PSFs of points on a grid that spans the scene from corner to corner, each centred like the PSF on the axis."""
@@ -166,7 +166,7 @@ class FieldCamera:
     @property
     def scene_size(self) -> Size:
         """Height and width of scenes."""
-        return self.weights.shape[-2], self.weights.shape[-1]
+        return size_of(self.weights)
 
     @property
     def sensor_size(self) -> Size:
@@ -185,7 +185,7 @@ class FieldCamera:
             ParameterError: it is no tensor of floats.
         """
         check_batch(scene, "scene")
-        if (scene.shape[-2], scene.shape[-1]) != self.scene_size:
+        if size_of(scene) != self.scene_size:
             raise ShapeError(
                 f"`scene` {tuple(scene.shape)} must have the camera's scene size {self.scene_size}. "
                 "Make the camera for this size: `FieldCamera.from_psfs(psfs, scene_size)`."
@@ -235,7 +235,7 @@ def two_depths(near: FieldCamera, far: FieldCamera, is_near: Tensor) -> FieldCam
 
 def gaussian_blur(image: Image, sigma: float) -> Image:
     """Blur pictures by a Gaussian of standard deviation ``sigma`` in pixels; zeros beyond their border."""
-    size = image.shape[-2], image.shape[-1]
+    size = size_of(image)
     # Padding by four standard deviations: 6e-5 of the light at a border wraps around to the opposite one.
     margin = math.ceil(4 * sigma)
     grid = fast_length(size[0] + margin), fast_length(size[1] + margin)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from mwdn.arguments import check_batch
 from mwdn.errors import PsfError
-from mwdn.types import Psf
+from mwdn.types import TINY, Psf
 
 SUM_TOLERANCE = 1e-3
 """A PSF whose channels sum to 1 within this is used as it is: 1e-3 is a tenth of the step of 8-bit brightness."""
@@ -23,9 +23,9 @@ def psf_hash(psf: Psf) -> str:
 def unit_sum(psf: Tensor) -> Tensor:
     """Divide each channel (..., h, w) by its sum: the camera then keeps the energy of the scene.
 
-    Nothing is checked, see `mwdn.optics.psf.checked_psf`: a channel without light becomes NaN.
+    Nothing is checked, see `mwdn.optics.psf.checked_psf`: a channel without light stays 0.
     """
-    return psf / psf.sum((-2, -1), keepdim=True)
+    return psf / psf.sum((-2, -1), keepdim=True).clamp(min=TINY)
 
 
 def checked_psf(psf: Tensor, *, values: bool = True, scale: bool = True) -> Psf:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mwdn.errors import ParameterError
 from mwdn.fourier.transforms import column_counts, frequency_grid, spectrum
-from mwdn.types import Image, Psf
+from mwdn.types import Image, Psf, size_of
 
 SCENE_CONTRAST = 0.5
 """Standard deviation of a photograph's linear light over its mean; 0.4 to 0.8 is usual."""
@@ -91,7 +91,7 @@ def radial_spectrum(psf: Psf, bins: int = 60) -> Tensor:
 
 def modulus_image(psf: Psf) -> Image:
     """|H| as a picture on a logarithmic scale, frequency 0 in the middle: white is its maximum, black 0.001 of it."""
-    size = (psf.shape[-2], psf.shape[-1])
+    size = size_of(psf)
     half = spectrum(psf.mean(1, keepdim=True), size).abs()
     # |H| of a real PSF is symmetric, |H(-v, -u)| = |H(v, u)|: the missing half is this one, turned by 180 degrees.
     turned = half[..., 1 : size[1] - size[1] // 2].flip(-1)

@@ -6,7 +6,7 @@ import torch
 
 from mwdn.arguments import check_batch, checked
 from mwdn.errors import ParameterError, ShapeError
-from mwdn.types import Image, Size
+from mwdn.types import Image, Size, size_of
 
 
 @checked
@@ -91,7 +91,7 @@ def check_sensor_size(measurement: Image, size: Size) -> None:
         ParameterError: it is no tensor of floats.
     """
     check_batch(measurement, "measurement")
-    if (measurement.shape[-2], measurement.shape[-1]) != tuple(size):
+    if size_of(measurement) != tuple(size):
         raise ShapeError(
             f"`measurement` {tuple(measurement.shape)} must have the camera's sensor size {tuple(size)}. For another "
             "sensor, make the camera with `size=(height, width)`."

@@ -3,7 +3,7 @@
 from torch import Tensor
 
 from mwdn.optics.polynomials import frame_places, polynomial
-from mwdn.types import Image, Size
+from mwdn.types import Image, Size, size_of
 
 
 def shading(coefficients: Tensor, size: Size) -> Tensor:
@@ -20,4 +20,4 @@ def shade(picture: Image, coefficients: Tensor) -> Image:
     """The picture (B, C, H, W) times `shading`; a grey picture times the geometric mean of the colours'."""
     if picture.shape[1] == 1:
         coefficients = coefficients.mean(0, keepdim=True)
-    return picture * shading(coefficients, (picture.shape[-2], picture.shape[-1])).to(picture)
+    return picture * shading(coefficients, size_of(picture)).to(picture)

@@ -18,6 +18,7 @@ from mwdn.preview.jobs import Job
 from mwdn.preview.limits import Limits
 from mwdn.preview.result import Result
 from mwdn.runtime.iterations import watch_iterations
+from mwdn.types import size_of
 
 KEPT = 4
 """Prepared methods that are kept for the next capture; one of 1 Mpixel takes about 100 MB."""
@@ -99,7 +100,7 @@ class Reconstructions:
         reconstruct, calibration = pipeline.reconstruct, pipeline.calibration
         frame = read_upload(order.capture, "capture", self.limits.frame_pixels, calibration.frames.read)
         measurement = calibration.to_measurement(frame)
-        check_pixels("capture", (measurement.shape[-2], measurement.shape[-1]), self.limits)
+        check_pixels("capture", size_of(measurement), self.limits)
         pipeline.check(measurement)
         job.advance(0.0)
         with watch_iterations(lambda _: job.advance(0.0)):  # which may cancel

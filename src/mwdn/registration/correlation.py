@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mwdn.errors import AlignmentError, ParameterError
-from mwdn.registration.projection import Points, Projection
+from mwdn.registration.projection import Points, Projection, side_vectors
 from mwdn.registration.views import Views, compress
 from mwdn.types import FloatFrame, Size
 
@@ -152,8 +152,7 @@ def sample(projection: Projection, views: Views, blur: float, *, step: float) ->
 
 def _side_lengths(projection: Projection) -> Array:
     """Mean height and width of the picture in pixels of the camera."""
-    corners = projection.corners()
-    top, right, bottom, left = np.hypot(*(np.roll(corners, -1, 0) - corners).T)
+    top, right, bottom, left = np.hypot(*side_vectors(projection.corners()).T)
     return np.clip([(left + right) / 2, (top + bottom) / 2], 8, 4096)
 
 
@@ -285,7 +284,7 @@ def _is_sound(projection: Projection) -> bool:
     if abs(h[6]) + abs(h[7]) > 0.8 or abs(h[8]) > 0.3:
         return False
     corners = projection.corners()
-    edges = np.roll(corners, -1, 0) - corners
-    after = np.roll(edges, -1, 0)
-    turns = np.sign(edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0])
+    sides = side_vectors(corners)
+    after = np.roll(sides, -1, 0)
+    turns = np.sign(sides[:, 0] * after[:, 1] - sides[:, 1] * after[:, 0])
     return abs(turns.sum()) == 4 and bool(np.abs(corners).max() < 8 * max(projection.camera_size))

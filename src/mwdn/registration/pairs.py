@@ -20,7 +20,7 @@ from mwdn.registration.projection import Projection
 from mwdn.registration.registration import KEY
 from mwdn.registration.views import Views
 from mwdn.registration.warp import warp_pictures
-from mwdn.types import Psf
+from mwdn.types import Psf, size_of
 
 Track = Callable[[list[int]], Iterable[int]]
 
@@ -96,7 +96,7 @@ def write_aligned(
         MwdnError: a pair is damaged, does not fit the camera, or the file cannot be written.
     """
     first = pairs.measurement(0)
-    projection.check_camera((first.shape[-2], first.shape[-1]))
+    projection.check_camera(size_of(first))
     brightest = 1.0 if levels is None else float(levels.max())
     colours = torch.ones(first.shape[1]) if levels is None else levels / brightest
     shape = (*first.shape[-2:], first.shape[1])

@@ -189,6 +189,11 @@ def picture_corners(size: Size) -> Points:
     return np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]])
 
 
+def side_vectors(corners: Points) -> Points:
+    """Vectors (4, 2) from corner to corner along the top, right, bottom and left side."""
+    return np.roll(corners, -1, 0) - corners
+
+
 def _picture_frame(size: Size) -> tuple[Points, Points]:
     """Middle and half width and height in pixels."""
     height, width = size

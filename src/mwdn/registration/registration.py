@@ -9,7 +9,7 @@ from mwdn.data.hdf5 import open_hdf5_header, read_attributes
 from mwdn.data.pair_writer import PAIR_SUFFIXES
 from mwdn.errors import ParameterError
 from mwdn.io.reading import parse_json, read_json, unexpected_content
-from mwdn.registration.projection import Points, Projection
+from mwdn.registration.projection import Points, Projection, side_vectors
 
 KEY = "registration"
 """Attribute of a file of aligned pairs that holds the registration as JSON."""
@@ -38,16 +38,15 @@ class Place:
     @classmethod
     def of(cls, corners: Points) -> "Place":
         """The place of a picture with these corners (4, 2): its own top left, top right, bottom right, bottom left."""
-        edges = np.roll(corners, -1, 0) - corners
-        mirrored = edges[0, 0] * edges[1, 1] - edges[0, 1] * edges[1, 0] < 0
-        along = edges[0] - edges[2]  # the picture's own rows
+        top, right, bottom, left = side_vectors(corners)
+        mirrored = top[0] * right[1] - top[1] * right[0] < 0
+        along = top - bottom  # the picture's own rows
         if mirrored:
             along = -along
         turn = np.degrees(np.arctan2(along[1], along[0]))
         first = corners[corners.sum(1).argmin()]
-        lengths = np.hypot(*edges.T)
         upright = abs((turn + 90) % 180 - 90) <= 45
-        across, down = (lengths[0] + lengths[2]) / 2, (lengths[1] + lengths[3]) / 2
+        across, down = ((np.hypot(*a) + np.hypot(*b)) / 2 for a, b in ((top, bottom), (right, left)))
         width, height = (across, down) if upright else (down, across)
         return cls(float(first[0]), float(first[1]), float(width), float(height), float(turn), bool(mirrored))
 

@@ -17,6 +17,7 @@ from torch.nn import functional as F
 
 from mwdn.optics.polynomials import coefficient_count, polynomials
 from mwdn.registration.distortion import GAUSS_NEWTON_STEPS, without_margin
+from mwdn.types import size_of
 
 SQUARE_PX = 8
 """Side of the squares that are averaged first: shading is smooth."""
@@ -36,7 +37,7 @@ def measure_shading(pictures: Sequence[Tensor], scenes: Sequence[Tensor], order:
             suits the other half better than no shading.
     """
     pairs = [(_blocks(picture), _blocks(scene)) for picture, scene in zip(pictures, scenes, strict=True)]
-    P = _blocks(polynomials(order, (pictures[0].shape[-2], pictures[0].shape[-1])).to(pictures[0].device))
+    P = _blocks(polynomials(order, size_of(pictures[0])).to(pictures[0].device))
     halves = pairs[::2], pairs[1::2]
     best, least = 0, _unexplained(pairs, P[:0], torch.zeros(len(pictures[0]), 0).to(P))
     for count in (coefficient_count(each) for each in range(order + 1) if halves[1]):

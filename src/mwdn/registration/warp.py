@@ -6,7 +6,7 @@ from torch import Tensor
 
 from mwdn.arguments import check_batch
 from mwdn.errors import ShapeError
-from mwdn.registration.projection import Points, Projection
+from mwdn.registration.projection import Points, Projection, side_vectors
 from mwdn.types import FloatFrame, Image, Scene
 
 _SAMPLES = 3
@@ -68,8 +68,7 @@ def _downsampled(frame: FloatFrame, projection: Projection) -> tuple[FloatFrame,
     import cv2
 
     h, w = projection.picture_size
-    corners = projection.corners()
-    top, right, bottom, left = np.hypot(*(np.roll(corners, -1, 0) - corners).T)
+    top, right, bottom, left = np.hypot(*side_vectors(projection.corners()).T)
     wanted = _SAMPLES * max(left, right), _SAMPLES * max(top, bottom)
     size = max(2, min(h, round(wanted[0]))), max(2, min(w, round(wanted[1])))
     if size == (h, w):

@@ -22,7 +22,7 @@ from mwdn.solvers.splitting import (
     update_copies,
     update_scene,
 )
-from mwdn.types import Measurement, Psf, Scene
+from mwdn.types import TINY, Measurement, Psf, Scene
 
 
 class Iterate(NamedTuple):
@@ -89,7 +89,7 @@ class Admm:
         """
         check_fit(measurement, psf, "measurement")
         measurement, psf = measurement.float(), checked_psf(psf).float()  # squares in half precision end at 65,504
-        b_norm = _norm(measurement).clamp(min=torch.finfo(torch.float32).tiny)
+        b_norm = _norm(measurement).clamp(min=TINY)
         h_norm = _norm(psf)
         b = measurement / b_norm
         problem = start.problem._replace(measurement=b) if start else Problem.from_psf(b, psf / h_norm)

@@ -43,7 +43,7 @@ from mwdn.solvers.levels import Level, relative_noise, root_mean_square
 from mwdn.solvers.pose import POSE_BLUR, Pose
 from mwdn.solvers.pyramid import halve, solve
 from mwdn.solvers.splitting import Penalties
-from mwdn.types import Image, Measurement, Psf, Size
+from mwdn.types import TINY, Image, Measurement, Psf, Size, size_of
 
 _NO_VARIATION = Penalties(0.15, 0.0, 0.6)
 
@@ -130,7 +130,7 @@ def align(measurement: Measurement, psf: Psf, *, steps: int = 2, min_gain: float
         none = torch.zeros(len(seen), device=seen.device)
         return Pose(none, none, none)
     half = halve(measurement.float())
-    half = half / half.abs().amax((1, 2, 3), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
+    half = half / half.abs().amax((1, 2, 3), keepdim=True).clamp(min=TINY)
     psf = checked_psf(psf).expand(len(half), -1, -1, -1)
     pose = _estimate_pose(half, psf, steps, min_gain)
     if min(measurement.shape[-2:]) >= _MIN_SIDE:
@@ -245,7 +245,7 @@ def _residual(measurement: Tensor, psfs: Psf) -> Tensor:
     high = 1 - gaussian_transfer(grid, _BLUR, device=measurement.device)
     r = inverse_spectrum(estimate.residual_spectrum * high, grid, grid)
     b = inverse_spectrum(spectrum(measurement, grid) * high, grid, grid)  # the prediction is b - r, high-passed
-    size = measurement.shape[-2], measurement.shape[-1]
+    size = size_of(measurement)
     return _without_fall_off(r, b.repeat_interleave(count, 0) - r, size, count).reshape(len(measurement), count, -1)
 
 

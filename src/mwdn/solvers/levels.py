@@ -2,12 +2,11 @@
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from mwdn.optics.noise import noise_level
 from mwdn.solvers.splitting import Penalties
-from mwdn.types import Measurement
+from mwdn.types import TINY, Measurement
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,7 @@ def pyramid_levels(finest: int) -> tuple[Level, ...]:
 def root_mean_square(measurement: Measurement) -> Tensor:
     """Root mean square of each sample, (B, 1, 1, 1); never 0."""
     square = measurement.float().square().mean((1, 2, 3), keepdim=True)
-    return square.sqrt().clamp(min=torch.finfo(torch.float32).tiny)
+    return square.sqrt().clamp(min=TINY)
 
 
 def relative_noise(measurement: Measurement) -> Tensor:

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from mwdn.solvers.unexplained import differences, energy, unexplained
-from mwdn.types import Measurement, Psf, Size
+from mwdn.types import Measurement, Psf, Size, size_of
 
 COSINE_ORDER = 6.0
 """Highest frequency of the cosines in half periods over the frame's width. A spot with a standard deviation of 0.15 of
@@ -62,7 +62,7 @@ class Cosines(NamedTuple):
     @property
     def size(self) -> Size:
         """Height and width of the frame."""
-        return self.light.shape[-2], self.light.shape[-1]
+        return size_of(self.light)
 
     def coefficients(self, light: Tensor) -> Tensor:
         """Coefficients (..., T) of light (..., h, w)."""
@@ -128,7 +128,7 @@ def refine_spot(b: Measurement, psf: Psf, saturated: Tensor, spot: Spot) -> Spot
 
 def _fit(b: Measurement, psf: Psf, saturated: Tensor, spot: Spot, *, promising: float) -> tuple[Spot, Tensor, Tensor]:
     """Improve a spot up to `SEARCH_STEPS` times; returns the best, and the unexplained energy (B,) before and after."""
-    basis = cosines((b.shape[-2], b.shape[-1]), b.device)
+    basis = cosines(size_of(b), b.device)
     best, r = spot, unexplained(b - spot.light(basis.size), psf, saturated)
     start = least = energy(r)
     for _ in range(SEARCH_STEPS):

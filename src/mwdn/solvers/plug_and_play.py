@@ -26,6 +26,7 @@ from mwdn.runtime.iterations import iterations
 from mwdn.solvers.levels import REFERENCE_NOISE, root_mean_square, smoothing_scale
 from mwdn.solvers.pyramid import Estimate
 from mwdn.solvers.splitting import Problem, deficit
+from mwdn.types import TINY
 
 Denoiser = Callable[[Tensor, Tensor], Tensor]
 """From an image (B, C, H, W), whose brightest pixel is about 1, and its noise level (B, 1, 1, 1) to the clean image."""
@@ -73,7 +74,7 @@ def plug_and_play(
     problem = Problem.from_transfer(estimate.measurement.float(), band.transfer, estimate.saturated)
     grid, (height, width) = problem.grid, problem.sensor
     z = (estimate.grid_scene * band.norm).expand(*estimate.measurement.shape[:2], *grid)
-    brightest = z[..., :height, :width].amax((1, 2, 3), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
+    brightest = z[..., :height, :width].amax((1, 2, 3), keepdim=True).clamp(min=TINY)
     sensor_noise = estimate.noise.clamp(min=REFERENCE_NOISE) * root_mean_square(estimate.measurement)
     noise = torch.maximum(sensor_noise, root_mean_square(estimate.residual))
     power = problem.transfer.abs().square()
@@ -103,6 +104,6 @@ def certainty(measurement: Tensor) -> Tensor:
     Photon noise has a variance in proportion to the light; noise from other sources is taken to have as much as the
     photon noise of the mean.
     """
-    mean = measurement.mean((1, 2, 3), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
+    mean = measurement.mean((1, 2, 3), keepdim=True).clamp(min=TINY)
     weight = mean / (measurement.clamp(min=0) + mean)
     return weight / weight.mean((1, 2, 3), keepdim=True)

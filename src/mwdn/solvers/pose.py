@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from mwdn.optics.aperture import displaced_envelope
+from mwdn.optics.psf import unit_sum
 from mwdn.optics.warp import hazed, warp
 from mwdn.types import Psf
 
@@ -50,5 +51,4 @@ class Pose(NamedTuple):
         moved = warp(psf, torch.stack([torch.stack([c, s], -1), torch.stack([-s, c], -1)], 1))
         if self.envelope is not None and self.envelope.any():
             moved = displaced_envelope(moved, self.envelope * min(psf.shape[-2:]), blur=POSE_BLUR)
-        moved = moved / moved.sum((-2, -1), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
-        return hazed(moved, torch.as_tensor(self.haze, device=moved.device).reshape(-1, 1, 1, 1))
+        return hazed(unit_sum(moved), torch.as_tensor(self.haze, device=moved.device).reshape(-1, 1, 1, 1))

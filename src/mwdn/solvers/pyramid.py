@@ -13,7 +13,7 @@ from mwdn.arguments import checked
 from mwdn.errors import ParameterError
 from mwdn.fourier.convolution import check_fit
 from mwdn.fourier.transforms import fast_length, inverse_spectrum, spectrum, transfer_function
-from mwdn.optics.psf import checked_psf
+from mwdn.optics.psf import checked_psf, unit_sum
 from mwdn.optics.saturation import saturated_pixels
 from mwdn.runtime.iterations import repeat
 from mwdn.solvers.levels import (
@@ -26,7 +26,7 @@ from mwdn.solvers.levels import (
     smoothing_scale,
 )
 from mwdn.solvers.splitting import Problem, initial_state, make_filters, update_copies, update_scene
-from mwdn.types import Measurement, Psf, Scene, Size, Spectrum
+from mwdn.types import TINY, Measurement, Psf, Scene, Size, Spectrum, size_of
 
 MIXED = 0.1
 """Saturated part of a coarse pixel above which its value is taken as a lower bound of the light."""
@@ -144,7 +144,7 @@ class Estimate:
         finest = self.psf.bands[-1]
         H = finest.transfer * finest.norm
         V = H.conj() * self.residual_spectrum / (H.abs().square() + regularisation)
-        return inverse_spectrum(V, finest.grid, (self.scene.shape[-2], self.scene.shape[-1]))
+        return inverse_spectrum(V, finest.grid, size_of(self.scene))
 
 
 class Band(NamedTuple):
@@ -173,20 +173,19 @@ class PsfPyramid:
         # The grid of a linear convolution, divisible by the coarsest level's downsampling.
         lengths = zip(size, psf.shape[-2:], strict=True)
         rows, columns = (fast_length(-(-(s + p) // coarsest)) * coarsest for s, p in lengths)
-        tiny = torch.finfo(torch.float32).tiny
-        H = transfer_function(psf.float() / psf.float().sum((-2, -1), keepdim=True).clamp(min=tiny), (rows, columns))
+        H = transfer_function(unit_sum(psf.float()), (rows, columns))
         bands = []
         for level in levels:
             low = low_band(H, (rows, columns), level.downsampling)
             grid = rows // level.downsampling, columns // level.downsampling
             norm = inverse_spectrum(low, grid, grid).square().sum((-2, -1), keepdim=True).mean(1, keepdim=True).sqrt()
-            norm = norm.clamp(min=tiny)
+            norm = norm.clamp(min=TINY)
             bands.append(Band(level, low / norm, norm))
         return cls(tuple(bands))
 
     def solve(self, measurement: Measurement) -> Estimate:
         """Estimate a smooth non-negative scene (B, C, H, W), from coarse to fine. Differentiable."""
-        size = measurement.shape[-2], measurement.shape[-1]
+        size = size_of(measurement)
         # tau is stated for a measurement of unit mean square.
         unit = root_mean_square(measurement)
         b = measurement.float() / unit
@@ -221,7 +220,7 @@ def solve(measurement: Measurement, psf: Psf, levels: tuple[Level, ...] = LEVELS
         ShapeError: batch or channels do not fit.
     """
     check_fit(measurement, psf, "measurement")
-    return PsfPyramid.from_psf(psf, (measurement.shape[-2], measurement.shape[-1]), levels).solve(measurement)
+    return PsfPyramid.from_psf(psf, size_of(measurement), levels).solve(measurement)
 
 
 def halve(image: Tensor) -> Tensor:

@@ -28,7 +28,7 @@ from mwdn.optics.saturation import subtract_light
 from mwdn.solvers.levels import LEVELS, root_mean_square
 from mwdn.solvers.light_spot import Cosines, Spot, best_spot, cosines
 from mwdn.solvers.pyramid import PsfPyramid
-from mwdn.types import Measurement, Psf, Scene, Size
+from mwdn.types import Measurement, Psf, Scene, Size, size_of
 
 COARSEST = replace(LEVELS[0], downsampling=1)
 """The iterations for a scene in these coarse pixels."""
@@ -110,7 +110,7 @@ class Phase(NamedTuple):
 
 def find_smooth_light(b: Measurement, psf: Psf) -> tuple[SmoothLight, Tensor]:
     """The light in measurements (B, C, h, w) of mean 1, through PSFs (B, C, h, w), and whether it counts, bool (B,)."""
-    size = b.shape[-2], b.shape[-1]
+    size = size_of(b)
     pyramid = PsfPyramid.from_psf(psf, size, (COARSEST,))
     basis = cosines(size, b.device)
     none = SmoothLight(b.new_zeros(*b.shape[:2], 3), Spot.none(b))

@@ -20,7 +20,7 @@ from mwdn.fourier.transforms import column_counts, frequency_grid, spectrum
 from mwdn.optics.noise import noise_level
 from mwdn.solvers.alignment import SMOOTH_LEVELS, halve_psf
 from mwdn.solvers.pyramid import halve, solve
-from mwdn.types import Image, Measurement, Psf
+from mwdn.types import TINY, Image, Measurement, Psf
 
 _BANDS = (0.03, 0.06, 0.09, 0.12, 0.16, 0.2, 0.25, 0.3, 0.36, 0.43, 0.5)
 """Edges in cycles per pixel. Below, most of the residual is ambient light."""
@@ -47,7 +47,7 @@ def spectral_misfit(measurement: Measurement, psf: Psf) -> Tensor:
         residuals.
     """
     b, h = measurement.float().mean(1, keepdim=True), psf.float().mean(1, keepdim=True)
-    b = b / b.abs().amax((1, 2, 3), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
+    b = b / b.abs().amax((1, 2, 3), keepdim=True).clamp(min=TINY)
     variance, halvings = noise_level(b).square().sum((1, 2, 3)), 0
     while b[0, 0].numel() > MAX_MISFIT_PIXELS:
         b, h, halvings = halve(b), halve_psf(h), halvings + 1

@@ -29,7 +29,7 @@ from torch import Tensor
 from mwdn.fourier.convolution import check_fit
 from mwdn.fourier.transforms import fast_length, inverse_spectrum, spectrum, transfer_function
 from mwdn.solvers.proximal import Gradient, Variation, divergence, dual_projection, gradient
-from mwdn.types import Measurement, Psf, Size, Spectrum
+from mwdn.types import Measurement, Psf, Size, Spectrum, size_of
 
 
 class Penalties(NamedTuple):
@@ -84,7 +84,7 @@ class Problem(NamedTuple):
     @property
     def sensor(self) -> Size:
         """Height and width of the measurement, the top left of the grid."""
-        return self.measurement.shape[-2], self.measurement.shape[-1]
+        return size_of(self.measurement)
 
 
 class State(NamedTuple):

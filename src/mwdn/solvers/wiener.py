@@ -13,7 +13,7 @@ from mwdn.fourier.transforms import column_counts, inverse_spectrum, spectrum, t
 from mwdn.fourier.wiener import deconvolution_grid
 from mwdn.optics.noise import noise_level
 from mwdn.optics.psf import checked_psf
-from mwdn.types import Measurement, Psf, Scene
+from mwdn.types import TINY, Measurement, Psf, Scene, size_of
 
 
 @checked
@@ -52,7 +52,7 @@ class Wiener:
         """Reconstruct a batch."""
         check_fit(measurement, psf, "measurement")
         psf = checked_psf(psf).float()
-        size = measurement.shape[-2], measurement.shape[-1]
+        size = size_of(measurement)
         grid = deconvolution_grid(size, self.boundary)
         total = psf.sum((-2, -1), keepdim=True)
         H = transfer_function(psf / total, grid)
@@ -75,7 +75,7 @@ class Wiener:
         """
         # In units of the contrast, so that no square leaves the range of float32.
         contrast = measurement.float().std((-2, -1), correction=0, keepdim=True)
-        contrast = contrast.clamp(min=torch.finfo(torch.float32).tiny)
+        contrast = contrast.clamp(min=TINY)
         allowed = (noise_level(measurement) / contrast).square() + self.tolerance**2
         # Parseval: sum |B|^2 = pixels x variance. The mean is left out.
         count = column_counts(width, device=B.device).repeat(B.shape[-2], 1)

@@ -139,14 +139,18 @@ def prepare(
     task, validation = (with_stored_psf(part, stored) for part in (data.task, data.validation))
     validator = Validator(recipe, validation, psf if stored is None else stored, captures)
     trainer = Trainer(recipe, task, out=out, calibration=calibration, validator=validator, device=place)
-    # A run may go on with more photographs. Other pairs have their numbers, but not their content.
+    _check_same_samples(trainer, out, photos=photos, pairs=pairs)
+    return trainer
+
+
+def _check_same_samples(trainer: Trainer, out: Path, *, photos: Path | None, pairs: Path | None) -> None:
+    """Refuse to continue a run on other samples, except an unfinished one on other photographs, such as more."""
     if not trainer.compare_samples() and (trainer.finished or pairs is not None):
         kind = "pairs" if pairs else "photographs"
         raise CheckpointError(
             f"`{out}` holds a run of the same recipe on other {kind} than those of `{pairs or photos}`. "
             "Choose another folder, `out`, or remove it."
         )
-    return trainer
 
 
 def simulated_captures(recipe: Recipe, photos: Path, psf: Psf, *, is_grey: bool) -> TrainingData:

@@ -27,7 +27,7 @@ from mwdn.fourier.convolution import convolve
 from mwdn.networks import Network
 from mwdn.training.losses import Loss
 from mwdn.training.tasks import Scores
-from mwdn.types import Image, Measurement
+from mwdn.types import TINY, Image, Measurement
 
 
 class SelfSupervisedLoss(NamedTuple):
@@ -82,7 +82,7 @@ def unexplained(explained: Image, measurement: Measurement) -> Tensor:
     residual, signal = (
         picture - picture.mean((-2, -1), keepdim=True) for picture in (measurement - explained, measurement)
     )
-    power = signal.square().sum((1, 2, 3)).clamp(min=torch.finfo(torch.float32).tiny)
+    power = signal.square().sum((1, 2, 3)).clamp(min=TINY)
     return residual.square().sum((1, 2, 3)) / power
 
 

@@ -10,7 +10,7 @@ from mwdn.io.contact_sheets import contact_sheet
 from mwdn.training.losses import Loss
 from mwdn.training.recipe import Recipe
 from mwdn.training.tasks import Task, reconstruct_aligned
-from mwdn.types import Image, Measurement, Psf
+from mwdn.types import Image, Measurement, Psf, size_of
 
 VALIDATION_START = 10**12
 """Number of the first validation sample, far above those of any training."""
@@ -70,9 +70,8 @@ class Validator:
             psnrs.append(scores.psnr)
             losses.append(len(numbers) * scores.loss)
             rows += _rows(*(pictures[: SHEET_ROWS - len(rows)] for pictures in scores.pictures))
-        blocks = [rows] if self.captures is None else [rows, self.reconstruct_captures(network)]
         left, right = self.task.columns
-        sheet = _sheet(blocks, (left, title, right), self.psf)
+        sheet = _sheet(rows, self.reconstruct_captures(network), (left, title, right), self.psf)
         return Validation(float(torch.cat(psnrs).mean()), sum(losses) / schedule.validation, sheet)
 
     @torch.no_grad()
@@ -90,13 +89,10 @@ def _rows(*pictures: Tensor) -> list[list[Tensor]]:
     return [[picture[None].cpu() for picture in row] for row in zip(*pictures, strict=True)]
 
 
-def _sheet(blocks: list[list[list[Tensor]]], titles: tuple[str, str, str], psf: Psf) -> Image:
-    """Samples on the left, captures on the right; white where one has fewer rows than the other."""
-    heads = [*titles, "capture", titles[1]] if len(blocks) > 1 else list(titles)
-    white = torch.ones(1, 1, *psf.shape[-2:])
-    blanks = [[white] * len(block[0]) for block in blocks]
-    lines = [
-        [picture for row, blank in zip(line, blanks, strict=True) for picture in row or blank]
-        for line in zip_longest(*blocks)
-    ]
-    return contact_sheet(lines, heads)
+def _sheet(samples: list[list[Tensor]], captures: list[list[Tensor]], titles: tuple[str, str, str], psf: Psf) -> Image:
+    """Samples on the left, captures if any on the right; white where one has fewer rows than the other."""
+    if not captures:
+        return contact_sheet(samples, list(titles))
+    blank = torch.ones(1, 1, *size_of(psf))
+    rows = [[*(sample or 3 * [blank]), *(capture or 2 * [blank])] for sample, capture in zip_longest(samples, captures)]
+    return contact_sheet(rows, [*titles, "capture", titles[1]])
