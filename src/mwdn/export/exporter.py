@@ -144,9 +144,7 @@ def export(
     with torch.no_grad(), tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / out.name
         module = FixedPsf(method, psf_for(method, calibration), dtype=torch.float16 if precision == "float16" else None)
-        # torch's own file holds one iteration after the other.
-        loops = as_loops() if file.suffix == ".onnx" else nullcontext()
-        with loops:
+        with as_loops() if file.suffix == ".onnx" else nullcontext():  # a .pt2 file has its iterations unrolled
             any_batch = ({0: Dim("batch", min=1)},)
             program = trace(module, (measurement,), f"`{type(module.method).__name__}`", dynamic_shapes=any_batch)
         write_file(file, program, about)

@@ -45,12 +45,12 @@ def to_onnx(program: ExportedProgram, outputs: Sequence[str] = ("scene",)) -> "o
         ExportError: an operation is not supported.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # from torch's copying of programs
+        warnings.simplefilter("ignore", FutureWarning)  # torch warns when it copies a program
         module = program.run_decompositions({}).module()
     values, steps = _fold_constants(module)
     g = OnnxGraph()
     inputs = {}
-    in_loop: set[fx.Node] = set()  # that depend on the state of the loop that has begun
+    in_loop: set[fx.Node] = set()  # nodes that depend on the state of the open loop
     arguments: Any
     for step in steps:
         if step.op == "placeholder":

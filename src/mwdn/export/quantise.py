@@ -40,7 +40,7 @@ def quantise(file: Path, measurements: Measurement) -> None:
         node.name for node in convolutions if shapes[node.input[1]][1] < MIN_HALF_CHANNELS or node is convolutions[-1]
     ]
     level = logging.root.level
-    logging.root.setLevel(logging.ERROR)  # hides advice on preparing other kinds of models
+    logging.root.setLevel(logging.ERROR)  # hides onnxruntime's advice on models of other kinds
     try:
         quantization.quantize_static(
             model,

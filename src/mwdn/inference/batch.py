@@ -146,7 +146,7 @@ class Batch:
             progress: called with the number of captures that are reconstructed, and after each iteration of a solver
                 with the part of the current one.
         """
-        solves = not isinstance(self.reconstruct.method, nn.Module)  # a network iterates only at its start
+        solves = not isinstance(self.reconstruct.method, nn.Module)  # a network's iterations are only its first part
 
         def read(job: Job) -> _Read | Job:
             return _attempt(job, lambda: self._read(job))
@@ -237,7 +237,7 @@ class Batch:
             if job.trust and self.map:
                 write_picture(map_file, support_picture(picture, job.trust.support.map))
             write_json(sidecar, content)
-        except ImageError:  # the disk is full: the next run would take the picture for something else
+        except ImageError:  # a full disk; without a sidecar, the next run would refuse to replace the picture
             job.output.unlink()
             map_file.unlink(missing_ok=True)
             raise

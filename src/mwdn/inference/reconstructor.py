@@ -179,7 +179,7 @@ class Reconstructor:
             due |= self.align and refresh > 0 and number % refresh == 0
             if due:
                 light_of_scene, _ = self.without_room_light(to_device(measurement, self.device))
-                if has_detail(light_of_scene).all():  # else on the next frame
+                if has_detail(light_of_scene).all():  # otherwise try again with the next frame
                     reconstruct = aligning.at(solvers.align(light_of_scene, self.psf))
                     due = False
             with torch.inference_mode():

@@ -78,7 +78,7 @@ def find_room_light(measurement: Measurement, psf: Psf) -> RoomLight:
     """
     check_fit(measurement, psf, "measurement")
     psf, b = checked_psf(psf).float(), measurement.float()
-    # The mean is the unit below. That of darkness less its dark frame may be negative.
+    # Light is measured in units of the mean, which is negative in some dark captures less their dark frame.
     usable = b.isfinite().flatten(1).all(1) & (b.mean((-2, -1)) >= 0).all(1)
     b = torch.where(usable[:, None, None, None], b, 1.0)
     size = size_of(b)

@@ -43,7 +43,7 @@ def build_empty(name: str, **options: Any) -> nn.Module:  # noqa: ANN401
         ParameterError: an option is out of range, a layer has no channels, or there are too many layers or parameters.
     """
     try:
-        with _Counted(), torch.device("meta"), warnings.catch_warnings(action="ignore"):  # about empty layers
+        with _Counted(), torch.device("meta"), warnings.catch_warnings(action="ignore"):  # torch warns of empty layers
             network = build(name, **options)
     except MwdnError:
         raise

@@ -259,14 +259,14 @@ class WienerBank(FixedFront[BankTransfers]):
         return estimates[:, : self.channels] + unit * correction
 
     def _unet_inputs(self, estimates: Tensor, unit: Tensor) -> Tensor:
-        """The pictures in whole blocks, at least 32 x 32 of them, and the evidence at one pixel of each block."""
+        """The pictures in whole blocks, at least 32 x 32 of them, and the smooth evidence at one pixel of each."""
         below, right = (max(-side % self.fold, 32 * self.fold - side) for side in size_of(estimates))
         if below or right:
             estimates = F.pad(estimates, (0, right, 0, below))
         pictures = pixel_unshuffle(estimates[:, : self.pictures], self.fold).div_(unit)
         if not self.has_evidence:
             return pictures
-        evidence = estimates[:, self.pictures :, :: self.fold, :: self.fold]  # smooth
+        evidence = estimates[:, self.pictures :, :: self.fold, :: self.fold]
         light, maps = evidence[:, : self.channels], evidence[:, self.channels :]
         evidence = torch.cat([light / unit, maps], dim=1).contiguous(memory_format=torch.channels_last)
         return torch.cat([pictures, evidence], dim=1)

@@ -167,7 +167,7 @@ def _fit_below(y: Tensor, X: Tensor, inside: Tensor) -> Tensor:
     penalty = RIDGE * X.shape[1] * torch.eye(len(X), device=X.device, dtype=X.dtype)
     inside = inside.expand_as(y)
     weight, c = inside, y
-    for _ in range(10):  # finds out what is above
+    for _ in range(10):  # each round lowers the weight of the values above the last fit
         XW = X * weight[..., None, :]
         c = torch.linalg.solve(XW @ X.mT + penalty, XW @ y[..., None])[..., 0]
         weight = torch.where(c @ X < y, ABOVE * inside, inside)
