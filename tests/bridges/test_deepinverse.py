@@ -111,12 +111,43 @@ def test_its_reconstructors_take_the_camera(name, camera):
         assert (result - scene).square().mean() < 0.5 * (measurement - scene).square().mean()
 
 
+def test_a_reconstructor_is_told_the_noise_at_its_scale(camera, generator):
+    """A network that takes the noise of a full capture for that of a dim one leaves the noise in the picture."""
+    told = []
+    solver = DeepInverseSolver(lambda y, physics: (told.append(physics.noise_model), y)[1])
+    measurement = torch.rand(2, 3, *SENSOR, generator=generator) * torch.tensor([0.01, 0.5])[:, None, None, None]
+    solver(measurement, camera.psf)
+    of_sensor, scale = LenslessPhysics(camera).noise_model, 1 / measurement.amax((1, 2, 3))
+    torch.testing.assert_close(told[0].gain, of_sensor.gain * scale)
+    torch.testing.assert_close(told[0].sigma, of_sensor.sigma * scale)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_measurements_of_another_size_are_refused(camera):
+    """Their scene was displaced and cropped."""
+    physics = LenslessPhysics(camera, scene_size=SCENE)
+    for solve in (physics.A_adjoint, physics.A_dagger):
+        with pytest.raises(ShapeError, match="measurement"):
+            solve(torch.rand(1, 3, *SCENE))
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("noise", [{"gain": 0.0}, {"sigma": -0.1}, {"gain": torch.tensor([1e-3, 1e-4])}])
+def test_noise_out_of_range_is_refused(noise, camera):
+    with pytest.raises(ParameterError, match="`gain`"):
+        LenslessPhysics(camera)(torch.rand(1, 3, *SENSOR), **noise)
+
+
 @pytest.mark.usefixtures("unchecked")
 def test_other_cameras_are_refused(camera):
     with pytest.raises(ShapeError, match="2 PSFs"):
         LenslessPhysics(Camera(camera.psf.expand(2, -1, -1, -1)))
     with pytest.raises(ParameterError, match="`camera`"):
         LenslessPhysics(camera.psf)
+    with pytest.raises(ParameterError, match="`channels`"):
+        LenslessPhysics(camera, channels="3")
+    with pytest.raises(ParameterError, match="`generator`"):
+        LenslessPhysics(camera, generator=3)
 
 
 def test_noise_follows_gain_and_sigma(generator):

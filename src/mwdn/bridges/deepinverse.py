@@ -13,6 +13,7 @@ from mwdn.errors import ParameterError
 from mwdn.fourier import convolve, correlate
 from mwdn.optics import Camera, Sensor
 from mwdn.optics.psf import checked_psf
+from mwdn.optics.sensor import check_sensor_size
 from mwdn.runtime.requirement import require
 from mwdn.types import Image, Measurement, Psf, Scene, Size
 
@@ -47,7 +48,8 @@ class LenslessPhysics(_physics.LinearPhysics):  # type: ignore[misc]
         generator: torch.Generator | None = None,
         **options: Any,  # noqa: ANN401
     ) -> None:
-        check_options(LenslessPhysics, "`LenslessPhysics`", {"camera": camera, "scene_size": scene_size})
+        given = {"camera": camera, "scene_size": scene_size, "channels": channels, "generator": generator}
+        check_options(LenslessPhysics, "`LenslessPhysics`", given)
         model = ForwardModel.of(camera, scene_size, channels)
         options.setdefault("noise_model", SensorNoise(camera.sensor, generator))
         super().__init__(img_size=model.scene, device=camera.psf.device, **options)
@@ -65,7 +67,12 @@ class LenslessPhysics(_physics.LinearPhysics):  # type: ignore[misc]
         return convolve(x, self.psf, size=self.sensor_size)
 
     def A_adjoint(self, y: Measurement, psf: Psf | None = None, **_: object) -> Scene:  # noqa: N802
-        """Exact adjoint of `A`."""
+        """Exact adjoint of `A`.
+
+        Raises:
+            ShapeError: the measurement does not have the sensor's size.
+        """
+        check_sensor_size(y, self.sensor_size)
         self.update_parameters(psf=psf)
         return correlate(y, self.psf, size=self.scene_size)
 
@@ -73,7 +80,8 @@ class LenslessPhysics(_physics.LinearPhysics):  # type: ignore[misc]
 class DeepInverseSolver:
     """A reconstructor of DeepInverse as a method of this package, for `mwdn.Reconstructor` and `mwdn.evaluation`.
 
-    It gets the measurement with a peak of 1, and `LenslessPhysics` of the PSF; the scale is restored.
+    It gets the measurement with a peak of 1, and `LenslessPhysics` of the PSF with the noise at this scale; the scale
+    is restored.
 
     Args:
         reconstruct: called as ``reconstruct(y, physics)``: a `deepinv.optim.PGD`, a `deepinv.models.RAM`.
@@ -92,6 +100,8 @@ class DeepInverseSolver:
         """
         physics = LenslessPhysics(Camera(psf, sensor=self.sensor), channels=measurement.shape[1])
         peak = measurement.amax((1, 2, 3), keepdim=True).clamp(min=MIN_LIGHT)
+        noise, scale = physics.noise_model, peak.flatten()
+        noise.update_parameters(gain=noise.gain / scale, sigma=noise.sigma / scale)
         return self.reconstruct(measurement / peak, physics) * peak
 
 
@@ -130,7 +140,7 @@ class SensorNoise(_physics.PoissonGaussianNoise):  # type: ignore[misc]
             seed: of the noise.
 
         Raises:
-            ParameterError: a number for each sample.
+            ParameterError: a number for each sample, or one out of its range.
         """
         self.update_parameters(gain=gain, sigma=sigma)
         self.rng_manual_seed(seed)
@@ -142,6 +152,8 @@ class SensorNoise(_physics.PoissonGaussianNoise):  # type: ignore[misc]
             if getattr(self, name).numel() > 1:
                 raise ParameterError(f"`{name}` must be one number: all captures of a batch are by one sensor.")
         gain, sigma = float(self.gain), float(self.sigma)
+        if not (gain > 0 and sigma >= 0):
+            raise ParameterError(f"`gain` ({gain:g}) must be positive, and `sigma` ({sigma:g}) not negative.")
         if (gain, sigma) == self.stated:
             return self.sensor
         return replace(self.sensor, full_well=1 / gain, read_noise=max(sigma**2 - self.rounding, 0.0) ** 0.5 / gain)
