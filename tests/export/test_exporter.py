@@ -592,6 +592,18 @@ def test_command(tmp_path, capsys):
     assert read_about(out)["method"] == "wiener"
 
 
+@pytest.mark.parametrize("taken", ["--psf", "--dark"])
+def test_the_command_does_not_replace_its_inputs(taken, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_frame(tmp_path / "psf.png", (camera().psf[0].movedim(0, -1) * 60000).numpy().round().astype(np.uint16))
+    shutil.copy("psf.png", "camera.onnx")
+    with pytest.raises(SystemExit) as ended:
+        main(["export", "wiener", *(["--psf", "psf.png"] if taken != "--psf" else []), taken, "camera.onnx"])
+    assert ended.value.code == 2
+    assert "would overwrite an input" in capsys.readouterr().err
+    assert Path("camera.onnx").read_bytes() == Path("psf.png").read_bytes()
+
+
 @pytest.mark.parametrize("name", ["a.onnx", "a.pt2"])
 def test_a_file_without_a_description_is_refused(tmp_path, name):
     with pytest.raises(ExportError, match=name):

@@ -94,6 +94,13 @@ def test_the_bank_and_its_unet(options, measurement, psf, generator):
     assert ("iterations" in rows) == (options["finest"] > 0)
 
 
+def test_a_share_of_an_even_picture_is_not_a_number(psf):
+    """It was a million: the rounding of an even capture has a standard deviation, too."""
+    bank = build("wiener-bank", width=2, finest=8, align=False, regularisations=(1e-3,)).eval()
+    found = interpret(bank, torch.full((1, 3, *psf.shape[-2:]), 0.5), psf)
+    assert next(part for part in found.content()["parts"] if part["name"] == "iterations")["residual"] is None
+
+
 def test_alignment_is_reported(measurement, psf, generator):
     network = build("wiener-bank", width=4, finest=4)
     result = interpret(network, measurement, psf)

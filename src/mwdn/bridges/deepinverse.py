@@ -17,7 +17,9 @@ from mwdn.optics.sensor import check_sensor_size
 from mwdn.runtime.requirement import require
 from mwdn.types import Image, Measurement, Psf, Scene, Size
 
-_physics: Any = require("deepinv.physics", "deepinverse")
+_INSTALL = "`pip install 'mwdn[deepinverse]'`, with a torchvision that was built for the installed torch"
+
+_physics: Any = require("deepinv.physics", "deepinverse", install=_INSTALL)
 
 
 class LenslessPhysics(_physics.LinearPhysics):  # type: ignore[misc]

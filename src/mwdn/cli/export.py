@@ -13,7 +13,7 @@ from mwdn.cli.progress import show_progress
 from mwdn.cli.terminal import say
 from mwdn.errors import ParameterError
 from mwdn.export.exporter import Exported, Precision, required_agreement
-from mwdn.io.files import check_folder
+from mwdn.io.files import check_folder, refuse_overwrite
 
 
 def export(  # noqa: PLR0913
@@ -56,6 +56,7 @@ def export(  # noqa: PLR0913
             raise ParameterError(f"`runtime` ({runtime}) is for pages. Add `--web CAMERA`, or leave it out.")
         out = out or Path("camera.onnx")
         check_folder(out.parent)
+        refuse_overwrite(out, *camera.files, Path(method))
         write, calibration = _writer(out), camera.load()
         with show_progress() as progress:
             progress.start("Exporting, and comparing with mwdn", None)

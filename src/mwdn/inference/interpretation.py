@@ -233,6 +233,7 @@ def _filter_numbers(wiener: WienerFilter, psf: Tensor) -> dict[str, float | None
     }
 
 
-def _share(change: Tensor, result: Tensor) -> float:
-    """Standard deviation of a change over that of the picture."""
-    return (change.std() / result.std().clamp(min=1e-12)).item()
+def _share(change: Tensor, result: Tensor) -> float | None:
+    """Standard deviation of a change over that of the picture; ``None`` for an even picture, up to rounding."""
+    spread = result.std()
+    return (change.std() / spread).item() if spread > 1e-6 * result.abs().max() else None

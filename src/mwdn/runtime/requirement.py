@@ -20,7 +20,8 @@ def require(module: str, extra: str, *, purpose: str = "This", install: str = ""
     """
     try:
         return import_module(module)
-    except (ImportError, ValueError) as error:  # ValueError: numpy and gi, for another version of a library
+    # ValueError: numpy and gi, for another version of a library. RuntimeError: torchvision, for another torch.
+    except (ImportError, ValueError, RuntimeError) as error:
         package = (getattr(error, "name", None) or module).partition(".")[0]
         install = install or f"`pip install 'mwdn[{extra}]'`"
         raise MissingPackageError(f"{purpose} needs the package {package} ({reason(error)}): {install}.") from error
