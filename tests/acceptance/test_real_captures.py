@@ -6,11 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch.nn import functional as F
 
-from mwdn import Calibration, convolve, read_frame
+from mwdn import Calibration, Reconstructor, convolve, read_frame
 from mwdn.calibration.isolated_pixels import find_isolated_pixels
 from mwdn.cli.app import main
 from mwdn.inference.room_light import find_room_light
+from mwdn.networks.checkerboard import remove_checkerboard
 
 pytestmark = pytest.mark.acceptance
 OUT = Path("results/acceptance")
@@ -68,6 +70,41 @@ def test_room_light_in_real_captures(data: Path) -> None:
         for b in (measurement, measurement.clamp(max=float(measurement.quantile(0.9)))):
             share = float(find_room_light(b, calibration.psf).share)
             assert (0.1 < share < 0.2) if calibration is small else share == 0.0, file.stem
+
+
+def checkerboard(scene: torch.Tensor) -> float:
+    """Root mean square over the brightest pixel, where the scene (1, C, H, W) varies by less than 2 % in 9 pixels."""
+    image = (scene / scene.amax()).movedim(1, 0)
+    binomial = torch.tensor([[1.0, 2, 1], [2, 4, 2], [1, 2, 1]])[None, None] / 16
+    smooth = F.conv2d(image, binomial)
+    is_flat = F.max_pool2d(smooth, 9, stride=4) + F.max_pool2d(-smooth, 9, stride=4) < 0.02
+    signs = 1 - 2 * (torch.arange(image.shape[-1]) % 2)
+    columns, rows = (F.avg_pool2d(F.conv2d(image * sign, binomial), 9, stride=4) for sign in (signs, signs[:, None]))
+    return float((columns.square() + rows.square())[is_flat].mean().sqrt())
+
+
+def test_the_denoisers_checkerboard_is_removed(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It hardly changes the picture otherwise."""
+    calibration = Calibration.from_file(data / "mwdn-camera" / "psf_320.png")
+    removed = []
+
+    def remove(scene: torch.Tensor) -> torch.Tensor:
+        removed.append((scene, remove_checkerboard(scene)))
+        return removed[-1][1]
+
+    monkeypatch.setattr("mwdn.networks.wiener_bank.remove_checkerboard", remove)
+    reconstructor = Reconstructor("universal", calibration, device="cpu")
+    for number in (0, 1, 3, 4):
+        reconstructor(calibration.frames.read(data / "mwdn-camera" / "real-objects" / f"object_{number}.png"))
+        before, after = removed[-1]
+        shown = [
+            checkerboard(before),
+            checkerboard(after),
+            float((after - before).square().mean().sqrt() / before.max()),
+        ]
+        print(f"object_{number}: {shown[0]:.1e} to {shown[1]:.1e}, change {shown[2]:.1e}")
+        assert shown[1] < 0.7 * shown[0]
+        assert shown[2] < 5e-4
 
 
 def test_one_pixel_of_all_real_captures_is_hot(data: Path) -> None:

@@ -14,6 +14,7 @@ from mwdn.fourier.transforms import inverse_spectrum, spectrum
 from mwdn.fourier.wiener import deconvolution_grid, wiener_transfer
 from mwdn.networks.block_means import block_means
 from mwdn.networks.blocks import Decoder, Encoder, check_channels, paper_widths
+from mwdn.networks.checkerboard import remove_checkerboard
 from mwdn.networks.drunet import Drunet
 from mwdn.networks.evidence import MAPS, against_psf, doubt_of_psf
 from mwdn.networks.network import FixedFront
@@ -91,7 +92,8 @@ class WienerBank(FixedFront[BankTransfers]):
         block: size of the blocks in which the U-Net keeps the mean of the iterations' estimate. The iterations model
             the crop; their shading and colour are up to 5 dB better than a U-Net's.
         rounds: rounds of plug and play (`mwdn.solvers.plug_and_play`) between the iterations and the bank, for
-            ``finest`` 1. The denoiser is trained separately on noisy pictures and frozen here; 0 for none.
+            ``finest`` 1. The denoiser is trained separately on noisy pictures and frozen here; 0 for none. A result of
+            plug and play is freed from the denoiser's checkerboard (`mwdn.networks.checkerboard`).
         mean_light: how far the U-Net may change a block's mean light: not at all (``kept``), without limit (``free``),
             or where the measurement contradicts the PSF (``gated``). All but ``kept`` need iterations.
         evidence: whether evidence against the PSF (`mwdn.networks.evidence`) is also an input of U-Net and denoiser;
@@ -165,7 +167,8 @@ class WienerBank(FixedFront[BankTransfers]):
             return self.reconstruct(measurement.expand(-1, self.channels, -1, -1), prepared).mean(1, keepdim=True)
         check_channels(measurement, self.channels)
         estimates = self._estimates(measurement, prepared)
-        return self.correct(estimates, self.unit(estimates))
+        scene = self.correct(estimates, self.unit(estimates))
+        return remove_checkerboard(scene) if self.rounds else scene
 
     def as_recorded(self, scene: Scene) -> Scene:
         """Convert a result of `reconstruct` to the geometry and light of the scenes that the network was trained on."""
