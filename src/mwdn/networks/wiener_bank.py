@@ -167,8 +167,7 @@ class WienerBank(FixedFront[BankTransfers]):
             return self.reconstruct(measurement.expand(-1, self.channels, -1, -1), prepared).mean(1, keepdim=True)
         check_channels(measurement, self.channels)
         estimates = self._estimates(measurement, prepared)
-        scene = self.correct(estimates, self.unit(estimates))
-        return remove_checkerboard(scene) if self.rounds else scene
+        return self.correct(estimates, self.unit(estimates))
 
     def as_recorded(self, scene: Scene) -> Scene:
         """Convert a result of `reconstruct` to the geometry and light of the scenes that the network was trained on."""
@@ -235,11 +234,14 @@ class WienerBank(FixedFront[BankTransfers]):
         return brightest.clamp(min=TINY)
 
     def correct(self, estimates: Tensor, unit: Tensor) -> Scene:
-        """Scene (B, C, H, W) from `estimates` or a crop of them: the U-Net's correction added to the smoothest."""
+        """Scene (B, C, H, W) from `estimates` or a crop of them: the U-Net's correction added to the smoothest.
+
+        In evaluation mode with rounds of plug and play, the denoiser's checkerboard is removed too.
+        """
         border = self._border(estimates)
         if border:
             wide = self._correct(F.pad(estimates, (border,) * 4, mode="reflect"), unit)
-            return wide[..., border:-border, border:-border]
+            return remove_checkerboard(wide[..., border:-border, border:-border])
         return self._correct(estimates, unit)
 
     def _border(self, estimates: Tensor) -> int:
