@@ -107,7 +107,7 @@ def test_a_scene_that_fills_the_frame_loses_little(psf, generator):
     assert float(find_room_light(fourier.convolve(scene, psf), psf).share) < 1 / 8
 
 
-@pytest.mark.parametrize("light", [0 * even_light(SIZE), 0.25 * sloping_light(SIZE, 0.6)])
+@pytest.mark.parametrize("light", [0 * even_light(SIZE), 0.2 * even_light(SIZE), 0.25 * sloping_light(SIZE, 0.6)])
 def test_a_scene_that_fills_the_frame_keeps_its_light(psf, generator, light):
     """With the light of a room, too: what is subtracted there is mostly the scene's own."""
     scene = F.interpolate(torch.rand(1, 3, 6, 8, generator=generator), SIZE, mode="bicubic").clamp(min=0.2)

@@ -68,11 +68,13 @@ def test_a_batch_has_the_light_of_its_captures(camera, capture, found):
 
 
 def test_only_networks_that_align_look_for_it_unasked(camera, capture):
-    """`test_find_room_light` has a reconstructor that was asked to."""
     calibration = Calibration(camera[0] / camera[0].sum((-2, -1), keepdim=True))
-    lit = capture + LIGHTS[1]
-    for sought in (None, False):
-        solver = Reconstructor(Pyramid(), calibration, device="cpu", room_light=sought)
-        assert solver.without_room_light(lit)[1] is None
-    assert Reconstructor(Pyramid(), calibration, device="cpu", room_light=True).room_light
+    lit = capture + 0.25 * sloping_light(SIZE, 0.6)
+    shares = {
+        sought: Reconstructor(Pyramid(), calibration, device="cpu", room_light=sought).without_room_light(lit)[1]
+        for sought in (None, False, True)
+    }
+    assert shares[None] is None
+    assert shares[False] is None
+    assert float(shares[True]) == pytest.approx(0.2, abs=0.1)
     assert Reconstructor(build("wiener-bank", width=2, finest=0), calibration, device="cpu").room_light

@@ -8,8 +8,8 @@ from mwdn.networks.block_means import block_means
 from mwdn.types import Scene, size_of
 
 FAINT = 0.004
-"""Largest detail that is taken for checkerboard, over the picture's brightest pixel. Twice the usual checkerboard, and
-far below the edges and the texture of a scene."""
+"""Largest detail that is taken for checkerboard, over the picture's brightest pixel. Edges and most texture are
+above it."""
 
 BLOCK = 16
 """Side in pixels of the blocks in which the checkerboard is measured."""
